@@ -19,7 +19,7 @@ demo-slam demo-grasp demo-planning: demo-%:
 	@tools/setup.sh bench
 	@tools/run.sh best -- ros2 launch fogros2_examples $*.launch.py picture:=$(CURDIR)/.cache/$*.png
 
-## cloud-check   PROVIDER=aws|gcp|kubernetes: the talker on the smallest machine of your own account
+## cloud-check   PROVIDER=aws|azure|gcp|kubernetes: the talker on the smallest machine there
 cloud-check:
 	@tools/setup.sh cloud
 	@tools/run.sh best -- python tools/cloud_check.py $(PROVIDER) $(if $(OPTIONS),--options '$(OPTIONS)')

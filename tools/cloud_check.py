@@ -35,6 +35,8 @@ from fogros2.runtime import cost
 SMALLEST = {
     'aws': ('ec2_instance_type=cheapest,min_cpu=2,min_memory_gb=2',
             'an EC2 instance with a 30 GB disk, a security group and a key pair'),
+    'azure': ('vm_size=cheapest,min_cpu=2,min_memory_gb=2',
+              'a resource group with a virtual machine, a 30 GB disk, a network and an address'),
     'gcp': ('machine_type=e2-medium',
             'a Compute Engine instance with a 30 GB disk, and three firewall rules'),
     'kubernetes': ('mcpu=500,mb=1024', 'a Job with a pod, and a Service for UDP'),

@@ -205,7 +205,7 @@ pip_in() {
 # What goes in beside the package itself; each includes the one before.
 case $target in
     demo) extras=none ;;
-    cloud) extras=aws,gcp,kubernetes ;;
+    cloud) extras=aws,azure,gcp,kubernetes ;;
     bench) extras=test,bench ;;
     *) extras=test ;;
 esac
@@ -213,7 +213,7 @@ esac
 enough() {
     case "$1 $extras" in
         'none none'|'test none'|'test,bench '*|'test test') return 0 ;;
-        'aws,gcp,kubernetes none'|'aws,gcp,kubernetes aws,gcp,kubernetes'|'test aws,gcp,kubernetes')
+        'aws,azure,gcp,kubernetes none'|'aws,azure,gcp,kubernetes aws,azure,gcp,kubernetes'|'test aws,azure,gcp,kubernetes')
             return 0 ;;
         *) return 1 ;;
     esac

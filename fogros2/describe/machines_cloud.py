@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Machines of cloud providers in launch files: instances, pods. They make no request."""
+"""Machines of cloud providers in launch files: virtual machines, a pod. They make no request."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
-from typing import Any, ClassVar, Optional, TYPE_CHECKING, TypedDict, Union
+from typing import Any, Optional, TYPE_CHECKING, TypedDict, Union
 
 from fogros2.describe.kinds import options_of
 from fogros2.describe.machines import CloudInstance
@@ -249,20 +249,89 @@ class KubeInstance(CloudInstance):
         }
 
 
-class _NoProvider(CloudInstance):
-    """A machine class of FogROS2 without a provider here; the constructor raises an error."""
+class AzureCloudInstance(CloudInstance):
+    """
+    A virtual machine of Azure, created for the launch in a resource group of its own.
 
-    cloud: ClassVar[str]
+    Defaults: the region of ``AZURE_DEFAULTS_LOCATION`` or else eastus, an image that ``ros2 fog``
+    has baked with what the launch needs or else Ubuntu 24.04, and the size Standard_B2als_v2, or
+    the cheapest size that meets the requirements below.
 
-    def __init__(self, *given: object, **keywords: object) -> None:
-        raise ConfigurationError(
-            f'{type(self).__name__} is not available: FogROS2 for Jazzy has no provider for '
-            f'{self.cloud}',
-            'use KubeInstance for a cluster there, SSHInstance(host=..., user=...) for a VM that '
-            'you create there yourself, AWSCloudInstance, or ContainerInstance on this computer')
+    The keywords of FogROS2's pull request 109 have other names: ``zone`` is ``region``,
+    ``machine_type`` is ``vm_size``, ``ami_image`` is ``image``.
 
+    :param resource_group: your own group: a machine joins its virtual network, if it has one in
+        the region. FogROS2 creates and deletes nothing in it.
+    :param ami_image: the same as ``image``.
+    :param zone: the same as ``region``.
+    :param machine_type: the same as ``vm_size``.
+    :param disk_size: GB; default and minimum 30.
+    :param region: such as 'westeurope'; 'nearest' for the region with the fastest response.
+    :param location: the same as ``region``.
+    :param vm_size: such as 'Standard_B2als_v2'; 'cheapest' for the cheapest size that meets the
+        requirements below.
+    :param image: 'publisher:offer:sku:version' of the Marketplace, or an image's resource id.
+    :param spot: use a spot machine: cheaper, but Azure may evict it with half a minute's notice.
+    :param arch: x86_64 or arm64.
+    :param min_cpu: minimum number of vCPUs.
+    :param min_memory_gb: minimum memory in GiB.
+    :param cpu_type: manufacturer of the processor: intel, amd, arm.
+    :param gpu: the number of GPUs, True for one, or part of the GPU's name.
+    :param gpu_memory_gb: minimum memory of each GPU in GB.
+    :param max_price: maximum price in US dollars per hour; also the limit of a spot price.
+    :param tags: tags for everything that is created, in addition to FogROS2's own.
+    :param regions: further regions to try, in this order, if one has no capacity.
+    :param vm_sizes: further sizes to try, in this order, if there is no capacity for one.
+    :param user: the login user.
+    :param ssh_from: networks (CIDR) that may reach the SSH port; None for this robot's public
+        address only.
+    """
 
-class AzureCloudInstance(_NoProvider):
-    """A virtual machine of Azure; launch files of FogROS2 may name it."""
+    provider = 'azure'
 
-    cloud = 'Azure'
+    def __init__(
+        self, resource_group: Optional[SomeSubstitutionsType] = None,
+        ami_image: Optional[ByRegion] = None,
+        zone: Optional[SomeSubstitutionsType] = None,
+        machine_type: Optional[ByRegion] = None,
+        disk_size: Optional[Value] = None, *,
+        region: Optional[SomeSubstitutionsType] = None,
+        location: Optional[SomeSubstitutionsType] = None,
+        vm_size: Optional[ByRegion] = None,
+        image: Optional[ByRegion] = None,
+        spot: Optional[Bool] = None,
+        arch: Optional[SomeSubstitutionsType] = None,
+        min_cpu: Optional[Value] = None,
+        min_memory_gb: Optional[Value] = None,
+        cpu_type: Optional[SomeSubstitutionsType] = None,
+        gpu: Optional[Union[Value, bool]] = None,
+        gpu_memory_gb: Optional[Value] = None,
+        max_price: Optional[Union[Value, Decimal]] = None,
+        tags: Optional[Mapping[str, SomeSubstitutionsType]] = None,
+        regions: Optional[Sequence[SomeSubstitutionsType]] = None,
+        vm_sizes: Optional[Sequence[SomeSubstitutionsType]] = None,
+        user: Optional[SomeSubstitutionsType] = None,
+        ssh_from: Optional[Sequence[SomeSubstitutionsType]] = None,
+        **common: Any,
+    ) -> None:
+        given = options_of(AzureCloudInstance.__init__, locals())
+        for other, name in (('location', 'region'), ('zone', 'region'),
+                            ('machine_type', 'vm_size'), ('ami_image', 'image')):
+            value = given.pop(other, None)
+            if value is not None:
+                if given.get(name) is not None:
+                    raise ConfigurationError(f'{other}= and {name}= are the same option',
+                                             f'leave {other}= out')
+                given[name] = value
+        super().__init__(options=given, **common)
+
+    def info(self, flush_to_disk: bool = False) -> dict[str, Any]:
+        """Return what is known about the machine, with the keys of pull request 109."""
+        machine = self._running.machine if self._running else None
+        return {
+            **super().info(flush_to_disk),
+            'compute_region': self._option('region'),
+            'compute_instance_type': self._option('vm_size'),
+            'disk_size': self._option('disk_size'),
+            'compute_instance_id': machine.id.split('/')[1] if machine else None,
+        }

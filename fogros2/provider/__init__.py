@@ -5,7 +5,7 @@ The plugin interface to computers: a cloud, a cluster, a container engine, an ex
 In reading order: ``offers`` (types of machines and their prices), ``options`` (reading a launch
 file's options), this module, then a module or package for each provider:
 ``ssh``, ``container``, ``kubernetes``, ``vm`` (shared by clouds of virtual machines), ``aws``,
-``gcp``.
+``gcp``, ``azure``.
 """
 
 from __future__ import annotations

@@ -49,8 +49,9 @@ MACHINES = {
     'Google Cloud': ("fogros2.GCPCloudInstance(project_id='robots')", ''),
     'Google Cloud by position': ("fogros2.GCPCloudInstance('robots-prod', 'projects/p12345/global/"
                                  "images/i', 'us-central1-a', 'e2-medium', 10)", ''),
-    'Azure': ("fogros2.AzureCloudInstance(resource_group='robots')",
-              'AzureCloudInstance is not available'),
+    'Azure': ("fogros2.AzureCloudInstance(resource_group='robots')", ''),
+    'Azure by position': ("fogros2.AzureCloudInstance('robots', 'UbuntuLTS', 'eastus', "
+                          "'Standard_DS2_v2', 10)", ''),
 }
 
 

@@ -221,7 +221,7 @@ launch:
     ('<fog_machine name="p" provider="awz"/>',
      ["there is no provider 'awz'", "did you mean 'aws'", 'container']),
     ('<fog_machine name="p"/>',
-     ['needs a provider', 'aws, container, gcp, kubernetes, robot, ssh']),
+     ['needs a provider', 'aws, azure, container, gcp, kubernetes, robot, ssh']),
     ('<fog_machine provider="aws"/>', ['needs a name']),
     ('<fog_machine name="p" provider="ssh"/>', ["provider 'ssh' needs host"]),
     ('<fog_machine name="P_" provider="aws"/>', ["'P_' is no name for a machine"]),

@@ -57,11 +57,11 @@ def complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Complete:
     ('ros2 fog list --region eu-west-', ['eu-west-1', 'eu-west-2', 'eu-west-3']),
     ('ros2 fog price --region ap-east-', ['ap-east-1', 'ap-east-2']),
     ('ros2 fog regions sa-', ['sa-east-1']),
-    ('ros2 fog doctor --provider ', ['aws', 'container', 'gcp', 'kubernetes', 'ssh']),
+    ('ros2 fog doctor --provider ', ['aws', 'azure', 'container', 'gcp', 'kubernetes', 'ssh']),
     ('ros2 launch --machine ma', ['mapper=']),
     ('ros2 launch --machine mapper=', [
-        'mapper=aws', 'mapper=container', 'mapper=gcp', 'mapper=kubernetes', 'mapper=robot',
-        'mapper=ssh']),
+        'mapper=aws', 'mapper=azure', 'mapper=container', 'mapper=gcp', 'mapper=kubernetes',
+        'mapper=robot', 'mapper=ssh']),
 ])
 def test_command_line_is_completed(complete: Complete, line: str, offered: list[str]) -> None:
     begin = time.monotonic()

@@ -95,14 +95,6 @@ def test_regional_values_in_text(element, expected):
     assert keywords.read(keywords.keywords(AWSCloudInstance)['ami_image'], text) == expected
 
 
-@pytest.mark.parametrize('name', ['AzureCloudInstance'])
-def test_clouds_without_a_provider_name_the_alternatives(name):
-    with pytest.raises(ConfigurationError, match=f'{name} is not available') as caught:
-        getattr(fogros2, name)(project_id='p')
-    for other in ('KubeInstance', 'SSHInstance', 'AWSCloudInstance', 'ContainerInstance'):
-        assert other in caught.value.hint and hasattr(fogros2, other)
-
-
 def test_launch_arguments(context):
     context.launch_configurations.update(
         spot='true', no='False', cpu='4', price='0.25', tag='red', group='sg-2')

@@ -168,7 +168,7 @@ def test_modules_that_a_page_names_exist(page):
 
 def test_providers_import_what_their_page_says():
     page = (ROOT / 'doc' / 'providers.md').read_text()
-    own = ('aws', 'container', 'gcp', 'kubernetes', 'ssh', 'vm')
+    own = ('aws', 'azure', 'container', 'gcp', 'kubernetes', 'ssh', 'vm')
     for path in (ROOT / 'fogros2' / 'provider').rglob('*.py'):
         for first, second, names in re.findall(
                 r'^ *from fogros2\.?(\w*)\.?(\w*)\S* import (.*)', path.read_text(), re.MULTILINE):

@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Requests to Azure Resource Manager: credentials, retries, long-running operations, pages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+import copy
+import json
+import os
+from pathlib import Path
+import threading
+import time
+from typing import Any, Optional
+
+from fogros2.errors import Cancelled, PrerequisiteError, ProviderError
+from fogros2.provider.azure.failures import AzureError, refusal
+from fogros2.waiting import cancellable, wait_until
+
+#: Names another endpoint than the public cloud's, such as a sovereign cloud's.
+ENDPOINT_VARIABLE, ENDPOINT = 'FOGROS2_AZURE_ENDPOINT', 'https://management.azure.com'
+#: Versions of the API, by the first of these words that the path contains.
+VERSIONS = {
+    'Microsoft.Authorization/roleDefinitions': '2022-04-01',
+    'Microsoft.Authorization': '2022-04-01', 'Microsoft.DevTestLab': '2018-09-15',
+    'Microsoft.Resources/tags': '2021-04-01', 'Microsoft.Compute/skus': '2021-07-01',
+    'Microsoft.Compute/snapshots': '2024-03-02', 'Microsoft.Compute/galleries': '2024-03-03',
+    'Microsoft.Compute': '2024-07-01', 'Microsoft.Network': '2024-05-01',
+    '': '2022-09-01'}
+#: Attempts of a request that Azure throttles, or that fails at Azure.
+ATTEMPTS = 6
+#: Seconds for an operation; the deletion of a group takes a minute or two.
+OPERATION = 900.0
+
+
+def endpoint() -> str:
+    """Return the address of Azure Resource Manager."""
+    return os.environ.get(ENDPOINT_VARIABLE, ENDPOINT).rstrip('/')
+
+
+def configured() -> bool:
+    """Return whether Azure is set up here; read only files and variables."""
+    return bool(os.environ.get('AZURE_SUBSCRIPTION_ID')) or _file('azureProfile.json').is_file()
+
+
+def _file(name: str) -> Path:
+    return Path(os.environ.get('AZURE_CONFIG_DIR') or Path.home() / '.azure', name)
+
+
+def subscription() -> str:
+    """
+    Return the id of the user's subscription: of the environment, else of ``az login``.
+
+    :raises PrerequisiteError: none is named.
+    """
+    named = os.environ.get('AZURE_SUBSCRIPTION_ID', '')
+    if not named:
+        try:
+            known = json.loads(_file('azureProfile.json').read_text(encoding='utf-8-sig'))
+            named = next((str(entry['id']) for entry in known['subscriptions']
+                          if entry.get('isDefault')), '')
+        except (OSError, ValueError, KeyError, TypeError):
+            named = ''
+    if not named:
+        raise PrerequisiteError('no subscription of Azure is named on this computer',
+                                'az login, or set AZURE_SUBSCRIPTION_ID')
+    return named
+
+
+class Account:
+    """
+    The user's account, as azure-identity finds it; thread-safe.
+
+    :param credential: an azure-identity credential; None for the usual chain, made when needed.
+    """
+
+    def __init__(self, credential: Optional[Any] = None) -> None:
+        self._credential = credential
+        self._lock = threading.Lock()
+        self._session: Any = None
+        #: Set when the launch ends; calls then raise Cancelled.
+        self.cancel: Optional[threading.Event] = None
+        self._hasty = False
+        #: What was asked once for this process, such as the sizes of a region.
+        self.known: dict[str, Any] = {}
+
+    def having(self, cancel: Optional[threading.Event], *, hasty: bool = False) -> Account:
+        """Return this account with calls that raise Cancelled once ``cancel`` is set."""
+        other = copy.copy(self)
+        other.cancel, other._hasty = cancel, hasty
+        return other
+
+    def credential(self) -> Any:
+        """
+        Return the credential.
+
+        :raises PrerequisiteError: azure-identity is not installed.
+        """
+        with self._lock:
+            if self._credential is None:
+                try:
+                    from azure.identity import DefaultAzureCredential
+                except ImportError as error:
+                    raise PrerequisiteError(
+                        'machines at Azure take azure-identity, which is not installed',
+                        'python3 -m pip install azure-identity requests') from error
+                self._credential = DefaultAzureCredential()
+            return self._credential
+
+    def path(self, group: str = '', rest: str = '') -> str:
+        """Return the path of a resource of a group, or of the subscription."""
+        words = [f'/subscriptions/{subscription()}', group and f'resourceGroups/{group}', rest]
+        return '/'.join(filter(None, words))
+
+    def call(
+        self, method: str, path: str, what: str, body: Optional[Mapping[str, Any]] = None, *,
+        wait: bool = False, query: Optional[Mapping[str, str]] = None,
+    ) -> Any:
+        """
+        Make one request and return the answer's JSON, None if it has none.
+
+        :param path: below the endpoint, without the version.
+        :param what: completes '... failed'.
+        :param wait: until a long-running operation is over.
+        :raises FogError: see :func:`~fogros2.provider.azure.failures.refusal`.
+        """
+        version = next(word for key, word in VERSIONS.items() if key.lower() in path.lower())
+        status, headers, answer = self._ask(
+            method, endpoint() + path, what, body, {'api-version': version, **(query or {})})
+        there = headers.get('Azure-AsyncOperation') or headers.get('Location')
+        if not wait or status not in (201, 202) or not there:
+            return answer
+        if method != 'PUT':
+            self._until(what, lambda: self._over(there, what) or None)
+            return answer
+        return answer if _state(answer) == 'Succeeded' else self._until(
+            what, lambda: self._made(path, there, what))
+
+    def pages(self, path: str, what: str, **query: str) -> Iterator[Mapping[str, Any]]:
+        """Yield the entries of a list."""
+        answer = self.call('GET', path, what, query=query)
+        while True:
+            yield from answer['value']
+            if not answer.get('nextLink'):
+                return
+            answer = self._ask('GET', answer['nextLink'], what, None, {})[2]
+
+    def public(self, url: str, what: str, query: Mapping[str, str]) -> Iterator[Mapping[str, Any]]:
+        """Yield the entries of a public list of Azure's, which takes no credentials."""
+        import requests
+
+        while url:
+            try:
+                answer = requests.get(url, params=query, timeout=5.0 if self._hasty else 30.0)
+                answer.raise_for_status()
+                found = answer.json()
+                yield from found['Items']
+                url, query = found.get('NextPageLink') or '', {}
+            except (requests.RequestException, ValueError, KeyError, TypeError) as error:
+                raise ProviderError(f'{what} failed: {error}') from error
+
+    def delete(
+        self, path: str, what: str, *, wait: bool = False,
+        query: Optional[Mapping[str, str]] = None,
+    ) -> None:
+        """Delete something; it may be deleted already."""
+        try:
+            self.call('DELETE', path, what, wait=wait, query=query)
+        except AzureError as error:
+            if not error.gone:
+                raise
+
+    def _until(self, what: str, look: Callable[[], Any]) -> Any:
+        return wait_until(look, timeout=OPERATION, cancel=self.cancel, first=0.3, interval=1.0,
+                          longest=8.0, what=f'{what} to be done')
+
+    def _made(self, path: str, there: str, what: str) -> Any:
+        """Return a resource that is ready; one request instead of two with its operation."""
+        found = self.call('GET', path, what)
+        if _state(found) in ('Failed', 'Canceled'):
+            self._over(there, what)
+            raise ProviderError(f'{what} failed: Azure gives no reason')
+        return found if _state(found) == 'Succeeded' else None
+
+    def _over(self, there: str, what: str) -> bool:
+        """Return whether an operation has succeeded; raise its error."""
+        status, _, answer = self._ask('GET', there, what, None, {})
+        state = str((answer or {}).get('status', '')).lower()
+        if state in ('failed', 'canceled'):
+            raise refusal(400, answer, what)
+        return status != 202 and state in ('', 'succeeded')
+
+    def _ask(
+        self, method: str, url: str, what: str, body: Optional[Mapping[str, Any]],
+        query: Mapping[str, str],
+    ) -> tuple[int, Mapping[str, str], Any]:
+        if not url.startswith(f'{endpoint()}/'):
+            raise ProviderError(f'{what} failed: Azure named another server, {url[:100]}')
+        # a request that creates something gets time for its answer
+        grace = 0.0 if method == 'GET' else 4.0
+        return cancellable(lambda: self._send(method, url, what, body, query), self.cancel,
+                           what=what, grace=lambda: grace)
+
+    def _send(
+        self, method: str, url: str, what: str, body: Optional[Mapping[str, Any]],
+        query: Mapping[str, str],
+    ) -> tuple[int, Mapping[str, str], Any]:
+        import requests
+
+        with self._lock:
+            if self._session is None:
+                self._session = requests.Session()
+                for scheme in ('https://', 'http://'):
+                    self._session.mount(scheme, requests.adapters.HTTPAdapter(pool_maxsize=20))
+        attempts = 2 if self._hasty else ATTEMPTS
+        for attempt in range(1, attempts + 1):
+            head = {'Authorization': f'Bearer {self._token(what)}'}
+            if self.cancel is not None and self.cancel.is_set():
+                raise Cancelled(what)  # nobody waits for this thread
+            try:
+                found = self._session.request(
+                    method, url, params=query, json=body, headers=head, allow_redirects=False,
+                    timeout=5.0 if self._hasty else 30.0)
+            except requests.RequestException as error:
+                if attempt < 2 and method != 'POST':
+                    continue
+                raise PrerequisiteError(
+                    f'{what} failed: Azure does not answer: {error}',
+                    'is there a way to the Internet (a proxy, FOGROS2_AZURE_ENDPOINT)?') from error
+            if found.status_code != 429 and found.status_code < 500 or attempt == attempts:
+                break
+            pause = found.headers.get('Retry-After', '')
+            time.sleep(min(float(pause) if pause.isdigit() else 0.5 * 2 ** attempt, 20.0))
+        try:
+            answer = found.json() if found.content else None
+        except ValueError:
+            answer = None
+        if found.status_code >= 300:
+            raise refusal(found.status_code, answer, what)
+        return found.status_code, found.headers, answer
+
+    def _token(self, what: str) -> str:
+        from azure.core.exceptions import ClientAuthenticationError
+
+        credential = self.credential()
+        try:
+            return str(credential.get_token(f'{endpoint()}/.default').token)
+        except ClientAuthenticationError as error:
+            raise PrerequisiteError(
+                f'{what} failed: there are no credentials for Azure: '
+                f'{" ".join(str(error).split())[:200]}',
+                'az login, or set AZURE_TENANT_ID, AZURE_CLIENT_ID and AZURE_CLIENT_SECRET',
+            ) from error
+
+
+def _state(answer: Mapping[str, Any]) -> str:
+    return str(answer['properties'].get('provisioningState', ''))

@@ -1,0 +1,440 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Azure as a cloud of virtual machines.
+
+Each machine has a resource group of its own, with the same name, so that one deletion takes
+everything. FogROS2 deletes only groups with its own tags. All names come from the idempotency
+token, and a repeated PUT of the same name creates nothing more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+import contextlib
+import dataclasses
+from decimal import Decimal
+import os
+import threading
+import time
+from typing import Any, ClassVar, Optional
+
+from fogros2.errors import ConfigurationError, FogError, MachineNotFound, ProviderError
+from fogros2.model import Image, MachineSpec, MachineState
+from fogros2.provider import TAG_EXPIRES, TAG_NAME, TAG_ROBOT
+from fogros2.provider.azure import ending, images, machines, prices
+from fogros2.provider.azure.account import Account, subscription
+from fogros2.provider.azure.failures import AzureError
+from fogros2.provider.azure.machines import Prepared
+from fogros2.provider.azure.options import Options
+from fogros2.provider.azure.regions import api_host, REGIONS
+from fogros2.provider.vm.cloud import (
+    CloudError,
+    Order,
+    own_name,
+    Place,
+    TAG_ATTEMPT,
+    TAG_MADE,
+    TAG_PRICE,
+    TAG_SSH_FROM,
+    Vm,
+    VmId,
+)
+from fogros2.provider.vm.options import VmOptions
+from fogros2.provider.vm.regions import Regions
+from fogros2.store import is_another_robot
+from fogros2.waiting import Periodic, wait_until
+
+_VMS = 'providers/Microsoft.Compute/virtualMachines'
+_NET = 'providers/Microsoft.Network'
+#: The region of pull request 109.
+OLD_REGION = 'eastus'
+#: Seconds in which Azure finds room for a machine, or says that there is none.
+ALLOCATION = 300.0
+#: Seconds after which a group without a machine is a leftover.
+SETTLED = 900.0
+#: One for all providers of this process, so that its sizes are asked for once.
+_USUAL = Account()
+
+
+class Azure(prices.AzurePrices):
+    """
+    Virtual machines of Azure.
+
+    :param account: None for the account of this computer's user.
+    """
+
+    name: ClassVar[str] = 'azure'
+    title: ClassVar[str] = 'Azure'
+    options: ClassVar[type[VmOptions]] = Options
+    regions: ClassVar[Regions] = Regions('Azure', REGIONS, api_host)
+    id_form: ClassVar[str] = 'fogros2-[0-9a-f]{16}-[0-9a-f]{8}'
+    base_region: ClassVar[str] = 'westeurope'
+    regions_variable: ClassVar[str] = 'FOGROS2_AZURE_REGIONS'
+
+    def __init__(self, account: Optional[Account] = None) -> None:
+        self._account = account or _USUAL
+        #: Notes about machines that this process has created, for people.
+        self._notes: dict[str, str] = {}
+
+    def until(self, cancel: Optional[threading.Event]) -> Azure:
+        """Return an adapter whose calls raise Cancelled once ``cancel`` is set."""
+        other = super().until(cancel)
+        other._account = self._account.having(cancel)
+        return other
+
+    def hasty(self) -> Azure:
+        """Return an adapter with short time-outs."""
+        other = super().until(self.cancel)
+        other._account = self._account.having(self.cancel, hasty=True)
+        return other
+
+    # -- the account ----------------------------------------------------------------------------
+
+    def check_credentials(self) -> None:
+        """Check that a subscription is named, and that azure-identity is installed."""
+        subscription()
+        self._account.credential()
+
+    def whoami(self, region: str) -> str:
+        """Return the subscription."""
+        found = self._account.having(None, hasty=True).call(
+            'GET', self._account.path(), 'asking Azure for the subscription')
+        return f'subscription {found["displayName"]}, {region}'
+
+    def default_region(self) -> str:
+        """Return the region that the user's environment names for the az command."""
+        return os.environ.get('AZURE_DEFAULTS_LOCATION') or OLD_REGION
+
+    def searched_regions(self) -> list[str]:
+        """Return '': one request answers for all regions."""
+        return ['']
+
+    # -- machines -------------------------------------------------------------------------------
+
+    def _all(self, region: str) -> list[Mapping[str, Any]]:
+        """Return the entries of FogROS2's machines that are not being deleted."""
+        return [entry for entry in self._account.pages(
+                    self._account.path(rest=_VMS), 'looking for machines')
+                if TAG_ATTEMPT in (entry.get('tags') or {}) and prices.is_in(entry, region)
+                and entry['properties'].get('provisioningState') != 'Deleting']
+
+    def find(self, region: str, tags: Mapping[str, str]) -> list[Vm]:
+        """Return the machines with all of ``tags``; a second request for their states."""
+        found = [entry for entry in self._all(region) if tags.items() <= entry['tags'].items()]
+        if not found:
+            return []
+        states = {str(entry['id']).lower(): entry['properties'].get('instanceView', {}).get(
+                      'statuses') or () for entry in self._account.pages(
+                          self._account.path(rest=_VMS), 'looking for the states of machines',
+                          statusOnly='true')}
+        return [machines.vm_of(entry, states.get(str(entry['id']).lower(), ()))
+                for entry in found]
+
+    def get(self, region: str, vm: str) -> Optional[Vm]:
+        """Return a machine."""
+        try:
+            found = machines.vm_of(self._entry(vm))
+        except AzureError as error:
+            if not error.gone:
+                raise
+            raise MachineNotFound(f'there is no {vm} in {region} any more') from error
+        if found.state is MachineState.DELETED:
+            raise MachineNotFound(f'{vm} in {region} is being deleted')
+        return dataclasses.replace(found, note=self._notes.get(vm, ''))
+
+    def _entry(self, vm: str) -> Mapping[str, Any]:
+        found: Mapping[str, Any] = self._account.call(
+            'GET', self._vm(vm), f'looking for {vm}', query={'$expand': 'instanceView'})
+        return found
+
+    def _vm(self, vm: str, rest: str = '') -> str:
+        return self._account.path(vm, f'{_VMS}/{vm}{rest}')
+
+    def prepare(self, region: str, order: Order, types: Sequence[str]) -> dict[str, Prepared]:
+        """Return image, disk and network of each size that the region has."""
+        options: Options = order.options
+        with ThreadPoolExecutor(3, 'fog-azure') as pool:
+            asked = pool.submit(self.sizes, region)
+            guarded = pool.submit(ending.may_assign, self._account)
+            subnet = pool.submit(self._subnet, options.resource_group, region)
+            baked = pool.submit(images.baked, self._account, region, options,
+                                order.request.dependencies)
+            sizes = {name: asked.result()[name] for name in types if name in asked.result()}
+            if not sizes:
+                raise ConfigurationError(
+                    f'Azure has no {" or ".join(types)} in {region} for this subscription',
+                    'ros2 fog price --region shows what it has')
+            found = {}
+            for name, entry in sizes.items():
+                kind, version = prices.machine_type(entry), prices.generation(entry)
+                made = baked.result().get((kind.arch, version), '')
+                found[name] = Prepared(
+                    machines.image_of(options.image or made, kind.arch, version),
+                    kind.gpu.startswith('NVIDIA'),
+                    prices.capabilities(entry).get('PremiumIO') == 'True',
+                    subnet.result(), guarded.result())
+            return found
+
+    def _subnet(self, group: str, region: str) -> str:
+        """Return a subnet of the user's own group in a region, '' if there is none."""
+        found: list[Mapping[str, Any]] = []
+        try:
+            found += self._account.pages(
+                self._account.path(group, f'{_NET}/virtualNetworks'),
+                f'looking for a network in {group}') if group else ()
+        except AzureError as error:
+            if not error.gone:  # pull request 109 creates the group
+                raise
+        return next((str(subnet['id']) for network in found if prices.is_in(network, region)
+                     for subnet in network['properties'].get('subnets') or ()
+                     if not subnet['properties'].get('delegations')), '')
+
+    def undo_begin(
+        self, region: str, attempt: str, created: Sequence[str],
+    ) -> Iterator[tuple[str, Callable[[], None]]]:
+        """Yield the deletion of the groups that this process has created."""
+        yield 'the resource group', lambda: self._drop(attempt, created)
+
+    def insert(
+        self, place: Place, order: Order, prepared: Prepared, created: list[str],
+        tags: Mapping[str, str],
+    ) -> str:
+        """Create a group with a network and a machine; without room, delete it again."""
+        name = machines.name_of(order, place)
+        created.append(name)
+        try:
+            self._account.call(
+                'PUT', self._account.path(name), f"making the group of '{order.spec.name}'",
+                {'location': place.region,
+                 'tags': {**order.tags, TAG_MADE: str(int(time.time()))}})
+            self._insert(name, place, order, prepared, tags)
+        except FogError:
+            # the next place has a group of its own; what stays is undone at the end, or by gc
+            with contextlib.suppress(FogError):
+                self.lasting()._drop(order.attempt, [name], empty=[name])
+            raise
+        return name
+
+    def _insert(
+        self, name: str, place: Place, order: Order, known: Prepared, tags: Mapping[str, str],
+    ) -> None:
+        common = {'location': place.region, 'tags': dict(order.tags)}
+
+        def put(kind: str, properties: Mapping[str, Any], **more: Any) -> Mapping[str, Any]:
+            found: Mapping[str, Any] = self._account.call(
+                'PUT', self._account.path(name, f'{_NET}/{kind}/{name}'),
+                f"making the {kind} of '{order.spec.name}'",
+                {**common, **more, 'properties': properties}, wait=True)
+            return found
+
+        with ThreadPoolExecutor(3, 'fog-azure') as pool:
+            firewall = pool.submit(put, 'networkSecurityGroups', machines.firewall(order))
+            address = pool.submit(put, 'publicIPAddresses', {
+                'publicIPAllocationMethod': 'Static', 'publicIPAddressVersion': 'IPv4'},
+                sku={'name': 'Standard'})
+            network = None if known.subnet else pool.submit(put, 'virtualNetworks', {
+                'addressSpace': {'addressPrefixes': ['10.0.0.0/28']},
+                'subnets': [{'name': 'machine', 'properties': {
+                    'addressPrefix': '10.0.0.0/28', 'defaultOutboundAccess': False}}]})
+            subnet = known.subnet if network is None else str(
+                network.result()['properties']['subnets'][0]['id'])
+            public = address.result()
+            nic = put('networkInterfaces', {
+                'networkSecurityGroup': {'id': firewall.result()['id']},
+                'ipConfigurations': [{'name': 'machine', 'properties': {
+                    'primary': True, 'privateIPAllocationMethod': 'Dynamic',
+                    'subnet': {'id': subnet}, 'publicIPAddress': {'id': public['id']}}}]})
+        tags = {**tags, machines.TAG_ADDRESS: str(public['properties']['ipAddress'])}
+        if known.subnet:
+            private = nic['properties']['ipConfigurations'][0]['properties']['privateIPAddress']
+            # machines of one network reach each other; its name is long
+            tags[machines.TAG_PRIVATE] = f'{private} {"/".join(subnet.split("/")[4:9:2])}'
+        what = f"creating '{order.spec.name}' ({place.kind})"
+        self._account.call('PUT', self._vm(name), what,
+                           machines.request(place, order, known, str(nic['id']), tags))
+        entry = self._allocated(name, what)
+        self._guard(name, place.region, order, known, entry)
+        if known.nvidia:
+            self._install_driver(name, place.region)
+
+    def _allocated(self, name: str, what: str) -> Mapping[str, Any]:
+        """Wait until a new machine has its computer; raise the error that comes late."""
+        def look() -> Optional[Mapping[str, Any]]:
+            entry = self._entry(name)
+            statuses = entry['properties'].get('instanceView', {}).get('statuses') or ()
+            codes = {str(status.get('code', '')): status for status in statuses}
+            for code, status in codes.items():
+                if code.startswith('ProvisioningState/failed/'):
+                    raise refused(code.rpartition('/')[2], str(status.get('message', '')), what)
+            if entry['properties'].get('provisioningState') == 'Failed':
+                raise CloudError(f'{what} failed: Azure gives no reason')
+            ready = any(code.startswith('PowerState/') for code in codes)
+            return entry if ready else None
+
+        return wait_until(look, timeout=ALLOCATION, cancel=self.cancel, first=0.3, interval=1.0,
+                          longest=4.0, what=what)
+
+    def _guard(
+        self, name: str, region: str, order: Order, known: Prepared, entry: Mapping[str, Any],
+    ) -> None:
+        """Let the machine end its own billing, or let Azure do it at a time of day."""
+        principal = str(entry.get('identity', {}).get('principalId', ''))
+        if known.guarded and principal and ending.assign(self._account, name, principal):
+            return
+        end = float(order.tags.get(TAG_EXPIRES, 0)) or time.time() + order.spec.lifetime
+        first = ending.schedule(self._account, name, region, end)
+        if end > first:
+            account = self._account.having(None)
+            Periodic('fog-azure', ending.DAY / 4, lambda: ending.rearm(account, name, region, end))
+        price = Decimal(entry['tags'].get(TAG_PRICE, 0)) * int(first - time.time()) / 3600
+        worst = f', at most ${price:.2f}' if price else ''
+        self._notes[name] = (
+            'if this robot vanishes, the machine powers itself off and is billed until Azure '
+            f'deallocates it at {time.strftime("%H:%M UTC", time.gmtime(first))}{worst} '
+            '(doc/azure.md)')
+
+    def _install_driver(self, name: str, region: str) -> None:
+        """Install NVIDIA's driver on a machine that runs, without waiting."""
+        wait_until(
+            lambda: self._entry(name)['properties']['provisioningState'] == 'Succeeded',
+            timeout=600.0, cancel=self.cancel, interval=3.0, longest=10.0, what=f'{name} to run')
+        self._account.call(
+            'PUT', self._vm(name, '/extensions/NvidiaGpuDriverLinux'),
+            f"installing NVIDIA's driver on {name}", {'location': region, 'properties': {
+                'publisher': 'Microsoft.HpcCompute', 'type': 'NvidiaGpuDriverLinux',
+                'typeHandlerVersion': '1.9', 'autoUpgradeMinorVersion': True}})
+
+    # -- its end --------------------------------------------------------------------------------
+
+    def _groups(self, attempt: str = '') -> list[Mapping[str, Any]]:
+        """Return the groups of FogROS2's machines, of one attempt if it is named."""
+        query = f"tagName eq '{TAG_ATTEMPT}'" + f" and tagValue eq '{attempt}'" * bool(attempt)
+        # a tag alone may have been copied to a group of the user's
+        return [group for group in self._account.pages(
+                    self._account.path(rest='resourceGroups'), 'looking for groups of machines',
+                    **{'$filter': query})
+                if (found := (group.get('tags') or {}).get(TAG_ATTEMPT, ''))
+                and attempt in ('', found) and str(group['name']).startswith(own_name(found))]
+
+    def _drop(
+        self, attempt: str, names: Iterable[str] = (), *, wait: bool = False,
+        empty: Optional[Collection[str]] = None,
+    ) -> None:
+        """
+        Delete the groups of an attempt with everything in them.
+
+        :param names: groups that a list may not have yet.
+        :param empty: only these of the groups.
+        :raises ProviderError: a group of this name is not FogROS2's, and stays.
+        """
+        listed = {str(group['name']) for group in self._groups(attempt)}
+
+        def drop(name: str) -> None:
+            path = self._account.path(name)
+            if name not in listed:
+                try:
+                    found = self._account.call('GET', path, f'looking for the group {name}')
+                except AzureError as error:
+                    if error.gone:
+                        return
+                    raise
+                if (found.get('tags') or {}).get(TAG_ATTEMPT) != attempt:
+                    raise ProviderError(f'the group {name} has no tag of FogROS2, and stays',
+                                        'FogROS2 deletes only groups that it created')
+            self._account.delete(path, f'deleting the group {name}', wait=wait,
+                                 query={'forceDeletionTypes': 'Microsoft.Compute/virtualMachines'})
+
+        chosen = sorted(name for name in {*names, *listed} if empty is None or name in empty)
+        with ThreadPoolExecutor(max(1, min(8, len(chosen))), 'fog-azure') as pool:
+            list(pool.map(drop, chosen))
+
+    def delete(self, machine: VmId) -> None:
+        """Delete the groups of a machine's attempt."""
+        self._drop(machine.attempt, [machine.vm], wait=True)
+
+    def end_attempt(self, region: str, attempt: str) -> None:
+        """Delete the groups of an attempt, without waiting."""
+        self._drop(attempt)
+
+    def leftovers(self, region: str, now: float, dead: Collection[str]) -> Mapping[str, str]:
+        """Return attempts with a group in which no machine is left, as after an eviction."""
+        return {group['tags'][TAG_ATTEMPT]: group['tags'].get(TAG_NAME, '?')
+                for group in self._empty(region)
+                if not is_another_robot(group['tags'].get(TAG_ROBOT, ''))
+                and (group['tags'][TAG_ATTEMPT] in dead
+                     or now - float(group['tags'].get(TAG_MADE, 0)) > SETTLED)}
+
+    def _empty(self, region: str) -> list[Mapping[str, Any]]:
+        there = {str(entry['id']).split('/')[4].lower() for entry in self._all('')}
+        return [group for group in self._groups() if prices.is_in(group, region)
+                and str(group['name']).lower() not in there]
+
+    def sweep(self, region: str, attempt: str) -> None:
+        """Delete the groups of an attempt that have no machine."""
+        self._drop(attempt, empty=[str(group['name']) for group in self._empty(region)])
+
+    # -- changes of a machine -------------------------------------------------------------------
+
+    def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
+        """Replace the rule of a port, or delete it."""
+        what, name = f'changing port {port} of {machine.vm}', machine.vm
+        path = self._account.path(
+            name, f'{_NET}/networkSecurityGroups/{name}/securityRules/tcp-{port}')
+        if not machines.ipv4(sources):
+            self._account.delete(path, what, wait=True)
+            return
+        if port == machines.SSH:
+            tags = self._account.call('GET', self._account.path(name), what).get('tags') or {}
+            sources = [*sources, *tags.get(TAG_SSH_FROM, '').split()]
+        self._account.call('PUT', path, what, machines.open_port(port, sources), wait=True)
+
+    def set_tags(self, machine: VmId, tags: Mapping[str, str]) -> None:
+        """Add tags to a machine, or replace them."""
+        self._account.call(
+            'PATCH', self._vm(machine.vm, '/providers/Microsoft.Resources/tags/default'),
+            f'writing tags of {machine.vm}',
+            {'operation': 'Merge', 'properties': {'tags': dict(tags)}}, wait=True)
+
+    def set_ending(self, machine: VmId, spec: MachineSpec) -> None:
+        """Set the schedule of an adopted machine anew, if it has one; the tags say the rest."""
+        path = self._account.path(machine.vm, 'providers/Microsoft.DevTestLab/schedules')
+        if any(True for _ in self._account.pages(path, f'looking how {machine.vm} ends')):
+            ending.schedule(self._account, machine.vm, machine.region,
+                            time.time() + spec.lifetime)
+
+    def stop(self, machine: VmId) -> None:
+        """Deallocate a machine; its disk and its address stay, and are billed."""
+        self._account.call('POST', self._vm(machine.vm, '/deallocate'), f'stopping {machine.vm}')
+
+    def start(self, machine: VmId) -> None:
+        """Start a machine; return when Azure has found room for it."""
+        self._account.call('POST', self._vm(machine.vm, '/start'), f'starting {machine.vm}',
+                           wait=True)
+
+    def end_command(self, tags: Mapping[str, str]) -> tuple[str, ...]:
+        """Return the command by which a machine deletes its group, or deallocates itself."""
+        return ending.end_command()
+
+    # -- images ---------------------------------------------------------------------------------
+
+    def bake(self, machine: VmId, name: str, dependencies: str) -> str:
+        """Make an image of a machine."""
+        entry = self._entry(machine.vm)
+        size = self.sizes(machine.region)[entry['properties']['hardwareProfile']['vmSize']]
+        return images.bake(self._account, machine, entry, prices.machine_type(size),
+                           prices.generation(size), name, dependencies)
+
+    def images(self, region: str) -> Iterable[Image]:
+        """Return the images of FogROS2."""
+        return images.images_in(self._account, region)
+
+    def delete_image(self, image_id: str) -> None:
+        """Delete an image with its group."""
+        images.delete(self._account, image_id)
+
+
+def refused(code: str, message: str, what: str) -> FogError:
+    """Return the error for a failure that Azure reports late, of the machine itself."""
+    from fogros2.provider.azure.failures import refusal
+    return refusal(400, {'code': code, 'message': message}, what)

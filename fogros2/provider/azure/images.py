@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Images of machines, each in a Compute Gallery with a resource group of its own.
+
+cloud-init treats a new machine's id as a first boot, so no machine is 'generalized' before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+import re
+import secrets
+import time
+from typing import Any
+
+from fogros2.errors import FogError, MachineNotFound, ProviderError
+from fogros2.model import Image
+from fogros2.provider import TAG_DEPENDENCIES
+from fogros2.provider.azure.account import Account
+from fogros2.provider.azure.failures import AzureError
+from fogros2.provider.azure.machines import region_of
+from fogros2.provider.azure.options import Options
+from fogros2.provider.offers import MachineType
+from fogros2.provider.vm.cloud import TAG_MADE, TAG_USER, VmId
+
+#: Tag of an image's group with the image's name; what its machines need to have.
+TAG_BAKED, TAG_KIND = 'fogros2-baked', 'fogros2-kind'
+_STATES = {'Succeeded': 'available', 'Failed': 'failed'}
+_ID = re.compile(r'azure:([a-z0-9]+)/(fogros2-image-[0-9a-f]{12})')
+_COMPUTE = 'providers/Microsoft.Compute'
+
+
+def _version(account: Account, group: str) -> str:
+    # a gallery's name has no hyphen
+    return account.path(group, f'{_COMPUTE}/galleries/{group.replace("-", "_")}/images/machine/'
+                               'versions/1.0.0')
+
+
+def bake(
+    account: Account, machine: VmId, entry: Mapping[str, Any], kind: MachineType,
+    generation: str, name: str, dependencies: str,
+) -> str:
+    """
+    Make an image of a running machine, and return its id; the last step takes minutes.
+
+    :param entry: the machine as Azure describes it.
+    """
+    region, group = machine.region, f'fogros2-image-{secrets.token_hex(6)}'
+    tags = {TAG_BAKED: name, TAG_DEPENDENCIES: dependencies, TAG_MADE: str(int(time.time())),
+            TAG_USER: entry['tags'].get(TAG_USER, ''), TAG_KIND: f'{kind.arch} {generation}'}
+    tags = {key: value for key, value in tags.items() if value}
+    version = _version(account, group)
+    definition, gallery = version.rsplit('/', 2)[0], version.rsplit('/', 4)[0]
+    snapshot = account.path(group, f'{_COMPUTE}/snapshots/machine')
+    disk = entry['properties']['storageProfile']['osDisk']['managedDisk']['id']
+    steps: list[tuple[str, dict[str, Any]]] = [
+        (account.path(group), {}),
+        (snapshot, {'incremental': True, 'creationData': {
+            'createOption': 'Copy', 'sourceResourceId': disk}}),
+        (gallery, {}),
+        (definition, {
+            'osType': 'Linux', 'osState': 'Generalized', 'hyperVGeneration': generation,
+            'architecture': 'Arm64' if kind.arch == 'arm64' else 'x64',
+            'identifier': {'publisher': 'fogros2', 'offer': 'machine', 'sku': group}}),
+        (version, {'publishingProfile': {'targetRegions': [{'name': region}]},
+                   'storageProfile': {'osDiskImage': {'source': {'id': snapshot}}}})]
+    try:
+        for path, properties in steps:
+            account.call('PUT', path, f"making the image '{name}'",
+                         {'location': region, 'tags': tags, 'properties': properties},
+                         wait=path is not version)
+    except FogError:
+        account.delete(account.path(group), f"deleting the rest of the image '{name}'")
+        raise
+    return f'azure:{region}/{group}'
+
+
+def _groups(account: Account, region: str, query: str) -> list[Mapping[str, Any]]:
+    return [group for group in account.pages(
+                account.path(rest='resourceGroups'), 'looking for images', **{'$filter': query})
+            if TAG_BAKED in (group.get('tags') or {}) and region in ('', region_of(group))
+            and group['properties']['provisioningState'] != 'Deleting']
+
+
+def _state(account: Account, group: str) -> str:
+    try:
+        found = account.call('GET', _version(account, group), f'looking for the image {group}')
+    except AzureError as error:
+        if not error.gone:
+            raise
+        return 'failed'
+    return _STATES.get(found['properties']['provisioningState'], 'pending')
+
+
+def images_in(account: Account, region: str) -> Iterator[Image]:
+    """Yield the images of FogROS2, of all regions if ``region`` is ''."""
+    for group in _groups(account, region, f"tagName eq '{TAG_BAKED}'"):
+        tags, name = group['tags'], str(group['name'])
+        yield Image(
+            f'azure:{region_of(group)}/{name}', tags[TAG_BAKED], 'azure', region_of(group),
+            created=float(tags.get(TAG_MADE, 0)) or None, state=_state(account, name),
+            dependencies=tags.get(TAG_DEPENDENCIES, ''), tags=tags)
+
+
+def baked(
+    account: Account, region: str, options: Options, dependencies: str,
+) -> dict[tuple[str, str], str]:
+    """Return the newest images with the same dependencies, by architecture and generation."""
+    found: dict[tuple[str, str], str] = {}
+    if options.image or not dependencies:
+        return found
+    groups = _groups(account, region,
+                     f"tagName eq '{TAG_DEPENDENCIES}' and tagValue eq '{dependencies}'")
+    for group in sorted(groups, key=lambda one: str(one['tags'].get(TAG_MADE, ''))):
+        arch, _, generation = group['tags'].get(TAG_KIND, '').partition(' ')
+        if group['tags'].get(TAG_DEPENDENCIES) == dependencies \
+                and group['tags'].get(TAG_USER, options.user) == options.user \
+                and _state(account, str(group['name'])) == 'available':
+            found[arch, generation] = _version(account, str(group['name']))
+    return found
+
+
+def delete(account: Account, image_id: str) -> None:
+    """
+    Delete an image with its group; it may be deleted already.
+
+    :raises MachineNotFound: the id is not an image's.
+    """
+    parts = _ID.fullmatch(image_id)
+    if parts is None:
+        raise MachineNotFound(f"'{image_id}' is no image at Azure", 'ros2 fog image list')
+    path, what = account.path(parts[2]), f'deleting the image {parts[2]}'
+    try:
+        found = account.call('GET', path, what)
+    except AzureError as error:
+        if not error.gone:
+            raise
+        return
+    if TAG_BAKED not in (found.get('tags') or {}):
+        raise ProviderError(f'{parts[2]} is no image of FogROS2',
+                            'ros2 fog image list shows those that are')
+    account.delete(path, what, wait=True)

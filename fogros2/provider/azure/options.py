@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options of a machine at Azure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import dataclasses
+import re
+from typing import ClassVar
+
+from fogros2.errors import ConfigurationError
+from fogros2.provider.vm.options import VmOptions
+
+#: PR 109's name of an Ubuntu image, which Azure has withdrawn: stands for the default here.
+OLD_UBUNTU = 'UbuntuLTS'
+_PART = r'[\w.-]+'
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(VmOptions):
+    """
+    Options of a machine at Azure, in addition to those of every virtual machine.
+
+    :param image: 'publisher:offer:sku:version' of the Marketplace, or the resource id of an
+        image; '' for one that was baked with the same dependencies, else Ubuntu 24.04.
+    :param vm_size: 'Standard_B2als_v2', or 'cheapest' that meets the requirements.
+    :param vm_sizes: further sizes to try, in this order, if there is no capacity for one.
+    :param resource_group: the user's own group, whose virtual network the machine joins.
+    """
+
+    image: str = ''
+    vm_size: str = ''
+    vm_sizes: tuple[str, ...] = ()
+    resource_group: str = ''
+
+    WHAT: ClassVar[str] = 'a machine at Azure'
+    TYPE: ClassVar[str] = 'vm_size'
+    TYPES: ClassVar[str] = 'vm_sizes'
+    DEFAULT_TYPE: ClassVar[str] = 'Standard_B2als_v2'
+    BY_REGION: ClassVar[tuple[str, ...]] = ('image', 'vm_size')
+    RESERVED: ClassVar[tuple[str, ...]] = ('microsoft', 'azure', 'windows', 'fogros2-')
+    FORMS: ClassVar[Mapping[str, tuple[str, str]]] = {
+        'region': (r'nearest|[a-z]+[0-9]?', "'westeurope' or 'nearest'"),
+        'vm_size': (r'cheapest|[A-Z][A-Za-z0-9]*_[A-Za-z0-9_-]+', "'Standard_B2als_v2'"),
+        'image': (rf'{OLD_UBUNTU}|{_PART}:{_PART}:{_PART}:{_PART}|/subscriptions/[\w./()-]+',
+                  "'publisher:offer:sku:version' or the resource id of an image"),
+        'resource_group': (r'[\w.()-]{1,89}[\w()-]', 'the name of a resource group'),
+        'user': (r'[a-z_][a-z0-9_-]{0,31}', "a login name, such as 'ubuntu'"),
+    }
+
+    def check(self) -> None:
+        """Check the values; Azure takes 50 tags, a dozen of which are FogROS2's."""
+        super().check()
+        for key in self.tags:
+            if re.search(r'[<>%&\\?/]', key) or len(self.tags) > 30:
+                raise ConfigurationError(f"'{key}' can't be a tag at Azure",
+                                         r'a key has none of <>%&\?/, and there are at most 30')
+        if len(' '.join(self.ssh_from)) > 256:
+            raise ConfigurationError('ssh_from= names too many networks for a tag of Azure',
+                                     'name fewer, or larger ones')

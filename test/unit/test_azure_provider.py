@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Decisions of the Azure provider, by value: options, requests, states, prices, errors."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+from decimal import Decimal
+import json
+import re
+import subprocess
+import sys
+
+import pytest
+
+from fogros2 import AzureCloudInstance
+from fogros2.errors import ConfigurationError, PrerequisiteError
+from fogros2.model import CreateRequest, MachineSpec, MachineState
+from fogros2.provider.azure import account, ending, failures, machines, prices
+from fogros2.provider.azure.machines import Prepared
+from fogros2.provider.azure.options import Options
+from fogros2.provider.azure.regions import REGIONS
+from fogros2.provider.vm.cloud import Order, Place
+from rigs.azure import catalogue, schema
+
+SPEC = MachineSpec('planner', 'azure', {'region': 'westeurope'})
+REQUEST = CreateRequest('5f0c7ab8', 'ssh-ed25519 AAAA robot\n', {'fogros2-launch': 'l1'}, 51820)
+KNOWN = Prepared({'id': '/image'}, False, True, '', True)
+PLACE = Place('westeurope', 'Standard_B2als_v2')
+
+
+def order(**options):
+    return Order(SPEC, REQUEST, Options.parse(options), {'fogros2-attempt': 'ab' * 8},
+                 b'user data', ['198.51.100.7/32', '2001:db8::1/128'])
+
+
+@pytest.mark.parametrize(('options', 'words'), [
+    ({'vm_siz': 'Standard_B2s'}, "did you mean 'vm_size'"),
+    ({'region': 'West Europe'}, "it takes 'westeurope' or 'nearest'"),
+    ({'vm_size': 't3.medium'}, "can't be the vm_size"),
+    ({'image': 'ubuntu'}, 'publisher:offer:sku:version'),
+    ({'resource_group': 'a b'}, 'the name of a resource group'),
+    ({'tags': {'a/b': 'x'}}, "can't be a tag"),
+    ({'tags': {'azure-team': 'x'}}, "can't be a tag"),
+    ({'tags': {f'key{n}': 'x' for n in range(31)}}, 'at most 30'),
+    ({'ssh_from': [f'198.51.100.{n}' for n in range(40)]}, 'too many networks'),
+])
+def test_a_wrong_option_is_named_with_what_to_do(options, words):
+    with pytest.raises(ConfigurationError) as caught:
+        Options.parse(options)
+    assert words in str(caught.value)
+
+
+def test_keywords_of_pull_request_109_are_accepted():
+    machine = AzureCloudInstance('robots', 'UbuntuLTS', 'eastus', 'Standard_DS2_v2', 10)
+    assert machine.info()['compute_region'] == 'eastus'
+    assert machine.info()['compute_instance_type'] == 'Standard_DS2_v2'
+    options = Options.parse({'image': 'UbuntuLTS', 'disk_size': 10, 'resource_group': 'robots'})
+    body = machines.request(PLACE, dataclasses.replace(order(), options=options), KNOWN, '', {})
+    assert body['properties']['storageProfile']['osDisk']['diskSizeGB'] == 30
+    with pytest.raises(ConfigurationError, match='are the same option'):
+        AzureCloudInstance(zone='eastus', location='eastus')
+
+
+def test_request_is_one_that_azure_s_models_have():
+    body = machines.request(PLACE, order(spot=True, max_price=0.02), KNOWN, '/nic', {'a': 'b'})
+    assert schema.unknown('virtualmachines', body) == ''
+    what = body['properties']
+    assert (what['priority'], what['billingProfile']) == ('Spot', {'maxPrice': 0.02})
+    assert base64.b64decode(what['osProfile']['customData']) == b'user data'
+    assert what['osProfile']['linuxConfiguration']['ssh']['publicKeys'] == [
+        {'path': '/home/ubuntu/.ssh/authorized_keys', 'keyData': 'ssh-ed25519 AAAA robot'}]
+    assert schema.unknown('virtualmachines', {'properties': {'osProfil': {}}})
+    assert schema.unknown('virtualmachines', {'properties': {'storageProfile': {'osDisk': {
+        'managedDisk': {'storageType': 'x'}}}}})
+
+
+def test_spot_without_a_limit_costs_at_most_the_price_on_demand():
+    body = machines.request(PLACE, order(spot=True), KNOWN, '', {})
+    assert body['properties']['billingProfile'] == {'maxPrice': -1}
+
+
+def test_firewall_admits_the_robot_and_nobody_else():
+    rules = {rule['name']: rule['properties'] for rule in machines.firewall(order())[
+        'securityRules']}
+    assert rules['tcp-22']['sourceAddressPrefixes'] == ['198.51.100.7/32']
+    assert rules['vpn']['protocol'] == 'Udp' and rules['vpn']['destinationPortRange'] == '51820'
+    assert rules['nothing-else']['access'] == 'Deny'
+    # before Azure's own rule that lets a whole virtual network in
+    assert max(rule['priority'] for rule in rules.values()) == \
+        rules['nothing-else']['priority'] < 65000
+
+
+def test_names_come_from_the_token_and_the_place():
+    here = machines.name_of(order(), PLACE)
+    assert here == machines.name_of(order(), PLACE)
+    assert here != machines.name_of(order(), PLACE._replace(kind='Standard_D2s_v5'))
+    assert re.fullmatch('fogros2-[0-9a-f]{16}-[0-9a-f]{8}', here)
+
+
+@pytest.mark.parametrize(('making', 'power', 'state'), [
+    ('Creating', '', MachineState.PENDING), ('Creating', 'starting', MachineState.PENDING),
+    ('Succeeded', 'running', MachineState.RUNNING), ('Updating', 'running', MachineState.RUNNING),
+    ('Updating', 'deallocating', MachineState.STOPPING),
+    ('Succeeded', 'deallocated', MachineState.STOPPED),
+    ('Updating', 'deallocated', MachineState.PENDING),
+    ('Succeeded', 'stopped', MachineState.STOPPED), ('Failed', '', MachineState.STOPPED),
+    ('Failed', 'running', MachineState.RUNNING), ('Deleting', 'running', MachineState.DELETED)])
+def test_states_of_azure_are_states_of_machines(making, power, state):
+    entry = {'id': '/subscriptions/s/resourceGroups/G/providers/x/y/z', 'location': 'West Europe',
+             'properties': {'provisioningState': making, 'instanceView': {'statuses': [
+                 {'code': f'ProvisioningState/{making}'},
+                 *([{'code': f'PowerState/{power}'}] if power else [])]}}}
+    found = machines.vm_of(entry)
+    assert (found.state, found.region, found.id) == (state, 'westeurope', 'g')
+
+
+def test_time_of_azure_is_read_with_any_decimals():
+    assert machines.when('2026-01-02T03:04:05.1234567+00:00') == 1767323045.0
+    assert machines.when('2026-01-02T03:04:05Z') == 1767323045.0
+    assert machines.when(None) is None
+
+
+@pytest.mark.parametrize(('code', 'message', 'full', 'words'), [
+    ('SkuNotAvailable', 'not in westeurope', 'zone', 'vm_sizes='),
+    ('OverconstrainedAllocationRequest', 'x', 'zone', 'no free machine'),
+    ('AllocationFailed', 'x', 'zone', 'no free machine'),
+    ('QuotaExceeded', 'x', 'region', 'quota'),
+    ('OperationNotAllowed', 'exceeding approved Total Regional Cores quota', 'region', 'quota'),
+    ('OperationNotAllowed', 'another operation is in progress', '', 'try again'),
+    ('AuthorizationFailed', "does not have authorization to perform action 'Microsoft.Compute/"
+     "virtualMachines/write' over scope", '', 'Microsoft.Compute/virtualMachines/write'),
+    ('MissingSubscriptionRegistration', "namespace 'Microsoft.Compute'", '', 'az provider'),
+    ('RequestDisallowedByPolicy', 'no public addresses', '', 'no public addresses'),
+    ('ScopeLocked', 'locked', '', 'az lock'), ('SomethingNew', 'so it is', '', 'so it is')])
+def test_refusal_says_what_it_means(code, message, full, words):
+    error = failures.refusal(409, {'error': {'code': code, 'message': message}}, 'creating it')
+    assert words in str(error) and str(error).startswith('creating it failed')
+    assert getattr(error, 'full', '') == full
+    assert error.refused
+
+
+def test_inner_code_of_a_failed_operation_counts():
+    error = failures.refusal(400, {'error': {'code': 'DeploymentFailed', 'details': [
+        {'code': 'ZonalAllocationFailed', 'message': 'x'}]}}, 'creating it')
+    assert error.full == 'zone'
+
+
+def test_fault_of_azure_leaves_open_whether_it_had_an_effect():
+    assert not failures.refusal(500, None, 'creating it').refused
+    assert failures.refusal(404, None, 'looking').gone
+
+
+def test_sizes_have_architecture_and_gpu():
+    sizes = {entry['name']: prices.machine_type(entry)
+             for entry in catalogue.skus('westeurope', set())
+             if entry['resourceType'] == 'virtualMachines'}
+    assert sizes['Standard_B2als_v2'].cpu == 'AMD' and sizes['Standard_B2als_v2'].cores == 1
+    assert sizes['Standard_B2pls_v2'].arch == 'arm64'
+    gpu = sizes['Standard_NC4as_T4_v3']
+    assert (gpu.gpus, gpu.gpu, gpu.gpu_memory_gb) == (1, 'NVIDIA T4', 16.0)
+    assert not sizes['Standard_DS2_v2'].spot
+
+
+@pytest.mark.parametrize(('name', 'gpu'), [
+    ('Standard_NC6s_v3', 'NVIDIA V100'), ('Standard_NV4as_v4', 'AMD MI25'),
+    ('Standard_NV12s_v3', 'NVIDIA M60'), ('Standard_NC24ads_A100_v4', 'NVIDIA A100'),
+    ('Standard_NV36ads_A10_v5', 'NVIDIA A10'), ('Standard_ND96isr_H100_v5', 'NVIDIA H100'),
+    ('Standard_ND96isr_MI300X_v5', 'AMD MI300X')])
+def test_gpu_is_known_from_the_name_of_a_size(name, gpu):
+    entry = {'name': name, 'capabilities': [
+        {'name': key, 'value': value} for key, value in (
+            ('vCPUs', '6'), ('MemoryGB', '112'), ('GPUs', '1'))]}
+    assert prices.machine_type(entry).gpu == gpu
+
+
+def test_prices_are_those_of_linux():
+    found = [prices.retail_price(entry) for entry in catalogue.retail('westeurope')]
+    assert {one for one in found if one and one[0] == 'Standard_B2als_v2'} == {
+        ('Standard_B2als_v2', Decimal('0.0376'), False),
+        ('Standard_B2als_v2', Decimal('0.0094'), True)}
+
+
+@pytest.mark.parametrize(('actions', 'not_actions', 'may'), [
+    (['*'], [], True), (['*'], ['Microsoft.Authorization/*/Write'], False),
+    (['Microsoft.Compute/*'], [], False),
+    (['Microsoft.Authorization/roleAssignments/*'], [], True), ([], [], False)])
+def test_right_to_assign_roles_is_read_from_permissions(actions, not_actions, may):
+    assert ending.grants({'actions': actions, 'notActions': not_actions}) is may
+
+
+def test_role_of_machines_is_the_narrowest(monkeypatch):
+    monkeypatch.setenv('AZURE_SUBSCRIPTION_ID', 'one')
+    (permission,) = ending.role()['properties']['permissions']
+    assert len(permission['actions']) == 2 and not any('*' in one for one in permission['actions'])
+
+
+def test_subscription_is_that_of_the_environment_or_of_the_login(monkeypatch, tmp_path):
+    monkeypatch.setenv('AZURE_CONFIG_DIR', str(tmp_path))
+    monkeypatch.delenv('AZURE_SUBSCRIPTION_ID', raising=False)
+    assert not account.configured()
+    with pytest.raises(PrerequisiteError, match='no subscription'):
+        account.subscription()
+    # az writes a byte order mark
+    (tmp_path / 'azureProfile.json').write_text(json.dumps({'subscriptions': [
+        {'id': 'one', 'isDefault': False}, {'id': 'two', 'isDefault': True}]}), 'utf-8-sig')
+    assert account.configured() and account.subscription() == 'two'
+    monkeypatch.setenv('AZURE_SUBSCRIPTION_ID', 'three')
+    assert account.subscription() == 'three'
+
+
+def test_regions_have_places_on_the_globe():
+    for latitude, longitude, place, _ in REGIONS.values():
+        assert -90 < latitude < 90 and -180 <= longitude <= 180 and place
+
+
+def test_no_library_of_azure_is_imported_before_a_request():
+    code = ('import sys; from fogros2.provider.azure import AzureProvider; AzureProvider(); '
+            "print([name for name in sys.modules if name.split('.')[0] in ('azure', 'msal', "
+            "'requests')])")
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert done.stdout == '[]\n', done.stderr
