@@ -115,6 +115,24 @@ def test_killed_robot_s_machine_deletes_its_group(robot, box, name):
 
 
 @pytest.mark.soak
+def test_credentials_stay_with_the_robot(robot, box, name):
+    run = robot.launch(robot.write('run.launch.py', LAUNCH.format(name=name, options={})),
+                       FOGROS2_STATE_HOME=str(robot.home / 'state'))
+    run.wait_for('I heard: ')
+    (machine,) = box.alive()
+    words = ['grep', '-rlF', '-e', service.TOKEN, '-e', service.HEADER]
+    there = box.run(machine.id, f'{shlex.join(words)} /etc /home /root /opt /run /tmp /var || :')
+    here = subprocess.run([*words, str(robot.home)], capture_output=True, text=True).stdout
+    arguments = subprocess.run(['ps', '-eo', 'args'], capture_output=True, text=True).stdout
+    shown = json.dumps(box.things()) + run.text + arguments.replace(shlex.join(words), '')
+    assert (there.strip(), here) == ('', '')
+    assert service.TOKEN not in shown and service.HEADER not in shown
+    assert 'OPENSSH PRIVATE KEY' not in shown
+    run.interrupt()
+    assert run.ended() == 0, run.text
+
+
+@pytest.mark.soak
 def test_machine_without_the_right_is_off_and_billed(robot, box, name):
     box.set_rights(owner=False)
     run = robot.launch(robot.write('run.launch.py', LAUNCH.format(name=name, options={})))

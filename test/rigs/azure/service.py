@@ -31,7 +31,7 @@ from rigs.computers.box import Call
 
 SUBSCRIPTION = '0b1f6471-1bf0-4dda-aec3-cb9272f09590'
 #: The user's token, and the secret with which the token service hands it out.
-TOKEN, HEADER = 'token-of-the-user', 'not-a-secret'
+TOKEN, HEADER = 'token-of-the-user', 'secret-of-the-token-service'
 OPERATOR = {'actions': ['*'], 'notActions': []}
 CONTRIBUTOR = {'actions': ['*'], 'notActions': [
     'Microsoft.Authorization/*/Delete', 'Microsoft.Authorization/*/Write',
