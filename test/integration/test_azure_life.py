@@ -29,6 +29,7 @@ from fogros2.errors import (
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.azure import AzureProvider, ending
+from fogros2.provider.azure.account import Account
 from fogros2.provider.offers import wants
 from fogros2.provider.vm.cloud import attempt_of
 from fogros2.provider.vm.user_data import LIMIT
@@ -341,6 +342,9 @@ def test_schedule_of_a_long_life_is_set_anew(robot, monkeypatch):
     machine_id = robot.create()
     wait_until(lambda: len(robot.asked('schedules', 'PUT')) > 2, timeout=5.0, what='two more')
     robot.provider.destroy(machine_id)
+    # until the machine is gone
+    wait_until(lambda: 'fog-rearm' not in [thread.name for thread in threading.enumerate()],
+               timeout=5.0, what='the last one')
 
 
 def test_user_data_stays_below_the_limit_of_the_clouds(robot):
@@ -502,6 +506,16 @@ def test_cheapest_size_and_spot_price_are_chosen(robot):
     spot = robot.provider.offers(wants(min_cpu=8, arch='any', spot=True), [HOME])
     assert [(one.type.name, one.spot_price) for one in spot.offers] == [
         ('Standard_D8s_v5', Decimal('0.0768'))]
+
+
+def test_service_that_does_not_answer_is_one_line(robot, monkeypatch):
+    monkeypatch.setenv('FOGROS2_AZURE_ENDPOINT', 'http://127.0.0.1:9')
+    with pytest.raises(PrerequisiteError, match='Azure does not answer'):
+        robot.create()
+    monkeypatch.setenv('IDENTITY_ENDPOINT', 'http://127.0.0.1:9/token')
+    monkeypatch.setattr('fogros2.provider.azure.cloud._USUAL', Account())
+    with pytest.raises(PrerequisiteError, match='Azure gives no token|no credentials'):
+        Robot(robot.azure).create()
 
 
 def test_another_server_gets_no_token(robot, monkeypatch):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 import copy
 import json
 import os
@@ -127,13 +127,20 @@ class Account:
         status, headers, answer = self._ask(
             method, endpoint() + path, what, body, {'api-version': version, **(query or {})})
         there = headers.get('Azure-AsyncOperation') or headers.get('Location')
-        if not wait or status not in (201, 202) or not there:
+        if not wait or status not in (201, 202) or not there or _state(answer) == 'Succeeded':
             return answer
-        if method != 'PUT':
-            self._until(what, lambda: self._over(there, what) or None)
-            return answer
-        return answer if _state(answer) == 'Succeeded' else self._until(
-            what, lambda: self._made(path, there, what))
+
+        def look() -> Any:
+            # the resource of a PUT has its state: no other request is needed for the operation
+            found = self.call('GET', path, what) if method == 'PUT' else True
+            if found is not True and _state(found) not in ('Succeeded', 'Failed', 'Canceled'):
+                return None
+            return found if _state(found) == 'Succeeded' or self._over(there, what) else None
+
+        # a group takes longer than what is in it
+        first = 0.3 if '/providers/' in path else 1.5
+        return wait_until(look, timeout=OPERATION, cancel=self.cancel, first=first, interval=1.0,
+                          longest=8.0, what=f'{what} to be done')
 
     def pages(self, path: str, what: str, **query: str) -> Iterator[Mapping[str, Any]]:
         """Yield the entries of a list."""
@@ -168,18 +175,6 @@ class Account:
         except AzureError as error:
             if not error.gone:
                 raise
-
-    def _until(self, what: str, look: Callable[[], Any]) -> Any:
-        return wait_until(look, timeout=OPERATION, cancel=self.cancel, first=0.3, interval=1.0,
-                          longest=8.0, what=f'{what} to be done')
-
-    def _made(self, path: str, there: str, what: str) -> Any:
-        """Return a resource that is ready; one request instead of two with its operation."""
-        found = self.call('GET', path, what)
-        if _state(found) in ('Failed', 'Canceled'):
-            self._over(there, what)
-            raise ProviderError(f'{what} failed: Azure gives no reason')
-        return found if _state(found) == 'Succeeded' else None
 
     def _over(self, there: str, what: str) -> bool:
         """Return whether an operation has succeeded; raise its error."""
@@ -224,7 +219,7 @@ class Account:
                 if attempt < 2 and method != 'POST':
                     continue
                 raise PrerequisiteError(
-                    f'{what} failed: Azure does not answer: {error}',
+                    f'{what} failed: Azure does not answer: {_line(error)}',
                     'is there a way to the Internet (a proxy, FOGROS2_AZURE_ENDPOINT)?') from error
             if found.status_code != 429 and found.status_code < 500 or attempt == attempts:
                 break
@@ -239,6 +234,7 @@ class Account:
         return found.status_code, found.headers, answer
 
     def _token(self, what: str) -> str:
+        from azure.core.exceptions import AzureError as LibraryError
         from azure.core.exceptions import ClientAuthenticationError
 
         credential = self.credential()
@@ -246,11 +242,17 @@ class Account:
             return str(credential.get_token(f'{endpoint()}/.default').token)
         except ClientAuthenticationError as error:
             raise PrerequisiteError(
-                f'{what} failed: there are no credentials for Azure: '
-                f'{" ".join(str(error).split())[:200]}',
+                f'{what} failed: there are no credentials for Azure: {_line(error)}',
                 'az login, or set AZURE_TENANT_ID, AZURE_CLIENT_ID and AZURE_CLIENT_SECRET',
             ) from error
+        except LibraryError as error:
+            raise PrerequisiteError(f'{what} failed: Azure gives no token: {_line(error)}',
+                                    'is there a way to the Internet (a proxy)?') from error
 
 
-def _state(answer: Mapping[str, Any]) -> str:
-    return str(answer['properties'].get('provisioningState', ''))
+def _line(error: BaseException) -> str:
+    return ' '.join(str(error).split())[:200]
+
+
+def _state(answer: Any) -> str:
+    return str(answer['properties'].get('provisioningState')) if isinstance(answer, dict) else ''

@@ -24,12 +24,11 @@ from fogros2.model import Image, MachineSpec, MachineState
 from fogros2.provider import TAG_EXPIRES, TAG_NAME, TAG_ROBOT
 from fogros2.provider.azure import ending, images, machines, prices
 from fogros2.provider.azure.account import Account, subscription
-from fogros2.provider.azure.failures import AzureError
+from fogros2.provider.azure.failures import AzureError, refusal
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
 from fogros2.provider.azure.regions import api_host, REGIONS
 from fogros2.provider.vm.cloud import (
-    CloudError,
     Order,
     own_name,
     Place,
@@ -43,7 +42,7 @@ from fogros2.provider.vm.cloud import (
 from fogros2.provider.vm.options import VmOptions
 from fogros2.provider.vm.regions import Regions
 from fogros2.store import is_another_robot
-from fogros2.waiting import Periodic, wait_until
+from fogros2.waiting import wait_until
 
 _VMS = 'providers/Microsoft.Compute/virtualMachines'
 _NET = 'providers/Microsoft.Network'
@@ -104,7 +103,8 @@ class Azure(prices.AzurePrices):
 
     def default_region(self) -> str:
         """Return the region that the user's environment names for the az command."""
-        return os.environ.get('AZURE_DEFAULTS_LOCATION') or OLD_REGION
+        named = os.environ.get('AZURE_DEFAULTS_LOCATION') or OLD_REGION
+        return named.lower().replace(' ', '')  # 'West Europe', too
 
     def searched_regions(self) -> list[str]:
         """Return '': one request answers for all regions."""
@@ -134,7 +134,8 @@ class Azure(prices.AzurePrices):
     def get(self, region: str, vm: str) -> Optional[Vm]:
         """Return a machine."""
         try:
-            found = machines.vm_of(self._entry(vm))
+            # what insert has just seen is reported once
+            found = machines.vm_of(self._account.known.pop(f'vm {vm}', None) or self._entry(vm))
         except AzureError as error:
             if not error.gone:
                 raise
@@ -253,7 +254,7 @@ class Azure(prices.AzurePrices):
         what = f"creating '{order.spec.name}' ({place.kind})"
         self._account.call('PUT', self._vm(name), what,
                            machines.request(place, order, known, str(nic['id']), tags))
-        entry = self._allocated(name, what)
+        entry = self._account.known[f'vm {name}'] = self._allocated(name, what)
         self._guard(name, place.region, order, known, entry)
         if known.nvidia:
             self._install_driver(name, place.region)
@@ -262,15 +263,12 @@ class Azure(prices.AzurePrices):
         """Wait until a new machine has its computer; raise the error that comes late."""
         def look() -> Optional[Mapping[str, Any]]:
             entry = self._entry(name)
-            statuses = entry['properties'].get('instanceView', {}).get('statuses') or ()
-            codes = {str(status.get('code', '')): status for status in statuses}
-            for code, status in codes.items():
-                if code.startswith('ProvisioningState/failed/'):
-                    raise refused(code.rpartition('/')[2], str(status.get('message', '')), what)
-            if entry['properties'].get('provisioningState') == 'Failed':
-                raise CloudError(f'{what} failed: Azure gives no reason')
-            ready = any(code.startswith('PowerState/') for code in codes)
-            return entry if ready else None
+            codes = []
+            for status in entry['properties'].get('instanceView', {}).get('statuses') or ():
+                codes.append(code := str(status.get('code', '')))
+                if code.startswith('ProvisioningState/failed'):
+                    raise refusal(400, {**status, 'code': code.split('/')[-1]}, what)
+            return entry if any(code.startswith('PowerState/') for code in codes) else None
 
         return wait_until(look, timeout=ALLOCATION, cancel=self.cancel, first=0.3, interval=1.0,
                           longest=4.0, what=what)
@@ -284,9 +282,6 @@ class Azure(prices.AzurePrices):
             return
         end = float(order.tags.get(TAG_EXPIRES, 0)) or time.time() + order.spec.lifetime
         first = ending.schedule(self._account, name, region, end)
-        if end > first:
-            account = self._account.having(None)
-            Periodic('fog-azure', ending.DAY / 4, lambda: ending.rearm(account, name, region, end))
         price = Decimal(entry['tags'].get(TAG_PRICE, 0)) * int(first - time.time()) / 3600
         worst = f', at most ${price:.2f}' if price else ''
         self._notes[name] = (
@@ -351,6 +346,7 @@ class Azure(prices.AzurePrices):
 
     def delete(self, machine: VmId) -> None:
         """Delete the groups of a machine's attempt."""
+        self._account.known.pop(f'vm {machine.vm}', None)
         self._drop(machine.attempt, [machine.vm], wait=True)
 
     def end_attempt(self, region: str, attempt: str) -> None:
@@ -405,6 +401,7 @@ class Azure(prices.AzurePrices):
 
     def stop(self, machine: VmId) -> None:
         """Deallocate a machine; its disk and its address stay, and are billed."""
+        self._account.known.pop(f'vm {machine.vm}', None)
         self._account.call('POST', self._vm(machine.vm, '/deallocate'), f'stopping {machine.vm}')
 
     def start(self, machine: VmId) -> None:
@@ -432,9 +429,3 @@ class Azure(prices.AzurePrices):
     def delete_image(self, image_id: str) -> None:
         """Delete an image with its group."""
         images.delete(self._account, image_id)
-
-
-def refused(code: str, message: str, what: str) -> FogError:
-    """Return the error for a failure that Azure reports late, of the machine itself."""
-    from fogros2.provider.azure.failures import refusal
-    return refusal(400, {'code': code, 'message': message}, what)

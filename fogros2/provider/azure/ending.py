@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import fnmatch
+import threading
 import time
 from typing import Any
 import uuid
@@ -18,7 +19,7 @@ import uuid
 from fogros2.errors import DeadlineExceeded, FogError
 from fogros2.provider.azure.account import Account, endpoint, subscription
 from fogros2.provider.azure.failures import AzureError
-from fogros2.waiting import wait_until
+from fogros2.waiting import Periodic, wait_until
 
 _ROLE_ACTIONS = ('Microsoft.Compute/virtualMachines/deallocate/action',
                  'Microsoft.Resources/subscriptions/resourceGroups/delete')
@@ -143,27 +144,33 @@ def assign(account: Account, name: str, principal: str) -> bool:
 
 def schedule(account: Account, name: str, region: str, end: float) -> float:
     """
-    Let Azure deallocate a machine at a time of day; return when it first does.
+    Let Azure deallocate a machine at a time of day, and return when it first does.
 
-    :param end: seconds since the epoch; a later time than a day from now is set anew by the robot.
+    :param end: seconds since the epoch; later than a day from now, this process sets the time
+        anew as long as it runs.
     """
-    # rounded up: a minute that has begun would be tomorrow's
-    end = min(end, time.time() + DAY) // 60 * 60 + 120
-    target = account.path(name, f'providers/Microsoft.Compute/virtualMachines/{name}')
-    account.call(
-        'PUT', account.path(name, 'providers/Microsoft.DevTestLab/schedules/'
-                                  f'shutdown-computevm-{name}'),
-        f'scheduling the end of {name}', {'location': region, 'properties': {
-            'status': 'Enabled', 'taskType': 'ComputeVmShutdownTask', 'timeZoneId': 'UTC',
-            'dailyRecurrence': {'time': time.strftime('%H%M', time.gmtime(end))},
-            'notificationSettings': {'status': 'Disabled'}, 'targetResourceId': target}})
-    return end
+    def put() -> float:
+        # rounded up: a minute that has begun would be tomorrow's
+        first = min(end, time.time() + DAY) // 60 * 60 + 120
+        account.having(None).call('PUT', path, f'scheduling the end of {name}', {
+            'location': region, 'properties': {
+                'status': 'Enabled', 'taskType': 'ComputeVmShutdownTask', 'timeZoneId': 'UTC',
+                'dailyRecurrence': {'time': time.strftime('%H%M', time.gmtime(first))},
+                'notificationSettings': {'status': 'Disabled'}, 'targetResourceId': account.path(
+                    name, f'providers/Microsoft.Compute/virtualMachines/{name}')}})
+        return first
 
+    def again() -> None:
+        try:
+            put()
+        except FogError as error:  # a later try may succeed
+            if isinstance(error, AzureError) and error.gone:
+                over.set()
 
-def rearm(account: Account, name: str, region: str, end: float) -> float:
-    """Set a schedule anew, for a thread; return the seconds until the next time."""
-    try:
-        schedule(account, name, region, end)
-    except FogError:
-        return 600.0
-    return DAY / 4
+    over = threading.Event()
+    path = account.path(
+        name, f'providers/Microsoft.DevTestLab/schedules/shutdown-computevm-{name}')
+    first = put()
+    if end > first:
+        Periodic('fog-rearm', DAY / 8, again, stop=over)
+    return first
