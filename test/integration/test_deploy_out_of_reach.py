@@ -5,21 +5,25 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 import functools
+import json
 import os
+from pathlib import Path
 import shutil
+import sys
 import threading
 import time
 import uuid
 
 import pytest
 
-from fogros2.agent_client import AgentClient
+from fogros2.agent_client import AgentClient, joined
 from fogros2.deploy import Launch
 from fogros2.deploy.machine_job import MachineJob
+from fogros2.deploy.steps import arming
 from fogros2.deploy.steps.arming import Arming
 from fogros2.errors import AgentError, FogError
 from fogros2.model import Command, Endpoint, Machine, MachineSpec, MachineState
-from fogros2.process import run
+from fogros2.process import _ENVIRONMENT, run
 from fogros2.provider.container import machine as container_machine
 from fogros2.shell.local import LocalShell
 from fogros2.store import Store
@@ -118,3 +122,24 @@ def test_of_two_robots_that_come_at_once_one_gets_the_computer(root, tmp_path):
         assert agent.request('status')['launch'] == contexts[winner].launch
         robots[winner][1].undo.close()
         assert not os.path.exists(f'/run/fogros2/{name}')
+
+
+def test_agent_is_removed_where_python_is_a_wrapper(root, tmp_path, monkeypatch):
+    if os.geteuid() != 0:
+        pytest.skip('the agent is started here as root')
+    wrapper = tmp_path / 'bin' / 'python3'  # as pyenv has one
+    wrapper.parent.mkdir()
+    wrapper.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    wrapper.chmod(0o755)
+    monkeypatch.setitem(_ENVIRONMENT, 'PATH', f"{wrapper.parent}:{_ENVIRONMENT['PATH']}")
+    folder = f'/run/fogros2/wrapped-{RUN}'
+    config = {'machine': 'wrapped', 'launch': 'first', 'directory': folder, 'user': 'root'}
+    run(Command(('sh', '-ec', arming._INSTALL, 'sh', '/run/fogros2', folder, f'{folder}/agent.py',
+                 f'{folder}/start-first.json', 'root'),
+                input=json.dumps(config).encode() + b'\n' + joined().encode()), timeout=30)
+    program = Path('/proc', Path(folder, 'agent.pid').read_text().strip(), 'cmdline')
+    assert b'agent.py' in program.read_bytes()
+    run(Command(('sh', '-ec', arming._REMOVE, 'sh', folder, 'first',
+                 f'{folder}/start-first.json')), timeout=30)
+    assert not os.path.exists(folder)
+    assert not program.exists() or not program.read_bytes()

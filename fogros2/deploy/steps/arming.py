@@ -49,7 +49,7 @@ python3 -IS "$3" serve --detach --config "$4"
 # Another robot's agent stays: its configuration names its launch.
 # $1 folder, $2 launch, $3 our configuration.
 _REMOVE = """\
-running() { [ "$(head -c 6 /proc/$pid/cmdline 2>/dev/null)" = python ]; }
+running() { grep -qs serve /proc/$pid/cmdline; }
 rm -f -- "$3"
 if read -r pid 2>/dev/null <"$1/agent.pid" && running; then
     owner=$(sed -n 's/.*"launch": "\\([^"]*\\)".*/\\1/p' "$1/config.json" 2>/dev/null) || :
