@@ -54,15 +54,29 @@ def _raw() -> Iterator[None]:
 @contextlib.contextmanager
 def _following_size(channel: Channel) -> Iterator[None]:
     """Send each new size of this terminal to the remote terminal during the block."""
-    def resized(number: int, frame: Optional[FrameType]) -> None:
-        columns, rows = os.get_terminal_size(0)
-        channel.resize_pty(columns, rows)
-
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread can handle signals
         return
+    changed, change = os.pipe()
+
+    def send() -> None:
+        while os.read(changed, 64):
+            columns, rows = os.get_terminal_size(0)
+            with contextlib.suppress(Exception):  # the program has ended
+                channel.resize_pty(columns, rows)
+
+    def resized(number: int, frame: Optional[FrameType]) -> None:
+        # it must not send: the thread that it interrupts may hold the lock of the connection
+        os.write(change, b'x')
+
+    thread = threading.Thread(target=send, name='fog-terminal-size', daemon=True)
+    thread.start()
     before = signal.signal(signal.SIGWINCH, resized)
+    os.write(change, b'x')  # the size may have changed since the channel was opened
     try:
         yield
     finally:
         signal.signal(signal.SIGWINCH, before)
+        os.close(change)  # ends the thread
+        thread.join(5.0)
+        os.close(changed)

@@ -384,19 +384,28 @@ def terminals(server):
         pytest.skip("needs root, or /dev/pts mounted with tty's group as distributions do")
 
 
+#: Prints the terminal's size, the other size when it has come, and exits with 7 after a line.
+RESIZED = """\
+stty size
+until stty size | grep '44 111'; do sleep 0.05; done
+read x
+[ "$x" = go ] && exit 7
+"""
+
+
 def test_a_terminal_is_given_with_its_size_and_keys(server, terminals):
     ours, theirs = os.openpty()
     try:
         termios.tcsetwinsize(ours, (33, 99))
         child = subprocess.Popen(
-            interactive(server, "Command(('sh', '-c', 'stty size; read x; stty size; exit 7'))"),
+            interactive(server, f"Command(('sh', '-c', {RESIZED!r}))"),
             stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
             preexec_fn=lambda: os.close(os.open(os.ttyname(0), os.O_RDWR)))
         read_until(ours, b'33 99\r\n')
         termios.tcsetwinsize(ours, (44, 111))
         wait_until(lambda: termios.tcgetwinsize(theirs) == (44, 111), timeout=5.0, what='resize')
-        os.write(ours, b'go\r')
         read_until(ours, b'44 111\r\n')
+        os.write(ours, b'go\r')
         assert child.wait(20.0) == 7
         # cooked again
         assert termios.tcgetattr(theirs)[3] & termios.ICANON

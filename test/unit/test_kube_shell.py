@@ -121,9 +121,13 @@ def shell(api):
 
 def ended(number: int) -> None:
     """Wait for a process to end."""
-    wait_until(lambda: not Path(f'/proc/{number}').exists() or
-               'Z' in Path(f'/proc/{number}/stat').read_text().split()[2], timeout=10.0,
-               what='the command to end')
+    def over() -> bool:
+        try:
+            return 'Z' in Path(f'/proc/{number}/stat').read_text().split()[2]
+        except (FileNotFoundError, ProcessLookupError):
+            return True
+
+    wait_until(over, timeout=10.0, what='the command to end')
 
 
 def test_commands_share_one_exec(api, shell):
