@@ -61,9 +61,8 @@ def _following_size(channel: Channel) -> Iterator[None]:
 
     def send() -> None:
         while os.read(changed, 64):
-            columns, rows = os.get_terminal_size(0)
-            with contextlib.suppress(Exception):  # the program has ended
-                channel.resize_pty(columns, rows)
+            with contextlib.suppress(Exception):  # the program or this terminal has ended
+                channel.resize_pty(*os.get_terminal_size(0))
 
     def resized(number: int, frame: Optional[FrameType]) -> None:
         # it must not send: the thread that it interrupts may hold the lock of the connection
