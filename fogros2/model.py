@@ -13,10 +13,14 @@ from typing import Any, Literal, Optional, Union
 OnExit = Literal['delete', 'stop', 'keep']
 Bootstrap = Literal['auto', 'apt', 'embedded', 'none']
 RobotNodes = Literal['after_cloud', 'immediately']
-OnInterrupt = Literal['shutdown', 'robot']
+OnInterrupt = Literal['shutdown', 'robot', 'replace']
 
 #: Maximum lifetime of a machine in seconds, unless its launch file sets another.
 DEFAULT_LIFETIME = 8 * 3600.0
+#: Default interval of the copies of a checkpoint in seconds.
+DEFAULT_CHECKPOINT_INTERVAL = 30.0
+#: Default number of replacements of one machine in a launch.
+DEFAULT_REPLACEMENTS = 3
 #: Default time in seconds without a heartbeat after which the launch counts as gone.
 DEFAULT_ROBOT_TIMEOUT = 120.0
 
@@ -50,9 +54,16 @@ class MachineSpec:
     :param environment: variables of every node on the machine.
     :param containers: ``docker run`` command lines that start before the nodes.
     :param on_interrupt: when the provider reclaims the machine while its nodes run: end the
-        launch, or run the nodes on the robot.
+        launch, run the nodes on the robot, or run them on a replacement of the machine.
+    :param on_loss_after: seconds of silence after which a machine is replaced; at least
+        ``robot_timeout``, 0 for as long as that.
+    :param max_replacements: the number of replacements in one launch.
+    :param checkpoint: a folder that a replacement takes over, '' for none.
+    :param checkpoint_interval: seconds between two copies of that folder to the robot.
     :param monitor_allow: networks (CIDR) that may reach its Foxglove bridge, besides the robot.
     :param apt: Debian packages to install; ``pip`` Python packages, in pip's syntax.
+    :param wanted: for a machine of any cloud, the requirements for which the launch has chosen
+        ``provider`` and ``options``.
     """
 
     name: str
@@ -69,9 +80,14 @@ class MachineSpec:
     launch_foxglove: bool = False
     vpn: str = 'wireguard'
     on_interrupt: OnInterrupt = 'shutdown'
+    on_loss_after: float = 0.0
+    max_replacements: int = DEFAULT_REPLACEMENTS
+    checkpoint: str = ''
+    checkpoint_interval: float = DEFAULT_CHECKPOINT_INTERVAL
     monitor_allow: tuple[str, ...] = ()
     apt: tuple[str, ...] = ()
     pip: tuple[str, ...] = ()
+    wanted: Optional[Mapping[str, Any]] = None
 
     @property
     def workspaces(self) -> tuple[str, ...]:
@@ -131,6 +147,7 @@ class Machine:
     :param end_command: command that the agent runs as root to end the machine; empty if the
         machine must not be ended.
     :param cost_per_hour: US dollars, None if unknown.
+    :param billed: a stopped machine costs as much as a running one.
     :param note: what the provider chose, and why; shown when the machine comes up.
     """
 
@@ -156,6 +173,7 @@ class Machine:
     cost_per_hour: Optional[Decimal] = None
     stopped: Optional[float] = None
     note: str = ''
+    billed: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,6 +14,7 @@ from typing import Any, Optional
 
 from fogros2.errors import ConfigurationError, DdsError, VpnError
 from fogros2.model import host_port, Machine, MachineSpec, Peer, VpnInterface
+from fogros2.vpn.addresses import FIRST_GUEST
 
 #: Number of the first machine's address; .0 is the network, .1 the robot.
 FIRST_MACHINE = 2
@@ -133,10 +134,10 @@ def machine_interface(
 
 def _host(network: str, number: int) -> str:
     subnet = ipaddress.ip_network(network)
-    if number >= subnet.num_addresses - 1:
+    if number >= FIRST_GUEST:
         raise ConfigurationError(
             f'{network} has no free address for another machine',
-            f'a launch can have {subnet.num_addresses - 2 - 1} machines')
+            f'a launch can have {FIRST_GUEST - FIRST_MACHINE} machines')
     return str(subnet[number])
 
 

@@ -47,6 +47,11 @@ class Pace:
         self._patience = 0.0
         self._tried = -MOST_PATIENCE
 
+    @property
+    def quickest(self) -> float:
+        """The recent minimum time until an acknowledgement in seconds; 0: unknown."""
+        return min((trip for _, trip in self._trips), default=0.0)
+
     def may_send(self) -> bool:
         """Return whether the window has room for another image."""
         return self._under_way < self.window
@@ -65,8 +70,7 @@ class Pace:
             self._trips.popleft()
         if sent.place < self.window:
             return  # the window did not delay this image, so it says nothing about its size
-        quickest = min(trip for _, trip in self._trips)
-        self._queued.append(self.window * (1 - quickest / trip))
+        self._queued.append(self.window * (1 - self.quickest / trip))
         if len(self._queued) < ROUND:
             return
         # A repeated fragment or a busy processor delays some images, a queue delays all.

@@ -40,6 +40,8 @@ UBUNTU = {
     'iproute2': 'iproute2',
     'openssh-client': 'openssh-client',
     'python3-boto3': 'python3-boto3 (>= 1.34)',
+    'python3-cryptography': 'python3-cryptography (>= 41.0)',
+    'python3-google-auth': 'python3-google-auth (>= 2.0)',
     'python3-numpy': 'python3-numpy (>= 1:1.26)',
     'python3-opencv': 'python3-opencv (>= 4.6)',
     'python3-paramiko': 'python3-paramiko (>= 2.12)',
@@ -51,14 +53,15 @@ UBUNTU = {
 #: What bloom adds to all packages: the folder's setup.bash.
 WORKSPACE = 'ros-jazzy-ros-workspace'
 #: What not every robot needs, and rosdep has no key for.
-RECOMMENDS = ('nftables', 'podman', 'python3-kubernetes (>= 22.6)', 'sudo', 'wireguard-go')
+RECOMMENDS = ('nftables', 'podman', 'python3-kubernetes (>= 22.6)',
+              'python3-zstandard (>= 0.20)', 'sudo', 'wireguard-go')
 #: The helper by which a group of users makes VPN interfaces, what it imports, and its rights.
 HELPER = ROOT / 'packaging/vpn_helper'
 HELPER_FILES = {
     HELPER / 'vpn.py': ('usr/libexec/fogros2/vpn', 0o755),
     **{ROOT / f'fogros2/{name}.py': (f'usr/libexec/fogros2/fogros2/{name}.py', 0o644)
        for name in ('__init__', 'errors', 'model', 'vpn/__init__', 'vpn/addresses',
-                    'vpn/receive_buffer', 'vpn/wireguard')},
+                    'vpn/guests', 'vpn/receive_buffer', 'vpn/wireguard')},
     HELPER / 'sudoers': ('etc/sudoers.d/fogros2-vpn', 0o440),
     **{HELPER / f'fogros2-vpn-tidy.{kind}': (f'usr/lib/systemd/system/fogros2-vpn-tidy.{kind}',
                                             0o644) for kind in ('service', 'timer')}}
@@ -68,7 +71,7 @@ TIMER = 'fogros2-vpn-tidy.timer'
 DESCRIPTION = (
     'Machines (EC2 instances, pods of a Kubernetes cluster, SSH hosts, containers) are',
     'created as the launch begins, get the workspace, ROS 2 and a VPN, and are deleted as',
-    'it ends. The examples and the image transport H.264 are in this package, too.')
+    'it ends. The examples and the streams of images and point clouds are here, too.')
 #: Run before removal and upgrade. VPN interfaces lose what would take them away, and a Python of
 #: root's has compiled modules, which dpkg knows nothing of, so that their folders would stay.
 PRERM = f"""\

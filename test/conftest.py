@@ -51,13 +51,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     module. These take longest, so they come first, and tests without a machine come last: no
     process begins with something long when the others are done.
     """
+    costly = ('kubernetes', 'aws', 'azure', 'gcp')
+
     def group(item: pytest.Item) -> str:
+        params = getattr(item, 'callspec', None)
+        cloud = params.params.get('cloud') if params else None
         folder = item.path.parent.name
-        return folder if folder in ('kubernetes', 'aws', 'azure', 'gcp') else str(item.path)
+        return str(cloud or (folder if folder == 'kubernetes' else item.path))
 
     for item in items:
         item.add_marker(pytest.mark.xdist_group(group(item)))
-    items.sort(key=lambda item: (group(item) not in ('kubernetes', 'aws', 'azure', 'gcp'),
+    items.sort(key=lambda item: (group(item) not in costly,
                                  'integration' not in item.path.parts))
 
 
@@ -141,9 +145,23 @@ def moto_server() -> Iterator[str]:
 
 
 @pytest.fixture
+def loopback_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refuse every look-up of another host in this process: clouds' libraries ask their own."""
+    look_up = socket.getaddrinfo
+
+    def here_alone(host: Any, *others: Any, **words: Any) -> Any:
+        if host not in ('127.0.0.1', 'localhost'):
+            raise socket.gaierror(socket.EAI_NONAME, f'the tests reach no {host}')
+        return look_up(host, *others, **words)
+
+    monkeypatch.setattr(socket, 'getaddrinfo', here_alone)
+
+
+@pytest.fixture
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     """Poll clouds without the pauses that real ones need."""
     from fogros2 import waiting
+    from fogros2.provider.vm import rest
 
     def wait_until(probe: Any, **options: Any) -> Any:
         return waiting.wait_until(probe, **{**options, 'first': 0.0, 'interval': 0.02})
@@ -151,10 +169,14 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in [found for name, found in sys.modules.items()
                    if name.startswith('fogros2.provider.') and hasattr(found, 'wait_until')]:
         monkeypatch.setattr(module, 'wait_until', wait_until)
+    monkeypatch.setattr(rest, 'PAUSE', 0.02)
+    monkeypatch.setattr(rest, 'LONGEST', 0.2)
 
 
 @pytest.fixture
-def gce(hasty: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Any]:
+def gce(
+    hasty: None, loopback_only: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> Iterator[Any]:
     """Lead Google's clients to an empty Compute Engine in a box, without computers."""
     pytest.importorskip('google.auth', reason='needs google-auth')
     pytest.importorskip('googleapiclient', reason="needs Google's description of the API")
@@ -165,10 +187,6 @@ def gce(hasty: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterato
             monkeypatch.delenv(name, raising=False)
         for name, value in {**found.variables, 'FOGROS2_ROBOT_ADDRESS': '198.51.100.7'}.items():
             monkeypatch.setenv(name, value)
-        look_up = socket.getaddrinfo
-        # clients of Google fall back to Google itself
-        monkeypatch.setattr(socket, 'getaddrinfo', lambda host, *others, **words: look_up(
-            host if host in ('127.0.0.1', 'localhost') else '', *others, **words))
         yield found
 
 
@@ -228,7 +246,9 @@ def moto_aws(moto_server: str, hasty: None, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.fixture
-def azure_service(hasty: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def azure_service(
+    hasty: None, loopback_only: None, monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[Any]:
     """Serve a simulated Azure on the loopback, and lead the provider there; yields it."""
     from werkzeug.serving import make_server
 

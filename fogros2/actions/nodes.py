@@ -39,6 +39,8 @@ class Node(launch_ros.actions.Node):
         'ros:jazzy-perception', with the machine's network, DDS configuration and workspace.
     :param image_options: more options for ``docker run``, such as ['--gpus=all']; a substitution
         separates them by commas.
+    :param checkpoint: folder of the node on the machine, such as '$HOME/map', that a replacement
+        of the machine takes over; see ``checkpoint`` of machines.
     :raises ConfigurationError: ``machine`` is no machine, or another option needs one.
     """
 
@@ -48,7 +50,8 @@ class Node(launch_ros.actions.Node):
     def __init__(
         self, *, machine: Optional[SomeMachine] = None, stream_topics: Sequence[Entry] = (),
         image: Optional[SomeSubstitutionsType] = None,
-        image_options: Union[Sequence[SomeSubstitutionsType], Substitution] = (), **kwargs: Any,
+        image_options: Union[Sequence[SomeSubstitutionsType], Substitution] = (),
+        checkpoint: Optional[SomeSubstitutionsType] = None, **kwargs: Any,
     ) -> None:
         with keywords.refused(type(self)):
             super().__init__(**kwargs)
@@ -57,14 +60,16 @@ class Node(launch_ros.actions.Node):
                 f'image_options={image_options!r} is no list of options for an image',
                 "such as image='ros:jazzy-perception', image_options=['--gpus=all']")
         if machine is None:
-            if image is not None or stream_topics:
-                given = 'stream_topics' if image is None else 'image'
+            given = ('image' if image is not None else 'checkpoint' if checkpoint is not None
+                     else 'stream_topics')
+            if image is not None or checkpoint is not None or stream_topics:
                 raise ConfigurationError(
                     f'{given}= of a node is for a machine, and this node has none',
                     f'add machine=, or leave {given}= out')
             return
         self.stream_topics = list(stream_topics)
         self._image = image
+        self._checkpoint = checkpoint
         self._image_options = values.items(image_options)
         self._fogros2_own_machine = True
         if image is not None and isinstance(machine, CloudInstance):
@@ -82,6 +87,8 @@ class Node(launch_ros.actions.Node):
                 namespace = '/'
             self._fogros2_streams = Coordinator.of(context).resolve_streams(
                 self.stream_topics, namespace)
+            assert isinstance(self, RemoteProcess)
+            self.add_checkpoint(values.resolve(context, self._checkpoint))
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Execute the action; components that it loads use the topic names of its machine."""

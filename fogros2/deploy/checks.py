@@ -51,6 +51,10 @@ def check(
         raise ConfigurationError(
             f"'{spec.name}' is a computer that exists already: no launch switches it off",
             "use on_exit='delete' to leave nothing there, or 'keep'")
+    if spec.on_interrupt == 'replace' and not provider.capabilities.owned:
+        raise ConfigurationError(
+            f"'{spec.name}' is a computer that exists already: no launch can replace it",
+            "use on_interrupt='robot' or 'shutdown'")
     for line in spec.containers:
         containers.check(containers.parse(line), rmw)
     if spec.containers or images:

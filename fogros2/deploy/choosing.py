@@ -9,10 +9,11 @@ import threading
 import time
 from typing import Optional
 
-from fogros2 import plan
+from fogros2 import model, plan
 from fogros2.errors import FogError
 from fogros2.model import MachineSpec
 from fogros2.provider import Provider
+from fogros2.provider.cheapest import Cheapest
 from fogros2.report import Reporter, step
 
 
@@ -28,6 +29,7 @@ class Choices:
         self._report = report
         self._lock = threading.Lock()
         self._resolved: dict[str, MachineSpec] = {}
+        self._places: dict[str, list[MachineSpec]] = {}
         self._costs: dict[str, tuple[Decimal, float, Optional[float]]] = {}
 
     def resolved(self, spec: MachineSpec) -> MachineSpec:
@@ -36,8 +38,9 @@ class Choices:
 
         :raises FogError: nothing fits.
         """
+        key = model.to_json(spec)
         with self._lock:
-            known = self._resolved.get(spec.name)
+            known = self._resolved.get(key)
         if known is not None:
             return known
         provider = self._provider(spec.provider)
@@ -50,8 +53,31 @@ class Choices:
             if price is not None:
                 detail.append(plan.price(price))
         with self._lock:
-            self._resolved[spec.name] = chosen
+            self._resolved[key] = chosen
         return chosen
+
+    def places(self, spec: MachineSpec) -> list[MachineSpec]:
+        """
+        Return the specs to try while there is no capacity, one after the other.
+
+        For a machine of any cloud, they are the cheapest offers, requested once for each launch.
+
+        :raises FogError: nothing fits.
+        """
+        provider = self._provider(spec.provider)
+        if not isinstance(provider, Cheapest):
+            return [spec]
+        with self._lock:
+            known = self._places.get(spec.name)
+        if known is None:
+            with step(self._report, spec.name, 'offers') as detail:
+                found = provider.places(spec)
+                detail += [str(offer) for offer, _ in found[:2]]
+                detail += [f'{len(found) - 2} more'] * (len(found) > 2)
+            known = [place for _, place in found]
+            with self._lock:
+                self._places[spec.name] = known
+        return known
 
     def price(self, spec: MachineSpec) -> Optional[Decimal]:
         """Return the price of a machine in US dollars per hour, None if unknown."""

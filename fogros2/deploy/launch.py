@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 import contextlib
+import dataclasses
 from decimal import Decimal
 import functools
 import os
@@ -30,8 +31,8 @@ from fogros2.errors import Cancelled, ConfigurationError, DdsError, FogError, St
 from fogros2.journal import Journal
 from fogros2.model import MachineSpec
 from fogros2.provider import Provider
-from fogros2.report import Reporter, silent, StepFailed
-from fogros2.store import Store, this_process, write_private
+from fogros2.report import Reporter, silent, StepFailed, Warned
+from fogros2.store import Record, Store, this_process, write_private
 from fogros2.vpn import addresses
 from fogros2.waiting import Timeouts
 
@@ -95,23 +96,37 @@ class Launch:
             check(spec, self.provider(spec.provider), rmw=rmw, environment=self.user_environment,
                   programs=programs.get(spec.name, ()), images=images.get(spec.name, ()),
                   report=self.report)
-        choosing = [spec for spec in specs if not self._may_be_kept(spec)]
-        with ThreadPoolExecutor(max(1, len(choosing)), 'fog-choose') as pool:
-            for choice in [pool.submit(self._choose, spec) for spec in choosing]:
+        with ThreadPoolExecutor(max(1, len(specs)), 'fog-choose') as pool:
+            for choice in [pool.submit(self._choose, spec) for spec in specs]:
                 choice.result()
 
     def _choose(self, spec: MachineSpec) -> None:
         """Make the open choices of a spec; check that wheels and workspace fit its processor."""
-        check_architecture(self._choices.resolved(spec), self.provider(spec.provider))
+        place = self._places(spec)[0]
+        before = self._before(spec)
+        if before is None or before.provider != place.provider:
+            self._check_choices(place)
 
-    def _may_be_kept(self, spec: MachineSpec) -> bool:
-        """Return whether this spec may reuse a machine of an earlier launch, with its choices."""
+    def _check_choices(self, place: MachineSpec) -> None:
+        check_architecture(self._choices.resolved(place), self.provider(place.provider))
+
+    def _places(self, spec: MachineSpec) -> list[MachineSpec]:
+        """Return the specs to try; a kept machine with the same requirements stays where it is."""
+        before = self._before(spec)
+        if before is not None and before.spec.wanted is not None and (
+                model.to_json(before.spec.wanted) == model.to_json(spec.options)):
+            return [dataclasses.replace(
+                spec, provider=before.provider, options=before.asked_options,
+                wanted=spec.options)]
+        return self._choices.places(spec)
+
+    def _before(self, spec: MachineSpec) -> Optional[Record]:
+        """Return the record of an earlier launch whose machine this spec may reuse, or None."""
         try:
             before = self.store.load(spec.name) if self.store.exists(spec.name) else None
         except StoreError:
-            return False
-        return before is not None and before.machine_id is not None \
-            and before.provider == spec.provider
+            return None
+        return before if before is not None and before.machine_id is not None else None
 
     def provider(self, name: str) -> Provider:
         """
@@ -246,6 +261,10 @@ class Launch:
         network = self.robot_vpn().interface.network
         return plan.machine_interface('', network, index, 0, '').address
 
+    def checkpoints(self, name: str) -> Path:
+        """Return the folder for a machine's checkpoints, which end with the launch."""
+        return self.store.launch(self.id) / 'checkpoints' / name
+
     # -- up -------------------------------------------------------------------------------------
 
     def expect(self, names: Iterable[str]) -> None:
@@ -293,13 +312,40 @@ class Launch:
         if known is not None:
             return known.result()
         try:
-            machine = bring_up(self.context(spec), spec)
+            machine = self._bring_up(spec)
         except BaseException as error:
             mine.set_exception(error)
             raise
         mine.set_result(machine)
         self._warm()
         return machine
+
+    def retire(self, name: str) -> None:
+        """
+        Delete a machine for good, whatever its ``on_exit``, so that ``up`` creates it anew.
+
+        :raises FogError: the provider has not confirmed the deletion; a later call may succeed.
+        """
+        with self._lock:
+            up = self._ups.get(name)
+        if up is not None and up.exception() is None:
+            up.result().retire()
+        with self._lock:
+            self._ups.pop(name, None)
+
+    def _bring_up(self, spec: MachineSpec) -> RunningMachine:
+        """Bring a machine up; without capacity, at the next place, as a new attempt."""
+        *places, last = self._places(spec)
+        for place, following in zip(places, (*places[1:], last)):
+            try:
+                return bring_up(self.context(place), place)
+            except FogError as error:
+                if not error.no_capacity or self.ending or self.cancel.is_set():
+                    raise
+                self.report(Warned(spec.name, f"'{spec.name}': {error.args[0]}",
+                                   f'the launch tries the next offer, of {following.provider}'))
+                self._check_choices(following)
+        return bring_up(self.context(last), last)
 
     def _warm(self) -> None:
         """

@@ -139,8 +139,9 @@ class RunningMachine(Step):
 
     def _is_lost(self, reason: str) -> None:
         """Report, once, that the machine is lost; stop its nodes there if it comes back."""
-        self._report_end(reason)
+        # without heartbeats, the machine ends its nodes by itself
         self.heartbeat.close()
+        self._report_end(reason)
         with contextlib.suppress(FogError):
             # they may run on the robot by then
             self.agent.request('stop', nodes=None, timeout=self.spec.robot_timeout)
@@ -152,6 +153,19 @@ class RunningMachine(Step):
             callbacks = list(self._callbacks)
         for callback in callbacks:
             callback({'event': 'lost', 'reason': reason})
+
+    def retire(self) -> None:
+        """
+        Stop the heartbeats, and delete the machine for good, whatever its ``on_exit``.
+
+        :raises FogError: the provider has not confirmed the deletion; nothing else is undone yet.
+        """
+        with self._lock:
+            self._lost = self._lost or 'it is replaced'
+        self.heartbeat.close()
+        self._context.provider.destroy(self._job.machine_id)
+        self._job.gone = self._job.deleted = True
+        self._job.undo.close()
 
     def close(self) -> None:
         """End the machine as its ``on_exit`` says."""

@@ -21,7 +21,8 @@ from launch import LaunchContext, Substitution
 from fogros2 import plugin_system
 from fogros2.describe import values
 from fogros2.errors import ConfigurationError
-from fogros2.provider import offers, Provider
+from fogros2.provider import clouds, offers, Provider
+from fogros2.provider.cheapest import WANTS
 
 if TYPE_CHECKING:
     from decimal import Decimal
@@ -148,32 +149,35 @@ def find_cheapest_ec2_instance_type(
 
 
 def find_cheapest(
-    regions: Optional[Sequence[SomeSubstitutionsType]] = None, **wanted: Any,
-) -> tuple[Choice, Choice]:
+    regions: Optional[Sequence[SomeSubstitutionsType]] = None, *, provider: str = 'aws',
+    max_round_trip_ms: Optional[float] = None, **wanted: Any,
+) -> tuple[Choice, ...]:
     """
-    Choose the region and the type of the cheapest EC2 instance that meets the requirements.
+    Choose the cheapest machine of a cloud, or of all clouds, that meets the requirements.
 
     :param regions: candidates; None for all regions that the account may use.
+    :param provider: the cloud, such as 'azure'; 'all' for all clouds that are set up.
+    :param max_round_trip_ms: maximum of the measured time to the region and back.
     :param wanted: ``arch``, ``min_cpu``, ``min_memory_gb``, ``cpu_type``, ``gpu``,
         ``gpu_memory_gb``, ``max_price``, ``spot``, with the meaning of AWSCloudInstance.
+    :returns: region and type; with 'all', the provider's name comes first. For a machine, use
+        :class:`~fogros2.CheapestInstance`: it continues with the next offer.
     :raises ConfigurationError: an unknown keyword.
     """
     for name in wanted:
-        if name not in _WANTED:
-            raise ConfigurationError(f"find_cheapest takes no '{name}'",
-                                     f"it takes regions, {', '.join(_WANTED)}")
-    # one request answers both
-    both = Choice('the cheapest EC2 instance', functools.partial(_cheapest, asked=wanted),
-                  {'regions': values.items(regions)})
-    return (
-        Choice('the region of the cheapest EC2 instance',
-               lambda both: str(both).partition(' ')[0], {'both': both}),
-        Choice('the type of the cheapest EC2 instance',
-               lambda both: str(both).partition(' ')[2], {'both': both}))
-
-
-_WANTED = ('arch', 'min_cpu', 'min_memory_gb', 'cpu_type', 'gpu', 'gpu_memory_gb', 'max_price',
-           'spot')
+        if name not in WANTS:
+            raise ConfigurationError(
+                f"find_cheapest takes no '{name}'",
+                f"it takes regions, provider, max_round_trip_ms, {', '.join(WANTS)}")
+    ask = functools.partial(
+        _cheapest, providers=() if provider == clouds.ALL else (provider,),
+        max_round_trip_ms=max_round_trip_ms, asked=wanted)
+    # one request answers all
+    offer = Choice('the cheapest offer', ask, {'regions': values.items(regions)})
+    found = tuple(
+        Choice(f'the {part} of the cheapest offer', functools.partial(_part, number),
+               {'offer': offer}) for number, part in enumerate(('provider', 'region', 'type')))
+    return found if provider == clouds.ALL else found[1:]
 
 
 def _said(**values: Any) -> dict[str, Any]:
@@ -205,6 +209,14 @@ def _type_of_fogros2(
         'cores': default_cores, 'threads_per_core': default_threads_per_core})
 
 
-def _cheapest(regions: Optional[Sequence[str]], asked: Mapping[str, Any]) -> str:
-    offer = _aws().offers(offers.wants(**asked), regions or ['all']).chosen
-    return f'{offer.region} {offer.type.name}'
+def _cheapest(
+    regions: Optional[Sequence[str]], providers: Sequence[str],
+    max_round_trip_ms: Optional[float], asked: Mapping[str, Any],
+) -> str:
+    offer = clouds.compare(offers.wants(**asked), providers, regions or [clouds.ALL],
+                           max_round_trip_ms=max_round_trip_ms).chosen
+    return f'{offer.provider} {offer.region} {offer.type.name}'
+
+
+def _part(number: int, offer: str) -> str:
+    return offer.split(' ')[number]

@@ -15,10 +15,13 @@ from fogros2.describe import names, networks, values
 from fogros2.describe.kinds import options_of
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.host import containers, dependencies
+from fogros2.host.checkpoint import check_folder
 from fogros2.host.workspace import find_workspaces, underlays
 from fogros2.model import (
     Bootstrap,
+    DEFAULT_CHECKPOINT_INTERVAL,
     DEFAULT_LIFETIME,
+    DEFAULT_REPLACEMENTS,
     DEFAULT_ROBOT_TIMEOUT,
     MachineSpec,
     OnExit,
@@ -71,7 +74,13 @@ class CloudInstance:
         when neither the machine nor its provider has answered for 37 s.
         'shutdown' ends the launch with a nonzero exit status. 'robot' restarts the nodes on the
         robot, where their programs must be installed. They keep names and parameters, and lose
-        their memory: lifecycle states and loaded components.
+        their memory: lifecycle states and loaded components. 'replace' creates a new machine;
+        until it is up, nodes whose programs are installed on the robot run there.
+    :param on_loss_after: silence after which on_interrupt='replace' replaces the machine, in
+        seconds or as above; at least ``robot_timeout``, which is the default.
+    :param max_replacements: how often on_interrupt='replace' replaces the machine in a launch.
+    :param checkpoint: folder of its nodes, such as '$HOME/map', that a replacement takes over.
+    :param checkpoint_interval: time between two copies of the folder to the robot.
     :param monitor_allow: networks (CIDR) from which external clients may connect to the Foxglove
         bridge, by TLS and with a token.
     :param options: the provider's own options; subclasses set it.
@@ -92,6 +101,10 @@ class CloudInstance:
         bootstrap: SomeSubstitutionsType = 'auto',
         environment: Optional[Mapping[str, SomeSubstitutionsType]] = None,
         on_interrupt: SomeSubstitutionsType = 'shutdown',
+        on_loss_after: Optional[Value] = None,
+        max_replacements: Value = DEFAULT_REPLACEMENTS,
+        checkpoint: Optional[SomeSubstitutionsType] = None,
+        checkpoint_interval: Value = DEFAULT_CHECKPOINT_INTERVAL,
         monitor_allow: Optional[Sequence[SomeSubstitutionsType]] = None,
         apt: Optional[Sequence[SomeSubstitutionsType]] = None,
         pip: Optional[Sequence[SomeSubstitutionsType]] = None,
@@ -111,6 +124,10 @@ class CloudInstance:
         self._values: dict[str, Any] = {
             'on_exit': on_exit, 'lifetime': lifetime, 'robot_timeout': robot_timeout,
             'bootstrap': bootstrap, 'on_interrupt': on_interrupt,
+            'max_replacements': max_replacements,
+            'checkpoint_interval': checkpoint_interval,
+            **({} if on_loss_after is None else {'on_loss_after': on_loss_after}),
+            **({} if checkpoint is None else {'checkpoint': checkpoint}),
         }
         self._environment = dict(environment or {})
         self._options = {k: v for k, v in (options or {}).items() if v is not None}
@@ -261,6 +278,7 @@ class CloudInstance:
                 key: _CHECKS[key](key, values.resolve(context, value))
                 for key, value in self._values.items()}
             self._check_findable(settings['on_exit'])
+            _check_loss(settings)
             workspace = values.resolve(context, self._workspace)
             chain = find_workspaces(context.environment)
             if workspace is None:
@@ -410,6 +428,28 @@ def parse_duration(what: str, value: Union[str, int, float]) -> float:
     return seconds
 
 
+def _check_loss(settings: Mapping[str, Any]) -> None:
+    """
+    Check that a lost machine has stopped its nodes before they start elsewhere.
+
+    :raises ConfigurationError: ``on_loss_after`` is too short.
+    """
+    after = settings.get('on_loss_after')
+    if after is not None and after < settings['robot_timeout']:
+        raise ConfigurationError(
+            f"on_loss_after={after:g} s is shorter than robot_timeout="
+            f"{settings['robot_timeout']:g} s: nodes may still run on a machine that is cut off",
+            'raise on_loss_after, or lower robot_timeout')
+
+
+def _count(what: str, value: Union[str, int, float]) -> int:
+    text = str(value)
+    if not text.isdecimal() or not 0 < int(text) < 1000:
+        raise ConfigurationError(f'{what}={value!r} is no number of machines',
+                                 'use a whole number from 1')
+    return int(text)
+
+
 @contextlib.contextmanager
 def _named(keyword: str) -> Iterator[None]:
     """Name the keyword in the error of a wrong value."""
@@ -454,4 +494,8 @@ _CHECKS: dict[str, Any] = {
     'on_interrupt': _choice(OnInterrupt),
     'lifetime': parse_duration,
     'robot_timeout': parse_duration,
+    'on_loss_after': parse_duration,
+    'max_replacements': _count,
+    'checkpoint': check_folder,
+    'checkpoint_interval': parse_duration,
 }

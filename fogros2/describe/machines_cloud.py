@@ -188,6 +188,58 @@ class GCPCloudInstance(CloudInstance):
         }
 
 
+class CheapestInstance(CloudInstance):
+    """
+    A virtual machine of the cloud with the cheapest offer, created for the launch.
+
+    The launch compares the offers of all clouds that are set up on the robot. If a cloud has no
+    capacity or quota for the cheapest, the launch takes the next offer, also of another cloud.
+
+    :param arch: x86_64 or arm64; None for the robot's own.
+    :param min_cpu: minimum number of vCPUs; default 2.
+    :param min_memory_gb: minimum memory in GiB; default 4.
+    :param cpu_type: manufacturer of the processor: intel, amd, aws.
+    :param gpu: the number of GPUs, True for one, or part of the GPU's name, such as 'L4'.
+    :param gpu_memory_gb: minimum memory of each GPU in GB.
+    :param max_price: maximum price in US dollars per hour.
+    :param max_round_trip_ms: maximum of the measured time to the region and back.
+    :param providers: names of clouds, such as 'aws'; None for all that are set up.
+    :param regions: names of regions of these clouds; None for all.
+    :param spot: use a spot machine, and compare spot prices.
+    :param disk_size: GB; default 30.
+    :param tags: tags for everything that is created.
+    :param user: the image's login user.
+    :param ssh_from: networks (CIDR) that may reach the SSH port; None for this robot's public
+        address only.
+    """
+
+    provider = 'cheapest'
+
+    def __init__(
+        self, *, arch: Optional[SomeSubstitutionsType] = None,
+        min_cpu: Optional[Value] = None,
+        min_memory_gb: Optional[Value] = None,
+        cpu_type: Optional[SomeSubstitutionsType] = None,
+        gpu: Optional[Union[Value, bool]] = None,
+        gpu_memory_gb: Optional[Value] = None,
+        max_price: Optional[Union[Value, Decimal]] = None,
+        max_round_trip_ms: Optional[Value] = None,
+        providers: Optional[Sequence[SomeSubstitutionsType]] = None,
+        regions: Optional[Sequence[SomeSubstitutionsType]] = None,
+        spot: Optional[Bool] = None,
+        disk_size: Optional[Value] = None,
+        tags: Optional[Mapping[str, SomeSubstitutionsType]] = None,
+        user: Optional[SomeSubstitutionsType] = None,
+        ssh_from: Optional[Sequence[SomeSubstitutionsType]] = None,
+        **common: Any,
+    ) -> None:
+        super().__init__(options=options_of(CheapestInstance.__init__, locals()), **common)
+
+
+#: ``machine=cheapest(min_cpu=8)`` reads like the other choices of a launch.
+cheapest = CheapestInstance
+
+
 class KubeInstance(CloudInstance):
     """
     A pod of a Kubernetes cluster, created for the launch in the context's namespace.

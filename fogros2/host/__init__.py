@@ -7,5 +7,5 @@ What a machine needs, and how the machine gets it.
 ``workspace`` sends workspaces, ``programs`` checks that the programs of nodes exist.
 ``dependencies`` names the packages that nodes declare, ``undeclared`` finds imports that nodes do
 not declare. ``bootstrap`` installs ROS 2. ``container_scripts`` has the scripts that run
-containers, ``containers`` the commands with them.
+containers, ``containers`` the commands with them. ``checkpoint`` has the snapshots of a folder.
 """

@@ -56,6 +56,7 @@ MODULES: Mapping[str, Module] = {module.name: module for module in (
     Module('av', ('av',), (17,)),
     Module('cv2', ('opencv-python-headless', 'opencv-contrib-python-headless', 'opencv-python',
                    'opencv-contrib-python')),
+    Module('zstandard', ('zstandard',)),
     Module('foxglove', ('foxglove-sdk',), (0, 30), replaced_by='foxglove_bridge'),
     # for the applications; their wheels need only NumPy
     Module('gtsam', ('gtsam',)),
@@ -63,10 +64,15 @@ MODULES: Mapping[str, Module] = {module.name: module for module in (
     Module('fcl', ('python-fcl',)),
 )}
 IMAGES = ('numpy', 'av', 'cv2')
+CLOUDS = ('numpy', 'zstandard')
 #: Modules that (package, executable) pairs need.
 NEEDS: Mapping[tuple[str, str], tuple[str, ...]] = {
     ('image_transport_h264', 'encoder'): IMAGES,
     ('image_transport_h264', 'decoder'): IMAGES,
+    ('point_cloud_stream', 'encoder'): CLOUDS,
+    ('point_cloud_stream', 'decoder'): CLOUDS,
+    ('fogros2_examples', 'lidar'): ('numpy',),
+    ('fogros2_examples', 'obstacle_finder'): ('numpy',),
     ('fogros2_examples', 'camera'): ('numpy', 'cv2'),
     ('fogros2_examples', 'image_processor'): ('numpy', 'cv2'),
     ('fogros2_examples', 'slam'): ('numpy', 'cv2', 'gtsam'),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Use the transports of C++ ``image_transport`` through its program ``republish``."""
+"""Use C++ ``image_transport`` and ``point_cloud_transport`` through their ``republish``."""
 
 from __future__ import annotations
 
@@ -22,6 +22,10 @@ class Republish(ImageTransport):
     """
 
     plugin: ClassVar[str]
+    #: The package of ``republish``; the plugin's package is ``<plugin>_<package>``.
+    package: ClassVar[str] = 'image_transport'
+    #: What to use where the plugin is not installed.
+    instead: ClassVar[str] = 'h264'
 
     def check(self) -> None:
         """
@@ -30,13 +34,13 @@ class Republish(ImageTransport):
         :raises PrerequisiteError: a package is missing.
         """
         prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
-        for package in ('image_transport', f'{self.plugin}_image_transport'):
+        for package in (self.package, f'{self.plugin}_{self.package}'):
             if not any(Path(prefix, 'share/ament_index/resource_index/packages', package).exists()
                        for prefix in prefixes if prefix):
                 apt = f"ros-jazzy-{package.replace('_', '-')}"
                 raise PrerequisiteError(
                     f'streams by {self.plugin} need the package {package}, which is not here',
-                    f"apt install {apt}, here and on the machine; or stream by 'h264'")
+                    f"apt install {apt}, here and on the machine; or stream by '{self.instead}'")
 
     def encoder(self, stream: Stream) -> NodeSpec:
         """Return the ``republish`` node from raw."""
@@ -65,11 +69,15 @@ class Republish(ImageTransport):
             words += ['-p', f"qos_overrides.{names['in']}.subscription.reliability:=best_effort"]
             for key, value in stream.options.items():
                 if key != 'camera_info':
-                    name = key if '.' in key else f'out.{self.plugin}.{key}'
+                    name = key if '.' in key else f'{self._prefix(between)}.{key}'
                     words += ['-p', f'{name}:={value}']
         return NodeSpec(
-            id=f"{machine or 'robot'}/{label}", name=label, package='image_transport',
+            id=f"{machine or 'robot'}/{label}", name=label, package=self.package,
             executable='republish', arguments=tuple(words), respawn=True, respawn_delay=1.0)
+
+    def _prefix(self, between: str) -> str:
+        """Return the beginning of the names of the plugin's parameters."""
+        return f'out.{self.plugin}'
 
 
 class Theora(Republish):
@@ -88,3 +96,25 @@ class RepublishedCompressed(Republish):
     """``compressed_image_transport``, for users who prefer the C++ implementation."""
 
     plugin = 'compressed'
+
+
+class Draco(Republish):
+    """``draco_point_cloud_transport``, for point clouds."""
+
+    plugin, package, instead = 'draco', 'point_cloud_transport', 'pointcloud'
+
+    def _prefix(self, between: str) -> str:
+        """Return the remapped topic's name, unlike ``image_transport``."""
+        return between.strip('/').replace('/', '.')
+
+
+class Zlib(Draco):
+    """``zlib_point_cloud_transport``, for point clouds."""
+
+    plugin = 'zlib'
+
+
+class Zstd(Draco):
+    """``zstd_point_cloud_transport``, for point clouds."""
+
+    plugin = 'zstd'

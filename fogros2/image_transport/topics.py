@@ -21,7 +21,8 @@ from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.host import modules
 from fogros2.model import NodeSpec, Stream
 
-_TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
+#: The full name of a topic or a service.
+TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 #: Options of a Stream that are parameters of the decoder, not of the encoder.
 _DECODER_PARAMETERS = ('show_damage', 'encoding')
 #: Suffix that FogROS2 appends to the name of a streamed topic on machines.
@@ -36,7 +37,7 @@ def check(stream: Stream) -> None:
 
     :raises ConfigurationError: not a full topic name, or both ends on one host.
     """
-    if not _TOPIC.fullmatch(stream.topic) or '__' in stream.topic:
+    if not TOPIC.fullmatch(stream.topic) or '__' in stream.topic:
         raise ConfigurationError(f"'{stream.topic}' is not the full name of a topic",
                                  "write it as ros2 topic list does, such as '/camera/image_raw'")
     if stream.source == stream.target:
@@ -83,16 +84,16 @@ def names_of(stream: Stream, role: str, name: str) -> tuple[str, str, str]:
     return label, full, f'{local_topic(stream.topic, stream.source)}/{name}'
 
 
-def check_modules() -> None:
+def check_modules(names: Iterable[str] = modules.IMAGES, what: str = 'images') -> None:
     """
-    Check that image_transport_h264 can run on this computer.
+    Check that the nodes of a stream can run on this computer.
 
     :raises PrerequisiteError: a Python module is missing.
     """
-    lacking = [module.requirement for module in modules.lacking_here(modules.IMAGES)]
+    lacking = [module.requirement for module in modules.lacking_here(names)]
     if lacking:
         raise PrerequisiteError(
-            f"streams of images need {', '.join(lacking)}, which this Python does not have",
+            f"streams of {what} need {', '.join(lacking)}, which this Python does not have",
             f'pip install {shlex.join(lacking)}')
 
 
@@ -154,7 +155,7 @@ def node(
     stream: Stream, *, role: str, codec: str, machine: Optional[str], name: str,
 ) -> NodeSpec:
     """
-    Return one node of this project's encoder and decoder pair.
+    Return one node of this project's encoder and decoder pair for images.
 
     :param role: 'encoder' or 'decoder'.
     :param codec: value of the node's parameter ``codec``.
@@ -162,21 +163,38 @@ def node(
     :param name: last part of the stream's topic; viewers look for 'compressed' there.
     :raises ConfigurationError: see ``check``; or an option that cannot be a parameter.
     """
+    return python_node(
+        stream, role=role, machine=machine, name=name, package='image_transport_h264',
+        topic='image', options=_DECODER_PARAMETERS,
+        parameters={'codec': codec, 'camera_info': carries_info(stream)})
+
+
+def python_node(
+    stream: Stream, *, role: str, machine: Optional[str], name: str, package: str, topic: str,
+    options: Iterable[str], parameters: Mapping[str, Any],
+) -> NodeSpec:
+    """
+    Return one node of a pair with the executables 'encoder' and 'decoder'.
+
+    :param topic: the nodes' name of the topic, which is remapped.
+    :param options: the options of the stream that are parameters of the decoder.
+    :param parameters: more parameters of the node.
+    :raises ConfigurationError: as of ``node``.
+    """
     check(stream)
-    image = local_topic(stream.topic, machine)
+    local = local_topic(stream.topic, machine)
     label, full, between = names_of(stream, role, name)
-    parameters: dict[str, Any] = {
-        'codec': codec, 'stream': between, 'camera_info': carries_info(stream)}
-    if role == 'encoder' and image != stream.topic:
-        parameters['topic'] = stream.topic
+    values: dict[str, Any] = {**parameters, 'stream': between}
+    if role == 'encoder' and local != stream.topic:
+        values['topic'] = stream.topic
     for key, value in stream.options.items():
-        if key != 'camera_info' and (key in _DECODER_PARAMETERS) == (role == 'decoder'):
-            parameters[key] = value
-    words = ['--ros-args', '-r', f'__node:={full}', '-r', f'image:={image}']
-    for key, value in parameters.items():
+        if key != 'camera_info' and (key in options) == (role == 'decoder'):
+            values[key] = value
+    words = ['--ros-args', '-r', f'__node:={full}', '-r', f'{topic}:={local}']
+    for key, value in values.items():
         words += ['-p', f'{key}:={_yaml(key, value)}']
     return NodeSpec(
-        id=f"{machine or 'robot'}/{label}", name=label, package='image_transport_h264',
+        id=f"{machine or 'robot'}/{label}", name=label, package=package,
         executable=role, arguments=tuple(words), respawn=True, respawn_delay=1.0)
 
 

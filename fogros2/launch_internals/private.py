@@ -17,16 +17,20 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+import contextlib
 import functools
+import signal
 from typing import Any, Optional, Union
 
 from launch import (
+    Event,
     LaunchContext,
     LaunchDescription,
     LaunchDescriptionEntity,
     LaunchDescriptionSource,
 )
 from launch.actions import ExecuteLocal, TimerAction
+from launch.events.process import ProcessExited
 from launch.utilities import AsyncSafeSignalManager
 
 #: The method of ExecuteLocal that starts the process and awaits its end.
@@ -93,6 +97,51 @@ class RemoteStart(ExecuteLocal):
         self, context: LaunchContext, *, send_sigint: bool,
     ) -> Optional[list[LaunchDescriptionEntity]]:
         return self.fogros2_shut_down(context, send_sigint)
+
+
+class Stay:
+    """
+    The stay of a remote process on the robot, which :meth:`leave` ends without launch's notice.
+
+    Its process uses it as the launch's context.
+    """
+
+    def __init__(self, action: ExecuteLocal, context: LaunchContext) -> None:
+        self._action = action
+        self._context = context
+        self._leaving = False
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the launch's context."""
+        return getattr(self._context, name)
+
+    @property
+    def is_shutdown(self) -> bool:
+        """Whether the process must not start again."""
+        return self._leaving or self._context.is_shutdown
+
+    async def emit_event(self, event: Event) -> None:
+        """Emit an event, except for the end of a process that continues elsewhere."""
+        if not (self._leaving and isinstance(event, ProcessExited)):
+            await self._context.emit_event(event)
+
+    async def leave(self, sigterm_timeout: float, sigkill_timeout: float) -> None:
+        """End the process by SIGINT, SIGTERM and SIGKILL; launch still waits for its end."""
+        ended: asyncio.Future[None] = self._context.asyncio_loop.create_future()
+        before = completed(self._action)
+        assert before is not None
+        self._leaving = True
+        vars(self._action)['_ExecuteLocal__completed_future'] = ended
+        for number, seconds in ((signal.SIGINT, sigterm_timeout),
+                                (signal.SIGTERM, sigkill_timeout), (signal.SIGKILL, None)):
+            with contextlib.suppress(ProcessLookupError):
+                if transport(self._action) is not None:
+                    transport(self._action).send_signal(number)
+            if (await asyncio.wait({ended}, timeout=seconds))[0]:
+                break
+        vars(self._action)['_ExecuteLocal__completed_future'] = before
+        if self._context.is_shutdown and not before.done():
+            before.set_result(None)
 
 
 def delay_start(

@@ -5,7 +5,7 @@ The plugin interface to computers: a cloud, a cluster, a container engine, an ex
 In reading order: ``offers`` (types of machines and their prices), ``options`` (reading a launch
 file's options), this module, then a module or package for each provider:
 ``ssh``, ``container``, ``kubernetes``, ``vm`` (shared by clouds of virtual machines), ``aws``,
-``gcp``, ``azure``.
+``gcp``, ``azure``, ``clouds`` (the offers of all), ``cheapest`` (a machine of any cloud).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import ClassVar, Optional
 
 from fogros2.errors import ProviderError, Unsupported
 from fogros2.model import CreateRequest, Image, Machine, MachineSpec, MachineState
-from fogros2.provider.offers import Offers, Region, Wants
+from fogros2.provider.offers import Offer, Offers, Region, Wants
 from fogros2.waiting import wait_until
 
 #: Tags that the core puts on every resource; the provider's copy of them is the truth.
@@ -51,7 +51,7 @@ class Capabilities:
     :param choices: ``resolve`` may change a spec.
     :param adopt: ``adopt`` changes how an existing machine ends.
     :param regions: it has regions: ``region_names``, ``regions``, ``search_in``.
-    :param prices: ``offers`` lists types of machines with prices.
+    :param prices: ``offers`` lists types of machines with prices, and ``taking`` takes one.
     :param agent_directory: folder on the machine of the agent that ``create`` starts at boot; ''
         if the launch starts the agent over the first connection.
     :param agent_program: path on the machine of that agent's program.
@@ -318,6 +318,26 @@ class Provider(abc.ABC):
             self.allow(machine.id, port, sources)
         return machine.vpn_host, port
 
+    def dialled_at(
+        self, machine: Machine, port: int, host: Optional[str] = None,
+    ) -> tuple[str, int]:
+        """
+        Open a machine's VPN port to other computers than the robot; return its host and port.
+
+        The host is '' for an address of the robot.
+
+        The firewalls of clouds admit everybody to that port: WireGuard answers only its peers.
+
+        :param port: the UDP port on the machine.
+        :param host: the user's choice of the address.
+        :raises Unsupported: no other computer can dial the machine.
+        """
+        if not machine.vpn_host:
+            raise Unsupported(
+                f"'{machine.name}' dials the robot, so no other computer can dial it",
+                'expose its VPN port: see the options of its provider')
+        return host or machine.vpn_host, machine.vpn_port or port
+
     def pin(self, machine_id: str, host_key: str) -> None:
         """
         Store the host key (OpenSSH form) that the machine has generated (``one_time_host_key``).
@@ -400,6 +420,14 @@ class Provider(abc.ABC):
         :raises ConfigurationError: nothing fits.
         :raises FogError: no region answers.
         :raises Unsupported: the provider has no price list.
+        """
+        raise Unsupported(f"provider '{self.name}' has no price list")
+
+    def taking(self, spec: MachineSpec, offer: Offer) -> MachineSpec:
+        """
+        Return the spec of a machine of this provider that takes an offer (``prices``).
+
+        :param spec: of a machine of any cloud; the result has its options as ``wanted``.
         """
         raise Unsupported(f"provider '{self.name}' has no price list")
 

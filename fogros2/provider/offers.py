@@ -119,6 +119,8 @@ class Offer:
     :param price: US dollars per hour; None if the type is not sold on demand.
     :param spot_price: the same for a spot machine in its cheapest zone now.
     :param zones: the zones of the region that have the type.
+    :param provider: name of the provider, '' while only one is asked.
+    :param round_trip_ms: measured time to the region and back, None if it was not measured.
     """
 
     region: str
@@ -126,6 +128,11 @@ class Offer:
     price: Optional[Decimal] = None
     spot_price: Optional[Decimal] = None
     zones: tuple[str, ...] = ()
+    provider: str = ''
+    round_trip_ms: Optional[float] = None
+
+    def __str__(self) -> str:
+        return f'{self.type.name} of {self.provider} in {self.region}'
 
     def cost(self, spot: bool) -> Optional[Decimal]:
         """Return the spot price or the price on demand."""

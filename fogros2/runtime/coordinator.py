@@ -36,8 +36,10 @@ from fogros2.errors import Cancelled, ConfigurationError, did_you_mean, FogError
 from fogros2.launch_internals import private, processes
 from fogros2.model import NodeSpec
 from fogros2.runtime import cost, interruption, republishers, signals, streaming, uncompressed
+from fogros2.runtime.checkpoints import Checkpoints
 from fogros2.runtime.console import Console
 from fogros2.runtime.interruption import MachineInterrupted
+from fogros2.runtime.replacer import Replacer
 from fogros2.runtime.session import Session
 
 if TYPE_CHECKING:
@@ -280,6 +282,19 @@ class Coordinator:
                 spec, self._context.asyncio_loop, in_thread=self._in_thread, fail=self._fail,
                 changed=self._open_gate, preempted=self._preempted,
                 busy=functools.partial(private.waiting_events, self._context))
+            if spec.on_interrupt == 'replace':
+                session.replacer = Replacer(
+                    session, self.launch, self._context.asyncio_loop, in_thread=self._in_thread,
+                    fail=self._fail, is_over=lambda: self._context.is_shutdown,
+                    logger=self._logger)
+                session.checkpoints = Checkpoints(
+                    session, self._context, self.launch.checkpoints(spec.name),
+                    f'.before-{self.launch.id}', self._cancel, in_thread=self._in_thread,
+                    logger=self._logger)
+            elif spec.checkpoint:
+                raise ConfigurationError(
+                    f"'{spec.name}' has a checkpoint, and nothing would restore it",
+                    "add on_interrupt='replace', or leave checkpoint= out")
             session.rename(self._streams.remappings(spec.name))
             self._sessions[spec.name] = session
             self._new.append(session)
@@ -314,6 +329,13 @@ class Coordinator:
         streaming.check(resolved)
         return resolved
 
+    def all_streams(self, entries: Iterable[Entry] = (), namespace: str = '/') -> list[Entry]:
+        """Return the streams of all machines, and further ones, all resolved."""
+        found: list[Entry] = []
+        for everywhere, of in (*self._stream_everywhere, (list(entries), namespace)):
+            found += self.resolve_streams(everywhere, of)
+        return found
+
     def _source(self, source: Optional[SomeMachine]) -> Optional[str]:
         """Return the name of the machine that publishes, None for the robot."""
         if source is None:
@@ -334,10 +356,7 @@ class Coordinator:
         :return: the processes that this needs and no earlier stream did.
         :raises ConfigurationError: an unknown transport, or contradictory streams.
         """
-        wanted: list[Entry] = []
-        for everywhere, namespace in self._stream_everywhere:
-            wanted += self.resolve_streams(everywhere, namespace)
-        wanted += entries
+        wanted = [*self.all_streams(), *entries]
         if not wanted:
             return []
         away = [name for name, one in self._sessions.items() if one.interrupted]

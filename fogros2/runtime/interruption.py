@@ -57,6 +57,10 @@ def react(
     """
     what = (f"the machine '{event.machine}' "
             f'{"is gone" if event.lost else "is being reclaimed"}: {event.reason}')
+    if session.replacer is not None:
+        logger.warning(f'{what}; a new machine will continue its nodes')
+        session.replacer.on('lost' if event.lost else 'notice')
+        return []
     if session.spec.on_interrupt == 'robot':
         logger.warning(f'{what}; its nodes continue on the robot')
         ended, new, left = streams.take_over(event.machine)
@@ -70,6 +74,9 @@ def react(
         return new
     if event.lost:
         session.end_all()
+    if session.replicated:
+        logger.warning(f'{what}; the other replicas go on')
+        return []
     raise ProviderError(what, "on_interrupt='robot' continues its nodes on the robot")
 
 

@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Optional, TYPE_CHECKING
+import contextlib
+from typing import Any, cast, Optional, TYPE_CHECKING
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal
 from launch.event_handlers import OnProcessIO
 
 from fogros2.errors import ConfigurationError
+from fogros2.host.checkpoint import check_folder
 from fogros2.launch_internals import components, private
 from fogros2.model import NodeSpec
 from fogros2.runtime import foxglove, node_spec, streaming
@@ -46,6 +48,7 @@ class RemoteProcess(private.RemoteStart):
     _fogros2_here = False
     #: Whether launch has reached the point at which it starts a local process.
     _fogros2_began = False
+    _fogros2_stay: Optional[private.Stay] = None
 
     @property
     def machine(self) -> SomeMachine:
@@ -67,9 +70,27 @@ class RemoteProcess(private.RemoteStart):
             self, context, coordinator.base_environment, session.spec, coordinator.launch.id,
             self._fogros2_image, self._fogros2_image_options,
             coordinator.launch.provider(session.spec.provider).has_own_packages(session.spec))
-        if session.spec.on_interrupt == 'robot' and not (
+        how = session.spec.on_interrupt
+        if how != 'shutdown' and not session.replicated and not (
                 self._fogros2_image or isinstance(self, AddedProcess)):
-            self._fogros2_command = node_spec.robot_command(self, context)
+            # until a replacement is up, only some nodes may be able to run on the robot
+            with contextlib.suppress(*([ConfigurationError] if how == 'replace' else [])):
+                self._fogros2_command = node_spec.robot_command(self, context)
+
+    def add_checkpoint(self, folder: Optional[str]) -> None:
+        """
+        Add a folder of the process to the checkpoints of its machine.
+
+        :raises ConfigurationError: no such folder, or the machine is not replaced.
+        """
+        if not folder or self._fogros2_here:
+            return
+        session = self._fogros2_session
+        if session.checkpoints is None:
+            raise ConfigurationError(
+                f"a node of '{session.spec.name}' has a checkpoint, and nothing would restore it",
+                "add on_interrupt='replace' to the machine, or leave checkpoint= out")
+        session.checkpoints.add(check_folder('checkpoint', folder))
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Execute the action; its process starts when its machine is up."""
@@ -81,7 +102,7 @@ class RemoteProcess(private.RemoteStart):
                 self._fogros2_streams, Coordinator.of(context))]
         run = RemoteRun(
             self, context, self._fogros2_session, self._fogros2_node,
-            self._come_here if self._fogros2_command is not None else None)
+            self._come_here if self._fogros2_command is not None else None, self._go_back)
         private.set_transport(self, run)
         context.register_event_handler(OnProcessIO(target_action=self, on_stdin=run.on_stdin))
         self._fogros2_session.submit(run)
@@ -118,6 +139,7 @@ class RemoteProcess(private.RemoteStart):
         """Start the process on the robot, as launch does; its machine no longer runs it."""
         assert self.process_details is not None and self._fogros2_command is not None
         self._fogros2_here = True
+        self._fogros2_stay = private.Stay(self, context)
         self.process_details.pop('pid', None)
         self.process_details['cmd'] = self._fogros2_command
         private.prefix_output(self, self._fogros2_session.spec.name, remove=True)
@@ -125,11 +147,19 @@ class RemoteProcess(private.RemoteStart):
         if self._fogros2_began:
             context.asyncio_loop.create_task(self.fogros2_start(context))
 
+    async def _go_back(self, run: RemoteRun) -> None:
+        """End the process on the robot; ``run`` follows it on its machine from now on."""
+        assert self._fogros2_stay is not None
+        await self._fogros2_stay.leave(run.node.sigterm_timeout, run.node.sigkill_timeout)
+        self._fogros2_here = False
+        private.prefix_output(self, self._fogros2_session.spec.name)
+        private.set_transport(self, run)
+
     async def fogros2_start(self, context: LaunchContext) -> None:
         """Do nothing if the process runs remotely: the session starts it and passes events."""
         self._fogros2_began = True
         if self._fogros2_here:
-            await super().fogros2_start(context)
+            await super().fogros2_start(cast(LaunchContext, self._fogros2_stay or context))
 
     def fogros2_shut_down(
         self, context: LaunchContext, send_sigint: bool,

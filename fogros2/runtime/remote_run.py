@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+import dataclasses
 import re
 import signal
 from typing import Any, Optional, TYPE_CHECKING, Union
@@ -35,11 +36,13 @@ class RemoteRun:
     launch's ExecuteLocal uses it as the subprocess's transport and protocol.
 
     :param come_here: starts the process on the robot; None if it cannot run there.
+    :param go_back: ends the process on the robot, because it is about to start on its machine.
     """
 
     def __init__(
         self, action: ExecuteLocal, context: LaunchContext, session: Session, node: NodeSpec,
         come_here: Optional[Callable[[LaunchContext], None]],
+        go_back: Callable[[RemoteRun], Awaitable[None]],
     ) -> None:
         completed = private.completed(action)
         assert completed is not None
@@ -47,6 +50,7 @@ class RemoteRun:
         self.complete = completed
         self._action = action
         self._come_here = come_here
+        self._go_back = go_back
         self.started = False
         self.stopping = False
         #: Whether it exited and its machine will restart it.
@@ -133,11 +137,50 @@ class RemoteRun:
         else:
             self._arrive()
 
-    def _arrive(self) -> None:
-        if not self._moving or self.complete.done() or self._come_here is None:
+    def halt(self, *, stop: bool) -> None:
+        """
+        Let the machine end the process, because another machine will continue it.
+
+        :param stop: whether the machine can be asked; False if it is gone.
+        """
+        if self.complete.done() or self._here:
             return
+        if self.stopping:
+            if not stop:
+                self.end()
+            return
+        self._moving = True
+        if not (stop and self._session.stop(self)) or self.respawning:
+            self._arrive()
+
+    def arrive(self) -> None:
+        """Continue on the robot, if the program is there; else wait for the machine."""
+        if not self._here:
+            self._moving = True
+            self._arrive()
+
+    @property
+    def homeless(self) -> bool:
+        """Whether the process runs neither on its machine nor on the robot."""
+        return not self._here and not self.complete.done()
+
+    async def come_back(self) -> bool:
+        """Prepare the start on the new machine; return False if the process has ended."""
+        if self._here and not self.complete.done():
+            await self._go_back(self)
+        self._here = self._moving = self.started = self.respawning = False
+        self.node = dataclasses.replace(self.node, id=f'{self.node.id}+')
+        return not self.complete.done()
+
+    def _arrive(self) -> None:
+        if not self._moving or self.complete.done():
+            return
+        if self._session.halted(self) or self._here:
+            return  # it may still run there
         if self.stopping or self._context.is_shutdown:
             self.end()
+            return
+        if self._come_here is None:
             return
         self._moving = False
         self._here = True
@@ -146,6 +189,8 @@ class RemoteRun:
 
     def unreported(self) -> None:
         """Stop waiting for the remote process: the agent will not report its exit."""
+        if self._moving and self._session.replacer is not None:
+            return  # only the agent, the provider or time confirms the end
         if self._moving:
             self._arrive()
         else:

@@ -13,11 +13,14 @@ from typing import Any, Optional, Protocol, TYPE_CHECKING, TypeVar
 import launch.logging
 
 from fogros2.describe import values
-from fogros2.errors import AgentError, FogError
+from fogros2.errors import AgentError, ConfigurationError, FogError
 from fogros2.events import Event
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2.runtime import streaming, uncompressed
 from fogros2.runtime.backlog import Backlog
+from fogros2.runtime.checkpoints import Checkpoints
+from fogros2.runtime.replacer import Replacer
+from fogros2.shell import Shell
 
 if TYPE_CHECKING:
     from fogros2.deploy import RunningMachine
@@ -68,6 +71,19 @@ class Run(Protocol):
     def move(self, *, stop: bool) -> None:
         """Move to the robot; with ``stop``, after the machine has ended the process."""
 
+    def halt(self, *, stop: bool) -> None:
+        """Let the machine end the process, because another machine will continue it."""
+
+    def arrive(self) -> None:
+        """Continue on the robot, if the program is there; else wait for the machine."""
+
+    @property
+    def homeless(self) -> bool:
+        """Whether the process runs neither on its machine nor on the robot."""
+
+    async def come_back(self) -> bool:
+        """Prepare the start on the new machine; return False if the process has ended."""
+
 
 class Session:
     """
@@ -100,6 +116,8 @@ class Session:
         self.has_helpers = False
         #: New names of topics for its nodes, because of streams.
         self.names: dict[str, str] = {}
+        #: New names of topics and services that the node ``first_answer`` serves on the robot.
+        self.replicated: dict[str, str] = {}
         self._loop = loop
         self._in_thread = in_thread
         self._fail = fail
@@ -110,17 +128,26 @@ class Session:
         #: Whether the machine is gone.
         self.lost = False
         self._ending = False
+        #: Whether all processes of a machine that is being replaced have ended there.
+        self._drained = False
         self._backlog = Backlog(loop, self._on_event, busy, self._dropped)
         self._held: list[tuple[Run, Event]] = []
         self._runs: dict[str, Run] = {}
         self._waiting: list[Run] = []
         self._to_stop: list[Run] = []
+        #: Replaces the machine, if its ``on_interrupt`` says so.
+        self.replacer: Optional[Replacer] = None
+        self.checkpoints: Optional[Checkpoints] = None
+        #: Processes that have left a machine that is being replaced.
+        self._away: list[Run] = []
         #: Topic names that the first loaded components got; None if none was loaded.
         self._component_names: Optional[dict[str, str]] = None
         #: Requests to the agent that are not answered yet.
         self.requests: set[asyncio.Task[None]] = set()
         # keeps requests to the agent in order
         self._order = asyncio.Lock()
+        # keeps moves between robot and machines in order
+        self._moves = asyncio.Lock()
         self._logger = launch.logging.get_logger('fogros2')
 
     @property
@@ -160,6 +187,23 @@ class Session:
                 'the first node of the machine')
         self._warn_of_components()
 
+    def replicate(self, names: dict[str, str]) -> None:
+        """
+        Rename the topics and services of replicated nodes.
+
+        :raises ConfigurationError: another group of replicas has one of them, or the nodes would
+            move to the robot, where ``first_answer`` has these names.
+        """
+        for name in names:
+            if name in self.replicated:
+                raise ConfigurationError(f"two groups of replicas have '{name}' on the machine "
+                                         f"'{self.spec.name}'", 'name it in one of them')
+        if self.spec.on_interrupt == 'robot':
+            raise ConfigurationError(
+                f"replicas cannot move to the robot, as on_interrupt='robot' of "
+                f"'{self.spec.name}' wants it", 'leave on_interrupt= out: the others go on')
+        self.replicated.update(names)
+
     def names_for_components(self) -> dict[str, str]:
         """Return the new topic names for components that are about to be loaded."""
         self._component_names = dict(self.names) if self._component_names is None else {
@@ -186,19 +230,33 @@ class Session:
         """Return the ROS names of the machine's nodes."""
         return [uncompressed.node_name(run.node) for run in list(self._runs.values())]
 
+    @property
+    def shell(self) -> Optional[Shell]:
+        """The shell of the machine, None while the machine does not run the nodes."""
+        return None if self.running is None or self.interrupted else self.running.shell
+
+    def nodes(self) -> list[NodeSpec]:
+        """Return the machine's nodes that have started."""
+        return [run.node for run in self._runs.values() if run.started]
+
     def submit(self, run: Run) -> None:
         """Start a process when the machine is up."""
         self._runs[run.node.id] = run
+        if self.replacer is not None:
+            self.replacer.allow(run.node)
         if self.interrupted:
-            run.move(stop=False)
+            if self.replacer is None:
+                run.move(stop=False)
+            else:
+                run.halt(stop=False)
             return
         self._waiting.append(run)
         if self.running is not None:
-            self._request(self._start_waiting)
+            self.request(self._start_waiting)
 
     def stop(self, run: Run) -> bool:
         """Stop a process; return False if it does not run there and never will."""
-        if run in self._waiting or self.running is None or self.lost:
+        if run in [*self._waiting, *self._away] or self.running is None or self.lost:
             if run in self._waiting:
                 self._waiting.remove(run)
             return False
@@ -209,16 +267,17 @@ class Session:
                 return True
         self._to_stop.append(run)
         if len(self._to_stop) == 1:
-            self._request(self._stop_collected)
+            self.request(self._stop_collected)
         return True
 
     def signal(self, run: Run, name: str) -> None:
         """Send a process a signal."""
-        self._request(functools.partial(self._signal, run, name))
+        self.request(functools.partial(self._signal, run, name))
 
     def forget(self, run: Run) -> None:
         """Remove a process that has ended."""
         self._runs.pop(run.node.id, None)
+        self._check_drained()
         self._changed()
 
     def open_port(
@@ -229,7 +288,7 @@ class Session:
             assert self.running is not None
             opened(*await self._in_thread(self.running.open_port, port, sources))
 
-        self._request(open_port)
+        self.request(open_port)
 
     # -- the machine ----------------------------------------------------------------------------
 
@@ -250,11 +309,12 @@ class Session:
             self.came_up.set_result(True)
         for instance in self.instances:
             instance.is_up(running)
-        self._request(self._subscribe)
-        self._request(self._start_waiting)
+        self.request(self._subscribe)
+        self.request(self._start_waiting)
         self._changed()
 
-    def _request(self, function: Callable[[], Any]) -> None:
+    def request(self, function: Callable[[], Any]) -> None:
+        """Run a coroutine function; the launch waits for it on its way down."""
         task = self._loop.create_task(function())
         self.requests.add(task)
         task.add_done_callback(self._answered)
@@ -286,7 +346,8 @@ class Session:
             async with self._order:
                 await self._in_thread(
                     self.running.start,
-                    [streaming.remapped(run.node, self.names) for run in runs])
+                    [streaming.remapped(run.node, {**self.names, **self.replicated})
+                     for run in runs])
         except FogError:
             for run in runs:
                 run.end()
@@ -340,17 +401,18 @@ class Session:
             if event['event'] == 'launch_exited' and event['said']:
                 text += f": {event['said']}"
             self._logger.log(level, f'{self.spec.name}: {text}')
-        if kind in _LAST_EVENTS and self.spec.on_interrupt == 'robot' and not self.interrupted:
+        if kind in _LAST_EVENTS and self.spec.on_interrupt != 'shutdown' and not self.interrupted:
             self._ending = True
             self._loop.call_later(_HOLD, self._release_exits)
         elif event['event'] == 'launch_exited' and not self._ending:
             respawning = self._respawning()
             self._end_unreported(event['returncode'], respawning)
             self._start_again(respawning)
-        elif kind == 'connection absent' and not self._ending:
+        elif kind == 'connection absent' and not self._ending and not (
+                self.interrupted and self.replacer):
             respawning = self._respawning()
             self._end_unreported(_UNREPORTED, [])
-            if respawning:
+            if respawning and not self.replicated:
                 self._fail(AgentError(
                     f"{', '.join(run.node.name for run in respawning)} can't respawn: the agent "
                     f"of '{self.spec.name}' is gone", 'launch again'))
@@ -361,6 +423,8 @@ class Session:
         self._ending = False
         if first:
             self._preempted(self, reason)
+        elif lost and self.replacer is not None:
+            self.replacer.on('lost')
         elif lost:
             self._logger.info(f'{self.spec.name}: the machine is gone: {reason}')
             self.move_all()
@@ -371,6 +435,88 @@ class Session:
         self._held.clear()
         for run in list(self._runs.values()):
             run.move(stop=not self.lost and run not in ended)
+
+    # -- a new machine ---------------------------------------------------------------------------
+
+    def halt_all(self) -> None:
+        """Let the machine end all of its processes, because another machine continues them."""
+        self.request(self._halt_all)
+
+    async def _halt_all(self) -> None:
+        if self.checkpoints:
+            await self.checkpoints.ask()
+        ended = [run for run, _ in self._held]
+        self._held.clear()
+        for run in list(self._runs.values()):
+            run.halt(stop=not self.lost and run not in ended)
+        self._check_drained()
+
+    def halted(self, run: Run) -> bool:
+        """Note that a process has left its machine; return whether it must not start elsewhere."""
+        if self.replacer is None:
+            return False
+        self._runs.pop(run.node.id, None)
+        if run not in self._away:
+            self._away.append(run)
+        self._check_drained()
+        return not self.replacer.state.moved
+
+    def _check_drained(self) -> None:
+        if self.replacer is not None and self.interrupted and not self._runs and not self.lost \
+                and not self._drained:
+            self._drained = True
+            self.request(self._last_checkpoint)
+
+    async def _last_checkpoint(self) -> None:
+        assert self.running is not None and self.replacer is not None
+        if self.checkpoints:
+            # nothing writes any more
+            await self.checkpoints.save(self.running.shell, still=True)
+        self.replacer.on('drained')
+
+    def move_halted(self) -> None:
+        """Let processes start on the robot: the machine no longer runs them."""
+        self._held.clear()
+        self.request(self._move_halted)
+
+    async def _move_halted(self) -> None:
+        async with self._moves:
+            if self.checkpoints:
+                await self.checkpoints.restore(self.checkpoints.robot)
+            for run in [*self._away, *self._runs.values()]:
+                run.arrive()
+
+    def homeless(self) -> list[str]:
+        """Return the names of processes that cannot run on the robot."""
+        return [run.node.name for run in self._away if run.homeless]
+
+    def replace(self, running: RunningMachine) -> None:
+        """Use another machine from now on."""
+        self.running = running
+        self.lost = False
+        for instance in self.instances:
+            instance.is_up(running)
+
+    async def come_back(self) -> None:
+        """Move all processes to the new machine."""
+        back: dict[Run, bool] = {}
+        async with self._moves:
+            was_here = len(self.homeless()) < len(self._away)
+            # processes that execute meanwhile join
+            while new := [run for run in self._away if run not in back]:
+                back.update(zip(new, await asyncio.gather(*(run.come_back() for run in new))))
+                if self.checkpoints and self.running is not None:
+                    if was_here:
+                        await self.checkpoints.save(self.checkpoints.robot, still=True)
+                    await self.checkpoints.restore(self.running.shell)
+        self._away.clear()
+        self.interrupted = self._drained = False
+        for run in [run for run, alive in back.items() if alive]:
+            self._runs[run.node.id] = run
+            self._waiting.append(run)
+        self._logger.info(f'{self.spec.name}: a new machine runs the nodes')
+        await self._subscribe()
+        await self._start_waiting()
 
     def end_all(self) -> None:
         """End all processes of a machine that is gone, for launch."""
@@ -401,7 +547,7 @@ class Session:
         if runs:
             self._waiting += runs
             delay = max(_RESPAWN_DELAY, *(run.node.respawn_delay for run in runs))
-            self._loop.call_later(delay, self._request, self._start_waiting)
+            self._loop.call_later(delay, self.request, self._start_waiting)
 
     def _end_unreported(self, returncode: int, respawning: list[Run]) -> None:
         for run in list(self._runs.values()):

@@ -81,6 +81,17 @@ class Shell(Protocol):
         :param on_progress: callback with the bytes sent and the total bytes (0: unknown).
         """
 
+    def fetch(
+        self, source: str, target: Path, *, known: Optional[Path], timeout: float,
+        cancel: Optional[threading.Event] = None,
+    ) -> None:
+        """
+        Make the local folder ``target`` equal to the folder ``source`` on the machine.
+
+        :param known: a local folder; files that are equal there become hard links to it.
+        :param timeout: seconds.
+        """
+
     def open(self, command: Command) -> Stream:
         """Start a program on the machine; closing the returned stream ends the program."""
 

@@ -48,6 +48,13 @@ class LocalShell:
             source, target, excludes=excludes, includes=includes, timeout=timeout,
             cancel=cancel, on_progress=on_progress)
 
+    def fetch(
+        self, source: str, target: Path, *, known: Optional[Path], timeout: float,
+        cancel: Optional[threading.Event] = None,
+    ) -> None:
+        """Make the local folder ``target`` equal to the machine's ``source``; see the protocol."""
+        sync.fetch(self.name, None, source, target, known=known, timeout=timeout, cancel=cancel)
+
     def open(self, command: Command) -> Stream:
         """Start a program; closing the returned stream ends the program."""
         try:

@@ -79,6 +79,14 @@ class MovableShell:
                 source, target, excludes=excludes, timeout=timeout, includes=includes,
                 cancel=cancel, on_progress=on_progress)
 
+    def fetch(
+        self, source: str, target: Path, *, known: Optional[Path], timeout: float,
+        cancel: Optional[threading.Event] = None,
+    ) -> None:
+        """Make the local folder ``target`` equal to the machine's ``source``; see the protocol."""
+        with self._current() as shell:
+            shell.fetch(source, target, known=known, timeout=timeout, cancel=cancel)
+
     def open(self, command: Command) -> Stream:
         """Start a program on the machine; closing the returned stream ends the program."""
         with self._current() as shell:

@@ -246,6 +246,14 @@ class RemoteShell(abc.ABC, Generic[Link]):
             self, source, target, excludes=excludes, includes=includes, timeout=timeout,
             cancel=cancel, on_progress=on_progress)
 
+    def fetch(
+        self, source: str, target: Path, *, known: Optional[Path], timeout: float,
+        cancel: Optional[threading.Event] = None,
+    ) -> None:
+        """Make the local folder ``target`` equal to the machine's ``source``; see the protocol."""
+        sync.fetch(self.name, self.start, source, target, known=known, timeout=timeout,
+                   cancel=cancel)
+
     def open(self, command: Command) -> Stream:
         """Start a program on the machine; closing the returned stream ends the program."""
         channel = self.start(command)

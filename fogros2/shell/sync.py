@@ -111,6 +111,37 @@ def to_folder(
     return _report(result, source, process.HERE, begin)
 
 
+def fetch(
+    name: str, start: Optional[Callable[[str], lines.Channel]], source: str, target: Path, *,
+    known: Optional[Path], timeout: float, cancel: Optional[threading.Event],
+) -> None:
+    """
+    Make a local folder equal to one of a machine, or of this computer; see the Shell protocol.
+
+    The machine is not trusted: no special files, no links out of the folder, no set-uid bits.
+
+    :param start: starts a command line on the machine; None for this computer.
+    """
+    process.require(['rsync'])
+    words = ['rsync', '-rltp', '-s', '--delete', '--safe-links', '--chmod=u-s,g-s']
+    words += [f'--link-dest={known.resolve()}'] if known is not None else []
+    with contextlib.ExitStack() as undo:
+        failures: list[FogError] = []
+        path = f'{os.path.expanduser(source)}/'
+        if start is not None:
+            rsh, failures = undo.enter_context(relay.remote_shell(start))
+            words += ['-e', rsh]
+            path = f'machine:{remote_folder(source)}'
+        result = process.run(
+            Command((*words, '--', path, f'{target}/'), environment={'LC_ALL': 'C'},
+                    what='rsync'), timeout=timeout, cancel=cancel, check=False)
+    if failures:
+        raise failures[0]
+    if result.returncode != 0:
+        lost = result.returncode in _LOST and 'No space left' not in result.stderr
+        raise explained(result, Path(source), f"'{name}'" if lost else process.HERE)
+
+
 def _report(result: Result, source: Path, where: str, begin: float) -> SyncReport:
     if result.returncode not in (0, VANISHED):
         raise explained(result, source, where)

@@ -413,6 +413,19 @@ class FakeShell:
             on_progress(size, size)
         return SyncReport(len(changed), size, 0.0)
 
+    def fetch(
+        self, source: str, target: Path, *, known: Optional[Path], timeout: float,
+        cancel: Optional[threading.Event] = None,
+    ) -> None:
+        """Write the files of a folder."""
+        with self._lock:
+            for name, (data, mode) in self.files.items():
+                if name.startswith(f'{source}/'):
+                    path = target / name[len(source) + 1:]
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    path.write_bytes(data)
+                    path.chmod(mode)
+
     def open(self, command: Command) -> Stream:
         """Return the next stream of ``streams``, or one that echoes."""
         with self._lock:

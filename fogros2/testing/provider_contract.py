@@ -26,7 +26,7 @@ from fogros2.errors import (
 )
 from fogros2.model import CreateRequest, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider, TAG_EXPIRES, TAG_NAME
-from fogros2.provider.offers import wants
+from fogros2.provider.offers import MachineType, Offer, wants
 from fogros2.testing.shell_contract import raised
 from fogros2.waiting import wait_until
 
@@ -302,9 +302,15 @@ class ProviderContract:
     def test_offers_are_sorted_by_price(self) -> None:
         provider, _ = self.make()
         asked = wants(arch='any', min_cpu=1, min_memory_gb=0.1)
+        spec = MachineSpec('any', 'cheapest', {'min_cpu': 1, 'disk_size': 40})
+        offer = Offer('region-1', MachineType('type-1', 2, 1, 4.0, 'x86_64'))
         if not provider.capabilities.prices:
             raised(Unsupported, lambda: provider.offers(asked))
+            raised(Unsupported, lambda: provider.taking(spec, offer))
             return
+        taken = provider.taking(spec, offer)
+        assert (taken.provider, taken.wanted) == (provider.name, spec.options)
+        assert {'region-1', 'type-1', 40} == {*taken.options.values()}
         with contextlib.suppress(FogError):  # a simulated service may have no price list
             found = provider.offers(asked)
             prices = [offer.price for offer in found.offers if offer.price is not None]

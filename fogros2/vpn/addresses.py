@@ -21,8 +21,10 @@ POOL_VARIABLE = 'FOGROS2_VPN_POOL'
 #: Variable with the robot's UDP port, for robots behind a router that forwards a port. Machines
 #: that have to dial the robot, such as pods that cannot be dialled from outside, use that port.
 PORT_VARIABLE = 'FOGROS2_VPN_PORT'
-#: Prefix length of a launch's subnet: one robot and up to 253 machines.
+#: Prefix length of a launch's subnet: one robot, up to 222 machines, and guests.
 PREFIX = 24
+#: The last addresses of the subnet belong to computers that an invitation admits to a machine.
+FIRST_GUEST, GUEST_PREFIX = 224, 27
 #: Networks with a shorter prefix mean "everything" in some VPN (two halves, four quarters). They
 #: do not collide: the more specific route wins.
 EVERYTHING = 8
@@ -62,6 +64,11 @@ def choose_subnet(used: Iterable[str], *, launch_id: str, pool: str = POOL) -> s
     raise VpnError(
         f'no /{PREFIX} of {pool} is free for the VPN',
         f'{POOL_VARIABLE}=10.213.0.0/16 names another range')
+
+
+def guests(subnet: str) -> str:
+    """Return the range of a launch's subnet that is for guests, in CIDR form."""
+    return str(_Network((int(_Network(subnet)[FIRST_GUEST]), GUEST_PREFIX)))
 
 
 def overlapping(subnet: str, used: Iterable[str]) -> list[str]:
@@ -124,6 +131,21 @@ def choose_port(environment: Mapping[str, str] = {}) -> int:
         probe.bind(('', 0))
         port: int = probe.getsockname()[1]
     return port
+
+
+def own_address() -> str:
+    """
+    Return this computer's address in the network of its default route.
+
+    :raises VpnError: there is none.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(('192.0.2.1', 9))  # sends nothing
+        except OSError as error:
+            raise VpnError('this computer has no default route, so its address is not known',
+                           'name the address: --address') from error
+        return str(probe.getsockname()[0])
 
 
 def _pool(text: str) -> _Network:

@@ -25,7 +25,7 @@ HELPER = '/usr/libexec/fogros2/vpn'
 #: The group whose members may use the helper.
 GROUP = 'fogros2'
 #: The helper's answer to ``check`` if its protocol is the one of this module.
-PROTOCOL = '2'
+PROTOCOL = '3'
 #: Folder of the helper's private keys, one subfolder per interface; the user cannot read them.
 KEYS = '/run/fogros2-vpn'
 
@@ -56,6 +56,11 @@ def _ask(verb: str, request: Mapping[str, object], what: str = '') -> Command:
     return Command((HELPER, verb), sudo=True, input=json.dumps(request).encode(), what=what)
 
 
+def lend(interface: VpnInterface, private: str) -> Command:
+    """Return the command that gives the helper the key of an interface that no launch has."""
+    return _ask('keys', {'name': interface.name, 'pid': 0, 'private': private})
+
+
 def made(interface: VpnInterface) -> bool:
     """Return whether the helper creates, or has created, an interface."""
     return interface.key_file == key_file(interface.name)
@@ -72,14 +77,15 @@ class HelpedWireGuard(WireGuard):
     def keys(self, interface: VpnInterface) -> Command:
         """Return the command that reserves the interface's name, and prints the public key."""
         return next(self._ask(
-            'keys', interface, [super().keys(interface)], pid=os.getpid()))
+            'keys', interface, [super().keys(interface)], pid=os.getpid(), private=''))
 
     def up(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """Yield the commands that create the interface."""
         return self._ask(
             'up', interface, super().up(interface, peers), peers=_peers(peers),
-            network=interface.network, port=interface.port, domain=self.domain,
-            ports=[list(pair) for pair in self.ports[1:]], asked=list(self.asked))
+            network=interface.network, address=interface.address, port=interface.port,
+            domain=self.domain, ports=[list(pair) for pair in self.ports[1:]],
+            asked=list(self.asked))
 
     def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """Yield the commands that set the peers."""

@@ -16,13 +16,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import dataclasses
 import ipaddress
+import json
 from pathlib import Path
 import re
 import shlex
 
 from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
-from fogros2.vpn import Vpn
+from fogros2.vpn import addresses, guests, Vpn
 
 #: Programs that each host needs, and their Debian and Ubuntu packages. ``wireguard-go`` is only
 #: for kernels without the module.
@@ -145,6 +146,10 @@ class WireGuard(Vpn):
         else:
             lines.append(f'found=$(wg show {name} endpoints) && '
                          f'printf "%s\\n" "$found" >{_noted(interface)} || :')
+            look = shlex.join(guest_request(interface, 'look').argv)
+            lines.append(f'[ ! -s {_guests(interface)} ] || {{ read -r _ due; '
+                         'read -r up _ </proc/uptime; [ "${up%.*}" -lt "$due" ] || '
+                         f'{look} >/dev/null || :; }} <{_guests(interface)}')
         return Command.script(
             '\n'.join(lines), sudo=not interface.firewall, what=_what('look at', interface))
 
@@ -193,6 +198,8 @@ class WireGuard(Vpn):
         undos = [step.undo for step in reversed(self._steps(interface, ())) if step.undo]
         lines = [_PATH, 'failed=0', *(f'{{ {undo}\n}} || failed=1' for undo in undos)]
         files = f'{shlex.quote(interface.key_file)} {_noted(interface)}'
+        if not interface.firewall:
+            files += f' {_guests(interface)} {_guests(interface)}.json {_guests(interface)}.lock'
         lines += [f'rm -f {files} || failed=1', 'exit $failed']
         yield Command.script('\n'.join(lines), sudo=True, what=_what('take', interface, 'down'))
 
@@ -235,7 +242,7 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
 
     No host accepts packets for its VPN address from another interface, as Linux does. On the
     robot, the filter admits only DDS and ping from a machine, which may be hijacked. A machine of
-    a launch accepts DDS from the VPN and from itself only.
+    a launch accepts DDS from the VPN and from itself only; guests reach its DDS and ping alone.
 
     It uses one table, so that one delete is its undo. One transaction replaces the whole table,
     so there is no moment without it. An accept in another table does not override a drop here,
@@ -269,8 +276,21 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
             '    type filter hook forward priority filter; policy accept;',
             f'    iifname "{name}" drop',
             f'    oifname "{name}" drop']
-    elif not interface.process:
-        rules += [f'    {outside} {RTPS} drop']
+    else:
+        admitted = f'iifname "{name}" ip saddr {addresses.guests(interface.network)}'
+        rules[3:3] = [
+            '  chain guests {',
+            f'    ip daddr != {{ {interface.address}, {DISCOVERY_GROUP} }} drop',
+            f'    udp dport {_set(ports)} accept',
+            '    icmp type echo-request accept',
+            '    drop',
+            '  }',
+            '  chain forward {',
+            '    type filter hook forward priority filter; policy accept;',
+            f'    {admitted} drop',
+            '  }']
+        rules.append(f'    {admitted} goto guests')
+        rules += [] if interface.process else [f'    {outside} {RTPS} drop']
     rules += ['  }', '}']
     # the first line creates the table if missing, so that the second cannot fail
     return _Step(
@@ -437,6 +457,8 @@ def _configure(
             lines.append(f'seen {shlex.quote(peer.public_key)}')
             config = []
     lines += [_print(config)] if config else []
+    if not interface.firewall:
+        lines.append(f'cat {_guests(interface)} 2>/dev/null || :')
     lines.append(f'}} | wg syncconf {_name(interface)} /dev/stdin')
     if interface.firewall:
         # for the health check, which runs without root
@@ -462,6 +484,21 @@ def _noted(interface: VpnInterface) -> str:
     # not beside the key, whose folder may belong to the login user: root must not write where
     # another user can place a symbolic link
     return f'/run/{_name(interface)}.noted'
+
+
+def _guests(interface: VpnInterface) -> str:
+    return f'/run/{_name(interface)}.guests'
+
+
+def guest_request(interface: VpnInterface, verb: str, request: object = None) -> Command:
+    """
+    Return the command that changes or lists the guests of a machine's interface.
+
+    :param verb: with ``request``, see ``fogros2.vpn.guests``.
+    """
+    source = Path(guests.__file__).read_text()
+    return Command(('python3', '-IS', '-c', source, _name(interface), verb), sudo=True,
+                   input=json.dumps(request).encode(), what='look at the guests of the VPN')
 
 
 def _print(lines: Sequence[str]) -> str:

@@ -2,7 +2,7 @@
 """Visual SLAM: the algorithm on ``machine:=``, the camera on the robot."""
 
 from launch.actions import DeclareLaunchArgument
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, PythonExpression
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
@@ -21,6 +21,8 @@ def generate_launch_description():
              'wait': (True, 'whether a frame waits for the pose of the one before'),
              'picture': ('', 'a file to draw the trajectory in'),
              'results': ('', 'a file for the figures, as JSON')}
+    answer = LaunchConfiguration('on_interrupt')
+    folder = PythonExpression(["'$HOME/.ros/slam' if '", answer, "' == 'replace' else ''"])
     return FogROSLaunchDescription([
         DeclareLaunchArgument('machine', default_value='container',
                               choices=['robot', 'container', 'aws', 'kubernetes'],
@@ -29,12 +31,15 @@ def generate_launch_description():
                               description='of the images there: h264, compressed or raw'),
         DeclareLaunchArgument('foxglove', default_value='false',
                               description='show the topics in a browser: ros2 fog monitor'),
+        DeclareLaunchArgument('on_interrupt', default_value='shutdown',
+                              description="'replace': keep the map, and continue it elsewhere"),
         *(DeclareLaunchArgument(name, default_value=str(value), description=what)
           for name, (value, what) in shown.items()),
-        FogMachine(LaunchConfiguration('machine'), {
-            'name': 'slam', 'launch_foxglove': LaunchConfiguration('foxglove')}),
+        FogMachine(LaunchConfiguration('machine'), {'name': 'slam', 'on_interrupt': answer,
+                   'launch_foxglove': LaunchConfiguration('foxglove')}),
         CloudNode(machine='slam', package='fogros2_examples', executable='slam', output='screen',
-                  on_exit=ended,
+                  on_exit=ended, checkpoint=folder,
+                  parameters=[{'map_folder': ParameterValue(folder, value_type=str)}],
                   stream_topics=[(f'/camera/{name}', LaunchConfiguration('transport')) for name in
                                  ('image', 'right/image')] + [('/camera/depth', 'h264')]),
         Node(package='fogros2_examples', executable='slam_camera', output='screen',

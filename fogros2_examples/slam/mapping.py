@@ -80,7 +80,9 @@ class Map:
         self.keyframes: list[Keyframe] = []
         #: Number of revisited places so far.
         self.loops = 0
-        self._factors = gtsam.NonlinearFactorGraph()
+        #: Numbers of two keyframes, the pose of the second relative to the first, and whether
+        #: the link may be wrong.
+        self.links: list[tuple[int, int, Array, bool]] = []
         self._noise = gtsam.noiseModel.Diagonal.Sigmas(numpy.array([TURN] * 3 + [SHIFT] * 3))
         # A robust model, so that one wrong recognition does not bend the whole map.
         self._wary = gtsam.noiseModel.Robust.Create(
@@ -99,16 +101,13 @@ class Map:
             len(self.keyframes), stamp, pose, features, points, features.deep & ~known,
             weight(features.depths), deep[::max(1, len(deep) // TELLING)][:TELLING])
         self.keyframes.append(keyframe)
-        if reference is None:
-            self._factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(pose), self._noise))
-        else:
-            self._link(reference, keyframe, inverse(reference.pose) @ pose, self._noise)
+        if reference is not None:
+            self.link(reference, keyframe, inverse(reference.pose) @ pose)
         return keyframe
 
-    def _link(self, one: Keyframe, two: Keyframe, between: Array,
-              noise: gtsam.noiseModel.Base) -> None:
-        self._factors.add(gtsam.BetweenFactorPose3(
-            one.number, two.number, gtsam.Pose3(between), noise))
+    def link(self, one: Keyframe, two: Keyframe, between: Array, wary: bool = False) -> None:
+        """Link two keyframes; ``wary`` if the link may be wrong."""
+        self.links.append((one.number, two.number, between, wary))
         one.links.add(two.number)
         two.links.add(one.number)
 
@@ -175,17 +174,22 @@ class Map:
         for place in self.similar(keyframe.features, besides, 2):
             between = self.seen_from(place, keyframe.features)
             if between is not None:
-                self._link(place, keyframe, between, self._wary)
+                self.link(place, keyframe, between, True)
                 self.loops += 1
                 self._optimise()
                 return True
         return False
 
     def _optimise(self) -> None:
-        values = gtsam.Values()
+        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        factors.add(gtsam.PriorFactorPose3(
+            0, gtsam.Pose3(self.keyframes[0].pose), self._noise))
+        for one, two, between, wary in self.links:
+            factors.add(gtsam.BetweenFactorPose3(
+                one, two, gtsam.Pose3(between), self._wary if wary else self._noise))
         for keyframe in self.keyframes:
             values.insert(keyframe.number, gtsam.Pose3(keyframe.pose))
-        best = gtsam.LevenbergMarquardtOptimizer(self._factors, values).optimize()
+        best = gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()
         for keyframe in self.keyframes:
             keyframe.pose = best.atPose3(keyframe.number).matrix()
 

@@ -11,11 +11,13 @@ The world's frame is ``map``; the camera's frame is the image's.
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 import time
 from typing import Any, Optional
 
 from geometry_msgs.msg import PoseStamped, TransformStamped
-from nav_msgs.msg import Path
+from nav_msgs.msg import Path as PathMessage
 import numpy
 import rclpy
 from rclpy.executors import ExternalShutdownException
@@ -23,8 +25,9 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, TimeReference
 from std_msgs.msg import Header, String
+from std_srvs.srv import Trigger
 
-from fogros2_examples.slam import messages
+from fogros2_examples.slam import messages, stored
 from fogros2_examples.slam.tracking import Slam, State, Tracked
 
 try:
@@ -45,7 +48,8 @@ class SlamNode(Node):
     The SLAM node.
 
     Parameters: ``features`` per image; ``map_frame``; ``best_effort``, for cameras that publish
-    with best effort.
+    with best effort; ``map_folder``, from which a map is read, and to which the service
+    ``~/checkpoint`` and the end of the node save it.
     """
 
     def __init__(self) -> None:
@@ -57,6 +61,10 @@ class SlamNode(Node):
             newest = QoSProfile(
                 depth=NEWEST.depth, reliability=ReliabilityPolicy.BEST_EFFORT)
         self.slam: Optional[Slam] = None
+        folder = os.path.expandvars(str(self.declare_parameter('map_folder', '').value))
+        self.file = Path(folder, 'map.npz') if folder else None
+        if self.file:
+            self.create_service(Trigger, '~/checkpoint', self._checkpoint)
         self.infos: dict[str, CameraInfo] = {}
         self.halves: dict[str, dict[int, Image]] = {'image': {}, 'depth': {}, 'right': {}}
         self.alone = 0
@@ -67,7 +75,7 @@ class SlamNode(Node):
         self.transforms = TFMessage and self.create_publisher(TFMessage, '/tf', 10)
         self.times = self.create_publisher(TimeReference, 'computing', 10)
         self.states = self.create_publisher(String, 'slam_state', KEPT)
-        self.paths = self.create_publisher(Path, 'path', KEPT)
+        self.paths = self.create_publisher(PathMessage, 'path', KEPT)
         self.clouds = self.create_publisher(PointCloud2, 'map_points', KEPT)
         for half, topic in (('image', 'image'), ('depth', 'depth'), ('right', 'right/image')):
             self.create_subscription(Image, f'camera/{topic}', self._taker(half), newest)
@@ -134,7 +142,23 @@ class SlamNode(Node):
                 return None
             self.slam = Slam(messages.camera(self.infos[needed], other == 'right'),
                              self.features)
+            if self.file and self.file.exists():
+                self.slam.resume(stored.load(self.slam.camera, self.file))
+                self.get_logger().info(f'{len(self.slam.map.keyframes)} keyframes resumed')
         return self.slam
+
+    def _checkpoint(self, request: object, response: Any) -> Any:
+        response.success, response.message = True, ''
+        try:
+            self.save()
+        except OSError as error:
+            response.success, response.message = False, str(error)
+        return response
+
+    def save(self) -> None:
+        """Write the map, if there is one and a folder for it."""
+        if self.file and self.slam and self.slam.map.keyframes:
+            stored.save(self.slam.map, self.file)
 
     def _publish(self, header: Header, tracked: Tracked) -> None:
         self._say(tracked.state, tracked.why)
@@ -171,7 +195,7 @@ class SlamNode(Node):
         track = self.slam.trajectory()
         if not track:
             return
-        path = Path()
+        path = PathMessage()
         path.header.frame_id = self.map_frame
         for stamp, pose in track:
             stamped = PoseStamped(pose=messages.pose(pose))
@@ -188,7 +212,10 @@ class SlamNode(Node):
 def main() -> None:
     """Run until interrupted."""
     rclpy.init()
+    node = SlamNode()
     try:
-        rclpy.spin(SlamNode())
+        rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
+    finally:
+        node.save()

@@ -108,6 +108,11 @@ class Slam:
         self._track.append((stamp, self._reference, self._last))
         return tracked
 
+    def resume(self, world: Map) -> None:
+        """Continue with a map; the next frame finds its place in it."""
+        if world.keyframes:
+            self.map, self.state, self._reference = world, State.LOST, world.keyframes[-1]
+
     def trajectory(self) -> list[tuple[int, Array]]:
         """Return stamps and poses of all tracked frames, by the current map."""
         return [(stamp, keyframe.pose @ pose) for stamp, keyframe, pose in self._track]

@@ -45,7 +45,7 @@ from fogros2.vpn import addresses  # noqa: E402
 from fogros2.vpn.wireguard import WireGuard  # noqa: E402
 
 #: What both sides mean by the words and fields below.
-PROTOCOL = 2
+PROTOCOL = 3
 #: One folder for each interface: its key, and whose it is. Gone at boot, as interfaces are. Not
 #: where agents are: a robot may be a machine, too.
 RECORDS = Path('/run/fogros2-vpn')
@@ -69,6 +69,7 @@ FIRST_PORT = 1024
 
 _NAME = re.compile('fog[0-9a-f]{6}')
 _KEY = re.compile('[A-Za-z0-9+/]{42}[AEIMQUYcgkosw048]=')
+_PRIVATE = re.compile('[A-Za-z0-9+/]{43}=')
 _HOST = re.compile(r'[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?|\[[0-9a-fA-F:.]{2,45}\]')
 
 
@@ -135,12 +136,12 @@ def asked_of(value: object) -> tuple[str, ...]:
     return tuple(value)
 
 
-def peers_of(value: object, network: str) -> list[Peer]:
+def peers_of(value: object, network: str, own: str) -> list[Peer]:
     """Return the machines that an interface leads to, each at an address of its network."""
     if not isinstance(value, list) or len(value) > PEERS:
         raise Refused(f'peers are a list of up to {PEERS}')
     inside = {str(address) for address in ipaddress.IPv4Network(network).hosts()}
-    inside.remove(own_address(network))
+    inside.discard(own)
     found = []
     for entry in value:
         if not isinstance(entry, dict) or set(entry) != {'key', 'address', 'endpoint'}:
@@ -167,15 +168,17 @@ def _endpoint(value: object) -> Optional[str]:
     return f'{host}:{port}'
 
 
-def own_address(network: str) -> str:
-    """Return the robot's address: the first."""
-    return str(ipaddress.IPv4Network(network)[1])
+def own_address(value: object, network: str) -> str:
+    """Return this computer's address: one of the network."""
+    if not isinstance(value, str) or value not in map(str, ipaddress.IPv4Network(network).hosts()):
+        raise Refused(f'the address is one of {network}')
+    return value
 
 
 #: Fields of a request, by its verb.
 FIELDS = {
-    'check': set[str](), 'keys': {'name', 'pid'},
-    'up': {'name', 'network', 'port', 'domain', 'ports', 'asked', 'peers'},
+    'check': set[str](), 'keys': {'name', 'pid', 'private'},
+    'up': {'name', 'network', 'address', 'port', 'domain', 'ports', 'asked', 'peers'},
     'peers': {'name', 'peers'}, 'repair': {'name', 'peers'}, 'status': {'name'}, 'down': {'name'}}
 
 
@@ -205,8 +208,9 @@ class Record:
     An interface that was made here.
 
     :param uid: whose it is.
-    :param pid: the launch; it is gone once no process of that id has begun at ``started``.
-    :param network: '' until it has been brought up.
+    :param pid: the launch; it is gone once no process of that id has begun at ``started``. 0 for
+        a guest's, which stays until ``down``.
+    :param network: '' until it has been brought up; ``address`` is this computer's in it.
     """
 
     name: str
@@ -214,6 +218,7 @@ class Record:
     pid: int
     started: int
     network: str = ''
+    address: str = '127.0.0.1'
     port: int = 0
     domain: int = 0
     ports: tuple[tuple[int, int], ...] = ()
@@ -222,8 +227,9 @@ class Record:
     def interface(self) -> VpnInterface:
         """Return what the VPN makes of it."""
         network = self.network or '127.0.0.0/24'
-        return VpnInterface(self.name, own_address(network), network, self.port,
-                            str(RECORDS / self.name / 'key'), firewall=True, process=str(self.pid))
+        return VpnInterface(self.name, self.address, network, self.port,
+                            str(RECORDS / self.name / 'key'), firewall=True,
+                            process=str(self.pid or ''))
 
     def vpn(self) -> WireGuard:
         """Return what knows the commands."""
@@ -310,7 +316,7 @@ def own(name: str, uid: int) -> Iterator[Record]:
 
 def claim(name: str, uid: int, pid: int) -> None:
     """Make a name a user's own, unless it is already."""
-    started = begun(pid, uid)
+    started = begun(pid, uid) if pid else 0
     with locked(RECORDS):
         for record in records():
             if record.name == name:
@@ -402,8 +408,15 @@ def check(request: Mapping[str, Any], uid: int) -> None:
 def keys(request: Mapping[str, Any], uid: int) -> None:
     """Make an interface's name this user's, and its key; print the public half."""
     name = name_of(request['name'])
-    claim(name, uid, number(request['pid'], 1, 2 ** 22, 'a process id'))
+    private = request['private']
+    if not isinstance(private, str) or private and not re.fullmatch(_PRIVATE, private):
+        raise Refused("private is a private key of WireGuard's, or ''")
+    claim(name, uid, number(request['pid'], 0, 2 ** 22, 'a process id'))
     with own(name, uid) as record:
+        if private and not record.network:
+            key = RECORDS / name / 'key'
+            key.touch(0o600)
+            key.write_text(f'{private}\n')
         run(record.vpn().keys(record.interface()))
 
 
@@ -413,10 +426,12 @@ def up(request: Mapping[str, Any], uid: int) -> None:
     port = number(request['port'], FIRST_PORT, 65535, 'the port')
     domain = number(request['domain'], 0, 232, 'the ROS domain')
     ports, asked = ports_of(request['ports']), asked_of(request['asked'])
-    peers = peers_of(request['peers'], network)
+    address = own_address(request['address'], network)
+    peers = peers_of(request['peers'], network, address)
     with own(request['name'], uid) as before:
         record = dataclasses.replace(
-            before, network=network, port=port, domain=domain, ports=ports, asked=asked)
+            before, network=network, address=address, port=port, domain=domain, ports=ports,
+            asked=asked)
         if before.network and before != record:
             raise Refused(f'{record.name} is up already, with other settings')
         with locked(RECORDS):
@@ -435,7 +450,7 @@ def _with_peers(
         with own(request['name'], uid) as record:
             if not record.network:
                 raise Refused(f'{record.name} has not been brought up')
-            run(what(record, peers_of(request['peers'], record.network)))
+            run(what(record, peers_of(request['peers'], record.network, record.address)))
     return act
 
 
@@ -460,7 +475,7 @@ def tidy() -> None:
     failed = False
     for record in records():
         try:
-            alive = begun(record.pid) == record.started
+            alive = not record.pid or begun(record.pid) == record.started
         except Refused:
             alive = False
         if not alive:

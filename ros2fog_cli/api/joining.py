@@ -17,30 +17,40 @@ from typing import Optional
 
 from fogros2 import ros2_daemon
 from fogros2.errors import ConfigurationError
-from fogros2.store import Record, Store
+from fogros2.store import Store
 from ros2fog_cli.api import reach
 
 #: Seconds to wait for a command's end after each signal.
 TIMEOUT = 3.0
 
 
-def launch_of(name: str, store: Store) -> tuple[Record, dict[str, str]]:
+def launch_of(name: str, store: Store) -> tuple[Path, dict[str, str]]:
     """
-    Return the record of a machine, and the environment variables of its launch.
+    Return the folder of a machine's launch, and its environment variables.
 
-    :raises ConfigurationError: no running launch uses the machine.
+    :raises ConfigurationError: no running launch uses the machine, and this computer has not
+        joined it.
     """
+    folder = reach.joined(store).get(name)
+    if folder is not None and not store.exists(name):
+        return folder, reach.variables_of(folder)
     record = store.load(name)
     variables = reach.robot_environment(record, store)
     if variables is None:
         raise ConfigurationError(f"no launch is running with the machine '{name}'",
                                  'join its nodes while a launch runs')
-    return record, variables
+    return store.launch(record.launch), variables
 
 
 def has_daemon() -> bool:
     """Return whether ``ros2`` here starts a daemon; the embedded default has none."""
     return importlib.util.find_spec('ros2cli.daemon') is not None
+
+
+def shell_lines(folder: Path, variables: Mapping[str, str]) -> list[str]:
+    """Return lines for a POSIX shell whose nodes join a launch; its end stops their daemon."""
+    return exports(variables, ros2_daemon.install(folder, sys.executable)
+                   if has_daemon() else None)
 
 
 def exports(variables: Mapping[str, str], programs: Optional[Path]) -> list[str]:

@@ -17,7 +17,7 @@ from typing import Any, Optional
 
 from fogros2.errors import FogError, MachineNotFound
 from fogros2.store import Record, robot_name, Store
-from ros2fog_cli.api import endings, machines
+from ros2fog_cli.api import endings, machines, replicas
 from ros2fog_cli.api.follower import Follower, LogLine
 from ros2fog_cli.api.graphs import Graphs
 from ros2fog_cli.api.machines import Entry
@@ -287,6 +287,8 @@ class Live:
             shown.steps = tuple(step for step in launch.steps
                                 if step.machine == shown.entry.name)
             shown.clock = launch.clocks.get(shown.entry.name)
+            shown.replicas = tuple(replicas.figures(
+                self.store.root / 'launches' / shown.launch, shown.entry.name))
         if not there:
             shown.ended = shown.ended or now
         up = there and record is not None and record.launch_alive and bool(record.agent) and (

@@ -70,7 +70,7 @@ class Entry:
             return 'gone'
         text = str(self._known.state)
         if self._known.state is MachineState.STOPPED:
-            return f'{text} (keeps its disk)'
+            return f"{text} ({'still billed' if self._known.billed else 'keeps its disk'})"
         if self.record is None:
             return f'{text} (orphan)' if self.own else f'{text} (robot {self.robot})'
         if self.record.launch and not self.record.launch_alive:
@@ -135,9 +135,13 @@ class Entry:
     @property
     def cost(self) -> Optional[Decimal]:
         """US dollars per hour; None if the machine does not run or its price is unknown."""
-        running = self._known.state in (
-            MachineState.PENDING, MachineState.RUNNING, MachineState.STOPPING)
-        return self._known.cost_per_hour if running else None
+        return self._known.cost_per_hour if self.runs else None
+
+    @property
+    def runs(self) -> bool:
+        """Whether the provider bills the machine as a running one."""
+        return self._known.owned and (self._known.billed or self._known.state in (
+            MachineState.PENDING, MachineState.RUNNING, MachineState.STOPPING))
 
     def spent(self, now: float) -> Optional[Decimal]:
         """Return the US dollars since the creation at today's price, None if unknown."""

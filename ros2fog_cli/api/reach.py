@@ -6,7 +6,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses
+import json
 import os
+from pathlib import Path
 import re
 import socket
 import sys
@@ -20,12 +22,15 @@ from fogros2.agent_client import AgentClient
 from fogros2.clock import ClockOffset
 from fogros2.errors import AgentError, ConnectError, DdsError, FogError, MachineNotFound
 from fogros2.events import Event
-from fogros2.model import Command, Endpoint
+from fogros2.model import Command, Endpoint, VpnInterface
 from fogros2.shell import Shell
 from fogros2.store import Record, Store
 from fogros2.vpn import Vpn
 from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Entry
+
+#: File with the invitation in the folder of a joined machine, which is like a launch's folder.
+JOINED = 'joined.json'
 
 
 def find(
@@ -189,14 +194,25 @@ def link(record: Record, *, pings: int = 5) -> Optional[Link]:
     """
     if record.vpn is None or record.robot_vpn is None:
         return None
-    vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
-    asked = process.run(vpn.status(record.robot_vpn), timeout=10.0)
-    peer = vpn.parse_status(asked.stdout).get(record.public_key, {})
+    return measure(record.vpn.address, record.robot_vpn, record.public_key, record.spec.vpn, pings)
+
+
+def measure(
+    address: str, interface: VpnInterface, key: str, kind: str, pings: int = 5,
+) -> Link:
+    """
+    Measure the link from an interface of this computer to a machine.
+
+    :param key: the machine's public key.
+    :param kind: the VPN plugin.
+    :raises FogError: the status of the interface cannot be read.
+    """
+    vpn: Vpn = plugin_system.load('fogros2.vpn', kind)()
+    asked = process.run(vpn.status(interface), timeout=10.0)
+    peer = vpn.parse_status(asked.stdout).get(key, {})
     handshake = peer.get('handshake', 0.0)
-    return Link(
-        record.vpn.address, record.robot_vpn.name,
-        time.time() - handshake if handshake else None,
-        peer.get('received', 0.0), peer.get('sent', 0.0), ping(record.vpn.address, pings))
+    return Link(address, interface.name, time.time() - handshake if handshake else None,
+                peer.get('received', 0.0), peer.get('sent', 0.0), ping(address, pings))
 
 
 def ping(address: str, count: int = 5) -> Optional[float]:
@@ -271,15 +287,32 @@ def robot_environment(record: Record, store: Store) -> Optional[dict[str, str]]:
 
     :raises FogError: the user's RMW_IMPLEMENTATION differs from the launch's.
     """
-    chosen = store.root / 'launches' / record.launch / 'rmw'
-    if not record.launch or not record.launch_alive or not chosen.exists():
+    folder = store.root / 'launches' / record.launch
+    if not record.launch or not record.launch_alive or not (folder / 'rmw').exists():
         return None
-    rmw = chosen.read_text()
+    return variables_of(folder)
+
+
+def variables_of(folder: Path) -> dict[str, str]:
+    """
+    Return the variables of a launch's folder, by which nodes of this computer join it.
+
+    :raises FogError: the user's RMW_IMPLEMENTATION differs from the launch's.
+    """
+    rmw = (folder / 'rmw').read_text()
     own = os.environ.get('RMW_IMPLEMENTATION') or rmw
     if own != rmw:
         raise DdsError(f'the launch has RMW_IMPLEMENTATION={rmw}, this terminal {own}',
                        'unset RMW_IMPLEMENTATION here')
     vendor = plugin_system.load('fogros2.dds', rmw)()
-    path = chosen.with_name(vendor.file_name)
-    return {**vendor.environment(str(path), os.environ),
-            'ROS_DOMAIN_ID': chosen.with_name('domain').read_text()}
+    return {**vendor.environment(str(folder / vendor.file_name), os.environ),
+            'ROS_DOMAIN_ID': (folder / 'domain').read_text()}
+
+
+def joined(store: Store) -> dict[str, Path]:
+    """Return the folders of the machines that this computer has joined, by machine."""
+    found = {}
+    for path in sorted((store.root / 'launches').glob(f'*/{JOINED}')):
+        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
+            found[str(json.loads(path.read_text())['machine'])] = path.parent
+    return found

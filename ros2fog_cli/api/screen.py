@@ -9,6 +9,7 @@ from decimal import Decimal
 import os
 from typing import Any, TextIO
 
+from ros2fog_cli.api import replicas
 from ros2fog_cli.api.follower import LogLine
 from ros2fog_cli.api.table import cost, duration, size, table
 
@@ -20,7 +21,8 @@ _HOME, _REST, _LINE = '\x1b[H', '\x1b[J', '\x1b[K'
 _STYLES = {'bold': '1', 'dim': '2', 'good': '32', 'busy': '36', 'bad': '31'}
 _OF_STATE = {
     'running': 'good', 'done': 'good', 'coming': 'busy', 'starting': 'busy', 'ending': 'busy',
-    'exited': 'dim', 'gone': 'dim', 'failed': 'bad', 'refused': 'bad'}
+    'exited': 'dim', 'gone': 'dim', 'failed': 'bad', 'refused': 'bad', 'live': 'good',
+    'left out': 'busy', 'died': 'bad'}
 _WORDS = {'coming': 'coming up'}
 
 Paint = Callable[[str, str], str]
@@ -77,6 +79,9 @@ def frame(
             (str(node['name']), str(node['state']), str(node['pid'] or '-'),
              '-' if node['returncode'] is None else str(node['returncode']),
              str(node['restarts'] or 0)) for node in machine['nodes']], column=1)
+    if machine['replicas']:
+        parts.append(('', ''))
+        parts += _table(replicas.HEADER, list(map(replicas.row, machine['replicas'])), column=1)
     crossing = _crossing(machine)
     if crossing:
         parts.append(('', ''))

@@ -33,6 +33,7 @@ class Shown:
     ended: float = 0.0
     deleting: bool = False
     trouble: str = ''
+    replicas: tuple[dict[str, Any], ...] = ()
 
     def is_of(self, entry: Entry) -> bool:
         """
@@ -106,6 +107,7 @@ def machine_json(key: str, shown: Shown) -> dict[str, Any]:
         'agent': None if agent is None else {
             key: agent[key] for key in ('since', 'rss', 'heartbeat_age')},
         'nodes': [] if agent is None else agent['nodes'],
+        'replicas': list(shown.replicas),
         'problems': [f'{part}: {text}' for part, text in sorted(follower.problems.items())]
         if follower is not None else [],
         'log': follower.last if follower is not None else 0,

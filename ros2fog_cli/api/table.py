@@ -62,6 +62,11 @@ def duration(seconds: Optional[float]) -> str:
     return f'{minutes // 1440} d {minutes % 1440 // 60} h'
 
 
+def milliseconds(time: Optional[float]) -> str:
+    """Return a round trip as text, ``-`` for None."""
+    return NONE if time is None else f'{time:.{0 if time >= 10 else 1}f} ms'
+
+
 def size(number: float) -> str:
     """Return bytes as text with a decimal unit."""
     for unit in ('B', 'kB', 'MB', 'GB'):

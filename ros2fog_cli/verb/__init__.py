@@ -75,6 +75,12 @@ def complete_providers(prefix: str, **_: object) -> list[str]:
     return [name for name in plugin_system.names('fogros2.provider') if name.startswith(prefix)]
 
 
+def complete_clouds(prefix: str, **_: object) -> list[str]:
+    """Return 'all' and the providers with prices that begin with ``prefix``."""
+    from fogros2.provider.clouds import clouds
+    return [name for name in ('all', *sum(clouds(), [])) if name.startswith(prefix)]
+
+
 def add_json(parser: argparse.ArgumentParser) -> None:
     """Add ``--json``."""
     parser.add_argument('--json', action='store_true', help='print JSON, for programs')

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 
 from ros2fog_cli.verb import add_json, add_name, VerbExtension
 
@@ -20,17 +19,11 @@ class EnvVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print lines for ``eval "$(ros2 fog env NAME)"``."""
-        from fogros2 import ros2_daemon
         from fogros2.store import Store
         from ros2fog_cli.api import joining
-        store = Store()
-        record, variables = joining.launch_of(args.name, store)
+        folder, variables = joining.launch_of(args.name, Store())
         if args.json:
             print(json.dumps(variables, indent=2))
-            return 0
-        programs = None
-        if joining.has_daemon():
-            # The end of the launch also stops this daemon.
-            programs = ros2_daemon.install(store.launch(record.launch), sys.executable)
-        print(*joining.exports(variables, programs), sep='\n')
+        else:
+            print(*joining.shell_lines(folder, variables), sep='\n')
         return 0

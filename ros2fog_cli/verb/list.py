@@ -45,6 +45,8 @@ class ListVerb(VerbExtension):
                       f'with its token: ros2 fog monitor {entry.name}')
         total = machines.total(entries, now)
         if total is not None:
+            unknown = sum(entry.runs and entry.cost is None for entry in entries)
             print(f'{table.cost(total[0])} an hour, {table.cost(total[1], 2)} so far, '
-                  'disks and traffic aside')
+                  'disks and traffic aside'
+                  + f'; the price of {unknown} more is unknown' * bool(unknown))
         return 0

@@ -8,7 +8,7 @@ import json
 
 from ros2fog_cli.verb import (
     add_json,
-    complete_providers,
+    complete_clouds,
     complete_regions,
     VerbExtension,
     warn,
@@ -16,7 +16,7 @@ from ros2fog_cli.verb import (
 
 
 class PriceVerb(VerbExtension):
-    """List the matching machine types, cheapest first; 'cheapest' takes the first one."""
+    """List the machine types of all clouds that match, cheapest first."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
@@ -29,60 +29,76 @@ class PriceVerb(VerbExtension):
         parser.add_argument('--cpu-type', choices=('intel', 'amd', 'aws'),
                             help="the processor's maker")
         parser.add_argument('--max-price', metavar='DOLLARS', help='an hour, at the most')
+        parser.add_argument('--max-round-trip', type=float, metavar='MS',
+                            help='search all regions within this time from here')
         parser.add_argument('--spot', action='store_true', help='spot prices count')
         region = parser.add_argument(
             '--region', nargs='*', metavar='REGION',
-            help="'all' for every one, 'nearest' for that (default: the configured region)")
+            help="of any cloud, 'all' for every one, 'nearest' for that of each cloud (default: "
+            'the configured region of each)')
         region.completer = complete_regions  # type: ignore[attr-defined]
         parser.add_argument('--limit', type=int, default=10, metavar='N',
                             help='rows to show, 0 for all (default: 10)')
+        parser.add_argument('--replicas', type=int, metavar='N',
+                            help='compare the cost of N machines with one on demand')
         parser.add_argument('--refresh', action='store_true',
                             help='do not use prices of the last 24 hours')
         provider = parser.add_argument(
-            '--provider', metavar='PROVIDER',
-            help='whose prices (default: the first one that is set up)')
-        provider.completer = complete_providers  # type: ignore[attr-defined]
+            '--provider', metavar='PROVIDER', default='all',
+            help="whose prices (default: 'all' that are set up)")
+        provider.completer = complete_clouds  # type: ignore[attr-defined]
         add_json(parser)
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the table; a launch would use the first row."""
-        from fogros2.provider import offers
-        from ros2fog_cli.api import machines, table
+        from fogros2.provider import clouds, offers
+        from ros2fog_cli.api import replicas, table
         from ros2fog_cli.api.interrupts import interruptible
         asked = offers.wants(
             arch=args.arch, min_cpu=args.min_cpu, min_memory_gb=args.min_memory,
             cpu_type=args.cpu_type, gpu=args.gpu, gpu_memory_gb=args.gpu_memory,
             max_price=args.max_price, spot=args.spot)
+        every = args.provider == clouds.ALL
         with interruptible() as cancel:
-            provider = machines.load(args.provider or machines.able('prices'))
-            provider.cancel = cancel
-            choice = provider.offers(asked, args.region or (), refresh=args.refresh)
+            choice = clouds.compare(
+                asked, () if every else (args.provider,), args.region or (), measure=True,
+                max_round_trip_ms=args.max_round_trip, refresh=args.refresh, cancel=cancel)
         regions = choice.regions
-        for region, reason in choice.left_out:
-            warn(f'{region}: {reason}')
         shown = choice.offers[:args.limit or None]
         if args.json:
             print(json.dumps([{
-                'region': one.region, 'type': one.type.name, 'vcpus': one.type.vcpus,
-                'memory_gb': one.type.memory_gb, 'arch': one.type.arch, 'cpu': one.type.cpu,
-                'gpus': one.type.gpus, 'gpu': one.type.gpu,
-                'gpu_memory_gb': one.type.gpu_memory_gb, 'zones': one.zones,
+                'provider': one.provider, 'region': one.region, 'type': one.type.name,
+                'vcpus': one.type.vcpus, 'memory_gb': one.type.memory_gb,
+                'arch': one.type.arch, 'cpu': one.type.cpu, 'gpus': one.type.gpus,
+                'gpu': one.type.gpu, 'gpu_memory_gb': one.type.gpu_memory_gb, 'zones': one.zones,
                 'price': None if one.price is None else str(one.price),
                 'spot_price': None if one.spot_price is None else str(one.spot_price),
+                'round_trip_ms': one.round_trip_ms,
             } for one in shown], indent=2))
-            return 0
-        where = ', '.join(regions) if len(regions) < 4 else f'{len(regions)} regions'
-        print(f'{asked}, in {where}')
-        print(table.table(
-            ('TYPE', 'REGION', 'CPUS', 'MEMORY', 'GPU', 'ARCH', 'CPU', 'PRICE/H', 'SPOT/H'),
-            [(one.type.name, one.region, str(one.type.vcpus), f'{one.type.memory_gb:g} GB',
-              _gpus(one.type.gpus, one.type.gpu, one.type.gpu_memory_gb), one.type.arch,
-              one.type.cpu or table.NONE, table.cost(one.price), table.cost(one.spot_price))
-             for one in shown], width=table.terminal_width(),
-            optional=('CPU', 'ARCH', *(('REGION',) if len(regions) == 1 else ()), 'GPU')))
-        left = len(choice.offers) - len(shown)
-        if left:
-            print(f"{left} more {'cost' if left > 1 else 'costs'} as much or more (--limit 0)")
+        else:
+            where = ', '.join(regions) if len(regions) < 4 else f'{len(regions)} regions'
+            print(f'{asked}, in {where}')
+            print(table.table(
+                ('TYPE', 'PROVIDER', 'REGION', 'CPUS', 'MEMORY', 'GPU', 'ARCH', 'CPU', 'PRICE/H',
+                 'SPOT/H', 'ROUND TRIP'),
+                [(one.type.name, one.provider, one.region, str(one.type.vcpus),
+                  f'{one.type.memory_gb:g} GB',
+                  _gpus(one.type.gpus, one.type.gpu, one.type.gpu_memory_gb), one.type.arch,
+                  one.type.cpu or table.NONE, table.cost(one.price), table.cost(one.spot_price),
+                  table.milliseconds(one.round_trip_ms)) for one in shown],
+                width=table.terminal_width(), optional=(
+                    'CPU', 'ARCH', *(('REGION',) if len(regions) == 1 else ()), 'GPU',
+                    'ROUND TRIP')))
+            left = len(choice.offers) - len(shown)
+            if left:
+                print(f"{left} more {'cost' if left > 1 else 'costs'} as much or more (--limit 0)")
+        if args.replicas and not args.json:
+            print(replicas.price(choice.offers, args.replicas, spot=args.spot))
+        for who, reason in choice.left_out:
+            warn(f'{who}: {reason}')
+        others = clouds.clouds()[1]
+        if every and others:
+            warn(f"not set up here: {', '.join(others)}")
         return 0
 
 

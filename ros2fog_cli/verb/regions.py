@@ -44,6 +44,7 @@ class RegionsVerb(VerbExtension):
 
 
 def _far(milliseconds: float | None, kilometres: float | None) -> str:
+    from ros2fog_cli.api import table
     if milliseconds is not None:
-        return f'{milliseconds:.{0 if milliseconds >= 10 else 1}f} ms'
+        return table.milliseconds(milliseconds)
     return 'no answer' if kilometres is None else f'{kilometres:.0f} km'

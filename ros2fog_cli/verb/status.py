@@ -7,9 +7,12 @@ import argparse
 import dataclasses
 import json
 import time
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from ros2fog_cli.verb import add_json, add_name, add_region, VerbExtension, warn
+
+if TYPE_CHECKING:
+    from ros2fog_cli.api.reach import Link
 
 
 class StatusVerb(VerbExtension):
@@ -32,7 +35,7 @@ class StatusVerb(VerbExtension):
         """Print the status; return 1 if there are problems or no expected agent answers."""
         from fogros2.errors import ConfigurationError, FogError
         from fogros2.store import Store
-        from ros2fog_cli.api import reach
+        from ros2fog_cli.api import guests, reach, replicas
         if args.watch:
             from ros2fog_cli.api.watching import watch
             if not 0.1 <= args.interval <= 3600:
@@ -43,15 +46,22 @@ class StatusVerb(VerbExtension):
         if args.topics:
             raise ConfigurationError('--topics is for --watch: a rate takes a while',
                                      'add --watch')
+        store = Store()
+        folder = reach.joined(store).get(args.name)
+        if folder is not None and not store.exists(args.name):
+            from ros2fog_cli.api import membership
+            return show_joined(membership.link(folder), as_json=args.json)
         entry = reach.find(args.name, warn, regions=args.region)
         status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'clock': None, 'agent': None,
-                                  'streams': []}
+                                  'streams': [], 'guests': [], 'replicas': []}
         problems: list[str] = []
         idle = reach.let_go(entry) and not entry.gone
         if idle:
             # The tag names the launch that created the machine.
             status['launch'] = ''
         elif entry.record is not None:
+            status['replicas'] = replicas.figures(
+                store.root / 'launches' / entry.record.launch, entry.name)
             try:
                 link = reach.link(entry.record)
                 status['vpn'] = dataclasses.asdict(link) if link is not None else None
@@ -66,6 +76,8 @@ class StatusVerb(VerbExtension):
                         reply = client.status(timeout=15.0)
                         status['agent'] = {
                             key: value for key, value in reply.items() if key not in ('id', 'ok')}
+                        if status['vpn'] is not None:
+                            status['guests'] = guests.ask(shell, entry.record, 'look')
                     finally:
                         client.close()
             except FogError as error:
@@ -95,6 +107,7 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
     from decimal import Decimal
 
     from fogros2.clock import ClockOffset
+    from ros2fog_cli.api import replicas
     from ros2fog_cli.api.table import cost, duration, size, table
     now = time.time()
     lines = [
@@ -141,6 +154,16 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
              str(node['pid']) if node.get('pid') else '-',
              '-' if node.get('returncode') is None else str(node['returncode']),
              str(node.get('restarts', 0))) for node in nodes]))
+    if status['replicas']:
+        print()
+        print(table(replicas.HEADER, list(map(replicas.row, status['replicas']))))
+    if status['guests']:
+        print()
+        print(table(('GUEST', 'ADDRESS', 'HEARD', 'MAY JOIN', 'KEY'), [
+            (guest['label'] or '-', guest['address'],
+             'never' if guest['heard'] is None else f"{duration(guest['heard'])} ago",
+             f"{duration(guest['left'])} more" if guest['left'] > 0 else 'no more', guest['key'])
+            for guest in status['guests']]))
     if status['streams']:
         print()
         print(table(('STREAM', 'BY', 'FROM', 'TO', 'RATE', 'TRAFFIC'), [
@@ -148,3 +171,17 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
              one['note'] or ('-' if one['rate'] is None else f"{one['rate']:.1f}/s"),
              '-' if one['bandwidth'] is None else f"{size(one['bandwidth'])}/s")
             for one in status['streams']]))
+
+
+def show_joined(link: Link, *, as_json: bool) -> int:
+    """Print a guest's link to a machine; return 0 if the machine answers."""
+    from ros2fog_cli.api.table import duration
+    if as_json:
+        print(json.dumps(dataclasses.asdict(link), indent=2))
+    else:
+        answer = 'no answer' if link.latency is None else f'{link.latency:.2f} ms'
+        handshake = 'none' if link.handshake_age is None \
+            else f'{duration(link.handshake_age)} ago'
+        print(f'VPN         {link.address} on {link.interface}\nhandshake   {handshake}\n'
+              f'round trip  {answer}')
+    return 0 if link.latency is not None else 1

@@ -15,6 +15,7 @@ import re
 import shutil
 import subprocess
 import sys
+from typing import Any
 import uuid
 
 import pytest
@@ -132,7 +133,6 @@ def nobody(engine: str, cloud_network: str) -> str:
     """Return an address in the cloud's network that no machine has."""
     subnet = run(Command((engine, 'network', 'inspect', cloud_network, '--format',
                           '{{range .Subnets}}{{.Subnet}}{{end}}'), sudo=True), timeout=60).stdout
-    # the engine hands addresses out from the other end
     return str(list(ipaddress.ip_network(subnet.strip()).hosts())[-1])
 
 
@@ -222,3 +222,11 @@ def children() -> Iterator[list[subprocess.Popen[bytes]]]:
         if child.poll() is None:
             child.kill()
         child.wait(10)
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Return a bench for nodes; see rigs.bench."""
+    from rigs.bench import made
+    with made(tmp_path, monkeypatch.setenv) as bench:
+        yield bench

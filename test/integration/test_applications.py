@@ -72,7 +72,7 @@ def twin(source):
                 gone.append(node)
             elif node.func.id == 'CloudNode':
                 gone += [word for word in node.keywords
-                         if word.arg in ('machine', 'stream_topics')]
+                         if word.arg in ('machine', 'stream_topics', 'checkpoint')]
     for node in sorted(gone, key=lambda node: -node.lineno):
         head = lines[node.lineno - 1][:node.col_offset]
         tail = lines[node.end_lineno - 1][node.end_col_offset:].lstrip(',').lstrip()
@@ -292,7 +292,8 @@ def test_node_checks_its_parameters_first(node, asked, said):
 
 
 @pytest.mark.parametrize(('package', 'executable'), [
-    (path.parts[-3], path.name) for path in sorted(ROOT.glob('*/scripts/*'))
+    ('fogros2' if path.parts[-3] == 'fogros2_replicas' else path.parts[-3], path.name)
+    for path in sorted(ROOT.glob('*/scripts/*'))
     if path.is_file() and path.parts[-3] != 'fogros2_monitor'])
 def test_starting_node_can_be_interrupted(package, executable, tmp_path):
     """As by another one's end: it has nothing to say, and nobody looks for a fault of its."""

@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 from decimal import Decimal
-import functools
 import gzip
 import json
 import re
@@ -16,7 +14,6 @@ import threading
 import uuid
 
 import boto3
-from botocore.awsrequest import AWSResponse
 import botocore.endpoint
 import botocore.session
 import pytest
@@ -39,76 +36,12 @@ from fogros2.provider.vm import user_data
 from fogros2.testing.provider_contract import PUBLIC_KEY
 from fogros2.waiting import wait_until
 from rigs.ec2 import iam
+from rigs.ec2.watched import ec2, left, NOTHING, Watched
 
 pytestmark = pytest.mark.usefixtures('moto_aws')
 
-#: Knows the services' models, which take longest to read, for all tests.
-LOADER = botocore.session.get_session().get_component('data_loader')
 HOME, AWAY = 'eu-central-1', 'us-east-1'
 KEY = 'ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJ3Tq0CrBqXbWb0bqzPkGrjsvC7OxUD3yAyRIqLHTNN9'
-
-
-class Watched:
-    """
-    A provider whose calls are counted, and refused as a test says.
-
-    :ivar calls: (service:Operation, parameters), each call once however often it is repeated.
-    """
-
-    def __init__(self) -> None:
-        #: Codes of the refusals that were sent, each repetition anew.
-        self.sent: list[str] = []
-        self.calls: list[tuple[str, dict]] = []
-        self.refusals: dict[str, list[tuple[str, str] | None]] = {}
-        core = botocore.session.get_session()
-        core.register_component('data_loader', LOADER)
-        session = boto3.session.Session(botocore_session=core)
-        session.events.register('provide-client-params', self._called)
-        session.events.register('before-send', self._sent)
-        self.account = Account(session)
-        self.provider = AWSProvider(self.account)
-
-    def _called(self, params, model, **words):
-        self.calls.append((f'{model.service_model.endpoint_prefix}:{model.name}', dict(params)))
-
-    def refuse(
-        self, operation: str, *codes: str | None, said: str = 'as AWS said', status: int = 400,
-    ) -> None:
-        """Answer the next calls of an operation so; None lets one through."""
-        self.status = status
-        self.refusals[operation] = [code and (code, said) for code in codes]
-
-    def _sent(self, event_name, request, **words):
-        waiting = self.refusals.get(event_name.rsplit('.', 1)[-1])
-        refusal = waiting.pop(0) if waiting else None
-        if refusal is None:
-            return None
-        code, said = refusal
-        if 'ssm' in event_name:
-            body = json.dumps({'__type': code, 'message': said})
-        else:
-            body = (f'<Response><Errors><Error><Code>{code}</Code><Message>{said}</Message>'
-                    '</Error></Errors><RequestID>1</RequestID></Response>')
-        self.sent.append(code)
-        status = 503 if code == 'RequestLimitExceeded' else 500 if 'Capacity' in code \
-            else self.status
-        return AWSResponse(request.url, status, {}, _Raw(body.encode()))
-
-    def count(self) -> Counter[str]:
-        return Counter(name for name, _ in self.calls)
-
-    def asked(self, operation: str) -> list[dict]:
-        return [params for name, params in self.calls if name.endswith(f':{operation}')]
-
-
-class _Raw:
-    """The body of an answer as urllib3 hands it over."""
-
-    def __init__(self, body: bytes) -> None:
-        self._body = body
-
-    def stream(self, **words) -> Iterator[bytes]:
-        yield self._body
 
 
 @pytest.fixture
@@ -121,31 +54,6 @@ def ask(name='planner', *, dependencies='', on_exit='delete', **options):
     return spec, CreateRequest(
         str(uuid.uuid4()), PUBLIC_KEY, {TAG_NAME: name, 'fogros2-launch': 'l1'}, 51820,
         agent_config={'machine': name, 'directory': '/run/fogros2'}, dependencies=dependencies)
-
-
-@functools.lru_cache
-def ec2(region=HOME):
-    """Return the test's own client: what it asks isn't counted."""
-    return boto3.client('ec2', region)
-
-
-def left(region=HOME) -> dict[str, list]:
-    """Return what of ours is in a region."""
-    client = ec2(region)
-    found = instances.instances_in(client.describe_instances(
-        Filters=[{'Name': 'instance-state-name', 'Values': list(instances.ALIVE)}]
-    )['Reservations'])
-    return {
-        'instances': [entry['InstanceId'] for entry in found],
-        'groups': [entry['GroupId'] for entry in client.describe_security_groups()[
-            'SecurityGroups'] if entry['GroupName'] != 'default'],
-        'keys': [entry['KeyName'] for entry in client.describe_key_pairs()['KeyPairs']],
-        'volumes': [entry['VolumeId'] for entry in client.describe_volumes()['Volumes']],
-        'addresses': [entry['PublicIp'] for entry in client.describe_addresses()['Addresses']],
-    }
-
-
-NOTHING = {'instances': [], 'groups': [], 'keys': [], 'volumes': [], 'addresses': []}
 
 
 def described(machine_id, region=HOME):
@@ -301,28 +209,6 @@ def test_an_instance_that_is_not_ours_is_never_ended(aws):
     aws.provider.destroy(f'aws:{HOME}/{theirs}/0123456789abcdef')
     assert left()['instances'] == [theirs]
     assert not list(aws.provider.find({}))
-
-
-def test_tidy_deletes_leftovers_but_no_machine_in_creation(aws, monkeypatch):
-    spec, request = ask()
-    gone = aws.provider.create(spec, request)
-    ec2().terminate_instances(InstanceIds=[gone.split('/')[1]])
-    alive = aws.provider.create(*ask('mapper'))
-    assert aws.provider.tidy() == []
-    monkeypatch.setattr('fogros2.provider.aws.ending.SETTLED', -1.0)
-    assert aws.provider.tidy() == [f"firewall and key of 'planner' in {HOME}"]
-    assert left()['keys'] == [f'fogros2-{alive.rsplit("/", 1)[1]}']
-    assert len(left()['groups']) == 1
-
-
-def test_tidy_deletes_a_dead_launch_s_group_at_once(aws):
-    spec, request = ask()
-    gone = aws.provider.create(spec, request)
-    ec2().terminate_instances(InstanceIds=[gone.split('/')[1]])
-    alive = aws.provider.create(*(mapper := ask('mapper')))
-    assert aws.provider.tidy(dead=[request.token, mapper[1].token]) == [
-        f"firewall and key of 'planner' in {HOME}"]
-    assert left()['keys'] == [f'fogros2-{alive.rsplit("/", 1)[1]}']
 
 
 def test_find_takes_at_most_two_calls_per_region(aws, monkeypatch):
@@ -706,14 +592,6 @@ def test_no_room_in_a_zone_leads_to_the_next(aws):
     assert len(left()['groups']) == 1
 
 
-def test_a_quota_leads_to_the_next_type_at_once(aws):
-    aws.refuse('RunInstances', 'VcpuLimitExceeded')
-    machine_id = aws.provider.create(*ask(instance_types=['t3.large']))
-    assert [params['InstanceType'] for params in aws.asked('RunInstances')] == [
-        't3.medium', 't3.large']
-    assert aws.provider.describe(machine_id).kind == 't3.large'
-
-
 def test_next_type_keeps_to_the_price_cap(aws, monkeypatch):
     prices = {'t3.medium': Decimal('0.04'), 't3.xlarge': Decimal('0.17')}
     monkeypatch.setattr(aws.provider, '_price', lambda region, kind, *more: prices.get(kind))
@@ -769,23 +647,6 @@ def test_types_that_a_region_lacks_are_skipped(aws):
     with pytest.raises(ConfigurationError, match=r't9.medium or t9.large in eu-central-1 failed'):
         aws.provider.create(*ask('mapper', ec2_instance_type='t9.medium',
                                  instance_types=['t9.large']))
-
-
-def test_an_answer_that_got_lost_may_have_been_a_yes(aws, monkeypatch):
-    spec, request = ask()
-    call = Account.call
-
-    def lost(self, service, region, operation, what, **words):
-        answer = call(self, service, region, operation, what, **words)
-        if operation == 'run_instances':
-            raise PrerequisiteError('AWS does not answer')
-        return answer
-
-    monkeypatch.setattr(Account, 'call', lost)
-    with pytest.raises(PrerequisiteError) as caught:
-        aws.provider.create(spec, request)
-    assert not caught.value.refused
-    assert left() == NOTHING
 
 
 def test_a_fault_of_aws_leaves_open_whether_there_is_a_machine(aws, monkeypatch):

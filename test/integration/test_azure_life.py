@@ -31,7 +31,6 @@ from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.azure import AzureProvider, ending
 from fogros2.provider.azure.account import Account
 from fogros2.provider.offers import wants
-from fogros2.provider.vm.cloud import attempt_of
 from fogros2.provider.vm.user_data import LIMIT
 from fogros2.testing.provider_contract import PUBLIC_KEY
 from fogros2.waiting import wait_until
@@ -130,7 +129,7 @@ def test_repeated_request_makes_the_same_names(robot):
 
 
 def test_interrupted_creation_is_taken_up_where_it_was(robot, monkeypatch):
-    monkeypatch.setattr('fogros2.provider.azure.account.ATTEMPTS', 1)
+    monkeypatch.setattr('fogros2.provider.vm.rest.ATTEMPTS', 1)
     request = robot.request()
     robot.azure.faults.append(Fault('InternalServerError', 500, 'PUT', 'virtualMachines', times=0))
     # the process dies there, without its undo
@@ -146,29 +145,6 @@ def test_interrupted_creation_is_taken_up_where_it_was(robot, monkeypatch):
 
 
 # -- undo ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize('late', [False, True], ids=['refused', 'fails late'])
-@pytest.mark.parametrize('step', STEPS)
-def test_fault_at_a_step_leaves_nothing(robot, step, late):
-    if late and step in ('resourcegroups', 'schedules'):
-        late = False  # these are done at once
-    robot.azure.rights = service.CONTRIBUTOR
-    robot.azure.faults.append(Fault('SomethingIsWrong', 400, 'PUT', step, times=0, late=late))
-    with pytest.raises(ProviderError, match='SomethingIsWrong') as caught:
-        robot.create()
-    assert caught.value.undo_failures == ()
-    robot.gone()
-
-
-@pytest.mark.parametrize('step', STEPS[:-1])
-def test_lost_answer_at_a_step_leaves_nothing(robot, step, monkeypatch):
-    monkeypatch.setattr('fogros2.provider.azure.account.ATTEMPTS', 1)
-    robot.azure.faults.append(Fault('Lost', 500, 'PUT', step, after=True))
-    with pytest.raises(ProviderError) as caught:
-        robot.create()
-    assert not caught.value.refused
-    robot.gone()
 
 
 @pytest.mark.parametrize('step', STEPS)
@@ -211,37 +187,12 @@ def test_group_that_is_not_ours_is_never_deleted(robot):
     assert name in robot.azure.groups
 
 
-def test_tidy_deletes_the_group_of_an_evicted_machine(robot, monkeypatch):
-    machine_id = robot.create()
-    robot.azure.evict(robot.azure.vms()[0]['id'])
-    wait_until(lambda: not robot.azure.vms(), timeout=5.0, what='the eviction')
-    assert robot.provider.tidy() == []  # a new group may still get its machine
-    monkeypatch.setattr('fogros2.provider.azure.cloud.SETTLED', -1.0)
-    (said,) = robot.provider.tidy()
-    assert 'planner' in said
-    robot.gone()
-    robot.provider.destroy(machine_id)
-
-
-def test_tidy_deletes_what_a_dead_launch_has_left_at_once(robot):
-    request = robot.request()
-    name = f'fogros2-{attempt_of(request.token)}-01234567'
-    robot.azure.groups[name] = {
-        'id': f'/subscriptions/{service.SUBSCRIPTION}/resourceGroups/{name}', 'name': name,
-        'location': HOME, 'properties': {'provisioningState': 'Succeeded'},
-        'tags': {'fogros2-attempt': attempt_of(request.token), 'fogros2-name': 'planner',
-                 'fogros2-made': str(int(time.time()))}}
-    assert robot.provider.tidy() == []
-    assert len(robot.provider.tidy([request.token])) == 1
-    robot.gone()
-
-
 # -- no room ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(('code', 'late'), [
     ('SkuNotAvailable', False), ('OverconstrainedAllocationRequest', True),
-    ('AllocationFailed', True), ('QuotaExceeded', False)])
+    ('AllocationFailed', True)])
 def test_no_room_leads_to_the_next_size(robot, code, late):
     robot.azure.faults.append(Fault(code, 409, 'PUT', 'virtualMachines', size=SMALL, late=late))
     machine_id = robot.create(vm_sizes=[LARGE])
@@ -279,13 +230,6 @@ def test_size_that_the_subscription_may_not_use_is_skipped(robot):
     robot.provider.destroy(machine_id)
     with pytest.raises(ConfigurationError, match=f'Azure has no {SMALL} in {HOME}'):
         robot.create()
-
-
-def test_throttled_requests_are_made_again(robot, monkeypatch):
-    monkeypatch.setattr(time, 'sleep', lambda seconds: None)
-    robot.azure.faults.append(Fault('TooManyRequests', 429, times=3))
-    robot.provider.destroy(robot.create())
-    assert robot.asked().count('TooManyRequests') == 3
 
 
 def test_known_problems_are_named_before_creation(robot, monkeypatch):

@@ -36,6 +36,7 @@ def machine(name: str, **changes: Any) -> dict[str, Any]:
         'created': NOW - 3600, 'expires': NOW + 7200, 'ended': None, 'address': '198.51.100.7',
         'place': 'eu-central-1', 'kind': 'g4dn.xlarge', 'cost_per_hour': '0.658',
         'on_exit': 'delete', 'bridge': 0, 'deleting': False, 'trouble': '', 'problems': [],
+        'replicas': [],
         'agent': {'since': NOW - 3500, 'rss': 16_000_000, 'heartbeat_age': 1.0},
         'vpn': {'address': '198.18.0.2', 'interface': 'fogabc123', 'received': 9_500_000,
                 'sent': 1_200_000, 'latency': 23.4, 'receiving': 250_000.0, 'sending': 90_000.0,

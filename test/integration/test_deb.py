@@ -32,10 +32,10 @@ NAME, PREFIX = 'ros-jazzy-fogros2', '/opt/ros/jazzy'
 SITE = f'{PREFIX}/lib/python3.12/site-packages'
 SUITE = 'trixie'
 #: What the package depends on and is there for real.
-REAL = ('iproute2', 'openssh-client', 'python3', 'python3-paramiko', 'python3-requests',
-        'python3-yaml', 'rsync', 'wireguard-tools')
+REAL = ('iproute2', 'openssh-client', 'python3', 'python3-cryptography', 'python3-paramiko',
+        'python3-requests', 'python3-yaml', 'rsync', 'wireguard-tools')
 #: Too large for what they would add to this test.
-HEAVY = ('python3-boto3', 'python3-numpy', 'python3-opencv')
+HEAVY = ('python3-boto3', 'python3-google-auth', 'python3-numpy', 'python3-opencv')
 #: debootstrap finds no package by what it provides, as python3-cryptography asks for this one.
 INCLUDE = (*REAL, 'python3-cffi-backend')
 #: A system that lives for a minute needs nothing synced to the disk.
@@ -293,7 +293,8 @@ def test_anybody_can_import_it_and_has_its_plugins(installed: System) -> None:
         'provider aws azure container gcp kubernetes ssh', 'shell kubernetes local ssh',
         'vpn wireguard',
         'dds rmw_cyclonedds_cpp rmw_fastrtps_cpp rmw_zenoh_cpp',
-        'image_transport compressed ffmpeg h264 raw republished_compressed theora']
+        'image_transport compressed draco ffmpeg h264 pointcloud raw republished_compressed '
+        'theora zlib zstd']
 
 
 def test_nodes_can_be_run(installed: System) -> None:
@@ -321,7 +322,7 @@ def test_what_goes_to_a_machine_has_the_nodes_in_it(installed: System) -> None:
 def test_group_member_may_create_vpn_interfaces(installed: System) -> None:
     helper = '/usr/libexec/fogros2/vpn'
     assert 'fogros2:' in installed.run('getent', 'group', 'fogros2').stdout
-    assert installed.run('sh', '-c', f'echo "{{}}" | {helper} check').stdout == '2\n'
+    assert installed.run('sh', '-c', f'echo "{{}}" | {helper} check').stdout == '3\n'
     assert 'by sudo' in installed.run(helper, 'check', user='nobody', check=False).stderr
     assert installed.run('stat', '-c', '%a %u', '/etc/sudoers.d/fogros2-vpn').stdout == '440 0\n'
 

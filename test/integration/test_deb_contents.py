@@ -26,10 +26,13 @@ ROOT = Path(__file__).resolve().parents[2]
 SITE = 'opt/ros/jazzy/lib/python3.12/site-packages'
 VPN = 'usr/libexec/fogros2/vpn'
 #: ROS packages, and the folders whose scripts are their executables.
-SCRIPTS = {'fogros2': 'fogros2_monitor', 'fogros2_examples': 'fogros2_examples',
-           'image_transport_h264': 'image_transport_h264'}
-NODES = {package: {path.name for path in (ROOT / folder / 'scripts').iterdir() if path.is_file()}
-         for package, folder in SCRIPTS.items()}
+SCRIPTS = {'fogros2': ('fogros2_monitor', 'fogros2_replicas'),
+           'fogros2_examples': ('fogros2_examples',),
+           'image_transport_h264': ('image_transport_h264',),
+           'point_cloud_stream': ('point_cloud_stream',)}
+NODES = {package: {path.name for folder in folders
+                   for path in (ROOT / folder / 'scripts').iterdir() if path.is_file()}
+         for package, folders in SCRIPTS.items()}
 
 
 @pytest.fixture(scope='module')
@@ -83,8 +86,9 @@ def test_says_what_it_is(built: Path) -> None:
 def test_depends_on_what_the_manifests_say(built: Path) -> None:
     found = set(field(built, 'Depends').split(', '))
     assert {
-        'python3 (>= 3.12)', 'python3-boto3 (>= 1.34)', 'python3-numpy (>= 1:1.26)',
-        'python3-opencv (>= 4.6)', 'python3-paramiko (>= 2.12)', 'python3-yaml (>= 6.0)',
+        'python3 (>= 3.12)', 'python3-boto3 (>= 1.34)', 'python3-google-auth (>= 2.0)',
+        'python3-numpy (>= 1:1.26)', 'python3-opencv (>= 4.6)',
+        'python3-paramiko (>= 2.12)', 'python3-yaml (>= 6.0)',
         'iproute2', 'openssh-client', 'rsync', 'wireguard-tools',
         'ros-jazzy-launch-ros', 'ros-jazzy-rclpy', 'ros-jazzy-rmw-cyclonedds-cpp',
         'ros-jazzy-ros2launch', 'ros-jazzy-ros-workspace', 'ros-jazzy-sensor-msgs'} <= found
@@ -98,7 +102,8 @@ def test_provides_the_other_packages_of_the_tree(built: Path) -> None:
     version = field(built, 'Version')
     assert field(built, 'Provides').split(', ') == [
         f'ros-jazzy-fogros2-examples (= {version})',
-        f'ros-jazzy-image-transport-h264 (= {version})']
+        f'ros-jazzy-image-transport-h264 (= {version})',
+        f'ros-jazzy-point-cloud-stream (= {version})']
 
 
 def test_brings_our_packages_without_the_rigs(

@@ -133,6 +133,29 @@ def test_preemption_notice_moves_the_nodes_in_time(
     assert run.ended() == 0, run.text
 
 
+def test_new_machine_replaces_a_killed_one(launched, engine):
+    """On the robot meanwhile; the machine has the same name, and launch sees no exit."""
+    name = f'gone-{RUN}-replaced'
+    run = launched(name, 'replace')
+    run.wait_for(f'I heard: [Hello World from {name} ')
+    begin = time.monotonic()
+    remove(engine, name, 'rm', '-f', '-t', '0')
+    run.wait_for(f"the machine '{name}' is gone")
+    here = subprocess.run(['hostname'], capture_output=True, text=True).stdout.strip()
+    run.wait_for(f'I heard: [Hello World from {here} ')
+    run.wait_for(f'{name}: a new machine runs the nodes', timeout=120)
+    replaced = time.monotonic()
+    wait_until(lambda: run.since(replaced, f'I heard: [Hello World from {name} ') or None,
+               timeout=30, what='a message of the new machine')
+    last = run.times[-1]
+    wait_until(lambda: len(run.since(last, f'Hello World from {name} ')) > 5,
+               timeout=20, what='more messages')
+    assert run.since(last + 0.5, f'Hello World from {here} ') == [], 'it runs once'
+    assert len(run.since(begin, 'process started')) == 2, run.text
+    run.interrupt()
+    assert run.ended() == 0, run.text
+
+
 def test_launch_ends_with_a_lost_machine(launched, engine):
     name = f'gone-{RUN}'
     run = launched(name, 'shutdown')

@@ -33,6 +33,7 @@ from sensor_msgs.msg import Image, Imu
 from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 
 from fogros2.dds.cyclonedds import CycloneDds
+from fogros2.errors import DeadlineExceeded
 from fogros2.model import DdsInterface
 from fogros2.waiting import wait_until
 from rigs import viewer as viewers
@@ -87,7 +88,12 @@ class Bench:
             stdout=subprocess.PIPE, text=True)
 
     def until(self, probe: Callable[[], Any], what: str) -> Any:
-        return wait_until(lambda: probe() or None, timeout=20, what=what)
+        try:
+            return wait_until(lambda: probe() or None, timeout=20, what=what)
+        except DeadlineExceeded as error:
+            raise DeadlineExceeded('\n'.join([
+                str(error), *(f'viewer: {viewer.unread()}' for viewer in self.viewers),
+                f'graph: {self.node.get_topic_names_and_types()}', *self.lines])) from None
 
     def listeners(self, topic: str, count: int) -> None:
         self.until(lambda: self.node.count_subscribers(topic) == count,

@@ -86,7 +86,12 @@ class Copy:
                            timeout=90.0, check=check)
 
     def ask(self, user: str, verb: str, *more: str, **request: Any) -> Result:
-        """Ask the helper for something, as the product does."""
+        """Ask the helper for something, as the product does for a launch."""
+        if verb == 'keys':
+            request = {'private': '', **request}
+        elif verb == 'up':
+            first = request['network'].replace('.0/', '.1/').partition('/')[0]
+            request = {'address': first, **request}
         return self.run(user, 'sudo', '-n', '--', HELPER, verb, *more,
                         data=json.dumps(request).encode())
 
@@ -154,7 +159,7 @@ def peer(address: str, key: str = KEY) -> dict[str, object]:
 
 
 def test_a_user_makes_changes_and_takes_away_an_interface(copy: Copy) -> None:
-    assert copy.ask('fogada', 'check').stdout == '2\n'
+    assert copy.ask('fogada', 'check').stdout == '3\n'
     with interface(copy, 'fogada', NAME, '198.18.7.0/24', 51820) as key:
         assert re.fullmatch('[A-Za-z0-9+/]{43}=', key)
         assert NAME in copy.links()
@@ -239,7 +244,7 @@ def test_what_the_caller_has_set_is_forgotten(copy: Copy, tmp_path: Path) -> Non
               f'PYTHONPATH={shlex.quote(str(tmp_path))} PATH=/nowhere SUDO_UID=0 '
               f'/usr/bin/sudo -n {HELPER} ')
     made = copy.run('fogada', 'sh', '-c', script + 'keys', data=json.dumps(
-        {'name': NAME, 'pid': copy.launch('fogada')}).encode())
+        {'name': NAME, 'pid': copy.launch('fogada'), 'private': ''}).encode())
     assert made.returncode == 0 and len(made.stdout) == 45, made
     assert copy.run('root', 'stat', '-c%a', '/run/fogros2-vpn', f'/run/fogros2-vpn/{NAME}',
                     f'/run/fogros2-vpn/{NAME}/key').stdout.split() == ['711', '700', '600']
@@ -414,4 +419,4 @@ def test_it_is_removed_without_a_trace(copy: Copy) -> None:
             assert copy.run('root', 'test', '-e', path).returncode == 1, path
         assert copy.run('root', 'getent', 'group', 'fogros2').returncode != 0
         copy.run('root', install, 'fogada', 'fogbob', check=True)
-    assert copy.ask('fogada', 'check').stdout == '2\n'
+    assert copy.ask('fogada', 'check').stdout == '3\n'

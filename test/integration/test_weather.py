@@ -146,8 +146,7 @@ def second_address(engine: str, network: str) -> str:
         engine, 'network', 'inspect', network, '--format',
         '{{.NetworkInterface}} {{range .Subnets}}{{.Subnet}}{{end}}'), sudo=True), timeout=60)
     interface, subnet = asked.stdout.split()
-    # no machine gets it: the engine begins at the other end
-    address = str(list(ipaddress.ip_network(subnet).hosts())[-2])
+    address = str(list(ipaddress.ip_network(subnet).hosts())[-2])  # no machine gets it
     words = ('ip', 'address', 'replace', f'{address}/32', 'dev', interface)
     process.run(Command(words, sudo=True), timeout=10)
     return address

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 import stat
 import tempfile
 import threading
@@ -14,6 +15,7 @@ import pytest
 from fogros2 import events
 from fogros2.errors import Cancelled
 from fogros2.report import step
+from fogros2.store import Store
 
 
 class FakeMachine:
@@ -81,12 +83,17 @@ class FakeLaunch:
         self.lock = threading.Lock()
         self.report = None
         self.cancel = None
+        self.store = Store()
         self.environment = {}
         #: Called with the machine and the node when a node was started.
         self.on_start = None
         #: Names of machines whose ``up`` waits until the event is set, or the launch ends.
         self.waits = {}
         self.errors = {}
+        #: Folder for snapshots.
+        self.folder = Path('/nonexistent')
+        #: Errors of the next calls of ``retire``, one for each call.
+        self.retire_errors = []
         self.prepare_error = None
         self.down_errors = []
         self.costs = []
@@ -135,6 +142,14 @@ class FakeLaunch:
         machine = self.machines[spec.name] = FakeMachine(self, spec)
         self.note('is up', spec.name)
         return machine
+
+    def checkpoints(self, name):
+        return self.folder / name
+
+    def retire(self, name):
+        self.note('retire', name)
+        if self.retire_errors:
+            raise self.retire_errors.pop(0)
 
     def down(self):
         self.note('down')

@@ -5,7 +5,7 @@ Launch files written for FogROS2 are read, and run where that takes no machine.
 Those here are our own, with the names, keywords and order of calls that FogROS2's documentation
 has. Where ``FOGROS2_UPSTREAM`` names a folder with checkouts of ``FogROS2`` and
 ``fogros2-examples``, their own files are read too, byte for byte. The runs on machines are in
-test/integration/aws and test/integration/kubernetes.
+test/integration/clouds and test/integration/kubernetes.
 """
 
 from __future__ import annotations

@@ -130,6 +130,13 @@ PYTHON_MACHINE = {
     'environment': {'RCUTILS_COLORIZED_OUTPUT': '1'}}
 
 
+def test_machine_of_any_cloud_is_an_element():
+    spec = machine(xml('<fog_machine name="planner" provider="cheapest" min_cpu="8" gpu="L4" '
+                       'max_round_trip_ms="60" providers="aws, azure" ros_workspace=""/>'))
+    assert (spec.provider, spec.options) == ('cheapest', {
+        'min_cpu': 8, 'gpu': 'L4', 'max_round_trip_ms': 60, 'providers': ['aws', 'azure']})
+
+
 @pytest.mark.parametrize('text', [f'<launch>{XML_MACHINE}</launch>', YAML_MACHINE])
 def test_a_machine_is_the_one_that_python_makes(text):
     assert machine(load(text)) == AWSCloudInstance(**PYTHON_MACHINE).spec(LaunchContext())
@@ -171,7 +178,9 @@ EXAMPLES = {'text': ('nearest', 'nearest'), 'number': ('2', 2), 'bool': ('true',
             'scalar': ('true', True), 'list': ('a,b', ['a', 'b']),
             'text or mapping': ('ami-1', 'ami-1')}
 #: Where not every value will do.
-CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'name': 'planner'}
+CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'on_loss_after': '5m',
+           'checkpoint': '$HOME/map',
+           'name': 'planner'}
 LISTS = {'monitor_allow': ('198.51.100.0/28,::1', ['198.51.100.0/28', '::1']),
          'apt': ('libzbar0, g++', ['libzbar0', 'g++']),
          'pip': ('pyzbar==0.1.9, qrcode', ['pyzbar==0.1.9', 'qrcode'])}
@@ -221,7 +230,7 @@ launch:
     ('<fog_machine name="p" provider="awz"/>',
      ["there is no provider 'awz'", "did you mean 'aws'", 'container']),
     ('<fog_machine name="p"/>',
-     ['needs a provider', 'aws, azure, container, gcp, kubernetes, robot, ssh']),
+     ['needs a provider', 'aws, azure, cheapest, container, gcp, kubernetes, robot, ssh']),
     ('<fog_machine provider="aws"/>', ['needs a name']),
     ('<fog_machine name="p" provider="ssh"/>', ["provider 'ssh' needs host"]),
     ('<fog_machine name="P_" provider="aws"/>', ["'P_' is no name for a machine"]),

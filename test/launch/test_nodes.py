@@ -380,4 +380,5 @@ def test_files_are_read_in_several_threads(registry):
 def test_fogros2_adds_elements_and_replaces_none(registry):
     assert {name for name, parse in expose.action_parse_methods.items()
             if parse.__module__.startswith('fogros2')} == {
-                'fog_machine', 'cloud_node', 'cloud_group', 'stream_topic', 'fogros_launch'}
+                'fog_machine', 'cloud_node', 'cloud_group', 'stream_topic', 'replicated',
+                'fogros_launch'}

@@ -100,7 +100,9 @@ class Browser:
             self.requested.append(about['request']['url'])
         elif told.get('method') == 'Runtime.exceptionThrown':
             self.complaints.append(json.dumps(about['exceptionDetails'])[:600])
-        elif told.get('method') == 'Log.entryAdded' and about['entry']['level'] == 'error':
+        elif (told.get('method') == 'Log.entryAdded' and about['entry']['level'] == 'error'
+              # Chromium ends requests when an interface of any other test comes or goes
+              and not about['entry']['text'].endswith('net::ERR_NETWORK_CHANGED')):
             self.complaints.append(about['entry']['text'])
 
     def prefer(self, *, dark: bool) -> None:

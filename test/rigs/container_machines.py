@@ -21,7 +21,7 @@ from fogros2.waiting import wait_until
 
 #: Of TEST-NET-2: nobody's, and no route leads out of an internal network. Several, as two runs of
 #: the tests may meet on one computer.
-SUBNETS = [f'198.51.100.{host}/28' for host in range(0, 256, 16)]
+SUBNETS = [f'198.51.100.{host}' for host in range(0, 256, 32)]
 
 
 @pytest.fixture(scope='session')
@@ -37,8 +37,10 @@ def cloud_network(engine: str) -> Iterator[str]:
     """Return a container network without a way out, for the time of the tests."""
     name = f'fogt{uuid.uuid4().hex[:8]}'
     for subnet in SUBNETS:
-        made = run(Command((engine, 'network', 'create', '--internal', '--subnet', subnet, name),
-                           sudo=True), timeout=60, check=False)
+        # machines get the lower half in turn; tests take addresses for others from the upper one
+        made = run(Command((engine, 'network', 'create', '--internal', '--subnet', f'{subnet}/27',
+                            '--ip-range', f'{subnet}/28', name), sudo=True),
+                   timeout=60, check=False)
         if made.returncode == 0:
             break
     else:

@@ -28,11 +28,16 @@ from fogros2.agent_client import connection
 from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.dds.fastdds import FastDds, VARIABLE
 from fogros2.errors import FogError
+from fogros2_examples.city import City
+from fogros2_examples.lidar import message
 from fogros2_monitor import request as gate
 from fogros2_monitor.dashboard import server as dashboard
 from image_transport_h264 import stills
 from image_transport_h264.codec import Decoder, Encoder, Picture
 from image_transport_h264.picture import CodecError
+from point_cloud_stream import codec
+from point_cloud_stream.cloud import CloudError, Field, Layout
+from point_cloud_stream.parts import Assembler, split
 from rigs import recorded_agent
 from rigs.stranger import NOBODY
 
@@ -90,6 +95,26 @@ def _stills() -> Iterator[Target]:
         form, _, rest = data.partition(b'|')
         return stills.decode(form.decode('latin-1'), rest)
     yield Target(valid, read, (CodecError,))
+
+
+@contextlib.contextmanager
+def _clouds() -> Iterator[Target]:
+    """Coded point clouds, without the checksum that a part has."""
+    scan = City(8, 64).scan(1)
+    made = message(scan)
+    fields = tuple(Field(each.name, each.offset, each.datatype) for each in made.fields)
+    valid = [codec.encode(
+        Layout(rows, 512 // rows, fields, made.point_step, 512 // rows * made.point_step),
+        scan.tobytes(), resolution).data for rows in (1, 8) for resolution in (0.0, 0.01)]
+    yield Target(valid, codec.decode, (CloudError,))
+
+
+@contextlib.contextmanager
+def _parts() -> Iterator[Target]:
+    """Parts of coded clouds, one assembler for all."""
+    assembler = Assembler(1 << 20)
+    yield Target([part for size in (100, 30_000) for part in split(bytes(size), 1, 2, 3)],
+                 assembler.add, ())
 
 
 @contextlib.contextmanager
@@ -250,8 +275,8 @@ def helper() -> ModuleType:
 @contextlib.contextmanager
 def _vpn_helper() -> Iterator[Target]:
     vpn: Any = helper()
-    up = {'name': 'fogabc123', 'network': '198.18.7.0/24', 'port': 40000, 'domain': 0,
-          'ports': [[7000, 7119]],
+    up = {'name': 'fogabc123', 'network': '198.18.7.0/24', 'address': '198.18.7.1',
+          'port': 40000, 'domain': 0, 'asked': [], 'ports': [[7000, 7119]],
           'peers': [{'key': KEY, 'address': '198.18.7.2', 'endpoint': 'host:51820'}]}
 
     def read(data: bytes) -> None:
@@ -261,13 +286,15 @@ def _vpn_helper() -> Iterator[Target]:
         network = vpn.network_of(request.get('network', '198.18.7.0/24'), ['198.18.0.0/15'])
         vpn.number(request.get('port', 40000), vpn.FIRST_PORT, 65535, 'the port')
         ports = vpn.ports_of(request.get('ports', []))
-        peers = vpn.peers_of(request.get('peers', []), network)
+        own = vpn.own_address(request.get('address', '198.18.7.1'), network)
+        peers = vpn.peers_of(request.get('peers', []), network, own)
         record = vpn.Record(request.get('name', 'fogabc123'), 0, 1, 1, network=network,
-                            port=40000, domain=0, ports=ports)
+                            address=own, port=40000, domain=0, ports=ports)
         for command in record.vpn().up(record.interface(), peers):
             assert '\0' not in ''.join(command.argv)
     yield Target([b'up ' + json.dumps(up).encode(), b'down {"name": "fogabc123"}',
-                  b'keys {"name": "fogabc123", "pid": 1}'], read, (vpn.Refused, ValueError))
+                  b'keys {"name": "fogabc123", "pid": 1, "private": ""}'], read,
+                 (vpn.Refused, ValueError))
 
 
 @contextlib.contextmanager
@@ -296,8 +323,9 @@ def _dds() -> Iterator[Target]:
 
 
 TARGETS: dict[str, Callable[[], contextlib.AbstractContextManager[Target]]] = {
-    'decoder': _decoder, 'stills': _stills, 'agent messages': _agent_messages,
-    'heartbeats': _heartbeats, 'agent': _agent, 'gate': _gate, 'dashboard': _dashboard,
-    'VPN helper': _vpn_helper, 'DDS configuration': _dds}
+    'decoder': _decoder, 'stills': _stills, 'clouds': _clouds, 'parts': _parts,
+    'agent messages': _agent_messages, 'heartbeats': _heartbeats, 'agent': _agent, 'gate': _gate,
+    'dashboard': _dashboard, 'VPN helper': _vpn_helper, 'DDS configuration': _dds}
 #: Targets whose readers are Python code in the process that feeds them.
-PYTHON = {'agent messages', 'heartbeats', 'gate', 'dashboard', 'VPN helper', 'DDS configuration'}
+PYTHON = {'parts', 'agent messages', 'heartbeats', 'gate', 'dashboard', 'VPN helper',
+          'DDS configuration'}

@@ -111,6 +111,12 @@ class Viewer:
                 return told
             self._kept.append(told)
 
+    def unread(self) -> list[dict[str, Any]]:
+        """Return what it has told so far and nobody has waited for."""
+        while not self._told.empty():
+            self._kept.append(self._told.get())
+        return self._kept
+
     def look(self, topic: str, **more: Any) -> dict[str, Any]:
         """Look at a topic once it is there; return its channel."""
         channel = self.until('channel', topic)

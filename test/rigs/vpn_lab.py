@@ -203,7 +203,8 @@ class Lab:
     def run(self, host: str, command: Command, *, check: bool = True) -> Result:
         """Run a command of the VPN's on a host."""
         return process.run(
-            Command(self.argv(host, command.argv), sudo=True, what=command.what),
+            Command(self.argv(host, command.argv), sudo=True, input=command.input,
+                    what=command.what),
             timeout=20.0, check=check)
 
     def shell(self, host: str, text: str, *, check: bool = True) -> str:
@@ -308,7 +309,7 @@ class Lab:
         if uri is None:
             path = self.folder / f'dds {host}.xml'
             name = self.interfaces[host].name
-            if host == 'robot':
+            if self.interfaces[host].firewall:
                 text = self.dds.render(self.dds.robot_interfaces(name, self.lan_name, {}), [])
             else:
                 others = {'machine': SECOND, 'second': MACHINE}

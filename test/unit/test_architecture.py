@@ -16,7 +16,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE = ROOT / 'fogros2'
-PACKAGES = ('image_transport_h264', 'fogros2', 'fogros2_monitor', 'ros2fog_cli')
+PACKAGES = ('fogros2_replicas', 'image_transport_h264', 'point_cloud_stream', 'fogros2',
+            'fogros2_monitor', 'ros2fog_cli')
 
 #: The parts of the core, lowest first; a module imports only its own part and those before it.
 #: Inside a package the order is the one in which the docstring of its ``__init__`` names the
@@ -26,7 +27,7 @@ ORDER = """
     model errors events clock
     waiting report process
     agent cloud_launch
-    plugin_system store journal ros2_daemon monitor_addresses
+    plugin_system store journal ros2_daemon monitor_addresses invitation
     kubernetes_client
     shell vpn dds
     agent_client
@@ -48,6 +49,7 @@ NAMED_PLUGINS = {
     ('ros2fog_cli.api.doctor', 'fogros2.provider.container'),
     ('ros2fog_cli.api.doctor', 'fogros2.vpn.helped'),
     ('ros2fog_cli.api.endings', 'fogros2.vpn.helped'),
+    ('ros2fog_cli.api.membership', 'fogros2.vpn.helped'),
     ('ros2fog_cli.api.pod_image', 'fogros2.provider.kubernetes'),
 }
 #: Packages with a circle of imports inside. Only ever remove names.
@@ -67,7 +69,7 @@ SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_c
         'google': 'provider', 'paramiko': 'shell', 'av': 'image_transport',
         'foxglove': 'fogros2_monitor'}
 #: Found by their entry points, or started by the user: the core imports none of them.
-ABOVE = ('fogros2_monitor', 'ros2fog_cli', 'rigs')
+ABOVE = ('fogros2_monitor', 'fogros2_replicas', 'ros2fog_cli', 'rigs')
 
 
 def python_files(folder: Path) -> list[Path]:
@@ -177,7 +179,10 @@ def test_exceptions_name_what_exists() -> None:
 
 
 @pytest.mark.parametrize(('folder', 'above'), [
-    ('fogros2', ABOVE), ('fogros2_monitor', ABOVE[1:]), ('image_transport_h264', ABOVE)])
+    ('fogros2', ABOVE), ('fogros2_monitor', ABOVE[1:]),
+    ('fogros2_replicas', ('fogros2', 'fogros2_monitor', 'ros2fog_cli', 'rigs')),
+    ('point_cloud_stream', (*ABOVE, 'fogros2')),
+    ('image_transport_h264', (*ABOVE, 'fogros2', 'point_cloud_stream'))])
 def test_package_imports_nothing_above_it(folder: str, above: tuple[str, ...]) -> None:
     pattern = rf"^\s*(from|import) ({'|'.join(above)})\b"
     for path in python_files(ROOT / folder):
@@ -259,7 +264,8 @@ def test_forbidden_words(pattern: str) -> None:
 
 def test_only_one_module_starts_processes() -> None:
     """A command that is waited for goes through ``process``; streams and daemons are few."""
-    allowed = {'process.py', 'cloud_launch.py', 'serve.py'}
+    # cloud_launch and guests are programs for machines
+    allowed = {'process.py', 'cloud_launch.py', 'guests.py', 'serve.py'}
     for path in (*python_files(CORE), *python_files(ROOT / 'fogros2_monitor')):
         if path.name not in allowed and 'subprocess' in path.read_text():
             names = {name for name, _ in imports(path)}

@@ -113,6 +113,7 @@ def test_states_of_azure_are_states_of_machines(making, power, state):
                  *([{'code': f'PowerState/{power}'}] if power else [])]}}}
     found = machines.vm_of(entry)
     assert (found.state, found.region, found.id) == (state, 'westeurope', 'g')
+    assert found.billed == (power == 'stopped')  # 'deallocated' is not
 
 
 def test_time_of_azure_is_read_with_any_decimals():
@@ -132,7 +133,8 @@ def test_time_of_azure_is_read_with_any_decimals():
      "virtualMachines/write' over scope", '', 'Microsoft.Compute/virtualMachines/write'),
     ('MissingSubscriptionRegistration', "namespace 'Microsoft.Compute'", '', 'az provider'),
     ('RequestDisallowedByPolicy', 'no public addresses', '', 'no public addresses'),
-    ('ScopeLocked', 'locked', '', 'az lock'), ('SomethingNew', 'so it is', '', 'so it is')])
+    ('ScopeLocked', 'locked', '', 'az lock'), ('Unauthorized', 'no token', '', 'az login'),
+    ('SomethingNew', 'so it is', '', 'so it is')])
 def test_refusal_says_what_it_means(code, message, full, words):
     error = failures.refusal(409, {'error': {'code': code, 'message': message}}, 'creating it')
     assert words in str(error) and str(error).startswith('creating it failed')

@@ -152,7 +152,13 @@ def test_list_shows_what_providers_and_the_store_know(
     assert 'eu-west-1  t3.medium' in states['alive']
     # what is stopped costs its disk alone; 10 minutes of the others
     assert '$' not in states['idle'] and 'min' not in states['idle'].split('198.51.100.7')[1]
-    assert lines[-1] == '$1.2416 an hour, $0.21 so far, disks and traffic aside'
+    # the price of others is unknown
+    assert lines[-1] == '$1.2416 an hour, $0.21 so far, disks and traffic aside; ' \
+        'the price of 3 more is unknown'
+    machine('idle', state=MachineState.STOPPED, cost_per_hour=Decimal('1.2'), billed=True)
+    assert run('list') == 0
+    (idle,) = [line for line in capsys.readouterr().out.splitlines() if 'idle' in line]
+    assert 'stopped (still billed)' in idle and '$1.2000' in idle
     assert '10 min' in states['alive'] and '60 min' in states['alive']
     assert 'unknown (record damaged)' in states['broken']
     assert ' gone ' in states['ghost']

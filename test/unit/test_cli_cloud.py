@@ -562,12 +562,12 @@ def test_prices_are_listed_cheapest_first(
     assert run('price', '--min-cpu', '8', '--min-memory', '32', '--arch', 'x86_64') == 0
     assert capsys.readouterr().out.splitlines() == [
         '8 CPUs, 32 GB, x86_64, in eu-west-1',
-        'TYPE         REGION     CPUS  MEMORY  GPU                    ARCH    CPU    PRICE/H  '
-        ' SPOT/H',
-        'g6.2xlarge   eu-west-1  8     32 GB   1 x NVIDIA L4 22.4 GB  x86_64  AMD    $9.9000  '
-        ' -',
-        'm6i.2xlarge  eu-west-1  8     32 GB   -                      x86_64  Intel  $10.9600 '
-        ' $0.1000']
+        'TYPE         PROVIDER  REGION     CPUS  MEMORY  GPU                    ARCH    CPU    '
+        'PRICE/H   SPOT/H',
+        'g6.2xlarge   cloud     eu-west-1  8     32 GB   1 x NVIDIA L4 22.4 GB  x86_64  AMD    '
+        '$9.9000   -',
+        'm6i.2xlarge  cloud     eu-west-1  8     32 GB   -                      x86_64  Intel  '
+        '$10.9600  $0.1000']
     assert run('price', '--spot', '--arch', 'x86_64', '--json') == 0
     (only,) = json.loads(capsys.readouterr().out)
     assert only['type'] == 'm6i.2xlarge' and only['spot_price'] == '0.1'
@@ -578,10 +578,10 @@ def test_prices_of_all_regions_are_compared(
 ) -> None:
     assert run('price', '--region', 'all', '--arch', 'any', '--limit', '1') == 0
     said = capsys.readouterr()
-    assert said.err == 'me-south-1: not enabled\n'
+    assert said.err == 'cloud me-south-1: not enabled\n'
     lines = said.out.splitlines()
     assert lines[0] == '2 CPUs, 4 GB, in eu-west-1, me-south-1, us-west-1'
-    assert lines[2].split()[:2] == ['g6.2xlarge', 'us-west-1']
+    assert lines[2].split()[:3] == ['g6.2xlarge', 'cloud', 'us-west-1']
     assert lines[3] == '3 more cost as much or more (--limit 0)'
 
 
@@ -609,7 +609,7 @@ def test_regions(
 
 
 def test_no_provider_has_prices() -> None:
-    assert 'no provider here has prices' in str(run('price'))
+    assert 'no cloud with prices is set up here (pip list shows' in str(run('price'))
     assert "'plain' has no price list" in str(run('price', '--provider', 'plain'))
 
 

@@ -15,7 +15,7 @@ import time
 import pytest
 
 from fogros2.model import MachineSpec
-from fogros2.store import Record, Store
+from fogros2.store import Record, Store, write_private
 
 pytestmark = [
     pytest.mark.skipif(util.find_spec('argcomplete') is None, reason='needs argcomplete'),
@@ -31,6 +31,7 @@ def complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Complete:
     monkeypatch.setenv('FOGROS2_STATE_HOME', str(tmp_path / 'state'))
     for name in ('planner', 'mapper'):
         Store().save(Record(name, 'container', MachineSpec(name, 'container')))
+    write_private(Store().launch('a1b2c3') / 'joined.json', b'{"machine": "slam"}')
 
     def complete(line: str) -> list[str]:
         answer = tmp_path / 'answer'
@@ -51,17 +52,22 @@ def complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Complete:
 @pytest.mark.parametrize('line, offered', [
     ('ros2 fog st', ['status']),
     ('ros2 fog do', ['doctor']),
+    ('ros2 fog in', ['invite']),
+    ('ros2 fog invite pl', ['planner']),
+    ('ros2 fog revoke ', ['mapper', 'planner']),
+    ('ros2 fog leave ', ['slam']),
     ('ros2 fog status ', ['mapper', 'planner']),
     ('ros2 fog status pl', ['planner']),
     ('ros2 fog delete ', ['all', 'mapper', 'planner']),
     ('ros2 fog list --region eu-west-', ['eu-west-1', 'eu-west-2', 'eu-west-3']),
     ('ros2 fog price --region ap-east-', ['ap-east-1', 'ap-east-2']),
+    ('ros2 fog price --provider a', ['all', 'aws', 'azure']),
     ('ros2 fog regions sa-', ['sa-east-1']),
     ('ros2 fog doctor --provider ', ['aws', 'azure', 'container', 'gcp', 'kubernetes', 'ssh']),
     ('ros2 launch --machine ma', ['mapper=']),
     ('ros2 launch --machine mapper=', [
-        'mapper=aws', 'mapper=azure', 'mapper=container', 'mapper=gcp', 'mapper=kubernetes',
-        'mapper=robot', 'mapper=ssh']),
+        'mapper=aws', 'mapper=azure', 'mapper=cheapest', 'mapper=container', 'mapper=gcp',
+        'mapper=kubernetes', 'mapper=robot', 'mapper=ssh']),
 ])
 def test_command_line_is_completed(complete: Complete, line: str, offered: list[str]) -> None:
     begin = time.monotonic()

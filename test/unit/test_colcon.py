@@ -18,7 +18,7 @@ Source = pytest.Config.ArgsSource
 def test_all_files_have_the_same_version() -> None:
     version = ElementTree.parse(ROOT / 'package.xml').findtext('version')
     assert version and re.fullmatch(r'\d+\.\d+\.\d+', version)
-    for name in ('fogros2_examples', 'image_transport_h264'):
+    for name in ('fogros2_examples', 'image_transport_h264', 'point_cloud_stream'):
         assert ElementTree.parse(ROOT / name / 'package.xml').findtext('version') == version
     assert f"\nVERSION = '{version}'\n" in (ROOT / 'ros2_embedded/setup.py').read_text()
     # the newest part of the change log

@@ -159,6 +159,7 @@ def machine(**changes: Any) -> dict[str, Any]:
         'created': 1000.0, 'expires': 4600.0, 'ended': None, 'address': '198.51.100.7',
         'place': 'eu-central-1', 'kind': 'g4dn.xlarge', 'cost_per_hour': '3.6',
         'on_exit': 'delete', 'bridge': 0, 'deleting': False, 'trouble': '', 'problems': [],
+        'replicas': [],
         'log': 0, 'agent': {'since': 1010.0, 'rss': 14_000_000, 'heartbeat_age': 1.0},
         'clock': None,
         'vpn': {'address': '198.18.0.2', 'interface': 'fogabc', 'received': 5e6, 'sent': 1e3,

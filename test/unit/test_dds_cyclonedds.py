@@ -181,7 +181,7 @@ def test_the_receive_buffer_asks_for_no_minimum() -> None:
 def test_lost_messages_are_repeated_within_milliseconds() -> None:
     """Both sides: the reader that misses something, the writer that asks whether it does."""
     root = rendered(VPN, LOOPBACK)
-    assert texts(root, 'NackDelay') == ['5 ms']
+    assert texts(root, 'NackDelay') == ['2 ms']
     assert texts(root, 'HeartbeatInterval') == ['20 ms']
     assert attributes(root, 'HeartbeatInterval') == [
         {'min': '5 ms', 'minsched': '10 ms', 'max': '1 s'}]

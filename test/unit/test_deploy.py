@@ -17,6 +17,7 @@ import pytest
 from fogros2 import plan, process
 from fogros2.agent_client import AgentClient
 from fogros2.deploy import Launch, robot_vpn
+from fogros2.deploy import launch as deployed
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.robot_vpn import VpnMember
 from fogros2.deploy.running import RunningMachine
@@ -44,6 +45,7 @@ from fogros2.errors import (
 from fogros2.host.bootstrap import RosInstall
 from fogros2.model import (
     Command,
+    CreateRequest,
     Endpoint,
     Machine,
     MachineSpec,
@@ -592,6 +594,54 @@ def test_machine_without_any_word_is_lost(cut, provider, monkeypatch):
     wait_until(lambda: link.closed, timeout=10, what='the verdict')
     assert [event['event'] for event in events] == ['lost']
     assert 'it is lost: no answer for ' in events[0]['reason'] and link.asked == ['stop']
+
+
+@pytest.mark.parametrize('on_loss_after, limit', [(0.0, 120.0), (300.0, 300.0)])
+def test_a_machine_is_replaced_after_longer_silence(launch, provider, on_loss_after, limit):
+    """Never before its robot_timeout, so a cut of 30 s replaces nothing."""
+    provider._machines['fake-1'] = Machine('fake-1', 'planner', 'fake', MachineState.RUNNING)
+    context, mine = begun(launch, dataclasses.replace(
+        SPEC, on_interrupt='replace', on_loss_after=on_loss_after))
+    mine.record = dataclasses.replace(mine.record, machine_id='fake-1')
+    mine.agent, mine.heartbeat = SimpleNamespace(silent_for=60.0), SimpleNamespace(age=limit)
+    lost = []
+    watch = Watch(context, mine, gone=lost.append, found=print, lost=lost.append)
+    wait_until(lambda: provider.calls.count('describe') > 0, timeout=10, what='a question')
+    assert lost == []
+    mine.heartbeat.age = limit + 0.1
+    wait_until(lambda: lost or None, timeout=5, what='the verdict')
+    assert lost == [f'it is lost: no answer for {limit:g} s']
+    watch.close()
+
+
+def test_retired_machine_is_deleted_and_created_anew(launch, provider, monkeypatch):
+    ended = []
+
+    def bring_up(context, spec):
+        mine = MachineJob(context, spec)
+        mine.heartbeat = SimpleNamespace(age=0.0, close=lambda: ended.append('heartbeat'))
+        mine.machine = mine.shell = None
+        mine.agent = SimpleNamespace(request=lambda *words, **named: None)
+        mine.interface = SimpleNamespace(address='198.18.7.2')
+        mine.failed = False
+        creation = Creation(context, mine)
+        mine.undoing('end', creation._end)
+        creation._claim('token')
+        mine.save(machine_id=provider.create(spec, CreateRequest('t', '', {}, 1)))
+        return RunningMachine(context, mine, None, None)
+
+    monkeypatch.setattr(deployed, 'bring_up', bring_up)
+    spec = dataclasses.replace(SPEC, on_exit='keep')
+    first = launch.up(spec)
+    provider.failures['destroy'] = ConnectError('no network')
+    with pytest.raises(ConnectError):
+        launch.retire('planner')
+    assert launch.up(spec) is first and ended == ['heartbeat'], 'its nodes may still run'
+    launch.retire('planner')
+    assert provider._machines == {} and not launch.store.exists('planner')
+    assert launch.up(spec) is not first
+    launch.retire('planner')
+    launch.retire('planner')
 
 
 def test_machine_that_its_provider_knows_is_not_lost(cut, provider, monkeypatch):

@@ -87,7 +87,7 @@ def test_substitutions_are_resolved_when_executed(context):
      "ContainerInstance has no attribute 'imge' (did you mean 'image'?)"),
     (lambda: ContainerInstance(lifetme=3), "did you mean 'lifetime'?"),
     (lambda: SSHInstance('host', hostkey='k'), "did you mean 'host_key'?"),
-    (lambda: ContainerInstance(zzz=1), 'there are: apt, bootstrap, containers, cpus'),
+    (lambda: ContainerInstance(zzz=1), 'there are: apt, bootstrap, checkpoint, '),
     (lambda: ContainerInstance(name='two words'), "'two words' is no name for a machine"),
     (lambda: ContainerInstance(name='$(reboot)'), 'is no name for a machine'),
     (lambda: ContainerInstance(name='../../up'), 'is no name for a machine'),

@@ -13,8 +13,9 @@ import pytest
 import fogros2
 from fogros2 import AWSCloudInstance, KubeInstance
 from fogros2.describe import choices as later
-from fogros2.describe import keywords, values
+from fogros2.describe import keywords, overrides, values
 from fogros2.errors import ConfigurationError
+from fogros2.provider import clouds
 from fogros2.provider.aws import AWSProvider
 from fogros2.provider.offers import MachineType, Offer, Offers, wants
 
@@ -156,12 +157,12 @@ def asked(monkeypatch):
         noted.append(('nearest', tuple(names)))
         return 'eu-north-1'
 
-    def offers(self, wanted, regions=()):
+    def offers(self, wanted, regions=(), *, refresh=False):
         noted.append(('offers', wanted, tuple(regions)))
         name = 't2.medium' if wanted.cores else 'c7i.large' if wanted.gpus else 't4g.large'
         region = 'eu-west-3' if len(regions) != 1 or 'all' in regions else regions[0]
         kind = MachineType(name, 8, 4, 16.0, 'x86_64')
-        return Offers(wanted, (Offer(region, kind),), tuple(regions))
+        return Offers(wanted, (Offer(region, kind, Decimal(1), Decimal(1)),), tuple(regions))
 
     monkeypatch.setattr(AWSProvider, 'nearest', nearest)
     monkeypatch.setattr(AWSProvider, 'offers', offers)
@@ -197,13 +198,34 @@ def test_the_one_helper_that_asks_at_once(asked):
     assert {'eu-north-1': 'ami-3'}[region] == 'ami-3'
 
 
-def test_the_cheapest_of_all(asked, context):
+def test_the_cheapest_of_all(asked, context, monkeypatch):
     region, kind = fogros2.find_cheapest(['eu-west-3', 'eu-west-1'], spot=True)
     assert found(AWSCloudInstance(region=region, ec2_instance_type=kind), context) == {
         'region': 'eu-west-3', 'ec2_instance_type': 't4g.large'}
     assert asked == [('offers', wants(spot=True), ('eu-west-3', 'eu-west-1'))]
     with pytest.raises(ConfigurationError, match="takes no 'cores'"):
         fogros2.find_cheapest(cores=3)
+    monkeypatch.setattr(clouds, 'clouds', lambda: (['aws'], []))
+    parts = fogros2.find_cheapest(['eu-west-3'], provider='all')
+    assert asked[1:] == []
+    assert [part.perform(context) for part in parts] == ['aws', 'eu-west-3', 't4g.large']
+    assert len(asked) == 2
+
+
+def test_machine_of_any_cloud_is_described_without_a_request(context, monkeypatch):
+    monkeypatch.setattr(clouds, 'compare', lambda *_, **__: pytest.fail('a request'))
+    wanted = {'min_cpu': 8, 'gpu': 'L4', 'max_round_trip_ms': 60, 'providers': ['aws', 'azure']}
+    context.launch_configurations['cpus'] = '8'
+    machine = fogros2.cheapest(
+        **{**wanted, 'min_cpu': LaunchConfiguration('cpus')}, name='planner', ros_workspace='')
+    spec = machine.spec(context)
+    assert (spec.provider, spec.options, spec.wanted) == ('cheapest', wanted, None)
+    assert machine.info()['cloud_service_provider'] == 'cheapest'
+    said = 'planner=cheapest,min_cpu=8,gpu=L4,max_round_trip_ms=60,providers=[aws, azure]'
+    assert overrides.parse(said).machine('planner').spec(context).options == wanted
+    with pytest.raises(ConfigurationError, match="no attribute 'min_memory'") as caught:
+        fogros2.cheapest(min_memory=4)
+    assert 'min_memory_gb' in caught.value.hint
 
 
 def test_fogros2_s_own_names(asked, context):

@@ -8,6 +8,7 @@ import dataclasses
 from decimal import Decimal
 import json
 import re
+import socket
 import subprocess
 import sys
 
@@ -20,9 +21,10 @@ from fogros2.errors import (
     ProviderError,
 )
 from fogros2.model import CreateRequest, MachineSpec, MachineState
-from fogros2.provider import TAG_ON_EXIT, TAG_ROBOT
+from fogros2.provider import TAG_ON_EXIT
 from fogros2.provider.gcp import account, failures, firewall, GCPProvider, instances, prices
 from fogros2.provider.gcp.options import Options
+from fogros2.provider.offers import wants
 from fogros2.provider.vm import cloud
 from fogros2.provider.vm.cloud import Order, Place
 from fogros2.testing import request_for
@@ -118,6 +120,13 @@ def test_cheapest_without_a_key_says_what_is_missing(gce, monkeypatch):
     monkeypatch.delenv(prices.KEY_VARIABLE, raising=False)
     with pytest.raises(ProviderError, match="Google's prices are not known here"):
         priced(machine_type='cheapest')
+
+
+def test_regions_share_one_answer_of_the_catalogue(catalogue):
+    found = GCPProvider().offers(wants(arch='x86_64'), ['europe-west3', 'europe-west1'])
+    assert found.chosen.region == 'europe-west3'
+    asked = [call for call in catalogue.api.calls if call.action == 'services.skus.list']
+    assert len(asked) == 3  # pages
 
 
 def test_refused_key_is_not_in_the_error(catalogue, monkeypatch):
@@ -264,15 +273,6 @@ def test_machine_that_shut_itself_down_is_a_leftover(gce):
     assert gce.instances == [] and gce.own_firewalls == []
 
 
-def test_leftovers_of_another_robot_stay(gce):
-    provider = GCPProvider()
-    provider.create(SPEC, request_for(SPEC, **{TAG_ROBOT: 'another'}))
-    gce.project.cloud.end(gce.instances[0]['id'], 'terminate')
-    for rule in gce.own_firewalls:
-        rule['description'] = rule['description'].replace('"fogros2-made": "', '"x": "')
-    assert provider.tidy() == []
-
-
 @pytest.mark.parametrize(('on_exit', 'program'), [('delete', 'python3'), ('stop', 'shutdown')])
 def test_machine_deletes_or_stops_itself(gce, on_exit, program):
     spec = dataclasses.replace(SPEC, on_exit=on_exit)
@@ -352,18 +352,6 @@ def test_late_failure_of_an_operation_is_certain(code, full):
     assert (error.full, error.refused) == (full, True)
 
 
-def test_full_quota_tries_the_next_type_with_a_new_token(gce):
-    gce.api.faults.append(fault('QUOTA_EXCEEDED', 'instances.insert'))
-    spec = MachineSpec('planner', 'gcp', {'machine_types': ['n2-standard-2']})
-    GCPProvider().create(spec, request_for(spec))
-    assert gce.instances[0]['machineType'].endswith('/n2-standard-2')
-
-
-def test_throttled_request_is_sent_again(gce):
-    gce.api.faults.append(fault('rateLimitExceeded', 'instances.aggregatedList'))
-    assert list(GCPProvider().find({})) == []
-
-
 def test_missing_credentials_are_named(monkeypatch, tmp_path):
     monkeypatch.setenv('HOME', str(tmp_path))
     monkeypatch.setenv('CLOUDSDK_CONFIG', str(tmp_path))
@@ -378,11 +366,6 @@ def test_project_is_that_of_the_options_first(gce, monkeypatch):
     monkeypatch.setenv('GOOGLE_CLOUD_PROJECT', 'other-project')
     assert account.Account().project == 'other-project'
     assert account.Account().of_project('third-project').project == 'third-project'
-
-
-def fault(code, action):
-    from rigs.gce.api import Fault
-    return Fault(code, action)
 
 
 # -- where ------------------------------------------------------------------------------------
@@ -468,3 +451,11 @@ def test_box_refuses_what_google_refuses(gce):
         'name': 'x', 'allowed': [{'IPProtocol': 'tcp'}], 'sourceRanges': ['198.51.100.0/24']},
         params={'requestId': '1'}) == (400, 'invalid')
     assert requests.get(f'{gce.endpoint}projects/robots', timeout=5).status_code == 401
+
+
+@pytest.mark.usefixtures('loopback_only')
+@pytest.mark.parametrize('host', [
+    'compute.googleapis.com', 'metadata.google.internal', '169.254.169.254'])
+def test_libraries_in_the_tests_reach_no_other_host(host):
+    with pytest.raises(OSError, match='the tests reach no'):
+        socket.create_connection((host, 443), 1.0)

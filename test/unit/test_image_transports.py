@@ -8,8 +8,9 @@ import pytest
 from fogros2.errors import ConfigurationError
 from fogros2.image_transport.compressed import Compressed
 from fogros2.image_transport.h264 import H264
+from fogros2.image_transport.pointcloud import PointCloud
 from fogros2.image_transport.raw import Raw
-from fogros2.image_transport.republish import Theora
+from fogros2.image_transport.republish import Draco, Theora
 from fogros2.image_transport.topics import identifier, local_topic, remappings, rewrite
 from fogros2.model import Stream, to_json
 
@@ -84,6 +85,33 @@ def test_raw_and_republish() -> None:
     assert words(decoder.arguments) == {
         '__node': 'camera_theora_decoder_on_m', 'in_transport': 'theora', 'out_transport': 'raw',
         'in/theora': '/camera/theora', 'out': '/fogros2/m/camera'}
+
+
+def test_point_clouds_use_their_own_nodes() -> None:
+    stream = Stream('/points', 'pointcloud', target='m', options={
+        'resolution': 1, 'lossless': False, 'max_rate': 5, 'drop_fields': 'ring,time',
+        'max_bytes': 1000})
+    encoder, decoder = PointCloud().encoder(stream), PointCloud().decoder(stream)
+    assert (encoder.package, encoder.executable) == ('point_cloud_stream', 'encoder')
+    assert words(encoder.arguments) == {
+        '__node': 'points_pointcloud_encoder', 'points': '/points',
+        'stream': '"/points/pointcloud"', 'resolution': '1', 'lossless': 'false',
+        'max_rate': '5', 'drop_fields': '"ring,time"'}
+    assert words(decoder.arguments) == {
+        '__node': 'points_pointcloud_decoder_on_m', 'points': '/fogros2/m/points',
+        'stream': '"/points/pointcloud"', 'max_bytes': '1000'}
+    assert remappings([(stream, PointCloud.camera_info)], 'm') == {
+        '/points': '/fogros2/m/points'}
+
+
+def test_point_clouds_by_republish() -> None:
+    stream = Stream('/points', 'draco', target='m', options={'encode_speed': 9})
+    encoder, decoder = Draco().encoder(stream), Draco().decoder(stream)
+    assert (encoder.package, encoder.executable) == ('point_cloud_transport', 'republish')
+    assert words(encoder.arguments)['out/draco'] == '/points/draco'
+    # as the plugin names it: by the remapped topic
+    assert words(encoder.arguments)['points.draco.encode_speed'] == '9'
+    assert words(decoder.arguments)['out'] == '/fogros2/m/points'
 
 
 @pytest.mark.parametrize('stream', [

@@ -8,8 +8,9 @@ import asyncio
 import inspect
 from pathlib import Path
 
-from launch import LaunchContext, LaunchService
-from launch.actions import ExecuteLocal, ExecuteProcess, TimerAction
+from launch import LaunchContext, LaunchDescription, LaunchService
+from launch.actions import ExecuteLocal, ExecuteProcess, RegisterEventHandler, TimerAction
+from launch.event_handlers import OnProcessExit, OnProcessIO, OnProcessStart
 from launch.utilities import AsyncSafeSignalManager
 import pytest
 
@@ -131,3 +132,32 @@ def test_other_packages_use_no_private_parts():
                     for node in ast.walk(ast.parse(path.read_text()))} & parts
             # a class may have private parts of its own
             assert not {name for name in used if f'self.{name}' not in path.read_text()}, path
+
+
+@pytest.mark.parametrize('ends_by', ['INT', 'TERM'])
+def test_a_stay_ends_without_notice(ends_by, tmp_path):
+    """The launch sees neither an exit nor a new start, and still waits for the process."""
+    ignored = "trap '' INT; " if ends_by == 'TERM' else ''
+    action = ExecuteProcess(
+        cmd=['sh', '-c', f'{ignored}echo begun; while :; do sleep 0.05; done'], respawn=True)
+    service = LaunchService(noninteractive=True)
+    context = service.context
+    stay = private.Stay(action, context)
+    start = getattr(action, private.EXECUTE_PROCESS)
+    setattr(action, private.EXECUTE_PROCESS, lambda given: start(stay))
+    seen = []
+
+    async def leave():
+        future = private.completed(action)
+        await stay.leave(0.3, 5.0)
+        assert private.completed(action) is future and not future.done()
+        assert stay.is_shutdown and not context.is_shutdown
+        future.set_result(None)
+
+    service.include_launch_description(LaunchDescription([
+        RegisterEventHandler(OnProcessIO(on_stdout=lambda event: context.asyncio_loop.create_task(
+            leave()) and None)),
+        RegisterEventHandler(OnProcessStart(on_start=lambda event, context: seen.append('start'))),
+        RegisterEventHandler(OnProcessExit(on_exit=lambda event, context: seen.append('exit'))),
+        action]))
+    assert service.run() == 0 and seen == ['start']

@@ -34,7 +34,7 @@ def test_addresses_are_robot_first_then_machines_in_order():
 
 def test_interface_names_are_short_and_unique():
     robot = plan.robot_interface('a1b2c3', NETWORK, 4, '/k', 7)
-    machine = plan.machine_interface('a1b2c3', NETWORK, 250, 4, '/k')
+    machine = plan.machine_interface('a1b2c3', NETWORK, 221, 4, '/k')
     assert robot.name != machine.name
     assert len(machine.name) <= 15
     assert robot.firewall and not machine.firewall
@@ -42,7 +42,7 @@ def test_interface_names_are_short_and_unique():
 
 def test_full_subnet_is_reported():
     with pytest.raises(ConfigurationError, match='no free address'):
-        plan.machine_interface('a1b2c3', NETWORK, 253, 4, '/k')
+        plan.machine_interface('a1b2c3', NETWORK, 222, 4, '/k')
 
 
 ROBOT = Peer('robot', 'R', '198.18.7.1', '198.51.100.9:1')

@@ -14,7 +14,15 @@ cv2 = pytest.importorskip('cv2', reason='OpenCV (the extra "applications") is no
 pytest.importorskip('gtsam', reason='GTSAM (the extra "applications") is not installed')
 pytest.importorskip('evo', reason='evo (the extra "applications") is not installed')
 
-from fogros2_examples.slam import geometry, matching, room, sources, tum  # noqa: E402
+from fogros2_examples.slam import (  # noqa: E402
+    geometry,
+    mapping,
+    matching,
+    room,
+    sources,
+    stored,
+    tum,
+)
 from fogros2_examples.slam.evaluation import accuracy  # noqa: E402
 from fogros2_examples.slam.features import Features  # noqa: E402
 from fogros2_examples.slam.pose import solve  # noqa: E402
@@ -199,3 +207,32 @@ def test_bad_dataset_is_reported_with_its_line(
     with pytest.raises(tum.DatasetError) as caught:
         list(sources.dataset(folder).shots)
     assert said in str(caught.value)
+
+
+def test_saved_map_is_read_again(tmp_path: Path) -> None:
+    """With its links, so that it can still be optimised; a damaged file is refused."""
+    dice = numpy.random.default_rng(21)
+    camera = geometry.Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+    world = mapping.Map(camera)
+    before = None
+    for stamp in (1, 2, 3):
+        features = Features(
+            dice.uniform(0, 400, (50, 2)), dice.integers(0, 4, 50).astype(numpy.int32),
+            dice.integers(0, 256, (50, 32)).astype(numpy.uint8), dice.uniform(1, 3, 50))
+        pose = numpy.eye(4)
+        pose[0, 3] = 0.3 * stamp
+        before = world.add(stamp, pose, features, numpy.zeros(50, bool), before)
+    file = tmp_path / 'maps/map.npz'
+    stored.save(world, file)
+    found = stored.load(camera, file)
+    assert [(k.number, k.stamp, k.links) for k in found.keyframes] == [
+        (k.number, k.stamp, k.links) for k in world.keyframes]
+    for one, two in zip(found.keyframes, world.keyframes):
+        assert (one.points == two.points).all() and (one.own == two.own).all()
+        assert (one.features.descriptors == two.features.descriptors).all()
+    found._optimise()
+    assert numpy.allclose(found.keyframes[2].pose, world.keyframes[2].pose, atol=1e-6)
+    assert [path.name for path in file.parent.iterdir()] == ['map.npz']
+    file.write_bytes(file.read_bytes()[:-200])
+    with pytest.raises(ValueError, match='is no map'):
+        stored.load(camera, file)

@@ -98,7 +98,7 @@ def test_hosts_to_ask_are_addresses(value: object) -> None:
     'endpoint': BAD | st.none() | st.just('203.0.113.9:51820')}), max_size=3) | BAD)
 def test_no_peer_brings_a_word_of_its_own_into_a_script(value: object) -> None:
     try:
-        found = vpn.peers_of(value, NETWORK)
+        found = vpn.peers_of(value, NETWORK, '198.18.7.1')
     except vpn.Refused:
         return
     for peer in found:
@@ -132,12 +132,13 @@ def test_a_request_is_whole_or_refused(verb: str, data: bytes) -> None:
     ([{}] * 254, 'up to 253')])
 def test_peers_that_are_refused(value: object, why: str) -> None:
     with pytest.raises(vpn.Refused, match=why):
-        vpn.peers_of(value, NETWORK)
+        vpn.peers_of(value, NETWORK, '198.18.7.1')
 
 
 @pytest.mark.parametrize('value', ['203.0.113.9:1', 'vpn.example.org:65535', '[2001:db8::1]:9'])
 def test_endpoints_as_providers_give_them(value: str) -> None:
-    (peer,) = vpn.peers_of([{'key': KEY, 'address': '198.18.7.2', 'endpoint': value}], NETWORK)
+    entry = {'key': KEY, 'address': '198.18.7.2', 'endpoint': value}
+    (peer,) = vpn.peers_of([entry], NETWORK, '198.18.7.1')
     assert peer == Peer('machine', KEY, '198.18.7.2', value)
 
 
@@ -205,16 +206,27 @@ def test_what_is_asked_of_it_is_what_it_takes() -> None:
         request = vpn.parse(verb, command.input)
         if verb == 'up':
             record = vpn.Record('fog0a1b2c', 1000, 1, 1, vpn.network_of(
-                request['network'], vpn.pools()), request['port'], request['domain'],
+                request['network'], vpn.pools()), vpn.own_address(
+                    request['address'], NETWORK), request['port'], request['domain'],
                 vpn.ports_of(request['ports']), vpn.asked_of(request['asked']))
             assert record.interface() == made
             assert record.vpn().ports == plugin.ports
             assert record.vpn().asked == plugin.asked
         if 'peers' in request:
             assert [(p.public_key, p.address, p.endpoint) for p in vpn.peers_of(
-                request['peers'], NETWORK)] == [
+                request['peers'], NETWORK, '198.18.7.1')] == [
                     (p.public_key, p.address, p.endpoint) for p in PEERS[:len(request['peers'])]]
     assert not plugin.health_check(made).sudo
+    lent = helped.lend(made, KEY)
+    assert lent.argv == (helped.HELPER, 'keys') and vpn.parse('keys', lent.input) == {
+        'name': 'fog0a1b2c', 'pid': 0, 'private': KEY}
+
+
+@pytest.mark.parametrize('value', ['198.18.8.2', '198.18.7.0', '198.18.7.255', 7, None, 'a'])
+def test_own_address_is_one_of_the_network(value: object) -> None:
+    assert vpn.own_address('198.18.7.224', NETWORK) == '198.18.7.224'
+    with pytest.raises(vpn.Refused, match='one of 198'):
+        vpn.own_address(value, NETWORK)
 
 
 def test_all_other_interfaces_are_root_s_commands() -> None:
@@ -229,7 +241,7 @@ def test_all_other_interfaces_are_root_s_commands() -> None:
 
 
 @pytest.mark.parametrize(('answer', 'expected'), [
-    (Result(0, '2\n', ''), True), (Result(0, '1\n', ''), False),
+    (Result(0, '3\n', ''), True), (Result(0, '2\n', ''), False),
     (Result(1, '', 'sudo: a password is required'), False)])
 def test_it_is_used_where_it_is_permitted(
     monkeypatch: pytest.MonkeyPatch, answer: Result, expected: bool,

@@ -27,5 +27,6 @@ def _expose(name: str) -> None:
     expose_action(name)(parse)
 
 
-for _name in ('fog_machine', 'cloud_node', 'cloud_group', 'stream_topic', 'fogros_launch'):
+for _name in ('fog_machine', 'cloud_node', 'cloud_group', 'replicated', 'stream_topic',
+              'fogros_launch'):
     _expose(_name)

@@ -20,6 +20,7 @@ from fogros2.actions.frontend.entity import (
     value,
 )
 from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, Node
+from fogros2.actions.replicated import Replicated
 from fogros2.describe import keywords, kinds, values
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.host.containers import described
@@ -97,7 +98,8 @@ def node(entity: Entity, parser: Parser, cls: type[Node]) -> Parsed:
     _, kwargs = cls.parse(entity, parser)
     kwargs['machine'] = _machine(entity, parser)
     known = {'image': kinds.Keyword('image', 'text'),
-             'image_options': kinds.Keyword('image_options', 'list')}
+             'image_options': kinds.Keyword('image_options', 'list'),
+             'checkpoint': kinds.Keyword('checkpoint', 'text')}
     given = {name: value(entity, parser, keyword) for name, keyword in known.items()}
     kwargs.update({name: values.items(content) if name == 'image_options' else content
                    for name, content in given.items() if content is not None})
@@ -126,6 +128,22 @@ def cloud_group(entity: Entity, parser: Parser) -> Parsed:
     kwargs['actions'], kwargs['stream_topics'] = instead_of(kwargs['actions'])
     complete(entity, ('machine', 'stream_topic', *_GROUP, *CONDITIONS))
     return CloudGroup, kwargs
+
+
+def replicated(entity: Entity, parser: Parser) -> Parsed:
+    """Read ``<replicated machines="a, b" services="/plan" topics="/in:/out">``."""
+    _, kwargs = Action.parse(entity, parser)
+    known: dict[str, kinds.Kind] = {
+        'machines': 'list', 'services': 'list', 'topics': 'list', 'hedge_after': 'scalar'}
+    for name, kind in known.items():
+        content = value(entity, parser, kinds.Keyword(name, kind))
+        if content is not None:
+            kwargs[name] = content
+    kwargs.setdefault('machines', [])
+    kwargs['actions'], kwargs['stream_topics'] = instead_of(
+        parser.parse_action(child) for child in entity.children)
+    complete(entity, (*known, 'stream_topic', *CONDITIONS))
+    return Replicated, kwargs
 
 
 def _machine(entity: Entity, parser: Parser) -> Any:

@@ -64,6 +64,7 @@ class Watch(Step):
 
     A machine that exists but is out of reach is not gone. It is lost if neither it nor its
     provider answers for ``LOSS`` seconds; a computer that FogROS2 does not own has no provider.
+    A machine that will be replaced is lost after its ``on_loss_after``.
     An unknown exception is a defect of FogROS2 or of a plugin: it ends the watch and is reported
     at once, and ``close`` raises it, so that the nodes continue until then.
 
@@ -82,6 +83,9 @@ class Watch(Step):
         self._found = found
         self._lost = lost
         self._silent = False
+        #: Silence of a machine that will be replaced, even if its provider says that it runs.
+        self._limit = (job.spec.on_loss_after or job.spec.robot_timeout) \
+            if job.spec.on_interrupt == 'replace' else None
         self._closed = threading.Event()
         self._ending = threading.Lock()
         self._fault: Optional[BaseException] = None
@@ -121,7 +125,10 @@ class Watch(Step):
         if (age > SILENCE) != self._silent:
             self._silent = not self._silent
             self._context.report(Silence(self._job.name, age if self._silent else 0.0))
-        if min(age, time.monotonic() - self._word_at) > LOSS:
+        if self._limit is not None:
+            if age > self._limit:
+                self._end(self._lost, f'it is lost: no answer for {age:.0f} s')
+        elif min(age, time.monotonic() - self._word_at) > LOSS:
             self._end(self._lost, f'it is lost: no answer for {age:.0f} s, and no word of its '
                       'provider')
 

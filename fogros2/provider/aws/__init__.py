@@ -4,7 +4,7 @@ EC2 instances, by boto3.
 
 In reading order: ``options``, ``regions``, ``spot`` (the preemption notice), ``failures`` (AWS's
 refusals), ``retry`` and ``clients`` (calls), ``instances``, ``network``, ``ending``,
-``images``, ``prices``, ``cloud`` (the adapter).
+``prices``, ``images``, ``cloud`` (the adapter).
 """
 
 from __future__ import annotations

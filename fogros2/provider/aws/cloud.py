@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import threading
 import time
@@ -17,6 +17,7 @@ from fogros2.provider.aws.failures import AwsError
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import Ec2Prices
 from fogros2.provider.aws.regions import api_host, REGIONS
+from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import Order, own_name, Place, Vm, VmId
 from fogros2.provider.vm.options import VmOptions
 from fogros2.provider.vm.regions import Regions
@@ -46,7 +47,6 @@ class Ec2(Ec2Prices):
         return other
 
     def until(self, cancel: Optional[threading.Event]) -> Ec2:
-        """Return an adapter whose calls raise Cancelled once ``cancel`` is set."""
         return self if cancel is None else self._with(self._account.until(cancel))
 
     def lasting(self) -> Ec2:
@@ -54,13 +54,11 @@ class Ec2(Ec2Prices):
         return self._with(self._account.apart())
 
     def hasty(self) -> Ec2:
-        """Return an adapter with short time-outs."""
         return self._with(self._account.hasty())
 
     # -- the account ----------------------------------------------------------------------------
 
     def check_credentials(self) -> None:
-        """Check that there are credentials."""
         self._account.check_credentials()
 
     def whoami(self, region: str) -> str:
@@ -80,15 +78,12 @@ class Ec2(Ec2Prices):
             'asking for the regions of the account')
         return sorted(str(entry['RegionName']) for entry in answer['Regions'])
 
-    def architecture(self, region: str, types: Sequence[str]) -> str:
-        """Return the architecture of types; one request."""
-        found = {kind.arch for kind in images.kinds(self._account, region, list(types))}
-        return found.pop() if len(found) == 1 else ''
+    def named_types(self, region: str, names: Sequence[str]) -> list[MachineType]:
+        return images.kinds(self._account, region, list(names))
 
     # -- machines -------------------------------------------------------------------------------
 
     def find(self, region: str, tags: Mapping[str, str]) -> list[Vm]:
-        """Return the instances with all of ``tags``."""
         found = instances.instances_in(self._account.pages(
             'ec2', region, 'describe_instances', 'Reservations', 'looking for machines',
             Filters=[*instances.tag_filters(tags),
@@ -119,7 +114,7 @@ class Ec2(Ec2Prices):
         found: dict[tuple[str, bool], Mapping[str, Any]] = {}
         chosen: dict[str, Any] = {}
         for kind in images.kinds(self._account, region, list(types)):
-            key = (kind.arch, kind.nvidia)
+            key = (kind.arch, images.has_nvidia(kind))
             if key not in found:
                 found[key] = images.choose(self._account, region, kind, order.options,
                                            order.request.dependencies)
@@ -171,7 +166,6 @@ class Ec2(Ec2Prices):
         self, place: Place, order: Order, prepared: Any, created: Sequence[str],
         tags: Mapping[str, str],
     ) -> str:
-        """Request an instance."""
         words = instances.run_request(place, order, prepared, created[0], tags)
         answer = self._account.call(
             'ec2', place.region, 'run_instances',
@@ -181,42 +175,36 @@ class Ec2(Ec2Prices):
         return vm
 
     def delete(self, machine: VmId) -> None:
-        """Terminate an instance, and delete what belongs to it."""
         ending.destroy(self._account, machine)
 
     def end_attempt(self, region: str, attempt: str) -> None:
-        """Terminate the instances of an attempt."""
         ending.end_instances(self._account, region, attempt)
 
     def sweep(self, region: str, attempt: str) -> None:
-        """Delete what belongs to an attempt besides its instance."""
         ending.sweep(self._account, region, attempt)
 
-    def leftovers(self, region: str, now: float, dead: Collection[str]) -> Mapping[str, str]:
-        """Return attempts of which only a group or a key is left."""
-        return ending.leftovers(self._account, region, now, dead)
+    def remains(self, region: str) -> list[dict[str, str]]:
+        return ending.remains(self._account, region)
+
+    def attempts(self, region: str) -> list[str]:
+        return ending.attempts(self._account, region)
 
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
-        """Change the rules of the machine's security group."""
         network.allow(self._account, machine.region, machine.attempt, port, sources)
 
     def set_tags(self, machine: VmId, tags: Mapping[str, str]) -> None:
-        """Add tags to an instance, or replace them."""
         self._call(machine, 'create_tags', f'writing tags of {machine.vm}',
                    Resources=[machine.vm], Tags=instances.tag_list(tags))
 
     def set_ending(self, machine: VmId, spec: MachineSpec) -> None:
-        """Change whether the instance stops or ends when it shuts itself down."""
         self._call(machine, 'modify_instance_attribute', f'saying how {machine.vm} ends',
                    InstanceId=machine.vm, Attribute='instanceInitiatedShutdownBehavior',
                    Value=instances.at_shutdown(spec))
 
     def stop(self, machine: VmId) -> None:
-        """Stop an instance."""
         self._call(machine, 'stop_instances', f'stopping {machine.vm}', InstanceIds=[machine.vm])
 
     def start(self, machine: VmId) -> None:
-        """Start an instance."""
         self._call(machine, 'start_instances', f'starting {machine.vm}',
                    InstanceIds=[machine.vm])
 
@@ -226,14 +214,12 @@ class Ec2(Ec2Prices):
     # -- images ---------------------------------------------------------------------------------
 
     def bake(self, machine: VmId, name: str, dependencies: str) -> str:
-        """Make an AMI of an instance."""
         vm = self.get(machine.region, machine.vm)
         if vm is None:
             raise MachineNotFound(f'EC2 does not know {machine.vm} yet', 'try again')
         return images.bake(self._account, vm, name, dependencies)
 
     def images(self, region: str) -> Iterable[Image]:
-        """Return the AMIs of FogROS2."""
         return images.images_in(self._account, region)
 
     def delete_image(self, image_id: str) -> None:

@@ -6,18 +6,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Optional
 
-from fogros2.provider import TAG_NAME, TAG_ROBOT
 from fogros2.provider.aws import instances, network
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.failures import AwsError
-from fogros2.provider.vm.cloud import own_name, TAG_ATTEMPT, TAG_MADE, VmId
-from fogros2.store import is_another_robot
+from fogros2.provider.vm.cloud import own_name, TAG_ATTEMPT, VmId
 from fogros2.waiting import wait_until
 
 #: Time-out in seconds for the end of an instance; usually it takes half a minute.
 TIMEOUT = 300.0
-#: Seconds after which a group without an instance is a leftover.
-SETTLED = 900.0
 
 
 def destroy(account: Account, machine: VmId) -> None:
@@ -136,29 +132,24 @@ def end_instances(account: Account, region: str, attempt: str) -> None:
                       InstanceIds=[instance['InstanceId'] for instance in found])
 
 
-def leftovers(
-    account: Account, region: str, now: float, dead: Collection[str],
-) -> dict[str, str]:
+def remains(account: Account, region: str) -> list[dict[str, str]]:
     """
-    Return this robot's attempts of which only a group or a key is left, with the machine's name.
+    Return the tags of groups and keys.
 
     The end of a machine deletes its disk and address, but not these; see ``VmCloud.leftovers``.
     """
-    ours = [{'Name': 'tag-key', 'Values': [TAG_ATTEMPT]}]
     entries = [
         *account.pages('ec2', region, 'describe_security_groups', 'SecurityGroups',
-                       'looking for what is left', Filters=ours),
+                       'looking for what is left', Filters=instances.tag_filters({})),
         *account.call('ec2', region, 'describe_key_pairs', 'looking for what is left',
-                      Filters=ours)['KeyPairs']]
-    tags = [instances.tags_of(entry) for entry in entries]
-    # another robot's clock may differ, and its machine may be about to be created
-    left = {t[TAG_ATTEMPT]: t.get(TAG_NAME, '?') for t in tags
-            if not is_another_robot(t.get(TAG_ROBOT, ''))
-            and (t[TAG_ATTEMPT] in dead or now - float(t.get(TAG_MADE, 0)) > SETTLED)}
-    if left:
-        for instance in instances.instances_in(account.pages(
-                'ec2', region, 'describe_instances', 'Reservations', 'looking for machines',
-                Filters=[*ours, {'Name': 'instance-state-name',
-                                 'Values': [*instances.ALIVE, 'shutting-down']}])):
-            left.pop(instances.tags_of(instance)[TAG_ATTEMPT], None)
-    return left
+                      Filters=instances.tag_filters({}))['KeyPairs']]
+    return [instances.tags_of(entry) for entry in entries]
+
+
+def attempts(account: Account, region: str) -> list[str]:
+    """Return the attempts with an instance that EC2 has not terminated yet."""
+    return [instances.tags_of(found)[TAG_ATTEMPT] for found in instances.instances_in(
+        account.pages('ec2', region, 'describe_instances', 'Reservations', 'looking for machines',
+                      Filters=[*instances.tag_filters({}), {
+                          'Name': 'instance-state-name',
+                          'Values': [*instances.ALIVE, 'shutting-down']}]))]

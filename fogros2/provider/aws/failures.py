@@ -8,14 +8,14 @@ common errors of all AWS services.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 import contextlib
 import json
 import re
-from typing import Any, NamedTuple, Optional
+from typing import Any, ClassVar, Optional
 
 from fogros2.errors import FogError, PrerequisiteError, ProviderError
-from fogros2.provider.vm.cloud import CloudError
+from fogros2.provider.vm.failures import CodedError, Failure, LENGTH
 
 #: No capacity in this zone; another zone may have some.
 NO_ROOM_IN_ZONE = frozenset({
@@ -36,14 +36,6 @@ GONE = frozenset({
     'InvalidAMIID.Malformed', 'InvalidAMIID.Unavailable', 'InvalidSnapshot.NotFound',
     'InvalidVolume.NotFound', 'InvalidAllocationID.NotFound',
 })
-
-
-class Failure(NamedTuple):
-    """The meaning of a code: a reason ('' keeps AWS's own), a remedy, the kind of error."""
-
-    reason: str
-    hint: str
-    kind: type[FogError] = ProviderError
 
 
 _LOG_IN = 'aws sso login, or new keys: aws configure'
@@ -134,19 +126,15 @@ _ACTION = re.compile(r'not authorized to perform:? ([A-Za-z0-9-]+:[A-Za-z0-9*]+)
 _ENCODED = re.compile(r'[Ee]ncoded authorization failure message: *([\w-]+)')
 
 
-#: Maximum length of AWS's own text in a message.
-_LENGTH = 300
-
-
-class AwsError(CloudError):
+class AwsError(CodedError):
     """AWS refused; ``code`` is its error code."""
 
-    def __init__(self, message: str, hint: str = '', *, code: str = '') -> None:
-        super().__init__(
-            message, hint, gone=code in GONE, denied=code in DENIED,
-            full='zone' if code in NO_ROOM_IN_ZONE else
-            'region' if code in NO_ROOM_IN_REGION else '')
-        self.code = code
+    TITLE: ClassVar[str] = 'AWS'
+    FAILURES: ClassVar[Mapping[str, Failure]] = _FAILURES
+    NO_ROOM_IN_ZONE: ClassVar[Collection[str]] = NO_ROOM_IN_ZONE
+    NO_ROOM_IN_REGION: ClassVar[Collection[str]] = NO_ROOM_IN_REGION
+    GONE: ClassVar[Collection[str]] = GONE
+    DENIED: ClassVar[Collection[str]] = DENIED
 
 
 @contextlib.contextmanager
@@ -181,36 +169,18 @@ def refused(
     decode: Optional[Callable[[str], str]] = None,
 ) -> FogError:
     """Return the error for a refusal; ``response`` as botocore has it."""
-    error = _refusal(response, operation, what, region, decode)
-    code = str((response.get('Error') or {}).get('Code', ''))
-    status = (response.get('ResponseMetadata') or {}).get('HTTPStatusCode', 400)
-    # after a fault of AWS, the request may have had its effect
-    error.refused = status < 500 or code in NO_ROOM
-    return error
-
-
-def _refusal(
-    response: Any, operation: str, what: str, region: str,
-    decode: Optional[Callable[[str], str]],
-) -> FogError:
     details = response.get('Error') or {}
-    code = str(details.get('Code', ''))
-    said = _plain(str(details.get('Message', '')))
+    code, said = str(details.get('Code', '')), _plain(str(details.get('Message', '')))
+    status = (response.get('ResponseMetadata') or {}).get('HTTPStatusCode', 400)
     where = f'{what} in {region}' if region else what
     if code in DENIED:
         action = denied_action(said, operation, decode)
         return AwsError(f'{where} failed: the policy of these credentials does not allow {action}',
                         f'add {action} to it: doc/aws.md has the whole policy', code=code)
-    known = _FAILURES.get(code) or Failure('', '')
-    reason = known.reason or said or code or 'AWS gave no reason'
-    if known.reason and said and code.startswith('Invalid'):
-        reason += f' ({said[:160].rstrip(".")})'
-    message = f'{where} failed: {reason}'
-    if code and code not in message:
-        message += f' [{code}]'
-    if known.kind is not ProviderError:
-        return known.kind(message, known.hint)
-    return AwsError(message, known.hint, code=code)
+    error = AwsError.of(code, said, where, status)
+    if code.startswith('Invalid') and said and _FAILURES.get(code, Failure('', '')).reason:
+        error.args = (f'{error.args[0]} ({said[:160].rstrip(".")})',)
+    return error
 
 
 def _plain(text: str) -> str:
@@ -219,7 +189,7 @@ def _plain(text: str) -> str:
         text = re.sub(r'<[^>]*>', ' ', text)
     words = ' '.join(text.split())
     # an encoded message must stay complete
-    return words if _ENCODED.search(words) or len(words) <= _LENGTH else f'{words[:_LENGTH]}...'
+    return words if _ENCODED.search(words) or len(words) <= LENGTH else f'{words[:LENGTH]}...'
 
 
 def denied_action(

@@ -4,10 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-import datetime
 import re
 import time
-from typing import Any, NamedTuple, Optional
+from typing import Any, Optional
 
 from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
 from fogros2.model import Image
@@ -16,10 +15,10 @@ from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.failures import AwsError
 from fogros2.provider.aws.instances import tag_list, tags_of
 from fogros2.provider.aws.options import Options
-from fogros2.provider.vm.cloud import TAG_USER, Vm
+from fogros2.provider.aws.prices import instance_type
+from fogros2.provider.offers import MachineType
+from fogros2.provider.vm.cloud import TAG_BAKED, TAG_USER, Vm, when
 
-#: Tag of images and their snapshots with the name of the image.
-TAG_BAKED = 'fogros2-baked'
 #: Public parameters of AWS's parameter store, by architecture; ROS 2 Jazzy is for Ubuntu 24.04.
 UBUNTU = {
     'x86_64': '/aws/service/canonical/ubuntu/server/24.04/stable/current/amd64/hvm/ebs-gp3/ami-id',
@@ -38,15 +37,7 @@ _STATES = {'invalid': 'failed', 'error': 'failed', 'transient': 'pending'}
 _ID = re.compile(r'aws:([a-z0-9-]+)/(ami-[0-9a-f]+)')
 
 
-class Kind(NamedTuple):
-    """The properties of an instance type that decide its image."""
-
-    name: str
-    arch: str
-    nvidia: bool
-
-
-def kinds(account: Account, region: str, names: list[str]) -> list[Kind]:
+def kinds(account: Account, region: str, names: list[str]) -> list[MachineType]:
     """
     Return the instance types that a region has, in the order of ``names``.
 
@@ -67,27 +58,28 @@ def kinds(account: Account, region: str, names: list[str]) -> list[Kind]:
             if some:
                 return some
         raise ConfigurationError(str(error.args[0]), error.hint) from error
-    return [_kind(found[name]) for name in names if name in found]
+    types = [instance_type(found[name]) for name in names if name in found]
+    fitting = [kind for kind in types if kind is not None]
+    if not fitting:
+        raise ConfigurationError(f'machines of the type {" or ".join(names)} run no Ubuntu',
+                                 'take one with an x86_64 or arm64 processor')
+    return fitting
 
 
-def _kinds_if_any(account: Account, region: str, name: str) -> list[Kind]:
+def _kinds_if_any(account: Account, region: str, name: str) -> list[MachineType]:
     try:
         return kinds(account, region, [name])
     except ConfigurationError:
         return []
 
 
-def _kind(entry: Mapping[str, Any]) -> Kind:
-    arches = entry['ProcessorInfo'].get('SupportedArchitectures') or ()
-    return Kind(
-        str(entry['InstanceType']),
-        next((arch for arch in ('x86_64', 'arm64') if arch in arches), ''),
-        any(str(gpu.get('Manufacturer', '')).upper() == 'NVIDIA'
-            for gpu in entry.get('GpuInfo', {}).get('Gpus') or ()))
+def has_nvidia(kind: MachineType) -> bool:
+    """Return whether a type has a GPU that takes NVIDIA's driver."""
+    return kind.gpu.upper().startswith('NVIDIA')
 
 
 def choose(
-    account: Account, region: str, kind: Kind, options: Options, dependencies: str,
+    account: Account, region: str, kind: MachineType, options: Options, dependencies: str,
 ) -> Mapping[str, Any]:
     """
     Return the image (an entry of DescribeImages) that a machine starts from.
@@ -95,25 +87,23 @@ def choose(
     :param dependencies: hash of the launch; an image that was baked with the same is preferred.
     :raises ConfigurationError: the image does not exist, or is for another processor.
     """
-    if kind.arch not in UBUNTU:
-        raise ConfigurationError(f'machines of the type {kind.name} run no Ubuntu',
-                                 'take one with an x86_64 or arm64 processor')
     if options.ami_image:
         return _named(account, region, kind, options.ami_image)
     baked = _baked(account, region, kind, options, dependencies) if dependencies else None
     if baked is not None:
         return baked
-    parameter = (DEEP_LEARNING if kind.nvidia else UBUNTU)[kind.arch]
+    nvidia = has_nvidia(kind)
+    parameter = (DEEP_LEARNING if nvidia else UBUNTU)[kind.arch]
     identity = account.call('ssm', region, 'get_parameter', f'asking for the image {parameter}',
                             Name=parameter)['Parameter']['Value']
-    if not kind.nvidia:
+    if not nvidia:
         # the other properties are known
         return {'ImageId': str(identity), 'RootDeviceName': ROOT_DEVICE,
                 'Architecture': kind.arch}
     return _named(account, region, kind, str(identity))
 
 
-def _named(account: Account, region: str, kind: Kind, identity: str) -> Mapping[str, Any]:
+def _named(account: Account, region: str, kind: MachineType, identity: str) -> Mapping[str, Any]:
     try:
         found = account.call('ec2', region, 'describe_images', f'looking for the image {identity}',
                              ImageIds=[identity])['Images']
@@ -136,7 +126,7 @@ def _named(account: Account, region: str, kind: Kind, identity: str) -> Mapping[
 
 
 def _baked(
-    account: Account, region: str, kind: Kind, options: Options, dependencies: str,
+    account: Account, region: str, kind: MachineType, options: Options, dependencies: str,
 ) -> Optional[Mapping[str, Any]]:
     """Return the newest image of FogROS2 with the same dependencies, or None."""
     found = account.call(
@@ -182,17 +172,9 @@ def images_in(account: Account, region: str) -> Iterator[Image]:
         state = str(entry.get('State', ''))
         yield Image(
             f'aws:{region}/{entry["ImageId"]}', tags.get(TAG_BAKED, ''), 'aws', region,
-            created=_when(entry.get('CreationDate')), size_gb=sum(sizes) or None,
+            created=when(entry.get('CreationDate')), size_gb=sum(sizes) or None,
             state=_STATES.get(state, state), dependencies=tags.get(TAG_DEPENDENCIES, ''),
             tags=tags)
-
-
-def _when(text: Optional[str]) -> Optional[float]:
-    """Return EC2's ISO 8601 time as seconds since the epoch."""
-    try:
-        return datetime.datetime.fromisoformat(str(text).replace('Z', '+00:00')).timestamp()
-    except ValueError:
-        return None
 
 
 def delete(account: Account, image_id: str) -> None:

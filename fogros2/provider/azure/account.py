@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests to Azure Resource Manager: credentials, retries, long-running operations, pages."""
+"""Requests to Azure Resource Manager: credentials, long-running operations, pages."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-import copy
 import json
 import os
 from pathlib import Path
 import threading
-import time
-from typing import Any, Optional
+from typing import Any, ClassVar, Optional
 
-from fogros2.errors import Cancelled, PrerequisiteError, ProviderError
+from fogros2.errors import FogError, PrerequisiteError, ProviderError
 from fogros2.provider.azure.failures import AzureError, refusal
-from fogros2.waiting import cancellable, wait_until
+from fogros2.provider.vm.failures import one_line
+from fogros2.provider.vm.rest import Answer, RestAccount
+from fogros2.waiting import wait_until
 
 #: Names another endpoint than the public cloud's, such as a sovereign cloud's.
 ENDPOINT_VARIABLE, ENDPOINT = 'FOGROS2_AZURE_ENDPOINT', 'https://management.azure.com'
@@ -26,8 +26,6 @@ VERSIONS = {
     'Microsoft.Compute/snapshots': '2024-03-02', 'Microsoft.Compute/galleries': '2024-03-03',
     'Microsoft.Compute': '2024-07-01', 'Microsoft.Network': '2024-05-01',
     '': '2022-09-01'}
-#: Attempts of a request that Azure throttles, or that fails at Azure.
-ATTEMPTS = 6
 #: Seconds for an operation; the deletion of a group takes a minute or two.
 OPERATION = 900.0
 
@@ -66,28 +64,20 @@ def subscription() -> str:
     return named
 
 
-class Account:
+class Account(RestAccount):
     """
-    The user's account, as azure-identity finds it; thread-safe.
+    The user's account, as azure-identity finds it.
 
     :param credential: an azure-identity credential; None for the usual chain, made when needed.
     """
 
+    TITLE: ClassVar[str] = 'Azure'
+    ENDPOINT_VARIABLE: ClassVar[str] = ENDPOINT_VARIABLE
+
     def __init__(self, credential: Optional[Any] = None) -> None:
+        super().__init__()
         self._credential = credential
         self._lock = threading.Lock()
-        self._session: Any = None
-        #: Set when the launch ends; calls then raise Cancelled.
-        self.cancel: Optional[threading.Event] = None
-        self._hasty = False
-        #: What was asked once for this process, such as the sizes of a region.
-        self.known: dict[str, Any] = {}
-
-    def having(self, cancel: Optional[threading.Event], *, hasty: bool = False) -> Account:
-        """Return this account with calls that raise Cancelled once ``cancel`` is set."""
-        other = copy.copy(self)
-        other.cancel, other._hasty = cancel, hasty
-        return other
 
     def credential(self) -> Any:
         """
@@ -124,10 +114,11 @@ class Account:
         :raises FogError: see :func:`~fogros2.provider.azure.failures.refusal`.
         """
         version = next(word for key, word in VERSIONS.items() if key.lower() in path.lower())
-        status, headers, answer = self._ask(
+        _, headers, answer = self._below(
             method, endpoint() + path, what, body, {'api-version': version, **(query or {})})
         there = headers.get('Azure-AsyncOperation') or headers.get('Location')
-        if not wait or status not in (201, 202) or not there or _state(answer) == 'Succeeded':
+        # a change of a resource is answered with 200 and takes an operation, too
+        if not wait or not there or _state(answer) == 'Succeeded':
             return answer
 
         def look() -> Any:
@@ -149,7 +140,7 @@ class Account:
             yield from answer['value']
             if not answer.get('nextLink'):
                 return
-            answer = self._ask('GET', answer['nextLink'], what, None, {})[2]
+            answer = self._below('GET', answer['nextLink'], what).body
 
     def public(self, url: str, what: str, query: Mapping[str, str]) -> Iterator[Mapping[str, Any]]:
         """Yield the entries of a public list of Azure's, which takes no credentials."""
@@ -178,62 +169,27 @@ class Account:
 
     def _over(self, there: str, what: str) -> bool:
         """Return whether an operation has succeeded; raise its error."""
-        status, _, answer = self._ask('GET', there, what, None, {})
+        status, _, answer = self._below('GET', there, what)
         state = str((answer or {}).get('status', '')).lower()
         if state in ('failed', 'canceled'):
             raise refusal(400, answer, what)
         return status != 202 and state in ('', 'succeeded')
 
-    def _ask(
-        self, method: str, url: str, what: str, body: Optional[Mapping[str, Any]],
-        query: Mapping[str, str],
-    ) -> tuple[int, Mapping[str, str], Any]:
+    def _below(
+        self, method: str, url: str, what: str, body: Optional[Mapping[str, Any]] = None,
+        query: Optional[Mapping[str, str]] = None,
+    ) -> Answer:
+        """Make a request below the endpoint, which alone gets the token."""
         if not url.startswith(f'{endpoint()}/'):
             raise ProviderError(f'{what} failed: Azure named another server, {url[:100]}')
-        # a request that creates something gets time for its answer
-        grace = 0.0 if method == 'GET' else 4.0
-        return cancellable(lambda: self._send(method, url, what, body, query), self.cancel,
-                           what=what, grace=lambda: grace)
+        return self.ask(method, url, what, body, query=query, repeatable=method != 'POST')
 
-    def _send(
-        self, method: str, url: str, what: str, body: Optional[Mapping[str, Any]],
-        query: Mapping[str, str],
-    ) -> tuple[int, Mapping[str, str], Any]:
-        import requests
+    def refusal(self, status: int, body: Any, what: str) -> FogError:
+        """Return the error for a refusal."""
+        return refusal(status, body, what)
 
-        with self._lock:
-            if self._session is None:
-                self._session = requests.Session()
-                for scheme in ('https://', 'http://'):
-                    self._session.mount(scheme, requests.adapters.HTTPAdapter(pool_maxsize=20))
-        attempts = 2 if self._hasty else ATTEMPTS
-        for attempt in range(1, attempts + 1):
-            head = {'Authorization': f'Bearer {self._token(what)}'}
-            if self.cancel is not None and self.cancel.is_set():
-                raise Cancelled(what)  # nobody waits for this thread
-            try:
-                found = self._session.request(
-                    method, url, params=query, json=body, headers=head, allow_redirects=False,
-                    timeout=5.0 if self._hasty else 30.0)
-            except requests.RequestException as error:
-                if attempt < 2 and method != 'POST':
-                    continue
-                raise PrerequisiteError(
-                    f'{what} failed: Azure does not answer: {_line(error)}',
-                    'is there a way to the Internet (a proxy, FOGROS2_AZURE_ENDPOINT)?') from error
-            if found.status_code != 429 and found.status_code < 500 or attempt == attempts:
-                break
-            pause = found.headers.get('Retry-After', '')
-            time.sleep(min(float(pause) if pause.isdigit() else 0.5 * 2 ** attempt, 20.0))
-        try:
-            answer = found.json() if found.content else None
-        except ValueError:
-            answer = None
-        if found.status_code >= 300:
-            raise refusal(found.status_code, answer, what)
-        return found.status_code, found.headers, answer
-
-    def _token(self, what: str) -> str:
+    def token(self, what: str) -> str:
+        """Return a token, which the library keeps as long as it is valid."""
         from azure.core.exceptions import AzureError as LibraryError
         from azure.core.exceptions import ClientAuthenticationError
 
@@ -242,16 +198,12 @@ class Account:
             return str(credential.get_token(f'{endpoint()}/.default').token)
         except ClientAuthenticationError as error:
             raise PrerequisiteError(
-                f'{what} failed: there are no credentials for Azure: {_line(error)}',
+                f'{what} failed: there are no credentials for Azure: {one_line(error)}',
                 'az login, or set AZURE_TENANT_ID, AZURE_CLIENT_ID and AZURE_CLIENT_SECRET',
             ) from error
         except LibraryError as error:
-            raise PrerequisiteError(f'{what} failed: Azure gives no token: {_line(error)}',
+            raise PrerequisiteError(f'{what} failed: Azure gives no token: {one_line(error)}',
                                     'is there a way to the Internet (a proxy)?') from error
-
-
-def _line(error: BaseException) -> str:
-    return ' '.join(str(error).split())[:200]
 
 
 def _state(answer: Any) -> str:

@@ -15,19 +15,19 @@ import contextlib
 import dataclasses
 from decimal import Decimal
 import os
-import threading
 import time
 from typing import Any, ClassVar, Optional
 
 from fogros2.errors import ConfigurationError, FogError, MachineNotFound, ProviderError
 from fogros2.model import Image, MachineSpec, MachineState
-from fogros2.provider import TAG_EXPIRES, TAG_NAME, TAG_ROBOT
+from fogros2.provider import TAG_EXPIRES
 from fogros2.provider.azure import ending, images, machines, prices
 from fogros2.provider.azure.account import Account, subscription
 from fogros2.provider.azure.failures import AzureError, refusal
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
 from fogros2.provider.azure.regions import api_host, REGIONS
+from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import (
     Order,
     own_name,
@@ -39,9 +39,9 @@ from fogros2.provider.vm.cloud import (
     Vm,
     VmId,
 )
-from fogros2.provider.vm.options import VmOptions
+from fogros2.provider.vm.options import ipv4, SSH, VmOptions
 from fogros2.provider.vm.regions import Regions
-from fogros2.store import is_another_robot
+from fogros2.provider.vm.rest import RestCloud
 from fogros2.waiting import wait_until
 
 _VMS = 'providers/Microsoft.Compute/virtualMachines'
@@ -50,13 +50,11 @@ _NET = 'providers/Microsoft.Network'
 OLD_REGION = 'eastus'
 #: Seconds in which Azure finds room for a machine, or says that there is none.
 ALLOCATION = 300.0
-#: Seconds after which a group without a machine is a leftover.
-SETTLED = 900.0
 #: One for all providers of this process, so that its sizes are asked for once.
 _USUAL = Account()
 
 
-class Azure(prices.AzurePrices):
+class Azure(prices.AzurePrices, RestCloud):
     """
     Virtual machines of Azure.
 
@@ -76,18 +74,6 @@ class Azure(prices.AzurePrices):
         #: Notes about machines that this process has created, for people.
         self._notes: dict[str, str] = {}
 
-    def until(self, cancel: Optional[threading.Event]) -> Azure:
-        """Return an adapter whose calls raise Cancelled once ``cancel`` is set."""
-        other = super().until(cancel)
-        other._account = self._account.having(cancel)
-        return other
-
-    def hasty(self) -> Azure:
-        """Return an adapter with short time-outs."""
-        other = super().until(self.cancel)
-        other._account = self._account.having(self.cancel, hasty=True)
-        return other
-
     # -- the account ----------------------------------------------------------------------------
 
     def check_credentials(self) -> None:
@@ -96,7 +82,6 @@ class Azure(prices.AzurePrices):
         self._account.credential()
 
     def whoami(self, region: str) -> str:
-        """Return the subscription."""
         found = self._account.having(None, hasty=True).call(
             'GET', self._account.path(), 'asking Azure for the subscription')
         return f'subscription {found["displayName"]}, {region}'
@@ -109,6 +94,10 @@ class Azure(prices.AzurePrices):
     def searched_regions(self) -> list[str]:
         """Return '': one request answers for all regions."""
         return ['']
+
+    def named_types(self, region: str, names: Sequence[str]) -> list[MachineType]:
+        sizes = self.sizes(region)
+        return [prices.machine_type(sizes[name]) for name in names if name in sizes]
 
     # -- machines -------------------------------------------------------------------------------
 
@@ -132,7 +121,6 @@ class Azure(prices.AzurePrices):
                 for entry in found]
 
     def get(self, region: str, vm: str) -> Optional[Vm]:
-        """Return a machine."""
         try:
             # what insert has just seen is reported once
             found = machines.vm_of(self._account.known.pop(f'vm {vm}', None) or self._entry(vm))
@@ -345,21 +333,15 @@ class Azure(prices.AzurePrices):
             list(pool.map(drop, chosen))
 
     def delete(self, machine: VmId) -> None:
-        """Delete the groups of a machine's attempt."""
         self._account.known.pop(f'vm {machine.vm}', None)
         self._drop(machine.attempt, [machine.vm], wait=True)
 
     def end_attempt(self, region: str, attempt: str) -> None:
-        """Delete the groups of an attempt, without waiting."""
         self._drop(attempt)
 
-    def leftovers(self, region: str, now: float, dead: Collection[str]) -> Mapping[str, str]:
-        """Return attempts with a group in which no machine is left, as after an eviction."""
-        return {group['tags'][TAG_ATTEMPT]: group['tags'].get(TAG_NAME, '?')
-                for group in self._empty(region)
-                if not is_another_robot(group['tags'].get(TAG_ROBOT, ''))
-                and (group['tags'][TAG_ATTEMPT] in dead
-                     or now - float(group['tags'].get(TAG_MADE, 0)) > SETTLED)}
+    def remains(self, region: str) -> list[Mapping[str, str]]:
+        """Return the tags of the groups in which no machine is left, as after an eviction."""
+        return [group['tags'] for group in self._empty(region)]
 
     def _empty(self, region: str) -> list[Mapping[str, Any]]:
         there = {str(entry['id']).split('/')[4].lower() for entry in self._all('')}
@@ -377,16 +359,15 @@ class Azure(prices.AzurePrices):
         what, name = f'changing port {port} of {machine.vm}', machine.vm
         path = self._account.path(
             name, f'{_NET}/networkSecurityGroups/{name}/securityRules/tcp-{port}')
-        if not machines.ipv4(sources):
+        if not ipv4(sources):
             self._account.delete(path, what, wait=True)
             return
-        if port == machines.SSH:
+        if port == SSH:
             tags = self._account.call('GET', self._account.path(name), what).get('tags') or {}
             sources = [*sources, *tags.get(TAG_SSH_FROM, '').split()]
         self._account.call('PUT', path, what, machines.open_port(port, sources), wait=True)
 
     def set_tags(self, machine: VmId, tags: Mapping[str, str]) -> None:
-        """Add tags to a machine, or replace them."""
         self._account.call(
             'PATCH', self._vm(machine.vm, '/providers/Microsoft.Resources/tags/default'),
             f'writing tags of {machine.vm}',
@@ -416,14 +397,12 @@ class Azure(prices.AzurePrices):
     # -- images ---------------------------------------------------------------------------------
 
     def bake(self, machine: VmId, name: str, dependencies: str) -> str:
-        """Make an image of a machine."""
         entry = self._entry(machine.vm)
         size = self.sizes(machine.region)[entry['properties']['hardwareProfile']['vmSize']]
         return images.bake(self._account, machine, entry, prices.machine_type(size),
                            prices.generation(size), name, dependencies)
 
     def images(self, region: str) -> Iterable[Image]:
-        """Return the images of FogROS2."""
         return images.images_in(self._account, region)
 
     def delete_image(self, image_id: str) -> None:

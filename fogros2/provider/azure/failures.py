@@ -8,12 +8,12 @@ allocation failures" in Azure's documentation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 import re
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
-from fogros2.errors import FogError, PrerequisiteError, ProviderError
-from fogros2.provider.vm.cloud import CloudError
+from fogros2.errors import FogError, PrerequisiteError
+from fogros2.provider.vm.failures import CodedError, Failure, one_line
 
 #: No capacity for this size here.
 NO_ROOM = frozenset({
@@ -33,17 +33,10 @@ _MORE = 'ask for more at Quotas in the Azure portal, or take another vm_size= or
 _LOG_IN = 'az login, or new values of AZURE_CLIENT_ID and AZURE_CLIENT_SECRET'
 
 
-class Failure(NamedTuple):
-    """The meaning of a code: a reason ('' keeps Azure's own), a remedy, the kind of error."""
-
-    reason: str
-    hint: str
-    kind: type[FogError] = ProviderError
-
-
 _FAILURES = {
     **dict.fromkeys(('InvalidAuthenticationToken', 'ExpiredAuthenticationToken',
-                     'InvalidAuthenticationTokenTenant', 'AuthenticationFailed'), Failure(
+                     'InvalidAuthenticationTokenTenant', 'AuthenticationFailed',
+                     'Unauthorized'), Failure(
         'Azure does not take these credentials', _LOG_IN, PrerequisiteError)),
     **dict.fromkeys(('SubscriptionNotFound', 'InvalidSubscriptionId'), Failure(
         'these credentials have no such subscription', 'az account list shows them; '
@@ -74,13 +67,15 @@ _FAILURES = {
 }
 
 
-class AzureError(CloudError):
+class AzureError(CodedError):
     """Azure refused; ``code`` is its error code."""
 
-    def __init__(self, message: str, hint: str = '', *, code: str = '') -> None:
-        super().__init__(message, hint, gone=code in GONE, denied=code in DENIED,
-                         full='zone' if code in NO_ROOM else 'region' if code in NO_QUOTA else '')
-        self.code = code
+    TITLE: ClassVar[str] = 'Azure'
+    FAILURES: ClassVar[Mapping[str, Failure]] = _FAILURES
+    NO_ROOM_IN_ZONE: ClassVar[Collection[str]] = NO_ROOM
+    NO_ROOM_IN_REGION: ClassVar[Collection[str]] = NO_QUOTA
+    GONE: ClassVar[Collection[str]] = GONE
+    DENIED: ClassVar[Collection[str]] = DENIED
 
 
 def refusal(status: int, body: Any, what: str) -> FogError:
@@ -90,26 +85,17 @@ def refusal(status: int, body: Any, what: str) -> FogError:
     :param body: the answer's JSON, with the error of ARM or of a long-running operation.
     """
     error = body.get('error', body) if isinstance(body, Mapping) else {}
-    code, said = str(error.get('code', '')), ' '.join(str(error.get('message', '')).split())
+    code, said = str(error.get('code', '')), one_line(error.get('message', ''))
     for part in error.get('details') or ():
         # the outer code of a failed operation says only that it failed
         if part.get('code') in _FAILURES and code not in _FAILURES:
-            code, said = part['code'], ' '.join(str(part.get('message', '')).split())
+            code, said = part['code'], one_line(part.get('message', ''))
     if code == 'OperationNotAllowed' and 'quota' in said.lower():
         code = 'QuotaExceeded'
-    known = _FAILURES.get(code) or Failure('', '')
-    reason = known.reason or said[:300] or code or f'Azure answered with status {status}'
-    message = f'{what} failed: {reason}' + (f' [{code}]' if code not in reason else '')
-    found: FogError
     if code in DENIED and code != 'RequestDisallowedByPolicy':
         action = re.search(r"perform action '([\w./]+)'", said)
         missing = action[1] if action else 'this'
-        found = AzureError(f'{what} failed: these credentials have no role that allows {missing}',
-                           'doc/azure.md has the roles that FogROS2 needs', code=code)
-    elif known.kind is not ProviderError:
-        found = known.kind(message, known.hint)
-    else:
-        found = AzureError(message, known.hint, code=code or ('NotFound' if status == 404 else ''))
-    # after a fault of Azure, the request may have had its effect
-    found.refused = status < 500 or code in NO_ROOM | NO_QUOTA
-    return found
+        return AzureError(f'{what} failed: these credentials have no role that allows {missing}',
+                          'doc/azure.md has the roles that FogROS2 needs', code=code)
+    code = code or ('NotFound' if status == 404 else '')
+    return AzureError.of(code, said or f'Azure answered with status {status}', what, status)

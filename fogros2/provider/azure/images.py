@@ -21,10 +21,10 @@ from fogros2.provider.azure.failures import AzureError
 from fogros2.provider.azure.machines import region_of
 from fogros2.provider.azure.options import Options
 from fogros2.provider.offers import MachineType
-from fogros2.provider.vm.cloud import TAG_MADE, TAG_USER, VmId
+from fogros2.provider.vm.cloud import made_at, TAG_BAKED, TAG_MADE, TAG_USER, VmId
 
-#: Tag of an image's group with the image's name; what its machines need to have.
-TAG_BAKED, TAG_KIND = 'fogros2-baked', 'fogros2-kind'
+#: Tag of an image's group with what its machines need to have.
+TAG_KIND = 'fogros2-kind'
 _STATES = {'Succeeded': 'available', 'Failed': 'failed'}
 _ID = re.compile(r'azure:([a-z0-9]+)/(fogros2-image-[0-9a-f]{12})')
 _COMPUTE = 'providers/Microsoft.Compute'
@@ -98,7 +98,7 @@ def images_in(account: Account, region: str) -> Iterator[Image]:
         tags, name = group['tags'], str(group['name'])
         yield Image(
             f'azure:{region_of(group)}/{name}', tags[TAG_BAKED], 'azure', region_of(group),
-            created=float(tags.get(TAG_MADE, 0)) or None, state=_state(account, name),
+            created=made_at(tags) or None, state=_state(account, name),
             dependencies=tags.get(TAG_DEPENDENCIES, ''), tags=tags)
 
 

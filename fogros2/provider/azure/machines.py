@@ -5,15 +5,13 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-import datetime
-from typing import Any, NamedTuple, Optional
+from typing import Any, NamedTuple
 
 from fogros2.model import MachineState
 from fogros2.provider.azure.options import OLD_UBUNTU, Options
-from fogros2.provider.vm.cloud import Order, own_name, Place, TAG_DISK, Vm
-from fogros2.provider.vm.options import cidr
+from fogros2.provider.vm.cloud import Order, own_name, Place, TAG_DISK, Vm, when
+from fogros2.provider.vm.options import ipv4, SSH
 
-SSH = 22
 #: The static public address, and on a network of the user's the private one: VMs do not have it.
 TAG_ADDRESS, TAG_PRIVATE = 'fogros2-address', 'fogros2-private-ip'
 #: Ubuntu 24.04 of Canonical by architecture and generation; ROS 2 Jazzy is for Ubuntu 24.04.
@@ -56,7 +54,7 @@ def rule(
     access: str = 'Allow',
 ) -> dict[str, Any]:
     """Return an inbound rule; a machine has no IPv6 address, so IPv6 sources are left out."""
-    networks = sorted({cidr(source) for source in sources if ':' not in source}) or ['*']
+    networks = ipv4(sources) or ['*']
     where = {'sourceAddressPrefix': '*'} if networks == ['*'] else {
         'sourceAddressPrefixes': networks}
     return {'name': name, 'properties': {
@@ -76,11 +74,6 @@ def firewall(order: Order) -> dict[str, Any]:
     return {'securityRules': [
         *ssh, rule('vpn', 3200, 'Udp', str(order.request.vpn_port), ()),
         rule('nothing-else', 4096, '*', '*', (), access='Deny')]}
-
-
-def ipv4(sources: Sequence[str]) -> bool:
-    """Return whether a network is one of IPv4."""
-    return any(':' not in source for source in sources)
 
 
 def request(
@@ -146,7 +139,7 @@ def vm_of(entry: Mapping[str, Any], statuses: Sequence[Mapping[str, Any]] = ()) 
     group = str(entry['id']).split('/')[4]
     return Vm(
         # the machine's own name is that of its group
-        group.lower(), region_of(entry), state, tags,
+        group.lower(), region_of(entry), state, tags, billed=words.get('PowerState') == 'stopped',
         kind=str(properties.get('hardwareProfile', {}).get('vmSize', '')),
         spot=properties.get('priority') == 'Spot', address=tags.get(TAG_ADDRESS, ''),
         private_network=_network(tags), private_ip=tags.get(TAG_PRIVATE, '').partition(' ')[0],
@@ -159,13 +152,3 @@ def vm_of(entry: Mapping[str, Any], statuses: Sequence[Mapping[str, Any]] = ()) 
 def _network(tags: Mapping[str, str]) -> str:
     network = tags.get(TAG_PRIVATE, '').partition(' ')[2]
     return f'azure:{network}' if network else ''
-
-
-def when(text: Any) -> Optional[float]:
-    """Return Azure's ISO 8601 time as seconds since the epoch; it may have seven decimals."""
-    try:
-        plain = str(text).partition('.')[0].removesuffix('Z').partition('+')[0]
-        found = datetime.datetime.fromisoformat(plain)
-    except ValueError:
-        return None
-    return found.replace(tzinfo=datetime.timezone.utc).timestamp()

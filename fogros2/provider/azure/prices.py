@@ -55,12 +55,6 @@ class AzurePrices(VmCloud):
         """Return the region as the only zone of each size: Azure chooses one."""
         return {name: [region] for name in self.sizes(region)}
 
-    def architecture(self, region: str, types: Sequence[str]) -> str:
-        """Return the architecture of sizes if it is one, else ''."""
-        sizes = self.sizes(region)
-        found = {machine_type(sizes[name]).arch for name in types if name in sizes}
-        return found.pop() if len(found) == 1 else ''
-
     def prices(self, region: str, name: str = '') -> dict[str, Decimal]:
         """Return the prices on demand in US dollars per hour, by type; of one type if named."""
         return {kind: price for kind, price, spot in self._retail(region, name) if not spot}

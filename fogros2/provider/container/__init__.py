@@ -322,6 +322,17 @@ class ContainerProvider(Provider):
         token = container_machine.labels_of(found)[container_machine.ATTEMPT]
         _start(engine, identity, token, kept=True, what=f'starting container {identity}')
 
+    def dialled_at(
+        self, machine: Machine, port: int, host: Optional[str] = None,
+    ) -> tuple[str, int]:
+        """Publish the machine's VPN port at the same port of this computer."""
+        token = container_machine.parse_id(machine.id)[2]
+        name = filter_name(container_machine.directory(token))
+        process.run(
+            Command.script(packet_filter.publish(name, port, machine.vpn_host), sudo=True,
+                           what=f"publish the VPN port of '{machine.name}'"), timeout=10.0)
+        return host or '', port
+
     def _host_key(self, engine: Engine, entry: Mapping[str, Any]) -> Optional[str]:
         """Return the public host key that a machine created at its first boot, None before."""
         identity = str(entry['Id'])[:12]

@@ -50,6 +50,27 @@ END
 """
 
 
+def publish(name: str, port: int, address: str) -> str:
+    """
+    Return shell text that leads a UDP port of this computer to a machine; ``unset`` ends it.
+
+    The machine sees this computer as the sender: its network may have no way to others.
+    """
+    return f"""\
+PATH=$PATH:/usr/sbin:/sbin
+nft -f - <<END
+table inet {name}
+table inet {name} {{
+    chain published {{ type nat hook prerouting priority dstnat; }}
+    chain answered {{ type nat hook postrouting priority srcnat; }}
+}}
+flush chain inet {name} published
+flush chain inet {name} answered
+add rule inet {name} published fib daddr type local udp dport {port} dnat ip to {address}
+add rule inet {name} answered ip daddr {address} udp dport {port} ct status dnat masquerade
+END"""
+
+
 def unset(name: str) -> str:
     """Return shell text that deletes a filter, if there is one."""
     return (f"PATH=$PATH:/usr/sbin:/sbin; for family in bridge inet; do printf "

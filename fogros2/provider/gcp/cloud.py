@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import copy
 from decimal import Decimal
 import os
@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Optional
 
 from fogros2.errors import ConfigurationError, MachineNotFound
 from fogros2.model import Image, MachineSpec, MachineState
-from fogros2.provider import TAG_NAME, TAG_ON_EXIT, TAG_ROBOT
+from fogros2.provider import TAG_ON_EXIT
 from fogros2.provider.gcp import firewall, guest, images, instances, prices
 from fogros2.provider.gcp.account import Account, ENDPOINT_VARIABLE
 from fogros2.provider.gcp.failures import GoogleError
@@ -25,22 +25,19 @@ from fogros2.provider.vm.cloud import (
     own_name,
     Place,
     TAG_ATTEMPT,
-    TAG_MADE,
     Vm,
-    VmCloud,
     VmId,
 )
-from fogros2.provider.vm.options import VmOptions
+from fogros2.provider.vm.options import ipv4, SSH, VmOptions
 from fogros2.provider.vm.regions import Regions
-from fogros2.store import is_another_robot
+from fogros2.provider.vm.rest import RestCloud
+from fogros2.waiting import cancellable
 
-#: Seconds after which firewall rules without an instance are leftovers.
-SETTLED = 900.0
 #: The region of FogROS2's default zone.
 DEFAULT_REGION = 'us-central1'
 
 
-class ComputeEngine(VmCloud):
+class ComputeEngine(RestCloud):
     """
     Compute Engine instances, each with its own firewall rules.
 
@@ -57,7 +54,7 @@ class ComputeEngine(VmCloud):
     regions_variable: ClassVar[str] = 'FOGROS2_GCP_REGIONS'
 
     def __init__(self, account: Optional[Account] = None) -> None:
-        self._account = account or Account()
+        self._account: Account = account or Account()
         #: GPUs to attach, for the price.
         self._gpus: Mapping[str, int] = {}
 
@@ -71,11 +68,9 @@ class ComputeEngine(VmCloud):
         return other
 
     def check_credentials(self) -> None:
-        """Check that there are credentials and a project."""
         self._account.check()
 
     def whoami(self, region: str) -> str:
-        """Return the project."""
         project = self._account.project
         self._account.call('GET', project, f"asking Google for the project '{project}'")
         return f'project {project}, {region}'
@@ -92,35 +87,34 @@ class ComputeEngine(VmCloud):
     # -- types and prices -----------------------------------------------------------------------
 
     def account_key(self) -> str:
-        """Return what distinguishes this project, endpoint and GPUs from others in the cache."""
         return f'{self._account.project}|{os.environ.get(ENDPOINT_VARIABLE, "")}|{self._gpus}'
 
     def _types(self, region: str, names: Sequence[str]) -> list[Mapping[str, Any]]:
         """Return the types of every zone of a region; all types if none is named."""
-        key = (self._account.project, region, *names)
-        if key not in self._account.types:
+        key, known = ' '.join((self._account.project, region, *names)), self._account.known
+        if key not in known:
             kinds = ' OR '.join(f'(name = "{name}")' for name in names)
             zones = ' OR '.join(f'(zone = "{region}-{letter}")' for letter in 'abcdef')
-            self._account.types[key] = list(self._account.pages(
+            known[key] = list(self._account.pages(
                 f'{self._account.project}/aggregated/machineTypes', 'asking for the machine types',
-                cancel=self.cancel, maxResults='500',
+                maxResults='500',
                 filter=f'({kinds}) AND ({zones})' if names else f'({zones})'))
-        return self._account.types[key]
+        found: list[Mapping[str, Any]] = known[key]
+        return found
 
     def types(self, region: str) -> list[MachineType]:
-        """Return the types of a region."""
         found = {entry['name']: entry for entry in self._types(region, ())}
         return [instances.machine_type(entry) for entry in found.values()]
 
     def zones(self, region: str) -> dict[str, list[str]]:
-        """Return the zones of a region that have each type."""
         found: dict[str, list[str]] = {}
         for entry in self._types(region, ()):
             found.setdefault(entry['name'], []).append(entry['zone'])
         return found
 
     def _priced(self, region: str, names: Sequence[str], spot: bool) -> dict[str, Decimal]:
-        known = prices.rates()
+        known = cancellable(prices.rates, self.cancel, what="asking for Google's prices",
+                            grace=lambda: 0.0)
         costs = {entry['name']: prices.price(known, region, entry, self._gpus, spot)
                  for entry in self._types(region, names)}
         return {name: cost for name, cost in costs.items() if cost is not None}
@@ -138,31 +132,27 @@ class ComputeEngine(VmCloud):
                 for name, cost in self._priced(region, (), True).items()
                 if names is None or name in names}
 
-    def architecture(self, region: str, types: Sequence[str]) -> str:
-        """Return the architecture of types, if it is the same for all."""
-        found = {instances.machine_type(entry).arch for entry in self._types(region, types)}
-        return found.pop() if len(found) == 1 else ''
+    def named_types(self, region: str, names: Sequence[str]) -> list[MachineType]:
+        return [instances.machine_type(entry) for entry in self._types(region, names)]
 
     # -- machines -------------------------------------------------------------------------------
 
     def _instances(self, tags: Mapping[str, str]) -> list[Vm]:
         project = self._account.project
         return [instances.vm_of(project, entry) for entry in self._account.pages(
-            f'{project}/aggregated/instances', 'looking for machines', cancel=self.cancel,
+            f'{project}/aggregated/instances', 'looking for machines',
             filter=instances.label_filter(tags))]
 
     def find(self, region: str, tags: Mapping[str, str]) -> list[Vm]:
-        """Return the instances with all of ``tags``."""
         return [vm for vm in self._instances(tags)
                 if region in ('', vm.region) and vm.state is not MachineState.DELETED
                 # one that is being deleted looks like one that is being stopped
                 and (vm.state is not MachineState.STOPPING or vm.tags.get(TAG_ON_EXIT) == 'stop')]
 
     def get(self, region: str, vm: str) -> Optional[Vm]:
-        """Return an instance."""
         project = vm.partition('/')[0]
         try:
-            found = self._account.call('GET', _path(vm), f'looking for {vm}', cancel=self.cancel)
+            found = self._account.call('GET', _path(vm), f'looking for {vm}')
         except GoogleError as error:
             if error.gone:
                 raise MachineNotFound(f'there is no {vm} any more') from error
@@ -192,7 +182,7 @@ class ComputeEngine(VmCloud):
             key = entry['arch'], entry['gpus']
             if key not in found:
                 found[key] = images.choose(
-                    self._account, options, *key, order.request.dependencies, self.cancel)
+                    self._account, options, *key, order.request.dependencies)
             entry['path'], entry['size'] = found[key]
         return {kind: chosen[kind] for kind in types if kind in chosen}
 
@@ -201,7 +191,7 @@ class ComputeEngine(VmCloud):
         network = f'global/networks/{order.options.network}'
         tags = {**{key: value for key, value in order.tags.items() if key.startswith('fogros2-')},
                 'region': region}
-        sources = firewall.ipv4(order.sources)
+        sources = ipv4(order.sources)
         if not sources:
             raise ConfigurationError(
                 'machines at Google have IPv4 addresses, and the robot has none',
@@ -210,8 +200,7 @@ class ComputeEngine(VmCloud):
             firewall.rule(order.attempt, 'deny', network, tags, firewall.ANYONE),
             firewall.rule(order.attempt, 'vpn', network, tags, firewall.ANYONE, 'udp',
                           order.request.vpn_port),
-            firewall.rule(order.attempt, f'tcp-{firewall.SSH}', network, tags, sources, 'tcp',
-                          firewall.SSH)], self.cancel)
+            firewall.rule(order.attempt, f'tcp-{SSH}', network, tags, sources, 'tcp', SSH)])
 
     def undo_begin(
         self, region: str, attempt: str, created: Sequence[str],
@@ -234,15 +223,11 @@ class ComputeEngine(VmCloud):
         if place.zone not in prepared['zones']:
             raise CloudError(f'{place.zone} has no machine type {place.kind}', full='zone')
         name, project = own_name(order.attempt), self._account.project
-        try:
-            self._account.run(
-                'POST', f'{project}/zones/{place.zone}/instances',
-                f"creating '{order.spec.name}' ({place.kind} in {place.zone})", cancel=self.cancel,
-                requestId=order.token(place),
-                body=instances.insertion(place, order, prepared, self._subnet(place, order), tags))
-        except GoogleError as error:
-            if error.code not in ('ALREADY_EXISTS', 'RESOURCE_ALREADY_EXISTS'):
-                raise
+        self._account.create(
+            f'{project}/zones/{place.zone}/instances',
+            f"creating '{order.spec.name}' ({place.kind} in {place.zone})",
+            instances.insertion(place, order, prepared, self._subnet(place, order), tags),
+            requestId=order.token(place))
         return f'{project}/{place.zone}/{name}'
 
     def _subnet(self, place: Place, order: Order) -> str:
@@ -252,7 +237,7 @@ class ComputeEngine(VmCloud):
             return ''
         found = self._account.call(
             'GET', f'{self._account.project}/global/networks/{name}',
-            f"looking for the network '{name}'", cancel=self.cancel)
+            f"looking for the network '{name}'")
         return next((str(url) for url in found.get('subnetworks', ())
                      if f'/regions/{place.region}/' in url), '')
 
@@ -268,7 +253,6 @@ class ComputeEngine(VmCloud):
         firewall.delete(self._account, machine.vm.partition('/')[0], machine.attempt)
 
     def end_attempt(self, region: str, attempt: str) -> None:
-        """Delete the instances of an attempt."""
         for vm in self._instances({TAG_ATTEMPT: attempt}):
             self._account.remove(_path(vm.id), f'deleting {vm.id}')
 
@@ -277,26 +261,19 @@ class ComputeEngine(VmCloud):
         self.end_attempt(region, attempt)
         firewall.delete(self._account, self._account.project, attempt)
 
-    def leftovers(self, region: str, now: float, dead: Collection[str]) -> Mapping[str, str]:
-        """Return attempts of which only firewall rules or a stopped disk are left."""
-        project = self._account.project
+    def remains(self, region: str) -> list[dict[str, str]]:
         tags = [firewall.tags_of(found) for found in self._account.pages(
-            f'{project}/global/firewalls', 'looking for what is left', cancel=self.cancel,
+            f'{self._account.project}/global/firewalls', 'looking for what is left',
             filter='name eq fogros2-.*')]
-        left = {t[TAG_ATTEMPT]: t.get(TAG_NAME, '?') for t in tags
-                if TAG_ATTEMPT in t and region in ('', t.get('region'))
-                and not is_another_robot(t.get(TAG_ROBOT, ''))
-                and (t[TAG_ATTEMPT] in dead or now - float(t.get(TAG_MADE, 0)) > SETTLED)}
-        if left:
-            for vm in self._instances({}):
-                if vm.state is not MachineState.DELETED:
-                    left.pop(vm.tags.get(TAG_ATTEMPT, ''), None)
-        return left
+        return [found for found in tags if region in ('', found.get('region'))]
+
+    def attempts(self, region: str) -> list[str]:
+        """Return the attempts with an instance, unless a stopped disk is all that is left."""
+        return [vm.tags.get(TAG_ATTEMPT, '') for vm in self._instances({})
+                if vm.state is not MachineState.DELETED]
 
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
-        """Change the machine's rule for a port."""
-        firewall.allow(self._account, machine.vm.partition('/')[0], machine.attempt, port, sources,
-                       self.cancel)
+        firewall.allow(self._account, machine.vm.partition('/')[0], machine.attempt, port, sources)
 
     def set_tags(self, machine: VmId, tags: Mapping[str, str]) -> None:
         """Replace labels, which Google takes only as a whole and with their fingerprint."""
@@ -309,7 +286,7 @@ class ComputeEngine(VmCloud):
             try:
                 self._account.run(
                     'POST', f'{_path(machine.vm)}/setLabels', f'writing labels of {machine.vm}',
-                    cancel=self.cancel, body={'labelFingerprint': fingerprint, 'labels': {
+                    body={'labelFingerprint': fingerprint, 'labels': {
                         **kept, **instances.RULES.encode(tags)}})
                 return
             except GoogleError as error:
@@ -319,37 +296,31 @@ class ComputeEngine(VmCloud):
     def set_ending(self, machine: VmId, spec: MachineSpec) -> None:
         """Change when Google ends an instance, which it takes for stopped instances only."""
         path, what = _path(machine.vm), f'writing how {machine.vm} ends'
-        found = self._account.call('GET', path, what, cancel=self.cancel)
+        found = self._account.call('GET', path, what)
         words = {key: value for key, value in found['scheduling'].items()
                  if key not in ('maxRunDuration', 'instanceTerminationAction')}
         if found['status'] == 'TERMINATED':
             # stopped, with the action of a machine that is deleted, would mean that it has ended
             words.update(instances.limit(spec, spot=False, action='STOP'))
-            self._account.run('POST', f'{path}/setScheduling', what, cancel=self.cancel,
-                              body=words)
+            self._account.run('POST', f'{path}/setScheduling', what, body=words)
 
     def stop(self, machine: VmId) -> None:
-        """Stop an instance."""
         self._account.call('POST', f'{_path(machine.vm)}/stop', f'stopping {machine.vm}')
 
     def start(self, machine: VmId) -> None:
-        """Start an instance."""
         self._account.run('POST', f'{_path(machine.vm)}/start', f'starting {machine.vm}')
 
     # -- images ---------------------------------------------------------------------------------
 
     def bake(self, machine: VmId, name: str, dependencies: str) -> str:
-        """Make an image of an instance."""
         vm = self.get(machine.region, machine.vm)
         assert vm is not None
         return images.bake(self._account, vm, name, dependencies)
 
     def images(self, region: str) -> Iterable[Image]:
-        """Return the images of FogROS2."""
-        return images.images_in(self._account, region, self.cancel)
+        return images.images_in(self._account, region)
 
     def delete_image(self, image_id: str) -> None:
-        """Delete an image."""
         images.delete(self._account, image_id)
 
 

@@ -8,12 +8,12 @@ A request is refused with a *reason* in camel case, and an operation that fails 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 import re
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
-from fogros2.errors import FogError, PrerequisiteError, ProviderError
-from fogros2.provider.vm.cloud import CloudError
+from fogros2.errors import FogError, PrerequisiteError
+from fogros2.provider.vm.failures import CodedError, Failure, not_the_cloud, one_line
 
 #: No capacity in this zone; another zone may have some.
 NO_ROOM_IN_ZONE = frozenset({
@@ -21,20 +21,6 @@ NO_ROOM_IN_ZONE = frozenset({
     'RESOURCE_POOL_EXHAUSTED', 'UNSUPPORTED_OPERATION'})
 #: The project's quota is used up; another type or region may have some.
 NO_ROOM_IN_REGION = frozenset({'QUOTA_EXCEEDED', 'LIMIT_EXCEEDED'})
-#: Google did nothing, and a later request may succeed.
-_TEMPORARY = frozenset({
-    'RATE_LIMIT_EXCEEDED', 'USER_RATE_LIMIT_EXCEEDED', 'RESOURCE_NOT_READY', 'BACKEND_ERROR'})
-_LENGTH = 300
-
-
-class Failure(NamedTuple):
-    """The meaning of a code: a reason ('' keeps Google's own), a remedy, the kind of error."""
-
-    reason: str
-    hint: str
-    kind: type[FogError] = ProviderError
-
-
 _QUOTA = Failure('', 'ask for more at IAM & Admin, Quotas, or take another type or region')
 _FAILURES = {
     'AUTH_ERROR': Failure(
@@ -56,19 +42,17 @@ _FAILURES = {
 }
 
 
-class GoogleError(CloudError):
+class GoogleError(CodedError):
     """Google refused; ``code`` is its error code, in capitals."""
 
-    def __init__(self, message: str, hint: str = '', *, code: str = '', status: int = 0) -> None:
-        super().__init__(
-            message, hint, gone=code in ('NOT_FOUND', 'RESOURCE_NOT_FOUND'),
-            denied=code in ('FORBIDDEN', 'PERMISSIONS_ERROR'),
-            full='zone' if code in NO_ROOM_IN_ZONE else
-            'region' if code in NO_ROOM_IN_REGION else '')
-        self.code = code
-        self.temporary = code in _TEMPORARY or status >= 500 and not self.full
-        # after a fault of Google, the request may have had its effect
-        self.refused = status < 500 or bool(self.full)
+    TITLE: ClassVar[str] = 'Google'
+    FAILURES: ClassVar[Mapping[str, Failure]] = _FAILURES
+    NO_ROOM_IN_ZONE: ClassVar[Collection[str]] = NO_ROOM_IN_ZONE
+    NO_ROOM_IN_REGION: ClassVar[Collection[str]] = NO_ROOM_IN_REGION
+    GONE: ClassVar[Collection[str]] = ('NOT_FOUND', 'RESOURCE_NOT_FOUND')
+    DENIED: ClassVar[Collection[str]] = ('FORBIDDEN', 'PERMISSIONS_ERROR')
+    TEMPORARY: ClassVar[Collection[str]] = (
+        'RATE_LIMIT_EXCEEDED', 'USER_RATE_LIMIT_EXCEEDED', 'RESOURCE_NOT_READY', 'BACKEND_ERROR')
 
 
 def refused(status: int, answer: Any, what: str) -> FogError:
@@ -83,28 +67,17 @@ def refused(status: int, answer: Any, what: str) -> FogError:
         said = str(error.get('message') or '')
         code = re.sub('([a-z])([A-Z])', r'\1_\2', str(details.get('reason') or '')).upper()
     except (TypeError, KeyError, AttributeError, IndexError):
-        return PrerequisiteError(f'{what} failed: what answered is not Google (HTTP {status})',
-                                 'is there a proxy, or a page to log in to this network?')
+        return not_the_cloud('Google', what, status)
     if status == 401:
         code = 'AUTH_ERROR'
     elif status == 404 and re.search(r"resource 'projects/[^/']+'", said):
         code = 'PROJECT_NOT_FOUND'
     elif status in (404, 429):
         code = 'NOT_FOUND' if status == 404 else 'RATE_LIMIT_EXCEEDED'
-    return failure(code or str(error.get('status') or status), said, what, status)
+    return GoogleError.of(code or str(error.get('status') or status), one_line(said), what, status)
 
 
 def failed(operation: Mapping[str, Any], what: str) -> FogError:
     """Return the error for an operation that ended with one."""
     first = operation['error']['errors'][0]
-    return failure(str(first.get('code', '')), str(first.get('message') or ''), what)
-
-
-def failure(code: str, said: str, what: str, status: int = 0) -> FogError:
-    """Return the error for a code and Google's own words."""
-    known = _FAILURES.get(code, Failure('', ''))
-    said = ' '.join(said.split())[:_LENGTH]
-    message = f'{what} failed: {known.reason or said or "Google gave no reason"} [{code}]'
-    if known.kind is not ProviderError:
-        return known.kind(message, known.hint)
-    return GoogleError(message, known.hint, code=code, status=status)
+    return GoogleError.of(str(first.get('code', '')), one_line(first.get('message') or ''), what)

@@ -11,16 +11,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import json
-import threading
-from typing import Any, Optional
+from typing import Any
 
 from fogros2.errors import ProviderError
 from fogros2.provider.gcp.account import Account
 from fogros2.provider.gcp.failures import GoogleError
 from fogros2.provider.vm.cloud import own_name, TAG_SSH_FROM
-from fogros2.provider.vm.options import cidr
+from fogros2.provider.vm.options import ipv4, SSH
 
-SSH = 22
 ALLOW, DENY = 1000, 2000
 #: Sources of WireGuard's port, which answers only known keys, and of the denial.
 ANYONE = ('0.0.0.0/0',)
@@ -43,11 +41,6 @@ def rule(
         'sourceRanges': list(sources), **action}
 
 
-def ipv4(sources: Sequence[str]) -> list[str]:
-    """Return the networks that a rule for IPv4 takes; the machine has no other address."""
-    return sorted({cidr(source) for source in sources if ':' not in source})
-
-
 def tags_of(found: Mapping[str, Any]) -> dict[str, str]:
     """Return the tags in the description of a rule; {} if it is not ours."""
     try:
@@ -56,25 +49,16 @@ def tags_of(found: Mapping[str, Any]) -> dict[str, str]:
         return {}
 
 
-def create(
-    account: Account, rules: Sequence[Mapping[str, Any]], cancel: Optional[threading.Event],
-) -> None:
+def create(account: Account, rules: Sequence[Mapping[str, Any]]) -> None:
     """Create rules at the same time; those of an earlier attempt are used again."""
-    def insert(body: Mapping[str, Any]) -> None:
-        try:
-            account.run('POST', f'{account.project}/global/firewalls',
-                        f'creating the firewall rule {body["name"]}', cancel=cancel, body=body)
-        except GoogleError as error:
-            if error.code not in ('ALREADY_EXISTS', 'RESOURCE_ALREADY_EXISTS'):
-                raise
-
     with ThreadPoolExecutor(max(1, len(rules)), 'fog-firewall') as pool:
-        list(pool.map(insert, rules))
+        list(pool.map(lambda body: account.create(
+            f'{account.project}/global/firewalls',
+            f'creating the firewall rule {body["name"]}', body), rules))
 
 
 def allow(
     account: Account, project: str, attempt: str, port: int, sources: Sequence[str],
-    cancel: Optional[threading.Event],
 ) -> None:
     """
     Let only ``sources`` reach a TCP port; none closes it.
@@ -87,7 +71,7 @@ def allow(
         account.remove(f'{base}/{name}', what)
         return
     try:
-        deny = account.call('GET', f'{base}/{own_name(attempt)}-deny', what, cancel=cancel)
+        deny = account.call('GET', f'{base}/{own_name(attempt)}-deny', what)
     except GoogleError as error:
         if not error.gone:
             raise
@@ -97,12 +81,8 @@ def allow(
     more = tags.get(TAG_SSH_FROM, '').split() if port == SSH else []
     body = rule(attempt, f'tcp-{port}', deny['network'], tags, ipv4([*sources, *more]), 'tcp',
                 port)
-    try:
-        account.run('POST', base, what, cancel=cancel, body=body)
-    except GoogleError as error:
-        if error.code not in ('ALREADY_EXISTS', 'RESOURCE_ALREADY_EXISTS'):
-            raise
-        account.run('PATCH', f'{base}/{name}', what, cancel=cancel,
+    if account.create(base, what, body):
+        account.run('PATCH', f'{base}/{name}', what,
                     body={'name': name, 'sourceRanges': body['sourceRanges']})
 
 

@@ -5,21 +5,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 import re
-import threading
 import time
-from typing import Any, Optional
+from typing import Any
 
 from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
 from fogros2.model import Image
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.gcp.account import Account
 from fogros2.provider.gcp.failures import GoogleError
-from fogros2.provider.gcp.instances import RULES, when
+from fogros2.provider.gcp.instances import RULES
 from fogros2.provider.gcp.options import Options
-from fogros2.provider.vm.cloud import TAG_USER, Vm
+from fogros2.provider.vm.cloud import TAG_BAKED, TAG_USER, Vm, when
 
-#: Label of images with the name of the image.
-TAG_BAKED = 'fogros2-baked'
 #: Families of images, by architecture; ROS 2 Jazzy is for Ubuntu 24.04.
 UBUNTU = 'projects/ubuntu-os-cloud/global/images/family/ubuntu-2404-lts-'
 #: The same with NVIDIA's driver in it.
@@ -31,7 +28,6 @@ _ARCHES = {'x86_64': 'amd64', 'arm64': 'arm64'}
 
 def choose(
     account: Account, options: Options, arch: str, gpus: bool, dependencies: str,
-    cancel: Optional[threading.Event],
 ) -> tuple[str, int]:
     """
     Return the path of the image that a machine starts from, and the size of its disk in GB.
@@ -39,9 +35,9 @@ def choose(
     :raises ConfigurationError: the image does not exist, or is for another processor.
     """
     if options.ami_image:
-        return _named(account, options.ami_image, arch, cancel)
+        return _named(account, options.ami_image, arch)
     fitting = [image for image in account.pages(
-        f'{account.project}/global/images', 'looking for images baked before', cancel=cancel,
+        f'{account.project}/global/images', 'looking for images baked before',
         filter=f'(labels.{TAG_BAKED}:*) (labels.{TAG_DEPENDENCIES} = "{dependencies}")')
         if image['status'] == 'READY' and image.get('architecture', 'X86_64').lower() == arch
         and image['labels'].get(TAG_USER) == RULES.encode({'': options.user})['']
@@ -53,15 +49,13 @@ def choose(
     return (ACCELERATED.format(_ARCHES[arch]) if gpus else f'{UBUNTU}{_ARCHES[arch]}'), 10
 
 
-def _named(
-    account: Account, name: str, arch: str, cancel: Optional[threading.Event],
-) -> tuple[str, int]:
+def _named(account: Account, name: str, arch: str) -> tuple[str, int]:
     short = name.removeprefix('global/images/')
     path = name if name.startswith('projects/') \
         else f'projects/{account.project}/global/images/{short}'
     try:
         image = account.call('GET', path.removeprefix('projects/'),
-                             f'looking for the image {name}', cancel=cancel)
+                             f'looking for the image {name}')
     except GoogleError as error:
         if not error.gone:
             raise
@@ -89,12 +83,10 @@ def bake(account: Account, vm: Vm, name: str, dependencies: str) -> str:
     return f'gcp:{vm.region}/{project}/{own}'
 
 
-def images_in(
-    account: Account, region: str, cancel: Optional[threading.Event],
-) -> Iterator[Image]:
+def images_in(account: Account, region: str) -> Iterator[Image]:
     """Yield the images of FogROS2 in a region; '' for all regions."""
     for entry in account.pages(f'{account.project}/global/images', 'looking for images',
-                               cancel=cancel, filter=f'labels.{TAG_BAKED}:*'):
+                               filter=f'labels.{TAG_BAKED}:*'):
         where, tags = entry.get('storageLocations', [''])[0], RULES.decode(entry['labels'])
         if region in ('', where):
             yield Image(

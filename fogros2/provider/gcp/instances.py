@@ -5,16 +5,15 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
-import datetime
 import math
 import re
-from typing import Any, Optional
+from typing import Any
 
 from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_ON_EXIT
 from fogros2.provider.gcp.options import Options
 from fogros2.provider.offers import MachineType
-from fogros2.provider.vm.cloud import Order, own_name, Place, TAG_DISK, Vm
+from fogros2.provider.vm.cloud import Order, own_name, Place, TAG_DISK, Vm, when
 from fogros2.provider.vm.labels import LabelRules
 
 RULES = LabelRules()
@@ -150,14 +149,6 @@ def machine_type(entry: Mapping[str, Any]) -> MachineType:
         gpus=int(gpus.get('guestAcceleratorCount', 0)),
         gpu=gpu.replace('-', ' ').upper(),
         gpu_memory_gb=round(_GPU_GB.get(gpu, 0) / 1.024 ** 3, 1), spot=True)
-
-
-def when(text: Optional[str]) -> Optional[float]:
-    """Return an RFC 3339 time as seconds since the epoch."""
-    try:
-        return datetime.datetime.fromisoformat(str(text).replace('Z', '+00:00')).timestamp()
-    except ValueError:
-        return None
 
 
 def _last(url: str) -> str:

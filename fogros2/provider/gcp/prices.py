@@ -13,6 +13,7 @@ from decimal import Decimal
 import functools
 import os
 import re
+import threading
 from typing import Any, Optional
 
 from fogros2.errors import ProviderError
@@ -45,7 +46,12 @@ def rates() -> Rates:
         raise ProviderError(
             f"Google's prices are not known here: {KEY_VARIABLE} has no key of its catalogue",
             'name a machine_type= and leave max_price= out, or see doc/gcp.md')
-    return _asked(key, os.environ.get(ENDPOINT_VARIABLE, ENDPOINT).rstrip('/') + '/')
+    with _ASKING:
+        return _asked(key, os.environ.get(ENDPOINT_VARIABLE, ENDPOINT).rstrip('/') + '/')
+
+
+#: Held while the catalogue is read: all regions need the same answer.
+_ASKING = threading.Lock()
 
 
 @functools.lru_cache(maxsize=1)

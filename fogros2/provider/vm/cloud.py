@@ -7,19 +7,23 @@ import abc
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 import copy
 import dataclasses
+import datetime
 from decimal import Decimal
 import hashlib
+import logging
+import re
 import threading
 from typing import Any, ClassVar, Literal, NamedTuple, Optional, TypeVar
 import uuid
 
 from fogros2.errors import ProviderError, Unsupported
 from fogros2.model import CreateRequest, Image, MachineSpec, MachineState
-from fogros2.provider import TAG_DEPENDENCIES, TAG_NAME
+from fogros2.provider import TAG_DEPENDENCIES, TAG_NAME, TAG_ROBOT
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.options import VmOptions
 from fogros2.provider.vm.regions import Regions
 from fogros2.provider.vm.user_data import END_COMMAND
+from fogros2.store import is_another_robot
 
 #: The tag of every resource of one machine: it identifies the attempt that created them.
 TAG_ATTEMPT = 'fogros2-attempt'
@@ -28,8 +32,13 @@ TAG_USER = 'fogros2-user'
 TAG_DISK = 'fogros2-disk-gb'
 TAG_PRICE = 'fogros2-price-per-hour'
 TAG_SSH_FROM = 'fogros2-ssh-from'
+#: Only on images: the image's name.
+TAG_BAKED = 'fogros2-baked'
 #: Only on resources beside the machine: seconds since the epoch of their creation.
 TAG_MADE = 'fogros2-made'
+#: Seconds after which a resource of an attempt without a machine is a leftover.
+SETTLED = 900.0
+_LOGGER = logging.getLogger(__name__)
 
 Adapter = TypeVar('Adapter', bound='VmCloud')
 
@@ -49,6 +58,7 @@ class CloudError(ProviderError):
     ) -> None:
         super().__init__(message, hint)
         self.full = full
+        self.no_capacity = bool(full)
         self.gone = gone
         self.denied = denied
 
@@ -78,6 +88,7 @@ class Vm:
     :param private_network: name of its private network, '' if it shares none.
     :param spot: whether the cloud may reclaim it.
     :param created: seconds since the epoch; ``stopped`` is when it was stopped.
+    :param billed: it is stopped, and costs as much as a running one.
     :param key: the cloud's name of its login key.
     :param reason: why it ended, in the cloud's words.
     :param note: a warning for people, shown when the machine is reached.
@@ -98,6 +109,7 @@ class Vm:
     key: str = ''
     reason: str = ''
     note: str = ''
+    billed: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,6 +148,22 @@ def attempt_of(token: str) -> str:
 def own_name(attempt: str) -> str:
     """Return the name of the resources of an attempt (firewall, key)."""
     return f'fogros2-{attempt}'
+
+
+def made_at(tags: Mapping[str, str]) -> Optional[float]:
+    """Return when a resource was made: seconds since the epoch, 0 without a tag, None if bad."""
+    text = tags.get(TAG_MADE, '0')
+    return float(text) if text.isdecimal() else None
+
+
+def when(text: Any) -> Optional[float]:
+    """Return a cloud's ISO 8601 time as seconds since the epoch, None if it is none."""
+    try:
+        # Python 3.10 takes no 'Z', and only three or six decimals
+        plain = re.sub(r'\.\d+', '', str(text).replace('Z', '+00:00'))
+        return datetime.datetime.fromisoformat(plain).timestamp()
+    except ValueError:
+        return None
 
 
 def own_tags(
@@ -242,10 +270,9 @@ class VmCloud(abc.ABC):
         """Return what distinguishes this account and endpoint from others in a cache."""
         return ''
 
-    def architecture(self, region: str, types: Sequence[str]) -> str:
-        """Return x86_64 or arm64 if it is the same for all these types, else ''."""
-        found = {kind.arch for kind in self.types(region) if kind.name in types}
-        return found.pop() if len(found) == 1 else ''
+    def named_types(self, region: str, names: Sequence[str]) -> Iterable[MachineType]:
+        """Return these types as far as the region has them; few requests."""
+        return [kind for kind in self.types(region) if kind.name in names]
 
     # -- machines -------------------------------------------------------------------------------
 
@@ -327,14 +354,40 @@ class VmCloud(abc.ABC):
         """Start a stopped machine."""
         raise Unsupported(f"a machine at {self.title} can't be started")
 
+    def remains(self, region: str) -> Iterable[Mapping[str, str]]:
+        """Return the tags of what attempts have besides machines; see ``leftovers``."""
+        return ()
+
+    def attempts(self, region: str) -> Collection[str]:
+        """Return the attempts that have a machine, in any state that may end."""
+        return ()
+
     def leftovers(self, region: str, now: float, dead: Collection[str]) -> Mapping[str, str]:
         """
         Return this robot's attempts of which no machine is left, with the machine's name.
 
+        An entry with a damaged time is left out, and a warning names it.
+
         :param now: seconds since the epoch; a new attempt may still get its machine.
         :param dead: attempts that get none, because their launches have died.
         """
-        return {}
+        left: dict[str, str] = {}
+        # one entry for each attempt, which may have a firewall and a key
+        for attempt, tags in {tags.get(TAG_ATTEMPT, ''): tags
+                              for tags in self.remains(region)}.items():
+            # another robot's clock may differ, and its machine may be about to be created
+            if not attempt or is_another_robot(tags.get(TAG_ROBOT, '')):
+                continue
+            made = made_at(tags)
+            if attempt not in dead and made is None:
+                _LOGGER.warning(
+                    "%s: '%s' has the damaged tag %s=%.40r, and stays: %s", self.title,
+                    tags.get(TAG_NAME, '?'), TAG_MADE, tags[TAG_MADE], own_name(attempt))
+            elif attempt in dead or now - (made or 0.0) > SETTLED:
+                left[attempt] = tags.get(TAG_NAME, '?')
+        for attempt in self.attempts(region) if left else ():
+            left.pop(attempt, None)
+        return left
 
     def sweep(self, region: str, attempt: str) -> None:
         """Delete what an attempt created besides its machine."""

@@ -160,8 +160,12 @@ class Market:
             raise failed[0][1]
         where = regions[0] if len(regions) == 1 else f'{len(regions)} regions'
         if not found:
-            raise ConfigurationError(f'no {self._source.title} type in {where} has {asked}',
-                                     'ask for less, or in another region')
+            gpus = {str(kind['gpu']) for region in regions
+                    for kind in self._fresh(f'types-{region}') or ()}
+            raise ConfigurationError(
+                f'no {self._source.title} type in {where} has {asked}',
+                f"GPUs there: {', '.join(sorted(filter(None, gpus))) or 'none'}" if asked.gpu else
+                'ask for less, or in another region')
         found = ranked(found, asked.spot)
         cheapest = found[0]
         if asked.max_price is not None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import dataclasses
 from decimal import Decimal
 import ipaddress
@@ -16,6 +16,8 @@ from fogros2.provider.offers import Wants, wants
 from fogros2.provider.options import convert, parsed
 
 NEAREST, CHEAPEST = 'nearest', 'cheapest'
+#: Port of the SSH server of every machine.
+SSH = 22
 _ARCHES = {'': '', 'x86_64': 'x86_64', 'amd64': 'x86_64', 'arm64': 'arm64', 'aarch64': 'arm64'}
 Own = TypeVar('Own', bound='VmOptions')
 
@@ -258,3 +260,8 @@ def cidr(text: str) -> str:
     except ValueError as error:
         raise ConfigurationError(f"'{text}' is no address or network",
                                  "such as '198.51.100.7' or '198.51.100.0/24'") from error
+
+
+def ipv4(sources: Iterable[str]) -> list[str]:
+    """Return the networks (CIDR) for machines that have no IPv6 address."""
+    return sorted({cidr(source) for source in sources if ':' not in source})

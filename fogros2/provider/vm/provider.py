@@ -23,7 +23,7 @@ from fogros2.errors import (
 )
 from fogros2.model import CreateRequest, Endpoint, Image, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider, TAG_NAME
-from fogros2.provider.offers import Offers, Region, Wants
+from fogros2.provider.offers import Offer, Offers, Region, Wants
 from fogros2.provider.vm.address import RobotAddress
 from fogros2.provider.vm.cloud import (
     attempt_of,
@@ -50,6 +50,8 @@ _ROBOT_ADDRESS = RobotAddress()
 #: Seconds in which a machine has to end or to stop; usually it is half a minute.
 END_TIMEOUT = 300.0
 ALL = 'all'
+#: Options with the same meaning in every cloud that do not choose the machine.
+EVERYWHERE = ('disk_size', 'spot', 'tags', 'user', 'ssh_from')
 #: Number of regions that are asked at the same time.
 PARALLEL = 20
 #: After the type of a spot machine, for people.
@@ -141,8 +143,9 @@ class VmProvider(Provider):
         """Return the architecture of the types that a resolved spec may use, if it is one."""
         options = self._cloud.options.parse(spec.options)
         region = self._region(options)
-        arch = self._cloud.account(options).architecture(
-            region, options.in_region(region).types)
+        arches = {kind.arch for kind in self._cloud.account(options).named_types(
+            region, options.in_region(region).types)}
+        arch = arches.pop() if len(arches) == 1 else ''
         return 'aarch64' if arch == 'arm64' else arch
 
     def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
@@ -211,7 +214,8 @@ class VmProvider(Provider):
             kind=f'{vm.kind}{_SPOT}' if vm.spot else vm.kind, image=vm.image, key=vm.key,
             disk_gb=int(disk) if disk.isdecimal() else None, tags=tags,
             end_command=self._cloud.end_command(tags),
-            cost_per_hour=_dollars(tags.get(TAG_PRICE, '')), stopped=vm.stopped)
+            cost_per_hour=_dollars(tags.get(TAG_PRICE, '')), stopped=vm.stopped,
+            billed=vm.billed)
 
     def capabilities_of(self, machine: Machine) -> Capabilities:
         """Only a spot machine gets a preemption notice, and it cannot be stopped."""
@@ -358,6 +362,12 @@ class VmProvider(Provider):
         named = list(dict.fromkeys(
             self.nearest() if name == NEAREST else name for name in names))
         return Market(cloud, refresh=refresh).choose(named, wanted, spot_too=True)
+
+    def taking(self, spec: MachineSpec, offer: Offer) -> MachineSpec:
+        """Return the spec with the offer's region and type, and options that all clouds have."""
+        kept = {name: spec.options[name] for name in EVERYWHERE if name in spec.options}
+        return dataclasses.replace(spec, provider=self.name, wanted=spec.options, options={
+            **kept, 'region': offer.region, self._cloud.options.TYPE: offer.type.name})
 
     def _named_regions(self) -> list[str]:
         """Return the regions that the user has named: by an option, else by the variable."""

@@ -221,7 +221,7 @@ def test_a_hijacked_machine_reaches_dds_and_ping_alone(vpn: Lab) -> None:
 
 
 def test_failure_of_a_step_is_reported(lab: Lab) -> None:
-    interface = dataclasses.replace(lab.interfaces['machine'], network='198.18.7.0/99')
+    interface = dataclasses.replace(lab.interfaces['machine'], address='198.18.7.999')
     lab.run('machine', lab.vpn.keys(interface))
     with pytest.raises(CommandError, match='set the VPN interface .* up failed'):
         lab.do('machine', lab.vpn.up(interface, []))

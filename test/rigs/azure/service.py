@@ -190,7 +190,7 @@ class Service:
         headers = {name: environ.get(f'HTTP_{name.upper().replace("-", "_")}', '')
                    for name in ('Authorization', 'X-IDENTITY-HEADER')}
         with self.lock:
-            self.url = f"http://{environ['HTTP_HOST']}"
+            self.url = f"{environ['wsgi.url_scheme']}://{environ['HTTP_HOST']}"
             status, more, answer = self.answer(
                 environ['REQUEST_METHOD'], target, headers, json.loads(text) if text else None)
             data = b'' if answer is None else json.dumps(answer).encode()
@@ -485,7 +485,10 @@ class Service:
         entry = {'id': path, 'name': provider[-1], 'type': '/'.join(
                      [provider[0], *provider[1::2]]),
                  **{key: value for key, value in body.items() if key != 'properties'},
-                 'properties': {**body.get('properties', {}), 'provisioningState': 'Updating'}}
+                 'properties': dict(body.get('properties', {}))}
+        # roles are there at once, and have no state
+        if not kind.startswith('role'):
+            entry['properties']['provisioningState'] = 'Updating'
         getattr(self, f'_new_{kind}', lambda *_: None)(entry, old)
         if old is not None and kind == 'virtualmachines':
             return 200, {}, plain(old)
@@ -497,13 +500,15 @@ class Service:
             if fault is not None:
                 entry['properties']['provisioningState'] = 'Failed'
                 raise Refusal(fault.status, fault.code)
-            entry['properties']['provisioningState'] = 'Succeeded'
+            if 'provisioningState' in entry['properties']:
+                entry['properties']['provisioningState'] = 'Succeeded'
             self._made(kind, entry)
 
         if kind not in _SLOW:
             finish()
             return 200 if old else 201, {}, plain(entry)
-        return 201, self.later(path, finish), plain(entry)
+        made = 202 if kind == 'snapshots' else 201
+        return 200 if old else made, self.later(path, finish), plain(entry)
 
     def _made(self, kind: str, entry: dict[str, Any]) -> None:
         if kind == 'publicipaddresses':

@@ -5,8 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fogros2.provider.aws.images import TAG_BAKED
-from fogros2.provider.vm.cloud import TAG_ATTEMPT
+from fogros2.provider.vm.cloud import TAG_ATTEMPT, TAG_BAKED
 
 #: Asked of what anybody has.
 LOOK = (

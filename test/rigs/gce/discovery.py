@@ -12,7 +12,8 @@ from typing import Any, NamedTuple, Optional
 
 ROOT = '/compute/v1/'
 #: Parameters that every request may have.
-_COMMON = ('alt', 'prettyPrint', 'key', 'fields', 'quotaUser')
+#: Google's command line sends the last one, which not every edition of the document has.
+_COMMON = ('alt', 'prettyPrint', 'key', 'fields', 'quotaUser', 'returnPartialSuccess')
 
 
 class Route(NamedTuple):

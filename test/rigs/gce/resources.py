@@ -595,7 +595,8 @@ class Project:
     # -- images ---------------------------------------------------------------------------
 
     def _image(self, path: str) -> dict[str, Any]:
-        found = re.search(r'(?:projects/([^/]+)/)?global/images/(family/)?([^/]+)$', path)
+        found = re.search(r'(?:projects/([^/]+)/)?'
+                          r'(?:global/images|zones/-)/(family/|imageFamilyViews/)?([^/]+)$', path)
         if found:
             owner, family, name = found[1] or self.name, found[2], found[3]
             for (project, known), image in reversed(self.images.items()):

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Replicated: run the same nodes on several machines, and use the first answer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+import copy
+from typing import Any, Optional, TYPE_CHECKING, Union
+
+from launch import Action, LaunchContext, LaunchDescriptionEntity
+from launch.actions import GroupAction
+
+from fogros2.actions.cloud_group import CloudGroup
+from fogros2.describe import values
+from fogros2.errors import ConfigurationError
+from fogros2.image_transport.streams import StreamTopic
+from fogros2.image_transport.topics import absolute, local_topic
+from fogros2.launch_internals import components
+from fogros2.runtime import replicas
+from fogros2.runtime.coordinator import Coordinator
+
+if TYPE_CHECKING:
+    from launch import SomeSubstitutionsType
+
+    from fogros2.describe.machines import SomeMachine
+    from fogros2.image_transport.streams import Entry
+
+
+class Replicated(Action):
+    """
+    Run the same nodes on several machines; the robot's nodes get the answer that comes first.
+
+    The nodes have to be stateless: each request may reach several of them. See doc/replicas.md.
+
+    :param machines: the machines, or their names.
+    :param actions: the content, of which each machine runs a copy.
+    :param services: services of these nodes that the node ``first_answer`` serves on the robot.
+    :param topics: pairs of an input of these nodes and the output that they make of it.
+    :param hedge_after: milliseconds after which a request goes to the next machine, or 'p95', the
+        learned 95th percentile; None: each request goes to all machines at once.
+    :param stream_topics: image topics that cross the VPN encoded, as for Node.
+    :raises ConfigurationError: too few machines, invalid or repeated names.
+    """
+
+    def __init__(
+        self, machines: Union[Sequence[SomeMachine], values.List], actions: Iterable[Action], *,
+        services: Union[Sequence[SomeSubstitutionsType], values.List] = (),
+        topics: Union[Sequence[tuple[SomeSubstitutionsType, SomeSubstitutionsType]],
+                      values.List] = (),
+        hedge_after: Union[float, SomeSubstitutionsType, None] = None,
+        stream_topics: Sequence[Entry] = (), **kwargs: Any,
+    ) -> None:
+        super().__init__(**kwargs)
+        self._machines, self._actions = machines, list(actions)
+        self._services, self._topics = services, topics
+        self._hedge_after = hedge_after
+        self._stream_topics = list(stream_topics)
+        self._groups = [] if isinstance(machines, values.List) else [
+            self._group(machine) for machine in machines]
+
+    def get_sub_entities(self) -> list[LaunchDescriptionEntity]:
+        """Return the group of each machine, because launch inspects sub-entities before."""
+        return list(self._groups)
+
+    def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
+        """Execute the action: return the groups, and the node that serves the public names."""
+        coordinator = Coordinator.of(context)
+        namespace = context.launch_configurations.get('ros_namespace', '/')
+        machines = values.resolve(context, self._machines) if isinstance(
+            self._machines, values.List) else [*self._machines]
+        services = [absolute(name, namespace) for name in values.resolve(
+            context, values.items(self._services)) or ()]
+        pairs = [_pair(pair, context, namespace) for pair in (
+            values.resolve(context, self._topics) if isinstance(self._topics, values.List)
+            else self._topics)]
+        hedge_after = values.resolve(context, self._hedge_after)
+        if isinstance(hedge_after, str) and hedge_after != 'p95':
+            hedge_after = values.read_number(hedge_after) if hedge_after else None
+        # checked before a machine is requested
+        labels = [coordinator.resolve(machine) for machine in machines]
+        replicas.check([label if isinstance(label, str) else label.name for label in labels],
+                       services, pairs, hedge_after)
+        here = [coordinator.on_robot(machine) for machine in machines]
+        if all(here):
+            return [GroupAction(copy.deepcopy(self._actions))]
+        if any(here):
+            raise ConfigurationError('replicas run partly on the robot, where their names are '
+                                     'those of the first answer', 'give all of them machines')
+        sessions = {session.spec.name: session for session in map(coordinator.session, machines)}
+        streamed = self._streamed(coordinator, namespace, [output for _, output in pairs])
+        public = [*services, *(name for pair in pairs for name in pair)]
+        for name, session in sessions.items():
+            session.replicate({one: local_topic(one, name) for one in public})
+        first = replicas.first_answer(
+            coordinator.launch.store.launch(coordinator.launch.id), sessions, services,
+            [(*pair, pair[0] in streamed) for pair in pairs], hedge_after, context)
+        return [*(self._groups or map(self._group, machines)), first]
+
+    def _group(self, machine: SomeMachine) -> CloudGroup:
+        return _Replica(
+            machine, copy.deepcopy(self._actions), stream_topics=self._stream_topics)
+
+    def _streamed(
+        self, coordinator: Coordinator, namespace: str, outputs: Sequence[str],
+    ) -> set[str]:
+        """Return the topics that reach the machines as streams from the robot."""
+        entries = [entry if isinstance(entry, StreamTopic) else StreamTopic(*entry)
+                   for entry in coordinator.all_streams(self._stream_topics, namespace)]
+        for entry in entries:
+            if entry.topic in outputs:
+                raise ConfigurationError(
+                    f'{entry.topic} is an output of replicas and a stream',
+                    'leave it out of stream_topics: the first answer forwards it')
+        return {entry.topic for entry in entries
+                if entry.direction == 'to_cloud' and entry.source is None}
+
+
+class _Replica(CloudGroup):
+    """The content on one machine."""
+
+    def _send(self, entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
+        lifecycle = any(cls.__name__ == 'LifecycleNode' for cls in type(entity).__mro__)
+        if lifecycle or components.are_loaded_by(entity):
+            raise ConfigurationError(
+                f'{type(entity).__name__} cannot be replicated: the launch changes it by a '
+                'service whose name all replicas have', 'run it on one machine')
+        if isinstance(entity, CloudGroup) or getattr(entity, '_fogros2_own_machine', False):
+            raise ConfigurationError('a part of replicas has a machine of its own',
+                                     'leave its machine= out, or move it out of Replicated')
+        super()._send(entity, context)
+
+
+def _pair(given: Any, context: LaunchContext, namespace: str) -> tuple[str, str]:
+    """Return the full names of an input and an output; XML and YAML write ``/in:/out``."""
+    parts = values.resolve(context, given).split(':') if values.is_text(given) and not (
+        isinstance(given, tuple)) else [values.resolve(context, part) for part in given]
+    if len(parts) != 2 or not all(parts):
+        raise ConfigurationError(
+            f'{given!r} is no pair of topics', "write ('/image', '/detections') in Python, "
+            "'/image:/detections' in XML and YAML")
+    return absolute(parts[0], namespace), absolute(parts[1], namespace)

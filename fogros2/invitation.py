@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Invitations of other computers to a machine: sealed text that only the invited computer can open.
+
+The text is ``fog1.`` and base64 of an ephemeral X25519 public key and a ChaCha20-Poly1305
+ciphertext. Its key is HKDF-SHA256 of the shared secret with the invited computer's key, salted
+with both public keys (as RFC 9180 does). Each text has an ephemeral key of its own, so the nonce
+is constant. All of the content is sealed and authenticated, the expiry included. The sealing does
+not show who wrote the text: the user pastes it, as a launch file.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import ipaddress
+import json
+import re
+import time
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    PublicFormat,
+)
+
+from fogros2.errors import ConfigurationError
+from fogros2.model import to_json
+from fogros2.store import check_name, robot_name, Store, write_private
+
+_PREFIX = 'fog1.'
+_NONCE = bytes(12)
+#: A computer's public key, with its name for people before it.
+_KEY = re.compile(r'(?:([A-Za-z0-9_.-]{1,80}):)?([A-Za-z0-9+/]{43}=)')
+
+
+@dataclasses.dataclass(frozen=True)
+class Invitation:
+    """
+    What a computer needs to join the VPN of a machine.
+
+    :param machine: the machine's name; ``key`` its WireGuard public key, ``address`` its VPN
+        address, ``endpoint`` the ``host:port`` at which other computers dial it.
+    :param joiner: VPN address of the invited computer; ``network`` is the VPN's, in CIDR form.
+    :param rmw: RMW_IMPLEMENTATION of the launch; ``domain`` its ROS_DOMAIN_ID.
+    :param expires: until when the computer may join, in seconds since the epoch.
+    """
+
+    machine: str
+    key: str
+    address: str
+    endpoint: str
+    joiner: str
+    network: str
+    rmw: str
+    domain: int
+    expires: float
+
+    def __post_init__(self) -> None:
+        check_name(self.machine)
+        subnet = ipaddress.IPv4Network(self.network)
+        inside = {ipaddress.IPv4Address(self.address), ipaddress.IPv4Address(self.joiner)}
+        if len(inside) != 2 or not all(address in subnet for address in inside):
+            raise ValueError('its addresses are not those of one network')
+        if type(self.domain) is not int or not 0 <= self.domain <= 232:
+            raise ValueError('its ROS domain is none')
+        if not isinstance(self.expires, float):
+            raise ValueError('its end is no time')
+
+
+def own_key(store: Store) -> X25519PrivateKey:
+    """Return this computer's private key; make it if there is none."""
+    path = store.root / 'key'
+    if not path.exists():
+        new = X25519PrivateKey.generate().private_bytes(
+            Encoding.Raw, PrivateFormat.Raw, NoEncryption())
+        write_private(path, base64.b64encode(new) + b'\n')
+    return X25519PrivateKey.from_private_bytes(base64.b64decode(path.read_bytes()))
+
+
+def public_text(key: X25519PrivateKey) -> str:
+    """Return the public key as ``wg`` writes it."""
+    return base64.b64encode(_public(key)).decode()
+
+
+def own_name(store: Store) -> str:
+    """Return the text of ``ros2 fog key``: this computer's name and public key."""
+    name = re.sub('[^A-Za-z0-9_.-]', '-', robot_name())[:80]
+    return f'{name}:{public_text(own_key(store))}'
+
+
+def parse_key(text: str) -> tuple[str, str]:
+    """
+    Return the name ('' if there is none) and the key of a text that ``ros2 fog key`` printed.
+
+    :raises ConfigurationError: the text is no key.
+    """
+    match = _KEY.fullmatch(text.strip())
+    if match is None:
+        raise ConfigurationError(f'{text[:60]!r} is no key of a computer',
+                                 'ros2 fog key prints it on the computer that joins')
+    return match[1] or '', match[2]
+
+
+def seal(invitation: Invitation, key: str) -> str:
+    """
+    Return the text of an invitation that only the holder of a key can open.
+
+    :param key: the invited computer's public key, in base64.
+    """
+    once = X25519PrivateKey.generate()
+    to = X25519PublicKey.from_public_bytes(base64.b64decode(key))
+    own = _public(once)
+    sealed = _cipher(once.exchange(to), own, base64.b64decode(key)).encrypt(
+        _NONCE, to_json(invitation).encode(), _PREFIX.encode())
+    return _PREFIX + base64.urlsafe_b64encode(own + sealed).decode()
+
+
+def unseal(text: str, key: X25519PrivateKey) -> Invitation:
+    """
+    Open an invitation to this computer.
+
+    :raises ConfigurationError: the text is for another computer, changed, or expired.
+    """
+    text = ''.join(text.split())
+    try:
+        data = base64.b64decode(text.removeprefix(_PREFIX), b'-_', validate=True)
+        if _PREFIX + base64.urlsafe_b64encode(data).decode() != text:
+            raise ValueError('a character is changed')  # base64 ignores some bits of the last
+        shared = key.exchange(X25519PublicKey.from_public_bytes(data[:32]))
+        content = _cipher(shared, data[:32], _public(key)).decrypt(
+            _NONCE, data[32:], text[:len(_PREFIX)].encode())
+        invitation = Invitation(**json.loads(content))
+    except InvalidTag:
+        raise ConfigurationError(
+            'this invitation is for another computer, or not complete',
+            'ros2 fog key prints the key that the invitation needs') from None
+    except (ValueError, TypeError, ConfigurationError, RecursionError) as error:
+        raise ConfigurationError(f'this is no invitation: {error}',
+                                 'ros2 fog invite prints one, in one line') from error
+    if time.time() > invitation.expires:
+        raise ConfigurationError(f"the invitation to '{invitation.machine}' has expired",
+                                 'ask for a new one: ros2 fog invite')
+    return invitation
+
+
+def _public(key: X25519PrivateKey) -> bytes:
+    return key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)
+
+
+def _cipher(shared: bytes, sender: bytes, recipient: bytes) -> ChaCha20Poly1305:
+    return ChaCha20Poly1305(HKDF(
+        SHA256(), 32, salt=sender + recipient, info=b'fogros2 invitation').derive(shared))

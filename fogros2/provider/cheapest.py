@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A machine of any cloud: it becomes a machine of the cloud with the cheapest offer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import ClassVar
+
+from fogros2 import plugin_system
+from fogros2.errors import ConfigurationError, MachineNotFound, Unsupported
+from fogros2.model import CreateRequest, Machine, MachineSpec
+from fogros2.provider import Provider
+from fogros2.provider.clouds import ALL, compare, GROUP
+from fogros2.provider.offers import Offer, Wants, wants
+
+#: Options that are requirements; see :func:`fogros2.provider.offers.wants`.
+WANTS = ('arch', 'min_cpu', 'min_memory_gb', 'cpu_type', 'gpu', 'gpu_memory_gb', 'max_price',
+         'spot')
+#: Number of offers to try; the cheapest of each other cloud comes in addition.
+TRIES = 6
+
+
+class Cheapest(Provider):
+    """
+    Stands for the cloud of a machine until the launch chooses one with :meth:`places`.
+
+    No machine ever belongs to it: records and tags name the chosen cloud.
+    """
+
+    name: ClassVar[str] = 'cheapest'
+
+    def check(self, spec: MachineSpec) -> None:
+        """Check the requirements without a request."""
+        _wants(spec)
+        for name in spec.options.get('providers') or ():
+            plugin_system.load(GROUP, name)
+
+    def places(self, spec: MachineSpec) -> list[tuple[Offer, MachineSpec]]:
+        """
+        Return the offers to try, the cheapest first, each with the spec of its machine.
+
+        :raises FogError: nothing fits, or no cloud answers.
+        """
+        found = compare(
+            _wants(spec), spec.options.get('providers') or (),
+            spec.options.get('regions') or [ALL], cancel=self.cancel,
+            max_round_trip_ms=spec.options.get('max_round_trip_ms')).offers
+        first = {offer.provider: offer for offer in reversed(found)}
+        places = []
+        for number, offer in enumerate(found):
+            if number < TRIES or first[offer.provider] is offer:
+                provider: Provider = plugin_system.load(GROUP, offer.provider)()
+                place = provider.taking(spec, offer)
+                provider.check(place)
+                places.append((offer, place))
+        return places
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        """Refuse: the chosen cloud creates the machine."""
+        raise Unsupported(f"no cloud was chosen for '{spec.name}'")
+
+    def describe(self, machine_id: str) -> Machine:
+        """Know no machine."""
+        raise MachineNotFound(machine_id)
+
+    def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
+        """Find no machine."""
+        return ()
+
+    def destroy(self, machine_id: str) -> None:
+        """Do nothing, because no machine exists."""
+
+
+def _wants(spec: MachineSpec) -> Wants:
+    limit = spec.options.get('max_round_trip_ms')
+    if limit is not None and limit <= 0:
+        raise ConfigurationError(f'max_round_trip_ms can not be {limit:g}',
+                                 'it takes milliseconds above 0')
+    return wants(**{name: spec.options[name] for name in WANTS if name in spec.options})

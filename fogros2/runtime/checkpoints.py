@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Save the folders of a machine's nodes at intervals, and restore them where the nodes start."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+import logging
+from pathlib import Path
+import threading
+from typing import Any, Optional, Protocol
+import zlib
+
+from launch import LaunchContext
+
+from fogros2.errors import FogError
+from fogros2.host.checkpoint import Checkpoint
+from fogros2.model import Endpoint, MachineSpec, NodeSpec
+from fogros2.shell import connect, Shell
+
+#: Seconds that a node has to answer ``~/checkpoint``.
+ANSWER = 5.0
+
+
+class Nodes(Protocol):
+    """The nodes of one machine, as a session has them."""
+
+    spec: MachineSpec
+
+    @property
+    def shell(self) -> Optional[Shell]:
+        """The shell of the machine, None while the machine does not run the nodes."""
+
+    def nodes(self) -> list[NodeSpec]:
+        """Return the nodes that have started."""
+
+    def request(self, function: Callable[[], Any]) -> None:
+        """Run a coroutine function; the launch waits for it on its way down."""
+
+
+class Checkpoints:
+    """
+    The checkpoints of one machine, on launch's event loop.
+
+    :param store: folder of the snapshots.
+    :param suffix: of a folder on the robot that was there before.
+    :param in_thread: runs a blocking function in a thread.
+    """
+
+    def __init__(
+        self, session: Nodes, context: LaunchContext, store: Path, suffix: str,
+        cancel: Optional[threading.Event], *, in_thread: Callable[..., asyncio.Future[Any]],
+        logger: logging.Logger,
+    ) -> None:
+        self.robot = connect(Endpoint('local'), name='robot')
+        self._session = session
+        self._context = context
+        self._store = store
+        self._suffix = suffix
+        self._cancel = cancel
+        self._in_thread = in_thread
+        self._logger = logger
+        self._folders: dict[str, Checkpoint] = {}
+        self._clients: dict[str, Any] = {}
+        self._order = asyncio.Lock()
+        self._said = ''
+        if session.spec.checkpoint:
+            self.add(session.spec.checkpoint)
+
+    def __bool__(self) -> bool:
+        return bool(self._folders)
+
+    def add(self, folder: str) -> None:
+        """Add a folder, as ``check_folder`` returns it."""
+        if not self._folders:
+            self._later()
+        # a number, because the path may be too long for a file name
+        self._folders[folder] = Checkpoint(
+            folder, self._store / f'{zlib.crc32(folder.encode()):08x}', self._cancel)
+
+    def _later(self, took: float = 0.0) -> None:
+        interval = self._session.spec.checkpoint_interval
+        # a state is as old as the begin of its copy, until the next copy, which may take longer
+        self._context.asyncio_loop.call_later(max(interval - 3 * took, interval / 10), self._due)
+
+    def _due(self) -> None:
+        async def save() -> None:
+            begin = self._context.asyncio_loop.time()
+            ready = await self.ask() if self._session.shell else False
+            # the machine may have been interrupted meanwhile
+            if ready is not False and (shell := self._session.shell):
+                await self.save(shell, still=bool(ready))
+            self._later(self._context.asyncio_loop.time() - begin)
+        if not self._context.is_shutdown:
+            self._session.request(save)
+
+    async def ask(self) -> Optional[bool]:
+        """
+        Ask the nodes that offer ``~/checkpoint`` to make their files consistent.
+
+        :return: None if no node offers it; False if one has refused or did not answer.
+        """
+        nodes = self._session.nodes() if self else []
+        answers: list[bool] = await self._in_thread(self._ask, nodes) if nodes else []
+        return all(answers) if answers else None
+
+    def _ask(self, nodes: list[NodeSpec]) -> list[bool]:
+        from launch_ros.ros_adapters import get_ros_node
+        from std_srvs.srv import Trigger
+        waits = []
+        for name in map(full_name, nodes):
+            if name not in self._clients:
+                self._clients[name] = get_ros_node(self._context).create_client(
+                    Trigger, f'{name}/checkpoint')
+            if self._clients[name].service_is_ready():
+                future, answered = self._clients[name].call_async(
+                    Trigger.Request()), threading.Event()
+                future.add_done_callback(lambda _, answered=answered: answered.set())
+                waits.append((future, answered))
+        return [answered.wait(ANSWER) and future.result().success for future, answered in waits]
+
+    async def save(self, shell: Shell, *, still: bool) -> None:
+        """Copy the folders of a machine, or of the robot; warn of a folder that is not copied."""
+        await self._each(lambda folder: folder.save(shell, still=still), 'has no new checkpoint')
+
+    async def restore(self, shell: Shell) -> None:
+        """Write the newest snapshots to a machine, or to the robot."""
+        aside = self._suffix if shell is self.robot else ''
+        await self._each(lambda folder: folder.restore(shell, aside), 'is not restored')
+
+    async def _each(self, act: Callable[[Checkpoint], object], failed: str) -> None:
+        async with self._order:
+            for folder in list(self._folders.values()):
+                try:
+                    await self._in_thread(act, folder)
+                    self._said = ''
+                except FogError as error:
+                    text = f'{self._session.spec.name}: {folder.folder} {failed}: {error}'
+                    if text != self._said and not self._context.is_shutdown:
+                        self._logger.warning(text)
+                    self._said = text
+
+
+def full_name(node: NodeSpec) -> str:
+    """Return the full ROS name of a node, from its arguments or its program."""
+    rules = dict(
+        argument.split(':=', 1) for argument in node.arguments
+        if isinstance(argument, str) and argument.startswith(('__node:=', '__ns:=')))
+    name = rules.get('__node', node.executable or node.name)
+    return f"{rules.get('__ns', '').rstrip('/')}/{name}"

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Decide which messages of replicated nodes are forwarded; pure.
+
+Replicas that work on the same input give their outputs the input's stamp. So the n-th message with
+a stamp and a frame id is the same from each replica, and the first one is forwarded.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+import struct
+from typing import Optional
+
+from fogros2_replicas.figures import Figures
+
+#: Stamp in nanoseconds, and frame id.
+Header = tuple[int, str]
+#: Inputs that are remembered, and outputs without a match after which none is expected.
+REMEMBERED, MISSES = 512, 10
+#: Without matching stamps: messages of another replica, with none of the chosen one between them,
+#: that make this other one the chosen one.
+STREAK = 3
+#: An input that is so many nanoseconds older than the newest one means that time was set back.
+SET_BACK = 1_000_000_000
+
+
+def header_of(data: bytes) -> Optional[Header]:
+    """
+    Read stamp and frame id of a serialized message that begins with ``std_msgs/Header``.
+
+    :param data: CDR with its encapsulation header of four bytes.
+    :returns: None if the data are too short.
+    """
+    little = data[1:2] in (b'\x01', b'\x07')
+    if len(data) < 16:
+        return None
+    seconds, nanoseconds, length = struct.unpack_from('<iII' if little else '>iII', data, 4)
+    if len(data) < 16 + length:
+        return None
+    frame = data[16:16 + max(0, length - 1)].decode(errors='replace')
+    return seconds * 1_000_000_000 + nanoseconds, frame
+
+
+class Pair:
+    """
+    An input topic and an output topic; all times are seconds of one clock.
+
+    :param replicas: their names, in the order of preference.
+    """
+
+    def __init__(self, replicas: Sequence[str]) -> None:
+        self.replicas = {name: Figures(name) for name in replicas}
+        #: Whether stamps of outputs match inputs; until then one replica is forwarded.
+        self.matches = False
+        #: Whether too many outputs match no input, which is worth a warning.
+        self.unmatched = False
+        self._inputs: dict[int, float] = {}
+        self._latest = self._newest = -1
+        self._misses = 0
+        self._came: Counter[tuple[str, str]] = Counter()
+        self._forwarded: Counter[str] = Counter()
+        self._chosen: Optional[str] = None
+        self._streaks: Counter[str] = Counter()
+
+    def input(self, now: float, header: Optional[Header]) -> None:
+        """Record an input."""
+        stamp = header[0] if header is not None else 0
+        if not stamp:
+            return  # 0 is no stamp
+        if stamp < self._latest - SET_BACK:
+            self._inputs.clear()
+            self._newest = -1
+        self._latest = stamp
+        self._inputs.setdefault(stamp, now)
+        while len(self._inputs) > REMEMBERED:
+            del self._inputs[next(iter(self._inputs))]
+
+    def output(self, now: float, name: str, header: Optional[Header]) -> bool:
+        """Return whether to forward an output of a replica."""
+        replica = self.replicas[name]
+        replica.died = False
+        begin = None if header is None else self._inputs.get(header[0])
+        if begin is not None:
+            replica.took(now - begin)
+            self.matches, self.unmatched = True, False
+        elif not self.matches:
+            self._misses += 1
+            self.unmatched = self._misses >= MISSES
+        first = self._is_first(name, header) if self.matches and header is not None \
+            else self._is_chosen(name)
+        replica.won += first
+        return first
+
+    def started(self, name: str) -> None:
+        """Record that a replica's process has started again."""
+        self.replicas[name].died = False
+
+    def died(self, name: str) -> None:
+        """Choose no replica whose process has ended."""
+        self.replicas[name].died = True
+        self.replicas[name].failures += 1
+        if self._chosen == name:
+            self._chosen = None
+
+    def _is_first(self, name: str, header: Header) -> bool:
+        stamp, frame = header
+        if stamp < self._newest:
+            return False
+        if stamp > self._newest:
+            self._newest = stamp
+            self._came.clear()
+            self._forwarded.clear()
+        self._came[name, frame] += 1
+        if self._came[name, frame] <= self._forwarded[frame]:
+            return False
+        self._forwarded[frame] += 1
+        return True
+
+    def _is_chosen(self, name: str) -> bool:
+        self._streaks[name] += 1
+        if self._chosen is None or self._streaks[name] >= STREAK:
+            self._chosen = name
+        if name == self._chosen:
+            self._streaks.clear()
+            return True
+        return False

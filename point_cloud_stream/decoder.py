@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Decode a stream on the subscriber's side, and publish its point clouds.
+
+The node publishes ``points`` (remap it) from ``<points>/pointcloud``, or from the topic in the
+parameter ``stream``. See doc/point_clouds.md for all topics and parameters.
+"""
+
+from __future__ import annotations
+
+import array
+import secrets
+
+from rcl_interfaces.msg import ParameterDescriptor
+from sensor_msgs.msg import CompressedImage, PointCloud2, PointField
+from std_msgs.msg import Header, UInt64MultiArray
+
+from image_transport_h264.lazy import IMAGE_QOS, LazyNode, run, STREAM_QOS, Tap
+from image_transport_h264.worker import Worker
+from point_cloud_stream.cloud import CloudError, MAX_BYTES
+from point_cloud_stream.codec import decode, FORMAT
+from point_cloud_stream.parts import Assembler, FEEDBACK
+
+
+class DecoderNode(LazyNode):
+    """Decode the newest cloud in a worker thread, while the points have a subscriber."""
+
+    def __init__(self) -> None:
+        super().__init__('point_cloud_decoder')
+        topic = self.resolve_topic_name('points')
+        stream = str(self.declare_parameter('stream', '').value) or f'{topic}/{FORMAT}'
+        self._max_bytes = int(self.declare_parameter('max_bytes', MAX_BYTES, ParameterDescriptor(
+            description='larger clouds are not decoded', read_only=True)).value)
+        self._assembler = Assembler(self._max_bytes)
+        self._identity = secrets.randbits(63)
+        self._feedback = self.create_publisher(
+            UInt64MultiArray, f'{stream}/{FEEDBACK}', STREAM_QOS)
+        self._worker: Worker[tuple[Header, bytes]] = Worker('decode', self._decode, self.fail)
+        self._parts = Tap(self, CompressedImage, stream, STREAM_QOS, self._part, adapt=False)
+        self._points = self.offer(PointCloud2, topic, IMAGE_QOS, self._matched)
+        self._matched()
+        self.get_logger().info(f'{stream} comes in as {topic}')
+
+    def destroy_node(self) -> None:
+        """Stop the worker, then destroy the node."""
+        self._worker.stop()
+        super().destroy_node()
+
+    def _matched(self) -> None:
+        self._parts.want(self._points.get_subscription_count() > 0)
+
+    def _part(self, part: CompressedImage) -> None:
+        acknowledge, whole = self._assembler.add(bytes(part.data))
+        if acknowledge is not None:
+            self.put_out(self._feedback, UInt64MultiArray(
+                data=[acknowledge[0], self._identity, acknowledge[1]]))
+        if whole is not None:
+            self._worker.put((part.header, whole))
+
+    def _decode(self, coded: tuple[Header, bytes]) -> None:
+        header, data = coded
+        try:
+            layout, octets = decode(data, self._max_bytes)
+        except CloudError as error:
+            self.complain(str(error), f'cloud not shown: {error}')
+            return
+        values = array.array('B')
+        values.frombytes(octets.data)
+        self.put_out(self._points, PointCloud2(
+            header=header, height=layout.height, width=layout.width, fields=[
+                PointField(name=each.name, offset=each.offset, datatype=each.datatype,
+                           count=each.count) for each in layout.fields],
+            is_bigendian=layout.is_bigendian, point_step=layout.point_step,
+            row_step=layout.row_step, is_dense=layout.is_dense, data=values))
+
+
+def main() -> None:
+    """Run the node until a signal."""
+    run(DecoderNode)

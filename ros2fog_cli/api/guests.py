@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Admit other computers to a machine of this robot: invite, list, revoke."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import ipaddress
+import json
+import math
+import time
+from typing import Optional, TypedDict
+
+from fogros2 import invitation
+from fogros2.errors import ConfigurationError, VpnError
+from fogros2.model import host_port
+from fogros2.shell import Shell
+from fogros2.store import Record, Store
+from fogros2.vpn import addresses
+from fogros2.vpn.wireguard import guest_request
+from ros2fog_cli.api import machines, reach
+from ros2fog_cli.api.machines import Entry
+
+#: Seconds without a handshake after which a guest whose invitation has expired is removed: a
+#: connected WireGuard peer makes a handshake at least each 2 minutes.
+PATIENCE = 180.0
+
+
+class Guest(TypedDict):
+    """
+    A computer that an invitation admits to a machine.
+
+    :param left: seconds until the invitation expires; negative for one that stays connected.
+    :param heard: seconds since the machine noticed its last handshake, None before the first.
+    """
+
+    key: str
+    label: str
+    address: str
+    left: float
+    heard: Optional[float]
+
+
+def invite(
+    name: str, key: str, seconds: float, warn: Callable[[str], None], *,
+    host: Optional[str] = None, store: Optional[Store] = None,
+) -> str:
+    """
+    Admit a computer to a machine's VPN; return the invitation for it.
+
+    :param key: the text of ``ros2 fog key`` of that computer.
+    :param seconds: how long it may join.
+    :param host: address at which it dials the machine; None for the provider's choice.
+    :raises FogError: no launch uses the machine, or no other computer can dial the machine.
+    """
+    store = store or Store()
+    label, public = invitation.parse_key(key)
+    entry = reach.find(name, warn)
+    record = held(entry)
+    assert entry.machine is not None and record.vpn is not None and record.robot_vpn is not None
+    folder = store.root / 'launches' / record.launch
+    rmw = (folder / 'rmw').read_text()
+    check_rmw(rmw)
+    found, port = machines.load(entry.provider).dialled_at(entry.machine, record.vpn.port, host)
+    found = found or addresses.own_address()
+    with reach.session(entry) as shell:
+        guests = ask(shell, record, 'admit', {
+            'key': public, 'label': label, 'seconds': seconds,
+            'patience': max(PATIENCE, record.spec.robot_timeout),
+            'addresses': [str(address) for address in ipaddress.IPv4Network(
+                addresses.guests(record.vpn.network)) if int(address) & 255 != 255]})
+    address = next((guest['address'] for guest in guests if guest['key'] == public), '')
+    return invitation.seal(invitation.Invitation(
+        machine=name, key=record.public_key, address=record.vpn.address,
+        endpoint=host_port(found, port), joiner=address, network=record.vpn.network,
+        rmw=rmw, domain=int((folder / 'domain').read_text()), expires=time.time() + seconds),
+        public)
+
+
+def check_rmw(rmw: str) -> None:
+    """
+    Check that a guest's nodes can use the launch's middleware.
+
+    :raises ConfigurationError: they would need a router of their own.
+    """
+    if rmw == 'rmw_zenoh_cpp':
+        raise ConfigurationError('a second computer cannot join a launch with rmw_zenoh_cpp',
+                                 'launch with Cyclone DDS or Fast DDS: unset RMW_IMPLEMENTATION')
+
+
+def held(entry: Entry) -> Record:
+    """
+    Return the record of a machine that a launch of this robot uses.
+
+    :raises ConfigurationError: no launch does, so the machine has no VPN.
+    """
+    record = entry.record
+    if record is None or entry.machine is None or not record.launch_alive or not (
+            record.launch and record.public_key):
+        raise ConfigurationError(
+            f"no launch on this robot runs with the machine '{entry.name}', so it has no VPN",
+            'invite while the launch that created it runs')
+    return record
+
+
+def ask(shell: Shell, record: Record, verb: str, request: object = None) -> list[Guest]:
+    """
+    Send a request to the machine's list of guests; return the list (``fogros2.vpn.guests``).
+
+    :raises FogError: the machine cannot be reached, has no address left, or lies.
+    """
+    assert record.vpn is not None
+    output = shell.run(guest_request(record.vpn, verb, request), timeout=15.0).stdout
+    try:
+        return [_checked(guest, record.vpn.network) for guest in json.loads(output)]
+    except (ValueError, LookupError, TypeError, ConfigurationError, RecursionError) as error:
+        raise VpnError(f"'{record.name}' sent an invalid list of guests",
+                       'the machine may be hijacked: delete it') from error
+
+
+def _checked(guest: Guest, network: str) -> Guest:
+    """Return a guest as a machine describes it, without anything that is not expected."""
+    label, key = invitation.parse_key(
+        f"{guest['label']}:{guest['key']}" if guest['label'] else guest['key'])
+    address = ipaddress.IPv4Address(guest['address'])
+    heard = None if guest['heard'] is None else float(guest['heard'])
+    if address not in ipaddress.IPv4Network(addresses.guests(network)) or not math.isfinite(
+            guest['left'] + (heard or 0.0)):
+        raise ValueError
+    return Guest(key=key, label=label, address=str(address), left=guest['left'], heard=heard)
+
+
+def revoke(name: str, who: Optional[str], warn: Callable[[str], None]) -> list[str]:
+    """
+    Remove guests from a machine; return their names or keys.
+
+    :param who: a guest's name, VPN address or key; None for all guests.
+    :raises FogError: there is no such guest, or the machine cannot be reached.
+    """
+    entry = reach.find(name, warn)
+    record = held(entry)
+    with reach.session(entry) as shell:
+        guests = ask(shell, record, 'look')
+        key = invitation.parse_key(who)[1] if who and who.endswith('=') else who
+        gone = [guest for guest in guests
+                if who is None or key in (guest['label'], guest['address'], guest['key'])]
+        if who is not None and not gone:
+            raise ConfigurationError(f"'{name}' has no guest {who}",
+                                     f'ros2 fog status {name} shows its guests')
+        ask(shell, record, 'remove', {'keys': [guest['key'] for guest in gone]})
+    return [guest['label'] or guest['key'] for guest in gone]

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What holds for every cloud of virtual machines, against their simulations in this process."""
+
+from __future__ import annotations
+
+import logging
+import time
+
+import pytest
+
+from fogros2.errors import FogError, ProviderError
+from fogros2.model import MachineSpec
+from fogros2.provider import TAG_ON_EXIT, TAG_ROBOT
+from fogros2.provider.vm import cloud
+from fogros2.testing import ProviderContract, request_for
+from fogros2.waiting import wait_until
+from rigs.clouds_in_memory import DAMAGED, MEMORIES
+
+STEPS = [(name, *step) for name, memory in MEMORIES.items() for step in memory.steps]
+
+
+def served(name, request, monkeypatch):
+    return MEMORIES[name](request.getfixturevalue(MEMORIES[name].fixture), monkeypatch)
+
+
+@pytest.fixture(params=MEMORIES)
+def memory(request, monkeypatch):
+    return served(request.param, request, monkeypatch)
+
+
+class TestClouds(ProviderContract):
+    timeout = 10.0
+
+    @pytest.fixture(autouse=True)
+    def _memory(self, memory):
+        self.memory = memory
+
+    def make(self):
+        return self.memory.provider(), dict(self.memory.options)
+
+
+def create(memory, name='planner', **options):
+    spec = MachineSpec(name, memory.name, {**memory.options, **options})
+    request = request_for(spec, **{TAG_ON_EXIT: 'delete'})
+    return memory.provider().create(spec, request), request.token
+
+
+def gone(memory):
+    wait_until(lambda: not memory.left(), timeout=5.0, what='nothing to be left')
+
+
+@pytest.mark.parametrize(('name', 'step', 'how'), STEPS)
+def test_fault_at_each_step_leaves_nothing(request, monkeypatch, name, step, how):
+    memory = served(name, request, monkeypatch)
+    memory.fail(step, how)
+    with pytest.raises(ProviderError) as caught:
+        create(memory)
+    assert caught.value.undo_failures == ()
+    assert caught.value.refused or how == 'lost'
+    gone(memory)
+
+
+def test_throttled_requests_are_made_again(memory):
+    memory.throttle()
+    machine, _ = create(memory)
+    assert [found.id for found in memory.provider().find({})] == [machine]
+    memory.provider().destroy(machine)
+    gone(memory)
+
+
+def test_full_quota_leads_to_the_next_type(memory):
+    memory.fill(1)
+    machine, _ = create(memory, **memory.more)
+    (further,) = memory.more.values()
+    assert memory.provider().describe(machine).kind == further[0]
+    memory.provider().destroy(machine)
+    gone(memory)
+
+
+def test_no_room_anywhere_is_the_error(memory):
+    memory.fill(0)
+    with pytest.raises(FogError) as caught:
+        create(memory, **memory.more)
+    assert caught.value.refused and 'quota' in str(caught.value).lower()
+    gone(memory)
+
+
+def test_list_of_all_regions_takes_few_requests(memory):
+    machines = {create(memory, name)[0] for name in ('planner', 'mapper')}
+    before = memory.calls()
+    assert {machine.id for machine in memory.provider().find({})} == machines
+    assert memory.calls() - before <= memory.listing
+
+
+def test_leftovers_go_when_they_have_settled(memory, monkeypatch):
+    create(memory)
+    memory.vanish()
+    provider = memory.provider()
+    assert provider.tidy() == []  # a new attempt may still get its machine
+    monkeypatch.setattr(cloud, 'SETTLED', -1.0)
+    (said,) = provider.tidy()
+    assert 'planner' in said
+    gone(memory)
+
+
+def test_leftovers_of_a_dead_launch_go_at_once(memory):
+    _, token = create(memory)
+    memory.vanish()
+    assert len(memory.provider().tidy([token])) == 1
+    gone(memory)
+
+
+@pytest.mark.parametrize(('tags', 'age'), [
+    ({TAG_ROBOT: 'neighbour-0-00000000'}, 1e6), ({}, 0.0)])
+def test_leftovers_of_others_or_of_now_stay(memory, tags, age):
+    create(memory)
+    memory.vanish()
+    memory.retag({**tags, cloud.TAG_MADE: str(int(time.time() - age))})
+    assert memory.provider().tidy() == []
+    assert memory.left()
+
+
+@pytest.mark.parametrize('text', [DAMAGED, 'nan', 'inf', ''])
+def test_damaged_time_tag_is_skipped_with_a_warning(memory, caplog, text):
+    create(memory)
+    memory.vanish()
+    memory.retag({cloud.TAG_MADE: text})
+    _, token = create(memory, 'mapper')
+    memory.vanish()
+    with caplog.at_level(logging.WARNING):
+        (said,) = memory.provider().tidy([token])
+    assert 'mapper' in said
+    (record,) = [each for each in caplog.records if each.levelno == logging.WARNING]
+    assert "'planner' has the damaged tag fogros2-made" in record.message
+    assert memory.left()

@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches in each cloud, from nothing to messages to nothing, and what goes wrong there."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import os
+from pathlib import Path
+import re
+import sys
+
+import pytest
+
+from fogros2.waiting import wait_until
+
+pytestmark = pytest.mark.timeout(240)
+
+CHECK = Path(__file__).resolve().parents[3] / 'tools' / 'cloud_check.py'
+#: What a cloud may be asked for one launch at the most, from its beginning to its end.
+CALLS = 25
+LAUNCH = '''\
+from fogros2 import {machine}, CloudNode, FogROSLaunchDescription, MachineInterrupted
+from launch import EventHandler
+from launch.actions import LogInfo, RegisterEventHandler
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    machine = {machine}(name={name!r}, robot_timeout=6, **{options!r})
+    words = {{'package': 'fogros2_examples', 'output': 'screen'}}
+    return FogROSLaunchDescription([
+        RegisterEventHandler(EventHandler(
+            matcher=lambda event: isinstance(event, MachineInterrupted),
+            entities=[LogInfo(msg='on our own')])),
+        CloudNode(machine=machine, executable='talker', **words),
+        Node(executable='listener', **words),
+    ])
+'''
+TWO = '''\
+from fogros2 import {machine}, CloudNode, FogROSLaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    one, two = ({machine}(name=name, **options) for name, options in zip(
+        ('{name}-one', '{name}-two'), {places!r}))
+    words = {{'package': 'fogros2_examples', 'output': 'screen'}}
+    return FogROSLaunchDescription([
+        CloudNode(machine=one, executable='talker', **words),
+        CloudNode(machine=two, executable='listener', **words),
+        Node(executable='listener', name='here', **words),
+    ])
+'''
+
+
+def clean(run):
+    """Return whether it said nothing that would worry anybody; Ctrl-C is a warning to launch."""
+    others = run.text.replace('[WARNING] [launch]: user interrupted with ctrl-c', '')
+    return run.errors == [] and 'WARNING' not in others and 'Traceback' not in others
+
+
+def complaint(run):
+    """Return the one line of error that a failed launch has, with what it failed with."""
+    assert run.ended() != 0, run.text
+    assert 'Traceback' not in run.text, run.text
+    assert len(run.errors) == 1, run.text
+    return run.errors[0]
+
+
+def launch(robot, name, *, of=LAUNCH, variables=None, **words):
+    """Start a launch file for a cloud's machines."""
+    return robot.launch(robot.write(f'{name}.launch.py', of.format(
+        machine=robot.cloud.machine, name=name, **words)), **(variables or {}))
+
+
+def test_talker_from_nothing_to_nothing(cloud, robot, box, name):
+    run = robot.talker(name)
+    run.wait_for(f'I heard: [Hello World from {name} ')
+    (instance,) = box.alive()
+    assert (instance.type, instance.region, instance.state) == (
+        cloud.kind, cloud.region, 'running')
+    tags = cloud.tags(instance)
+    assert tags['fogros2-name'] == name
+    # the host key that went through user data is nobody's any more
+    now = box.run(instance.id, 'cat /etc/ssh/ssh_host_ed25519_key.pub').split()[1]
+    assert now in tags['fogros2-host-key']
+    # SSH goes through the VPN by now, and its port is closed to everybody
+    run.wait_for('port 22 closed')
+    before = len(cloud.asked(box))
+    cloud.look(box, instance, name)
+    looked = len(cloud.asked(box)) - before
+    # the robot goes on from another address, as from a train, and stays there: TCP may wait for
+    # seconds after one move, and longer than a machine may be silent after two in a row
+    heard = run.text.count('I heard: ')
+    box.move_robot()
+    try:
+        run.wait_for('I heard: ', times=heard + 2)
+        run.interrupt()
+        assert run.ended() == 0, run.text
+    finally:
+        box.move_robot(back=True)
+    assert clean(run), run.text
+    if cloud.price:
+        assert f'{name}: ' in run.text and f'h at ${cloud.price} an hour, $' in run.text
+    asked = cloud.asked(box)
+    assert len(asked) - looked <= CALLS, asked
+
+
+@pytest.mark.parametrize('cloud', [
+    'aws', *(pytest.param(name, marks=pytest.mark.soak) for name in ('azure', 'gcp'))],
+    indirect=True, scope='session')
+def test_machines_of_two_places_hear_each_other(cloud, robot, box, name):
+    run = launch(robot, name, of=TWO, places=cloud.places)
+    run.wait_for(f'[listener]: I heard: [Hello World from {name}-one ')
+    run.wait_for(f'[here]: I heard: [Hello World from {name}-one ')
+    found = {cloud.tags(one)['fogros2-name']: one for one in box.alive()}
+    there = found[f'{name}-two']
+    assert len(found) == 2 and there.type in (*cloud.places[1].values(), cloud.kind)
+    assert {there.region, there.zone} & {*cloud.places[1].values()}
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert clean(run), run.text
+
+
+@pytest.mark.soak
+def test_showing_arguments_asks_nothing(cloud, robot, box, name):
+    shown = robot.ros2('launch', 'fogros2_examples', f'talker.{cloud.name}.launch.py', '-s')
+    assert shown.returncode == 0, shown.stdout + shown.stderr
+    assert cloud.asked(box) == []
+
+
+@pytest.mark.soak
+def test_stopped_machine_is_started_again(cloud, robot, box, name):
+    run = robot.talker(name, 'on_exit:=stop', 'count:=1')
+    assert run.ended() == 0, run.text
+    (stopped,) = box.alive()
+    box.wait_for(stopped.id, 'stopped', 'deallocated')
+    # to be deleted this time, which it was not made for
+    again = robot.talker(name, 'on_exit:=delete', 'count:=1')
+    assert again.ended() == 0, again.text
+    assert clean(again), again.text
+    assert box.instances()[-1].id == stopped.id
+    assert not robot.things()
+
+
+@pytest.mark.soak
+def test_kept_machine_is_baked_listed_and_deleted_elsewhere(cloud, robot, box, name):
+    run = robot.talker(name, 'on_exit:=keep', 'count:=1')
+    assert run.ended() == 0, run.text
+    (kept,) = box.alive()
+    box.run(kept.id, 'echo baked >/root/baked; sync')
+    assert robot.fog('image', name, '--dry-run')
+    assert robot.fog('image', 'list', '--json').strip() in ('', '[]')
+    robot.fog('image', name)
+    # a computer that knows nothing of this robot's machines finds this one, and ends it
+    elsewhere = {'FOGROS2_STATE_HOME': str(robot.home / 'elsewhere')}
+    before = len(cloud.asked(box))
+    (found,) = [one for one in json.loads(robot.fog('list', '--json', **elsewhere))
+                if one['name'] == name]
+    assert (found['provider'], found['disk_gb']) == (cloud.name, 30)
+    assert len(cloud.asked(box)) - before <= cloud.listing
+    assert cloud.name in robot.fog('doctor', '--provider', cloud.name)
+    robot.fog('delete', '--yes', name, **elsewhere)
+    assert not box.alive()
+    # the robot that made it finds nothing to delete but its own memory
+    robot.fog('delete', '--yes', name)
+    again = robot.talker(f'{name}-b', 'on_exit:=keep', 'count:=1')
+    assert again.ended() == 0, again.text
+    assert clean(again), again.text
+    assert box.run(box.alive()[0].id, 'cat /root/baked').strip() == 'baked'
+    robot.fog('delete', '--yes', f'{name}-b')
+    (image,) = json.loads(robot.fog('image', 'list', '--json'))
+    robot.fog('image', 'delete', image['id'], '--yes')
+    assert not robot.things()
+
+
+@pytest.mark.soak
+def test_spot_machines_are_taken_away(cloud, robot, box, name):
+    """After a notice the nodes move to the robot; without one, the launch ends."""
+    moves, ends = (launch(
+        robot, f'{name}-{how}', options={'spot': True, 'on_interrupt': how},
+        # the two talk on the same topic, and each is to hear its own talker alone
+        variables={'ROS_DOMAIN_ID': domain})
+        for how, domain in (('robot', '101'), ('shutdown', '102')))
+    for run, how in ((moves, 'robot'), (ends, 'shutdown')):
+        run.wait_for(f'I heard: [Hello World from {name}-{how} ')
+    instances = {cloud.tags(found)['fogros2-name']: found for found in box.alive()}
+    assert all(found.spot for found in instances.values())
+    box.interrupt(instances[f'{name}-robot'].id, notice=30.0)
+    box.interrupt(instances[f'{name}-shutdown'].id, notice=0.0)
+    assert ends.ended() != 0, ends.text
+    assert f'{name}-shutdown' in '\n'.join(ends.errors), ends.text
+    moves.wait_for('on our own')
+    moves.wait_for(f'I heard: [Hello World from {os.uname().nodename} ')
+    moves.interrupt()
+    assert moves.ended() == 0, moves.text
+    wait_until(lambda: not robot.things(), timeout=30, what='nothing to be left')
+
+
+@pytest.mark.soak
+def test_new_spot_machine_replaces_a_reclaimed_one(cloud, robot, box, name):
+    """The old machine is deleted before another one gets its name."""
+    run = launch(robot, name, options={'spot': True, 'on_interrupt': 'replace'})
+    run.wait_for(f'I heard: [Hello World from {name} ')
+    (first,) = box.alive()
+    box.interrupt(first.id, notice=30.0)
+    run.wait_for(f"the machine '{name}' is being reclaimed")
+    run.wait_for(f'I heard: [Hello World from {os.uname().nodename} ')
+    run.wait_for(f'{name}: a new machine runs the nodes', timeout=90)
+    heard = run.text.count(f'I heard: [Hello World from {name} ')
+    run.wait_for(f'I heard: [Hello World from {name} ', times=heard + 1)
+    (second,) = box.alive()
+    assert second.id != first.id and second.spot
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    wait_until(lambda: not robot.things(), timeout=30, what='nothing to be left')
+
+
+@pytest.mark.soak
+def test_machine_ends_whose_robot_was_killed(cloud, robot, box, name):
+    run = launch(robot, name, options={})
+    run.wait_for(f'I heard: [Hello World from {name} ')
+    (instance,) = box.alive()
+    run.kill()
+    box.wait_for(instance.id, 'terminated', 'stopped', timeout=60)
+    # what the machine can't take along goes with the robot's record of it
+    robot.fog('gc')
+    robot.fog('delete', '--yes', 'all')
+    wait_until(lambda: not box.alive() and not robot.things(), timeout=30,
+               what='nothing to be left')
+
+
+@pytest.mark.soak
+def test_launch_gets_round_what_passes(cloud, robot, box, name):
+    """No room in the first place, throttling, and an answer to what was done that gets lost."""
+    cloud.disturb(box)
+    before = len(box.instances())
+    run = robot.talker(name, 'count:=1')
+    assert run.ended() == 0, run.text
+    assert run.errors == [] and 'Traceback' not in run.text, run.text
+    assert cloud.disturbed(box.calls()), box.calls()
+    assert len(box.instances()) == before + 1
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(400)
+def test_fault_at_each_step_leaves_nothing(cloud, robot, box, name):
+    for number, (code, words, fails) in enumerate(cloud.faults):
+        box.fail(code, **words)
+        run = robot.talker(f'{name}-{number}', 'count:=1')
+        assert run.ended() != 0 or not fails, f'{code} {words}: {run.text}'
+        assert 'Traceback' not in run.text, run.text
+        box.heal()
+        wait_until(lambda: not box.alive() and not robot.things(), timeout=30,
+                   what=f'nothing to be left after {code} {words}')
+
+
+@pytest.mark.soak
+def test_refusal_is_said_in_one_line(cloud, robot, box, name):
+    for number, (code, words, said) in enumerate(cloud.refusals):
+        box.fail(code, times=0, **words)
+        assert said in complaint(robot.talker(f'{name}-{number}'))
+        box.heal()
+
+
+@pytest.mark.soak
+def test_known_problems_are_reported_before_creation(cloud, robot, box, name):
+    for said, arguments, variables in cloud.mistakes:
+        assert said in complaint(robot.talker(name, *arguments, **variables))
+    assert not [call for call in box.calls() if call.action in cloud.creating]
+
+
+@pytest.mark.soak
+def test_cloud_check_runs_the_talker_and_deletes_it(cloud, robot, box):
+    done = robot.run([sys.executable, str(CHECK), cloud.name], timeout=150, YES='1')
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stderr == '' and cloud.checked in done.stdout
+    if cloud.price:
+        assert re.search(r'-- cost: at most \$0\.\d+ \(\d+ s at \$0\.\d+ an hour\)', done.stdout)
+    assert f'{cloud.name} works: 5 messages arrived, and nothing is left.' in done.stdout
+    assert box.alive() == [] and not robot.things()
+
+
+@pytest.mark.soak
+def test_cloud_check_asks_before_it_creates_anything(cloud, robot, box):
+    done = robot.run([sys.executable, str(CHECK), cloud.name, '--options',
+                      f'region={cloud.elsewhere}'])
+    assert done.returncode == 1
+    assert re.search(rf"creates 'check-\w+': .*{cloud.announced}.* in {cloud.elsewhere}",
+                     done.stdout, re.DOTALL)
+    assert 'YES=1' in done.stdout and 'Nothing was created.' in done.stdout
+    if cloud.price:
+        assert re.search(r'\$0\.\d+ an hour', done.stdout)
+    assert not cloud.creating & {call.action for call in box.calls()}
+    wrong = robot.run([sys.executable, str(CHECK), cloud.name, '--options', 'regon=x'], YES='1')
+    assert wrong.returncode == 1 and "did you mean 'region'" in wrong.stderr
+    assert 'Traceback' not in wrong.stderr and box.alive() == []
+
+
+def places(robot, box, instance, run, secrets):
+    """Return where somebody else could read one of the secrets."""
+    # the words that look for a secret must not have it
+    coded = base64.b64encode('\n'.join(secrets).encode()).decode()
+    there = box.run(instance.id, (
+        f'echo {coded} | base64 -d | grep -rlFsf - /etc /home /root /opt /run /tmp /var /dev/shm '
+        '/proc/[0-9]*/environ /proc/[0-9]*/cmdline || :'))
+    shown = {'tags': robot.cloud.described(box), 'output': run.text}
+    for path in (*Path('/proc').glob('[0-9]*/cmdline'), *(robot.home / 'state').rglob('*'),
+                 *(robot.home / 'log').rglob('*')):
+        with contextlib.suppress(OSError):
+            shown[str(path)] = path.read_text(errors='replace')
+    return sorted([*there.split(), *(
+        where for where, text in shown.items() if any(one in text for one in secrets))])
+
+
+@pytest.mark.soak
+def test_secrets_stay_with_the_robot(cloud, robot, box, name):
+    run = launch(robot, name, options={},
+                 variables={'FOGROS2_STATE_HOME': str(robot.home / 'state')})
+    run.wait_for(f'I heard: [Hello World from {name} ')
+    (instance,) = box.alive()
+    secrets = cloud.secrets(robot)
+    assert places(robot, box, instance, run, secrets) == []
+    assert 'OPENSSH PRIVATE KEY' not in cloud.described(box) + run.text
+    # the scan sees what somebody has planted: on the machine, in its processes, in the state
+    planted = robot.home / 'state' / 'planted'
+    planted.write_text(secrets[0])
+    box.run(instance.id, f"echo '{secrets[0]}' >/var/tmp/planted; "
+                         f"PLANTED='{secrets[0]}' setsid sleep 60 >/dev/null 2>&1 & sleep 0.2")
+    found = places(robot, box, instance, run, secrets)
+    assert {str(planted), '/var/tmp/planted'} <= set(found)
+    assert any(re.fullmatch('/proc/[0-9]+/environ', where) for where in found)
+    run.interrupt()
+    assert run.ended() == 0, run.text

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Encoder and decoder of point clouds as processes of their own, seen through ROS topics alone."""
+
+from __future__ import annotations
+
+import array
+from collections.abc import Callable
+import os
+from typing import Any
+
+import pytest
+
+pytest.importorskip('zstandard', reason='the extra "point_clouds" is not installed')
+pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
+import numpy
+from sensor_msgs.msg import CompressedImage, PointCloud2
+
+from fogros2_examples.city import City
+from fogros2_examples.lidar import message
+from point_cloud_stream.parts import split
+from rigs.bench import Bench, BEST_EFFORT, RELIABLE
+
+SCAN = City(16, 256).scan(3)
+
+
+def cloud(number: int, scan: Any = SCAN) -> PointCloud2:
+    """Return cloud ``number`` of a sequence."""
+    made = message(scan)
+    made.header.frame_id = f'frame {number}'
+    made.header.stamp.sec, made.header.stamp.nanosec = 1000 + number, 7 * number
+    return made
+
+
+def source(bench: Bench, topic: str = '/points', scan: Any = SCAN) -> Callable[[], None]:
+    """Return what publishes the next cloud."""
+    publisher = bench.node.create_publisher(PointCloud2, topic, RELIABLE)
+    count = iter(range(1_000_000))
+    return lambda: publisher.publish(cloud(next(count), scan))
+
+
+def start(bench: Bench, role: str, *words: str) -> list[str]:
+    return bench.start(role, *words, package='point_cloud_stream')
+
+
+def pair(bench: Bench, *words: str, topic: str = '/points') -> None:
+    """Start both, from a topic to the same one below /seen."""
+    start(bench, 'encoder', '-r', f'points:={topic}', *words)
+    start(bench, 'decoder', '-r', f'points:=/seen{topic}', '-p', f'stream:={topic}/pointcloud')
+
+
+def points(got: PointCloud2) -> Any:
+    return numpy.frombuffer(got.data, SCAN.dtype).reshape(got.height, got.width)
+
+
+@pytest.mark.parametrize(('words', 'rows', 'bound'), [
+    ((), 16, 0.0005), (('-p', 'resolution:=0.01'), 16, 0.005), (('-p', 'resolution:=0.01'), 1,
+                                                                0.005),
+    (('-p', 'lossless:=true'), 16, 0.0)], ids=['default', 'organised', 'unorganised', 'lossless'])
+def test_clouds_come_out_as_they_went_in(
+    bench: Bench, words: tuple[str, ...], rows: int, bound: float,
+) -> None:
+    pair(bench, *words)
+    seen = bench.heard(PointCloud2, '/seen/points')
+    scan = SCAN.reshape(rows, -1)
+    bench.until(lambda: len(seen) >= 5, 'a cloud', meanwhile=source(bench, scan=scan))
+    for got in seen:
+        sent = cloud(got.header.stamp.sec - 1000, scan)
+        assert got.header == sent.header and got.fields == sent.fields
+        assert (got.height, got.width, got.point_step, got.row_step, got.is_bigendian,
+                got.is_dense) == (sent.height, sent.width, sent.point_step, sent.row_step,
+                                  sent.is_bigendian, sent.is_dense)
+        after = points(got)
+        for name in SCAN.dtype.names:
+            if name in 'xyz':
+                assert (numpy.isnan(after[name]) == numpy.isnan(scan[name])).all()
+                error = numpy.nanmax(abs(after[name].astype(float) - scan[name]))
+                assert error <= bound, error
+            else:
+                assert (after[name] == scan[name]).all()
+
+
+def test_dropped_fields_are_gone(bench: Bench) -> None:
+    pair(bench, '-p', 'drop_fields:=intensity,time')
+    seen = bench.heard(PointCloud2, '/seen/points')
+    bench.until(lambda: seen, 'a cloud', meanwhile=source(bench))
+    assert [field.name for field in seen[0].fields] == ['x', 'y', 'z', 'ring']
+    assert (points(seen[0])['ring'] == SCAN['ring']).all()
+
+
+def test_several_streams_and_late_subscribers(bench: Bench) -> None:
+    pair(bench)
+    pair(bench, topic='/rear')
+    publish = [source(bench), source(bench, '/rear')]
+    seen = bench.heard(PointCloud2, '/seen/points', BEST_EFFORT)
+    bench.until(lambda: len(seen) >= 5, 'clouds', meanwhile=lambda: [p() for p in publish])
+    # nobody looks at the other stream, so nothing is done for it
+    assert bench.node.count_subscribers('/rear/pointcloud') == 0
+    rear = bench.heard(PointCloud2, '/seen/rear')
+    start(bench, 'decoder', '-r', 'points:=/late', '-p', 'stream:=/points/pointcloud')
+    late = bench.heard(PointCloud2, '/late')
+    before = len(seen)
+    bench.until(lambda: len(rear) >= 5 and len(late) >= 5 and len(seen) >= before + 5, 'clouds',
+                meanwhile=lambda: [p() for p in publish])
+    numbers = [got.header.stamp.sec for got in seen]
+    assert numbers == sorted(numbers)
+
+
+def test_a_decoder_that_dies_stops_nobody(bench: Bench) -> None:
+    pair(bench)
+    start(bench, 'decoder', '-r', 'points:=/other', '-p', 'stream:=/points/pointcloud')
+    seen, other = (bench.heard(PointCloud2, topic) for topic in ('/seen/points', '/other'))
+    publish = source(bench)
+    bench.until(lambda: seen and other, 'clouds', meanwhile=publish)
+    process, _, _ = bench.processes.pop()
+    process.kill()
+    process.wait(10)
+    before = len(seen)
+    bench.until(lambda: len(seen) >= before + 10, 'clouds', meanwhile=publish)
+
+
+def test_large_clouds_cross_a_link_that_loses_messages(bench: Bench) -> None:
+    """Every fifth message is lost; the middleware repeats parts, and none is shown damaged."""
+    bench.environment['CYCLONEDDS_URI'] = os.environ['CYCLONEDDS_URI'] + (
+        ',<CycloneDDS><Domain Id="any"><Internal><Test><XmitLossiness>200</XmitLossiness></Test>'
+        '</Internal></Domain></CycloneDDS>')
+    pair(bench, '-p', 'lossless:=true')
+    seen = bench.heard(PointCloud2, '/seen/points')
+    bench.until(lambda: len(seen) >= 3, 'clouds', timeout=60, meanwhile=source(bench))
+    assert all(bytes(got.data) == SCAN.tobytes() for got in seen)
+
+
+def test_damaged_parts_leave_the_decoder_running(bench: Bench) -> None:
+    lines = start(bench, 'decoder', '-r', 'points:=/seen/points', '-p', 'stream:=/s')
+    seen = bench.heard(PointCloud2, '/seen/points')
+    publisher = bench.node.create_publisher(CompressedImage, '/s', RELIABLE)
+    bench.until(publisher.get_subscription_count, 'the decoder')
+
+    def put(data: bytes) -> None:
+        publisher.publish(CompressedImage(format='pointcloud', data=array.array('B', data)))
+
+    for data in (b'', b'PCP1', bytes(100), *split(b'PCS1' + bytes(500), 1, 1, 1)):
+        put(data)
+    bench.until(lambda: any('cloud not shown' in line for line in lines), 'a warning')
+    start(bench, 'encoder', '-r', 'points:=/points', '-p', 'stream:=/s')
+    bench.until(lambda: seen, 'a cloud', meanwhile=source(bench))
+
+
+def test_a_cloud_without_coordinates_is_one_warning(bench: Bench) -> None:
+    lines = start(bench, 'encoder', '-r', 'points:=/points')
+    bench.heard(CompressedImage, '/points/pointcloud')
+    publisher = bench.node.create_publisher(PointCloud2, '/points', RELIABLE)
+    good, bad = source(bench), PointCloud2(height=1, width=1, point_step=4, row_step=4,
+                                           data=array.array('B', bytes(4)))
+    parts = bench.heard(CompressedImage, '/points/pointcloud')
+    bench.until(lambda: any('not float32' in line for line in lines), 'a warning',
+                meanwhile=lambda: publisher.publish(bad))
+    bench.until(lambda: parts, 'a cloud', meanwhile=good)
+    assert parts[0].format == 'pointcloud' and parts[0].header.frame_id.startswith('frame ')

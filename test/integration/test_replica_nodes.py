@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``first_answer`` as a process, seen through ROS alone: services, topics, and what it reports."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+import threading
+
+import pytest
+
+pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
+from example_interfaces.srv import AddTwoInts
+import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.context import Context
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from fogros2.waiting import wait_until
+
+ROOT = Path(__file__).parents[2]
+_domains = itertools.count(os.getpid())
+pytestmark = pytest.mark.timeout(90)
+
+
+class Bench:
+    """Replicas ``a`` and ``b`` and a client in this process, and ``first_answer`` in another."""
+
+    def __init__(self, folder):
+        self.folder, self.lines = folder, []
+        os.mkfifo(folder / 'first.events')
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=int(os.environ['ROS_DOMAIN_ID']))
+        self.executor = MultiThreadedExecutor(8, context=self.context)
+        self.client = self.node('client')
+        # of each replica the node has the same name, as on machines of their own
+        self.replicas = {name: self.node('planner') for name in 'ab'}
+        self.process = None
+        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
+        self.thread.start()
+
+    def node(self, name):
+        node = Node(name, context=self.context)
+        self.executor.add_node(node)
+        return node
+
+    def start(self, services=(), topics=(), hedge_after=None, first=()):
+        self.process = subprocess.Popen(
+            [sys.executable, str(ROOT / 'fogros2_replicas/scripts/first_answer'), json.dumps({
+                'name': 'first', 'services': services, 'topics': topics,
+                'replicas': {'a': '/fogros2/a', 'b': '/fogros2/b'},
+                'hedge_after': hedge_after, 'folder': str(self.folder)})],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env={
+                **os.environ, 'PYTHONPATH': os.pathsep.join(
+                    filter(None, [*first, str(ROOT), os.environ.get('PYTHONPATH', '')]))})
+        threading.Thread(target=lambda: self.lines.extend(self.process.stdout),
+                         daemon=True).start()
+
+    def serve(self, name, kind, answer, service='/plan'):
+        self.replicas[name].create_service(kind, f'/fogros2/{name}{service}', answer,
+                                           callback_group=ReentrantCallbackGroup())
+
+    def call(self, kind, request, service='/plan'):
+        client = self.client.create_client(kind, service)
+        assert client.wait_for_service(20.0), ''.join(self.lines)
+        return client.call_async(request)
+
+    def answer(self, future):
+        wait_until(future.done, timeout=20.0, what='an answer')
+        return future.result()
+
+    def until(self, condition, what):
+        wait_until(lambda: bool(condition()), timeout=20.0, what=what)
+
+    def said(self, words):
+        self.until(lambda: words in ''.join(self.lines), repr(words))
+
+    def rows(self):
+        path = self.folder / 'first.json'
+        return {row['machine']: row for row in json.loads(path.read_text())} \
+            if path.exists() else {}
+
+    def all_live(self):
+        self.until(lambda: [row['state'] for row in self.rows().values()] == ['live', 'live'],
+                   'live replicas')
+
+    def close(self):
+        if self.process is not None:
+            self.process.terminate()
+            self.process.wait(20)
+        self.executor.shutdown()
+        rclpy.shutdown(context=self.context)
+        self.thread.join(10)
+
+
+@pytest.fixture
+def bench(tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(next(_domains) % 90 + 5))
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    bench = Bench(tmp_path)
+    yield bench
+    bench.close()
+
+
+def test_first_answer_of_a_service_wins(bench):
+    held = threading.Event()
+
+    def slow(request, response):
+        held.wait(30)
+        response.sum = -1
+        return response
+
+    def quick(request, response):
+        response.sum = request.a + request.b
+        return response
+
+    bench.serve('a', AddTwoInts, slow)
+    bench.serve('b', AddTwoInts, quick)
+    bench.start(['/plan'])
+    bench.all_live()
+    assert bench.answer(bench.call(AddTwoInts, AddTwoInts.Request(a=2, b=3))).sum == 5
+    held.set()
+    bench.until(lambda: bench.rows()['a']['latency'] is not None, 'the late answer')
+    assert [bench.rows()[name]['won'] for name in 'ab'] == [0, 1]
+
+
+def test_failure_is_answered_when_all_have_failed(bench):
+    asked = []
+
+    def fails(request, response):
+        asked.append(response)
+        response.success = False
+        response.message = f'no {len(asked)}'
+        return response
+
+    bench.serve('a', Trigger, fails)
+    bench.serve('b', Trigger, fails)
+    bench.start(['/plan'], hedge_after=5000)
+    bench.all_live()
+    answer = bench.answer(bench.call(Trigger, Trigger.Request()))
+    assert not answer.success and answer.message.startswith('no') and len(asked) == 2
+
+
+def test_reported_death_sends_the_request_on(bench):
+    """Long before the next replica would be asked."""
+    held, asked = threading.Event(), []
+
+    def answer_of(name):
+        def answer(request, response):
+            asked.append(name)
+            if len(asked) == 3:
+                held.wait(30)
+            response.sum = 7
+            return response
+        return answer
+
+    for name in 'ab':
+        bench.serve(name, AddTwoInts, answer_of(name))
+    bench.start(['/plan'], hedge_after=60_000)
+    bench.all_live()
+    # the first request goes to both: their latencies are not known
+    bench.answer(bench.call(AddTwoInts, AddTwoInts.Request()))
+    bench.until(lambda: len(asked) == 2, 'two requests')
+    future = bench.call(AddTwoInts, AddTwoInts.Request())
+    bench.until(lambda: len(asked) == 3, 'a request')
+    (bench.folder / 'first.events').write_text(f'died {asked[2]}\n')
+    assert bench.answer(future).sum == 7
+    assert len(set(asked[2:])) == 2
+    held.set()
+    bench.until(lambda: bench.rows()[asked[2]]['state'] == 'died', 'the state')
+    (bench.folder / 'first.events').write_text(f'started {asked[2]}\n')
+    bench.until(lambda: bench.rows()[asked[2]]['state'] == 'live', 'the state')
+
+
+def test_outputs_are_forwarded_as_bytes_once_for_each_input(bench):
+    quality = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    camera = bench.client.create_publisher(CompressedImage, '/image', quality)
+    came = []
+    bench.client.create_subscription(CameraInfo, '/seen', came.append, quality)
+    for name, node in bench.replicas.items():
+        output = node.create_publisher(CameraInfo, f'/fogros2/{name}/seen', quality)
+
+        def seen(image, name=name, output=output):
+            output.publish(CameraInfo(header=image.header, height=len(image.data),
+                                      distortion_model=name))
+
+        node.create_subscription(CompressedImage, f'/fogros2/{name}/image', seen, quality)
+    bench.start(topics=[('/image', '/seen', False)])
+    number = itertools.count(1)
+
+    def shoot():
+        image = CompressedImage(data=bytes(9))
+        image.header.stamp.sec, image.header.frame_id = next(number), 'eye'
+        camera.publish(image)
+        return len(came) >= 30
+
+    wait_until(shoot, timeout=40.0, what='outputs', longest=0.05)
+    stamps = [info.header.stamp.sec for info in came]
+    assert stamps == sorted(set(stamps))
+    assert {(info.header.frame_id, info.height) for info in came} == {('eye', 9)}
+    assert sum(row['won'] for row in bench.rows().values()) > 0
+    assert 'match no' not in ''.join(bench.lines)
+
+
+def test_outputs_without_stamps_come_from_one_replica(bench):
+    bench.client.create_publisher(String, '/text', 10)
+    came = []
+    bench.client.create_subscription(String, '/out', lambda text: came.append(text.data), 10)
+    outputs = {name: node.create_publisher(String, f'/fogros2/{name}/out', 10)
+               for name, node in bench.replicas.items()}
+    bench.start(topics=[('/text', '/out', False)])
+
+    def say():
+        for name, output in outputs.items():
+            output.publish(String(data=name))
+        return len(came) >= 10
+
+    wait_until(say, timeout=40.0, what='outputs', longest=0.05)
+    bench.said('stamps of its messages match no /text')
+    assert len(set(came[3:])) == 1
+
+
+def test_type_that_is_missing_here_is_one_error(bench, monkeypatch):
+    bench.serve('a', AddTwoInts, lambda request, response: response)
+    # the robot lacks the package that the machines have
+    hidden = bench.folder / 'example_interfaces'
+    hidden.mkdir()
+    (hidden / '__init__.py').write_text('raise ImportError("no such package")')
+    bench.start(['/plan'], first=[str(bench.folder)])
+    bench.said("/plan: its type 'example_interfaces/srv/AddTwoInts' can't be imported on the "
+               'robot')
+    bench.until(bench.rows, 'figures')
+    assert ''.join(bench.lines).count("can't be imported") == 1
+
+
+def test_different_types_are_reported_and_left_out(bench):
+    def answer(request, response):
+        response.sum = 3
+        return response
+
+    bench.serve('a', AddTwoInts, answer)
+    bench.start(['/plan'])
+    bench.until(lambda: bench.rows() and bench.rows()['a']['state'] == 'live', 'the first one')
+    bench.serve('b', SetBool, lambda request, response: response)
+    bench.said('/plan: replicas have different types')
+    assert bench.answer(bench.call(AddTwoInts, AddTwoInts.Request())).sum == 3
+    assert bench.rows()['b']['state'] == 'absent'
+
+
+def test_names_that_replicas_share_are_reported(bench):
+    for name, node in bench.replicas.items():
+        bench.serve(name, Trigger, lambda request, response: response)
+        node.create_publisher(String, '/status', 10)
+    bench.start(['/plan'])
+    bench.said("/status: the node 'planner' of each replica has this name")
+    assert 'get_parameters' not in ''.join(bench.lines)
+
+
+def test_action_is_refused_with_a_reason(bench):
+    bench.serve('a', Trigger, lambda request, response: response)
+    bench.replicas['a'].create_service(
+        Trigger, '/go/_action/send_goal', lambda request, response: response)
+    bench.start(['/go'])
+    bench.said('/go is a ROS action, which has goals')

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Replicas on three machines: a node that dies, and a machine that is lost."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import time
+import uuid
+
+import pytest
+
+from fogros2.model import Command
+from fogros2.process import argv
+from fogros2.waiting import wait_until
+from rigs import replicated
+from rigs.launched import launching, ros2
+
+pytestmark = [
+    pytest.mark.usefixtures('nothing_left'),
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+]
+
+RUN = uuid.uuid4().hex[:6]
+CALL = re.compile(r'call (\d+) by (\d+): ([\d.]+) ms')
+
+
+def calls(run):
+    return [(int(number), int(by), float(taken)) for number, by, taken in CALL.findall(run.text)]
+
+
+def test_calls_go_on_when_a_node_dies_and_a_machine_is_lost(
+    cloud_network, engine, tmp_path, monkeypatch,
+):
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    names = [f'replica-{RUN}-{number}' for number in range(3)]
+    path = replicated.write(tmp_path / 'replicated.launch.py', names, cloud_network)
+    with launching() as launch:
+        run = launch(str(path))
+        run.wait_for('death of', times=1, timeout=120)
+        cost = float(re.search(r'death of \d: ([\d.]+) ms from then', run.text)[1])
+        assert cost < replicated.HEDGE, 'the agent reports the end before the next one is asked'
+        # let its node start again, then take away the machine that answers
+        run.wait_for('process started with pid', times=6)
+        before = calls(run)
+        wait_until(lambda: len(calls(run)) > len(before) + 10, timeout=20.0, what='calls')
+        gone = calls(run)[-1][1]
+        subprocess.run(argv(Command((
+            engine, 'rm', '-f', '-t', '0', f'fogros2-{names[gone]}'), sudo=True)),
+            check=True, capture_output=True, timeout=60)
+        begin = time.monotonic()
+        run.wait_for(f"the machine '{names[gone]}' is gone", timeout=60)
+        run.wait_for('the other replicas go on')
+        count = len(calls(run))
+        wait_until(lambda: len(calls(run)) > count + 20, timeout=30.0, what='calls')
+        after = [by for at, line in run.since(begin, 'call ') for by in [CALL.search(line)] if by]
+        assert all(int(match[2]) != gone for match in after[5:])
+        assert not re.search(r'call \d+ is lost', run.text)
+        live = names[calls(run)[-1][1]]
+        status = ros2('fog', 'status', live)
+        assert re.search(r'REPLICA OF +STATE', status.stdout), status.stdout + status.stderr
+        assert re.search(r'/plan +live', status.stdout), status.stdout
+        run.interrupt()
+        assert run.ended() == 0, run.text

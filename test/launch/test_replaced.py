@@ -1,0 +1,329 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A machine that another one replaces: its nodes move to the robot, and to the new machine."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import stat
+import threading
+
+from launch import LaunchDescription
+from launch.actions import ExecuteProcess, OpaqueFunction, RegisterEventHandler, Shutdown
+from launch.event_handlers import OnProcessExit, OnProcessIO, OnProcessStart
+from launch.events import Shutdown as ShutdownEvent
+import pytest
+
+from fogros2 import CloudNode, ContainerInstance
+from fogros2.errors import ConfigurationError, ConnectError, ProviderError
+from fogros2.host import checkpoint
+from fogros2.model import Endpoint
+from fogros2.process import which
+from fogros2.runtime import replacer
+from fogros2.shell.local import LocalShell
+from fogros2.waiting import wait_until
+
+pytestmark = pytest.mark.timeout(60)
+
+HERE = """#!/bin/sh
+echo "here: $*"
+exec sleep 60
+"""
+THERE = '/there/program'
+
+
+@pytest.fixture
+def planner():
+    return ContainerInstance(name='planner', ros_workspace='', on_interrupt='replace')
+
+
+@pytest.fixture
+def talker(package):
+    program = package / 'lib/demo/says'
+    program.write_text(HERE)
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    return functools.partial(CloudNode, package='demo', executable='says', output='screen')
+
+
+class Watch:
+    """Notes starts and exits, and does something at the n-th start."""
+
+    def __init__(self):
+        self.starts = []
+        self.exits = []
+        self.at_start = {}
+
+    def __call__(self):
+        return [RegisterEventHandler(OnProcessStart(on_start=self._start)),
+                RegisterEventHandler(OnProcessExit(on_exit=self._exit))]
+
+    def _start(self, event, context):
+        self.starts.append(event.cmd[0])
+        do = self.at_start.get(len(self.starts))
+        return do and do(event)
+
+    def _exit(self, event, context):
+        self.exits.append(event.process_name.rpartition('-')[0])
+
+
+@pytest.fixture
+def watch():
+    return Watch()
+
+
+def end(event=None):
+    return [Shutdown(reason='the test is over')]
+
+
+def says(fake, kind, **fields):
+    def do(event=None):
+        return [OpaqueFunction(function=lambda context: context.asyncio_loop.call_soon(
+            lambda: fake.machines['planner'].say(kind, **fields)) and None)]
+    return do
+
+
+def held(fake, event, handler=OnProcessIO):
+    """Hold the next creation of the machine back until the process has said something here."""
+    gate = threading.Event()
+
+    def wait(found):
+        fake.waits['planner'] = gate
+        return event(found)
+    if handler is OnProcessExit:
+        return wait, RegisterEventHandler(OnProcessExit(on_exit=lambda found, _: gate.set()))
+    return wait, RegisterEventHandler(OnProcessIO(
+        on_stdout=lambda found: gate.set() if b'here' in found.text else None))
+
+
+def test_nodes_run_here_until_a_new_machine_runs_them(run, fake, package, planner, talker, watch):
+    node = talker(machine=planner, name='mapper', namespace='arm')
+    notice, free = held(fake, says(fake, 'notice', reason='at 12:00'))
+    watch.at_start = {1: notice, 3: end}
+    assert run(LaunchDescription([*watch(), free, node])) == 0
+    assert watch.starts == [THERE, str(package / 'lib/demo/says'), THERE]
+    first, second = fake.noted('up'), [note[0] for note in fake.notes]
+    assert first == [('planner',), ('planner',)]
+    order = [what for what in second if what in ('start', 'stop', 'retire', 'up')]
+    assert order[:6] == ['up', 'start', 'stop', 'retire', 'up', 'start']
+    # the same process to launch, which ended once: with the launch
+    assert watch.exits == ['says']
+
+
+@pytest.mark.parametrize('kind', ['notice', 'lost'])
+def test_node_that_the_robot_lacks_waits_for_the_machine(run, fake, planner, watch, kind):
+    planner._options['image'] = 'mine'  # a machine with packages of its own
+    node = CloudNode(machine=planner, package='absent', executable='says')
+    watch.at_start = {1: says(fake, kind, reason='at 12:00'), 2: end}
+    assert run(LaunchDescription([*watch(), node])) == 0
+    assert watch.starts == [THERE, THERE] and watch.exits == ['says']
+
+
+def test_lost_machine_is_deleted_before_nodes_start_here(
+        run, fake, package, planner, talker, watch, monkeypatch):
+    monkeypatch.setattr(replacer, 'RETRY', 0.1)
+    fake.retire_errors += [ConnectError('no network'), ConnectError('no network')]
+    lost, free = held(fake, says(fake, 'lost', reason='no answer'))
+
+    def here(event):
+        fake.note('here')
+
+    watch.at_start = {1: lost, 2: here, 3: end}
+    assert run(LaunchDescription([*watch(), free, talker(machine=planner)])) == 0
+    order = [note[0] for note in fake.notes if note[0] in ('retire', 'here')]
+    assert order[:4] == ['retire', 'retire', 'retire', 'here']
+    assert len(watch.starts) == 3
+
+
+def test_agent_that_is_silent_lets_nothing_start_here(
+        run, fake, planner, talker, watch, monkeypatch):
+    """The nodes did not confirm their end: the machine is deleted first."""
+    monkeypatch.setattr(replacer, 'GRACE', 0.2)
+
+    def silent(event):
+        fake.machines['planner'].exits_on_stop = False
+        return says(fake, 'notice', reason='at 12:00')(event)
+
+    def here(event):
+        fake.note('here')
+
+    notice, free = held(fake, silent)
+    watch.at_start = {1: notice, 2: here, 3: end}
+    node = talker(machine=planner, sigterm_timeout='0.1', sigkill_timeout='0.1')
+    assert run(LaunchDescription([*watch(), free, node])) == 0
+    order = [note[0] for note in fake.notes if note[0] in ('stop', 'retire', 'here')]
+    assert order[:3] == ['stop', 'retire', 'here']
+
+
+def test_creations_that_fail_end_a_launch_whose_nodes_wait(
+        run, fake, planner, watch, monkeypatch, capfd):
+    monkeypatch.setattr(replacer, 'RETRY', 0.1)
+    planner._options['image'] = 'mine'
+    node = CloudNode(machine=planner, package='absent', executable='says')
+
+    def full(event):
+        fake.errors['planner'] = ProviderError('no capacity')
+        return says(fake, 'lost', reason='deleted')(event)
+
+    watch.at_start = {1: full}
+    assert run(LaunchDescription([*watch(), node])) == 1
+    assert len(fake.noted('up')) == 4
+    said = capfd.readouterr()
+    assert 'max_replacements=3 is reached' in said.out + said.err
+
+
+def test_node_that_ended_on_the_robot_stays_ended(run, fake, package, planner, talker, watch):
+    program = package / 'lib/demo/says'
+    notice, free = held(fake, says(fake, 'notice', reason='at 12:00'), OnProcessExit)
+    node = talker(machine=planner)
+    program.write_text('#!/bin/sh\necho "here"\n')
+    other = ExecuteProcess(cmd=['sleep', '60'], name='other')
+    watch.at_start = {2: notice}
+    fake_up = fake.up
+
+    def up(spec):
+        found = fake_up(spec)
+        if len(fake.noted('up')) == 2:
+            loop = run.context.asyncio_loop
+            loop.call_soon_threadsafe(
+                loop.call_later, 0.5, run.context.emit_event_sync, ShutdownEvent(reason='over'))
+        return found
+
+    fake.up = up
+    assert run(LaunchDescription([*watch(), free, other, node])) == 0
+    assert fake.noted('start') == [('planner', node.process_details['name'])]
+
+
+class There(LocalShell):
+    """A shell to a machine whose folders are beside those of the robot."""
+
+    def __init__(self, folder, other):
+        super().__init__(Endpoint('local'), name='planner')
+        self.folder, self.other = str(folder), str(other)
+
+    def moved(self, text):
+        return text.replace(self.folder, self.other)
+
+    def run(self, command, **words):
+        return super().run(dataclasses.replace(
+            command, argv=tuple(map(self.moved, command.argv))), **words)
+
+    def fetch(self, source, target, **words):
+        super().fetch(self.moved(source), target, **words)
+
+    def sync(self, source, target, **words):
+        return super().sync(source, self.moved(target), **words)
+
+
+@pytest.mark.skipif(which('rsync') is None, reason='needs rsync')
+@pytest.mark.parametrize('whose', ['machine', 'node'])
+def test_files_go_along_to_the_robot_and_to_the_new_machine(
+        run, fake, package, talker, watch, tmp_path, monkeypatch, whose):
+    """What the node wrote before its end, and what it wrote on the robot."""
+    fake.folder = tmp_path / 'snapshots'
+    folder = tmp_path / 'map'
+    folder.mkdir()
+    (folder / 'old').write_text("the robot's own")
+    machines = [tmp_path / 'first', tmp_path / 'second']
+    machines[0].mkdir()
+    up = fake.up
+
+    def with_shell(spec):
+        machine = up(spec)
+        machine.shell = There(folder, machines[len(fake.noted('up')) - 1])
+        return machine
+
+    fake.up = with_shell
+    program = package / 'lib/demo/says'
+    program.write_text(f'#!/bin/sh\necho more >{folder}/there; cat {folder}/state\n'
+                       'echo here; exec sleep 60\n')
+
+    def notice(event):
+        (machines[0] / 'state').write_text('one\n')
+        return says(fake, 'notice', reason='at 12:00')(event)
+
+    wait, free = held(fake, notice)
+    texts = []
+
+    def end_there(event):
+        texts.extend((path.name, path.read_text()) for path in sorted(machines[1].iterdir()))
+        return end()
+
+    watch.at_start = {1: wait, 3: end_there}
+    words = {'checkpoint': str(folder)}
+    machine = ContainerInstance(name='planner', ros_workspace='', on_interrupt='replace',
+                                **(words if whose == 'machine' else {}))
+    node = talker(machine=machine, **(words if whose == 'node' else {}))
+    assert run(LaunchDescription([*watch(), free, node])) == 0
+    assert texts == [('state', 'one\n'), ('there', 'more\n')]
+    assert (tmp_path / 'map.before-abcdef/old').read_text() == "the robot's own"
+
+
+@pytest.mark.skipif(which('rsync') is None, reason='needs rsync')
+def test_folder_is_copied_at_intervals(run, fake, watch, tmp_path, capfd, monkeypatch):
+    """Until then it may be missing; a folder that is too large is reported once."""
+    fake.folder = tmp_path / 'snapshots'
+    folder = tmp_path / 'map'
+    up = fake.up
+
+    def with_shell(spec):
+        machine = up(spec)
+        machine.shell = LocalShell(Endpoint('local'), name='planner')
+        return machine
+
+    fake.up = with_shell
+    machine = ContainerInstance(
+        name='planner', ros_workspace='', on_interrupt='replace', checkpoint=str(folder),
+        checkpoint_interval=0.05)
+    machine._options['image'] = 'mine'
+    node = CloudNode(machine=machine, package='absent', executable='says')
+
+    tries = []
+    save = checkpoint.Checkpoint.save
+    monkeypatch.setattr(checkpoint.Checkpoint, 'save', lambda kept, shell, **words: (
+        tries.append(checkpoint.LIMIT), save(kept, shell, **words))[1])
+
+    def wait_for(what):
+        wait_until(what, timeout=20, what='a snapshot', longest=0.05)
+
+    def write(context):
+        def work():
+            try:
+                folder.mkdir()
+                (folder / 'state').write_text('one')
+                wait_for(lambda: [*fake.folder.rglob('0*1/state')] or None)
+                monkeypatch.setattr(checkpoint, 'LIMIT', 1)
+                (folder / 'state').write_text('two')
+                wait_for(lambda: tries.count(1) > 3)
+                monkeypatch.setattr(checkpoint, 'LIMIT', 1 << 20)
+                wait_for(lambda: [*fake.folder.rglob('0*2/state')] or None)
+            finally:
+                run.context.asyncio_loop.call_soon_threadsafe(
+                    run.context.emit_event_sync, ShutdownEvent(reason='over'))
+        worked.append(context.asyncio_loop.run_in_executor(None, work))
+
+    worked = []
+    watch.at_start = {1: lambda event: [OpaqueFunction(function=write)]}
+    assert run(LaunchDescription([*watch(), node])) == 0
+    assert worked[0].exception() is None
+    said = capfd.readouterr()
+    assert (said.out + said.err).count('a checkpoint at most') == 1
+
+
+@pytest.mark.parametrize('words', [{'checkpoint': '$HOME/map'}, {}])
+def test_checkpoint_needs_a_replacement(run, fake, package, words):
+    node = {} if words else {'checkpoint': '$HOME/map'}
+    machine = ContainerInstance(name='planner', ros_workspace='', **words)
+    assert run(LaunchDescription([CloudNode(
+        machine=machine, package='demo', executable='talker', **node)])) == 1
+    assert fake.noted('up') == []
+
+
+@pytest.mark.parametrize('words, message', [
+    ({'on_loss_after': 60}, 'on_loss_after=60 s is shorter than robot_timeout=120 s'),
+    ({'max_replacements': 0}, 'max_replacements=0 is no number of machines'),
+])
+def test_wrong_limits_are_refused(words, message):
+    from launch import LaunchContext
+    with pytest.raises(ConfigurationError, match=message):
+        ContainerInstance(name='planner', **{'on_interrupt': 'replace', **words}).spec(
+            LaunchContext())

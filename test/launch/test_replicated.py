@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Replicated nodes: what runs where, under which names, and what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import os
+import select
+import threading
+
+from launch import LaunchDescription
+from launch.actions import (
+    DeclareLaunchArgument,
+    GroupAction,
+    OpaqueFunction,
+    RegisterEventHandler,
+    Shutdown,
+    TimerAction,
+)
+from launch.event_handlers import OnProcessStart
+from launch.frontend import Parser
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import LifecycleNode, LoadComposableNodes, Node, PushROSNamespace
+import pytest
+
+from fogros2 import (
+    CloudNode,
+    ContainerInstance,
+    FogROSLaunchDescription,
+    Replicated,
+    StreamTopic,
+)
+from fogros2.actions.override import OverrideMachines
+from fogros2.describe.overrides import Overrides
+from fogros2.image_transport.h264 import H264
+from fogros2.model import NodeSpec
+from fogros2.runtime import replicas
+from fogros2.testing.plugins import instead
+
+pytestmark = pytest.mark.timeout(60)
+NAMES = ('one', 'two', 'three')
+
+
+@pytest.fixture(autouse=True)
+def first(monkeypatch):
+    """Replace the program of ``first_answer`` by one that only sleeps; return its settings."""
+    found = []
+
+    def spec(**given):
+        found.append(json.loads(given['arguments'][0]))
+        return NodeSpec(**{**given, 'package': 'demo', 'executable': 'talker'})
+
+    monkeypatch.setattr(replicas, 'NodeSpec', spec)
+    return found
+
+
+def machines(*names, **kwargs):
+    return [ContainerInstance(name=name, ros_workspace='', **kwargs) for name in names or NAMES]
+
+
+def talker(**kwargs):
+    return Node(package='demo', executable='talker', **kwargs)
+
+
+def ends_when_started(fake, count):
+    """Have the machines' nodes end when so many have started; return the nodes."""
+    lock, started = threading.Lock(), []
+
+    def on_start(machine, node):
+        with lock:
+            if 'decoder' in node.name:
+                return
+            started.append((machine, node))
+            if len(started) == count:
+                for one, its in started:
+                    one.say('exited', its, returncode=0, respawns=False)
+
+    fake.on_start = on_start
+    return started
+
+
+def rules(node):
+    return [word for before, word in zip(node.arguments, node.arguments[1:]) if before == '-r']
+
+
+def test_each_machine_runs_a_copy_under_its_own_names(run, fake, first):
+    started = ends_when_started(fake, 3)
+    assert run(FogROSLaunchDescription([Replicated(
+        machines(), [talker(name='planner', remappings=[('out', '/detections')])],
+        services=['/plan'], topics=[('/image', '/detections')], hedge_after='p95')])) == 0
+    assert sorted(machine.spec.name for machine, _ in started) == sorted(NAMES)
+    for machine, node in started:
+        prefix = f'/fogros2/{machine.spec.name}'
+        assert rules(node) == [
+            '__node:=planner', f'out:={prefix}/detections', f'/plan:={prefix}/plan',
+            f'/image:={prefix}/image', f'/detections:={prefix}/detections']
+    settings, = first
+    assert settings.pop('folder') == str(fake.store.launch('abcdef'))
+    assert settings == {
+        'name': 'first_answer_plan', 'services': ['/plan'], 'hedge_after': 'p95',
+        'topics': [['/image', '/detections', False]],
+        'replicas': {name: f'/fogros2/{name}' for name in NAMES}}
+
+
+def test_names_are_relative_to_their_namespace(run, fake, first):
+    ends_when_started(fake, 2)
+    assert run(LaunchDescription([GroupAction([PushROSNamespace('arm'), Replicated(
+        machines('one', 'two'), [talker()], services=['plan'])])])) == 0
+    assert first[0]['services'] == ['/arm/plan']
+
+
+def test_end_and_start_of_a_node_are_reported(run, fake, tmp_path):
+    """In the pipe of the launch's folder, as lines."""
+    read, killed = [], []
+
+    def on_start(machine, node):
+        folder = fake.store.launch('abcdef')
+        if not read:
+            read.append(os.open(folder / 'first_answer_plan.events', os.O_RDWR | os.O_NONBLOCK))
+        if machine.spec.name == 'two' and not killed:
+            killed.append(node)
+            machine.say('exited', node, returncode=-9, respawns=True)
+            machine.say('started', node, pid=77, cmd=['/there/program'])
+
+    fake.on_start = on_start
+    lines = []
+
+    def look(context):
+        while select.select(read, [], [], 5.0 if 'started two' not in ''.join(lines) else 0)[0]:
+            lines.append(os.read(read[0], 4096).decode())
+            if ''.join(lines).count('two') >= 3:
+                break
+        return None
+
+    assert run(FogROSLaunchDescription([
+        Replicated(machines('one', 'two'), [talker(respawn=True)], services=['/plan']),
+        TimerAction(period=0.2, actions=[OpaqueFunction(function=look), Shutdown()]),
+    ])) == 0
+    os.close(read[0])
+    said = [line for line in ''.join(lines).splitlines() if line.endswith('two')]
+    assert said[:3] == ['started two', 'died two', 'started two']
+
+
+def test_lost_machine_does_not_end_the_launch(run, fake, caplog):
+    started = ends_when_started(fake, 99)
+    ended = threading.Event()
+
+    def lose(event, context):
+        if len(started) == 2 and not ended.is_set():
+            ended.set()
+            gone = fake.machines['one']
+            threading.Thread(target=lambda: (
+                gone.say('lost', reason='taken away'),
+                fake.machines['two'].say('exited', fake.machines['two'].all[0], returncode=0,
+                                         respawns=False))).start()
+
+    assert run(FogROSLaunchDescription([
+        RegisterEventHandler(OnProcessStart(on_start=lose)),
+        Replicated(machines('one', 'two'), [talker()], services=['/plan'])])) == 0
+    assert "the machine 'one' is gone: taken away; the other replicas go on" in caplog.text
+
+
+class Harmless(H264):
+    """H.264's decisions, carried out by a program that only sleeps."""
+
+    def encoder(self, stream):
+        return dataclasses.replace(
+            super().encoder(stream), package='demo', executable='talker')
+
+    def decoder(self, stream):
+        return dataclasses.replace(
+            super().decoder(stream), package='demo', executable='talker')
+
+
+def test_streamed_input_is_not_forwarded_again(run, fake, first, monkeypatch):
+    instead(monkeypatch, 'fogros2.image_transport', {'h264': Harmless})
+    ends_when_started(fake, 2)
+    assert run(FogROSLaunchDescription([Replicated(
+        machines('one', 'two'), [talker(exec_name='own')], topics=[('/image', '/seen')],
+        stream_topics=[('/image', 'h264')])])) == 0
+    assert first[0]['topics'] == [['/image', '/seen', True]]
+
+
+def test_streamed_output_is_refused(run, caplog, monkeypatch):
+    instead(monkeypatch, 'fogros2.image_transport', {'h264': Harmless})
+    assert run(FogROSLaunchDescription([Replicated(
+        machines('one', 'two'), [talker()], topics=[('/image', '/seen')],
+        stream_topics=[StreamTopic('/seen', 'h264', 'to_robot')])])) == 1
+    assert '/seen is an output of replicas and a stream' in caplog.text
+
+
+def test_on_the_robot_the_nodes_run_once_with_their_own_names(run, fake, first):
+    replicated = Replicated(machines('one', 'two'), [talker()],
+                            services=['/plan'])
+    starts = []
+
+    def seen(event, context):
+        starts.append(event.process_name)
+        return [Shutdown()]
+
+    assert run(LaunchDescription([
+        RegisterEventHandler(OnProcessStart(on_start=seen)),
+        OverrideMachines(Overrides(['*=robot']), [replicated])])) == 0
+    assert len(starts) == 1 and first == [] and fake.machines == {}
+
+
+@pytest.mark.parametrize(('given', 'said'), [
+    ({'machines': []}, 'need two machines or more, not 0'),
+    ({'machines': ['one']}, 'need two machines or more, not 1'),
+    ({'machines': ['one', 'one']}, "have the machine 'one' twice"),
+    ({'services': ['/plan', 'plan']}, "have the name '/plan' twice"),
+    ({'topics': [('/a', '/plan')]}, "have the name '/plan' twice"),
+    ({'services': []}, 'need a service or a pair of topics'),
+    ({'services': ['/go/_action/send_goal']}, 'belongs to a ROS action'),
+    ({'services': ['/a b']}, "'/a b' is not the full name"),
+    ({'topics': [('/a',)]}, 'is no pair of topics'),
+    ({'topics': ['/a']}, 'is no pair of topics'),
+    ({'hedge_after': -1}, 'hedge_after=-1 is no time'),
+    ({'hedge_after': 'soon'}, "'soon' is no number"),
+])
+def test_bad_input_is_refused_before_a_machine_is_made(run, fake, caplog, given, said):
+    given = {'machines': ['one', 'two'], 'services': ['/plan'], **given}
+    names = given.pop('machines')
+    assert run(LaunchDescription([Replicated(machines(*names) if names else [], [talker()],
+                                             **given)])) == 1
+    assert said in caplog.text and fake.noted('up') == []
+
+
+@pytest.mark.parametrize(('content', 'said'), [
+    (lambda: LifecycleNode(package='demo', executable='talker', name='x', namespace=''),
+     'LifecycleNode cannot be replicated'),
+    (lambda: LoadComposableNodes(target_container='/box', composable_node_descriptions=[]),
+     'LoadComposableNodes cannot be replicated'),
+    (lambda: CloudNode(machine=machines('own')[0], package='demo', executable='talker'),
+     'a part of replicas has a machine of its own'),
+])
+def test_content_that_cannot_be_replicated_is_refused(run, fake, caplog, content, said):
+    assert run(LaunchDescription([Replicated(
+        machines('one', 'two'), [content()], services=['/plan'])])) == 1
+    assert said in caplog.text
+
+
+def test_machine_that_would_move_to_the_robot_is_refused(run, caplog):
+    assert run(LaunchDescription([Replicated(
+        machines('one', 'two', on_interrupt='robot'), [talker()], services=['/plan'])])) == 1
+    assert 'replicas cannot move to the robot' in caplog.text
+
+
+def test_two_groups_with_the_same_name_are_refused(run, caplog):
+    both = machines('one', 'two')
+    assert run(LaunchDescription([
+        Replicated(both, [talker()], services=['/plan']),
+        Replicated(both, [talker()], services=['/plan'])])) == 1
+    assert "two groups of replicas have '/plan'" in caplog.text
+
+
+XML = """
+<launch>
+  <arg name="second" default="two"/>
+  <fog_machine name="one" provider="container" ros_workspace=""/>
+  <fog_machine name="$(var second)" provider="container" ros_workspace=""/>
+  <replicated machines="one, $(var second)" services="/plan" topics="/image:/seen"
+              hedge_after="50">
+    <node pkg="demo" exec="talker" name="planner"/>
+  </replicated>
+</launch>
+"""
+YAML = """
+launch:
+- arg: {name: second, default: two}
+- fog_machine: {name: one, provider: container, ros_workspace: ''}
+- fog_machine: {name: $(var second), provider: container, ros_workspace: ''}
+- replicated:
+    machines: [one, $(var second)]
+    services: [/plan]
+    topics: ['/image:/seen']
+    hedge_after: 50
+    children:
+    - node: {pkg: demo, exec: talker, name: planner}
+"""
+
+
+def python():
+    return LaunchDescription([
+        DeclareLaunchArgument('second', default_value='two'),
+        Replicated([machines('one')[0], ContainerInstance(
+            name=LaunchConfiguration('second'), ros_workspace='')], [talker(name='planner')],
+            services=['/plan'], topics=[('/image', '/seen')], hedge_after=50)])
+
+
+@pytest.mark.parametrize('form', ['python', 'xml', 'yaml'])
+def test_three_formats_are_one_plan(run, fake, first, form):
+    if form == 'python':
+        description = python()
+    else:
+        source = io.StringIO({'xml': XML, 'yaml': YAML}[form].strip())
+        source.name = f'test.launch.{form}'
+        entity, parser = Parser.load(source)
+        description = parser.parse_description(entity)
+    started = ends_when_started(fake, 2)
+    assert run(description) == 0
+    assert sorted(machine.spec.name for machine, _ in started) == ['one', 'two']
+    assert [first[0][key] for key in ('services', 'topics', 'hedge_after')] == [
+        ['/plan'], [['/image', '/seen', False]], 50]
+    assert all('/seen:=/fogros2/' in ' '.join(rules(node)) for _, node in started)

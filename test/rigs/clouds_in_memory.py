@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The clouds without computers, for tests that they all share: one adapter for each."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping, Sequence
+import json
+import re
+from typing import Any, ClassVar
+
+import pytest
+
+from fogros2.provider.vm.provider import VmProvider
+from fogros2.waiting import wait_until
+
+#: A time tag that no program of FogROS2 has written.
+DAMAGED = 'yesterday, or so'
+
+
+class Memory(abc.ABC):
+    """
+    One cloud, simulated in this process.
+
+    :param served: value of the fixture that serves it.
+    :param patch: undoes its changes when the test ends.
+    """
+
+    #: The fixture of ``test/conftest.py``.
+    fixture: ClassVar[str]
+    name: ClassVar[str]
+    #: Options of a machine, and the type to try next.
+    options: ClassVar[Mapping[str, Any]]
+    more: ClassVar[Mapping[str, Any]]
+    #: The requests that create something, and how each can fail; see ``fail``.
+    steps: ClassVar[Sequence[tuple[str, str]]]
+    #: The most requests that list the machines of all regions.
+    listing: ClassVar[int]
+
+    def __init__(self, served: Any, patch: pytest.MonkeyPatch) -> None:
+        self.served, self.patch = served, patch
+
+    @abc.abstractmethod
+    def provider(self) -> VmProvider:
+        """Return a provider."""
+
+    @abc.abstractmethod
+    def left(self) -> bool:
+        """Return whether anything is left of machines."""
+
+    @abc.abstractmethod
+    def calls(self) -> int:
+        """Return the number of requests so far."""
+
+    @abc.abstractmethod
+    def fail(self, step: str, how: str) -> None:
+        """
+        Let a step fail from now on.
+
+        :param how: 'refused', 'late' (its operation fails), or 'lost' (it has its effect, and
+            its answer is an error).
+        """
+
+    @abc.abstractmethod
+    def fill(self, times: int) -> None:
+        """Let the next ``times`` machines find no room in their region; 0 for all."""
+
+    @abc.abstractmethod
+    def throttle(self) -> None:
+        """Refuse the next two requests because of their number."""
+
+    @abc.abstractmethod
+    def vanish(self) -> None:
+        """Let all machines end, and nothing else."""
+
+    @abc.abstractmethod
+    def retag(self, tags: Mapping[str, str]) -> None:
+        """Change tags of what is beside machines."""
+
+
+class Aws(Memory):
+    """Moto's EC2."""
+
+    fixture, name = 'moto_aws', 'aws'
+    options = {'ec2_instance_type': 't3.medium', 'disk_size': 10}
+    more = {'instance_types': ['t3.large']}
+    steps = tuple((step, how) for step in (
+        'CreateSecurityGroup', 'AuthorizeSecurityGroupIngress', 'ImportKeyPair', 'RunInstances')
+        for how in ('refused', 'lost'))
+    listing = 2  # there are two regions
+
+    def __init__(self, served: Any, patch: pytest.MonkeyPatch) -> None:
+        super().__init__(served, patch)
+        from rigs.ec2 import watched
+        self._rig, self._watched = watched, watched.Watched()
+
+    def provider(self) -> VmProvider:
+        """Return the watched provider."""
+        return self._watched.provider
+
+    def left(self) -> bool:
+        """Return whether there is anything."""
+        return self._rig.left() != self._rig.NOTHING
+
+    def calls(self) -> int:
+        """Return the number of calls."""
+        return len(self._watched.calls)
+
+    def fail(self, step: str, how: str) -> None:
+        """Refuse a call, or raise an error after it."""
+        if how == 'refused':
+            self._watched.refuse(step, *['UnauthorizedOperation'] * 9)
+            return
+        from fogros2.provider.aws.clients import Account
+        from fogros2.provider.aws.failures import AwsError
+        call, operation = Account.call, re.sub('(?<!^)([A-Z])', r'_\1', step).lower()
+
+        def lost(own: Any, service: str, region: str, asked: str, what: str, **words: Any) -> Any:
+            answer = call(own, service, region, asked, what, **words)
+            if asked == operation:
+                raise AwsError(f'{what} failed', code='InternalError', status=500)
+            return answer
+
+        self.patch.setattr(Account, 'call', lost)
+
+    def fill(self, times: int) -> None:
+        """Report a quota, which holds for the region."""
+        self._watched.refuse('RunInstances', *['VcpuLimitExceeded'] * (times or 20))
+
+    def throttle(self) -> None:
+        """Refuse two calls."""
+        self._watched.refuse('RunInstances', *['RequestLimitExceeded'] * 2)
+
+    def vanish(self) -> None:
+        """Terminate the instances."""
+        self._rig.ec2().terminate_instances(InstanceIds=self._rig.left()['instances'])
+
+    def retag(self, tags: Mapping[str, str]) -> None:
+        """Change the tags of groups and keys."""
+        ec2 = self._rig.ec2()
+        ids = [*self._rig.left()['groups'],
+               *(pair['KeyPairId'] for pair in ec2.describe_key_pairs()['KeyPairs'])]
+        ec2.create_tags(Resources=ids, Tags=[
+            {'Key': key, 'Value': value} for key, value in tags.items()])
+
+
+class Azure(Memory):
+    """The simulated Azure."""
+
+    fixture, name = 'azure_service', 'azure'
+    options = {'vm_size': 'Standard_B2als_v2', 'region': 'westeurope'}
+    more = {'vm_sizes': ['Standard_D2s_v5']}
+    #: Groups and schedules are there at once.
+    steps = tuple((step, how) for step in (
+        'resourcegroups', 'networksecuritygroups', 'publicipaddresses', 'virtualnetworks',
+        'networkinterfaces', 'virtualmachines', 'schedules')
+        for how in ('refused', 'late', 'lost') if how == 'refused' or step != 'schedules'
+        and (how == 'lost' or step != 'resourcegroups'))
+    listing = 2
+
+    def provider(self) -> VmProvider:
+        """Return the provider."""
+        from fogros2.provider.azure import AzureProvider
+        return AzureProvider()
+
+    def left(self) -> bool:
+        """Return whether there is a group or a machine; the role of machines stays."""
+        return bool(self.served.vms() or self.served.groups)
+
+    def calls(self) -> int:
+        """Return the number of requests."""
+        return len(self.served.calls)
+
+    def fail(self, step: str, how: str) -> None:
+        """Order an error; without the right to assign roles there is a schedule."""
+        from rigs.azure import service
+        self.served.rights = service.CONTRIBUTOR
+        self.patch.setattr('fogros2.provider.vm.rest.ATTEMPTS', 1)
+        self.served.faults.append(service.Fault(
+            'SomethingIsWrong', 500 if how == 'lost' else 400, 'PUT', step, times=0,
+            late=how == 'late', after=how == 'lost'))
+
+    def fill(self, times: int) -> None:
+        """Report a quota."""
+        from rigs.azure.service import Fault
+        self.served.faults.append(Fault('QuotaExceeded', 409, 'PUT', 'virtualMachines',
+                                        times=times))
+
+    def throttle(self) -> None:
+        """Refuse two requests."""
+        from rigs.azure.service import Fault
+        self.served.faults.append(Fault('TooManyRequests', 429, times=2))
+
+    def vanish(self) -> None:
+        """Evict the machines."""
+        for vm in self.served.vms():
+            self.served.evict(vm['id'])
+
+    def retag(self, tags: Mapping[str, str]) -> None:
+        """Change the tags of groups."""
+        for group in self.served.groups.values():
+            group['tags'] = {**group['tags'], **tags}
+
+
+class Gcp(Memory):
+    """The simulated Compute Engine."""
+
+    fixture, name = 'gce', 'gcp'
+    options = {'region': 'europe-west3', 'disk_size': 10}
+    more = {'machine_types': ['n2-standard-2']}
+    steps = tuple((step, how) for step in ('firewalls.insert', 'instances.insert')
+                  for how in ('refused', 'late', 'lost'))
+    listing = 1
+
+    def provider(self) -> VmProvider:
+        """Return the provider."""
+        from fogros2.provider.gcp import GCPProvider
+        return GCPProvider()
+
+    def left(self) -> bool:
+        """Return whether there is an instance or a rule."""
+        return bool(self.served.instances or self.served.own_firewalls)
+
+    def calls(self) -> int:
+        """Return the number of requests."""
+        return len(self.served.api.calls)
+
+    def _order(self, code: str, action: str, times: int, *, after: bool = False) -> None:
+        from rigs.gce.api import Fault
+        self.served.api.faults.append(Fault(code, action, times=times, after=after))
+
+    def fail(self, step: str, how: str) -> None:
+        """Order an error; a code in capitals is that of an operation."""
+        self.patch.setattr('fogros2.provider.vm.rest.ATTEMPTS', 1)
+        code = {'refused': 'forbidden', 'late': 'INTERNAL_ERROR', 'lost': 'internalError'}[how]
+        self._order(code, step, 0, after=how == 'lost')
+
+    def fill(self, times: int) -> None:
+        """Report a quota."""
+        self._order('QUOTA_EXCEEDED', 'instances.insert', times)
+
+    def throttle(self) -> None:
+        """Refuse two requests."""
+        self._order('rateLimitExceeded', '', 2)
+
+    def vanish(self) -> None:
+        """End the instances."""
+        for instance in self.served.instances:
+            self.served.project.cloud.end(instance['id'], 'terminate')
+        project = self.served.project  # which shows an instance for a while that has ended
+        wait_until(lambda: not self.served.instances and not [*project._lingering('instance')],
+                   timeout=5.0, what='the instances to end')
+
+    def retag(self, tags: Mapping[str, str]) -> None:
+        """Change the tags in the descriptions of rules."""
+        for rule in self.served.own_firewalls:
+            rule['description'] = json.dumps({**json.loads(rule['description']), **tags})
+
+
+MEMORIES: Mapping[str, type[Memory]] = {one.name: one for one in (Aws, Azure, Gcp)}
+

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A launch file with replicas on container machines, and a client that prints what each call costs.
+
+The client prints ``call NUMBER by REPLICA: MILLISECONDS``. It asks the replica that answers to die
+at the end of a call, and prints the milliseconds from the death to the answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Optional
+
+#: Seconds that a call takes, and milliseconds until the next replica is asked.
+TAKES, HEDGE = 0.02, 300.0
+#: Calls between two deaths; the first calls measure the latency of each replica.
+BETWEEN = 60
+
+SERVER = f"""
+import os, sys, time
+import rclpy
+from example_interfaces.srv import AddTwoInts
+
+def answer(request, response):
+    time.sleep({TAKES})
+    if request.b == number:
+        print(f'dies at {{time.monotonic()}}', flush=True)
+        os._exit(1)
+    response.sum = request.a * 100 + number
+    return response
+
+rclpy.init()
+node = rclpy.create_node('planner')
+number = int(os.uname().nodename.rpartition('-')[2])
+node.create_service(AddTwoInts, 'plan', answer)
+rclpy.spin(node)
+"""
+
+CLIENT = f"""
+import time
+import rclpy
+from example_interfaces.srv import AddTwoInts
+
+rclpy.init()
+node = rclpy.create_node('client')
+client = node.create_client(AddTwoInts, '/plan')
+client.wait_for_service()
+number = by = 0
+while rclpy.ok():
+    number += 1
+    dies = by if number % {BETWEEN} == 0 else -1
+    begin = time.monotonic()
+    future = client.call_async(AddTwoInts.Request(a=number, b=dies))
+    rclpy.spin_until_future_complete(node, future, timeout_sec=30)
+    taken = time.monotonic() - begin
+    if not future.done() or future.result().sum // 100 != number:
+        print(f'call {{number}} is lost', flush=True)
+        continue
+    by = future.result().sum % 100
+    print(f'call {{number}} by {{by}}: {{1e3 * taken:.1f}} ms', flush=True)
+    if dies >= 0:
+        # the one that died took as long before it did
+        print(f'death of {{dies}}: {{1e3 * (taken - {TAKES}):.1f}} ms from then', flush=True)
+    time.sleep(0.03)
+"""
+
+LAUNCH = """
+from fogros2 import ContainerInstance, FogROSLaunchDescription, Replicated
+from launch.actions import ExecuteProcess
+
+
+def generate_launch_description():
+    return FogROSLaunchDescription([
+        Replicated(
+            [ContainerInstance(name=name, network={network!r}) for name in {names!r}],
+            [ExecuteProcess(cmd=['python3', '-c', {server!r}, '--ros-args'], name='planner',
+                            respawn=True, respawn_delay=0.5, output='screen')],
+            services=['/plan'], hedge_after={hedge}),
+        ExecuteProcess(cmd=['python3', '-u', '-c', {client!r}], name='client', output='screen'),
+    ])
+"""
+
+
+def write(path: Path, names: Sequence[str], network: Optional[str]) -> Path:
+    """Write the launch file; names of machines end with ``-`` and a number."""
+    path.write_text(LAUNCH.format(names=list(names), network=network, server=SERVER,
+                                  client=CLIENT, hedge=HEDGE))
+    return path

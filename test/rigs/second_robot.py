@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A second robot on this computer: a network namespace behind a NAT of its own.
+
+::
+
+    this computer 203.0.113.241 --- .242  NAT  192.168.78.1 --- .2  second robot
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import os
+from pathlib import Path
+import subprocess
+
+import pytest
+
+from fogros2.model import Command
+from fogros2.process import argv, run
+from fogros2.store import Store
+from ros2fog_cli.api import reach
+
+HOST = '203.0.113.241'
+#: No packet of another connection comes in, as with a home's router.
+NAT = """\
+table inet nat {
+    chain forward { type filter hook forward priority filter; policy drop;
+        iifname "in" accept
+        ct state established,related accept
+    }
+    chain postrouting { type nat hook postrouting priority srcnat; oifname "out" masquerade; }
+}
+"""
+
+
+class SecondRobot:
+    """A computer with its own network, state folder and processes."""
+
+    def __init__(self, state: Path) -> None:
+        mark = f'fogs{os.getpid() % 100000}'
+        self.spaces = [f'{mark}n', f'{mark}r']
+        self.environment = {
+            **os.environ, 'FOGROS2_STATE_HOME': str(state),
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
+
+    def open(self) -> None:
+        nat, robot = self.spaces
+        for space in self.spaces:
+            self.ip('netns', 'add', space)
+            self.ip('-n', space, 'link', 'set', 'lo', 'up')
+        self.ip('link', 'add', nat, 'type', 'veth', 'peer', 'name', 'out', 'netns', nat)
+        self.ip('address', 'add', f'{HOST}/30', 'dev', nat)
+        self.ip('link', 'set', nat, 'up')
+        self.ip('link', 'add', 'in', 'netns', nat, 'type', 'veth',
+                'peer', 'name', 'e0', 'netns', robot)
+        for space, name, address in (
+                (nat, 'out', '203.0.113.242/30'), (nat, 'in', '192.168.78.1/24'),
+                (robot, 'e0', '192.168.78.2/24')):
+            self.ip('-n', space, 'address', 'add', address, 'dev', name)
+            self.ip('-n', space, 'link', 'set', name, 'up')
+        self.ip('-n', nat, 'route', 'add', 'default', 'via', HOST)
+        self.ip('-n', robot, 'route', 'add', 'default', 'via', '192.168.78.1')
+        run(Command(('ip', 'netns', 'exec', nat, 'sh', '-ec',
+                     'echo 1 >/proc/sys/net/ipv4/ip_forward; nft -f -'), sudo=True,
+                    input=NAT.encode()), timeout=10.0)
+
+    def close(self) -> None:
+        for name in reach.joined(Store(Path(self.environment['FOGROS2_STATE_HOME']))):
+            self.run('ros2', 'fog', 'leave', name)
+        for words in (('link', 'delete', self.spaces[0]),
+                      *(('netns', 'delete', space) for space in self.spaces)):
+            run(Command(('ip', *words), sudo=True), timeout=10.0, check=False)
+
+    def ip(self, *words: str) -> None:
+        run(Command(('ip', *words), sudo=True), timeout=10.0)
+
+    def start(self, *words: str) -> subprocess.Popen[str]:
+        """Start a program there; its output is read by the caller."""
+        return subprocess.Popen(
+            argv(Command(('ip', 'netns', 'exec', self.spaces[1], *words), sudo=True)),
+            env=self.environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True)
+
+    def run(self, *words: str, status: int = 0, timeout: float = 60.0) -> str:
+        """Return what a program there prints: its output, or its errors if it has to fail."""
+        child = self.start(*words)
+        try:
+            out, errors = child.communicate(timeout=timeout)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            out, errors = child.communicate()
+        assert child.returncode == status, f'{words}: {child.returncode}\n{out}{errors}'
+        return errors if status else out
+
+
+@pytest.fixture
+def second(tmp_path: Path, tun: None) -> Iterator[SecondRobot]:
+    robot = SecondRobot(tmp_path / 'second')
+    try:
+        robot.open()
+        yield robot
+    finally:
+        robot.close()

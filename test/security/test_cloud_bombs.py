@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A small point cloud from a hijacked machine takes no more than 300 MB of the robot's memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import struct
+import subprocess
+import sys
+
+import numpy
+import pytest
+
+pytest.importorskip('zstandard', reason='the extra "point_clouds" is not installed')
+from point_cloud_stream import codec
+from point_cloud_stream.cloud import Field, Layout, MAX_BYTES
+
+#: Bytes that decoding may take.
+LIMIT = 300e6
+#: Decodes what a file has, and prints how many bytes more the process held, and what came of it.
+DECODE = """\
+import resource, sys
+from pathlib import Path
+from point_cloud_stream.codec import decode, encode
+from point_cloud_stream.cloud import CloudError
+data = Path(sys.argv[1]).read_bytes()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+try:
+    said = decode(data)[1].size
+except CloudError as error:
+    said = error
+print(1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before), said, sep=';')
+"""
+FIELDS = tuple(Field(name, 4 * index, 7) for index, name in enumerate('xyz'))
+
+
+def decode(folder: Path, data: bytes) -> tuple[int, str]:
+    """Return bytes of memory that decoding took, and the size of the cloud or the refusal."""
+    (folder / 'cloud').write_bytes(data)
+    done = subprocess.run(
+        [sys.executable, '-c', DECODE, str(folder / 'cloud')], capture_output=True, text=True,
+        timeout=60, env={'PYTHONPATH': str(Path(__file__).parents[2])})
+    assert done.returncode == 0, done.stderr
+    taken, said = done.stdout.strip().split(';')
+    return int(taken), said
+
+
+def smooth(height: int, width: int) -> bytes:
+    """Return a coded range image of few bytes."""
+    turn = numpy.linspace(-3, 3, width)
+    rows = numpy.linspace(-5, 5, height)[:, None]
+    points = numpy.stack(numpy.broadcast_arrays(
+        50 * numpy.cos(turn), 50 * numpy.sin(turn), rows), -1).astype('<f4')
+    return codec.encode(Layout(height, width, FIELDS, 12, 12 * width), points.tobytes(),
+                        0.01).data
+
+
+def test_the_largest_allowed_cloud_stays_below_the_limit(tmp_path: Path) -> None:
+    data = smooth(1024, MAX_BYTES // 12 // 1024)
+    assert data[4] == codec.LIDAR and len(data) < 10_000
+    taken, said = decode(tmp_path, data)
+    assert int(said) > 0.99 * MAX_BYTES and taken < LIMIT, taken
+
+
+@pytest.mark.parametrize('height, width, point_step, row_step', [
+    (2 ** 31, 2 ** 31, 12, 2 ** 31), (0, 2 ** 31, 12, 0), (2 ** 31, 0, 12, 0),
+    (1, 1, 2 ** 31, 2 ** 31), (0, 0, 2 ** 31, 0), (2 ** 31, 1, 0, 0), (1, 100, 12, 2 ** 32 - 1)])
+def test_absurd_sizes_are_refused_before_memory_is_taken(
+    tmp_path: Path, height: int, width: int, point_step: int, row_step: int,
+) -> None:
+    data = bytearray(smooth(8, 64))
+    struct.pack_into('<IIII', data, 13, height, width, point_step, row_step)
+    taken, said = decode(tmp_path, bytes(data))
+    assert not said.isdecimal() and taken < 20e6, (taken, said)

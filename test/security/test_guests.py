@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Guests of a machine: what they reach, and who gets no answer at all."""
+
+from __future__ import annotations
+
+import sys
+
+from fogros2.waiting import wait_until
+from rigs.vpn_guest import Guest, guest
+from rigs.vpn_lab import Child, Lab, MACHINE, ROBOT
+
+__all__ = ['guest']
+
+#: Prints what arrives at its arguments, KIND:HOST:PORT.
+LISTENER = '''
+import json, selectors, socket, sys
+chosen = selectors.DefaultSelector()
+for word in sys.argv[1:]:
+    kind, host, port = word.split(':')
+    one = socket.socket(type=socket.SOCK_STREAM if kind == 'tcp' else socket.SOCK_DGRAM)
+    one.bind((host, int(port)))
+    if kind == 'tcp':
+        one.listen()
+    chosen.register(one, selectors.EVENT_READ, word)
+print(json.dumps({'ready': True}), flush=True)
+while True:
+    for key, _ in chosen.select():
+        said = key.fileobj.accept()[1][0] if key.data[0] == 't' else key.fileobj.recv(99).decode()
+        print(json.dumps({'at': key.data, 'said': said}), flush=True)
+'''
+SENDER = '''
+import socket, sys
+for word in sys.argv[1:]:
+    kind, host, port = word.split(':')
+    one = socket.socket(type=socket.SOCK_STREAM if kind == 'tcp' else socket.SOCK_DGRAM)
+    one.settimeout(0.5)
+    try:
+        one.connect((host, int(port)))
+        one.send(host.encode())
+    except OSError:
+        pass
+'''
+PORTS = ['tcp:0.0.0.0:22', 'tcp:0.0.0.0:8765', 'udp:0.0.0.0:7399', 'udp:0.0.0.0:53']
+DDS = 'udp:0.0.0.0:7410'
+#: Seconds in which WireGuard makes a second attempt at a handshake.
+ATTEMPTS = 6.0
+
+
+def listen(vpn: Lab, host: str) -> Child:
+    child = vpn.start(host, [sys.executable, '-c', LISTENER, *PORTS, DDS])
+    child.wait('ready')
+    return child
+
+
+def send(vpn: Lab, *to: str) -> None:
+    vpn.start('guest', [sys.executable, '-c', SENDER, *to]).process.wait(30)
+
+
+def silent(guest: Guest) -> bool:
+    """Tell whether the machine answers nothing to a guest that tries to connect."""
+    before = guest.received()
+    guest.up(answered=False)
+    assert not guest.lab.ping('guest', MACHINE, timeout=ATTEMPTS)
+    return guest.received() == before
+
+
+def looked(guest: Guest) -> bool:
+    """Run the machine's health check, as its agent does; tell whether a guest is left."""
+    vpn = guest.lab
+    vpn.run('machine', vpn.vpn.health_check(vpn.interfaces['machine']))
+    return guest.key in vpn.shell('machine', 'wg show all peers')
+
+
+def test_guest_reaches_dds_and_ping_of_the_machine_alone(vpn: Lab, guest: Guest) -> None:
+    # a machine that forwards, and a hijacked guest that sends all it can through the VPN
+    vpn.shell('machine', 'echo 1 >/proc/sys/net/ipv4/ip_forward')
+    guest.admit()
+    guest.up()
+    vpn.shell('guest', f'wg set {guest.interface.name} peer {guest.machine_key} '
+              'allowed-ips 198.18.7.0/24,203.0.113.2/32')
+    vpn.ip('-n', vpn.spaces['guest'], 'route', 'add', '203.0.113.2', 'dev', guest.interface.name)
+    machine, robot = listen(vpn, 'machine'), listen(vpn, 'robot')
+    send(vpn, *(word.replace('0.0.0.0', host) for host in (MACHINE, ROBOT, '203.0.113.2')
+                for word in (*PORTS, DDS)))
+    send(vpn, f'udp:{MACHINE}:7410')
+    machine.wait('said', count=2)
+    assert [(line['at'], line['said']) for line in machine.lines('said')] == [(DDS, MACHINE)] * 2
+    assert robot.lines('said') == []
+    assert not vpn.ping('guest', ROBOT) and vpn.ping('guest', MACHINE)
+
+
+def test_revoked_guest_gets_no_answer(guest: Guest) -> None:
+    guest.admit()
+    guest.up()
+    assert guest.ask('remove', keys=[guest.key]) == []
+    assert silent(guest)  # the invitation is used again, with the same key
+
+
+def test_expired_invitation_gets_no_answer(guest: Guest) -> None:
+    guest.admit(seconds=1.0)
+    wait_until(lambda: not looked(guest), timeout=10.0, what='the end of the invitation')
+    assert silent(guest)
+
+
+def test_invitation_of_another_computer_gets_no_answer(guest: Guest) -> None:
+    guest.admit()
+    guest.new_key()
+    assert silent(guest)
+
+
+def test_connected_guest_stays_and_an_absent_one_goes(guest: Guest) -> None:
+    vpn = guest.lab
+    guest.admit(seconds=1.0, patience=4.0)
+    guest.up()
+    wait_until(lambda: guest.ask('look')[0]['left'] < 0, timeout=10.0, what='the expiry')
+    assert looked(guest) and vpn.ping('guest', MACHINE)
+    guest.down()
+    wait_until(lambda: not looked(guest), timeout=20.0, what='the guest to be removed')
+    assert silent(guest)
+
+
+def test_changed_peers_and_repairs_keep_the_guest(vpn: Lab, guest: Guest) -> None:
+    guest.admit()
+    guest.up()
+    interface, peers = vpn.interfaces['machine'], vpn.peers()['machine']
+    for commands in (vpn.vpn.peers(interface, peers), vpn.vpn.repair(interface, peers)):
+        vpn.do('machine', commands)
+        assert vpn.ping('guest', MACHINE, timeout=5.0)
+    vpn.do('machine', vpn.vpn.down(interface))
+    assert vpn.shell('machine', f'ls /run/{interface.name}.* || :') == ''

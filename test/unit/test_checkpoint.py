@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Snapshots of a node's folder: complete or not there, and never larger than a disk."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+import random
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from fogros2.errors import ConfigurationError, ConnectError, ShellError
+from fogros2.host import checkpoint
+from fogros2.host.checkpoint import check_folder, Checkpoint
+from fogros2.model import Endpoint, Result
+from fogros2.process import which
+from fogros2.shell.local import LocalShell
+from fogros2.testing.fakes import FakeShell
+
+pytestmark = pytest.mark.skipif(which('rsync') is None, reason='needs rsync')
+
+
+@pytest.fixture
+def shell():
+    return LocalShell(Endpoint('local'), name='planner')
+
+
+@pytest.fixture
+def folder(tmp_path):
+    path = tmp_path / 'machine' / 'map'
+    (path / 'parts').mkdir(parents=True)
+    (path / 'parts/1').write_text('one')
+    return path
+
+
+@pytest.fixture
+def kept(folder, tmp_path):
+    return Checkpoint(str(folder), tmp_path / 'robot')
+
+
+def texts(path):
+    return {str(found.relative_to(path)): found.read_text()
+            for found in sorted(path.rglob('*')) if found.is_file()}
+
+
+def test_newest_snapshot_replaces_the_one_before(kept, folder, shell, tmp_path):
+    assert kept.save(shell, still=False) and texts(kept.newest) == {'parts/1': 'one'}
+    assert not kept.save(shell, still=False), 'nothing has changed'
+    inode = (kept.newest / 'parts/1').stat().st_ino
+    (folder / 'parts/2').write_text('two')
+    assert kept.save(shell, still=False)
+    assert texts(kept.newest) == {'parts/1': 'one', 'parts/2': 'two'}
+    assert (kept.newest / 'parts/1').stat().st_ino == inode, 'a link, and no second copy'
+    (folder / 'parts/1').unlink()
+    assert kept.save(shell, still=False) and texts(kept.newest) == {'parts/2': 'two'}
+    assert [path.name for path in (tmp_path / 'robot').iterdir()] == ['00000003']
+
+
+def test_restored_folder_equals_the_snapshot(kept, folder, shell, tmp_path):
+    assert not kept.restore(shell), 'there is none yet'
+    kept.save(shell, still=False)
+    (folder / 'parts/1').write_text('later')
+    (folder / 'other').write_text('later')
+    assert kept.restore(shell, '.before-abc') and texts(folder) == {'parts/1': 'one'}
+    assert texts(tmp_path / 'machine/map.before-abc') == {'parts/1': 'later', 'other': 'later'}
+    (folder / 'parts/1').write_text('here')
+    assert texts(kept.newest) == {'parts/1': 'one'}, 'nodes write no snapshot'
+    kept.restore(shell, '.before-abc')
+    assert texts(tmp_path / 'machine/map.before-abc')['other'] == 'later', 'kept once'
+
+
+class Torn(LocalShell):
+    """A shell over which a copy does what a test wants, then ends."""
+
+    def fetch(self, source, target, **words):
+        self.during(Path(source), target)
+        super().fetch(source, target, **words)
+
+
+@pytest.fixture
+def torn():
+    return Torn(Endpoint('local'), name='planner')
+
+
+def test_copy_of_a_changing_folder_is_not_used(kept, folder, torn):
+    numbers = iter(range(100))
+    torn.during = lambda source, target: (source / 'more').write_text(str(next(numbers)))
+    with pytest.raises(ShellError, match='changes faster than it can be copied.*~/checkpoint'):
+        kept.save(torn, still=False)
+    assert kept.newest is None
+    assert kept.save(torn, still=True), 'its node says that the files are consistent'
+
+
+def test_copy_that_was_cut_off_is_not_used(kept, folder, torn, shell):
+    def cut(source, target):
+        target.mkdir()
+        (target / 'parts').write_text('half')
+        raise ConnectError('the connection is lost')
+
+    kept.save(shell, still=False)
+    (folder / 'parts/2').write_text('two')
+    torn.during = cut
+    with pytest.raises(ConnectError):
+        kept.save(torn, still=True)
+    assert texts(kept.newest) == {'parts/1': 'one'}
+    kept.save(shell, still=True)
+    assert texts(kept.newest) == {'parts/1': 'one', 'parts/2': 'two'}
+
+
+def test_missing_folder_has_no_snapshot(shell, tmp_path):
+    kept = Checkpoint(str(tmp_path / 'nothing'), tmp_path / 'robot')
+    assert not kept.save(shell, still=False) and kept.newest is None
+
+
+def test_too_large_folder_is_refused(kept, shell, monkeypatch):
+    monkeypatch.setattr(checkpoint, 'LIMIT', 1000)
+    with pytest.raises(ShellError, match=r'has 0.0 GB, and a checkpoint at most 0.0 GB'):
+        kept.save(shell, still=False)
+
+
+def test_unreadable_file_is_named(kept):
+    shell = FakeShell(handlers={'sh': lambda command: Result(0, 'unreadable ./parts/1\n', '')})
+    with pytest.raises(ShellError, match='./parts/1 in .* can not be read'):
+        kept.save(shell, still=False)
+
+
+def test_robot_whose_disk_is_full_keeps_the_last_snapshot(kept, folder, shell, tmp_path):
+    """A file system of the test's own would need root; a limit of sizes fails as a full disk."""
+    kept.save(shell, still=False)
+    (folder / 'large').write_bytes(b'x' * 3_000_000)
+    program = ('import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20,) * 2)\n'
+               'import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n'
+               'from pathlib import Path\n'
+               'from fogros2.host.checkpoint import Checkpoint\n'
+               'from fogros2.model import Endpoint\n'
+               'from fogros2.shell.local import LocalShell\n'
+               'Checkpoint(sys.argv[1], Path(sys.argv[2])).save(\n'
+               '    LocalShell(Endpoint("local"), name="planner"), still=True)\n')
+    ended = subprocess.run([sys.executable, '-c', program, str(folder), str(tmp_path / 'robot')],
+                           capture_output=True, text=True)
+    assert ended.returncode != 0 and 'Error: ' in ended.stderr
+    assert texts(kept.newest) == {'parts/1': 'one'}
+    assert not (tmp_path / 'robot/partial').exists()
+
+
+def test_killed_copies_leave_complete_snapshots(tmp_path):
+    """At random moments; each snapshot has one generation of all files."""
+    folder = tmp_path / 'map'
+    folder.mkdir()
+    dice = random.Random(21)
+    program = ('import sys\nfrom pathlib import Path\n'
+               'from fogros2.host.checkpoint import Checkpoint\n'
+               'from fogros2.model import Endpoint\n'
+               'from fogros2.shell.local import LocalShell\n'
+               'kept = Checkpoint(sys.argv[1], Path(sys.argv[2]))\n'
+               'print("ready", flush=True); sys.stdin.readline()\n'
+               'kept.save(LocalShell(Endpoint("local"), name="planner"), still=False)\n')
+    kept = Checkpoint(str(folder), tmp_path / 'robot')
+    used = set()
+    for generation in range(6):
+        for number in range(20):
+            (folder / str(number)).write_text(str(generation) * 20_000)
+        child = subprocess.Popen(
+            [sys.executable, '-c', program, str(folder), str(tmp_path / 'robot')],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
+        child.stdout.readline()
+        child.stdin.write('go\n')
+        child.stdin.flush()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            child.wait(dice.uniform(0.0, 0.6))
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)
+        child.communicate()
+        if kept.newest is not None:
+            found = texts(kept.newest)
+            assert len(found) == 20 and len({text[:1] for text in found.values()}) == 1
+            used.add(found['0'][:1])
+    assert kept.save(LocalShell(Endpoint('local'), name='planner'), still=False) or used
+
+
+@pytest.mark.parametrize('given, path', [
+    ('$HOME/map', '~/map'), ('~/a/b/', '~/a/b'), ('/var/map', '/var/map')])
+def test_folders(given, path):
+    assert check_folder('checkpoint', given) == path
+
+
+@pytest.mark.parametrize('given', ['$HOME', '~', '/', '', 'map', '~/../etc', '/var//map', '~/.'])
+def test_folder_that_cannot_be_copied_is_refused(given):
+    with pytest.raises(ConfigurationError, match='is no folder that can be copied'):
+        check_folder('checkpoint', given)

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog invite``, ``revoke`` and ``join`` over a provider that lives in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import dataclasses
+import json
+import os
+from pathlib import Path
+import time
+from typing import Any
+
+import pytest
+from ros2cli.cli import main
+
+from fogros2 import invitation
+from fogros2.errors import VpnError
+from fogros2.model import (
+    Command,
+    Endpoint,
+    Machine,
+    MachineSpec,
+    MachineState,
+    Result,
+    VpnInterface,
+)
+from fogros2.provider.container import packet_filter
+from fogros2.store import process_start, Record, Store, write_private
+from fogros2.testing.fakes import FakeShell
+from fogros2.testing.plugins import instead, MemoryProvider
+from ros2fog_cli.api import endings, guests, membership, reach
+
+OTHER = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
+MACHINE = Machine('id', 'planner', 'memory', MachineState.RUNNING, time.time(),
+                  Endpoint('ssh', '203.0.113.9'), vpn_host='203.0.113.9', vpn_port=30000)
+
+
+class Memory(MemoryProvider):
+    """A provider with one machine."""
+
+    name = 'memory'
+    machines: dict[str, Machine] = {}
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Any]]:
+    """Return what the machine is asked; its list of guests has one."""
+    instead(monkeypatch, 'fogros2.provider', {'memory': Memory})
+    Memory.machines = {'id': MACHINE}
+    store, interface = Store(), VpnInterface(
+        'fogabc123m0', '198.18.7.2', '198.18.7.0/24', 50000, '/run/key')
+    store.save(Record(
+        'planner', 'memory', MachineSpec('planner', 'memory'), machine_id='id', launch='abc123',
+        pid=os.getpid(), pid_start=process_start(os.getpid()) or 0, public_key=OTHER,
+        vpn=interface, robot_vpn=dataclasses.replace(interface, name='fogabc123')))
+    for name, content in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '7')):
+        write_private(store.launch('abc123') / name, content.encode())
+    found: list[tuple[str, Any]] = []
+
+    def answer(command: Command) -> Result:
+        assert command.sudo and command.argv[:3] == ('python3', '-IS', '-c')
+        assert command.argv[4] == 'fogabc123m0'
+        request = json.loads(command.input)
+        found.append((command.argv[5], request))
+        own = {'key': (request or {}).get('key', OTHER), 'label': 'robot2',
+               'address': '198.18.7.224', 'left': 60.0, 'heard': None}
+        return Result(0, json.dumps([own] if command.argv[5] != 'remove' else []), '')
+
+    @contextlib.contextmanager
+    def session(*arguments: object, **more: object) -> Iterator[FakeShell]:
+        yield FakeShell(handlers={'python3': answer})
+
+    monkeypatch.setattr(reach, 'session', session)
+    return found
+
+
+def fog(*words: str) -> Any:
+    return main(argv=['fog', *words])
+
+
+def test_invitation_names_all_that_the_joiner_needs(
+    asked: list[tuple[str, Any]], capsys: pytest.CaptureFixture[str], tmp_path: Path,
+) -> None:
+    second = Store(tmp_path / 'second')
+    key = invitation.own_name(second)
+    assert fog('invite', 'planner', '--key', key, '--for', '10m') == 0
+    text = capsys.readouterr().out.strip()
+    found = invitation.unseal(text, invitation.own_key(second))
+    assert dataclasses.replace(found, expires=0.0) == invitation.Invitation(
+        'planner', OTHER, '198.18.7.2', '203.0.113.9:30000', '198.18.7.224', '198.18.7.0/24',
+        'rmw_cyclonedds_cpp', 7, 0.0)
+    assert 590 < found.expires - time.time() <= 600
+    ((verb, request),) = asked
+    assert (verb, request['key'], request['seconds'], request['patience']) == (
+        'admit', invitation.parse_key(key)[1], 600.0, 180.0)
+    assert request['addresses'][0] == '198.18.7.224' and len(request['addresses']) == 31
+    assert fog('invite', 'planner', '--key', key, '--address', 'robot.example') == 0
+    text = capsys.readouterr().out.strip()
+    assert invitation.unseal(
+        text, invitation.own_key(second)).endpoint == 'robot.example:30000'
+
+
+def test_machine_that_nobody_can_dial_is_one_clear_error(
+    asked: list[tuple[str, Any]], capsys: pytest.CaptureFixture[str],
+) -> None:
+    Memory.machines = {'id': dataclasses.replace(
+        MACHINE, vpn_host='', robot_host='198.51.100.1')}
+    assert "'planner' dials the robot" in fog('invite', 'planner', '--key', OTHER)
+    assert capsys.readouterr().out == '' and asked == []
+
+
+@pytest.mark.parametrize('change, words', [
+    ({'launch': ''}, 'no launch on this robot'), ({'public_key': ''}, 'no launch on this robot'),
+    ({'rmw': 'rmw_zenoh_cpp'}, 'rmw_zenoh_cpp'), ({'key': 'AAAA'}, 'no key')])
+def test_what_cannot_be_joined_admits_nobody(
+    asked: list[tuple[str, Any]], capsys: pytest.CaptureFixture[str], change: dict[str, str],
+    words: str,
+) -> None:
+    key = change.pop('key', OTHER)
+    if 'rmw' in change:
+        write_private(Store().launch('abc123') / 'rmw', change.pop('rmw').encode())
+    changes: Any = change
+    Store().save(dataclasses.replace(Store().load('planner'), **changes))
+    assert words in fog('invite', 'planner', '--key', key)
+    assert capsys.readouterr().out == '' and asked == []
+
+
+@pytest.mark.parametrize('who', [(), ('robot2',), ('198.18.7.224',), (OTHER,), (f'x:{OTHER}',)])
+def test_guests_are_revoked_by_name_address_or_key(
+    asked: list[tuple[str, Any]], capsys: pytest.CaptureFixture[str], who: tuple[str, ...],
+) -> None:
+    assert fog('revoke', 'planner', *who) == 0
+    assert capsys.readouterr().out == 'revoked robot2\n'
+    assert asked == [('look', None), ('remove', {'keys': [OTHER]})]
+
+
+@pytest.mark.parametrize('change', [
+    {'label': '\x1b[2J'}, {'key': 'short'}, {'address': '198.18.7.1'}, {'address': '192.0.2.1'},
+    {'left': 'long'}, {'left': float('nan')}, {'heard': 'x'}, {'heard': float('inf')}])
+def test_machine_that_lies_about_its_guests_is_reported(
+    asked: list[tuple[str, Any]], change: dict[str, object],
+) -> None:
+    guest = {'key': OTHER, 'label': 'a', 'address': '198.18.7.224', 'left': 1.0, 'heard': None}
+    for answer in ([{**guest, **change}], [{}], 7):
+        text = json.dumps(answer)
+        shell = FakeShell(handlers={'python3': lambda c, text=text: Result(0, text, '')})
+        with pytest.raises(VpnError, match='invalid list of guests'):
+            guests.ask(shell, Store().load('planner'), 'look')
+
+
+def test_folder_of_a_joined_machine_stays_until_a_reboot(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    store = Store(tmp_path / 'second')
+    text = invitation.seal(invitation.Invitation(
+        'planner', OTHER, '198.18.7.2', '203.0.113.9:30000', '198.18.7.224', '198.18.7.0/24',
+        'rmw_cyclonedds_cpp', 7, time.time() + 60), invitation.public_text(
+            invitation.own_key(store)))
+    ran: list[Command] = []
+    monkeypatch.setattr(membership, 'check_robot', lambda: None)
+    monkeypatch.setattr(membership, 'run', lambda commands, **k: ran.extend(commands) or '')
+    folder = membership.join(text, store, {})
+    assert (folder / 'vpn.key').read_text() == (store.root / 'key').read_text()
+    assert f'fog{folder.name}' in (folder / 'dds.xml').read_text()
+    assert reach.variables_of(folder)['ROS_DOMAIN_ID'] == '7'
+    assert 'Endpoint = 203.0.113.9:30000' in ran[-1].argv[-1]
+    key = (store.root / 'key').read_text().strip()
+    assert not [word for command in ran for word in command.argv if key in word]
+    assert reach.joined(store) == {'planner': folder} and endings.leftovers(store) == []
+    process = json.loads((folder / 'process.json').read_text())
+    (folder / 'process.json').write_text(json.dumps({**process, 'boot': 'before'}))
+    assert endings.leftovers(store) == [folder]
+
+
+def test_range_of_the_joiners_own_is_one_clear_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    store = Store(tmp_path / 'second')
+    text = invitation.seal(invitation.Invitation(
+        'planner', OTHER, '198.18.7.2', '203.0.113.9:30000', '198.18.7.224', '198.18.7.0/24',
+        'rmw_cyclonedds_cpp', 7, time.time() + 60), invitation.public_text(
+            invitation.own_key(store)))
+    monkeypatch.setattr(membership, 'check_robot', lambda: None)
+    monkeypatch.setattr(membership, 'run', lambda *a, **k: json.dumps(
+        [{'dst': '198.18.0.0/16', 'dev': 'eth1'}]))
+    with pytest.raises(VpnError, match='uses 198.18.0.0/16'):
+        membership.join(text, store, {})
+    assert reach.joined(store) == {}
+
+
+def test_published_port_is_part_of_the_machines_filter() -> None:
+    text = packet_filter.publish('fogros2-abc', 50000, '198.51.100.2')
+    assert 'fib daddr type local udp dport 50000 dnat ip to 198.51.100.2' in text
+    assert 'table inet fogros2-abc' in text
+    assert 'delete table %s fogros2-abc' in packet_filter.unset('fogros2-abc')

@@ -1,0 +1,332 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Prices of several clouds in one table, and the machine that takes the cheapest of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+import dataclasses
+from decimal import Decimal
+import json
+from pathlib import Path
+import subprocess
+import sys
+import threading
+from typing import Any
+
+import pytest
+from ros2cli.cli import main
+
+from fogros2.deploy import Launch
+from fogros2.deploy import launch as launches
+from fogros2.errors import ConfigurationError, FogError, ProviderError
+from fogros2.model import MachineSpec
+from fogros2.provider import clouds
+from fogros2.provider.azure import AzureProvider
+from fogros2.provider.cheapest import Cheapest
+from fogros2.provider.gcp import GCPProvider, prices
+from fogros2.provider.offers import MachineType, Offer, Offers, ranked, Region, Wants, wants
+from fogros2.provider.vm import regions
+from fogros2.report import Warned
+from fogros2.store import Store
+from fogros2.testing.fakes import FakeProvider, FakeVpn
+from fogros2.testing.plugins import instead
+from rigs.gce.catalogue import API_KEY
+
+
+def run(*words: str) -> Any:
+    return main(argv=['fog', 'price', *words])
+
+
+class Fake(FakeProvider):
+    """A cloud with two regions and one size."""
+
+    place = 'north'
+    price = Decimal(1)
+    size = MachineType('small', 8, 4, 32.0, 'x86_64', 'AMD', 1, 'NVIDIA L4', 22.4)
+    capabilities = FakeProvider.can(regions=True, prices=True)
+    times: dict[str, float] = {}
+    here = True
+
+    @classmethod
+    def configured(cls) -> bool:
+        return cls.here
+
+    @classmethod
+    def region_names(cls) -> Sequence[str]:
+        return [cls.place, f'{cls.place}-2']
+
+    def regions(self, names: Sequence[str] = (), *, every: bool = False) -> list[Region]:
+        found = [Region(name, '', self.times.get(name))
+                 for name in names or self.region_names()]
+        return sorted(found, key=lambda one: one.milliseconds or 1e9)
+
+    def offers(
+        self, wanted: Wants, regions: Sequence[str] = (), *, refresh: bool = False,
+    ) -> Offers:
+        self._called('offers')
+        named = list(regions) or [self.place]
+        named = list(self.region_names()) if 'all' in named else named
+        found = [Offer(name, self.size, self.price * (number + 1))
+                 for number, name in enumerate(named)]
+        return Offers(wanted, tuple(ranked(found, wanted.spot)), tuple(named))
+
+    def taking(self, spec: MachineSpec, offer: Offer) -> MachineSpec:
+        return dataclasses.replace(
+            spec, provider=self.name, wanted=spec.options, options={'size': offer.region})
+
+
+class North(Fake):
+    name = 'north'
+
+
+class South(Fake):
+    name, place, price = 'south', 'south', Decimal('1.5')
+
+
+@pytest.fixture
+def fakes(monkeypatch: pytest.MonkeyPatch) -> dict[str, Fake]:
+    """Install two clouds, one object each; the first is the cheaper one."""
+    made: dict[str, Fake] = {'north': North(), 'south': South()}
+
+    def maker(kind: type[Fake]) -> Any:
+        def make() -> Fake:
+            return made[kind.name]
+        # the class's methods are asked before there is an object
+        make.__dict__.update(capabilities=kind.capabilities, configured=lambda: kind.here,
+                             region_names=kind.region_names)
+        return make
+
+    monkeypatch.setattr(Fake, 'times', {'north': 30.0, 'north-2': 80.0, 'south': 12.34})
+    instead(monkeypatch, 'fogros2.provider', {'north': maker(North), 'south': maker(South)})
+    return made
+
+
+@pytest.fixture
+def two_clouds(
+    gce: Any, azure_service: Any, monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[Callable[..., None]]:
+    """Use Google's and Azure's simulated services, with prices and connect times."""
+    prices._asked.cache_clear()
+    monkeypatch.setenv(prices.KEY_VARIABLE, API_KEY)
+    monkeypatch.setenv(prices.ENDPOINT_VARIABLE, f'{gce.url}/')
+    monkeypatch.setenv('CLOUDSDK_COMPUTE_REGION', 'europe-west3')
+    monkeypatch.setattr(clouds, 'DEADLINE', 300.0)  # a busy computer loads libraries slowly
+    monkeypatch.setattr(clouds, 'DEADLINE_ALL', 300.0)
+    monkeypatch.setattr(regions, 'connect_time', lambda host, port, timeout: (
+        0.0123 if 'europe-west3' in host else 0.0456))
+    instead(monkeypatch, 'fogros2.provider', {'azure': AzureProvider, 'gcp': GCPProvider})
+    yield monkeypatch.setenv
+    prices._asked.cache_clear()
+
+
+# -- the table --------------------------------------------------------------------------------
+
+
+def test_one_table_has_the_prices_of_all_clouds(
+    two_clouds: Any, capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run('--arch', 'x86_64', '--limit', '3') == 0
+    said = capsys.readouterr()
+    assert said.out.splitlines() == [
+        '2 CPUs, 4 GB, x86_64, in westeurope, europe-west3',
+        'TYPE               PROVIDER  REGION        CPUS  MEMORY  ARCH    CPU    PRICE/H  SPOT/H '
+        '  ROUND TRIP',
+        'Standard_B2als_v2  azure     westeurope    2     4 GB    x86_64  AMD    $0.0376  $0.0094'
+        '  46 ms',
+        'e2-medium          gcp       europe-west3  2     4 GB    x86_64  -      $0.0432  $0.0086'
+        '  12 ms',
+        'Standard_D2s_v5    azure     westeurope    2     8 GB    x86_64  Intel  $0.0960  $0.0192'
+        '  46 ms',
+        '6 more cost as much or more (--limit 0)']
+    assert said.err == ''
+
+
+def test_spot_price_and_round_trip_are_in_json(
+    two_clouds: Any, capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run('--arch', 'x86_64', '--spot', '--limit', '2', '--json') == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [(one['provider'], one['type'], one['spot_price'], round(one['round_trip_ms'], 1))
+            for one in found] == [('gcp', 'e2-medium', '0.0086319', 12.3),
+                                  ('azure', 'Standard_B2als_v2', '0.0094', 45.6)]
+
+
+def test_google_without_a_key_has_an_unknown_price(
+    two_clouds: Any, capsys: pytest.CaptureFixture[str],
+) -> None:
+    two_clouds(prices.KEY_VARIABLE, '')
+    assert run('--arch', 'x86_64', '--limit', '1') == 0
+    said = capsys.readouterr()
+    assert 'azure' in said.out and 'gcp' not in said.out
+    assert "gcp: Google's prices are not known here" in said.err
+
+
+def test_cloud_that_is_not_set_up_is_named_and_not_asked(
+    fakes: dict[str, Fake], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(South, 'here', False)
+    assert run() == 0
+    said = capsys.readouterr()
+    assert said.err == 'not set up here: south\n'
+    assert fakes['south'].calls == [] and said.out.splitlines()[2].split()[:3] == [
+        'small', 'north', 'north']
+    monkeypatch.setattr(North, 'here', False)
+    assert 'no cloud with prices is set up here (one of north, south needs credentials)' in str(
+        run())
+    # named, it is asked
+    assert run('--provider', 'south') == 0
+    assert capsys.readouterr().err == ''
+
+
+def test_table_is_printed_without_a_silent_cloud(
+    fakes: dict[str, Fake], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    end = threading.Event()
+    monkeypatch.setattr(clouds, 'DEADLINE', 0.5)
+    monkeypatch.setattr(South, 'offers', lambda *_, **__: end.wait(20.0))
+    assert run() == 0
+    end.set()
+    said = capsys.readouterr()
+    assert 'small' in said.out and said.err == 'south: does not answer within 0.5 s\n'
+
+
+def test_refusing_cloud_is_a_line_below_the_table(
+    fakes: dict[str, Fake], capsys: pytest.CaptureFixture[str],
+) -> None:
+    fakes['north'].failures['offers'] = ProviderError('the token has expired', 'log in')
+    assert run() == 0
+    said = capsys.readouterr()
+    assert 'south' in said.out and said.err == 'north: the token has expired (log in)\n'
+    for fake in fakes.values():
+        fake.failures['offers'] = ProviderError(f'no {fake.name}')
+    assert 'no cloud offers 2 CPUs, 4 GB' in str(error := run()) and 'no north' in str(error)
+
+
+@pytest.mark.parametrize(('words', 'expected'), [
+    (['--gpu', 'L5'], 'no Azure type in westeurope has 2 CPUs, 4 GB, 1 GPU L5, x86_64 '
+     '(GPUs there: NVIDIA T4)'),
+    (['--gpu', 'L5'], 'no Google Cloud type in europe-west3 has'),
+    (['--min-cpu', '512'], '(ask for less, or in another region)'),
+    (['--max-price', '0.001'], 'costs at most $0.001 an hour (the cheapest is'),
+    (['--max-price', 'cheap'], "'cheap' is no price"),
+    (['--max-round-trip', '5'], 'azure: has no region within 5 ms'),
+    (['--region', 'moon-1'], 'none of azure, gcp has a region moon-1'),
+    (['--provider', 'acme'], "there is no provider 'acme'")])
+def test_bad_input_is_named(
+    two_clouds: Any, words: list[str], expected: str, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if words[0] == '--provider':
+        monkeypatch.undo()
+    assert expected in str(run('--arch', 'x86_64', *words))
+
+
+def test_regions_belong_to_their_clouds(fakes: dict[str, Fake]) -> None:
+    found = clouds.compare(wants(arch='x86_64'), (), ['south-2', 'north'])
+    assert [str(offer) for offer in found.offers] == [
+        'small of north in north', 'small of south in south-2']
+    assert fakes['north'].calls == ['offers']
+
+
+def test_regions_that_are_too_far_are_left_out(fakes: dict[str, Fake]) -> None:
+    found = clouds.compare(wants(), max_round_trip_ms=50.0)
+    assert [(offer.region, offer.round_trip_ms) for offer in found.offers] == [
+        ('north', 30.0), ('south', 12.34)]
+    with pytest.raises(ConfigurationError, match=r'within 5 ms \(north takes 30 ms\)'):
+        clouds.compare(wants(), ['north'], max_round_trip_ms=5.0)
+
+
+def test_prices_load_no_library_of_an_unused_cloud() -> None:
+    program = ('import os, sys; from fogros2.provider import clouds\n'
+               'print(clouds.clouds()[1], [name for name in ("boto3", "google.auth", '
+               '"azure.identity", "requests", "kubernetes") if name in sys.modules])')
+    done = subprocess.run(
+        [sys.executable, '-c', program], capture_output=True, text=True, check=True,
+        env={'HOME': '/nonexistent', 'PYTHONPATH': ':'.join(sys.path)})
+    assert done.stdout == "['aws', 'azure', 'gcp'] []\n"
+
+
+# -- a machine of the cheapest cloud ----------------------------------------------------------
+
+
+def test_cheapest_tries_each_cloud_and_the_cheapest_first(
+    fakes: dict[str, Fake], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr('fogros2.provider.cheapest.TRIES', 2)
+    spec = MachineSpec('planner', 'cheapest', {'min_cpu': 8, 'gpu': 'L4'})
+    found = Cheapest().places(spec)
+    assert [str(offer) for offer, _ in found] == [
+        'small of north in north', 'small of south in south']
+    assert [(place.provider, place.options, place.wanted) for _, place in found] == [
+        ('north', {'size': 'north'}, spec.options), ('south', {'size': 'south'}, spec.options)]
+    for options, words in (({'max_round_trip_ms': 0}, 'max_round_trip_ms can not be 0'),
+                           ({'min_cpu': -1}, 'min_cpu can not be -1')):
+        with pytest.raises(ConfigurationError, match=words):
+            Cheapest().check(dataclasses.replace(spec, options=options))
+
+
+def test_offer_of_a_cloud_becomes_its_options() -> None:
+    spec = MachineSpec('planner', 'cheapest', {'min_cpu': 2, 'disk_size': 40, 'spot': True})
+    taken = AzureProvider().taking(spec, Offer(
+        'westeurope', MachineType('Standard_D2s_v5', 2, 1, 8.0, 'x86_64')))
+    assert (taken.provider, taken.options) == ('azure', {
+        'region': 'westeurope', 'vm_size': 'Standard_D2s_v5', 'disk_size': 40, 'spot': True})
+
+
+@pytest.fixture
+def launch(
+    fakes: dict[str, Fake], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> Callable[[list[Any]], Launch]:
+    monkeypatch.setattr(launches, 'check_robot', lambda: None)
+    instead(monkeypatch, 'fogros2.vpn', {'wireguard': FakeVpn})
+    monkeypatch.setattr('fogros2.shell.warm', lambda kind: None)
+    return lambda events: Launch(store=Store(tmp_path), environment={}, report=events.append)
+
+
+SPEC = MachineSpec('planner', 'cheapest', {'min_cpu': 8, 'regions': ['north', 'south']})
+
+
+@pytest.mark.parametrize(('full', 'tried'), [(True, ['north', 'south']), (False, ['north'])])
+def test_only_a_lack_of_capacity_tries_the_next_cloud(
+    fakes: dict[str, Fake], launch: Any, monkeypatch: pytest.MonkeyPatch, full: bool,
+    tried: list[str],
+) -> None:
+    events: list[Any] = []
+    made: list[tuple[str, str]] = []
+    error = ProviderError('no machine is free')
+    error.no_capacity = full
+
+    def bring_up(context: Any, place: MachineSpec) -> str:
+        made.append((place.provider, place.options['size']))
+        if place.provider == 'north':
+            raise error
+        return 'up'
+
+    monkeypatch.setattr(launches, 'bring_up', bring_up)
+    monkeypatch.setattr(Launch, 'context', lambda self, spec: None)
+    mine = launch(events)
+    mine.prepare([SPEC])
+    assert made == []
+    if full:
+        assert mine._bring_up(SPEC) == 'up'
+    else:
+        with pytest.raises(FogError, match='no machine is free'):
+            mine._bring_up(SPEC)
+    assert [provider for provider, _ in made] == tried
+    assert [one for one in events if isinstance(one, Warned)] == [Warned(
+        'planner', "'planner': no machine is free",
+        'the launch tries the next offer, of south')] * full
+    # asked once for the launch
+    assert fakes['north'].calls.count('offers') == 1
+
+
+def test_kept_machine_stays_in_its_cloud(
+    fakes: dict[str, Fake], launch: Any, tmp_path: Path,
+) -> None:
+    from fogros2.store import Record
+    place = dataclasses.replace(
+        SPEC, provider='south', options={'size': 'south'}, wanted=SPEC.options)
+    Store(tmp_path).save(Record('planner', 'south', place, machine_id='m', asked=place.options))
+    mine = launch([])
+    assert mine._places(SPEC) == [place] and fakes['north'].calls == []
+    other = dataclasses.replace(SPEC, options={'min_cpu': 4})
+    assert mine._places(other)[0].provider == 'north'

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What replaces a machine, by value: no node starts elsewhere while it may still run."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import random
+
+import pytest
+
+from fogros2.runtime.replacement import decide, Replacement
+
+UP = Replacement(limit=2, drain=20.0, fence=140.0)
+
+
+def play(*events, state=UP):
+    """Return the commands of each event, given as its name or (name, seconds)."""
+    said = []
+    for event in events:
+        name, now = event if isinstance(event, tuple) else (event, 0.0)
+        state, commands = decide(state, name, now)
+        said.append(commands)
+    return said, state
+
+
+def test_notice_drains_before_nodes_move():
+    said, state = play('notice', 'drained', 'ended', 'created')
+    assert said == [('drain',), ('move', 'end'), ('create',), ('come_back',)]
+    assert state == dataclasses.replace(UP, created=1)
+
+
+def test_ended_machine_is_confirmed_before_nodes_move():
+    said, _ = play('lost', 'ended', 'created')
+    assert said == [('end',), ('move', 'create'), ('come_back',)]
+
+
+def test_silent_machine_without_provider_is_fenced_by_time():
+    said, state = play('lost', ('unended', 5.0), ('time', 139.9), ('time', 140.0), 'unended')
+    assert said == [('end',), ('retry',), (), ('move',), ('retry',)]
+    assert play('ended', state=state)[0] == [('create',)], 'its nodes have moved already'
+
+
+def test_agent_that_confirms_no_end_is_fenced():
+    said, state = play('notice', ('time', 19.9), ('time', 20.0), 'drained', ('time', 159.9))
+    assert said == [('drain',), (), ('end',), (), ()] and not state.moved
+    assert play(('time', 160.0), state=state)[0] == [('move',)]
+
+
+def test_loss_during_the_notice_waits_for_the_provider():
+    assert play('notice', 'lost', 'drained', 'ended')[0] == [
+        ('drain',), ('end',), (), ('move', 'create')]
+
+
+def test_refused_creation_is_tried_again_up_to_the_limit():
+    said, state = play('lost', 'ended', 'refused', 'ended', 'refused', 'ended', 'lost')
+    assert said == [('end',), ('move', 'create'), ('retry',), ('create',), ('retry',),
+                    ('give_up',), ()]
+    assert state.phase == 'over'
+
+
+def test_third_loss_gives_up_after_two_replacements():
+    once = ('lost', 'ended', 'created')
+    said, _ = play(*once, *once, 'notice', 'drained', 'ended')
+    assert said[-3:] == [('drain',), ('move', 'end'), ('give_up',)]
+
+
+@pytest.mark.parametrize('event', ['drained', 'ended', 'unended', 'created', 'refused', 'time'])
+def test_late_event_changes_nothing(event):
+    assert decide(UP, event, 1e9) == (UP, ())
+
+
+def test_nodes_never_move_unfenced():
+    """In random histories, ``move`` follows the agent, the provider, or the watchdog's time."""
+    dice = random.Random(21)
+    events = ('notice', 'lost', 'drained', 'ended', 'unended', 'created', 'refused', 'time')
+    for _ in range(3000):
+        state, now, silent = UP, 0.0, None
+        for event in itertools.islice(iter(lambda: dice.choice(events), None), 40):
+            now += dice.choice([0.0, 1.0, 15.0, 60.0])
+            before = state
+            state, commands = decide(state, event, now)
+            if 'end' in commands and silent is None:
+                silent = now
+            if 'move' in commands:
+                assert not before.moved and (
+                    event == 'ended' or event == 'drained' and before.phase == 'draining'
+                    or event == 'time' and now - silent >= UP.fence)
+            if 'create' in commands:
+                assert event == 'ended' and state.moved
+            if 'come_back' in commands:
+                silent = None

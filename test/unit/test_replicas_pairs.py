@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which messages of replicas are forwarded, by value."""
+
+from __future__ import annotations
+
+import struct
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import pytest
+
+from fogros2_replicas.pairs import header_of, MISSES, Pair, SET_BACK, STREAK
+
+NAMES = ('a', 'b', 'c')
+
+
+@pytest.fixture
+def pair():
+    """Return a pair whose stamps have matched."""
+    pair = Pair(NAMES)
+    pair.input(0.0, (1, ''))
+    assert pair.output(0.1, 'a', (1, ''))
+    return pair
+
+
+@settings(deadline=None)
+@given(st.integers(-2**31, 2**31 - 1), st.integers(0, 999_999_999), st.text(max_size=9),
+       st.binary(max_size=9), st.booleans())
+def test_header_is_read_from_the_bytes(seconds, nanoseconds, frame, rest, little):
+    text = frame.replace('\0', '').encode() + b'\0'
+    data = (b'\0\x01\0\0' if little else b'\0\0\0\0') + struct.pack(
+        '<iII' if little else '>iII', seconds, nanoseconds, len(text)) + text + rest
+    assert header_of(data) == (seconds * 10**9 + nanoseconds, text[:-1].decode())
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=40))
+def test_any_bytes_are_a_header_or_none(data):
+    found = header_of(data)
+    assert found is None or isinstance(found[0], int)
+
+
+def test_first_output_of_a_stamp_is_forwarded(pair):
+    pair.input(1.0, (2, ''))
+    assert [pair.output(1.1, name, (2, 'x')) for name in 'bac'] == [True, False, False]
+    assert pair.replicas['b'].latency == pytest.approx(0.1)
+
+
+def test_output_older_than_the_newest_is_dropped(pair):
+    assert pair.output(1.0, 'b', (5, ''))
+    assert not pair.output(1.1, 'a', (4, ''))
+
+
+def test_nth_output_of_a_key_is_forwarded_once(pair):
+    """A node that publishes three messages for each image."""
+    came = [('a', 'l'), ('b', 'l'), ('b', 'l'), ('a', 'l'), ('b', 'r'), ('a', 'l'), ('a', 'r')]
+    assert [pair.output(1.0, name, (9, frame)) for name, frame in came] == [
+        True, False, True, False, True, True, False]
+
+
+def test_time_that_is_set_back_begins_again(pair):
+    pair.input(1.0, (5 * SET_BACK, ''))
+    assert pair.output(1.0, 'a', (5 * SET_BACK, ''))
+    pair.input(2.0, (SET_BACK, ''))
+    assert pair.output(2.1, 'a', (SET_BACK, ''))
+
+
+@pytest.mark.parametrize('header', [None, (0, ''), (77, '')])
+def test_outputs_without_match_come_from_one_replica(header):
+    pair = Pair(NAMES)
+    forwarded = []
+    for number in range(MISSES):
+        pair.input(number, (1000 + number, ''))
+        forwarded += [name for name in 'bac' if pair.output(number, name, header)]
+        assert pair.unmatched == (3 * (number + 1) >= MISSES)
+    assert forwarded == ['b'] * MISSES
+
+
+def test_silent_replica_is_replaced_without_stamps():
+    pair = Pair(NAMES)
+    assert pair.output(0.0, 'a', None)
+    assert [pair.output(1.0, 'b', None) for _ in range(STREAK + 1)] == [False, False, True, True]
+    assert not pair.output(2.0, 'a', None)
+
+
+def test_dead_replica_is_replaced_at_once():
+    pair = Pair(NAMES)
+    assert pair.output(0.0, 'a', None)
+    pair.died('a')
+    assert pair.output(0.1, 'c', None)
+    assert pair.replicas['a'].failures == 1
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.sampled_from(NAMES), st.integers(1, 4), st.sampled_from('lr'))))
+def test_forwarded_is_what_the_fastest_sent(messages):
+    """Stamps never go back, and of each key as many come as the most eager replica sent."""
+    pair = Pair(NAMES)
+    for stamp in range(1, 5):
+        pair.input(0.0, (stamp, ''))
+    forwarded = [(name, stamp, frame) for name, stamp, frame in messages
+                 if pair.output(1.0, name, (stamp, frame))]
+    stamps = [stamp for _, stamp, _ in forwarded]
+    assert stamps == sorted(stamps)
+    newest = max((stamp for _, stamp, _ in messages), default=0)
+    first = next((i for i, one in enumerate(messages) if one[1] == newest), 0)
+    for frame in 'lr':
+        sent = [sum(one == (name, newest, frame) for one in messages[first:]) for name in NAMES]
+        assert sum(one[1:] == (newest, frame) for one in forwarded) == max(sent)

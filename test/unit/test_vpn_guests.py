@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which guests a machine's VPN has: pure decisions over a list and a time."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from fogros2.vpn import addresses, guests
+from fogros2.vpn.guests import Guest
+
+KEY, OTHER = 'first=', 'second='
+
+
+def asked(key: str = KEY, **changes: object) -> Guest:
+    return {'key': key, 'label': 'robot2', 'seconds': 60.0, 'patience': 180.0,
+            'addresses': ['198.18.7.224', '198.18.7.225'], **changes}
+
+
+def test_guests_get_the_free_addresses_in_turn() -> None:
+    found = guests.admitted(guests.admitted([], asked(), 100.0), asked(OTHER), 100.0)
+    assert [(guest['key'], guest['address'], guest['until']) for guest in found] == [
+        (KEY, '198.18.7.224', 160.0), (OTHER, '198.18.7.225', 160.0)]
+    with pytest.raises(SystemExit, match='2 guests'):
+        guests.admitted(found, asked('third='), 100.0)
+
+
+def test_second_invitation_keeps_the_address() -> None:
+    found = guests.admitted(guests.admitted([], asked(), 100.0), asked(OTHER), 100.0)
+    guests.heard(found, {KEY: 1700000000}, 110.0)
+    again = guests.admitted(found, asked(seconds=600.0), 120.0)
+    assert [(guest['key'], guest['address'], guest['until'], guest['heard'])
+            for guest in again] == [
+        (OTHER, '198.18.7.225', 160.0, None), (KEY, '198.18.7.224', 720.0, 110.0)]
+
+
+def test_expired_guest_stays_while_it_is_heard() -> None:
+    found = guests.admitted([], asked(), 100.0)
+    (guest,) = found
+    assert guests.due(guest) == 160.0
+    guests.heard(found, {KEY: 0}, 150.0)  # no handshake yet
+    assert guests.due(guest) == 160.0
+    guests.heard(found, {KEY: 1700000000}, 159.0)
+    assert guests.due(guest) == 339.0
+    guests.heard(found, {KEY: 1700000000}, 300.0)  # the same handshake as before
+    assert guests.due(guest) == 339.0
+    guests.heard(found, {KEY: 9}, 301.0)  # the clock was set back
+    assert guests.due(guest) == 481.0
+
+
+def test_wg_reads_the_guests_and_the_time_to_look() -> None:
+    found = guests.admitted([], asked(), 100.0)
+    assert guests.rendered(found, 100.0) == (
+        '# 161\n[Peer]\nPublicKey = first=\nAllowedIPs = 198.18.7.224/32\n')
+    assert guests.rendered(found, 200.0).startswith('# 211\n')
+    assert guests.rendered([], 100.0) == '# 1\n'
+
+
+def test_guests_have_the_end_of_the_subnet() -> None:
+    assert addresses.guests('198.18.7.0/24') == '198.18.7.224/27'
+
+
+def test_list_is_private_and_replaces_no_file_of_others(tmp_path: Path) -> None:
+    (tmp_path / 'other').write_text('')
+    (tmp_path / 'fog.guests.new').symlink_to(tmp_path / 'other')
+    path = tmp_path / 'fog.guests'
+    guests.write(path, json.dumps([1]))
+    assert path.read_text() == '[1]' and path.stat().st_mode & 0o777 == 0o600
+    assert (tmp_path / 'other').read_text() == ''
