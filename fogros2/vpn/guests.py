@@ -68,7 +68,8 @@ def due(guest: Guest) -> float:
 
 def rendered(guests: list[Guest], now: float) -> str:
     """Return the guests as peers for ``wg``; the first line says when to look at them again."""
-    again = min((max(guest['until'], now + INTERVAL) for guest in guests), default=0)
+    again = min((guest['until'] if guest['until'] > now else now + INTERVAL for guest in guests),
+                default=0)
     return '\n'.join([f'# {int(again) + 1}', *(
         f"[Peer]\nPublicKey = {guest['key']}\nAllowedIPs = {guest['address']}/32"
         for guest in guests), ''])

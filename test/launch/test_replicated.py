@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import json
 import os
 import select
@@ -115,10 +116,12 @@ def test_end_and_start_of_a_node_are_reported(run, fake, tmp_path):
     """In the pipe of the launch's folder, as lines."""
     read, killed = [], []
 
+    def reader(context):
+        # before any node starts: what is told without a reader is lost
+        read.append(os.open(fake.store.launch('abcdef') / 'first_answer_plan.events',
+                            os.O_RDWR | os.O_NONBLOCK))
+
     def on_start(machine, node):
-        folder = fake.store.launch('abcdef')
-        if not read:
-            read.append(os.open(folder / 'first_answer_plan.events', os.O_RDWR | os.O_NONBLOCK))
         if machine.spec.name == 'two' and not killed:
             killed.append(node)
             machine.say('exited', node, returncode=-9, respawns=True)
@@ -136,6 +139,7 @@ def test_end_and_start_of_a_node_are_reported(run, fake, tmp_path):
 
     assert run(FogROSLaunchDescription([
         Replicated(machines('one', 'two'), [talker(respawn=True)], services=['/plan']),
+        OpaqueFunction(function=reader),
         TimerAction(period=0.2, actions=[OpaqueFunction(function=look), Shutdown()]),
     ])) == 0
     os.close(read[0])
@@ -144,20 +148,16 @@ def test_end_and_start_of_a_node_are_reported(run, fake, tmp_path):
 
 
 def test_lost_machine_does_not_end_the_launch(run, fake, caplog):
-    started = ends_when_started(fake, 99)
-    ended = threading.Event()
+    count = itertools.count(1)
 
-    def lose(event, context):
-        if len(started) == 2 and not ended.is_set():
-            ended.set()
-            gone = fake.machines['one']
-            threading.Thread(target=lambda: (
-                gone.say('lost', reason='taken away'),
-                fake.machines['two'].say('exited', fake.machines['two'].all[0], returncode=0,
-                                         respawns=False))).start()
+    def on_start(machine, node):
+        if next(count) == 2:
+            fake.machines['one'].say('lost', reason='taken away')
+            other = fake.machines['two']
+            other.say('exited', other.all[0], returncode=0, respawns=False)
 
+    fake.on_start = on_start
     assert run(FogROSLaunchDescription([
-        RegisterEventHandler(OnProcessStart(on_start=lose)),
         Replicated(machines('one', 'two'), [talker()], services=['/plan'])])) == 0
     assert "the machine 'one' is gone: taken away; the other replicas go on" in caplog.text
 
