@@ -117,7 +117,7 @@ def test_end_and_start_of_a_node_are_reported(run, fake, tmp_path):
     read, killed = [], []
 
     def reader(context):
-        # before any node starts: what is told without a reader is lost
+        # before any node starts: a line that nobody reads is lost
         read.append(os.open(fake.store.launch('abcdef') / 'first_answer_plan.events',
                             os.O_RDWR | os.O_NONBLOCK))
 
