@@ -8,6 +8,7 @@ encoder sends a few parts, and the next one when a part has arrived.
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 from typing import Optional
 import zlib
@@ -39,6 +40,15 @@ def split(data: bytes, stream: int, cloud: int, first: int) -> list[bytes]:
             + data[index * size:(index + 1) * size] for index in range(count)]
 
 
+@dataclasses.dataclass
+class _Open:
+    """A cloud of which parts are missing."""
+
+    identity: tuple[int, int, int]
+    parts: dict[int, bytes] = dataclasses.field(default_factory=dict)
+    size: int = 0
+
+
 class Assembler:
     """
     Put clouds together; of each stream the newest one.
@@ -48,8 +58,7 @@ class Assembler:
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes
-        #: by stream: parts by index, of one cloud
-        self._clouds: dict[int, tuple[tuple[int, int, int], dict[int, bytes]]] = {}
+        self._clouds: dict[int, _Open] = {}  # by stream
 
     def add(self, part: bytes) -> tuple[Optional[tuple[int, int]], Optional[bytes]]:
         """Return what to acknowledge (stream, number), None if invalid, and a complete cloud."""
@@ -59,17 +68,18 @@ class Assembler:
         if magic != _MAGIC or index >= count:
             return None, None
         identity = cloud, count, checksum
-        if stream not in self._clouds or self._clouds[stream][0] != identity:
-            self._clouds[stream] = identity, {}
+        if stream not in self._clouds or self._clouds[stream].identity != identity:
+            self._clouds[stream] = _Open(identity)
             while len(self._clouds) > OPEN:
                 del self._clouds[next(iter(self._clouds))]
-        found = self._clouds[stream][1]
-        found[index] = part[_HEAD.size:]
-        if sum(len(each) for _, parts in self._clouds.values()
-               for each in parts.values()) > self._max_bytes:
+        found = self._clouds[stream]
+        if index not in found.parts:
+            found.parts[index] = part[_HEAD.size:]
+            found.size += len(part) - _HEAD.size
+        if sum(each.size for each in self._clouds.values()) > self._max_bytes:
             self._clouds.clear()
-        if len(found) < count:
+        if len(found.parts) < count:
             return (stream, number), None
-        whole = b''.join(found[at] for at in range(count))
-        found.clear()
+        whole = b''.join(found.parts[at] for at in range(count))
+        self._clouds[stream] = _Open(identity)
         return (stream, number), whole if zlib.crc32(whole) == checksum else None

@@ -15,7 +15,7 @@ pytest.importorskip('zstandard', reason='the extra "point_clouds" is not install
 import zstandard
 
 from fogros2_examples.city import City
-from point_cloud_stream import codec, numbers
+from point_cloud_stream import codec, numbers, parts
 from point_cloud_stream.cloud import CloudError, Field, Layout, unpack
 from point_cloud_stream.codec import Coded, decode, encode
 from point_cloud_stream.parts import Assembler, LARGEST, split
@@ -265,10 +265,22 @@ def test_invalid_parts_are_not_acknowledged() -> None:
     assert assembler.add(part[:-1] + b'1') == ((1, 1), None)
 
 
+def part_of_many(index: int, size: int) -> bytes:
+    """Return a part of a cloud that claims to have the largest number of parts."""
+    return parts._HEAD.pack(parts._MAGIC, 1, index, 1, index, 65535, 0) + bytes(size)
+
+
 def test_endless_parts_take_bounded_memory() -> None:
     assembler = Assembler(100_000)
-    for number in range(100):
-        assembler.add(split(bytes(5000), number, 1, 1)[0][:-5000].replace(
-            struct.pack('<HH', 0, 1), struct.pack('<HH', number, 65535)) + bytes(5000))
-    held = sum(len(part) for _, parts in assembler._clouds.values() for part in parts.values())
-    assert held <= 100_000
+    for index in range(100):
+        assembler.add(part_of_many(index, 5000))
+    held = sum(len(part) for one in assembler._clouds.values() for part in one.parts.values())
+    assert 0 < held <= 100_000
+
+
+@pytest.mark.timeout(60)  # adding up all parts at each one takes minutes
+def test_tiny_parts_take_bounded_time() -> None:
+    assembler = Assembler(1 << 20)
+    for index in range(60_000):
+        assembler.add(part_of_many(index, 1))
+    assert len(assembler._clouds[1].parts) == 60_000
