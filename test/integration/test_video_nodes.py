@@ -85,11 +85,11 @@ def test_how_packets_are_taken(
         '</Internal></Domain></CycloneDDS>')
     bench.pair()
     seen = bench.heard(Image, '/seen/camera')
-    bench.until(lambda: len(seen) >= 3, 'an image', timeout=40,
-                meanwhile=source(bench, encoding=encoding, **options))
+    camera = source(bench, encoding=encoding, **options)
+    bench.until(lambda: len(seen) >= 3, 'an image', timeout=40, meanwhile=camera)
     bench.until(lambda: [info.qos_profile.reliability for info in
                          bench.node.get_subscriptions_info_by_topic('/camera/h264')
-                         ] == [reliability], 'the subscription', meanwhile=source(bench))
+                         ] == [reliability], 'the subscription', meanwhile=camera)
 
 
 @pytest.mark.parametrize('codec', ['jpeg', 'png', 'raw'])
