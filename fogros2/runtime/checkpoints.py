@@ -106,17 +106,21 @@ class Checkpoints:
 
     def _ask(self, nodes: list[NodeSpec]) -> list[bool]:
         from launch_ros.ros_adapters import get_ros_node
+        from rclpy.exceptions import InvalidHandle
         from std_srvs.srv import Trigger
         waits = []
-        for name in map(full_name, nodes):
-            if name not in self._clients:
-                self._clients[name] = get_ros_node(self._context).create_client(
-                    Trigger, f'{name}/checkpoint')
-            if self._clients[name].service_is_ready():
-                future, answered = self._clients[name].call_async(
-                    Trigger.Request()), threading.Event()
-                future.add_done_callback(lambda _, answered=answered: answered.set())
-                waits.append((future, answered))
+        try:
+            for name in map(full_name, nodes):
+                if name not in self._clients:
+                    self._clients[name] = get_ros_node(self._context).create_client(
+                        Trigger, f'{name}/checkpoint')
+                if self._clients[name].service_is_ready():
+                    future, answered = self._clients[name].call_async(
+                        Trigger.Request()), threading.Event()
+                    future.add_done_callback(lambda _, answered=answered: answered.set())
+                    waits.append((future, answered))
+        except InvalidHandle:
+            return [False]  # the launch is ending and has destroyed its node
         return [answered.wait(ANSWER) and future.result().success for future, answered in waits]
 
     async def save(self, shell: Shell, *, still: bool) -> None:

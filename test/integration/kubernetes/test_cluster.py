@@ -34,8 +34,10 @@ with cluster(binaries.parent, binaries, store=store) as running:
 
 def pod(name: str, *words: str, **spec: object) -> dict[str, object]:
     return {'apiVersion': 'v1', 'kind': 'Pod', 'metadata': {'name': name, 'labels': {'pod': name}},
-            'spec': {'restartPolicy': 'Never', 'containers': [
-                {'name': 'it', 'image': BARE, 'command': list(words)}], **spec}}
+            # a new namespace may not have the token of its service account yet
+            'spec': {'restartPolicy': 'Never', 'automountServiceAccountToken': False,
+                     'containers': [{'name': 'it', 'image': BARE, 'command': list(words)}],
+                     **spec}}
 
 
 ECHO = ('import socket\ns = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)\n'
