@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tests that hold for ROS 2 and for the embedded default alike."""
 
+import contextlib
 import os
+
+from rigs.domains import taken
 
 # before anything of ROS is imported
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 os.environ['RMW_IMPLEMENTATION'] = 'rmw_cyclonedds_cpp'
-os.environ['ROS_DOMAIN_ID'] = str(70 + os.getpid() % 30)  # one's own, for tests side by side
+_held = contextlib.ExitStack()
+os.environ['ROS_DOMAIN_ID'] = _held.enter_context(taken())  # until this process ends
 os.environ['CYCLONEDDS_URI'] = (  # this computer's loopback and nothing else
     '<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/></Interfaces>'
     '<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto'

@@ -24,6 +24,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
+from rigs.domains import taken
+
 SETUP = Path(os.environ.get('ROS2_SETUP', '/opt/ros/jazzy/setup.sh'))
 LIMIT = 20.0  # seconds until something that should happen hasn't
 
@@ -242,12 +244,17 @@ def test_our_commands_see_a_ros2_node(peer):
         assert any(line.startswith(expected) for line in done.stdout.splitlines()), done.stdout
 
 
+@pytest.fixture
+def domain():
+    with taken() as domain:
+        yield domain
+
+
 @pytest.mark.parametrize('peers', ['', '127.0.0.2'])
-def test_nodes_discover_each_other_on_one_computer(monkeypatch, peers):
+def test_nodes_discover_each_other_on_one_computer(monkeypatch, domain, peers):
     """The older one to be there is ours, then ROS 2's: each has to answer a newcomer."""
-    domain = int(os.environ['ROS_DOMAIN_ID']) + 100
     monkeypatch.delenv('CYCLONEDDS_URI')
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
+    monkeypatch.setenv('ROS_DOMAIN_ID', domain)
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     monkeypatch.setenv('ROS_STATIC_PEERS', peers)
     context = Context()

@@ -16,7 +16,6 @@ import shutil
 import subprocess
 import sys
 from typing import Any
-import uuid
 
 import pytest
 
@@ -29,6 +28,7 @@ from fogros2.provider.container import debian_root
 from fogros2.provider.container import root as container_root
 from rigs.cluster import images as cluster_images
 from rigs.container_machines import cloud_network, engine
+from rigs.domains import taken
 from rigs.traces import nothing_left as nothing_left_of
 from rigs.traces import RUN, Traces
 
@@ -68,11 +68,10 @@ def slow_agent(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope='session')
-def domain() -> str:
-    """Return a ROS domain that no other process of this run has, and hardly another run."""
-    run = int(os.environ.get('PYTEST_XDIST_TESTRUNUID') or uuid.uuid4().hex, 16)
-    worker = os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw')
-    return str(1 + (run + int(worker)) % 69)  # 70 to 99: ros2_embedded's tests
+def domain() -> Iterator[str]:
+    """Have a ROS domain for all tests of this process that need only one."""
+    with taken() as domain:
+        yield domain
 
 
 @pytest.fixture(scope='module', autouse=True)

@@ -31,9 +31,8 @@ pytestmark = [
 
 @pytest.fixture(autouse=True)
 def surroundings(tmp_path, monkeypatch):
-    """Keep what launch logs out of the user's home, and others' nodes out of the test."""
+    """Keep what launch logs out of the user's home."""
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-    monkeypatch.setenv('ROS_DOMAIN_ID', '57')
 
 
 @pytest.fixture

@@ -37,13 +37,13 @@ from fogros2.errors import DeadlineExceeded
 from fogros2.model import DdsInterface
 from fogros2.waiting import wait_until
 from rigs import viewer as viewers
+from rigs.domains import taken
 
 ROOT = Path(__file__).parents[2]
 CACHE = ROOT / '.cache/node'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 #: Messages a second that the robot publishes to a crowd of viewers.
 RATE = 20.0
-_domains = itertools.count(os.getpid())
 
 
 class Bench:
@@ -126,12 +126,13 @@ def bench(client: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iter
     path.write_text(vendor.render([DdsInterface('lo')], []))
     for key, value in vendor.environment(str(path), {}).items():
         monkeypatch.setenv(key, value)
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(20 + next(_domains) % 80))
-    made = Bench()
-    try:
-        yield made
-    finally:
-        made.close()
+    with taken() as domain:
+        monkeypatch.setenv('ROS_DOMAIN_ID', domain)
+        made = Bench()
+        try:
+            yield made
+        finally:
+            made.close()
 
 
 def test_messages_arrive_as_they_were_published(bench):

@@ -26,9 +26,9 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from fogros2.waiting import wait_until
+from rigs.domains import taken
 
 ROOT = Path(__file__).parents[2]
-_domains = itertools.count(os.getpid())
 pytestmark = pytest.mark.timeout(90)
 
 
@@ -104,11 +104,12 @@ class Bench:
 
 @pytest.fixture
 def bench(tmp_path, monkeypatch):
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(next(_domains) % 90 + 5))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    bench = Bench(tmp_path)
-    yield bench
-    bench.close()
+    with taken() as domain:
+        monkeypatch.setenv('ROS_DOMAIN_ID', domain)
+        bench = Bench(tmp_path)
+        yield bench
+        bench.close()
 
 
 def test_first_answer_of_a_service_wins(bench):

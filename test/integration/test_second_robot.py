@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import json
-import os
 from pathlib import Path
 import uuid
 
@@ -19,7 +18,7 @@ from rigs.second_robot import HOST, second, SecondRobot
 
 __all__ = ['second']
 
-NAME, DOMAIN = f'shared-{uuid.uuid4().hex[:6]}', str(60 + os.getpid() % 40)
+NAME = f'shared-{uuid.uuid4().hex[:6]}'
 LAUNCH = """
 from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 
@@ -41,7 +40,7 @@ def launch(
     path = tmp_path / 'shared.launch.py'
     path.write_text(LAUNCH.format(name=NAME, network=cloud_network))
     with launching() as start:
-        started = start(str(path), environment={**os.environ, 'ROS_DOMAIN_ID': DOMAIN})
+        started = start(str(path))
         started.wait_for('Publishing')
         # this computer forwards nothing from a network of the tests: let answers out
         said = run(Command((engine, 'network', 'inspect', cloud_network), sudo=True), timeout=30.0)

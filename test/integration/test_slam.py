@@ -45,10 +45,8 @@ SMALL = ('width:=320', 'height:=240', 'frames:=25', 'rate:=20.0')
 
 @pytest.fixture(autouse=True)
 def surroundings(tmp_path, monkeypatch):
-    """Keep what launch logs out of the user's home, and others' nodes out of the test."""
+    """Keep what launch logs out of the user's home."""
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-    monkeypatch.setenv('ROS_DOMAIN_ID', '58')
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 
 @pytest.fixture

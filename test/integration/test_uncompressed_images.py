@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import os
 import threading
 
@@ -10,18 +11,26 @@ import pytest
 
 from fogros2.runtime import uncompressed
 from fogros2.waiting import wait_until
+from rigs.domains import taken
 
 rclpy = pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is here')
 
 
-def test_image_topic_between_two_hosts_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def new_domain() -> Iterator[str]:
+    """Have another: one keeps the configuration of its first participant in a process."""
+    with taken() as domain:
+        yield domain
+
+
+def test_image_topic_between_two_hosts_is_found(
+    monkeypatch: pytest.MonkeyPatch, new_domain: str,
+) -> None:
     from sensor_msgs.msg import Image
 
-    # a domain keeps the configuration of its first participant in a process: take a new one
-    domain = int(os.environ['ROS_DOMAIN_ID']) + 100
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
+    monkeypatch.setenv('ROS_DOMAIN_ID', new_domain)
     context = rclpy.context.Context()
-    rclpy.init(context=context, domain_id=domain)
+    rclpy.init(context=context, domain_id=int(new_domain))
     camera, slam = (rclpy.create_node(name, context=context) for name in ('camera', 'slam'))
     camera.create_publisher(Image, '/camera/image_raw', 1)
     slam.create_subscription(Image, '/camera/image_raw', lambda _: None, 1)

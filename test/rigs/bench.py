@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import contextlib
-import itertools
 import os
 from pathlib import Path
 import signal
@@ -23,11 +22,11 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.model import DdsInterface
+from rigs.domains import taken
 
 ROOT = Path(__file__).parents[2]
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-_domains = itertools.count(os.getpid())
 
 
 class Bench:
@@ -119,9 +118,10 @@ def made(folder: Path, setenv: Callable[[str, str], None]) -> Iterator[Bench]:
     path.write_text(vendor.render([DdsInterface('lo')], []))
     for key, value in vendor.environment(str(path), {}).items():
         setenv(key, value)
-    setenv('ROS_DOMAIN_ID', str(20 + next(_domains) % 80))
-    bench = Bench(folder)
-    try:
-        yield bench
-    finally:
-        bench.close()
+    with taken() as domain:
+        setenv('ROS_DOMAIN_ID', domain)
+        bench = Bench(folder)
+        try:
+            yield bench
+        finally:
+            bench.close()

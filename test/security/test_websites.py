@@ -22,6 +22,7 @@ import threading
 import pytest
 
 from fogros2.waiting import wait_until
+from rigs.domains import taken
 
 pytest.importorskip('foxglove', reason='the extra "monitor" is not installed')
 
@@ -75,7 +76,13 @@ def opened(place: tuple[str, int], request: str, *, tls: bool = False) -> int:
 
 
 @pytest.fixture(scope='module')
-def bridge(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bridge]:
+def domain() -> Iterator[str]:
+    with taken() as domain:
+        yield domain
+
+
+@pytest.fixture(scope='module')
+def bridge(tmp_path_factory: pytest.TempPathFactory, domain: str) -> Iterator[Bridge]:
     folder = tmp_path_factory.mktemp('secrets') / 'monitor' / 'launch'
     with socket.create_server(('127.0.0.1', 0)) as probe:
         port = probe.getsockname()[1]
@@ -84,7 +91,7 @@ def bridge(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bridge]:
          '--listen', f'127.0.0.1:{port}', '--vpn', str(port), '--public', str(port + 1),
          '--secrets', str(folder)],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        env={**os.environ, 'FOGROS2_VPN_ADDRESS': VPN, 'ROS_DOMAIN_ID': '97',
+        env={**os.environ, 'FOGROS2_VPN_ADDRESS': VPN, 'ROS_DOMAIN_ID': domain,
              'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'})
     running = None
     try:
