@@ -9,18 +9,20 @@ arguments, variables, logs, store, tags, user data and files. ``strangers`` laun
 each, and sends ``--packets`` to the open ports of the machine, and a quarter of that to the robot.
 
     python benchmarks/security.py [fuzz] [secrets] [strangers] [--minutes 10] [--seed 1]
+
+With ``--provider``, the figures of the other providers stay as they are.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 import json
 from pathlib import Path
 import subprocess
 import sys
 
-from figures import Row, write
+from figures import machine, RESULTS, Row, write
 from figures.places import place
 from figures.secrets_scan import scan
 from figures.strangers import attack, CONTROL
@@ -28,7 +30,9 @@ from figures.strangers import attack, CONTROL
 from rigs.fuzz_targets import PYTHON, TARGETS
 
 NOTES = Path('.cache/fuzz')
-PROVIDERS = ('container', 'aws', 'kubernetes', 'ssh')
+#: All, and those whose firewall the strangers' benchmark can open.
+PROVIDERS = ('container', 'aws', 'gcp', 'azure', 'kubernetes', 'ssh')
+ADMITTING = ('container', 'aws', 'kubernetes', 'ssh')
 
 
 def fuzz(seed: int, seconds: float) -> Iterator[Row]:
@@ -85,6 +89,17 @@ def strangers(provider: str, packets: int, seed: int) -> Iterator[Row]:
               'problems', 0.0)
 
 
+def record(name: str, title: str, providers: Sequence[str], rows: Sequence[Row]) -> None:
+    """Write the rows of some providers beside the earlier rows of the others."""
+    path = RESULTS / f'{name}.json'
+    before = json.loads(path.read_text()) if path.exists() else {'rows': []}
+    kept = [Row(**row) for row in before['rows'] if row['what'].partition(':')[0] not in providers]
+    rows = sorted([*rows, *kept], key=lambda row: PROVIDERS.index(row.what.partition(':')[0]))
+    earlier = dict.fromkeys(row.what.partition(':')[0] for row in rows if row in kept)
+    computer = f"{machine()}; {', '.join(earlier)}: {before['machine']}, {before['date']}"
+    write(name, title, rows, computer=computer if kept else '')
+
+
 def main() -> None:
     """Take the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -96,15 +111,16 @@ def main() -> None:
     given = parser.parse_args()
     parts = given.parts or ['fuzz', 'secrets', 'strangers']
     providers = given.provider or PROVIDERS
+    admitting = [provider for provider in providers if provider in ADMITTING]
     if 'fuzz' in parts:
         write('fuzzing', f'Mutated inputs for {given.minutes:g} minutes each, seed {given.seed}',
               list(fuzz(given.seed, 60 * given.minutes)))
     if 'secrets' in parts:
-        write('secrets', 'Planted credentials and own keys where others could read them', [
-            row for provider in providers for row in secrets(provider)])
+        record('secrets', 'Planted credentials and own keys where others could read them',
+               providers, [row for provider in providers for row in secrets(provider)])
     if 'strangers' in parts:
-        write('strangers', f'Packets of strangers, seed {given.seed}', [
-            row for provider in providers
+        record('strangers', f'Packets of strangers, seed {given.seed}', admitting, [
+            row for provider in admitting
             for row in strangers(provider, given.packets, given.seed)])
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places of robots' machines: this computer's podman, EC2 in a box, a cluster, an SSH host."""
+"""Places of robots' machines: this computer's podman, a cloud in a box, a cluster, a host."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ import secrets
 import subprocess
 import tempfile
 import time
-from typing import Any, ClassVar
+from typing import Any
 
 from fogros2.provider.container import root
 from rigs.bare_computer import bare_computer, BareComputer
+from rigs.clouds import Cloud, CLOUDS
 from rigs.cluster import Client, Cluster, cluster, READY, running_cluster
 from rigs.cluster.namespaces import making_namespaces, Namespace
-from rigs.ec2 import Ec2Box
+from rigs.computers.box import Instance
 
 ROOT = Path(__file__).resolve().parents[2]
 REGION = 'us-east-1'
@@ -49,7 +50,7 @@ class Place(abc.ABC):
     :param short: whether time-outs are seconds.
     """
 
-    kind: ClassVar[str]
+    kind: str
     #: Time-outs in seconds of the boot and of SSH where they are short; see ``Timeouts``.
     boot, ssh = 10.0, 5.0
     options = ''
@@ -107,19 +108,38 @@ class Container(Place):
                            capture_output=True, timeout=60, check=False)
 
 
-class Ec2(Place):
-    """Instances of EC2 in a box."""
+class Boxed(Place):
+    """
+    Instances of a cloud in a box.
 
-    kind = 'AWSCloudInstance'
+    :param folder: for files of its user.
+    """
+
     boot, ssh = 15.0, 10.0
 
-    def __init__(self, box: Ec2Box, *, short: bool = True) -> None:
+    def __init__(self, cloud: Cloud, box: Any, folder: Path, *, short: bool = True) -> None:
         super().__init__(short=short)
-        self.box = box
+        self.cloud, self.box, self.kind = cloud, box, cloud.machine
         self.prefix = box.on_robot([])
         self.network = box.robot
-        self.environment = {**box.environment(REGION), 'FOGROS2_AWS_CHECKIP': box.checkip,
-                            'FOGROS2_AWS_REGIONS': REGION}
+        self.environment = {**cloud.variables(box, folder), 'FOGROS2_AWS_CHECKIP': box.checkip}
+
+    def instances(self, name: str) -> list[Instance]:
+        """Return the running instances of that name."""
+        return [each for each in self.box.alive()
+                if self.cloud.tags(each).get('fogros2-name') == name]
+
+    def things(self, name: str) -> dict[str, bool]:
+        """Return instances by their tags."""
+        return {f'instance {each.id}': True for each in self.instances(name)}
+
+
+class Ec2(Boxed):
+    """Instances of EC2 in a box."""
+
+    def __init__(self, cloud: Cloud, box: Any, folder: Path, *, short: bool = True) -> None:
+        super().__init__(cloud, box, folder, short=short)
+        self.environment = {**self.environment, 'FOGROS2_AWS_REGIONS': REGION}
 
     def api(self) -> Any:
         """Return a client of the box's EC2."""
@@ -128,8 +148,7 @@ class Ec2(Place):
 
     def things(self, name: str) -> dict[str, bool]:
         """Return instances, and groups, keys and disks by their tags."""
-        found = {f'instance {each.id}': True for each in self.box.alive()
-                 if each.tags.get('fogros2-name') == name}
+        found = super().things(name)
         api, tag = self.api(), [{'Name': 'tag:fogros2-name', 'Values': [name]}]
         for kind, entries in (
                 ('GroupId', api.describe_security_groups(Filters=tag)['SecurityGroups']),
@@ -218,8 +237,11 @@ def place(provider: str, *, short: bool = True) -> Iterator[Place]:
     with contextlib.ExitStack() as stack:
         if provider == 'container':
             yield Container(short=short)
-        elif provider == 'aws':
-            yield Ec2(stack.enter_context(Ec2Box()), short=short)
+        elif provider in CLOUDS:
+            cloud = CLOUDS[provider]()
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix='place-'))
+            yield (Ec2 if provider == 'aws' else Boxed)(
+                cloud, stack.enter_context(cloud.open()), Path(folder), short=short)
         elif provider == 'ssh':
             yield Host(stack.enter_context(computer()), short=short)
         else:

@@ -16,7 +16,7 @@ import time
 from typing import Optional
 from urllib.parse import unquote
 
-from figures.places import Container, Ec2, Host, Place, Pod
+from figures.places import Boxed, Container, Ec2, Host, Place, Pod
 from figures.robots import Robot, robot, UP
 from fogros2.waiting import wait_until
 
@@ -46,8 +46,12 @@ def plant(its: Robot) -> dict[str, str]:
         {'auths': {'registry.invalid': {'auth': found['docker']}}}))
     os.environ['SOME_API_TOKEN'] = found['variable']
     if isinstance(its.place, Ec2):
-        found['aws'] = f'planted{secrets.token_hex(16)}'
-        its.place.environment = {**its.place.environment, 'AWS_SECRET_ACCESS_KEY': found['aws']}
+        its.place.environment = {
+            **its.place.environment,
+            'AWS_SECRET_ACCESS_KEY': f'planted{secrets.token_hex(16)}'}
+    if isinstance(its.place, Boxed):
+        found |= {f'{its.place.cloud.name} {at}': secret for at, secret in enumerate(
+            its.place.cloud.secrets(its.place.environment))}
     if isinstance(its.place, Pod):
         config = json.loads(Path(its.place.environment['KUBECONFIG']).read_text())
         found['kubernetes'] = config['users'][0]['user']['token']
@@ -119,14 +123,12 @@ def described(here: Place, name: str) -> Found:
         yield 'tags', 'podman inspect', json.dumps(
             json.loads(text)[0]['Config']['Labels']).encode()
         yield 'user data', 'podman inspect', text
-    elif isinstance(here, Ec2):
-        api, mine = here.api(), next(i for i in here.box.alive()
-                                     if i.tags.get('fogros2-name') == name)
-        for what in ('instances', 'tags', 'security_groups', 'key_pairs', 'volumes'):
-            yield 'tags', what, repr(getattr(api, f'describe_{what}')()).encode()
-        data = api.describe_instance_attribute(InstanceId=mine.id, Attribute='userData')
-        coded = base64.b64decode(data['UserData']['Value'])
-        yield 'user data', mine.id, gzip.decompress(coded) if coded[:2] == b'\x1f\x8b' else coded
+    elif isinstance(here, Boxed):
+        (mine,) = here.instances(name)
+        yield 'tags', mine.id, repr([here.cloud.tags(mine), here.cloud.described(
+            here.box)]).encode()
+        data = here.box.user_data(mine.id)
+        yield 'user data', mine.id, gzip.decompress(data) if data[:2] == b'\x1f\x8b' else data
     elif isinstance(here, Pod):
         for kind in ('jobs', 'pods', 'services', 'configmaps', 'events'):
             for each in here.space.all(kind):

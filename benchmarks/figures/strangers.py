@@ -30,7 +30,7 @@ import threading
 import time
 from typing import Any
 
-from figures.places import computer, Container, Ec2, Host, Place, Pod
+from figures.places import Boxed, computer, Container, Host, Place, Pod
 from figures.robots import DOMAIN, Robot, robot, UP
 from figures.secrets_scan import agent_of
 from fogros2.agent.protocol import BEAT, sign
@@ -336,7 +336,7 @@ def attack(here: Place, count: int, seed: int) -> Outcome:
                        timeout=30.0, what="the node's ports")
             # a neighbour of the robot; its own containers may not reach it
             beside = f'/proc/{agent}/ns/net'
-            if isinstance(here, Ec2):
+            if isinstance(here, Boxed):
                 beside = f'{here.network[:-1]}x'
             elif isinstance(here, Container):
                 beside = f'/proc/{stack.enter_context(computer()).process}/ns/net'

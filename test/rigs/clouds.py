@@ -72,8 +72,8 @@ class Cloud(abc.ABC):
         """Delete everything."""
 
     @abc.abstractmethod
-    def secrets(self, robot: Robot) -> list[str]:
-        """Return the credentials of the user, which no machine and no tag may have."""
+    def secrets(self, variables: Mapping[str, str]) -> list[str]:
+        """Return the credentials in a user's variables, which no machine and no tag may have."""
 
     @abc.abstractmethod
     def described(self, box: Any) -> str:
@@ -255,9 +255,9 @@ class Aws(Cloud):
                     operation, word = delete[kind]
                     getattr(self._api(box, region), operation)(**{word: which})
 
-    def secrets(self, robot: Robot) -> list[str]:
+    def secrets(self, variables: Mapping[str, str]) -> list[str]:
         """Return the secret access key."""
-        return [robot.variables['AWS_SECRET_ACCESS_KEY']]
+        return [variables['AWS_SECRET_ACCESS_KEY']]
 
     def described(self, box: Any) -> str:
         """Return the answers of all lists."""
@@ -360,10 +360,10 @@ class Gcp(Cloud):
         """Delete everything."""
         box.clear()
 
-    def secrets(self, robot: Robot) -> list[str]:
+    def secrets(self, variables: Mapping[str, str]) -> list[str]:
         """Return a line of the service account's private key."""
         import json
-        key = json.loads(Path(robot.variables['GOOGLE_APPLICATION_CREDENTIALS']).read_text())
+        key = json.loads(Path(variables['GOOGLE_APPLICATION_CREDENTIALS']).read_text())
         return [str(key['private_key']).splitlines()[3]]
 
     def described(self, box: Any) -> str:
@@ -458,7 +458,7 @@ class Azure(Cloud):
         wait_until(lambda: not self.left(box) and not box.alive(), timeout=20,
                    what='groups to be deleted')
 
-    def secrets(self, robot: Robot) -> list[str]:
+    def secrets(self, variables: Mapping[str, str]) -> list[str]:
         """Return the user's token, and the secret of the service that gives it."""
         from rigs.azure import service
         return [service.TOKEN, service.HEADER]

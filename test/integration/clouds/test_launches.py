@@ -321,7 +321,7 @@ def test_secrets_stay_with_the_robot(cloud, robot, box, name):
                  variables={'FOGROS2_STATE_HOME': str(robot.home / 'state')})
     run.wait_for(f'I heard: [Hello World from {name} ')
     (instance,) = box.alive()
-    secrets = cloud.secrets(robot)
+    secrets = cloud.secrets(robot.variables)
     assert places(robot, box, instance, run, secrets) == []
     assert 'OPENSSH PRIVATE KEY' not in cloud.described(box) + run.text
     # the scan sees what somebody has planted: on the machine, in its processes, in the state

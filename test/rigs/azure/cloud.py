@@ -60,10 +60,14 @@ class Cloud(cloud.Cloud, service.Computers):
 
     # -- what the computers ask for -------------------------------------------------------------
 
+    def user_data(self, machine: Machine) -> bytes:
+        """Return the customData."""
+        return base64.b64decode(machine.instance['properties']['osProfile']['customData'])
+
     def plan(self, machine: Machine) -> dict[str, Any]:
         """Return what customData and the login key say."""
         system = machine.instance['properties']['osProfile']
-        found = dataclasses.asdict(cloud_config.parse(base64.b64decode(system['customData'])))
+        found = dataclasses.asdict(cloud_config.parse(self.user_data(machine)))
         return {**found, 'instance': machine.instance['properties']['vmId'],
                 'user': system['adminUsername'],
                 'keys': [key['keyData'] for key in

@@ -235,6 +235,10 @@ class Box:
         return str(self._ask({'do': 'run', 'instance': instance, 'script': script,
                               'check': check}))
 
+    def user_data(self, instance: str) -> bytes:
+        """Return what the launch gave an instance for its first boot."""
+        return bytes.fromhex(self._ask({'do': 'user data', 'instance': instance}))
+
     def console(self, instance: str) -> str:
         """Return what an instance's first process has said, until it ends."""
         return str(self._ask({'do': 'console', 'instance': instance}))

@@ -97,6 +97,10 @@ class Cloud(abc.ABC):
     # -- what a cloud fills in ------------------------------------------------------------
 
     @abc.abstractmethod
+    def user_data(self, machine: Machine) -> bytes:
+        """Return what an instance was given for its first boot."""
+
+    @abc.abstractmethod
     def plan(self, machine: Machine) -> dict[str, Any]:
         """Return what the first process of an instance has to do; see ``guest``."""
 

@@ -160,6 +160,8 @@ class Box(abc.ABC):
         elif what == 'run':
             return self.cloud.machines[order['instance']].computer.run(
                 order['script'], check=order['check'])
+        elif what == 'user data':
+            return self.cloud.user_data(self.cloud.machines[order['instance']]).hex()
         elif what == 'console':
             return self.cloud.machines[order['instance']].computer.console()
         elif what == 'move_robot':

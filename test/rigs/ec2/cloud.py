@@ -29,6 +29,10 @@ MOTO: dict[str, Callable[..., Any]] = {}
 class Cloud(cloud.Cloud):
     """The computers of EC2 in a box."""
 
+    def user_data(self, machine: Machine) -> bytes:
+        """Return the attribute of that name."""
+        return told.user_data(machine.instance)
+
     def plan(self, machine: Machine) -> dict[str, Any]:
         """Return what the user data and the key pair say."""
         return told.plan(machine.instance)

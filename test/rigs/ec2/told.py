@@ -15,7 +15,7 @@ from rigs.computers.computer import USER
 
 def plan(instance: Any) -> dict[str, Any]:
     """Return what the first process of an instance has to do; see ``guest``."""
-    found = dataclasses.asdict(cloud_config.parse(_user_data(instance)))
+    found = dataclasses.asdict(cloud_config.parse(user_data(instance)))
     return {**found, 'instance': instance.id, 'user': USER, 'keys': _public_keys(instance)}
 
 
@@ -48,7 +48,7 @@ def values(instance: Any, *, spot: bool, notice: str) -> dict[str, bytes]:
     found['dynamic/instance-identity/document'] = _document(found)
     answers = {name: value.encode() for name, value in found.items()}
     if instance.user_data:
-        answers['user-data'] = _user_data(instance)
+        answers['user-data'] = user_data(instance)
     return answers
 
 
@@ -73,7 +73,7 @@ def allowed(
     return tuple(found)
 
 
-def _user_data(instance: Any) -> bytes:
+def user_data(instance: Any) -> bytes:
     return base64.b64decode(instance.user_data.as_bytes()) if instance.user_data else b''
 
 

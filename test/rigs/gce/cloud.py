@@ -30,13 +30,16 @@ class Cloud(cloud.Cloud):
 
     firewalls: Callable[[], Sequence[Mapping[str, Any]]] = staticmethod(lambda: ())
 
-    def plan(self, machine: Machine) -> dict[str, Any]:
-        """Return what the user data says."""
+    def user_data(self, machine: Machine) -> bytes:
+        """Return the metadata of that name."""
         items = {item['key']: item['value']
                  for item in machine.instance.get('metadata', {}).get('items', ())}
-        data = items.get('user-data', '').encode()
-        if items.get('user-data-encoding') == 'base64':
-            data = base64.b64decode(data)
+        data: bytes = items.get('user-data', '').encode()
+        return base64.b64decode(data) if items.get('user-data-encoding') == 'base64' else data
+
+    def plan(self, machine: Machine) -> dict[str, Any]:
+        """Return what the user data says."""
+        data = self.user_data(machine)
         return {**dataclasses.asdict(cloud_config.parse(data)), 'instance': machine.id,
                 'user': USER, 'keys': []}
 
