@@ -48,12 +48,22 @@ def best_effort(qos: QoSProfile) -> QoSProfile:
 
 def run(kind: Callable[[], LazyNode]) -> None:
     """Run a node until a signal; exit with status 1 if its worker failed."""
+    spins = False
+
+    def interrupt(number: int, frame: object) -> None:
+        # rclpy's own handler ends the spin. A KeyboardInterrupt while rclpy converts a message would
+        # be an error of the conversion.
+        if not spins:
+            raise KeyboardInterrupt
+
     memory.keep()
+    signal.signal(signal.SIGINT, interrupt)
     rclpy.init()
     node = kind()
     try:
+        spins = True
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except ExternalShutdownException:
         pass  # rclpy shuts down already, in its own thread; do not do it twice
     finally:
         # A second Ctrl-C must not interrupt the clean-up.

@@ -178,7 +178,8 @@ def test_nodes_respawn_when_what_runs_them_is_killed(launched, victim):
         launch.said.clear()
         killed = subprocess.run(
             ['ros2', 'fog', 'connect', NAME, '--', 'sh', '-c',
-             f'agent=$(cat /run/fogros2/agent.pid); sudo kill -9 {victim}'],
+             # a health check, another child of the agent, may have ended meanwhile
+             f'agent=$(cat /run/fogros2/agent.pid); sudo kill -9 {victim} || true'],
             stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60)
         assert killed.returncode == 0, killed
         launch.wait_for('the launch on the machine ended with exit status -9')

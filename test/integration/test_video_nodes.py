@@ -7,6 +7,8 @@ from collections.abc import Callable
 import os
 from pathlib import Path
 import signal
+import subprocess
+import sys
 import threading
 from typing import Any
 
@@ -392,6 +394,45 @@ def test_a_second_interrupt_while_it_ends_changes_nothing(bench: Bench) -> None:
         assert encoder.wait(10) == 0, lines
     finally:
         decoder.send_signal(signal.SIGCONT)
+
+
+#: A node of image_transport_h264 that computes in a callback when it is interrupted.
+COMPUTING = """
+import sys
+from image_transport_h264.lazy import LazyNode, run
+
+
+class Computing(LazyNode):
+    def __init__(self):
+        super().__init__('computing')
+        self.create_timer(0.001, self.compute)
+
+    def compute(self):
+        print('computing', flush=True)
+        try:
+            for line in sys.stdin:
+                print('through', flush=True)
+                return
+        except KeyboardInterrupt:
+            print('interrupted', flush=True)
+
+
+run(Computing)
+"""
+
+
+def test_interrupt_does_not_break_a_callback_off(bench: Bench) -> None:
+    """One that came while ROS 2's rclpy converts an image would be an error of the conversion."""
+    with subprocess.Popen([sys.executable, '-c', COMPUTING], env=bench.environment, text=True,
+                          stdin=subprocess.PIPE, stdout=subprocess.PIPE) as node:
+        assert node.stdin is not None and node.stdout is not None
+        assert node.stdout.readline() == 'computing\n'
+        node.send_signal(signal.SIGINT)
+        node.stdin.write('go on\n')
+        node.stdin.flush()
+        assert node.stdout.readline() == 'through\n'
+        assert node.wait(20) == 0
+        assert 'interrupted' not in node.stdout.read()
 
 
 def ignores_interrupts(process: int) -> bool:

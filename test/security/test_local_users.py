@@ -23,6 +23,7 @@ from fogros2.testing.fakes import FakeShell
 from fogros2_monitor.dashboard.server import Dashboard
 from fogros2_monitor.gate import Gate
 from fogros2_monitor.tunnel import Tunnel
+from rigs import loops
 from rigs.stranger import stranger
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -206,4 +207,4 @@ def test_no_account_takes_up_the_gate_s_connections(root: None) -> None:
         serving.cancel()
         return answer
 
-    assert asyncio.run(knock()).startswith(b'HTTP/1.1 401 ')
+    assert loops.run(knock()).startswith(b'HTTP/1.1 401 ')

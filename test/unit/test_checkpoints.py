@@ -15,6 +15,7 @@ from rclpy.exceptions import InvalidHandle
 
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2.runtime.checkpoints import Checkpoints
+from rigs import loops
 
 
 class Destroyed:
@@ -39,4 +40,4 @@ def test_ending_launch_counts_as_no_consent(
                            logger=logging.getLogger())
         return await kept.ask()
 
-    assert asyncio.run(ask()) is False
+    assert loops.run(ask()) is False

@@ -15,6 +15,8 @@ from types import ModuleType
 
 import pytest
 
+from rigs import loops
+
 
 @pytest.fixture(scope='module')
 def relay() -> ModuleType:
@@ -80,7 +82,7 @@ def test_packets_pass_both_ways_and_a_rebind_moves_the_client(relay: ModuleType)
             target.close()
             client.close()
 
-    got, ports, counters = asyncio.run(run())
+    got, ports, counters = loops.run(run())
     assert got == [b're0', b're1'] and len(ports) == 2
     assert counters['passed'] == 4 and counters['lost'] == 0
 
@@ -102,7 +104,7 @@ def test_relay_adds_less_than_a_millisecond(
             pending.close()
         return late
 
-    late = asyncio.run(run())
+    late = loops.run(run())
     # a busy computer makes some late; what rounds to milliseconds makes all of them late
     assert 2e-4 <= min(late) < 8e-4
 
@@ -122,4 +124,4 @@ def test_packets_under_way_overtake_each_other_by_their_times(relay: ModuleType)
             pending.close()
         return ' '.join(order)
 
-    assert asyncio.run(run()) == 'first a b c'
+    assert loops.run(run()) == 'first a b c'
