@@ -48,23 +48,25 @@ def best_effort(qos: QoSProfile) -> QoSProfile:
 
 def run(kind: Callable[[], LazyNode]) -> None:
     """Run a node until a signal; exit with status 1 if its worker failed."""
-    spins = False
+    interrupted = False
 
     def interrupt(number: int, frame: object) -> None:
-        # rclpy's own handler ends the spin. A KeyboardInterrupt while rclpy converts a message would
-        # be an error of the conversion.
-        if not spins:
-            raise KeyboardInterrupt
+        nonlocal interrupted
+        interrupted = True
+        raise KeyboardInterrupt
 
     memory.keep()
     signal.signal(signal.SIGINT, interrupt)
     rclpy.init()
     node = kind()
     try:
-        spins = True
         rclpy.spin(node)
-    except ExternalShutdownException:
+    except (KeyboardInterrupt, ExternalShutdownException):
         pass  # rclpy shuts down already, in its own thread; do not do it twice
+    except Exception:
+        # an interrupt while rclpy converts a message, or before it waits, is an error of these
+        if not interrupted and rclpy.ok():
+            raise
     finally:
         # A second Ctrl-C must not interrupt the clean-up.
         signal.signal(signal.SIGINT, signal.SIG_IGN)

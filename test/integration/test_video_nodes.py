@@ -396,43 +396,47 @@ def test_a_second_interrupt_while_it_ends_changes_nothing(bench: Bench) -> None:
         decoder.send_signal(signal.SIGCONT)
 
 
-#: A node of image_transport_h264 that computes in a callback when it is interrupted.
-COMPUTING = """
+#: A node of image_transport_h264 in whose callback an interrupt, or the end of the input, becomes
+#: an error, as an interrupt does in ROS 2's rclpy while it converts an image.
+CONVERTING = """
 import sys
 from image_transport_h264.lazy import LazyNode, run
 
 
-class Computing(LazyNode):
+class Converting(LazyNode):
     def __init__(self):
-        super().__init__('computing')
-        self.create_timer(0.001, self.compute)
+        super().__init__('converting')
+        self.create_timer(0.001, self.convert)
 
-    def compute(self):
-        print('computing', flush=True)
+    def convert(self):
+        print('begins', flush=True)
         try:
-            for line in sys.stdin:
-                print('through', flush=True)
-                return
+            sys.stdin.read()
         except KeyboardInterrupt:
-            print('interrupted', flush=True)
+            pass
+        raise TypeError('Unable to convert call argument')
 
 
-run(Computing)
+run(Converting)
 """
 
 
-def test_interrupt_does_not_break_a_callback_off(bench: Bench) -> None:
-    """One that came while ROS 2's rclpy converts an image would be an error of the conversion."""
-    with subprocess.Popen([sys.executable, '-c', COMPUTING], env=bench.environment, text=True,
-                          stdin=subprocess.PIPE, stdout=subprocess.PIPE) as node:
+@pytest.mark.parametrize(('interrupted', 'status'), [(True, 0), (False, 1)])
+def test_error_after_an_interrupt_is_no_failure(
+    bench: Bench, interrupted: bool, status: int,
+) -> None:
+    with subprocess.Popen([sys.executable, '-c', CONVERTING], env=bench.environment, text=True,
+                          stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                          stderr=subprocess.STDOUT) as node:
         assert node.stdin is not None and node.stdout is not None
-        assert node.stdout.readline() == 'computing\n'
-        node.send_signal(signal.SIGINT)
-        node.stdin.write('go on\n')
-        node.stdin.flush()
-        assert node.stdout.readline() == 'through\n'
-        assert node.wait(20) == 0
-        assert 'interrupted' not in node.stdout.read()
+        assert node.stdout.readline() == 'begins\n'
+        if interrupted:
+            node.send_signal(signal.SIGINT)
+        else:
+            node.stdin.close()
+        said = node.stdout.read()
+        assert node.wait(20) == status
+        assert ('Traceback' in said) is (not interrupted), said
 
 
 def ignores_interrupts(process: int) -> bool:
