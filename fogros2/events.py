@@ -111,13 +111,6 @@ class PreemptionNotice(_Numbered):
     reason: str
 
 
-class MachineIdle(_Numbered):
-    """Nobody has used the machine for so many seconds."""
-
-    event: Literal['idle']
-    seconds: float
-
-
 class AgentEnding(_Numbered):
     """A signal ends the agent, and with it the nodes."""
 
@@ -162,8 +155,7 @@ class MachineLost(TypedDict):
 NodeEvent = Union[NodeStarted, NodeOutput, NodeExited, NodeRefused]
 #: Events that an agent sends; the robot makes the others itself.
 AgentEvent = Union[
-    NodeEvent, WatchdogFired, VpnRepaired, EndFailed, PreemptionNotice, MachineIdle, AgentEnding,
-    LaunchExited]
+    NodeEvent, WatchdogFired, VpnRepaired, EndFailed, PreemptionNotice, AgentEnding, LaunchExited]
 Event = Union[AgentEvent, ConnectionChanged, Gap, MachineLost]
 
 

@@ -270,6 +270,5 @@ def agent_config(spec: MachineSpec, launch_id: str, directory: str,
     return {
         'machine': spec.name, 'launch': launch_id, 'directory': directory,
         'on_exit': spec.on_exit, 'lifetime': spec.lifetime,
-        'robot_timeout': spec.robot_timeout, 'idle_timeout': spec.idle_timeout,
-        'end_command': list(end_command),
+        'robot_timeout': spec.robot_timeout, 'end_command': list(end_command),
     }

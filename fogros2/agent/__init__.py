@@ -12,11 +12,10 @@ modules, in this order:
 - ``watchdog``: when the machine has to end, and heartbeats;
 - ``processes``: commands as root, health checks and watches;
 - ``nodes``: the launch process that runs the nodes;
-- ``idle``: when nobody uses the machine;
 - ``server``: clients, their requests, and the command line.
 
 A module may import the standard library, the modules before it, and types of ``fogros2.events``.
 """
 
 #: The modules in reading order; the joined file has them in this order.
-MODULES = ('protocol', 'journal', 'loop', 'watchdog', 'processes', 'nodes', 'idle', 'server')
+MODULES = ('protocol', 'journal', 'loop', 'watchdog', 'processes', 'nodes', 'server')

@@ -69,7 +69,6 @@ CONFIG: dict[str, tuple[tuple[type, ...], Any]] = {
     'lifetime': ((int, float), 8 * 3600.0),
     'robot_timeout': ((int, float), 120.0),
     'boot_timeout': ((int, float), 1800.0),
-    'idle_timeout': ((int, float, type(None)), None),
     'end_command': ((list,), []),
     'heartbeat': ((dict, type(None)), None),
     'environment': ((dict,), {}),

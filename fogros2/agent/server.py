@@ -21,7 +21,6 @@ import sys
 import threading
 import time
 
-from fogros2.agent.idle import IdleWatch
 from fogros2.agent.journal import BLOCK, Journal
 from fogros2.agent.loop import Channel, Loop
 from fogros2.agent.nodes import Nodes
@@ -45,7 +44,7 @@ FIRST_RESTART, LAST_RESTART = 0.1, 30.0
 #: Settings that a restarted agent takes over from its predecessor.
 RESUMED = (
     'launch', 'on_exit', 'lifetime', 'robot_timeout', 'heartbeat', 'environment', 'setup',
-    'ros_command', 'idle_timeout')
+    'ros_command')
 
 
 class Client(Channel):
@@ -138,7 +137,6 @@ class Agent:
         self.watchdog = Watchdog(self.config, self.loop.clock())
         self.heartbeats = Heartbeats(
             self.loop, self.config, self.watchdog, self.save_deadlines)
-        self.idle = IdleWatch(self.loop, self.identity.account.pw_uid, self._idle)
         self.clients: list[Client] = []
         self.ending = self.done = False
         #: Whether a launch has taken the machine over from the launch that created it.
@@ -444,11 +442,7 @@ class Agent:
         """Start nodes."""
         specs = request['nodes']
         self._check_held()
-        known = self.nodes.start(specs)
-        where = self.config['heartbeat']
-        self.idle.start(self.config['idle_timeout'], self.nodes.mark,
-                        where['bind'] if where else '')
-        return {'known': known}
+        return {'known': self.nodes.start(specs)}
 
     def do_stop(self, client: Client, request: Json) -> Empty:
         """Stop nodes."""
@@ -500,7 +494,6 @@ class Agent:
         self.claimed = ''
         self.released = True
         self.watchdog.disarm()
-        self.idle.stop()
         self.config.update(heartbeat=None, launch='')
         self.heartbeats.open()
         self.save()
@@ -538,10 +531,6 @@ class Agent:
         else:
             self._hurry()
             self.nodes.stop_all(self._end_machine)
-
-    def _idle(self) -> None:
-        """Report that the machine is idle; the robot ends it."""
-        self.emit({'event': 'idle', 'seconds': self.config['idle_timeout']})
 
     def _hurry(self) -> None:
         """Start nothing more, and give processes that a launch process left little time."""

@@ -167,12 +167,6 @@ class RunningMachine(Step):
         self._job.gone = self._job.deleted = True
         self._job.undo.close()
 
-    def end(self, reason: str) -> None:
-        """End the machine as its ``on_exit`` says; its further events are ignored."""
-        with self._lock:
-            self._lost = reason
-        self.close()
-
     def close(self) -> None:
         """End the machine as its ``on_exit`` says."""
         self._job.undo.close()
