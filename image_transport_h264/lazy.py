@@ -125,6 +125,15 @@ class LazyNode(Node):
                 raise
             return False  # the node is shutting down
 
+    def subscribers(self, publisher: Publisher) -> int:
+        """Return the number of a topic's subscribers; 0 while the node is shutting down."""
+        try:
+            return publisher.get_subscription_count()
+        except RuntimeError:
+            if rclpy.ok(context=self.context):
+                raise
+            return 0
+
     def complain(self, cause: str, message: str) -> None:
         """Log a warning for the first message of each cause."""
         with self._complaining:

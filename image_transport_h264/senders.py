@@ -279,7 +279,7 @@ class VideoSender(Sender):
     def _publish(self, header: Header, packet: Packet) -> None:
         self._node.put_out(self._video, message.compressed(header, packet))
         for publisher, kind, make in self._others:
-            if publisher.get_subscription_count():
+            if self._node.subscribers(publisher):
                 self._node.put_out(publisher, make(kind, header, packet))
 
 

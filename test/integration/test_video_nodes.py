@@ -439,6 +439,26 @@ def test_error_after_an_interrupt_is_no_failure(
         assert ('Traceback' in said) is (not interrupted), said
 
 
+#: The thread of a node's worker may ask so after an interrupt has shut rclpy down.
+ENDED = """
+import rclpy
+from image_transport_h264.lazy import LazyNode
+from std_msgs.msg import Empty
+
+rclpy.init()
+node = LazyNode('ended')
+publisher = node.create_publisher(Empty, 'news', 1)
+rclpy.shutdown()
+print(node.subscribers(publisher))
+"""
+
+
+def test_node_that_shuts_down_has_no_subscribers(bench: Bench) -> None:
+    done = subprocess.run([sys.executable, '-c', ENDED], env=bench.environment, text=True,
+                          capture_output=True, timeout=30)
+    assert (done.returncode, done.stdout) == (0, '0\n'), done.stderr
+
+
 def ignores_interrupts(process: int) -> bool:
     """Return whether a process that runs ignores SIGINT; see proc(5)."""
     for line in Path(f'/proc/{process}/status').read_text().splitlines():
