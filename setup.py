@@ -102,6 +102,7 @@ setup(
             'azure = fogros2.provider.azure:AzureProvider',
             'container = fogros2.provider.container:ContainerProvider',
             'gcp = fogros2.provider.gcp:GCPProvider',
+            'joined = fogros2.provider.joined:JoinedProvider',
             'kubernetes = fogros2.provider.kubernetes:KubernetesProvider',
             'ssh = fogros2.provider.ssh:SSHProvider',
         ],
@@ -111,6 +112,7 @@ setup(
             'cheapest = fogros2.describe.machines_cloud:CheapestInstance',
             'container = fogros2.describe.machines:ContainerInstance',
             'gcp = fogros2.describe.machines_cloud:GCPCloudInstance',
+            'joined = fogros2.describe.machines:JoinedMachine',
             'kubernetes = fogros2.describe.machines_cloud:KubeInstance',
             'ssh = fogros2.describe.machines:SSHInstance',
         ],
@@ -125,6 +127,7 @@ setup(
             'graph = fogros2_monitor:GRAPH',
         ],
         'fogros2.shell': [
+            'guest = fogros2.shell.guest:GuestShell',
             'kubernetes = fogros2.shell.kubernetes:KubernetesShell',
             'ssh = fogros2.shell.ssh:SSHShell',
             'local = fogros2.shell.local:LocalShell',

@@ -50,6 +50,9 @@ if TYPE_CHECKING:
         ContainerInstance as ContainerInstance,
     )
     from fogros2.describe.machines import (
+        JoinedMachine as JoinedMachine,
+    )
+    from fogros2.describe.machines import (
         SSHInstance as SSHInstance,
     )
     from fogros2.describe.machines_cloud import (
@@ -85,7 +88,7 @@ _NAMES = {
     'describe.choices':
         'find_cheapest find_cheapest_ec2_instance_type find_nearest_aws_region '
         'nearest_aws_region_now',
-    'describe.machines': 'CloudInstance ContainerInstance SSHInstance',
+    'describe.machines': 'CloudInstance ContainerInstance JoinedMachine SSHInstance',
     'describe.machines_cloud':
         'AWSCloudInstance AzureCloudInstance CheapestInstance GCPCloudInstance KubeInstance '
         'cheapest',

@@ -12,11 +12,15 @@ not show who wrote the text: the user pastes it, as a launch file.
 from __future__ import annotations
 
 import base64
+import contextlib
 import dataclasses
+import hashlib
 import ipaddress
 import json
+from pathlib import Path
 import re
 import time
+from typing import Optional
 
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
@@ -36,6 +40,9 @@ from fogros2.store import check_name, robot_name, Store, write_private
 
 _PREFIX = 'fog1.'
 _NONCE = bytes(12)
+#: File with the invitation in the folder of a joined machine, which is like a launch's folder;
+#: and the file there with the secret for ``GuestShell``.
+JOINED, SECRET = 'joined.json', 'door.key'
 #: A computer's public key, with its name for people before it.
 _KEY = re.compile(r'(?:([A-Za-z0-9_.-]{1,80}):)?([A-Za-z0-9+/]{43}=)')
 
@@ -50,6 +57,8 @@ class Invitation:
     :param joiner: VPN address of the invited computer; ``network`` is the VPN's, in CIDR form.
     :param rmw: RMW_IMPLEMENTATION of the launch; ``domain`` its ROS_DOMAIN_ID.
     :param expires: until when the computer may join, in seconds since the epoch.
+    :param interface: name of the machine's VPN interface; '' of a machine without a door.
+    :param secret: by which the computer proves to the door that it was invited, hexadecimal.
     """
 
     machine: str
@@ -61,6 +70,8 @@ class Invitation:
     rmw: str
     domain: int
     expires: float
+    interface: str = ''
+    secret: str = ''
 
     def __post_init__(self) -> None:
         check_name(self.machine)
@@ -72,6 +83,28 @@ class Invitation:
             raise ValueError('its ROS domain is none')
         if not isinstance(self.expires, float):
             raise ValueError('its end is no time')
+        if self.interface and not re.fullmatch('fog[0-9a-f]{6}m[0-9]{1,3}', self.interface) \
+                or len(bytes.fromhex(self.secret)) not in (0, 32):
+            raise ValueError('its door is none')
+
+    @property
+    def number(self) -> str:
+        """The name of the folder of the joined machine; digits of the interface's name too."""
+        return hashlib.sha256(f'{self.key} {self.joiner}'.encode()).hexdigest()[:6]
+
+
+def joined(store: Store) -> dict[str, Path]:
+    """Return the folders of the machines that this computer has joined, by machine."""
+    return {found.machine: path.parent
+            for path in sorted((store.root / 'launches').glob(f'*/{JOINED}'))
+            if (found := read(path.parent)) is not None}
+
+
+def read(folder: Path) -> Optional[Invitation]:
+    """Return the invitation by which this computer has joined a machine, None if there is none."""
+    with contextlib.suppress(OSError, ValueError, TypeError, ConfigurationError):
+        return Invitation(**json.loads((folder / JOINED).read_text()))
+    return None
 
 
 def own_key(store: Store) -> X25519PrivateKey:

@@ -28,6 +28,8 @@ from fogros2.model import Endpoint, MachineSpec, VpnInterface
 
 #: Name of a file that is being written, with the process that writes it.
 _UNFINISHED = re.compile(r'\..+\.([0-9]+)\.[a-z0-9_]{8}')
+#: File in a machine's folder: guests were invited, and may have stayed when their launch ended.
+GUESTS = 'guests'
 _NAME = re.compile(r'[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?')
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import dataclasses
 import shutil
 import threading
+from typing import Optional
 
 from fogros2 import plan
 from fogros2.dds import DdsVendor
@@ -14,6 +15,7 @@ from fogros2.deploy.choosing import Choices
 from fogros2.deploy.robot_vpn import RobotVpn
 from fogros2.errors import FogError, PrerequisiteError
 from fogros2.host import workspace
+from fogros2.invitation import Invitation
 from fogros2.provider import Capabilities, Provider
 from fogros2.report import Reporter
 from fogros2.store import Store
@@ -35,6 +37,7 @@ class Context:
     :param others: returns the VPN addresses of the other machines that are known now.
     :param programs: the (package, executable) pairs that are known to run on the machine.
     :param images: the container images that nodes on the machine are known to run in.
+    :param invitation: how the launch has joined the machine of another robot; None for its own.
     """
 
     launch: str
@@ -53,6 +56,7 @@ class Context:
     others: Callable[[], Sequence[str]] = tuple
     programs: Sequence[tuple[str, str]] = ()
     images: Sequence[str] = ()
+    invitation: Optional[Invitation] = None
 
     @property
     def capabilities(self) -> Capabilities:

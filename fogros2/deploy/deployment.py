@@ -21,7 +21,7 @@ from fogros2.deploy.steps.arming import Arming
 from fogros2.deploy.steps.connecting import Connection
 from fogros2.deploy.steps.containers import Containers
 from fogros2.deploy.steps.creating import Creation
-from fogros2.deploy.steps.joining import Joining
+from fogros2.deploy.steps.joining import Joined, Joining
 from fogros2.deploy.steps.watching import ClockComparison
 from fogros2.host.bootstrap import RosInstall
 from fogros2.model import MachineSpec
@@ -44,7 +44,7 @@ def bring_up(context: Context, spec: MachineSpec) -> RunningMachine:
 def _run(context: Context, job: MachineJob) -> RunningMachine:
     job.undo.enter_context(context.store.lock(job.name))
     connection, arming = Connection(context, job), Arming(context, job)
-    joining = Joining(context, job, arming.release)
+    joining = (Joining if context.invitation is None else Joined)(context, job, arming.release)
     # the robot's VPN interface needs nothing from the machine: it comes up in parallel
     with ThreadPoolExecutor(6, f'fog-{job.name}') as pool:
         robot = pool.submit(context.vpn.ensure)

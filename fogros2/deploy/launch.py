@@ -18,18 +18,19 @@ from typing import Optional
 
 from fogros2 import model, plan, plugin_system, ros2_daemon
 from fogros2.dds import addresses_of, DdsVendor
-from fogros2.deploy import robot_router
+from fogros2.deploy import membership, robot_router
 from fogros2.deploy.checks import check, check_architecture, check_names
 from fogros2.deploy.choosing import Choices
 from fogros2.deploy.context import Context
 from fogros2.deploy.deployment import bring_up
-from fogros2.deploy.robot import check_robot, provider, run
+from fogros2.deploy.robot import check_robot, clear, provider, run
 from fogros2.deploy.robot_vpn import choose_interface, RobotVpn
 from fogros2.deploy.running import RunningMachine
 from fogros2.deploy.undo import UndoStack
 from fogros2.errors import Cancelled, ConfigurationError, DdsError, FogError, StoreError
+from fogros2.invitation import Invitation, own_key, unseal
 from fogros2.journal import Journal
-from fogros2.model import MachineSpec
+from fogros2.model import DdsInterface, MachineSpec
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent, StepFailed, Warned
 from fogros2.store import Record, Store, this_process, write_private
@@ -70,7 +71,10 @@ class Launch:
         self._choices = Choices(self.provider, self.report)
         self._vpn: Optional[RobotVpn] = None
         self._rmw = ''
+        self._interfaces: list[DdsInterface] = []
         self._robot_environment: Optional[dict[str, str]] = None
+        #: How this launch has joined machines of other robots, by their names here.
+        self._invitations: dict[str, Invitation] = {}
 
     # -- before anything is created -------------------------------------------------------------
 
@@ -211,11 +215,10 @@ class Launch:
                 lan = vendor.parse_lan(run(
                     [vendor.ask_lan()], timeout=self.timeouts.vpn, cancel=self.cancel))
                 vpn = self.robot_vpn()
-                interfaces = vendor.robot_interfaces(
-                    vpn.interface.address if vendor.by_address else vpn.interface.name, lan, user)
                 path = self.store.launch(self.id) / vendor.file_name
-                # no peers: the machines announce themselves
-                write_private(path, vendor.render(interfaces, (), user).encode())
+                self._interfaces = vendor.robot_interfaces(
+                    vpn.interface.address if vendor.by_address else vpn.interface.name, lan, user)
+                self._write_interfaces()
                 # for terminals that join the launch: they read the domain and the middleware
                 write_private(path.with_name('domain'), str(self.domain).encode())
                 write_private(path.with_name('rmw'), vendor.rmw.encode())
@@ -230,6 +233,41 @@ class Launch:
                     self.undo.callback(robot_router.RobotRouter(router, path.parent, user).close)
                 self._robot_environment = dict(vendor.environment(str(path), user))
             return dict(self._robot_environment)
+
+    def _write_interfaces(self) -> None:
+        """Write the middleware's configuration for nodes of the robot that start from now on."""
+        vendor = self.dds()
+        # of all interfaces, the last is the launch's; none stands for all that there are
+        more = [dataclasses.replace(own, name=found.joiner if vendor.by_address else
+                                    f'fog{found.number}')
+                for own in self._interfaces[-1:] for found in self._invitations.values()]
+        # no peers: the machines announce themselves
+        write_private(self.store.launch(self.id) / vendor.file_name, vendor.render(
+            [*self._interfaces, *more], (), self.user_environment).encode())
+
+    def join(self, spec: MachineSpec) -> Optional[Invitation]:
+        """
+        Join the VPN of another robot's machine, before the first node that needs it; once.
+
+        :returns: None for a machine of this launch's own.
+        :raises FogError: the invitation is not valid, or does not fit this launch.
+        """
+        text = self.provider(spec.provider).invitation(spec)
+        with self._lock:
+            if text and spec.name not in self._invitations:
+                found = unseal(text, own_key(self.store))
+                if (found.rmw, found.domain) != (self.dds().rmw, self.domain):
+                    raise DdsError(
+                        f"'{spec.name}' has RMW_IMPLEMENTATION={found.rmw} and ROS_DOMAIN_ID="
+                        f'{found.domain}, this launch {self.dds().rmw} and {self.domain}',
+                        'launch with the same')
+                if not membership.is_up(found):  # else joined by hand, and left by hand
+                    self.undo.callback(clear, self.store.root / 'launches' / found.number)
+                membership.join(text, self.store, self.user_environment, owner=this_process())
+                self._invitations[spec.name] = found
+                if self._robot_environment is not None:
+                    self._write_interfaces()
+            return self._invitations.get(spec.name)
 
     def robot_vpn(self) -> RobotVpn:
         """Return the robot's VPN; its interface need not be up yet."""
@@ -282,7 +320,7 @@ class Launch:
         def others() -> list[str]:
             with self._lock:
                 return [self._address(index) for name, index in self._indices.items()
-                        if name != spec.name]
+                        if name != spec.name and not {name, spec.name} & {*self._invitations}]
 
         self.expect([spec.name])
         return Context(
@@ -290,7 +328,7 @@ class Launch:
             report=self.report, failures=self._failures, timeouts=self.timeouts,
             cancel=self.cancel, ending=self._ending, provider=self.provider(spec.provider),
             choices=self._choices, vpn=self.robot_vpn(), dds=self.dds(),
-            index=self._indices[spec.name], others=others,
+            index=self._indices[spec.name], others=others, invitation=self.join(spec),
             programs=self._programs.get(spec.name, ()), images=self._images.get(spec.name, ()))
 
     def up(self, spec: MachineSpec) -> RunningMachine:

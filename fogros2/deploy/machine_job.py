@@ -9,11 +9,13 @@ import dataclasses
 import threading
 from typing import Any, Optional
 
+from fogros2 import plan
 from fogros2.agent_client import AgentClient, Heartbeat
 from fogros2.deploy.context import Context
 from fogros2.deploy.undo import UndoStack
 from fogros2.errors import ConnectError, DeadlineExceeded, FogError
 from fogros2.model import Command, Machine, MachineSpec, VpnInterface
+from fogros2.provider import Capabilities
 from fogros2.report import step
 from fogros2.shell import Shell
 from fogros2.store import Record
@@ -52,6 +54,8 @@ class MachineJob:
         #: Whether an earlier launch created the machine, and the id of its last launch.
         self.reused = False
         self.former = ''
+        #: The agent's UDP port for heartbeats, and the address from which they come.
+        self.heartbeats = (plan.HEARTBEAT_PORT, context.vpn.interface.address)
         #: False as soon as the machine is up.
         self.failed = True
         #: ``gone``: the provider reports the machine as stopped.
@@ -129,9 +133,15 @@ class MachineJob:
         return self.record.machine_id
 
     @property
+    def capabilities(self) -> Capabilities:
+        """What this machine can do, as far as it is known."""
+        provider, machine = self._context.provider, getattr(self, 'machine', None)
+        return provider.capabilities if machine is None else provider.capabilities_of(machine)
+
+    @property
     def directory(self) -> str:
         """The agent's folder on the machine."""
-        return self._context.capabilities.agent_directory or f'{AGENT_FOLDER}/{self.name}'
+        return self.capabilities.agent_directory or f'{AGENT_FOLDER}/{self.name}'
 
     @property
     def dds_file(self) -> str:

@@ -152,7 +152,7 @@ def ensure(
     shell: Shell, under: Underlay, spec: MachineSpec, *, timeout: float,
     cancel: Optional[threading.Event] = None,
     on_plan: Callable[[RosInstall], object] = lambda install: None, elsewhere: bool = False,
-    packages: Sequence[str] = (),
+    packages: Sequence[str] = (), guest: bool = False,
 ) -> tuple[RosInstall, str]:
     """
     Prepare a machine for ROS 2 nodes, by its facts and by ``spec.bootstrap``.
@@ -163,6 +163,7 @@ def ensure(
         steps need not wait for the slowest ones.
     :param elsewhere: refuse a machine with this computer's network, see ``check_elsewhere``.
     :param packages: packages of the nodes that will run there.
+    :param guest: send workspaces to the login user's home; other users may have the same paths.
     :returns: how ROS programs run there, and what was done in a few words.
     :raises ConfigurationError: the machine has this computer's network.
     :raises PrerequisiteError: the machine cannot be prepared, or its answer is not valid.
@@ -199,6 +200,11 @@ def ensure(
         if todo.install.kind == 'embedded':
             # The machine gets a copy of this environment.
             keys = needs.outside(keys, [sys.prefix])
+    if guest:
+        ways, variables = workspaces.moved(
+            todo.install.workspaces, todo.install.environment, f'{facts.home}/ws', spec.name)
+        todo = dataclasses.replace(todo, install=dataclasses.replace(
+            todo.install, workspaces=ways, environment=variables))
     folder = needs.PipFolder.of(spec, facts, keys)
     if spec.pip or keys:
         todo = dataclasses.replace(todo, install=dataclasses.replace(

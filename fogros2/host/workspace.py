@@ -235,6 +235,32 @@ def plan(
         tuple(_build(workspace, ros_setup)), setup, reason)
 
 
+def moved(
+    ways: Sequence[WorkspacePlan], environment: Mapping[str, str], folder: str, name: str,
+) -> tuple[tuple[WorkspacePlan, ...], dict[str, str]]:
+    """
+    Return plans and variables with the workspaces below a folder of the machine.
+
+    An install space without links can be moved: programs find it by the variables.
+
+    :raises WorkspaceError: a workspace has links, or must be built on the machine.
+    """
+    roots = [way.target for way in ways]
+    for way in ways:
+        if way.commands or way.includes or way.linked:
+            why = way.reason or 'its install space was built with --symlink-install'
+            raise WorkspaceError(f"{way.source} can't go to machine '{name}' as it is: {why}",
+                                 "a guest's has to be complete: colcon build, without links")
+
+    def there(entry: str) -> str:
+        return f'{folder}{entry}' if any(
+            entry == root or entry.startswith(f'{root}/') for root in roots) else entry
+
+    return tuple(dataclasses.replace(way, target=there(way.target)) for way in ways), {
+        key: os.pathsep.join(map(there, value.split(os.pathsep)))
+        for key, value in environment.items()}
+
+
 def no_sources(workspace: Workspace, name: str, reason: str) -> WorkspaceError:
     """Return the error for an install space that does not run on a machine, without sources."""
     return WorkspaceError(

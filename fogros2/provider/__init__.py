@@ -4,7 +4,7 @@ The plugin interface to computers: a cloud, a cluster, a container engine, an ex
 
 In reading order: ``offers`` (types of machines and their prices), ``options`` (reading a launch
 file's options), this module, then a module or package for each provider:
-``ssh``, ``container``, ``kubernetes``, ``vm`` (shared by clouds of virtual machines), ``aws``,
+``ssh``, ``joined``, ``container``, ``kubernetes``, ``vm`` (shared by virtual machines), ``aws``,
 ``gcp``, ``azure``, ``clouds`` (the offers of all), ``cheapest`` (a machine of any cloud).
 """
 
@@ -151,6 +151,10 @@ class Provider(abc.ABC):
         :raises FogError: nothing fits, or the provider does not answer.
         """
         return spec
+
+    def invitation(self, spec: MachineSpec) -> str:
+        """Return the text of the invitation by which a launch joins a machine; '' for none."""
+        return ''
 
     def choices(self, asked: MachineSpec, chosen: MachineSpec) -> list[str]:
         """Describe for people what ``resolve`` has changed."""

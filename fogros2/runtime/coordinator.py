@@ -299,6 +299,7 @@ class Coordinator:
             self._sessions[spec.name] = session
             self._new.append(session)
             self.launch.expect([spec.name])
+            self.launch.join(spec)
             self._set_dds_environment()
             self.begin()
         elif session.requested != spec:

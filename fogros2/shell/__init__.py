@@ -6,9 +6,10 @@ The plugin interface to a machine's command line: run, put, sync, open.
 local streams to a program on a machine (``rsh`` is rsync's end of it), ``terminal`` the user's
 terminal. ``ssh_connection`` opens SSH connections, ``sync`` calls rsync. ``local`` is the shell of
 this computer. ``remote`` is the base of the shells with a connection. ``ssh`` is one of them.
-To a pod, ``kubernetes_mux`` is the program in the pod, ``kubernetes_link`` the connection to it,
-and ``kubernetes`` the shell. ``movable`` replaces a shell in use, ``host_key`` a machine's host
-key.
+``multiplexer`` is a program on a machine that runs many commands over one connection, and
+``multiplexed`` the robot's end of it. So do pods by ``kubernetes_link`` and ``kubernetes``, the
+connection and the shell, and machines of other robots by ``guest``. ``movable`` replaces a shell
+in use, ``host_key`` a machine's host key.
 """
 
 from __future__ import annotations

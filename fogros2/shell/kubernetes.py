@@ -2,7 +2,7 @@
 """
 Run commands in a pod through the API server: the image needs no SSH server, the pod no open port.
 
-One ``exec`` carries all commands (see ``kubernetes_mux``), so a command takes one round trip.
+One ``exec`` carries all commands (see ``multiplexer``), so a command takes one round trip.
 """
 
 from __future__ import annotations
@@ -12,16 +12,17 @@ import threading
 from typing import Optional
 
 from fogros2.errors import ConnectError, DeadlineExceeded, FogError
-from fogros2.model import Command, Endpoint
-from fogros2.shell.kubernetes_link import Channel, Link
-from fogros2.shell.remote import connecting, RemoteShell
+from fogros2.model import Endpoint
+from fogros2.shell.kubernetes_link import Link
+from fogros2.shell.multiplexed import MultiplexedShell
+from fogros2.shell.remote import connecting
 from fogros2.waiting import wait_until
 
 #: Time-out of one attempt to connect, in seconds.
 _ATTEMPT = 10.0
 
 
-class KubernetesShell(RemoteShell[Link]):
+class KubernetesShell(MultiplexedShell):
     """
     A Shell for endpoints of kind 'kubernetes', whose host is ``namespace/pod@context``.
 
@@ -55,19 +56,6 @@ class KubernetesShell(RemoteShell[Link]):
                               what=f"a connection to '{self.name}'")
         except DeadlineExceeded as error:
             raise last[0] if last else error from error
-
-    def _start(
-        self, connection: Link, command: Command | str, timeout: float,
-        cancel: Optional[threading.Event],
-    ) -> Channel:
-        return connection.open(
-            Command(('sh', '-c', command)) if isinstance(command, str) else command)
-
-    def _start_in_terminal(
-        self, command: Optional[Command], size: Optional[tuple[int, int, str]],
-    ) -> Channel:
-        return self._connected(self._timeout).open(
-            command or Command(()), terminal=size, login=command is None)
 
 
 def _load() -> None:

@@ -58,3 +58,7 @@ class Vpn(abc.ABC):
     @abc.abstractmethod
     def down(self, interface: VpnInterface) -> Iterator[Command]:
         """Yield the commands that undo ``up`` and delete the key file."""
+
+    def leave(self, interface: VpnInterface) -> Iterator[Command]:
+        """Yield the commands of ``down`` for a machine that is kept; guests may need more time."""
+        return self.down(interface)

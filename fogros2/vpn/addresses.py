@@ -25,11 +25,15 @@ PORT_VARIABLE = 'FOGROS2_VPN_PORT'
 PREFIX = 24
 #: The last addresses of the subnet belong to computers that an invitation admits to a machine.
 FIRST_GUEST, GUEST_PREFIX = 224, 27
+#: TCP port of a machine on its VPN address at which guests' robots reach their accounts.
+GUEST_PORT = 7399
+#: Number of a guest's UDP port for heartbeats, beside DDS's, less the last byte of its address.
+GUEST_HEARTBEATS = 7000
 #: Networks with a shorter prefix mean "everything" in some VPN (two halves, four quarters). They
 #: do not collide: the more specific route wins.
 EVERYTHING = 8
 
-_Network = ipaddress.IPv4Network
+_Network, _Address = ipaddress.IPv4Network, ipaddress.IPv4Address
 
 
 def pool_from(environment: Mapping[str, str]) -> str:
@@ -69,6 +73,11 @@ def choose_subnet(used: Iterable[str], *, launch_id: str, pool: str = POOL) -> s
 def guests(subnet: str) -> str:
     """Return the range of a launch's subnet that is for guests, in CIDR form."""
     return str(_Network((int(_Network(subnet)[FIRST_GUEST]), GUEST_PREFIX)))
+
+
+def guest_heartbeats(address: str) -> int:
+    """Return the UDP port of a machine's VPN address for the heartbeats of one guest."""
+    return GUEST_HEARTBEATS + _Address(address).packed[3]
 
 
 def overlapping(subnet: str, used: Iterable[str]) -> list[str]:

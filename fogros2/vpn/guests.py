@@ -13,23 +13,60 @@ health check starts no Python before.
 Runs as python3 -c SOURCE NAME VERB, where NAME is the interface, with a request as JSON on the
 standard input; prints the list. Imports nothing of fogros2.
 
-``admit``   ``key``, ``label``, ``seconds``, ``patience``, ``addresses`` to choose from
+``admit``   ``key``, ``label``, ``seconds``, ``patience``, ``addresses`` to choose from, ``secret``,
+            ``left``: seconds until the machine's lifetime ends, and ``door`` for ``serve``
 ``remove``  ``keys``, or null for all
 ``look``    removes those whose time is over
+``serve``   is the door of the guests' nodes; ``admit`` starts it, in the background. It listens at
+            ``address`` and ``port`` until there are no guests. A guest proves with its secret that
+            it was invited, and gets a ``shell`` (a program's source) of an account of its own. The
+            account has no rights, and ends with the guest: processes, files and agent included.
+``clear``   ends the accounts of all guests, because the interface ends
+
+A launch that keeps its machine leaves the interface to guests, with the file ``NAME.left``; then
+the door runs the script ``down`` after the last guest. All of this is for root; only the processes
+of a guest's account, its agent among them, read what the guest sends after its proof.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
+import contextlib
 import fcntl
+import hmac
 import json
 import os
 from pathlib import Path
+import pwd
+import select
+import shutil
+import socket
 import subprocess
 import sys
+import threading
+import time
 from typing import Any
 
 #: Seconds between two looks at a guest that is connected beyond its invitation.
 INTERVAL = 10.0
+#: Seconds that a guest may take to prove who it is, and its connections at the same time.
+PROOF_TIMEOUT, CONNECTIONS = 10.0, 8
+#: Bytes of a challenge, and of its answer by HMAC-SHA256.
+CHALLENGE = 32
+#: Folder of the guests' homes, and where else their files may be.
+HOMES, ELSEWHERE = Path('/var/lib/fogros2'), ('/tmp', '/var/tmp', '/dev/shm', '/var/spool/cron')
+#: Linux: allow to bind to an address that does not exist yet.
+IP_FREEBIND = 15
+#: Ends all other processes of an account; fails until there are none.
+KILL = """\
+import os
+try:
+    os.kill(-1, 9)
+except ProcessLookupError:
+    raise SystemExit(0)
+raise SystemExit(1)
+"""
 
 Guest = dict[str, Any]
 
@@ -57,13 +94,16 @@ def admitted(guests: list[Guest], request: dict[str, Any], now: float) -> list[G
     return [*others, {
         **(known[0] if known else {'address': free[0], 'handshake': 0, 'heard': None}),
         'key': request['key'], 'label': request['label'], 'until': now + request['seconds'],
-        'patience': request['patience']}]
+        'patience': request['patience'], 'secret': request.get('secret', ''),
+        'end': now + request['left'] if 'left' in request else None}]
 
 
 def due(guest: Guest) -> float:
     """Return when a guest's time is over, in seconds since boot, unless it is heard again."""
     until: float = guest['until']
-    return until if guest['heard'] is None else max(until, guest['heard'] + guest['patience'])
+    if guest['heard'] is not None:
+        until = max(until, guest['heard'] + guest['patience'])
+    return until if guest.get('end') is None else min(until, guest['end'])
 
 
 def rendered(guests: list[Guest], now: float) -> str:
@@ -84,35 +124,243 @@ def write(path: Path, text: str) -> None:
     aside.replace(path)
 
 
-def main(name: str, verb: str, folder: Path = Path('/run')) -> None:
-    """Run one request, and print the guests that there are afterwards."""
-    config, state = folder / f'{name}.guests', folder / f'{name}.guests.json'
-    if verb == 'look' and not state.exists():
-        print('[]')  # there never was one
-        return
-    with open(folder / f'{name}.guests.lock', 'a') as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        now = float(Path('/proc/uptime').read_text().split()[0])  # the health check's clock
-        before = json.loads(state.read_text()) if state.exists() else []
-        output = subprocess.run(('wg', 'show', name, 'latest-handshakes'), check=True,
+def account(name: str, address: str) -> str:
+    """Return the account of the guest at an address of an interface."""
+    return f"{name}g{address.rpartition('.')[2]}"
+
+
+class Guests:
+    """
+    The guests of an interface.
+
+    :param name: of the interface.
+    """
+
+    def __init__(self, name: str, folder: Path = Path('/run')) -> None:
+        self.name = name
+        self.config, self.state = folder / f'{name}.guests', folder / f'{name}.guests.json'
+        self.left = folder / f'{name}.left'
+        self.lock, self.door = (folder / f'{name}.guests.{what}' for what in ('lock', 'door'))
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[list[Guest]]:
+        """Keep other processes from changing the list during the block; yield the list."""
+        with open(self.lock, 'a') as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield json.loads(self.state.read_text()) if self.state.exists() else []
+
+    def change(self, before: list[Guest], verb: str, request: dict[str, Any]) -> list[Guest]:
+        """Run one request, with the lock held; return the guests that there are afterwards."""
+        now = uptime()
+        output = subprocess.run(('wg', 'show', self.name, 'latest-handshakes'), check=True,
                                 stdout=subprocess.PIPE, text=True).stdout
         heard(before, {key: int(at) for key, at in map(str.split, output.splitlines())}, now)
-        request = {} if verb == 'look' else json.load(sys.stdin)
         after = admitted(before, request, now) if verb == 'admit' else [
             guest for guest in before if verb != 'remove'
             or request['keys'] is not None and guest['key'] not in request['keys']]
         after = [guest for guest in after if now < due(guest)]
-        write(state, json.dumps(after))
-        write(config, rendered(after, now))
+        write(self.state, json.dumps(after))
+        write(self.config, rendered(after, now))
         for guest in [guest for guest in before if guest not in after and not any(
                 guest['key'] == other['key'] for other in after)]:
-            subprocess.run(('wg', 'set', name, 'peer', guest['key'], 'remove'), check=True)
+            subprocess.run(('wg', 'set', self.name, 'peer', guest['key'], 'remove'), check=True)
+            evict(account(self.name, guest['address']))
         for guest in after if verb == 'admit' else ():
-            subprocess.run(('wg', 'set', name, 'peer', guest['key'],
+            subprocess.run(('wg', 'set', self.name, 'peer', guest['key'],
                             'allowed-ips', guest['address']), check=True)
             # a machine whose networks overlap the VPN's has no route to the VPN as a whole
-            subprocess.run(('ip', 'route', 'replace', f"{guest['address']}/32", 'dev', name),
+            subprocess.run(('ip', 'route', 'replace', f"{guest['address']}/32", 'dev', self.name),
                            check=True)
+        return after
+
+
+def uptime() -> float:
+    """Return the seconds since boot, by the health check's clock."""
+    return float(Path('/proc/uptime').read_text().split()[0])
+
+
+def evict(user: str) -> None:
+    """End a guest's processes, and delete its account and its files; idempotent."""
+    try:
+        found = pwd.getpwnam(user)
+    except KeyError:
+        return
+    until = time.monotonic() + 5.0
+    while time.monotonic() < until and subprocess.run(
+            (sys.executable, '-ISc', KILL), user=found.pw_uid, group=found.pw_gid,
+            extra_groups=(), stderr=subprocess.DEVNULL).returncode:
+        time.sleep(0.02)
+    subprocess.run(('userdel', user), stderr=subprocess.DEVNULL)
+    shutil.rmtree(HOMES / user, ignore_errors=True)
+    subprocess.run(('find', *ELSEWHERE, '-xdev', '-uid', str(found.pw_uid), '-delete'),
+                   stderr=subprocess.DEVNULL)
+    with contextlib.suppress(OSError):
+        HOMES.rmdir()  # of the last guest
+
+
+class Door:
+    """
+    Where guests' robots reach their accounts.
+
+    :param request: ``address``, ``port``, ``shell``, ``down``, ``machine``, ``agent`` (the path of
+        the agent's program), ``process`` (the file with the process id of the machine's agent).
+    """
+
+    def __init__(self, guests: Guests, request: dict[str, Any]) -> None:
+        self.guests = guests
+        self.request = request
+        self.agent = Path(request['agent']).read_text()
+        self.open: Counter[str] = Counter()
+
+    def serve(self) -> None:
+        """Serve until there are no guests, or there is another door."""
+        os.umask(0o022)
+        with socket.socket() as listener, open(self.guests.door, 'a') as own:
+            with self.guests.locked():
+                try:
+                    fcntl.flock(own, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    return
+            self.follow()
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.setsockopt(socket.IPPROTO_IP, IP_FREEBIND, 1)
+            listener.bind((self.request['address'], self.request['port']))
+            listener.listen()
+            look = 0.0
+            while True:
+                if select.select([listener], [], [], max(0.0, look - time.monotonic()))[0]:
+                    with contextlib.suppress(OSError):
+                        self.accept(*listener.accept())
+                    continue
+                look = time.monotonic() + INTERVAL
+                with self.guests.locked() as left:
+                    with contextlib.suppress(OSError, subprocess.CalledProcessError):
+                        left = left and self.guests.change(left, 'look', {})
+                    if not left:
+                        own.close()  # a guest that is admitted from now on gets another door
+                        break
+        if self.guests.left.exists():
+            os.execvp('sh', ('sh', '-c', self.request['down']))
+
+    def follow(self) -> None:
+        """Enter the control group of the agent, whose processes take no DDS of strangers."""
+        with contextlib.suppress(OSError):
+            pid = Path(self.request['process']).read_text().strip()
+            for line in Path(f'/proc/{pid}/cgroup').read_text().splitlines():
+                if line.startswith('0::'):
+                    for top in ('/sys/fs/cgroup', '/sys/fs/cgroup/unified'):
+                        with contextlib.suppress(OSError):
+                            Path(f'{top}{line[3:]}/cgroup.procs').write_text(str(os.getpid()))
+
+    def accept(self, link: socket.socket, peer: tuple[str, int]) -> None:
+        """Serve a connection in a thread; close one too many of a guest."""
+        if self.open[peer[0]] >= CONNECTIONS:
+            link.close()
+            return
+        self.open[peer[0]] += 1
+
+        def run() -> None:
+            try:
+                with link, contextlib.suppress(OSError):
+                    self.answer(link, peer[0])
+            finally:
+                self.open[peer[0]] -= 1
+        threading.Thread(target=run, daemon=True).start()
+
+    def answer(self, link: socket.socket, address: str) -> None:
+        """Let a guest prove who it is; then run its shell until the connection ends."""
+        link.settimeout(PROOF_TIMEOUT)
+        challenge = os.urandom(CHALLENGE)
+        if not self.admits(address, challenge, b''):
+            return  # neither a guest nor a word to it
+        link.sendall(challenge)
+        proof, until = b'', time.monotonic() + PROOF_TIMEOUT
+        while len(proof) < CHALLENGE and time.monotonic() < until:
+            proof += (more := link.recv(CHALLENGE - len(proof)))
+            if not more:
+                return
+        with self.guests.locked():  # a guest that is revoked now is evicted after this
+            if not self.admits(address, challenge, proof):
+                return
+            try:
+                child = self.begin(link, account(self.guests.name, address))
+            except (OSError, KeyError, subprocess.SubprocessError) as error:
+                why = (getattr(error, 'stderr', None) or str(error)).strip().splitlines()
+                link.sendall(f"{''.join(why[-1:])[:200]}\n".encode())
+                return
+        child.wait()
+
+    def admits(self, address: str, challenge: bytes, proof: bytes) -> bool:
+        """Return whether an address is a guest's, and a proof, unless empty, is that guest's."""
+        secrets = [bytes.fromhex(guest['secret'])
+                   for guest in json.loads(self.guests.state.read_text())
+                   if guest['address'] == address and guest.get('secret')]
+        return any(not proof or hmac.compare_digest(
+            hmac.digest(secret, challenge, 'sha256'), proof) for secret in secrets)
+
+    def begin(self, link: socket.socket, user: str) -> subprocess.Popen[bytes]:
+        """
+        Start a guest's shell on a connection, beside its agent.
+
+        :raises OSError, KeyError, SubprocessError: the machine has no room for an account.
+        """
+        home = HOMES / user
+        try:
+            found = pwd.getpwnam(user)
+        except KeyError:
+            HOMES.mkdir(mode=0o755, exist_ok=True)
+            subprocess.run(
+                ('useradd', '--system', '--user-group', '--no-create-home', '--home-dir', home,
+                 '--shell', '/bin/sh', user), check=True, stderr=subprocess.PIPE, text=True)
+            found = pwd.getpwnam(user)
+            home.mkdir(mode=0o700)
+            (home / 'agent.py').write_text(self.agent)
+            (home / 'agent.json').write_text(json.dumps({
+                'machine': self.request['machine'], 'directory': f'{home}/agent', 'user': user,
+                'boot_timeout': 120.0}))
+            os.chown(home, found.pw_uid, found.pw_gid)
+        options: dict[str, Any] = {
+            'cwd': home, 'user': found.pw_uid, 'group': found.pw_gid, 'extra_groups': (),
+            'start_new_session': True, 'stderr': subprocess.DEVNULL, 'umask': 0o022,
+            'env': {'HOME': str(home), 'USER': user, 'LOGNAME': user, 'SHELL': '/bin/sh',
+                    'LANG': 'C.UTF-8', 'PATH': '/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin'}}
+        # ends at once if the agent runs
+        subprocess.run(('python3', '-IS', 'agent.py', 'serve', '--detach', '--config',
+                        'agent.json'), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                       timeout=30.0, **options)
+        link.settimeout(None)
+        link.sendall(b'\n')
+        return subprocess.Popen(('python3', '-IS', '-c', self.request['shell']), stdin=link,
+                                stdout=link, **options)
+
+
+def main(name: str, verb: str, folder: Path = Path('/run')) -> None:
+    """Run one request, and print the guests that there are afterwards."""
+    guests = Guests(name, folder)
+    if verb in ('look', 'clear') and not guests.state.exists():
+        print('[]')  # there never was one
+        return
+    request = {} if verb in ('look', 'clear') else json.load(sys.stdin)
+    if verb == 'serve':
+        Door(guests, request).serve()
+        return
+    with guests.locked() as before:
+        if verb == 'clear':
+            guests.state.unlink()  # a door that runs admits nobody any more
+            guests.left.unlink(missing_ok=True)
+            for guest in before:
+                evict(account(name, guest['address']))
+            return
+        after = guests.change(before, verb, request)
+    if 'door' in request:
+        door = subprocess.Popen(
+            (sys.executable, '-IS', '-c', request['door'].pop('source'), name, 'serve'),
+            stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            cwd='/', start_new_session=True)
+        assert door.stdin is not None
+        with door.stdin as stdin:
+            stdin.write(json.dumps(request['door']).encode())
+    now = uptime()
     print(json.dumps([{
         'key': guest['key'], 'label': guest['label'], 'address': guest['address'],
         'left': guest['until'] - now, 'heard': guest['heard'] and now - guest['heard'],

@@ -196,12 +196,22 @@ class WireGuard(Vpn):
     def down(self, interface: VpnInterface) -> Iterator[Command]:
         """Yield one script that undoes ``up`` in reverse order, and continues after errors."""
         undos = [step.undo for step in reversed(self._steps(interface, ())) if step.undo]
-        lines = [_PATH, 'failed=0', *(f'{{ {undo}\n}} || failed=1' for undo in undos)]
         files = f'{shlex.quote(interface.key_file)} {_noted(interface)}'
         if not interface.firewall:
-            files += f' {_guests(interface)} {_guests(interface)}.json {_guests(interface)}.lock'
+            clear = shlex.join(guest_request(interface, 'clear').argv)
+            undos.insert(0, f'[ ! -e {_guests(interface)}.json ] || {clear}')
+            files += f' {_guests(interface)}* {_left(interface)}'
+        lines = [_PATH, 'failed=0', *(f'{{ {undo}\n}} || failed=1' for undo in undos)]
         lines += [f'rm -f {files} || failed=1', 'exit $failed']
         yield Command.script('\n'.join(lines), sudo=True, what=_what('take', interface, 'down'))
+
+    def leave(self, interface: VpnInterface) -> Iterator[Command]:
+        """Yield the script of ``down``; while there are guests it leaves that to their door."""
+        look = shlex.join(guest_request(interface, 'look').argv)
+        for command in self.down(interface):
+            yield dataclasses.replace(command, argv=(*command.argv[:-1], (
+                f'if [ -e {_guests(interface)}.json ] && [ "$({look})" != "[]" ]; then\n'
+                f'  : >{_left(interface)}; exit 0\nfi\n{command.argv[-1]}')))
 
     def _steps(
         self, interface: VpnInterface, peers: Sequence[Peer], *, recall: bool = False,
@@ -242,7 +252,8 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
 
     No host accepts packets for its VPN address from another interface, as Linux does. On the
     robot, the filter admits only DDS and ping from a machine, which may be hijacked. A machine of
-    a launch accepts DDS from the VPN and from itself only; guests reach its DDS and ping alone.
+    a launch accepts DDS from the VPN and from itself only; guests reach its DDS, ping and door
+    (``guests``) alone.
 
     It uses one table, so that one delete is its undo. One transaction replaces the whole table,
     so there is no moment without it. An accept in another table does not override a drop here,
@@ -277,12 +288,17 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
             f'    iifname "{name}" drop',
             f'    oifname "{name}" drop']
     else:
-        admitted = f'iifname "{name}" ip saddr {addresses.guests(interface.network)}'
+        own = addresses.guests(interface.network)
+        admitted = f'iifname "{name}" ip saddr {own}'
+        heartbeats = [f'{guest} . {addresses.guest_heartbeats(str(guest))}'
+                      for guest in ipaddress.IPv4Network(own)]
         rules[3:3] = [
             '  chain guests {',
             f'    ip daddr != {{ {interface.address}, {DISCOVERY_GROUP} }} drop',
             f'    udp dport {_set(ports)} accept',
             '    icmp type echo-request accept',
+            f'    tcp dport {addresses.GUEST_PORT} accept',
+            f'    ip saddr . udp dport {{ {", ".join(heartbeats)} }} accept',
             '    drop',
             '  }',
             '  chain forward {',
@@ -488,6 +504,10 @@ def _noted(interface: VpnInterface) -> str:
 
 def _guests(interface: VpnInterface) -> str:
     return f'/run/{_name(interface)}.guests'
+
+
+def _left(interface: VpnInterface) -> str:
+    return f'/run/{_name(interface)}.left'
 
 
 def guest_request(interface: VpnInterface, verb: str, request: object = None) -> Command:

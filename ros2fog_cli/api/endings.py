@@ -12,13 +12,13 @@ import json
 import math
 from pathlib import Path
 import re
-import shutil
 import time
 from typing import Optional
 
-from fogros2 import deploy, plan, plugin_system, process, ros2_daemon
+from fogros2 import deploy, plugin_system
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
+from fogros2.deploy.robot import clear, take_down
 from fogros2.errors import (
     AgentError,
     ConfigurationError,
@@ -29,11 +29,11 @@ from fogros2.errors import (
     ProviderError,
     ShellError,
 )
-from fogros2.model import Command, Machine, MachineState, VpnInterface
+from fogros2.model import Command, Machine, MachineState
 from fogros2.report import Reporter
 from fogros2.shell import Shell
 from fogros2.store import process_alive, Record, robot_id, Store
-from fogros2.vpn import helped, owner, Vpn
+from fogros2.vpn import owner, Vpn
 from fogros2.waiting import Timeouts, wait_until
 from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry
@@ -210,15 +210,17 @@ def _leave(record: Record, *, force: bool) -> None:
                 if not force and not _sure(record) and _hears_launch(client):
                     raise _used(record)
                 client.request('release', on_exit='delete', exit=True, timeout=30.0)
-        if record.vpn is not None:
-            vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
-            for command in vpn.down(record.vpn):
-                shell.run(command, timeout=timeouts.vpn)
+        if record.vpn is None:
+            return  # the machine of another robot
+        vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
+        for command in vpn.down(record.vpn):
+            shell.run(command, timeout=timeouts.vpn)
         if record.agent:
             shell.run(Command(('rm', '-rf', '--', record.agent), sudo=True,
                               what='remove the agent'), timeout=timeouts.command)
     except (ShellError, DeadlineExceeded):
-        if not force:
+        # the machine of another robot, without a VPN of ours, may have forgotten this computer
+        if not force and record.vpn is not None:
             raise
     finally:
         shell.close()
@@ -331,7 +333,7 @@ def let_go(record: Record, store: Store) -> None:
     """
     folder = store.root / 'launches' / record.launch
     with store.lock(record.name):
-        _take_down(folder, record.robot_vpn, record.spec.vpn)
+        take_down(folder, record.robot_vpn, record.spec.vpn)
         store.save(dataclasses.replace(record, launch='', pid=0, pid_start=0, robot_vpn=None))
 
 
@@ -357,25 +359,3 @@ def _dead(folder: Path, now: float) -> bool:
             return not runs if runs is not None else now - folder.stat().st_mtime > FOLDER_AGE
         except OSError:
             return False
-
-
-def clear(folder: Path) -> None:
-    """
-    Delete the VPN interface, firewall rules, key and folder of a dead launch.
-
-    :raises FogError: a resource could not be deleted.
-    """
-    name = f'fog{folder.name}'
-    interface = plan.robot_interface(
-        folder.name, '127.0.0.0/24', 0, helped.key_of(name) or str(folder / 'vpn.key'), 0)
-    _take_down(folder, interface, 'wireguard')
-
-
-def _take_down(folder: Path, interface: Optional[VpnInterface], kind: str) -> None:
-    """Delete a launch's VPN interface and folder, and stop the ROS 2 daemon that it had."""
-    if interface is not None:
-        ros2_daemon.stop(folder)
-        vpn: Vpn = plugin_system.load('fogros2.vpn', kind)()
-        for command in vpn.down(interface):
-            process.run(command, timeout=Timeouts().vpn)
-    shutil.rmtree(folder, ignore_errors=True)

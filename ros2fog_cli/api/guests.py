@@ -7,15 +7,19 @@ from collections.abc import Callable
 import ipaddress
 import json
 import math
+from pathlib import Path
+import secrets
 import time
 from typing import Optional, TypedDict
 
-from fogros2 import invitation
+from fogros2 import invitation, plugin_system
+from fogros2.deploy import membership
 from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import host_port
-from fogros2.shell import Shell
-from fogros2.store import Record, Store
-from fogros2.vpn import addresses
+from fogros2.shell import multiplexer, Shell
+from fogros2.store import GUESTS, Record, Store
+from fogros2.vpn import addresses, Vpn
+from fogros2.vpn import guests as guest_program
 from fogros2.vpn.wireguard import guest_request
 from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry
@@ -59,12 +63,16 @@ def invite(
     assert entry.machine is not None and record.vpn is not None and record.robot_vpn is not None
     folder = store.root / 'launches' / record.launch
     rmw = (folder / 'rmw').read_text()
-    check_rmw(rmw)
+    membership.check_rmw(rmw)
     found, port = machines.load(entry.provider).dialled_at(entry.machine, record.vpn.port, host)
     found = found or addresses.own_address()
+    secret = secrets.token_hex(32)
+    (store.machine(name) / GUESTS).touch()
     with reach.session(entry) as shell:
         guests = ask(shell, record, 'admit', {
-            'key': public, 'label': label, 'seconds': seconds,
+            'key': public, 'label': label, 'seconds': seconds, 'secret': secret,
+            'left': record.armed + record.spec.lifetime - time.time(),
+            'door': door(record),
             'patience': max(PATIENCE, record.spec.robot_timeout),
             'addresses': [str(address) for address in ipaddress.IPv4Network(
                 addresses.guests(record.vpn.network)) if int(address) & 255 != 255]})
@@ -72,30 +80,32 @@ def invite(
     return invitation.seal(invitation.Invitation(
         machine=name, key=record.public_key, address=record.vpn.address,
         endpoint=host_port(found, port), joiner=address, network=record.vpn.network,
-        rmw=rmw, domain=int((folder / 'domain').read_text()), expires=time.time() + seconds),
-        public)
+        rmw=rmw, domain=int((folder / 'domain').read_text()), expires=time.time() + seconds,
+        interface=record.vpn.name, secret=secret), public)
 
 
-def check_rmw(rmw: str) -> None:
-    """
-    Check that a guest's nodes can use the launch's middleware.
+def door(record: Record) -> dict[str, object]:
+    """Return what starts the door of a machine's guests; see ``fogros2.vpn.guests``."""
+    assert record.vpn is not None
+    vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
+    return {
+        'source': Path(guest_program.__file__).read_text(),
+        'shell': Path(multiplexer.__file__).read_text(), 'machine': record.name,
+        'address': record.vpn.address, 'port': addresses.GUEST_PORT,
+        'agent': record.agent_program, 'process': f'{record.agent}/agent.pid',
+        'down': '\n'.join(command.argv[-1] for command in vpn.down(record.vpn))}
 
-    :raises ConfigurationError: they would need a router of their own.
-    """
-    if rmw == 'rmw_zenoh_cpp':
-        raise ConfigurationError('a second computer cannot join a launch with rmw_zenoh_cpp',
-                                 'launch with Cyclone DDS or Fast DDS: unset RMW_IMPLEMENTATION')
 
-
-def held(entry: Entry) -> Record:
+def held(entry: Entry, *, kept: bool = False) -> Record:
     """
     Return the record of a machine that a launch of this robot uses.
 
+    :param kept: the launch may have ended and kept the machine.
     :raises ConfigurationError: no launch does, so the machine has no VPN.
     """
     record = entry.record
-    if record is None or entry.machine is None or not record.launch_alive or not (
-            record.launch and record.public_key):
+    if record is None or entry.machine is None or record.vpn is None or not (
+            kept or record.launch_alive and record.launch) or not record.public_key:
         raise ConfigurationError(
             f"no launch on this robot runs with the machine '{entry.name}', so it has no VPN",
             'invite while the launch that created it runs')
@@ -137,7 +147,7 @@ def revoke(name: str, who: Optional[str], warn: Callable[[str], None]) -> list[s
     :raises FogError: there is no such guest, or the machine cannot be reached.
     """
     entry = reach.find(name, warn)
-    record = held(entry)
+    record = held(entry, kept=True)
     with reach.session(entry) as shell:
         guests = ask(shell, record, 'look')
         key = invitation.parse_key(who)[1] if who and who.endswith('=') else who

@@ -15,7 +15,7 @@ import sys
 import tempfile
 from typing import Optional
 
-from fogros2 import ros2_daemon
+from fogros2 import invitation, ros2_daemon
 from fogros2.errors import ConfigurationError
 from fogros2.store import Store
 from ros2fog_cli.api import reach
@@ -31,7 +31,7 @@ def launch_of(name: str, store: Store) -> tuple[Path, dict[str, str]]:
     :raises ConfigurationError: no running launch uses the machine, and this computer has not
         joined it.
     """
-    folder = reach.joined(store).get(name)
+    folder = invitation.joined(store).get(name)
     if folder is not None and not store.exists(name):
         return folder, reach.variables_of(folder)
     record = store.load(name)

@@ -16,7 +16,7 @@ import threading
 import time
 from typing import cast, Optional
 
-from fogros2 import journal, plugin_system, process
+from fogros2 import invitation, journal, plugin_system, process
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
 from fogros2.clock import ClockOffset
@@ -25,12 +25,9 @@ from fogros2.events import Event
 from fogros2.model import Command, Endpoint, VpnInterface
 from fogros2.shell import Shell
 from fogros2.store import Record, Store
-from fogros2.vpn import Vpn
+from fogros2.vpn import helped, Vpn
 from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Entry
-
-#: File with the invitation in the folder of a joined machine, which is like a launch's folder.
-JOINED = 'joined.json'
 
 
 def find(
@@ -309,10 +306,14 @@ def variables_of(folder: Path) -> dict[str, str]:
             'ROS_DOMAIN_ID': (folder / 'domain').read_text()}
 
 
-def joined(store: Store) -> dict[str, Path]:
-    """Return the folders of the machines that this computer has joined, by machine."""
-    found = {}
-    for path in sorted((store.root / 'launches').glob(f'*/{JOINED}')):
-        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-            found[str(json.loads(path.read_text())['machine'])] = path.parent
-    return found
+def link_of_joined(folder: Path) -> Link:
+    """
+    Measure the link of this computer to a machine that it has joined.
+
+    :raises FogError: the status of the interface cannot be read.
+    """
+    name = f'fog{folder.name}'
+    joined = json.loads((folder / invitation.JOINED).read_text())
+    interface = VpnInterface(name, joined['joiner'], joined['network'], 0,
+                             helped.key_of(name) or str(folder / 'vpn.key'), firewall=True)
+    return measure(joined['address'], interface, joined['key'], 'wireguard')

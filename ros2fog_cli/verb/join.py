@@ -17,8 +17,9 @@ class JoinVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print lines for ``eval "$(ros2 fog join INVITATION)"``."""
+        from fogros2.deploy import membership
         from fogros2.store import Store
-        from ros2fog_cli.api import joining, membership, reach
+        from ros2fog_cli.api import joining, reach
         folder = membership.join(args.invitation, Store())
         print(*joining.shell_lines(folder, reach.variables_of(folder)), sep='\n')
         return 0

@@ -18,8 +18,8 @@ class LeaveVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Delete this computer's end of the VPN."""
+        from fogros2.deploy import membership
         from fogros2.store import Store
-        from ros2fog_cli.api import membership
         membership.leave(args.name, Store())
         print(f'left {args.name}')
         return 0
@@ -27,6 +27,6 @@ class LeaveVerb(VerbExtension):
 
 def complete_joined(prefix: str, **_: object) -> list[str]:
     """Return the machines that this computer has joined and that begin with ``prefix``."""
+    from fogros2 import invitation
     from fogros2.store import Store
-    from ros2fog_cli.api import reach
-    return [name for name in reach.joined(Store()) if name.startswith(prefix)]
+    return [name for name in invitation.joined(Store()) if name.startswith(prefix)]

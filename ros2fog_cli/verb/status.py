@@ -47,10 +47,9 @@ class StatusVerb(VerbExtension):
             raise ConfigurationError('--topics is for --watch: a rate takes a while',
                                      'add --watch')
         store = Store()
-        folder = reach.joined(store).get(args.name)
+        folder = invitation.joined(store).get(args.name)
         if folder is not None and not store.exists(args.name):
-            from ros2fog_cli.api import membership
-            return show_joined(membership.link(folder), as_json=args.json)
+            return show_joined(reach.link_of_joined(folder), as_json=args.json)
         entry = reach.find(args.name, warn, regions=args.region)
         status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'clock': None, 'agent': None,
                                   'streams': [], 'guests': [], 'replicas': []}

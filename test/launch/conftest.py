@@ -121,6 +121,9 @@ class FakeLaunch:
     def expect(self, names):
         self.note('expect', *names)
 
+    def join(self, spec):
+        """Join nothing: all machines are the launch's own."""
+
     def robot_environment(self):
         return {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp', 'CYCLONEDDS_URI': '<CycloneDDS/>'}
 

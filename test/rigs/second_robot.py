@@ -16,10 +16,10 @@ import subprocess
 
 import pytest
 
+from fogros2 import invitation
 from fogros2.model import Command
 from fogros2.process import argv, run
 from fogros2.store import Store
-from ros2fog_cli.api import reach
 
 HOST = '203.0.113.241'
 #: No packet of another connection comes in, as with a home's router.
@@ -66,7 +66,7 @@ class SecondRobot:
                     input=NAT.encode()), timeout=10.0)
 
     def close(self) -> None:
-        for name in reach.joined(Store(Path(self.environment['FOGROS2_STATE_HOME']))):
+        for name in invitation.joined(Store(Path(self.environment['FOGROS2_STATE_HOME']))):
             self.run('ros2', 'fog', 'leave', name)
         for words in (('link', 'delete', self.spaces[0]),
                       *(('netns', 'delete', space) for space in self.spaces)):

@@ -42,14 +42,14 @@ ORDER = """
 UPWARD: set[tuple[str, str]] = set()
 #: Plugins that are named by others: (importing module, plugin). Only ever remove lines.
 NAMED_PLUGINS = {
+    ('fogros2.deploy.membership', 'fogros2.vpn.helped'),
     ('fogros2.deploy.robot', 'fogros2.vpn.helped'),
     ('fogros2.deploy.robot_vpn', 'fogros2.vpn.helped'),
     ('fogros2_monitor.application', 'fogros2.provider.container'),
     ('ros2fog_cli.api.doctor', 'fogros2.dds.cyclonedds'),
     ('ros2fog_cli.api.doctor', 'fogros2.provider.container'),
     ('ros2fog_cli.api.doctor', 'fogros2.vpn.helped'),
-    ('ros2fog_cli.api.endings', 'fogros2.vpn.helped'),
-    ('ros2fog_cli.api.membership', 'fogros2.vpn.helped'),
+    ('ros2fog_cli.api.reach', 'fogros2.vpn.helped'),
     ('ros2fog_cli.api.pod_image', 'fogros2.provider.kubernetes'),
 }
 #: Packages with a circle of imports inside. Only ever remove names.

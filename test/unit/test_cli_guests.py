@@ -16,6 +16,7 @@ import pytest
 from ros2cli.cli import main
 
 from fogros2 import invitation
+from fogros2.deploy import membership
 from fogros2.errors import VpnError
 from fogros2.model import (
     Command,
@@ -30,7 +31,7 @@ from fogros2.provider.container import packet_filter
 from fogros2.store import process_start, Record, Store, write_private
 from fogros2.testing.fakes import FakeShell
 from fogros2.testing.plugins import instead, MemoryProvider
-from ros2fog_cli.api import endings, guests, membership, reach
+from ros2fog_cli.api import endings, guests, reach
 
 OTHER = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
 MACHINE = Machine('id', 'planner', 'memory', MachineState.RUNNING, time.time(),
@@ -168,7 +169,7 @@ def test_folder_of_a_joined_machine_stays_until_a_reboot(
     assert 'Endpoint = 203.0.113.9:30000' in ran[-1].argv[-1]
     key = (store.root / 'key').read_text().strip()
     assert not [word for command in ran for word in command.argv if key in word]
-    assert reach.joined(store) == {'planner': folder} and endings.leftovers(store) == []
+    assert invitation.joined(store) == {'planner': folder} and endings.leftovers(store) == []
     process = json.loads((folder / 'process.json').read_text())
     (folder / 'process.json').write_text(json.dumps({**process, 'boot': 'before'}))
     assert endings.leftovers(store) == [folder]
@@ -187,7 +188,7 @@ def test_range_of_the_joiners_own_is_one_clear_error(
         [{'dst': '198.18.0.0/16', 'dev': 'eth1'}]))
     with pytest.raises(VpnError, match='uses 198.18.0.0/16'):
         membership.join(text, store, {})
-    assert reach.joined(store) == {}
+    assert invitation.joined(store) == {}
 
 
 def test_published_port_is_part_of_the_machines_filter() -> None:

@@ -81,7 +81,7 @@ class Arming(Step):
 
         :raises AgentError: another launch uses the machine.
         """
-        context, job, program = self._context, self._job, self._context.capabilities.agent_program
+        context, job, program = self._context, self._job, self._job.capabilities.agent_program
         endpoint = job.machine.shell
         config = {
             **plan.agent_config(
@@ -181,12 +181,11 @@ class Arming(Step):
         :raises VpnError: no heartbeat was answered through the VPN.
         """
         context, job, address = self._context, self._job, self._job.interface.address
-        key = secrets.token_hex(32)
+        key, (port, peer) = secrets.token_hex(32), job.heartbeats
         try:
             configured = job.agent.request(
                 'configure', timeout=context.timeouts.agent, launch=context.launch, again=True,
-                heartbeat={'bind': address, 'port': plan.HEARTBEAT_PORT,
-                           'peer': context.vpn.interface.address, 'key': key},
+                heartbeat={'bind': address, 'port': port, 'peer': peer, 'key': key},
                 environment={
                     'FOGROS2_VPN_ADDRESS': address,
                     **plan.extended({**ros.environment, **dds}, job.spec.environment)},
@@ -194,12 +193,11 @@ class Arming(Step):
         except AgentError as error:
             if 'in use' in str(error):
                 raise VpnError(
-                    f"UDP port {plan.HEARTBEAT_PORT} of '{job.name}' is in use already",
-                    f"end what listens there: ss -lunp 'sport = :{plan.HEARTBEAT_PORT}'"
+                    f"UDP port {port} of '{job.name}' is in use already",
+                    f"end what listens there: ss -lunp 'sport = :{port}'"
                 ) from error
             raise
-        job.heartbeat = Heartbeat(address, plan.HEARTBEAT_PORT, context.launch,
-                                  key if configured.get('signed') else '')
+        job.heartbeat = Heartbeat(address, port, context.launch, key if configured.get('signed') else '')
         job.undo.callback(job.heartbeat.close)
         try:
             wait_until(
@@ -234,7 +232,7 @@ class Arming(Step):
                 job.agent.request(
                     'release', timeout=job.timeout(context.timeouts.command),
                     silent=SILENCE_TIMEOUT, launch=context.launch, on_exit=job.spec.on_exit,
-                    exit=not context.capabilities.agent_program)
+                    exit=not job.capabilities.agent_program)
             except DeadlineExceeded:
                 job.out_of_reach()
                 raise

@@ -32,7 +32,7 @@ def install_ros(
         ros, note = bootstrap.ensure(
             job.shell, context.underlay(job.spec.workspaces), job.spec,
             timeout=context.timeouts.install, cancel=job.cancel, on_plan=on_plan,
-            elsewhere=True, packages=context.packages)
+            elsewhere=True, packages=context.packages, guest=context.invitation is not None)
         detail.append(note)
         return ros
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import dataclasses
 from typing import Optional
@@ -13,8 +13,9 @@ from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob, Step
 from fogros2.deploy.robot_vpn import VpnMember
 from fogros2.errors import CommandError, FogError, VpnError
-from fogros2.model import Command, host_port, Machine, Peer
+from fogros2.model import Command, host_port, Machine, Peer, VpnInterface
 from fogros2.report import step
+from fogros2.store import GUESTS
 from fogros2.vpn import addresses
 
 #: Sends a packet to an address and port, from which the peer learns this end's endpoint.
@@ -36,10 +37,13 @@ class Joining(Step):
         super().__init__(context, job)
         self._release = release
         self._member: Optional[VpnMember] = None
+        #: The interface of an earlier launch.
+        self._former: Optional[VpnInterface] = None
 
     def choose_interface(self) -> None:
         """Choose the machine's interface; record it before it is created."""
         context, job = self._context, self._job
+        self._former = job.record.vpn
         port = job.record.vpn.port if job.record.vpn else plan.machine_port(context.launch)
         job.interface = plan.machine_interface(
             context.launch, context.vpn.interface.network, context.index, port,
@@ -70,6 +74,11 @@ class Joining(Step):
         with job.step('VPN') as detail:
             job.undoing('VPN', self._leave)
             job.undoing('VPN', lambda: robot.remove(job.name))
+            noted = self._context.store.machine(job.name) / GUESTS
+            if self._former is not None and noted.exists():
+                # an earlier launch has left it to guests, and its port is needed
+                job.run(*robot.vpn.down(self._former))
+            noted.unlink(missing_ok=True)
             public_key = job.run(robot.vpn.keys(interface)).strip()
             route = plan.route(
                 job.machine, Peer(job.name, public_key, interface.address), interface.port,
@@ -114,7 +123,12 @@ class Joining(Step):
             'keep', timeout=self._context.timeouts.agent, what='vpn', interval=1.0,
             alive=list(vpn.health_check(job.interface).argv),
             repair=[list(c.argv) for c in vpn.repair(job.interface, peers)],
-            down=[list(c.argv) for c in vpn.down(job.interface)])
+            down=[list(c.argv) for c in self._down()])
+
+    def _down(self) -> Iterator[Command]:
+        """Yield the commands that take the interface down, or leave it to guests."""
+        vpn, job = self._context.vpn.vpn, self._job
+        return (vpn.leave if job.spec.on_exit == 'keep' else vpn.down)(job.interface)
 
     def redial(self, machine: Machine) -> None:
         """
@@ -141,4 +155,23 @@ class Joining(Step):
         job = self._job
         if job.survives:
             job.undone('nodes', self._release)
-            job.clean_up(self._context.vpn.vpn.down(job.interface))
+            job.clean_up(self._down())
+
+
+class Joined(Joining):
+    """Use the machine of another robot, in whose VPN this computer is a guest."""
+
+    def choose_interface(self) -> None:
+        """Take the interface of the invitation; the machine's own robot has made it."""
+        invitation, job = self._context.invitation, self._job
+        assert invitation is not None
+        job.interface = VpnInterface(
+            invitation.interface, invitation.address, invitation.network, 0, '')
+        job.heartbeats = (
+            addresses.guest_heartbeats(invitation.joiner), invitation.joiner)
+
+    def avoid(self, routes: Sequence[str]) -> None:
+        """Do nothing: the interface exists."""
+
+    def join(self) -> None:
+        """Do nothing: the launch has joined before its first node."""

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Run in a pod as root, and multiplex many commands over the stream of one ``exec``.
+Run on a machine, and multiplex many commands over one connection: its standard streams.
 
-Each ``exec`` takes a tenth of a second, and cannot end a command's input. So one ``exec`` runs
-this program. The program runs commands on request, and ends with the connection. It uses only the
-standard library; the robot sends its source over its standard input.
+In a pod it runs as root: each ``exec`` takes a tenth of a second, and cannot end a command's
+input, so one ``exec`` runs this program. For a guest it runs as the guest's account. It runs
+commands on request, and ends with the connection. It uses only the standard library; the robot
+sends its source.
 
 Frames in both directions: type, channel, length, payload.
 """
@@ -241,7 +242,7 @@ def begin(number: int, what: dict[str, Any]) -> Process:
     environment = {
         **os.environ, 'HOME': user.pw_dir, 'USER': user.pw_name, 'LOGNAME': user.pw_name,
         'SHELL': user.pw_shell or '/bin/sh', **what['env']}
-    if user.pw_uid != 0:
+    if user.pw_uid != os.geteuid():
         # Announces that commands can become root without sudo.
         environment['FOGROS2_ROOT'] = 'yes'
     options: dict[str, Any] = {

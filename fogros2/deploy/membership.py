@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
-import hashlib
-import json
 import os
 from pathlib import Path
 from typing import Optional
@@ -15,39 +13,42 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 
 from fogros2 import plugin_system, process
 from fogros2.dds import addresses_of, DdsVendor
-from fogros2.deploy.robot import check_robot, run
+from fogros2.deploy.robot import check_robot, clear, run
 from fogros2.errors import ConfigurationError, DdsError, VpnError
-from fogros2.invitation import Invitation, own_key, unseal
+from fogros2.invitation import Invitation, JOINED, joined, own_key, read, SECRET, unseal
 from fogros2.model import Peer, to_json, VpnInterface
 from fogros2.store import boot_id, process_start, Store, write_private
 from fogros2.vpn import addresses, helped, Vpn
 from fogros2.waiting import Timeouts
-from ros2fog_cli.api import endings, guests, reach
 
 
-def join(text: str, store: Store, environment: Mapping[str, str] = os.environ) -> Path:
+def join(
+    text: str, store: Store, environment: Mapping[str, str] = os.environ, *,
+    owner: Optional[Mapping[str, object]] = None,
+) -> Path:
     """
     Bring up this computer's end of a machine's VPN; return the folder for its terminals.
 
-    Idempotent. The folder is like the one of a launch. It names the first process of this
-    computer: ``ros2 fog gc`` clears the folder after a reboot, which also ends the interface.
+    Idempotent. The folder is like the one of a launch. It names the process that has joined, or
+    else the first one of this computer: ``ros2 fog gc`` clears the folder after a reboot, which
+    also ends the interface.
 
+    :param owner: the fields of a record that name a process.
     :raises FogError: the invitation is not for this computer, has expired, or collides with a
         network here; or the interface cannot be created.
     """
     key = own_key(store)
     invitation = unseal(text, key)
     vendor = _vendor(invitation, environment)
-    number = hashlib.sha256(f'{invitation.key} {invitation.joiner}'.encode()).hexdigest()[:6]
-    folder = store.root / 'launches' / number
-    name = f'fog{number}'
-    up = Path('/sys/class/net', name).exists()
-    if up and _known(folder) == invitation:
+    folder = store.root / 'launches' / invitation.number
+    name = f'fog{invitation.number}'
+    up = is_up(invitation)
+    if up and read(folder) == invitation:
         return folder
     check_robot()
-    before = reach.joined(store).get(invitation.machine, folder)
+    before = joined(store).get(invitation.machine, folder)
     if before != folder:
-        endings.clear(before)  # of a launch with this machine that has ended
+        clear(before)  # of a launch with this machine that has ended
     if not up:
         _check_free(invitation)
     interface = VpnInterface(
@@ -58,9 +59,10 @@ def join(text: str, store: Store, environment: Mapping[str, str] = os.environ) -
         asked=addresses_of(vendor.asked(environment)))
     private = base64.b64encode(key.private_bytes(
         Encoding.Raw, PrivateFormat.Raw, NoEncryption())).decode()
-    store.launch(number)
+    store.launch(invitation.number)
     try:
-        _write(folder, invitation, interface, vendor, environment)
+        _write(folder, invitation, interface, vendor, environment, owner or {
+            'pid': 1, 'pid_start': process_start(1) or 0, 'boot': boot_id()})
         if helped.made(interface):
             process.run(helped.lend(interface, private), timeout=Timeouts().vpn)
         else:
@@ -68,13 +70,29 @@ def join(text: str, store: Store, environment: Mapping[str, str] = os.environ) -
         run(vpn.up(interface, [Peer(invitation.machine, invitation.key, invitation.address,
                                     invitation.endpoint)]), timeout=Timeouts().vpn)
     except BaseException:
-        endings.clear(folder)
+        clear(folder)
         raise
     return folder
 
 
+def is_up(invitation: Invitation) -> bool:
+    """Return whether this computer's end of a machine's VPN exists."""
+    return Path('/sys/class/net', f'fog{invitation.number}').exists()
+
+
+def check_rmw(rmw: str) -> None:
+    """
+    Check that a guest's nodes can use the launch's middleware.
+
+    :raises ConfigurationError: they would need a router of their own.
+    """
+    if rmw == 'rmw_zenoh_cpp':
+        raise ConfigurationError('a second computer cannot join a launch with rmw_zenoh_cpp',
+                                 'launch with Cyclone DDS or Fast DDS: unset RMW_IMPLEMENTATION')
+
+
 def _vendor(invitation: Invitation, environment: Mapping[str, str]) -> DdsVendor:
-    guests.check_rmw(invitation.rmw)
+    check_rmw(invitation.rmw)
     if invitation.rmw not in plugin_system.names('fogros2.dds'):
         raise DdsError(f'FogROS2 does not support RMW_IMPLEMENTATION={invitation.rmw}')
     vendor: DdsVendor = plugin_system.load('fogros2.dds', invitation.rmw)(
@@ -98,7 +116,7 @@ def _check_free(invitation: Invitation) -> None:
 
 def _write(
     folder: Path, invitation: Invitation, interface: VpnInterface, vendor: DdsVendor,
-    environment: Mapping[str, str],
+    environment: Mapping[str, str], owner: Mapping[str, object],
 ) -> None:
     """Write the files of a launch's folder that terminals read, and the invitation."""
     lan = vendor.parse_lan(run([vendor.ask_lan()], timeout=Timeouts().vpn))
@@ -107,18 +125,9 @@ def _write(
     for name, content in {
             vendor.file_name: vendor.render(interfaces, (), environment),
             'domain': str(invitation.domain), 'rmw': vendor.rmw,
-            'process.json': json.dumps(
-                {'pid': 1, 'pid_start': process_start(1) or 0, 'boot': boot_id()}),
-            reach.JOINED: to_json(invitation)}.items():
+            'process.json': to_json(owner), SECRET: invitation.secret,
+            JOINED: to_json(invitation)}.items():
         write_private(folder / name, content.encode())
-
-
-def _known(folder: Path) -> Optional[Invitation]:
-    """Return the invitation by which this computer has joined, None if there is none."""
-    try:
-        return Invitation(**json.loads((folder / reach.JOINED).read_text()))
-    except (OSError, ValueError, TypeError):
-        return None
 
 
 def leave(name: str, store: Store) -> None:
@@ -127,21 +136,8 @@ def leave(name: str, store: Store) -> None:
 
     :raises ConfigurationError: this computer has not joined the machine.
     """
-    folder = reach.joined(store).get(name)
+    folder = joined(store).get(name)
     if folder is None:
         raise ConfigurationError(f"this computer has not joined a machine '{name}'",
                                  'ros2 fog join INVITATION joins one')
-    endings.clear(folder)
-
-
-def link(folder: Path) -> reach.Link:
-    """
-    Measure the link of this computer to a machine that it has joined.
-
-    :raises FogError: the status of the interface cannot be read.
-    """
-    name = f'fog{folder.name}'
-    joined = json.loads((folder / reach.JOINED).read_text())
-    interface = VpnInterface(name, joined['joiner'], joined['network'], 0,
-                             helped.key_of(name) or str(folder / 'vpn.key'), firewall=True)
-    return reach.measure(joined['address'], interface, joined['key'], 'wireguard')
+    clear(folder)

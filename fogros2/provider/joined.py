@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Machines of other robots, by an invitation; a launch has an account of its own there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+import dataclasses
+from typing import Any, ClassVar
+
+from fogros2.errors import ConfigurationError, MachineNotFound, Unsupported
+from fogros2.invitation import Invitation, own_key, read, SECRET, unseal
+from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
+from fogros2.provider import Capabilities, Provider
+from fogros2.provider.options import parsed
+from fogros2.store import Store
+from fogros2.vpn import addresses, guests
+
+_SCHEME = 'joined:'
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """
+    Options of another robot's machine.
+
+    :param invitation: what ``ros2 fog invite`` printed for this computer.
+    """
+
+    invitation: str = ''
+
+
+class JoinedProvider(Provider):
+    """Machines of other robots, whose launches admit this computer."""
+
+    name: ClassVar[str] = 'joined'
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        shell_kind='guest', owned=False, containers=False)
+    poll_interval: ClassVar[float] = 0.1
+
+    def check(self, spec: MachineSpec) -> None:
+        """Check that the invitation is for this computer, and valid."""
+        if not self._unsealed(spec).interface:
+            raise ConfigurationError(f"the invitation of '{spec.name}' has no place for nodes",
+                                     'invite by a newer version of FogROS2')
+        if spec.monitored:
+            raise Unsupported(f"'{spec.name}' is another robot's, and serves no viewer",
+                              'leave launch_foxglove and monitor_allow out')
+
+    def invitation(self, spec: MachineSpec) -> str:
+        """Return the text of the invitation."""
+        return parsed(Options, spec.options, 'a joined machine').invitation
+
+    def _unsealed(self, spec: MachineSpec) -> Invitation:
+        return unseal(self.invitation(spec), own_key(Store()))
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        """Return the id of the machine, which the launch has joined."""
+        return f'{_SCHEME}{self._unsealed(spec).number}:{spec.name}'
+
+    def describe(self, machine_id: str) -> Machine:
+        """Return the machine while this computer has joined it."""
+        number, _, name = machine_id.removeprefix(_SCHEME).partition(':')
+        folder = Store().root / 'launches' / number
+        found = read(folder) if number.isalnum() else None
+        if found is None:
+            raise MachineNotFound(f"this computer has left the machine '{name}'")
+        return Machine(
+            machine_id, name, self.name, MachineState.RUNNING, owned=False, region=found.machine,
+            shell=Endpoint('guest', found.address, addresses.GUEST_PORT, guests.account(
+                found.interface, found.joiner), key_file=str(folder / SECRET)))
+
+    def capabilities_of(self, machine: Machine) -> Capabilities:
+        """Return the capabilities with the place of the agent, which each guest has."""
+        assert machine.shell is not None
+        home = guests.HOMES / machine.shell.user
+        return dataclasses.replace(self.capabilities, agent_directory=f'{home}/agent',
+                                   agent_program=f'{home}/agent.py')
+
+    def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
+        """Raise Unsupported: this computer has no rights to another robot's tags."""
+        raise Unsupported('a joined machine keeps no tags of this robot')
+
+    def destroy(self, machine_id: str) -> None:
+        """Do nothing: the launch did not create the machine."""

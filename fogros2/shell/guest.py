@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Run commands in a guest's account of another robot's machine, inside the VPN.
+
+WireGuard encrypts the connection, and shows the machine whose address this is. The door there
+(``fogros2.vpn.guests``) sends a challenge. This end answers with an HMAC, by the secret of the
+invitation, so that another account of this computer is not the guest.
+"""
+
+from __future__ import annotations
+
+import hmac
+from pathlib import Path
+import socket
+import threading
+from typing import Optional
+
+from fogros2.errors import AuthenticationError, ConnectError
+from fogros2.events import clean
+from fogros2.model import Endpoint
+from fogros2.shell.multiplexed import Link, MultiplexedShell
+from fogros2.shell.remote import connecting
+
+#: Bytes of the challenge, and of the longest answer to its proof.
+_CHALLENGE, _LINE = 32, 300
+#: Time-out of a partly transferred frame, in seconds: its thread holds the lock.
+_STALL = 10.0
+
+
+class GuestShell(MultiplexedShell):
+    """
+    A Shell for endpoints of kind 'guest'; ``key_file`` has the invitation's secret.
+
+    :param name: the machine's name, for messages.
+    :param timeout: seconds for which to try to connect.
+    """
+
+    def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
+        super().__init__(endpoint, name=name, user=endpoint.user, timeout=timeout)
+
+    def _connect(self, timeout: float, cancel: Optional[threading.Event]) -> Link:
+        return connecting(
+            lambda: _Door(self.endpoint, self.name, timeout), cancel, self.name)
+
+
+class _Door(Link):
+    """
+    A connection to a machine's door.
+
+    :raises ConnectError: the machine does not answer.
+    :raises AuthenticationError: the machine does not know the invitation.
+    """
+
+    def __init__(self, endpoint: Endpoint, name: str, timeout: float) -> None:
+        super().__init__(name, endpoint.user)
+        secret = bytes.fromhex(Path(endpoint.key_file or '').read_text())
+        try:
+            self._poll = socket.create_connection((endpoint.host, endpoint.port), timeout)
+        except OSError as error:
+            raise ConnectError(
+                f"'{name}' does not answer: {error}",
+                'the invitation may have been revoked, or the machine may have ended') from error
+        try:
+            challenge = self._exactly(_CHALLENGE)
+            self._poll.sendall(hmac.digest(secret, challenge, 'sha256'))
+            text = b''
+            while not text.endswith(b'\n') and len(text) < _LINE:
+                text += self._exactly(1)
+            self._poll.settimeout(_STALL)
+            if text != b'\n':
+                raise ConnectError(f"'{name}' has no room for this computer: "
+                                   f'{clean(text.decode(errors="replace")).strip()}')
+        except OSError as error:
+            self._poll.close()
+            raise AuthenticationError(
+                f"'{name}' refuses this invitation: {error}",
+                'ask for a new one: ros2 fog invite') from error
+        except BaseException:
+            self._poll.close()
+            raise
+        self._begin()
+
+    def _exactly(self, size: int) -> bytes:
+        data = b''
+        while len(data) < size:
+            data += (more := self._poll.recv(size - len(data)))
+            if not more:
+                raise ConnectionResetError('it closed the connection')
+        return data
+
+    def _write(self, data: bytes) -> None:
+        self._poll.sendall(data)
+
+    def _read(self) -> bytes:
+        data = self._poll.recv(1 << 18)
+        if not data:
+            raise ConnectError(f"'{self._name}' has closed the connection")
+        return data

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A launch of a second robot runs nodes on the first robot's machine, by an invitation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import json
+from pathlib import Path
+import signal
+import uuid
+
+import pytest
+
+from fogros2.model import Command
+from fogros2.process import run
+from fogros2.waiting import wait_until
+from rigs.launched import Launched, launching, ros2
+from rigs.second_robot import HOST, second, SecondRobot
+
+__all__ = ['second']
+
+FIRST = """
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
+
+
+def generate_launch_description():
+    machine = ContainerInstance(
+        name='{name}', network='{network}', ros_workspace='', on_exit='{on_exit}')
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='fogros2_examples', executable='listener',
+                  output='screen', remappings=[('chatter', '/near')])])
+"""
+SECOND = """
+from launch_ros.actions import Node
+
+from fogros2 import CloudNode, FogROSLaunchDescription, JoinedMachine
+
+
+def generate_launch_description():
+    machine = JoinedMachine('{text}', name='theirs', ros_workspace='{workspace}',
+                            robot_timeout=10)
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='fogros2_examples', executable='talker',
+                  output='screen', remappings=[('chatter', '/near')]),
+        Node(package='fogros2_examples', executable='listener', output='screen',
+             remappings=[('chatter', '/near')])])
+"""
+
+
+class First:
+    """The first robot's launch, and its machine."""
+
+    def __init__(self, name: str, launched: Launched, engine: str) -> None:
+        self.name = name
+        self.launched = launched
+        self.engine = engine
+
+    def there(self, script: str) -> str:
+        """Return what a shell of root on the machine prints."""
+        return run(Command((self.engine, 'exec', f'fogros2-{self.name}', 'sh', '-c', script),
+                           sudo=True), timeout=30.0, check=False).stdout
+
+    def accounts(self) -> list[str]:
+        """Return the accounts of guests on the machine, and their processes."""
+        return self.there('grep "^fog.*g2" /etc/passwd; ls /var/lib/fogros2; '
+                          'for p in /proc/[0-9]*; do stat -c %U $p; done | grep "^fog.*g2"'
+                          ).split()
+
+    def talkers(self) -> int:
+        return self.there('cat /proc/[0-9]*/cmdline | tr "\\0" " "').count('/talker ')
+
+    def invited(self, second: SecondRobot, *options: str) -> str:
+        key = second.run('ros2', 'fog', 'key').strip()
+        done = ros2('fog', 'invite', self.name, '--key', key, '--address', HOST, *options)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return str(done.stdout).strip()
+
+
+@pytest.fixture
+def first(
+    tmp_path: Path, cloud_network: str, engine: str, nothing_left: None,
+) -> Iterator[Callable[[str], First]]:
+    name = f'host-{uuid.uuid4().hex[:6]}'
+    with launching() as start:
+        def launch(on_exit: str) -> First:
+            path = tmp_path / 'first.launch.py'
+            path.write_text(FIRST.format(name=name, network=cloud_network, on_exit=on_exit))
+            started = start(str(path))
+            started.wait_for('process started')
+            # this computer forwards nothing from a network of the tests: let answers out
+            said = run(Command((engine, 'network', 'inspect', cloud_network), sudo=True),
+                       timeout=30.0)
+            bridge = json.loads(said.stdout)[0]['network_interface']
+            run(Command.script(f'echo 1 >/proc/sys/net/ipv4/conf/{bridge}/forwarding',
+                               sudo=True), timeout=10.0)
+            return First(name, started, engine)
+        yield launch
+    ros2('fog', 'delete', name)
+
+
+@pytest.fixture
+def join(
+    second: SecondRobot, tmp_path: Path,
+) -> Iterator[Callable[..., Launched]]:
+    with launching() as start:
+        def launch(text: str, workspace: str = '') -> Launched:
+            path = tmp_path / 'second.launch.py'
+            path.write_text(SECOND.format(text=text, workspace=workspace))
+            return start(str(path), environment=second.environment,
+                         prefix=('ip', 'netns', 'exec', second.spaces[1]))
+        yield launch
+
+
+def test_nodes_of_a_second_robot_end_with_its_heartbeat(
+    first: Callable[[str], First], second: SecondRobot, join: Callable[..., Launched],
+) -> None:
+    host = first('delete')
+    text = host.invited(second)
+    joined = join(text)
+    joined.wait_for('I heard', timeout=120.0)
+    assert host.talkers() == 1
+    host.launched.wait_for('I heard')  # the first robot's node there hears the second's too
+    joined.interrupt()
+    assert joined.ended() == 0, joined.text
+    assert host.talkers() == 0
+    again = join(text)
+    again.wait_for('I heard', timeout=120.0)
+    again.child.send_signal(signal.SIGKILL)
+    wait_until(lambda: host.talkers() == 0, timeout=60.0, what='the end of the nodes')
+    assert host.accounts()
+    assert ros2('fog', 'revoke', host.name).returncode == 0
+    assert host.accounts() == []
+    again.kill()
+    second.run('ros2', 'fog', 'gc')  # what the killed launch left, the interface to the machine too
+    assert second.run('ip', '-brief', 'link').count('fog') == 0
