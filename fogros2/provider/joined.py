@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from fogros2.errors import ConfigurationError, MachineNotFound, Unsupported
 from fogros2.invitation import Invitation, own_key, read, SECRET, unseal

@@ -33,7 +33,7 @@ GUEST_HEARTBEATS = 7000
 #: do not collide: the more specific route wins.
 EVERYTHING = 8
 
-_Network, _Address = ipaddress.IPv4Network, ipaddress.IPv4Address
+_Network = ipaddress.IPv4Network
 
 
 def pool_from(environment: Mapping[str, str]) -> str:
@@ -77,7 +77,7 @@ def guests(subnet: str) -> str:
 
 def guest_heartbeats(address: str) -> int:
     """Return the UDP port of a machine's VPN address for the heartbeats of one guest."""
-    return GUEST_HEARTBEATS + _Address(address).packed[3]
+    return GUEST_HEARTBEATS + ipaddress.IPv4Address(address).packed[3]
 
 
 def overlapping(subnet: str, used: Iterable[str]) -> list[str]:

@@ -13,8 +13,8 @@ health check starts no Python before.
 Runs as python3 -c SOURCE NAME VERB, where NAME is the interface, with a request as JSON on the
 standard input; prints the list. Imports nothing of fogros2.
 
-``admit``   ``key``, ``label``, ``seconds``, ``patience``, ``addresses`` to choose from, ``secret``,
-            ``left``: seconds until the machine's lifetime ends, and ``door`` for ``serve``
+``admit``   ``key``, ``label``, ``seconds``, ``patience``, ``addresses`` to choose from,
+            ``secret``, ``left``: seconds of the machine's lifetime, and ``door`` for ``serve``
 ``remove``  ``keys``, or null for all
 ``look``    removes those whose time is over
 ``serve``   is the door of the guests' nodes; ``admit`` starts it, in the background. It listens at
@@ -39,14 +39,14 @@ import json
 import os
 from pathlib import Path
 import pwd
-import select
+import re
 import shutil
 import socket
+import socketserver
 import subprocess
 import sys
-import threading
 import time
-from typing import Any
+from typing import Any, IO, Optional
 
 #: Seconds between two looks at a guest that is connected beyond its invitation.
 INTERVAL = 10.0
@@ -54,10 +54,9 @@ INTERVAL = 10.0
 PROOF_TIMEOUT, CONNECTIONS = 10.0, 8
 #: Bytes of a challenge, and of its answer by HMAC-SHA256.
 CHALLENGE = 32
-#: Folder of the guests' homes, and where else their files may be.
-HOMES, ELSEWHERE = Path('/var/lib/fogros2'), ('/tmp', '/var/tmp', '/dev/shm', '/var/spool/cron')
-#: Linux: allow to bind to an address that does not exist yet.
-IP_FREEBIND = 15
+#: Folder of the guests' homes; where else their files may be.
+HOMES = Path('/var/lib/fogros2')
+ELSEWHERE = ('/tmp', '/var/tmp', '/dev/shm', '/var/spool/cron')  # noqa: S108 - only deleted there
 #: Ends all other processes of an account; fails until there are none.
 KILL = """\
 import os
@@ -198,7 +197,7 @@ def evict(user: str) -> None:
         HOMES.rmdir()  # of the last guest
 
 
-class Door:
+class Door(socketserver.ThreadingTCPServer):
     """
     Where guests' robots reach their accounts.
 
@@ -206,75 +205,66 @@ class Door:
         the agent's program), ``process`` (the file with the process id of the machine's agent).
     """
 
+    allow_reuse_address = daemon_threads = True
+
     def __init__(self, guests: Guests, request: dict[str, Any]) -> None:
         self.guests = guests
         self.request = request
         self.agent = Path(request['agent']).read_text()
         self.open: Counter[str] = Counter()
+        super().__init__((request['address'], request['port']), socketserver.BaseRequestHandler)
 
-    def serve(self) -> None:
-        """Serve until there are no guests, or there is another door."""
-        os.umask(0o022)
-        with socket.socket() as listener, open(self.guests.door, 'a') as own:
-            with self.guests.locked():
-                try:
-                    fcntl.flock(own, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
+    def serve(self, own: IO[str]) -> None:
+        """
+        Serve until there are no guests.
+
+        :param own: the lock of doors; released while nobody can be admitted.
+        """
+        look = 0.0
+        while True:
+            self.timeout = max(0.0, look - time.monotonic())
+            self.handle_request()
+            if time.monotonic() < look:
+                continue
+            look = time.monotonic() + INTERVAL
+            with self.guests.locked() as left:
+                with contextlib.suppress(OSError, subprocess.CalledProcessError):
+                    left = left and self.guests.change(left, 'look', {})
+                if not left:
+                    self.server_close()
+                    own.close()  # a guest that is admitted from now on gets another door
                     return
-            self.follow()
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.setsockopt(socket.IPPROTO_IP, IP_FREEBIND, 1)
-            listener.bind((self.request['address'], self.request['port']))
-            listener.listen()
-            look = 0.0
-            while True:
-                if select.select([listener], [], [], max(0.0, look - time.monotonic()))[0]:
-                    with contextlib.suppress(OSError):
-                        self.accept(*listener.accept())
-                    continue
-                look = time.monotonic() + INTERVAL
-                with self.guests.locked() as left:
-                    with contextlib.suppress(OSError, subprocess.CalledProcessError):
-                        left = left and self.guests.change(left, 'look', {})
-                    if not left:
-                        own.close()  # a guest that is admitted from now on gets another door
-                        break
-        if self.guests.left.exists():
-            os.execvp('sh', ('sh', '-c', self.request['down']))
 
     def follow(self) -> None:
         """Enter the control group of the agent, whose processes take no DDS of strangers."""
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, IndexError):
             pid = Path(self.request['process']).read_text().strip()
-            for line in Path(f'/proc/{pid}/cgroup').read_text().splitlines():
-                if line.startswith('0::'):
-                    for top in ('/sys/fs/cgroup', '/sys/fs/cgroup/unified'):
-                        with contextlib.suppress(OSError):
-                            Path(f'{top}{line[3:]}/cgroup.procs').write_text(str(os.getpid()))
+            group = re.findall('^0::(.*)', Path(f'/proc/{pid}/cgroup').read_text(), re.MULTILINE)
+            for top in ('/sys/fs/cgroup', '/sys/fs/cgroup/unified'):
+                with contextlib.suppress(OSError):
+                    Path(f'{top}{group[0]}/cgroup.procs').write_text(str(os.getpid()))
 
-    def accept(self, link: socket.socket, peer: tuple[str, int]) -> None:
-        """Serve a connection in a thread; close one too many of a guest."""
-        if self.open[peer[0]] >= CONNECTIONS:
-            link.close()
-            return
-        self.open[peer[0]] += 1
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        """Return whether a guest may have one more connection."""
+        return self.open[client_address[0]] < CONNECTIONS
 
-        def run() -> None:
-            try:
-                with link, contextlib.suppress(OSError):
-                    self.answer(link, peer[0])
-            finally:
-                self.open[peer[0]] -= 1
-        threading.Thread(target=run, daemon=True).start()
+    def finish_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection, in a thread of its own."""
+        self.open[client_address[0]] += 1
+        try:
+            with contextlib.suppress(OSError):
+                self.answer(request, client_address[0])
+        finally:
+            self.open[client_address[0]] -= 1
 
     def answer(self, link: socket.socket, address: str) -> None:
         """Let a guest prove who it is; then run its shell until the connection ends."""
+        challenge, proof = os.urandom(CHALLENGE), b''
+        if not self.admits(address, challenge, None):
+            return  # it gets not even a challenge
         link.settimeout(PROOF_TIMEOUT)
-        challenge = os.urandom(CHALLENGE)
-        if not self.admits(address, challenge, b''):
-            return  # neither a guest nor a word to it
         link.sendall(challenge)
-        proof, until = b'', time.monotonic() + PROOF_TIMEOUT
+        until = time.monotonic() + PROOF_TIMEOUT
         while len(proof) < CHALLENGE and time.monotonic() < until:
             proof += (more := link.recv(CHALLENGE - len(proof)))
             if not more:
@@ -285,18 +275,17 @@ class Door:
             try:
                 child = self.begin(link, account(self.guests.name, address))
             except (OSError, KeyError, subprocess.SubprocessError) as error:
-                why = (getattr(error, 'stderr', None) or str(error)).strip().splitlines()
+                why = str(getattr(error, 'stderr', None) or error).strip().splitlines()
                 link.sendall(f"{''.join(why[-1:])[:200]}\n".encode())
                 return
         child.wait()
 
-    def admits(self, address: str, challenge: bytes, proof: bytes) -> bool:
-        """Return whether an address is a guest's, and a proof, unless empty, is that guest's."""
-        secrets = [bytes.fromhex(guest['secret'])
-                   for guest in json.loads(self.guests.state.read_text())
-                   if guest['address'] == address and guest.get('secret')]
-        return any(not proof or hmac.compare_digest(
-            hmac.digest(secret, challenge, 'sha256'), proof) for secret in secrets)
+    def admits(self, address: str, challenge: bytes, proof: Optional[bytes]) -> bool:
+        """Return whether an address is a guest's, and the proof, if there is one, that guest's."""
+        return any(proof is None or hmac.compare_digest(
+            hmac.digest(bytes.fromhex(guest['secret']), challenge, 'sha256'), proof)
+            for guest in json.loads(self.guests.state.read_text())
+            if guest['address'] == address and guest.get('secret'))
 
     def begin(self, link: socket.socket, user: str) -> subprocess.Popen[bytes]:
         """
@@ -319,19 +308,21 @@ class Door:
                 'machine': self.request['machine'], 'directory': f'{home}/agent', 'user': user,
                 'boot_timeout': 120.0}))
             os.chown(home, found.pw_uid, found.pw_gid)
-        options: dict[str, Any] = {
-            'cwd': home, 'user': found.pw_uid, 'group': found.pw_gid, 'extra_groups': (),
-            'start_new_session': True, 'stderr': subprocess.DEVNULL, 'umask': 0o022,
-            'env': {'HOME': str(home), 'USER': user, 'LOGNAME': user, 'SHELL': '/bin/sh',
-                    'LANG': 'C.UTF-8', 'PATH': '/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin'}}
+
+        def start(*words: str, stdin: Any, stdout: Any) -> subprocess.Popen[bytes]:
+            return subprocess.Popen(
+                ('python3', '-IS', *words), stdin=stdin, stdout=stdout, stderr=subprocess.DEVNULL,
+                cwd=home, user=found.pw_uid, group=found.pw_gid, extra_groups=(), umask=0o022,
+                start_new_session=True, env={
+                    'HOME': str(home), 'USER': user, 'LOGNAME': user, 'SHELL': '/bin/sh',
+                    'LANG': 'C.UTF-8', 'PATH': '/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin'})
+
         # ends at once if the agent runs
-        subprocess.run(('python3', '-IS', 'agent.py', 'serve', '--detach', '--config',
-                        'agent.json'), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                       timeout=30.0, **options)
+        start('agent.py', 'serve', '--detach', '--config', 'agent.json',
+              stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL).wait(30.0)
         link.settimeout(None)
         link.sendall(b'\n')
-        return subprocess.Popen(('python3', '-IS', '-c', self.request['shell']), stdin=link,
-                                stdout=link, **options)
+        return start('-c', self.request['shell'], stdin=link, stdout=link)
 
 
 def main(name: str, verb: str, folder: Path = Path('/run')) -> None:
@@ -342,7 +333,18 @@ def main(name: str, verb: str, folder: Path = Path('/run')) -> None:
         return
     request = {} if verb in ('look', 'clear') else json.load(sys.stdin)
     if verb == 'serve':
-        Door(guests, request).serve()
+        os.umask(0o022)
+        with open(guests.door, 'a') as own:
+            with guests.locked():
+                try:
+                    fcntl.flock(own, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    return  # there is a door
+            door = Door(guests, request)
+            door.follow()
+            door.serve(own)
+        if guests.left.exists():
+            os.execvp('sh', ('sh', '-c', request['down']))
         return
     with guests.locked() as before:
         if verb == 'clear':
@@ -353,12 +355,12 @@ def main(name: str, verb: str, folder: Path = Path('/run')) -> None:
             return
         after = guests.change(before, verb, request)
     if 'door' in request:
-        door = subprocess.Popen(
+        started = subprocess.Popen(
             (sys.executable, '-IS', '-c', request['door'].pop('source'), name, 'serve'),
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             cwd='/', start_new_session=True)
-        assert door.stdin is not None
-        with door.stdin as stdin:
+        assert started.stdin is not None
+        with started.stdin as stdin:
             stdin.write(json.dumps(request['door']).encode())
     now = uptime()
     print(json.dumps([{

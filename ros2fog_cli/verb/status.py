@@ -33,6 +33,7 @@ class StatusVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the status; return 1 if there are problems or no expected agent answers."""
+        from fogros2 import invitation
         from fogros2.errors import ConfigurationError, FogError
         from fogros2.store import Store
         from ros2fog_cli.api import guests, reach, replicas

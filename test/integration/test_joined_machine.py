@@ -13,6 +13,7 @@ import pytest
 
 from fogros2.model import Command
 from fogros2.process import run
+from fogros2.provider.container.entry import AGENT_DIRECTORY
 from fogros2.waiting import wait_until
 from rigs.launched import Launched, launching, ros2
 from rigs.second_robot import HOST, second, SecondRobot
@@ -95,7 +96,7 @@ def first(
                                sudo=True), timeout=10.0)
             return First(name, started, engine)
         yield launch
-    ros2('fog', 'delete', name)
+    ros2('fog', 'delete', '--yes', name)
 
 
 @pytest.fixture
@@ -120,6 +121,13 @@ def test_nodes_of_a_second_robot_end_with_its_heartbeat(
     joined.wait_for('I heard', timeout=120.0)
     assert host.talkers() == 1
     host.launched.wait_for('I heard')  # the first robot's node there hears the second's too
+    (account,) = {name for name in host.accounts() if ':' not in name}
+    for script in ('cat /{0}/config.json', 'sudo -n true', 'kill -0 1', 'ls /home/*',
+                   'cat /run/fog*.guests.json', 'touch /var/lib/fogros2/x'):
+        said = host.there(f"su -s /bin/sh -c '{script.format(AGENT_DIRECTORY)}' {account} "
+                          '2>/dev/null && echo may')
+        assert 'may' not in said, (script, said)
+    assert 'may' in host.there(f"su -s /bin/sh -c 'touch ~/x' {account} && echo may")
     joined.interrupt()
     assert joined.ended() == 0, joined.text
     assert host.talkers() == 0
@@ -131,5 +139,55 @@ def test_nodes_of_a_second_robot_end_with_its_heartbeat(
     assert ros2('fog', 'revoke', host.name).returncode == 0
     assert host.accounts() == []
     again.kill()
-    second.run('ros2', 'fog', 'gc')  # what the killed launch left, the interface to the machine too
+    second.run('ros2', 'fog', 'gc')
     assert second.run('ip', '-brief', 'link').count('fog') == 0
+
+
+def test_nodes_go_on_when_the_inviting_launch_keeps_its_machine(
+    first: Callable[[str], First], second: SecondRobot, join: Callable[..., Launched],
+) -> None:
+    host = first('keep')
+    joined = join(host.invited(second))
+    joined.wait_for('I heard', timeout=120.0)
+    host.launched.interrupt()
+    assert host.launched.ended() == 0, host.launched.text
+    heard = joined.text.count('I heard')
+    joined.wait_for('I heard', times=heard + 5)
+    assert host.talkers() == 1 and host.there('ls /sys/class/net').count('fog') == 1
+    joined.interrupt()
+    assert joined.ended() == 0, joined.text
+    assert ros2('fog', 'revoke', host.name).returncode == 0
+    wait_until(lambda: not host.there('ls /sys/class/net /run | grep ^fog.*m0'), timeout=60.0,
+               what='the door to take the VPN down')
+    assert host.accounts() == []
+    deleted = ros2('fog', 'delete', '--yes', host.name)
+    assert deleted.returncode == 0, deleted.stdout + deleted.stderr
+
+
+def test_next_launch_takes_its_machine_from_the_guests(
+    first: Callable[[str], First], second: SecondRobot, join: Callable[..., Launched],
+) -> None:
+    host = first('keep')
+    joined = join(host.invited(second))
+    joined.wait_for('I heard', timeout=120.0)
+    host.launched.interrupt()
+    assert host.launched.ended() == 0, host.launched.text
+    again = first('delete')
+    assert again.accounts() == [] and again.talkers() == 0
+    assert again.there('ls /sys/class/net').count('fog') == 1
+
+
+def test_invitation_that_is_not_valid_any_more_gets_no_answer(
+    first: Callable[[str], First], second: SecondRobot, join: Callable[..., Launched],
+) -> None:
+    host = first('delete')
+    old = host.invited(second)
+    new = host.invited(second)
+    replayed = join(old)
+    assert replayed.ended(120.0) == 1
+    assert "'theirs' refuses this invitation" in replayed.text, replayed.text
+    assert host.accounts() == []
+    assert ros2('fog', 'revoke', host.name).returncode == 0
+    revoked = join(new)
+    assert revoked.ended(120.0) == 1
+    assert "'theirs' does not answer" in revoked.text, revoked.text

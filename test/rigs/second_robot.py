@@ -41,7 +41,7 @@ class SecondRobot:
         mark = f'fogs{os.getpid() % 100000}'
         self.spaces = [f'{mark}n', f'{mark}r']
         self.environment = {
-            **os.environ, 'FOGROS2_STATE_HOME': str(state),
+            **os.environ, 'FOGROS2_STATE_HOME': str(state), 'XDG_CONFIG_HOME': f'{state}/config',
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
 
     def open(self) -> None:

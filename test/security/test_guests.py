@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import sys
 
+from fogros2.vpn.addresses import guest_heartbeats, GUEST_PORT
 from fogros2.waiting import wait_until
-from rigs.vpn_guest import Guest, guest
+from rigs.vpn_guest import Guest, GUEST, guest
 from rigs.vpn_lab import Child, Lab, MACHINE, ROBOT
 
 __all__ = ['guest']
@@ -40,14 +41,18 @@ for word in sys.argv[1:]:
     except OSError:
         pass
 '''
-PORTS = ['tcp:0.0.0.0:22', 'tcp:0.0.0.0:8765', 'udp:0.0.0.0:7399', 'udp:0.0.0.0:53']
+#: The last one is for the heartbeats of another guest.
+PORTS = ['tcp:0.0.0.0:22', 'tcp:0.0.0.0:8765', 'udp:0.0.0.0:7399', 'udp:0.0.0.0:53',
+         f"udp:0.0.0.0:{guest_heartbeats('198.18.7.225')}"]
 DDS = 'udp:0.0.0.0:7410'
+#: What a guest reaches besides DDS: the door, and the port for its heartbeats.
+OWN = [f'tcp:0.0.0.0:{GUEST_PORT}', f'udp:0.0.0.0:{guest_heartbeats(GUEST)}']
 #: Seconds in which WireGuard makes a second attempt at a handshake.
 ATTEMPTS = 6.0
 
 
 def listen(vpn: Lab, host: str) -> Child:
-    child = vpn.start(host, [sys.executable, '-c', LISTENER, *PORTS, DDS])
+    child = vpn.start(host, [sys.executable, '-c', LISTENER, *PORTS, *OWN, DDS])
     child.wait('ready')
     return child
 
@@ -71,7 +76,7 @@ def looked(guest: Guest) -> bool:
     return guest.key in vpn.shell('machine', 'wg show all peers')
 
 
-def test_guest_reaches_dds_and_ping_of_the_machine_alone(vpn: Lab, guest: Guest) -> None:
+def test_guest_reaches_dds_ping_and_its_door_alone(vpn: Lab, guest: Guest) -> None:
     # a machine that forwards, and a hijacked guest that sends all it can through the VPN
     vpn.shell('machine', 'echo 1 >/proc/sys/net/ipv4/ip_forward')
     guest.admit()
@@ -81,10 +86,10 @@ def test_guest_reaches_dds_and_ping_of_the_machine_alone(vpn: Lab, guest: Guest)
     vpn.ip('-n', vpn.spaces['guest'], 'route', 'add', '203.0.113.2', 'dev', guest.interface.name)
     machine, robot = listen(vpn, 'machine'), listen(vpn, 'robot')
     send(vpn, *(word.replace('0.0.0.0', host) for host in (MACHINE, ROBOT, '203.0.113.2')
-                for word in (*PORTS, DDS)))
+                for word in (*PORTS, *OWN, DDS)))
     send(vpn, f'udp:{MACHINE}:7410')
-    machine.wait('said', count=2)
-    assert [(line['at'], line['said']) for line in machine.lines('said')] == [(DDS, MACHINE)] * 2
+    machine.wait('said', count=4)
+    assert [line['at'] for line in machine.lines('said')] == [*OWN, DDS, DDS]
     assert robot.lines('said') == []
     assert not vpn.ping('guest', ROBOT) and vpn.ping('guest', MACHINE)
 

@@ -197,7 +197,8 @@ class Arming(Step):
                     f"end what listens there: ss -lunp 'sport = :{port}'"
                 ) from error
             raise
-        job.heartbeat = Heartbeat(address, port, context.launch, key if configured.get('signed') else '')
+        job.heartbeat = Heartbeat(
+            address, port, context.launch, key if configured.get('signed') else '')
         job.undo.callback(job.heartbeat.close)
         try:
             wait_until(
