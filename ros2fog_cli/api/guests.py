@@ -71,7 +71,7 @@ def invite(
     with reach.session(entry) as shell:
         guests = ask(shell, record, 'admit', {
             'key': public, 'label': label, 'seconds': seconds, 'secret': secret,
-            'left': record.armed + record.spec.lifetime - time.time(),
+            'left': (record.armed or time.time()) + record.spec.lifetime - time.time(),
             'door': door(record),
             'patience': max(PATIENCE, record.spec.robot_timeout),
             'addresses': [str(address) for address in ipaddress.IPv4Network(

@@ -28,6 +28,7 @@ from fogros2.agent_client import connection
 from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.dds.fastdds import FastDds, VARIABLE
 from fogros2.errors import FogError
+from fogros2.vpn import guests
 from fogros2_examples.city import City
 from fogros2_examples.lidar import message
 from fogros2_monitor import request as gate
@@ -196,6 +197,27 @@ def _agent() -> Iterator[Target]:
 
 
 @contextlib.contextmanager
+def _door() -> Iterator[Target]:
+    """What a guest sends to a machine's door before it has proved who it is."""
+    class Door(guests.Door):
+        def begin(self, link: socket.socket, user: str) -> subprocess.Popen[bytes]:
+            raise AssertionError('opened without the secret')
+
+    with tempfile.TemporaryDirectory() as folder:
+        listed = guests.Guests('fogabc123m0', Path(folder))
+        listed.state.write_text(json.dumps([{'address': '127.0.0.1', 'secret': '5a' * 32}]))
+        with Door(listed, {'address': '127.0.0.1', 'port': 0, 'agent': os.devnull}) as door:
+            def read(data: bytes) -> None:
+                ours, theirs = socket.socketpair()
+                with ours, theirs:
+                    ours.sendall(data[:1 << 15])
+                    ours.shutdown(socket.SHUT_WR)
+                    door.answer(theirs, '127.0.0.1')
+                    assert len(ours.recv(1 << 10)) == guests.CHALLENGE
+            yield Target([bytes(32), b'\x5a' * 32, bytes(64)], read, ())
+
+
+@contextlib.contextmanager
 def _gate() -> Iterator[Target]:
     head = ('GET /?token={0} HTTP/1.1\r\nHost: 127.0.0.1:8765\r\nOrigin: https://app.foxglove.dev'
             '\r\nUpgrade: websocket\r\nCookie: a=b\r\n\r\n')
@@ -324,8 +346,8 @@ def _dds() -> Iterator[Target]:
 
 TARGETS: dict[str, Callable[[], contextlib.AbstractContextManager[Target]]] = {
     'decoder': _decoder, 'stills': _stills, 'clouds': _clouds, 'parts': _parts,
-    'agent messages': _agent_messages, 'heartbeats': _heartbeats, 'agent': _agent, 'gate': _gate,
-    'dashboard': _dashboard, 'VPN helper': _vpn_helper, 'DDS configuration': _dds}
+    'agent messages': _agent_messages, 'heartbeats': _heartbeats, 'agent': _agent, 'door': _door,
+    'gate': _gate, 'dashboard': _dashboard, 'VPN helper': _vpn_helper, 'DDS configuration': _dds}
 #: Targets whose readers are Python code in the process that feeds them.
-PYTHON = {'parts', 'agent messages', 'heartbeats', 'gate', 'dashboard', 'VPN helper',
+PYTHON = {'parts', 'agent messages', 'heartbeats', 'door', 'gate', 'dashboard', 'VPN helper',
           'DDS configuration'}

@@ -55,6 +55,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Any]]:
     store.save(Record(
         'planner', 'memory', MachineSpec('planner', 'memory'), machine_id='id', launch='abc123',
         pid=os.getpid(), pid_start=process_start(os.getpid()) or 0, public_key=OTHER,
+        armed=time.time(), agent_program=__file__,
         vpn=interface, robot_vpn=dataclasses.replace(interface, name='fogabc123')))
     for name, content in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '7')):
         write_private(store.launch('abc123') / name, content.encode())
@@ -89,13 +90,16 @@ def test_invitation_names_all_that_the_joiner_needs(
     assert fog('invite', 'planner', '--key', key, '--for', '10m') == 0
     text = capsys.readouterr().out.strip()
     found = invitation.unseal(text, invitation.own_key(second))
-    assert dataclasses.replace(found, expires=0.0) == invitation.Invitation(
+    assert dataclasses.replace(found, expires=0.0, secret='') == invitation.Invitation(
         'planner', OTHER, '198.18.7.2', '203.0.113.9:30000', '198.18.7.224', '198.18.7.0/24',
-        'rmw_cyclonedds_cpp', 7, 0.0)
+        'rmw_cyclonedds_cpp', 7, 0.0, 'fogabc123m0')
     assert 590 < found.expires - time.time() <= 600
     ((verb, request),) = asked
     assert (verb, request['key'], request['seconds'], request['patience']) == (
         'admit', invitation.parse_key(key)[1], 600.0, 180.0)
+    assert request['secret'] == found.secret and len(bytes.fromhex(found.secret)) == 32
+    assert 0 < request['left'] <= 8 * 3600 and request['door']['port'] == 7399
+    assert found.secret not in str(request['door'])
     assert request['addresses'][0] == '198.18.7.224' and len(request['addresses']) == 31
     assert fog('invite', 'planner', '--key', key, '--address', 'robot.example') == 0
     text = capsys.readouterr().out.strip()

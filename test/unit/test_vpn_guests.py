@@ -50,6 +50,13 @@ def test_expired_guest_stays_while_it_is_heard() -> None:
     assert guests.due(guest) == 481.0
 
 
+def test_guest_ends_with_the_lifetime_of_the_machine() -> None:
+    found = guests.admitted([], asked(left=100.0), 100.0)
+    guests.heard(found, {KEY: 1700000000}, 150.0)
+    assert guests.due(found[0]) == 200.0
+    assert guests.account('fogabc123m0', '198.18.7.224') == 'fogabc123m0g224'
+
+
 def test_wg_reads_the_guests_and_the_time_to_look() -> None:
     found = guests.admitted([], asked(), 100.0)
     assert guests.rendered(found, 100.0) == (

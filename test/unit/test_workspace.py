@@ -7,13 +7,14 @@ import dataclasses
 import os
 from pathlib import Path
 import subprocess
+from typing import Any
 
 import pytest
 
 from fogros2.errors import WorkspaceError
 from fogros2.host import workspace
 from fogros2.host.inspection import HostFacts, Python
-from fogros2.model import Result, SyncReport
+from fogros2.model import Command, Result, SyncReport
 from fogros2.shell import sync
 from fogros2.testing.fakes import FakeShell
 from fogros2.waiting import Timeouts
@@ -131,6 +132,27 @@ def test_install_space_is_copied_between_equal_computers(root: Path) -> None:
 def test_pure_python_is_copied_to_another_system(root: Path) -> None:
     machine = HostFacts(system='debian', release='13', architecture='aarch64', pythons=(PYTHON,))
     assert plan(workspace.inspect(root), machine).commands == ()
+
+
+def test_workspace_of_a_guest_moves_with_its_variables(root: Path) -> None:
+    way = plan(workspace.inspect(root))
+    (moved,), variables = workspace.moved(
+        [way], {'AMENT_PREFIX_PATH': f'{root}/install/alpha:{root}s:/opt/ros/jazzy', 'A': 'b'},
+        '/home/guest/ws', 'm')
+    assert (moved.source, moved.target) == (root, f'/home/guest/ws{root}')
+    assert variables == {'A': 'b', 'AMENT_PREFIX_PATH':
+                         f'/home/guest/ws{root}/install/alpha:{root}s:/opt/ros/jazzy'}
+
+
+@pytest.mark.parametrize('change, why', [
+    ({'includes': ('/src/',)}, 'symlink-install'), ({'linked': (Path('/x'),)}, 'symlink-install'),
+    ({'commands': (Command(('true',)),), 'reason': 'it is not built'}, 'it is not built')])
+def test_workspace_of_a_guest_has_to_be_complete(
+    root: Path, change: dict[str, Any], why: str,
+) -> None:
+    way = dataclasses.replace(plan(workspace.inspect(root)), **change)
+    with pytest.raises(WorkspaceError, match=why):
+        workspace.moved([way], {}, '/home/guest/ws', 'm')
 
 
 def test_another_python_builds_there(root: Path) -> None:
