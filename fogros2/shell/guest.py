@@ -69,7 +69,8 @@ class _Door(Link):
             self._poll.settimeout(_STALL)
             if text != b'\n':
                 raise ConnectError(f"'{name}' has no room for this computer: "
-                                   f'{clean(text.decode(errors="replace")).strip()}')
+                                   f'{clean(text.decode(errors="replace")).strip()}',
+                                   'the machine needs useradd, of the package passwd')
         except OSError as error:
             self._poll.close()
             raise AuthenticationError(

@@ -50,7 +50,7 @@ class Check:
 
 
 #: Providers that have checks of their own.
-_LOOKED_AT = ('container', 'ssh')
+_LOOKED_AT = ('container', 'joined', 'ssh')
 #: Time-out of a provider's answer, in seconds.
 TIMEOUT = 8.0
 

@@ -200,6 +200,7 @@ def _leave(record: Record, *, force: bool) -> None:
     if record.shell is None:
         return
     timeouts = Timeouts()
+    joined = bool(machines.load(record.provider).invitation(record.spec))
     shell = shells.connect(record.shell, name=record.name, timeout=10.0)
     try:
         with _agent(record, shell) as client, contextlib.suppress(AgentError):
@@ -210,17 +211,15 @@ def _leave(record: Record, *, force: bool) -> None:
                 if not force and not _sure(record) and _hears_launch(client):
                     raise _used(record)
                 client.request('release', on_exit='delete', exit=True, timeout=30.0)
-        if record.vpn is None:
-            return  # the machine of another robot
-        vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
-        for command in vpn.down(record.vpn):
-            shell.run(command, timeout=timeouts.vpn)
-        if record.agent:
+        if record.vpn is not None:
+            vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
+            for command in vpn.down(record.vpn):
+                shell.run(command, timeout=timeouts.vpn)
+        if record.agent and not joined:
             shell.run(Command(('rm', '-rf', '--', record.agent), sudo=True,
                               what='remove the agent'), timeout=timeouts.command)
     except (ShellError, DeadlineExceeded):
-        # the machine of another robot, without a VPN of ours, may have forgotten this computer
-        if not force and record.vpn is not None:
+        if not force and not joined:  # another robot's machine may have forgotten this computer
             raise
     finally:
         shell.close()

@@ -19,6 +19,7 @@ from fogros2 import (
     AWSCloudInstance,
     CloudInstance,
     ContainerInstance,
+    JoinedMachine,
     KubeInstance,
     SSHInstance,
     StreamTopic,
@@ -34,8 +35,8 @@ if TYPE_CHECKING:
 
     from fogros2.describe.machines import Bool, Value
 
-CLASSES = {'aws': AWSCloudInstance, 'container': ContainerInstance, 'kubernetes': KubeInstance,
-           'ssh': SSHInstance}
+CLASSES = {'aws': AWSCloudInstance, 'container': ContainerInstance, 'joined': JoinedMachine,
+           'kubernetes': KubeInstance, 'ssh': SSHInstance}
 
 
 class Harmless(H264):
@@ -189,7 +190,8 @@ LISTS = {'monitor_allow': ('198.51.100.0/28,::1', ['198.51.100.0/28', '::1']),
 @pytest.mark.parametrize('provider', sorted(CLASSES))
 def test_keywords_are_attributes_and_take_substitutions(provider):
     needed = {'name': 'planner', 'ros_workspace': '', **(
-        {'host': 'here'} if provider == 'ssh' else {})}
+        {'host': 'here'} if provider == 'ssh' else
+        {'invitation': 'fog1.x'} if provider == 'joined' else {})}
     for keyword in keywords.keywords(CLASSES[provider]).values():
         if keyword.kind in ('mapping', 'table'):
             continue
@@ -230,9 +232,10 @@ launch:
     ('<fog_machine name="p" provider="awz"/>',
      ["there is no provider 'awz'", "did you mean 'aws'", 'container']),
     ('<fog_machine name="p"/>',
-     ['needs a provider', 'aws, azure, cheapest, container, gcp, kubernetes, robot, ssh']),
+     ['needs a provider', 'aws, azure, cheapest, container, gcp, joined, kubernetes, robot, ssh']),
     ('<fog_machine provider="aws"/>', ['needs a name']),
     ('<fog_machine name="p" provider="ssh"/>', ["provider 'ssh' needs host"]),
+    ('<fog_machine name="p" provider="joined"/>', ["provider 'joined' needs invitation"]),
     ('<fog_machine name="P_" provider="aws"/>', ["'P_' is no name for a machine"]),
     ('<fog_machine name="p" provider="aws" regoin="x"/>',
      ["provider 'aws'", "'regoin'", "did you mean 'region'"]),

@@ -105,7 +105,7 @@ def test_a_name_beats_a_pattern_and_the_last_one_counts():
 
 @pytest.mark.parametrize('text, words', [
     ('planner', ["'planner'", 'planner=container',
-                 'aws, azure, cheapest, container, gcp, kubernetes, robot, ssh']),
+                 'aws, azure, cheapest, container, gcp, joined, kubernetes, robot, ssh']),
     ('=container', ['lacks the name']),
     ('planner=', ['lacks the name']),
     ('planner=contaner', ["'contaner'", "did you mean 'container'? there are: aws"]),
@@ -311,7 +311,7 @@ def test_an_argument_completes_name_provider_and_keyword(tmp_path, monkeypatch):
     assert complete('') == ['*=']
     assert complete('planner=') == [
         f'planner={one}' for one in (
-            'aws', 'azure', 'cheapest', 'container', 'gcp', 'kubernetes',
+            'aws', 'azure', 'cheapest', 'container', 'gcp', 'joined', 'kubernetes',
             'robot', 'ssh')]
     assert complete('planner=co') == ['planner=container']
     assert complete('planner=aws,re') == ['planner=aws,region=', 'planner=aws,regions=']

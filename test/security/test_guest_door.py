@@ -145,8 +145,8 @@ def endpoint(door: Door, tmp_path: Path, secret: str = SECRET) -> Endpoint:
 
 
 def test_shell_of_a_guest_runs_commands(door: Door, tmp_path: Path) -> None:
-    import pwd
     import os
+    import pwd
     user = pwd.getpwuid(os.geteuid()).pw_name
     place = endpoint(door, tmp_path)
     shell = GuestShell(Endpoint(place.kind, place.host, place.port, user,

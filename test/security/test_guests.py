@@ -7,7 +7,7 @@ import sys
 
 from fogros2.vpn.addresses import guest_heartbeats, GUEST_PORT
 from fogros2.waiting import wait_until
-from rigs.vpn_guest import Guest, GUEST, guest
+from rigs.vpn_guest import GUEST, Guest, guest
 from rigs.vpn_lab import Child, Lab, MACHINE, ROBOT
 
 __all__ = ['guest']

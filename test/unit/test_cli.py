@@ -20,6 +20,7 @@ import pytest
 from ros2cli.cli import main
 
 from fogros2 import process
+from fogros2.deploy import robot
 from fogros2.errors import PrerequisiteError, ProviderError, Unsupported
 from fogros2.model import (
     Endpoint,
@@ -451,9 +452,9 @@ def test_gc_stops_the_daemon_of_a_kept_machines_launch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     done: list[str] = []
-    monkeypatch.setattr(endings.ros2_daemon, 'stop', lambda folder: done.append(folder.name))
-    monkeypatch.setattr(endings.process, 'run',
-                        lambda command, **more: done.append(' '.join(command.argv)))
+    monkeypatch.setattr(robot.ros2_daemon, 'stop', lambda folder: done.append(folder.name))
+    monkeypatch.setattr(robot, 'run', lambda commands, **more: done.extend(
+        ' '.join(command.argv) for command in commands))
     interface = VpnInterface('fogabc123', '198.18.0.1', '198.18.0.0/24', 51820, '/none')
     kept = record('a', on_exit='keep', robot_vpn=interface, **dead())
     endings.let_go(kept, Store())

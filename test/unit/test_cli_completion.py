@@ -14,7 +14,8 @@ import time
 
 import pytest
 
-from fogros2.model import MachineSpec
+from fogros2.invitation import Invitation
+from fogros2.model import MachineSpec, to_json
 from fogros2.store import Record, Store, write_private
 
 pytestmark = [
@@ -31,7 +32,8 @@ def complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Complete:
     monkeypatch.setenv('FOGROS2_STATE_HOME', str(tmp_path / 'state'))
     for name in ('planner', 'mapper'):
         Store().save(Record(name, 'container', MachineSpec(name, 'container')))
-    write_private(Store().launch('a1b2c3') / 'joined.json', b'{"machine": "slam"}')
+    write_private(Store().launch('a1b2c3') / 'joined.json', to_json(Invitation(
+        'slam', '', '198.18.7.2', '', '198.18.7.224', '198.18.7.0/24', '', 0, 0.0)).encode())
 
     def complete(line: str) -> list[str]:
         answer = tmp_path / 'answer'
@@ -63,11 +65,12 @@ def complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Complete:
     ('ros2 fog price --region ap-east-', ['ap-east-1', 'ap-east-2']),
     ('ros2 fog price --provider a', ['all', 'aws', 'azure']),
     ('ros2 fog regions sa-', ['sa-east-1']),
-    ('ros2 fog doctor --provider ', ['aws', 'azure', 'container', 'gcp', 'kubernetes', 'ssh']),
+    ('ros2 fog doctor --provider ', [
+        'aws', 'azure', 'container', 'gcp', 'joined', 'kubernetes', 'ssh']),
     ('ros2 launch --machine ma', ['mapper=']),
     ('ros2 launch --machine mapper=', [
         'mapper=aws', 'mapper=azure', 'mapper=cheapest', 'mapper=container', 'mapper=gcp',
-        'mapper=kubernetes', 'mapper=robot', 'mapper=ssh']),
+        'mapper=joined', 'mapper=kubernetes', 'mapper=robot', 'mapper=ssh']),
 ])
 def test_command_line_is_completed(complete: Complete, line: str, offered: list[str]) -> None:
     begin = time.monotonic()
