@@ -9,6 +9,7 @@ invitation, so that another account of this computer is not the guest.
 
 from __future__ import annotations
 
+import contextlib
 import hmac
 from pathlib import Path
 import socket
@@ -39,61 +40,40 @@ class GuestShell(MultiplexedShell):
         super().__init__(endpoint, name=name, user=endpoint.user, timeout=timeout)
 
     def _connect(self, timeout: float, cancel: Optional[threading.Event]) -> Link:
-        return connecting(
-            lambda: _Door(self.endpoint, self.name, timeout), cancel, self.name)
+        def connect() -> Link:
+            return Link(admitted(self.endpoint, self.name, timeout), self.name, self.user)
+        return connecting(connect, cancel, self.name)
 
 
-class _Door(Link):
+def admitted(endpoint: Endpoint, name: str, timeout: float) -> socket.socket:
     """
-    A connection to a machine's door.
+    Return a connection to the shell behind a machine's door.
 
-    :raises ConnectError: the machine does not answer.
+    :raises ConnectError: the machine does not answer, or has no account for a guest.
     :raises AuthenticationError: the machine does not know the invitation.
     """
-
-    def __init__(self, endpoint: Endpoint, name: str, timeout: float) -> None:
-        super().__init__(name, endpoint.user)
-        secret = bytes.fromhex(Path(endpoint.key_file or '').read_text())
+    secret, text = bytes.fromhex(Path(endpoint.key_file or '').read_text()), b''
+    try:
+        link = socket.create_connection((endpoint.host, endpoint.port), timeout)
+    except OSError as error:
+        raise ConnectError(
+            f"'{name}' does not answer: {error}",
+            'the invitation may have been revoked, or the machine may have ended') from error
+    with contextlib.ExitStack() as failed:
+        failed.enter_context(link)
         try:
-            self._poll = socket.create_connection((endpoint.host, endpoint.port), timeout)
-        except OSError as error:
-            raise ConnectError(
-                f"'{name}' does not answer: {error}",
-                'the invitation may have been revoked, or the machine may have ended') from error
-        try:
-            challenge = self._exactly(_CHALLENGE)
-            self._poll.sendall(hmac.digest(secret, challenge, 'sha256'))
-            text = b''
+            link.sendall(hmac.digest(secret, link.recv(_CHALLENGE, socket.MSG_WAITALL), 'sha256'))
             while not text.endswith(b'\n') and len(text) < _LINE:
-                text += self._exactly(1)
-            self._poll.settimeout(_STALL)
-            if text != b'\n':
-                raise ConnectError(f"'{name}' has no room for this computer: "
-                                   f'{clean(text.decode(errors="replace")).strip()}',
-                                   'the machine needs useradd, of the package passwd')
+                text += (more := link.recv(1))
+                if not more:
+                    raise ConnectionResetError('it closed the connection')
         except OSError as error:
-            self._poll.close()
-            raise AuthenticationError(
-                f"'{name}' refuses this invitation: {error}",
-                'ask for a new one: ros2 fog invite') from error
-        except BaseException:
-            self._poll.close()
-            raise
-        self._begin()
-
-    def _exactly(self, size: int) -> bytes:
-        data = b''
-        while len(data) < size:
-            data += (more := self._poll.recv(size - len(data)))
-            if not more:
-                raise ConnectionResetError('it closed the connection')
-        return data
-
-    def _write(self, data: bytes) -> None:
-        self._poll.sendall(data)
-
-    def _read(self) -> bytes:
-        data = self._poll.recv(1 << 18)
-        if not data:
-            raise ConnectError(f"'{self._name}' has closed the connection")
-        return data
+            raise AuthenticationError(f"'{name}' refuses this invitation: {error}",
+                                      'ask for a new one: ros2 fog invite') from error
+        if text != b'\n':
+            raise ConnectError(f"'{name}' has no room for this computer: "
+                               f'{clean(text.decode(errors="replace")).strip()}',
+                               'the machine needs useradd, of the package passwd')
+        link.settimeout(_STALL)
+        failed.pop_all()
+    return link

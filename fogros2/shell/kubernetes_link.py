@@ -45,24 +45,23 @@ class Link(multiplexed.Link):
     """
 
     def __init__(self, endpoint: Endpoint, *, name: str, timeout: float) -> None:
-        super().__init__(name, endpoint.user or 'root')
+        self._name = name
         self._context, self._namespace, self._pod = parse_host(endpoint.host)
-        self._socket = self._connect(timeout)
-        assert self._socket.sock is not None
-        self._poll = self._socket.sock
-        self._begin()
+        self._exec = self._connect(timeout)
+        assert self._exec.sock is not None
+        super().__init__(self._exec.sock, name, endpoint.user or 'root')
 
     def _errors(self) -> tuple[type[BaseException], ...]:
         return _websocket_errors()
 
     def _write(self, data: bytes) -> None:
-        self._socket.send_binary(bytes([_STDIN]) + data)
+        self._exec.send_binary(bytes([_STDIN]) + data)
 
     def _pending(self) -> bool:
-        return isinstance(self._poll, ssl.SSLSocket) and self._poll.pending() > 0
+        return isinstance(self._socket, ssl.SSLSocket) and self._socket.pending() > 0
 
     def _read(self) -> bytes:
-        data = _bytes(self._socket.recv())
+        data = _bytes(self._exec.recv())
         if not data:
             raise ConnectError(f"'{self._name}' has closed the connection")
         if data[0] == _ERROR:
@@ -75,7 +74,7 @@ class Link(multiplexed.Link):
         super()._lose(error)
 
     def _ended(self) -> None:
-        self._socket.close(timeout=0)
+        self._exec.close(timeout=0)
 
     # -- the connection -------------------------------------------------------------------------
 
@@ -110,8 +109,8 @@ class Link(multiplexed.Link):
         return link
 
     def _greeting(self, link: websocket.WebSocket, deadline: float) -> None:
-        """Wait for the multiplexer's first frame."""
-        errors = b''
+        """Wait for the multiplexer's first frame; nothing follows before the first request."""
+        errors, incoming = b'', bytearray()
         while True:
             link.settimeout(max(0.1, deadline - time.monotonic()))
             data = _bytes(link.recv())
@@ -121,8 +120,8 @@ class Link(multiplexed.Link):
             elif kind == _ERROR:
                 raise self._no_program(errors + data)
             elif kind == _STDOUT:
-                self._incoming += data
-                if list(mux.frames(self._incoming)):
+                incoming += data
+                if list(mux.frames(incoming)):
                     return
             if time.monotonic() > deadline:
                 raise DeadlineExceeded(f"'{self._name}' doesn't answer")

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Iterator
 import contextlib
 import json
@@ -154,19 +153,17 @@ class Channel:
         self._link.forget(self._number)
 
 
-class Link(abc.ABC):
+class Link:
     """
     A connection to a machine's multiplexer; thread-safe.
 
-    A subclass connects in its constructor, sets ``_poll`` to the socket, and calls ``_begin``.
-
+    :param connection: a socket to it; a subclass may have other ways to write and read.
     :param name: the machine's name, for messages.
     :param user: the login user.
     """
 
-    _poll: socket.socket
-
-    def __init__(self, name: str, user: str) -> None:
+    def __init__(self, connection: socket.socket, name: str, user: str) -> None:
+        self._socket = connection
         self._name = name
         self._user = user
         self._lock = threading.Lock()
@@ -175,22 +172,22 @@ class Link(abc.ABC):
         self._incoming = bytearray()
         self._error: Optional[FogError] = None
         self._closed = False
-
-    def _begin(self) -> None:
-        """Start to read."""
         threading.Thread(target=self._run, name='fog-link', daemon=True).start()
 
-    @abc.abstractmethod
     def _write(self, data: bytes) -> None:
         """Send bytes to the multiplexer, with the lock held."""
+        self._socket.sendall(data)
 
-    @abc.abstractmethod
     def _read(self) -> bytes:
         """
         Return bytes that have arrived, with the lock held.
 
         :raises ConnectError: the multiplexer has ended.
         """
+        data = self._socket.recv(1 << 18)
+        if not data:
+            raise ConnectError(f"'{self._name}' has closed the connection")
+        return data
 
     def _errors(self) -> tuple[type[BaseException], ...]:
         """Return the errors of a lost connection."""
@@ -202,7 +199,7 @@ class Link(abc.ABC):
 
     def _ended(self) -> None:
         """Close the socket, after the last read."""
-        self._poll.close()
+        self._socket.close()
 
     def is_alive(self) -> bool:
         """Return whether new commands can start."""
@@ -255,7 +252,7 @@ class Link(abc.ABC):
     def _wake(self) -> None:
         """Wake the reading thread, which closes the connection."""
         with contextlib.suppress(OSError):
-            self._poll.shutdown(socket.SHUT_RDWR)
+            self._socket.shutdown(socket.SHUT_RDWR)
 
     def forget(self, number: int) -> None:
         """Close a command's channel."""
@@ -299,7 +296,7 @@ class Link(abc.ABC):
         :raises ConnectError: the connection is lost or closed.
         """
         poll = select.poll()
-        poll.register(self._poll, select.POLLIN)
+        poll.register(self._socket, select.POLLIN)
         heard = time.monotonic()
         while True:
             for kind, number, payload in mux.frames(self._incoming):
