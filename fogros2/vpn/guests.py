@@ -67,6 +67,13 @@ except ProcessLookupError:
 raise SystemExit(1)
 """
 
+#: What the guest's account runs: its agent, unless that runs, then its shell on the connection.
+ENTRY = """\
+python3 -IS agent.py serve --detach --config agent.json </dev/null >/dev/null
+echo
+exec python3 -IS -c "$0"
+"""
+
 Guest = dict[str, Any]
 
 
@@ -202,7 +209,7 @@ class Door(socketserver.ThreadingTCPServer):
     Where guests' robots reach their accounts.
 
     :param request: ``address``, ``port``, ``shell``, ``down``, ``machine``, ``agent`` (the path of
-        the agent's program), ``process`` (the file with the process id of the machine's agent).
+        the agent's program), ``process`` (the file with a process id, of ``VpnInterface``).
     """
 
     allow_reuse_address = daemon_threads = True
@@ -236,7 +243,7 @@ class Door(socketserver.ThreadingTCPServer):
                     return
 
     def follow(self) -> None:
-        """Enter the control group of the agent, whose processes take no DDS of strangers."""
+        """Enter the control group that takes no DDS of strangers, on a host that has one."""
         with contextlib.suppress(OSError, IndexError):
             pid = Path(self.request['process']).read_text().strip()
             group = re.findall('^0::(.*)', Path(f'/proc/{pid}/cgroup').read_text(), re.MULTILINE)
@@ -308,21 +315,13 @@ class Door(socketserver.ThreadingTCPServer):
                 'machine': self.request['machine'], 'directory': f'{home}/agent', 'user': user,
                 'boot_timeout': 120.0}))
             os.chown(home, found.pw_uid, found.pw_gid)
-
-        def start(*words: str, stdin: Any, stdout: Any) -> subprocess.Popen[bytes]:
-            return subprocess.Popen(
-                ('python3', '-IS', *words), stdin=stdin, stdout=stdout, stderr=subprocess.DEVNULL,
-                cwd=home, user=found.pw_uid, group=found.pw_gid, extra_groups=(), umask=0o022,
-                start_new_session=True, env={
-                    'HOME': str(home), 'USER': user, 'LOGNAME': user, 'SHELL': '/bin/sh',
-                    'LANG': 'C.UTF-8', 'PATH': '/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin'})
-
-        # ends at once if the agent runs
-        start('agent.py', 'serve', '--detach', '--config', 'agent.json',
-              stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL).wait(30.0)
         link.settimeout(None)
-        link.sendall(b'\n')
-        return start('-c', self.request['shell'], stdin=link, stdout=link)
+        return subprocess.Popen(
+            ('sh', '-c', ENTRY, self.request['shell']), stdin=link, stdout=link,
+            stderr=subprocess.DEVNULL, cwd=home, user=found.pw_uid, group=found.pw_gid,
+            extra_groups=(), umask=0o022, start_new_session=True, env={
+                'HOME': str(home), 'USER': user, 'LOGNAME': user, 'SHELL': '/bin/sh',
+                'LANG': 'C.UTF-8', 'PATH': '/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin'})
 
 
 def main(name: str, verb: str, folder: Path = Path('/run')) -> None:

@@ -210,8 +210,9 @@ class WireGuard(Vpn):
         look = shlex.join(guest_request(interface, 'look').argv)
         for command in self.down(interface):
             yield dataclasses.replace(command, argv=(*command.argv[:-1], (
-                f'if [ -e {_guests(interface)}.json ] && [ "$({look})" != "[]" ]; then\n'
-                f'  : >{_left(interface)}; exit 0\nfi\n{command.argv[-1]}')))
+                f'if [ -e {_guests(interface)}.json ] && found=$({look}) && '
+                f'[ "$found" != "[]" ]; then\n  : >{_left(interface)}\n  exit 0\nfi\n'
+                f'{command.argv[-1]}')))
 
     def _steps(
         self, interface: VpnInterface, peers: Sequence[Peer], *, recall: bool = False,

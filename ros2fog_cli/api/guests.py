@@ -92,7 +92,7 @@ def door(record: Record) -> dict[str, object]:
         'source': Path(guest_program.__file__).read_text(),
         'shell': Path(multiplexer.__file__).read_text(), 'machine': record.name,
         'address': record.vpn.address, 'port': addresses.GUEST_PORT,
-        'agent': record.agent_program, 'process': f'{record.agent}/agent.pid',
+        'agent': record.agent_program, 'process': record.vpn.process,
         'down': '\n'.join(command.argv[-1] for command in vpn.down(record.vpn))}
 
 

@@ -213,3 +213,9 @@ def test_invitation_that_is_not_valid_any_more_gets_no_answer(
     revoked = join(new)
     assert revoked.ended(120.0) == 1
     assert "'theirs' does not answer" in revoked.text, revoked.text
+    own = ros2('fog', 'key').stdout.strip()
+    foreign = ros2('fog', 'invite', host.name, '--key', own, '--address', HOST).stdout.strip()
+    stranger = join(foreign)
+    assert stranger.ended(120.0) == 1
+    assert 'this invitation is for another computer' in stranger.text, stranger.text
+    assert 'theirs: machine' not in stranger.text and host.accounts() == []
