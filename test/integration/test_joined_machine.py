@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-import json
 from pathlib import Path
 import signal
 import uuid
@@ -15,8 +14,9 @@ from fogros2.model import Command
 from fogros2.process import run
 from fogros2.provider.container.entry import AGENT_DIRECTORY
 from fogros2.waiting import wait_until
+from rigs.bare_computer import bare_computer
 from rigs.launched import Launched, launching, ros2
-from rigs.second_robot import HOST, second, SecondRobot
+from rigs.second_robot import HOST, NAT_ADDRESS, second, SecondRobot
 
 __all__ = ['second']
 
@@ -81,7 +81,7 @@ class First:
 
 @pytest.fixture
 def first(
-    tmp_path: Path, cloud_network: str, engine: str, nothing_left: None,
+    tmp_path: Path, cloud_network: str, engine: str, nothing_left: None, second: SecondRobot,
 ) -> Iterator[Callable[[str], First]]:
     name = f'host-{uuid.uuid4().hex[:6]}'
     with launching() as start:
@@ -90,12 +90,7 @@ def first(
             path.write_text(FIRST.format(name=name, network=cloud_network, on_exit=on_exit))
             started = start(str(path))
             started.wait_for('process started')
-            # this computer forwards nothing from a network of the tests: let answers out
-            said = run(Command((engine, 'network', 'inspect', cloud_network), sudo=True),
-                       timeout=30.0)
-            bridge = json.loads(said.stdout)[0]['network_interface']
-            run(Command.script(f'echo 1 >/proc/sys/net/ipv4/conf/{bridge}/forwarding',
-                               sudo=True), timeout=10.0)
+            second.reaches(engine, cloud_network)
             return First(name, started, engine)
         yield launch
     ros2('fog', 'delete', '--yes', name)
@@ -219,3 +214,50 @@ def test_invitation_that_is_not_valid_any_more_gets_no_answer(
     assert stranger.ended(120.0) == 1
     assert 'this invitation is for another computer' in stranger.text, stranger.text
     assert 'theirs: machine' not in stranger.text and host.accounts() == []
+
+
+SSH = """
+from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
+
+
+def generate_launch_description():
+    machine = SSHInstance(
+        '{host.address}', '{host.user}', key='{host.key}', host_key='{host.host_key}',
+        name='{host.name}', ros_workspace='', bootstrap='embedded', on_exit='keep')
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='fogros2_examples', executable='listener',
+                  output='screen', remappings=[('chatter', '/near')])])
+"""
+
+
+@pytest.mark.timeout(600)
+def test_guest_of_an_ssh_host_gets_what_its_nodes_need(
+    second: SecondRobot, join: Callable[..., Launched], tmp_path: Path, cloud_network: str,
+    engine: str, nothing_left: None,
+) -> None:
+    name = f'ssh-{uuid.uuid4().hex[:6]}'
+    path = tmp_path / 'ssh.launch.py'
+    with bare_computer(name, tmp_path / 'computer', cloud_network) as computer, \
+            launching() as start:
+        path.write_text(SSH.format(host=computer))
+        launched = start(str(path))
+        launched.wait_for('process started', timeout=300.0)
+        gateway = second.reaches(engine, cloud_network)
+        computer.run(f'ip route add {NAT_ADDRESS} via {gateway}')
+        key = second.run('ros2', 'fog', 'key').strip()
+        done = ros2('fog', 'invite', name, '--key', key)
+        assert done.returncode == 0, done.stderr
+        joined = join(done.stdout.strip())
+        joined.wait_for('I heard', timeout=300.0)
+        launched.interrupt()
+        assert launched.ended() == 0, launched.text
+        joined.wait_for('I heard', times=joined.text.count('I heard') + 5)
+        joined.interrupt()
+        assert joined.ended() == 0, joined.text
+        assert ros2('fog', 'revoke', name).returncode == 0
+        wait_until(lambda: not computer.run(
+            'ls -d /sys/class/net/fog* /run/fog* /var/lib/fogros2 || :').stdout, timeout=60.0,
+            what='the guest and the VPN to be gone')
+        assert computer.run('grep -c ^fog.*g2 /etc/passwd || :').stdout == '0\n'
+        deleted = ros2('fog', 'delete', '--yes', name)
+        assert deleted.returncode == 0, deleted.stderr

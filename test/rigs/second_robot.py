@@ -10,6 +10,7 @@ A second robot on this computer: a network namespace behind a NAT of its own.
 from __future__ import annotations
 
 from collections.abc import Iterator
+import json
 import os
 from pathlib import Path
 import subprocess
@@ -21,7 +22,7 @@ from fogros2.model import Command
 from fogros2.process import argv, run
 from fogros2.store import Store
 
-HOST = '203.0.113.241'
+HOST, NAT_ADDRESS = '203.0.113.241', '203.0.113.242'
 #: No packet of another connection comes in, as with a home's router.
 NAT = """\
 table inet nat {
@@ -64,6 +65,19 @@ class SecondRobot:
         run(Command(('ip', 'netns', 'exec', nat, 'sh', '-ec',
                      'echo 1 >/proc/sys/net/ipv4/ip_forward; nft -f -'), sudo=True,
                     input=NAT.encode()), timeout=10.0)
+
+    def reaches(self, engine: str, network: str) -> str:
+        """Let packets pass between this robot and a network of the tests; return its gateway."""
+        said = json.loads(run(Command((engine, 'network', 'inspect', network), sudo=True),
+                              timeout=30.0).stdout)[0]
+        # this computer forwards nothing from there
+        for link in (said['network_interface'], self.spaces[0]):
+            run(Command.script(f'echo 1 >/proc/sys/net/ipv4/conf/{link}/forwarding', sudo=True),
+                timeout=10.0)
+        shown = json.loads(run(Command((
+            'ip', '-json', '-4', 'address', 'show', said['network_interface'])),
+            timeout=10.0).stdout)
+        return str(shown[0]['addr_info'][0]['local'])
 
     def close(self) -> None:
         for name in invitation.joined(Store(Path(self.environment['FOGROS2_STATE_HOME']))):
