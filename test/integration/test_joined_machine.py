@@ -20,6 +20,8 @@ from rigs.second_robot import HOST, NAT_ADDRESS, second, SecondRobot
 
 __all__ = ['second']
 
+#: The key of a third computer.
+OTHER = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
 FIRST = """
 from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 
@@ -208,8 +210,7 @@ def test_invitation_that_is_not_valid_any_more_gets_no_answer(
     revoked = join(new)
     assert revoked.ended(120.0) == 1
     assert "'theirs' does not answer" in revoked.text, revoked.text
-    own = ros2('fog', 'key').stdout.strip()
-    foreign = ros2('fog', 'invite', host.name, '--key', own, '--address', HOST).stdout.strip()
+    foreign = ros2('fog', 'invite', host.name, '--key', OTHER, '--address', HOST).stdout.strip()
     stranger = join(foreign)
     assert stranger.ended(120.0) == 1
     assert 'this invitation is for another computer' in stranger.text, stranger.text
