@@ -317,7 +317,7 @@ class Door(socketserver.ThreadingTCPServer):
             os.chown(home, found.pw_uid, found.pw_gid)
         link.settimeout(None)
         return subprocess.Popen(
-            ('sh', '-c', ENTRY, self.request['shell']), stdin=link, stdout=link,
+            ('sh', '-c', ENTRY, self.request['shell']), stdin=link.fileno(), stdout=link.fileno(),
             stderr=subprocess.DEVNULL, cwd=home, user=found.pw_uid, group=found.pw_gid,
             extra_groups=(), umask=0o022, start_new_session=True, env={
                 'HOME': str(home), 'USER': user, 'LOGNAME': user, 'SHELL': '/bin/sh',
