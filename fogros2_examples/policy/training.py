@@ -39,7 +39,7 @@ def demonstrations(count: int, seed: int) -> tuple[Singles, Singles]:
         small(arm.picture(view, angles, goal)[..., ::-1], WIDTH, HEIGHT)
         for view in VIEWS.values()] for angles, goal in zip(joints, goals)])
     # no camera and no codec has quite the same colours
-    for wide, shape in ((0.02, (count, 2, 3, 1, 1)), (0.01, images.shape)):
+    for wide, shape in ((0.03, (count, 2, 3, 1, 1)), (0.03, images.shape)):
         images += wide * chance.standard_normal(shape, numpy.float32)
     seen = numpy.concatenate([images.reshape(count, -1), joints], axis=1, dtype=numpy.float32)
     return seen, plans.reshape(count, -1).astype(numpy.float32)
