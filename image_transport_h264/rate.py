@@ -20,7 +20,7 @@ from typing import Optional
 QUEUE, QUEUE_SECONDS, QUEUE_ACKNOWLEDGEMENTS = 0.04, 0.3, 4
 #: Seconds beyond the usual round trip after which new pictures are skipped. If no packet was
 #: acknowledged for LOST seconds, a picture is sent every PROBE seconds: it shows the end of a cut.
-LATEST, PROBE = 0.25, 0.4
+LATEST, PROBE = 0.25, 0.3
 #: Seconds after which a packet counts as lost, and the state of the link as unknown.
 LOST = 1.5
 #: Windows of the minimum round trip and of the rate of arrival, in seconds.
