@@ -262,10 +262,13 @@ def controlled(name: str, launch: Any, machine: Any, link: Link, output: Output,
     last = began if cut else math.inf
     ticks = [when for when in told['commands'] if told['begin'] < when < last]
     actions = [when for when, _ in told['actions']]
+    counted = [when for when in actions if told['begin'] < when < last]
+    # a tick is starved if it has a command between two actions, and not close to one of them
+    starved = sum(1 for a, b in zip(counted, counted[1:]) if b - a > 1.5 / RATE
+                  for when in ticks if a + 0.5 / RATE < when < b - 0.5 / RATE)
     done = Outcome(
         name, at(arrived, 0.5), at(arrived, 0.95), sent / count, count, len(trips) - len(arrived),
-        1e3 * statistics.median(age for _, age in told['actions']),
-        len(ticks) - sum(told['begin'] < when < last for when in actions), len(ticks))
+        1e3 * statistics.median(age for _, age in told['actions']), starved, len(ticks))
     if cut:
         before = max(when for when in actions if when < ended)
         done.stopped = 1e3 * (min(when for when in told['commands'] if when > before + 1e-3)
@@ -281,7 +284,7 @@ def websocket(name: str, launch: Any, machine: Any, link: Link, output: Output, 
     from fogros2.model import NodeSpec
     from fogros2.waiting import wait_until
 
-    address = machine.machine.vpn_host
+    address = machine.vpn_address
     server = f'openpi-{name.replace(" ", "-")}'
     machine.start([NodeSpec(
         server, server, environment={'PYTHONPATH': FOLDER}, arguments=(
@@ -308,12 +311,12 @@ def websocket(name: str, launch: Any, machine: Any, link: Link, output: Output, 
                    limit=1e3 * (sent / count * 8 / LINK + 2 * DELAY))
 
 
-def hop(launch: Any) -> float:
-    """Return what :func:`streaming.hop_alone` does; a busy computer may need a second try."""
-    try:
-        return hop_alone(launch, 'VGA')
-    except subprocess.CalledProcessError:
-        return hop_alone(launch, 'VGA')
+class Here:
+    """In place of a launch, for nodes that are all on this computer."""
+
+    def robot_environment(self) -> dict[str, str]:
+        """Return the settings of DDS."""
+        return {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
 
 # --- all of it ----------------------------------------------------------------------------------
@@ -360,6 +363,9 @@ def main() -> None:
 
     less = 10 if arguments.short else 1
     outcomes: list[Outcome] = []
+    # three cameras share the cores; each image is handed on twice, as in ``streaming``
+    share = len(CAMERAS) / min(len(CAMERAS), os.cpu_count() or 1)
+    parts = share * (2 * hop_alone(Here(), 'VGA') + sum(codec_alone('VGA')))
     launch = Launch()
     link: Optional[Link] = None
     try:
@@ -371,6 +377,9 @@ def main() -> None:
         output = Output()
         machine.subscribe(output.heard)
         link = Link(launch, machine)
+        for name, count, jpeg in (('WebSocket, JPEG', 300, True), ('WebSocket, raw', 30, False)):
+            outcomes.append(websocket(name, launch, machine, link, output, count // less, jpeg))
+            print(outcomes[-1], flush=True)
         for name, count, loss, cut in (
                 ('H.264', arguments.count, 0.0, False),
                 ('H.264, 2 % loss, then a cut of 5 s', round(600 * RATE), 0.02, True)):
@@ -378,14 +387,8 @@ def main() -> None:
                 ',', ''), launch, machine, link, output, count // less, loss, cut))
             outcomes[-1].name = name
             print(outcomes[-1], flush=True)
-        # three cameras share the cores; each image is handed on twice, as in ``streaming``
-        share = len(CAMERAS) / min(len(CAMERAS), os.cpu_count() or 1)
-        parts = share * (2 * hop(launch) + sum(codec_alone('VGA')))
-        for outcome in outcomes:
+        for outcome in outcomes[2:]:
             outcome.limit = parts + 1e3 * (outcome.size * 8 / LINK + 2 * DELAY)
-        for name, count, jpeg in (('WebSocket, JPEG', 300, True), ('WebSocket, raw', 30, False)):
-            outcomes.append(websocket(name, launch, machine, link, output, count // less, jpeg))
-            print(outcomes[-1], flush=True)
     finally:
         if link is not None:
             link.close()
@@ -397,7 +400,7 @@ def main() -> None:
     print(text)
     if arguments.short:
         return None
-    first, control = outcomes[:2]
+    first, control = outcomes[2:]
     tick = 1e3 / RATE
     rows = [Row('three cameras: observation to action, median', first.median, 'ms', 40.0),
             Row('three cameras: the same, sum of its parts', first.limit, 'ms'),
@@ -408,7 +411,7 @@ def main() -> None:
             Row('cut: control resumes', control.resumed, 'ms', 1000.0),
             # the next observation, its way, the next tick
             Row('cut: the same, sum of its parts', control.limit + 2 * tick, 'ms')]
-    for outcome in (first, *outcomes[2:]):
+    for outcome in (first, *outcomes[:2]):
         rows += [Row(f'{outcome.name}: bytes per observation', outcome.size / 1e3, 'kB'),
                  Row(f'{outcome.name}: median', outcome.median, 'ms'),
                  Row(f'{outcome.name}: median over limit', outcome.median / outcome.limit, '')]
