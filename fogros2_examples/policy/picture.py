@@ -16,9 +16,8 @@ COLOURS = ('#d1495b', '#2e6f95', '#66a182', '#edae49')
 
 def summary(run: Mapping[str, Any]) -> str:
     """Return a line about a run of ``policy_arm``."""
-    count, done = len(run['targets']), list(run['reached'].values())
-    age = 1e3 * numpy.median([age for _, age in run['ages']])
-    return (f"{run['label']}: {len(done)} of {count} targets reached, after "
+    done, age = list(run['reached'].values()), 1e3 * numpy.median(numpy.array(run['ages'])[:, 1])
+    return (f"{run['label']}: {len(done)} of {len(run['targets'])} targets reached, after "
             f'{numpy.mean(done or [numpy.nan]):.2f} s; median age of an action {age:.0f} ms')
 
 

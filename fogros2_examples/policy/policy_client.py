@@ -56,8 +56,7 @@ class PolicyClient(Node):
         path = str(self.declare_parameter('policy', '').value)
         if path:
             self.models = self.create_publisher(UInt8MultiArray, 'policy_model', LATCHED)
-            model = array.array('B', Path(path).read_bytes())
-            self.models.publish(UInt8MultiArray(data=model))
+            self.models.publish(UInt8MultiArray(data=array.array('B', Path(path).read_bytes())))
         self.create_subscription(JointState, 'joint_states', self._measure, SENSED)
         self.create_subscription(JointTrajectory, 'action_chunk', self._take, SENSED)
         # the node's clock may be set back, and the robot has to stop all the same
