@@ -24,7 +24,7 @@ demo-policy: launch := tools/run.sh best -- ros2 launch fogros2_examples policy.
 	policy:=$(CURDIR)/.cache/policy.onnx runs:=$(CURDIR)/.cache/policy.jsonl
 demo-policy:
 	@tools/setup.sh bench
-	@tools/run.sh best -- python -m fogros2_examples.policy.training .cache/policy.onnx
+	@OPENBLAS_NUM_THREADS=1 tools/run.sh best -- python -m fogros2_examples.policy.training .cache/policy.onnx
 	@rm -f .cache/policy.jsonl
 	@$(launch) machine:=robot slowdown:=23.3
 	@$(launch) machine:=container picture:=$(CURDIR)/.cache/policy.png
