@@ -2,7 +2,7 @@
 # Everything below does its own set-up: see tools/setup.sh.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning cloud-check test test-fast test-kubernetes test-minimum fresh lint bench soak deb docs clean
+.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning demo-policy cloud-check test test-fast test-kubernetes test-minimum fresh lint bench soak deb docs clean
 
 ## demo   a launch file puts a talker on a container machine and takes it down again
 demo:
@@ -18,6 +18,16 @@ demo-video:
 demo-slam demo-grasp demo-planning: demo-%:
 	@tools/setup.sh bench
 	@tools/run.sh best -- ros2 launch fogros2_examples $*.launch.py picture:=$(CURDIR)/.cache/$*.png
+
+## demo-policy   a policy trained by imitation, on a slowed-down robot and on a container machine
+demo-policy: launch := tools/run.sh best -- ros2 launch fogros2_examples policy.launch.py \
+	policy:=$(CURDIR)/.cache/policy.onnx runs:=$(CURDIR)/.cache/policy.jsonl
+demo-policy:
+	@tools/setup.sh bench
+	@OPENBLAS_NUM_THREADS=1 tools/run.sh best -- python -m fogros2_examples.policy.training .cache/policy.onnx
+	@rm -f .cache/policy.jsonl
+	@$(launch) machine:=robot slowdown:=23.3
+	@$(launch) machine:=container picture:=$(CURDIR)/.cache/policy.png
 
 ## cloud-check   PROVIDER=aws|azure|gcp|kubernetes: the talker on the smallest machine there
 cloud-check:

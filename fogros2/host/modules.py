@@ -62,6 +62,7 @@ MODULES: Mapping[str, Module] = {module.name: module for module in (
     Module('gtsam', ('gtsam',)),
     Module('ompl', ('ompl',), (2,)),
     Module('fcl', ('python-fcl',)),
+    Module('onnxruntime', ('onnxruntime', 'onnxruntime-gpu')),
 )}
 IMAGES = ('numpy', 'av', 'cv2')
 CLOUDS = ('numpy', 'zstandard')
@@ -78,6 +79,8 @@ NEEDS: Mapping[tuple[str, str], tuple[str, ...]] = {
     ('fogros2_examples', 'slam'): ('numpy', 'cv2', 'gtsam'),
     ('fogros2_examples', 'grasp_planner'): ('numpy', 'cv2', 'fcl'),
     ('fogros2_examples', 'motion_planner'): ('numpy', 'ompl', 'fcl'),
+    ('fogros2_examples', 'policy_server'): ('numpy', 'cv2', 'onnxruntime'),
+    ('fogros2_examples', 'policy_client'): ('numpy', 'cv2'),
     ('fogros2', 'bridge'): ('foxglove',),
 }
 

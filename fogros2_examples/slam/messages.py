@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import array
+from typing import Optional
 
 from builtin_interfaces.msg import Time
 import cv2
@@ -16,10 +17,12 @@ from std_msgs.msg import Header
 from fogros2_examples.slam.geometry import Array, Camera, from_quaternion, quaternion
 
 Pixels = NDArray[numpy.uint8]
-#: Bytes of a pixel, and its conversion to grey; None: already grey.
-_COLOURS = {'bgr8': (3, cv2.COLOR_BGR2GRAY), 'rgb8': (3, cv2.COLOR_RGB2GRAY),
-            'bgra8': (4, cv2.COLOR_BGRA2GRAY), 'rgba8': (4, cv2.COLOR_RGBA2GRAY),
-            'mono8': (1, None), '8UC1': (1, None)}
+#: Bytes of a pixel, and its conversions to grey and to RGB; None: there is nothing to convert.
+_COLOURS = {'bgr8': (3, cv2.COLOR_BGR2GRAY, cv2.COLOR_BGR2RGB),
+            'rgb8': (3, cv2.COLOR_RGB2GRAY, None),
+            'bgra8': (4, cv2.COLOR_BGRA2GRAY, cv2.COLOR_BGRA2RGB),
+            'rgba8': (4, cv2.COLOR_RGBA2GRAY, cv2.COLOR_RGBA2RGB),
+            'mono8': (1, None, cv2.COLOR_GRAY2RGB), '8UC1': (1, None, cv2.COLOR_GRAY2RGB)}
 _DEPTHS = {'16UC1': 'u2', 'mono16': 'u2', '32FC1': 'f4'}
 
 
@@ -29,14 +32,32 @@ def grey(image: Image) -> Pixels:
 
     :raises ValueError: the encoding has no brightness, or the fields contradict each other.
     """
-    if image.encoding not in _COLOURS:
-        raise ValueError(f"an image as '{image.encoding}': {', '.join(_COLOURS)} are for me")
-    channels, conversion = _COLOURS[image.encoding]
+    channels, conversion = _colours(image, 0)
     pixels = _rows(image, channels)
     if conversion is None:
         return pixels
     return numpy.asarray(cv2.cvtColor(
         pixels.reshape(image.height, image.width, channels), conversion), numpy.uint8)
+
+
+def rgb(image: Image) -> Pixels:
+    """
+    Return the colours of an image, (height, width, 3) of red, green, blue.
+
+    :raises ValueError: the encoding has no brightness, or the fields contradict each other.
+    """
+    channels, conversion = _colours(image, 1)
+    pixels = _rows(image, channels).reshape(image.height, image.width, channels)
+    return pixels if conversion is None else numpy.asarray(
+        cv2.cvtColor(pixels, conversion), numpy.uint8)
+
+
+def _colours(image: Image, which: int) -> tuple[int, Optional[int]]:
+    """Return the channels of an image and its conversion, to grey or to RGB."""
+    if image.encoding not in _COLOURS:
+        raise ValueError(f"an image as '{image.encoding}': {', '.join(_COLOURS)} are for me")
+    channels, *conversions = _COLOURS[image.encoding]
+    return channels, conversions[which]
 
 
 def depth(image: Image) -> NDArray[numpy.generic]:

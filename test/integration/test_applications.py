@@ -85,7 +85,7 @@ def twin(source):
         'FogROSLaunchDescription', 'LaunchDescription').replace('CloudNode', 'Node')
 
 
-@pytest.mark.parametrize('name', ['grasp', 'planning', 'slam'])
+@pytest.mark.parametrize('name', ['grasp', 'planning', 'policy', 'slam'])
 def test_cloud_launch_file_has_at_most_ten_more_lines(name, launch, tmp_path):
     source = launch_file(name).read_text()
     here = twin(source)
@@ -274,6 +274,9 @@ def test_impossible_request_fails_the_launch(name, asked, said, launch, tmp_path
     ('grasp.grasp_camera.GraspCamera', 'trials:=-1', "'trials' is -1: it has to be 0 at least"),
     ('grasp.grasp_camera.GraspCamera', 'encoding:=rgb8', "'encoding' is 'rgb8': it has to be 16"),
     ('planning.planning_client.PlanningClient', 'picture:=/no/x.png', 'there is no folder /no'),
+    ('policy.policy_arm.PolicyArm', 'targets:=0', "'targets' is 0: it has to be from 1 to 1000"),
+    ('policy.policy_client.PolicyClient', 'rate:=5.0', "'rate' is 5: it has to be from 10"),
+    ('policy.policy_server.PolicyServer', 'images:=[/front]', 'each has to be of the form INPUT='),
     ('planning.motion_planner.MotionPlanner', 'time:=0.0', "'time' is 0: it has to be 0.1 at le")])
 def test_node_checks_its_parameters_first(node, asked, said):
     import rclpy

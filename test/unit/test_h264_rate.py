@@ -169,6 +169,16 @@ def test_stream_resumes_after_a_cut() -> None:
     assert len(between(records, 14, 16)) > 50
 
 
+@pytest.mark.parametrize('end', [106.0, 106.2, 106.5, 106.9, 107.2, 107.4])
+def test_picture_follows_the_end_of_a_cut_at_once(end: float) -> None:
+    """Whenever a cut ends, the next picture is the one that finds out."""
+    records = stream(lambda now: 10e6, 8, cut=lambda now: 102 <= now < end)
+    first = next(record for record in records if record.size and record.sent >= end - 100)
+    assert first.sent - (end - 100) < 0.35
+    # and the next ones follow at the stream's rate
+    assert len(between(records, first.sent, first.sent + 0.5)) > 8
+
+
 def test_stream_without_acknowledgements_is_not_limited() -> None:
     control = Control(Settings())
     assert all(control.due(n / 30, PIXELS) for n in range(300))
