@@ -31,6 +31,7 @@ from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_DEPENDENCIES, TAG_NAME
 from fogros2.provider.aws import AWSProvider, images, instances
 from fogros2.provider.aws.clients import Account
+from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.aws.failures import AwsError
 from fogros2.provider.vm import user_data
 from fogros2.testing.provider_contract import PUBLIC_KEY
@@ -744,7 +745,7 @@ def test_a_new_instance_that_ec2_does_not_know_yet_is_pending(aws):
     assert aws.provider.describe(machine_id).state is MachineState.PENDING
     aws.refuse('DescribeInstances', 'InvalidInstanceID.NotFound')
     with pytest.raises(MachineNotFound):
-        AWSProvider(Account(aws.account.session())).describe(machine_id)
+        AWSProvider(Ec2(Account(aws.account.session()))).describe(machine_id)
 
 
 def test_a_machine_that_ends_while_it_comes_up_says_why(aws):

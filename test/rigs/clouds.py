@@ -441,7 +441,8 @@ class Azure(Cloud):
         """Return a provider that remembers nothing of earlier tests."""
         from fogros2.provider.azure import AzureProvider
         from fogros2.provider.azure.account import Account
-        return AzureProvider(Account())
+        from fogros2.provider.azure.cloud import Azure
+        return AzureProvider(Azure(Account()))
 
     def variables(self, box: Any, folder: Path, *, here: bool = False) -> dict[str, str]:
         """Return the variables of a managed identity."""

@@ -27,6 +27,7 @@ from fogros2.agent_client import joined
 from fogros2.errors import ConfigurationError, MachineNotFound, PrerequisiteError, ProviderError
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider.aws import AWSProvider, clients, failures, instances, network
+from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.aws.options import Options
 from fogros2.provider.vm import address, cloud
 from fogros2.provider.vm import user_data as boot
@@ -620,7 +621,7 @@ def test_unreachable_aws_is_one_line(monkeypatch):
                         'FOGROS2_AWS_REGIONS': 'eu-central-1',
                         'AWS_ENDPOINT_URL': f'http://127.0.0.1:{free_port()}'}.items():
         monkeypatch.setenv(name, value)
-    provider = AWSProvider(clients.Account())
+    provider = AWSProvider(Ec2(clients.Account()))
     begin = time.monotonic()
     for ask in (provider.answers, lambda: list(provider.find({}))):
         with pytest.raises(PrerequisiteError, match='AWS does not answer') as caught:

@@ -17,9 +17,9 @@ from fogros2 import AzureCloudInstance
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider.azure import account, ending, failures, machines, prices
+from fogros2.provider.azure.cloud import Azure
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
-from fogros2.provider.azure.regions import REGIONS
 from fogros2.provider.vm.cloud import Order, Place
 from rigs.azure import catalogue, schema
 
@@ -212,7 +212,7 @@ def test_subscription_is_that_of_the_environment_or_of_the_login(monkeypatch, tm
 
 
 def test_regions_have_places_on_the_globe():
-    for latitude, longitude, place, _ in REGIONS.values():
+    for latitude, longitude, place, _ in Azure.regions.table.values():
         assert -90 < latitude < 90 and -180 <= longitude <= 180 and place
 
 

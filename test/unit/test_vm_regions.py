@@ -11,10 +11,11 @@ import time
 import pytest
 
 from fogros2.errors import PrerequisiteError, ProviderError
-from fogros2.provider.aws.regions import api_host, REGIONS
+from fogros2.provider.aws.cloud import api_host, Ec2
 from fogros2.provider.offers import Region
 from fogros2.provider.vm import regions
 
+REGIONS = Ec2.regions.table
 AWS = regions.Regions('AWS', REGIONS, api_host)
 
 

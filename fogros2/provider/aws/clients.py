@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
-import copy
 import os
 from pathlib import Path
 import threading
@@ -15,6 +14,7 @@ from typing import Any, Optional, TypeVar
 from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.aws import retry
 from fogros2.provider.aws.failures import AwsError, translated
+from fogros2.provider.vm import cloud as vm
 
 T = TypeVar('T')
 
@@ -57,7 +57,7 @@ def usual() -> Account:
         return _accounts[settings]
 
 
-class Account:
+class Account(vm.Account):
     """
     An AWS account as boto3 finds it (variables, files, roles); thread-safe.
 
@@ -67,6 +67,7 @@ class Account:
     """
 
     def __init__(self, session: Optional[Any] = None) -> None:
+        super().__init__()
         self._session = session
         #: Instances that this process has created, and when (``time.monotonic``).
         self.made: dict[str, float] = {}
@@ -75,36 +76,19 @@ class Account:
         self.doors: dict[str, tuple[str, Mapping[str, Any]]] = {}
         #: Ids of the disks that are deleted with instances that this process has seen run.
         self.disks: dict[str, set[str]] = {}
-        self._clients: dict[tuple[str, str, bool], Any] = {}
+        self.clients: dict[tuple[str, str, bool], Any] = {}
         # boto3 creates clients of one session in one thread only; their use is thread-safe
         self._lock = threading.RLock()
-        self._cancel: Optional[threading.Event] = None
-        self._hasty = False
 
-    def hasty(self) -> Account:
-        """Return this account with short time-outs and few attempts."""
-        other = copy.copy(self)
-        other._hasty = True
-        return other
-
-    def until(self, cancel: Optional[threading.Event]) -> Account:
-        """Return this account with calls that raise Cancelled once ``cancel`` is set."""
+    def having(self, cancel: Optional[threading.Event], *, hasty: bool = False) -> Account:
+        """Return this account for calls that end with ``cancel``, with the same session."""
         self.session()
-        other = copy.copy(self)
-        other._cancel = cancel
-        return other
+        return super().having(cancel, hasty=hasty)
 
     def just_made(self, instance: str) -> bool:
         """Return whether EC2 may not report an instance yet that this process has created."""
         made = self.made.get(instance)
         return made is not None and time.monotonic() - made < SETTLING
-
-    def apart(self) -> Account:
-        """Return this account with its own clients, which the others' throttling does not slow."""
-        self.session()
-        other = copy.copy(self)
-        other._clients = {}
-        return other
 
     def session(self) -> Any:
         """
@@ -150,7 +134,7 @@ class Account:
         :param hasty: short time-outs and few attempts, because a user waits for the answer.
         """
         with self._lock:
-            found = self._clients.get((service, region, hasty))
+            found = self.clients.get((service, region, hasty))
             if found is None:
                 session = self.session()
                 from botocore.config import Config
@@ -162,7 +146,7 @@ class Account:
                 with translated(f"reaching AWS's {service}", region):
                     found = session.client(service, region_name=region, config=config)
                 retry.teach(found)
-                self._clients[(service, region, hasty)] = found
+                self.clients[(service, region, hasty)] = found
             return found
 
     def call(
@@ -204,11 +188,11 @@ class Account:
         self, ask: Callable[[Any], T], service: str, region: str, what: str,
     ) -> T:
         def asked() -> T:
-            client = self.client(service, region, hasty=self._hasty)
+            client = self.client(service, region, hasty=self.hasty)
             with translated(what, region, decode=lambda message: self._decode(region, message)):
                 return ask(client)
 
-        return retry.unless(self._cancel, asked, what)
+        return retry.unless(self.cancel, asked, what)
 
     def _decode(self, region: str, message: str) -> str:
         """Return an encoded authorization failure as JSON, '' if that isn't allowed either."""

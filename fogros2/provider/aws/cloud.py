@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-import threading
 import time
 from typing import Any, ClassVar, Optional
 
@@ -16,11 +15,16 @@ from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.failures import AwsError
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import Ec2Prices
-from fogros2.provider.aws.regions import api_host, REGIONS
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import Order, own_name, Place, Vm, VmId
 from fogros2.provider.vm.options import VmOptions
-from fogros2.provider.vm.regions import Regions
+from fogros2.provider.vm.regions import read_table, Regions
+
+
+def api_host(region: str) -> str:
+    """Return the host of a region's EC2 API, which is in the region."""
+    suffix = '.cn' if region.startswith('cn-') else ''
+    return f'ec2.{region}.amazonaws.com{suffix}'
 
 
 class Ec2(Ec2Prices):
@@ -33,28 +37,20 @@ class Ec2(Ec2Prices):
     name: ClassVar[str] = 'aws'
     title: ClassVar[str] = 'AWS'
     options: ClassVar[type[VmOptions]] = Options
-    regions: ClassVar[Regions] = Regions('AWS', REGIONS, api_host)
+    regions: ClassVar[Regions] = Regions('AWS', read_table(__file__), api_host)
     id_form: ClassVar[str] = 'i-[0-9a-f]+'
     base_region: ClassVar[str] = 'us-east-1'
     regions_variable: ClassVar[str] = 'FOGROS2_AWS_REGIONS'
+    configured = staticmethod(clients.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
-        self._account = account or clients.usual()
-
-    def _with(self, account: Account) -> Ec2:
-        other = super().until(None)
-        other._account = account
-        return other
-
-    def until(self, cancel: Optional[threading.Event]) -> Ec2:
-        return self if cancel is None else self._with(self._account.until(cancel))
+        self._account: Account = account or clients.usual()
 
     def lasting(self) -> Ec2:
         """Return an adapter with its own clients, which the throttling of others does not slow."""
-        return self._with(self._account.apart())
-
-    def hasty(self) -> Ec2:
-        return self._with(self._account.hasty())
+        other = super().lasting()
+        other._account.clients = {}
+        return other
 
     # -- the account ----------------------------------------------------------------------------
 
@@ -63,7 +59,7 @@ class Ec2(Ec2Prices):
 
     def whoami(self, region: str) -> str:
         """Return the account; no policy can refuse this request."""
-        told = self._account.hasty().call(
+        told = self._account.having(self.cancel, hasty=True).call(
             'sts', region, 'get_caller_identity', 'asking AWS who we are')
         return f'account {told["Account"]}, {str(told["Arn"]).split(":")[-1]}, {region}'
 

@@ -12,10 +12,8 @@ from typing import Any, Optional
 
 from fogros2.errors import ProviderError
 from fogros2.provider.aws.clients import Account
-from fogros2.provider.aws.regions import REGIONS
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import VmCloud
-from fogros2.provider.vm.regions import distance_km
 
 #: The regions that have a pricing API.
 PRICING_REGIONS = ('us-east-1', 'eu-central-1', 'ap-south-1')
@@ -61,8 +59,11 @@ class Ec2Prices(VmCloud):
         """Return the prices on demand in US dollars per hour, by type; of one type if named."""
         wanted = {**ON_DEMAND, 'regionCode': region, **({'instanceType': name} if name else {})}
         found: dict[str, Decimal] = {}
+        place = self.regions.table.get(region)
+        near = self.regions.by_distance(PRICING_REGIONS, place[:2])[0].region if place \
+            else PRICING_REGIONS[0]
         for text in self._account.pages(
-                'pricing', pricing_region(region), 'get_products', 'PriceList',
+                'pricing', near, 'get_products', 'PriceList',
                 'asking for the prices', ServiceCode='AmazonEC2', FormatVersion='aws_v1',
                 Filters=[{'Type': 'TERM_MATCH', 'Field': field, 'Value': value}
                          for field, value in wanted.items()]):
@@ -90,14 +91,6 @@ class Ec2Prices(VmCloud):
                 newest[name, zone] = when
                 found.setdefault(name, {})[zone] = Decimal(entry['SpotPrice'])
         return found
-
-
-def pricing_region(region: str) -> str:
-    """Return the region with the nearest pricing API."""
-    if region not in REGIONS:
-        return PRICING_REGIONS[0]
-    here = REGIONS[region][:2]
-    return min(PRICING_REGIONS, key=lambda name: distance_km(here, REGIONS[name][:2]))
 
 
 def instance_type(entry: Mapping[str, Any]) -> Optional[MachineType]:

@@ -78,6 +78,8 @@ class Account(RestAccount):
         super().__init__()
         self._credential = credential
         self._lock = threading.Lock()
+        #: Machines that this process has just created, as Azure reports them.
+        self.seen: dict[str, Mapping[str, Any]] = {}
 
     def credential(self) -> Any:
         """
@@ -148,7 +150,7 @@ class Account(RestAccount):
 
         while url:
             try:
-                answer = requests.get(url, params=query, timeout=5.0 if self._hasty else 30.0)
+                answer = requests.get(url, params=query, timeout=5.0 if self.hasty else 30.0)
                 answer.raise_for_status()
                 found = answer.json()
                 yield from found['Items']

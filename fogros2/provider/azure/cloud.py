@@ -22,11 +22,10 @@ from fogros2.errors import ConfigurationError, FogError, MachineNotFound, Provid
 from fogros2.model import Image, MachineSpec, MachineState
 from fogros2.provider import TAG_EXPIRES
 from fogros2.provider.azure import ending, images, machines, prices
-from fogros2.provider.azure.account import Account, subscription
+from fogros2.provider.azure.account import Account, configured, subscription
 from fogros2.provider.azure.failures import AzureError, refusal
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
-from fogros2.provider.azure.regions import api_host, REGIONS
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import (
     Order,
@@ -40,8 +39,7 @@ from fogros2.provider.vm.cloud import (
     VmId,
 )
 from fogros2.provider.vm.options import ipv4, SSH, VmOptions
-from fogros2.provider.vm.regions import Regions
-from fogros2.provider.vm.rest import RestCloud
+from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import wait_until
 
 _VMS = 'providers/Microsoft.Compute/virtualMachines'
@@ -54,7 +52,7 @@ ALLOCATION = 300.0
 _USUAL = Account()
 
 
-class Azure(prices.AzurePrices, RestCloud):
+class Azure(prices.AzurePrices):
     """
     Virtual machines of Azure.
 
@@ -64,10 +62,13 @@ class Azure(prices.AzurePrices, RestCloud):
     name: ClassVar[str] = 'azure'
     title: ClassVar[str] = 'Azure'
     options: ClassVar[type[VmOptions]] = Options
-    regions: ClassVar[Regions] = Regions('Azure', REGIONS, api_host)
+    regions: ClassVar[Regions] = Regions(
+        'Azure', read_table(__file__),
+        lambda region: f'{region}.handler.control.monitor.azure.com')
     id_form: ClassVar[str] = 'fogros2-[0-9a-f]{16}-[0-9a-f]{8}'
     base_region: ClassVar[str] = 'westeurope'
     regions_variable: ClassVar[str] = 'FOGROS2_AZURE_REGIONS'
+    configured = staticmethod(configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
         self._account = account or _USUAL
@@ -123,7 +124,8 @@ class Azure(prices.AzurePrices, RestCloud):
     def get(self, region: str, vm: str) -> Optional[Vm]:
         try:
             # what insert has just seen is reported once
-            found = machines.vm_of(self._account.known.pop(f'vm {vm}', None) or self._entry(vm))
+            seen = self._account.seen
+            found = machines.vm_of(seen.pop(vm) if vm in seen else self._entry(vm))
         except AzureError as error:
             if not error.gone:
                 raise
@@ -242,7 +244,7 @@ class Azure(prices.AzurePrices, RestCloud):
         what = f"creating '{order.spec.name}' ({place.kind})"
         self._account.call('PUT', self._vm(name), what,
                            machines.request(place, order, known, str(nic['id']), tags))
-        entry = self._account.known[f'vm {name}'] = self._allocated(name, what)
+        entry = self._account.seen[name] = self._allocated(name, what)
         self._guard(name, place.region, order, known, entry)
         if known.nvidia:
             self._install_driver(name, place.region)
@@ -333,7 +335,7 @@ class Azure(prices.AzurePrices, RestCloud):
             list(pool.map(drop, chosen))
 
     def delete(self, machine: VmId) -> None:
-        self._account.known.pop(f'vm {machine.vm}', None)
+        self._account.seen.pop(machine.vm, None)
         self._drop(machine.attempt, [machine.vm], wait=True)
 
     def end_attempt(self, region: str, attempt: str) -> None:
@@ -382,7 +384,7 @@ class Azure(prices.AzurePrices, RestCloud):
 
     def stop(self, machine: VmId) -> None:
         """Deallocate a machine; its disk and its address stay, and are billed."""
-        self._account.known.pop(f'vm {machine.vm}', None)
+        self._account.seen.pop(machine.vm, None)
         self._account.call('POST', self._vm(machine.vm, '/deallocate'), f'stopping {machine.vm}')
 
     def start(self, machine: VmId) -> None:

@@ -13,10 +13,9 @@ from fogros2.errors import ConfigurationError, MachineNotFound
 from fogros2.model import Image, MachineSpec, MachineState
 from fogros2.provider import TAG_ON_EXIT
 from fogros2.provider.gcp import firewall, guest, images, instances, prices
-from fogros2.provider.gcp.account import Account, ENDPOINT_VARIABLE
+from fogros2.provider.gcp.account import Account, configured, ENDPOINT_VARIABLE
 from fogros2.provider.gcp.failures import GoogleError
 from fogros2.provider.gcp.options import Options
-from fogros2.provider.gcp.regions import api_host, REGIONS
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.address import ADDRESS_VARIABLE
 from fogros2.provider.vm.cloud import (
@@ -26,18 +25,18 @@ from fogros2.provider.vm.cloud import (
     Place,
     TAG_ATTEMPT,
     Vm,
+    VmCloud,
     VmId,
 )
 from fogros2.provider.vm.options import ipv4, SSH, VmOptions
-from fogros2.provider.vm.regions import Regions
-from fogros2.provider.vm.rest import RestCloud
+from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import cancellable
 
 #: The region of FogROS2's default zone.
 DEFAULT_REGION = 'us-central1'
 
 
-class ComputeEngine(RestCloud):
+class ComputeEngine(VmCloud):
     """
     Compute Engine instances, each with its own firewall rules.
 
@@ -47,11 +46,14 @@ class ComputeEngine(RestCloud):
     name: ClassVar[str] = 'gcp'
     title: ClassVar[str] = 'Google Cloud'
     options: ClassVar[type[VmOptions]] = Options
-    regions: ClassVar[Regions] = Regions('Google Cloud', REGIONS, api_host)
+    regions: ClassVar[Regions] = Regions(
+        'Google Cloud', read_table(__file__),
+        lambda region: f'compute.{region}.rep.googleapis.com')
     #: Project, zone and name.
     id_form: ClassVar[str] = r'[a-z0-9.:-]+/[a-z0-9-]+/fogros2-[0-9a-f]{16}'
     base_region: ClassVar[str] = DEFAULT_REGION
     regions_variable: ClassVar[str] = 'FOGROS2_GCP_REGIONS'
+    configured = staticmethod(configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
         self._account: Account = account or Account()
@@ -91,16 +93,13 @@ class ComputeEngine(RestCloud):
 
     def _types(self, region: str, names: Sequence[str]) -> list[Mapping[str, Any]]:
         """Return the types of every zone of a region; all types if none is named."""
-        key, known = ' '.join((self._account.project, region, *names)), self._account.known
-        if key not in known:
-            kinds = ' OR '.join(f'(name = "{name}")' for name in names)
-            zones = ' OR '.join(f'(zone = "{region}-{letter}")' for letter in 'abcdef')
-            known[key] = list(self._account.pages(
-                f'{self._account.project}/aggregated/machineTypes', 'asking for the machine types',
-                maxResults='500',
-                filter=f'({kinds}) AND ({zones})' if names else f'({zones})'))
-        found: list[Mapping[str, Any]] = known[key]
-        return found
+        kinds = ' OR '.join(f'(name = "{name}")' for name in names)
+        zones = ' OR '.join(f'(zone = "{region}-{letter}")' for letter in 'abcdef')
+        project = self._account.project
+        return self._account.once(' '.join((project, region, *names)), lambda: list(
+            self._account.pages(
+                f'{project}/aggregated/machineTypes', 'asking for the machine types',
+                maxResults='500', filter=f'({kinds}) AND ({zones})' if names else f'({zones})')))
 
     def types(self, region: str) -> list[MachineType]:
         found = {entry['name']: entry for entry in self._types(region, ())}

@@ -41,6 +41,8 @@ SETTLED = 900.0
 _LOGGER = logging.getLogger(__name__)
 
 Adapter = TypeVar('Adapter', bound='VmCloud')
+Own = TypeVar('Own', bound='Account')
+T = TypeVar('T')
 
 
 class CloudError(ProviderError):
@@ -176,6 +178,31 @@ def own_tags(
     return {key: value for key, value in tags.items() if value}
 
 
+class Account:
+    """The user's account at a cloud; thread-safe."""
+
+    #: Set when the launch ends; calls then raise Cancelled.
+    cancel: Optional[threading.Event] = None
+    #: Short time-outs and few attempts, because a user waits for the answer.
+    hasty = False
+
+    def __init__(self) -> None:
+        self._known: dict[str, Any] = {}
+
+    def having(self: Own, cancel: Optional[threading.Event], *, hasty: bool = False) -> Own:
+        """Return this account for calls that end with ``cancel``; it shares what is known."""
+        other = copy.copy(self)
+        other.cancel, other.hasty = cancel, hasty
+        return other
+
+    def once(self, key: str, ask: Callable[[], T]) -> T:
+        """Return the answer to a question that is asked once in this process."""
+        if key not in self._known:
+            self._known[key] = ask()
+        found: T = self._known[key]
+        return found
+
+
 class VmCloud(abc.ABC):
     """
     The API of one cloud. All methods may be called by several threads at the same time.
@@ -197,11 +224,22 @@ class VmCloud(abc.ABC):
     regions_variable: ClassVar[str] = ''
     #: Set when the launch ends; calls then raise Cancelled.
     cancel: Optional[threading.Event] = None
+    #: An ``Account``, if the cloud's requests go through one.
+    _account: Any = None
 
-    def until(self: Adapter, cancel: Optional[threading.Event]) -> Adapter:
+    @staticmethod
+    def configured() -> bool:
+        """Return whether the cloud is set up here; read only files and variables."""
+        return True
+
+    def until(
+        self: Adapter, cancel: Optional[threading.Event], *, hasty: bool = False,
+    ) -> Adapter:
         """Return an adapter whose calls raise Cancelled once ``cancel`` is set."""
         other = copy.copy(self)
         other.cancel = cancel
+        if self._account is not None:
+            other._account = self._account.having(cancel, hasty=hasty)
         return other
 
     def lasting(self: Adapter) -> Adapter:
@@ -210,7 +248,7 @@ class VmCloud(abc.ABC):
 
     def hasty(self: Adapter) -> Adapter:
         """Return an adapter with short time-outs, for values that are only displayed."""
-        return self
+        return self.until(self.cancel, hasty=True)
 
     # -- the account ----------------------------------------------------------------------------
 

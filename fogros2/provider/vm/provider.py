@@ -62,18 +62,31 @@ class VmProvider(Provider):
     """
     Virtual machines of one cloud.
 
-    :param cloud: the adapter; its calls are not cancelled.
+    :param cloud: None for an adapter with the account of this computer's user.
     """
 
+    #: The class of the adapter.
+    adapter: ClassVar[type[VmCloud]]
     capabilities: ClassVar[Capabilities] = Capabilities(
         firewall=True, one_time_host_key=True, choices=True, adopt=True, regions=True,
         prices=True, agent_directory=AGENT_DIRECTORY, agent_program=AGENT_PROGRAM)
 
-    def __init__(self, cloud: VmCloud) -> None:
-        self._cloud = cloud
+    def __init__(self, cloud: Optional[VmCloud] = None) -> None:
+        # its calls are not cancelled
+        self._cloud = cloud or self.adapter()
         self._searched: tuple[str, ...] = ()
         #: Notes for people, by the cloud's id of the machine.
         self._notes: dict[str, str] = {}
+
+    @classmethod
+    def configured(cls) -> bool:
+        """Return whether the cloud is set up here."""
+        return cls.adapter.configured()
+
+    @classmethod
+    def region_names(cls) -> Sequence[str]:
+        """Return the names of all regions."""
+        return tuple(cls.adapter.regions.table)
 
     def _until(self) -> VmCloud:
         """Return the adapter for a call that ends with the launch; later calls are clean-up."""

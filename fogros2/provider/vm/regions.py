@@ -8,7 +8,9 @@ The resulting table is Table VI of the FogROS2 paper.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+import csv
 import math
+from pathlib import Path
 import socket
 import statistics
 import threading
@@ -86,6 +88,18 @@ def distance_km(one: tuple[float, float], other: tuple[float, float]) -> float:
             + math.cos(latitude) * math.cos(latitude2)
             * math.sin((longitude2 - longitude) / 2) ** 2)
     return 2 * 6371.0 * math.asin(math.sqrt(min(1.0, half)))
+
+
+def read_table(beside: str) -> Table:
+    """
+    Read ``regions.csv``, in which places are in degrees.
+
+    :param beside: a file of the same folder.
+    """
+    with Path(beside).with_name('regions.csv').open(encoding='utf-8', newline='') as lines:
+        _, *rows = csv.reader(lines)
+    return {name: (float(latitude), float(longitude), place, everybody == 'yes')
+            for name, latitude, longitude, place, everybody in rows}
 
 
 class Regions:

@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
-import copy
 import functools
 import threading
-from typing import Any, ClassVar, NamedTuple, Optional, TypeVar
+from typing import Any, ClassVar, NamedTuple, Optional
 
 from fogros2.errors import Cancelled, FogError
-from fogros2.provider.vm.cloud import VmCloud
+from fogros2.provider.vm.cloud import Account
 from fogros2.provider.vm.failures import CodedError, not_the_cloud, one_line, Silent
 from fogros2.waiting import cancellable
 
@@ -21,9 +20,6 @@ ATTEMPTS = 6
 PAUSE, LONGEST = 1.0, 20.0
 #: Seconds to wait for the answer to a sent request, which may create something.
 ON_ITS_WAY = 4.0
-
-Own = TypeVar('Own', bound='RestAccount')
-Cloud = TypeVar('Cloud', bound='RestCloud')
 
 
 class Answer(NamedTuple):
@@ -44,29 +40,12 @@ def _session() -> Any:
     return session
 
 
-class RestAccount(abc.ABC):
-    """The user's account at a cloud with a REST API; thread-safe."""
+class RestAccount(Account, abc.ABC):
+    """The user's account at a cloud with a REST API."""
 
     TITLE: ClassVar[str]
     #: Names another address of the API.
     ENDPOINT_VARIABLE: ClassVar[str]
-    #: Set when the launch ends; calls then raise Cancelled.
-    cancel: Optional[threading.Event] = None
-    _hasty = False
-
-    def __init__(self) -> None:
-        #: What was asked once for this process, such as the types of a region.
-        self.known: dict[str, Any] = {}
-
-    def having(self: Own, cancel: Optional[threading.Event], *, hasty: bool = False) -> Own:
-        """
-        Return this account with calls that raise Cancelled once ``cancel`` is set.
-
-        :param hasty: short time-outs and few attempts, because a user waits for the answer.
-        """
-        other = copy.copy(self)
-        other.cancel, other._hasty = cancel, hasty
-        return other
 
     @abc.abstractmethod
     def token(self, what: str) -> str:
@@ -103,7 +82,7 @@ class RestAccount(abc.ABC):
                 error.refused = not unsure
                 silent = isinstance(error, Silent)
                 if not error.temporary or silent and not repeatable \
-                        or attempt >= (2 if silent or self._hasty else ATTEMPTS):
+                        or attempt >= (2 if silent or self.hasty else ATTEMPTS):
                     raise
                 pause = PAUSE * 2 ** (attempt - 1) if error.pause is None else error.pause
             except FogError as error:
@@ -124,7 +103,7 @@ class RestAccount(abc.ABC):
         try:
             answer = _session().request(
                 method, url, params=query, json=body, headers=head, allow_redirects=False,
-                timeout=(5.0, 5.0 if self._hasty else timeout))
+                timeout=(5.0, 5.0 if self.hasty else timeout))
         except requests.RequestException as error:
             raise self.silent(error, what, isinstance(error, requests.ConnectTimeout)) from error
         try:
@@ -146,21 +125,3 @@ class RestAccount(abc.ABC):
         return Silent(
             f'{what} failed: {self.TITLE} does not answer: {one_line(error)}',
             f'is there a way to the Internet (a proxy, {self.ENDPOINT_VARIABLE})?', unsent=unsent)
-
-
-class RestCloud(VmCloud):
-    """A cloud whose adapter makes all requests by a RestAccount."""
-
-    _account: Any  #: a RestAccount
-
-    def until(self: Cloud, cancel: Optional[threading.Event]) -> Cloud:
-        """Return an adapter whose calls raise Cancelled once ``cancel`` is set."""
-        other = super().until(cancel)
-        other._account = self._account.having(cancel)
-        return other
-
-    def hasty(self: Cloud) -> Cloud:
-        """Return an adapter with short time-outs."""
-        other = super().until(self.cancel)
-        other._account = self._account.having(self.cancel, hasty=True)
-        return other
