@@ -2,9 +2,8 @@
 """
 EC2 instances, by boto3.
 
-In reading order: ``options``, ``spot`` (the preemption notice), ``failures`` (AWS's
-refusals), ``retry`` and ``clients`` (calls), ``instances``, ``network``, ``ending``,
-``prices``, ``images``, ``cloud`` (the adapter).
+In reading order: ``options``, ``failures`` (AWS's refusals), ``retry`` and ``clients`` (calls),
+``instances``, ``network``, ``ending``, ``prices``, ``images``, ``cloud`` (the adapter).
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import dataclasses
 from typing import ClassVar
 
 from fogros2.provider import Capabilities
-from fogros2.provider.aws import spot
+from fogros2.provider.aws import instances
 from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.vm.cloud import VmCloud
 from fogros2.provider.vm.provider import VmProvider
@@ -25,4 +24,4 @@ class AWSProvider(VmProvider):
     name: ClassVar[str] = Ec2.name
     adapter: ClassVar[type[VmCloud]] = Ec2
     capabilities: ClassVar[Capabilities] = dataclasses.replace(
-        VmProvider.capabilities, stop=True, images=True, preemption_notice=spot.NOTICE)
+        VmProvider.capabilities, stop=True, images=True, preemption_notice=instances.NOTICE)

@@ -13,8 +13,9 @@ from typing import Any, Optional, TypeVar
 
 from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.aws import retry
-from fogros2.provider.aws.failures import AwsError, translated
+from fogros2.provider.aws.failures import translated
 from fogros2.provider.vm import cloud as vm
+from fogros2.provider.vm.failures import unless_gone
 
 T = TypeVar('T')
 
@@ -167,11 +168,8 @@ class Account(vm.Account):
 
     def remove(self, region: str, operation: str, what: str, **parameters: Any) -> None:
         """Make a call of EC2 that deletes something; it may be deleted already."""
-        try:
+        with unless_gone():
             self.call('ec2', region, operation, what, **parameters)
-        except AwsError as error:
-            if not error.gone:
-                raise
 
     def pages(
         self, service: str, region: str, operation: str, key: str, what: str,

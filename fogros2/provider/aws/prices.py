@@ -31,12 +31,10 @@ class Ec2Prices(VmCloud):
     _account: Account
 
     def account_key(self) -> str:
-        """Return what distinguishes this account and endpoint from others in the cache."""
         return '|'.join(os.environ.get(name, '') for name in (
             'AWS_ENDPOINT_URL', 'AWS_ENDPOINT_URL_EC2', 'AWS_ENDPOINT_URL_PRICING', 'AWS_PROFILE'))
 
     def types(self, region: str) -> Iterator[MachineType]:
-        """Yield the current types that run Linux on x86_64 or arm64."""
         for entry in self._account.pages(
                 'ec2', region, 'describe_instance_types', 'InstanceTypes',
                 'asking for the instance types', Filters=[
@@ -47,7 +45,6 @@ class Ec2Prices(VmCloud):
                 yield kind
 
     def zones(self, region: str) -> dict[str, list[str]]:
-        """Return the zones of a region that have each type."""
         found: dict[str, list[str]] = {}
         for entry in self._account.pages(
                 'ec2', region, 'describe_instance_type_offerings', 'InstanceTypeOfferings',
@@ -56,7 +53,6 @@ class Ec2Prices(VmCloud):
         return {name: sorted(places) for name, places in found.items()}
 
     def prices(self, region: str, name: str = '') -> dict[str, Decimal]:
-        """Return the prices on demand in US dollars per hour, by type; of one type if named."""
         wanted = {**ON_DEMAND, 'regionCode': region, **({'instanceType': name} if name else {})}
         found: dict[str, Decimal] = {}
         place = self.regions.table.get(region)
@@ -74,7 +70,6 @@ class Ec2Prices(VmCloud):
     def spot_prices(
         self, region: str, names: Optional[Sequence[str]],
     ) -> dict[str, dict[str, Decimal]]:
-        """Return the newest spot prices in US dollars per hour, by type and zone."""
         found: dict[str, dict[str, Decimal]] = {}
         newest: dict[tuple[str, str], float] = {}
         # a history from now on has only the current prices

@@ -13,15 +13,11 @@ import threading
 from typing import Any, Optional, TypeVar
 
 from fogros2.errors import Cancelled
-from fogros2.provider.aws.failures import NO_ROOM
+from fogros2.provider.aws.failures import AwsError
 from fogros2.waiting import cancellable
 
 T = TypeVar('T')
 
-#: AWS refused a request because of its rate, and did nothing.
-THROTTLED = frozenset({
-    'RequestLimitExceeded', 'Throttling', 'ThrottlingException', 'RequestThrottled',
-    'EC2ThrottledException', 'TooManyRequestsException'})
 #: Attempts of a call without any answer.
 UNANSWERED = 2
 #: Seconds to wait for the answer to a sent request, which may create something.
@@ -91,12 +87,13 @@ def _answered(
     call: Optional[_Call] = getattr(_here, 'call', None)
     http = response[0] if response else None
     code = response[1].get('Error', {}).get('Code', '') if response else ''
+    known = AwsError.known(code)
     if call is not None and call.sent:
         call.sent = False
         fault = http is None or http.status_code >= 500
-        call.unsure = call.unsure or fault and code not in NO_ROOM | THROTTLED
+        call.unsure = call.unsure or fault and not known.full and not known.temporary
     if caught_exception is not None and (
             attempts >= UNANSWERED or call is not None and call.cancel.is_set()):
         raise caught_exception
-    if http is not None and http.status_code >= 500 and code in NO_ROOM:
+    if http is not None and http.status_code >= 500 and known.full:
         http.status_code = 400

@@ -19,11 +19,11 @@ import time
 from typing import Any, ClassVar, Optional
 
 from fogros2.errors import ConfigurationError, FogError, MachineNotFound, ProviderError
-from fogros2.model import Image, MachineSpec, MachineState
+from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_EXPIRES
 from fogros2.provider.azure import ending, images, machines, prices
 from fogros2.provider.azure.account import Account, configured, subscription
-from fogros2.provider.azure.failures import AzureError, refusal
+from fogros2.provider.azure.failures import refusal
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
 from fogros2.provider.offers import MachineType
@@ -38,6 +38,7 @@ from fogros2.provider.vm.cloud import (
     Vm,
     VmId,
 )
+from fogros2.provider.vm.failures import unless_gone
 from fogros2.provider.vm.options import ipv4, SSH, VmOptions
 from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import wait_until
@@ -52,7 +53,7 @@ ALLOCATION = 300.0
 _USUAL = Account()
 
 
-class Azure(prices.AzurePrices):
+class Azure(prices.AzurePrices, images.AzureImages):
     """
     Virtual machines of Azure.
 
@@ -78,7 +79,6 @@ class Azure(prices.AzurePrices):
     # -- the account ----------------------------------------------------------------------------
 
     def check_credentials(self) -> None:
-        """Check that a subscription is named, and that azure-identity is installed."""
         subscription()
         self._account.credential()
 
@@ -122,14 +122,13 @@ class Azure(prices.AzurePrices):
                 for entry in found]
 
     def get(self, region: str, vm: str) -> Optional[Vm]:
-        try:
-            # what insert has just seen is reported once
-            seen = self._account.seen
-            found = machines.vm_of(seen.pop(vm) if vm in seen else self._entry(vm))
-        except AzureError as error:
-            if not error.gone:
-                raise
-            raise MachineNotFound(f'there is no {vm} in {region} any more') from error
+        # what insert has just seen is reported once
+        entry = self._account.seen.pop(vm, {})
+        with unless_gone():
+            entry = entry or self._entry(vm)
+        if not entry:
+            raise MachineNotFound(f'there is no {vm} in {region} any more')
+        found = machines.vm_of(entry)
         if found.state is MachineState.DELETED:
             raise MachineNotFound(f'{vm} in {region} is being deleted')
         return dataclasses.replace(found, note=self._notes.get(vm, ''))
@@ -170,13 +169,10 @@ class Azure(prices.AzurePrices):
     def _subnet(self, group: str, region: str) -> str:
         """Return a subnet of the user's own group in a region, '' if there is none."""
         found: list[Mapping[str, Any]] = []
-        try:
+        with unless_gone():  # pull request 109 creates the group
             found += self._account.pages(
                 self._account.path(group, f'{_NET}/virtualNetworks'),
                 f'looking for a network in {group}') if group else ()
-        except AzureError as error:
-            if not error.gone:  # pull request 109 creates the group
-                raise
         return next((str(subnet['id']) for network in found if prices.is_in(network, region)
                      for subnet in network['properties'].get('subnets') or ()
                      if not subnet['properties'].get('delegations')), '')
@@ -184,7 +180,6 @@ class Azure(prices.AzurePrices):
     def undo_begin(
         self, region: str, attempt: str, created: Sequence[str],
     ) -> Iterator[tuple[str, Callable[[], None]]]:
-        """Yield the deletion of the groups that this process has created."""
         yield 'the resource group', lambda: self._drop(attempt, created)
 
     def insert(
@@ -317,18 +312,15 @@ class Azure(prices.AzurePrices):
 
         def drop(name: str) -> None:
             path = self._account.path(name)
-            if name not in listed:
-                try:
-                    found = self._account.call('GET', path, f'looking for the group {name}')
-                except AzureError as error:
-                    if error.gone:
-                        return
-                    raise
-                if (found.get('tags') or {}).get(TAG_ATTEMPT) != attempt:
+            with unless_gone():
+                tags = {} if name in listed else self._account.call(
+                    'GET', path, f'looking for the group {name}').get('tags') or {}
+                if name not in listed and tags.get(TAG_ATTEMPT) != attempt:
                     raise ProviderError(f'the group {name} has no tag of FogROS2, and stays',
                                         'FogROS2 deletes only groups that it created')
-            self._account.delete(path, f'deleting the group {name}', wait=wait,
-                                 query={'forceDeletionTypes': 'Microsoft.Compute/virtualMachines'})
+                self._account.delete(
+                    path, f'deleting the group {name}', wait=wait,
+                    query={'forceDeletionTypes': 'Microsoft.Compute/virtualMachines'})
 
         chosen = sorted(name for name in {*names, *listed} if empty is None or name in empty)
         with ThreadPoolExecutor(max(1, min(8, len(chosen))), 'fog-azure') as pool:
@@ -357,7 +349,6 @@ class Azure(prices.AzurePrices):
     # -- changes of a machine -------------------------------------------------------------------
 
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
-        """Replace the rule of a port, or delete it."""
         what, name = f'changing port {port} of {machine.vm}', machine.vm
         path = self._account.path(
             name, f'{_NET}/networkSecurityGroups/{name}/securityRules/tcp-{port}')
@@ -383,17 +374,14 @@ class Azure(prices.AzurePrices):
                             time.time() + spec.lifetime)
 
     def stop(self, machine: VmId) -> None:
-        """Deallocate a machine; its disk and its address stay, and are billed."""
         self._account.seen.pop(machine.vm, None)
         self._account.call('POST', self._vm(machine.vm, '/deallocate'), f'stopping {machine.vm}')
 
     def start(self, machine: VmId) -> None:
-        """Start a machine; return when Azure has found room for it."""
         self._account.call('POST', self._vm(machine.vm, '/start'), f'starting {machine.vm}',
                            wait=True)
 
     def end_command(self, tags: Mapping[str, str]) -> tuple[str, ...]:
-        """Return the command by which a machine deletes its group, or deallocates itself."""
         return ending.end_command()
 
     # -- images ---------------------------------------------------------------------------------
@@ -403,10 +391,3 @@ class Azure(prices.AzurePrices):
         size = self.sizes(machine.region)[entry['properties']['hardwareProfile']['vmSize']]
         return images.bake(self._account, machine, entry, prices.machine_type(size),
                            prices.generation(size), name, dependencies)
-
-    def images(self, region: str) -> Iterable[Image]:
-        return images.images_in(self._account, region)
-
-    def delete_image(self, image_id: str) -> None:
-        """Delete an image with its group."""
-        images.delete(self._account, image_id)

@@ -29,7 +29,6 @@ class AzurePrices(VmCloud):
     _account: Account
 
     def account_key(self) -> str:
-        """Return what distinguishes this account and endpoint from others in the cache."""
         return '|'.join((endpoint(), os.environ.get(PRICES_VARIABLE, ''),
                          os.environ.get('AZURE_SUBSCRIPTION_ID', '')))
 
@@ -43,21 +42,17 @@ class AzurePrices(VmCloud):
                 limit.get('type') == 'Location' for limit in entry.get('restrictions') or ())})
 
     def types(self, region: str) -> Iterator[MachineType]:
-        """Yield the types that run Linux on x86_64 or arm64."""
         yield from map(machine_type, self.sizes(region).values())
 
     def zones(self, region: str) -> dict[str, list[str]]:
-        """Return the region as the only zone of each size: Azure chooses one."""
         return {name: [region] for name in self.sizes(region)}
 
     def prices(self, region: str, name: str = '') -> dict[str, Decimal]:
-        """Return the prices on demand in US dollars per hour, by type; of one type if named."""
         return {kind: price for kind, price, spot in self._retail(region, name) if not spot}
 
     def spot_prices(
         self, region: str, names: Optional[Sequence[str]],
     ) -> dict[str, dict[str, Decimal]]:
-        """Return the spot prices in US dollars per hour; they are the same in all zones."""
         one = names[0] if names and len(names) == 1 else ''
         return {kind: {region: price} for kind, price, spot in self._retail(region, one) if spot}
 

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import copy
 from decimal import Decimal
 import os
 from typing import Any, ClassVar, Optional
 
 from fogros2.errors import ConfigurationError, MachineNotFound
-from fogros2.model import Image, MachineSpec, MachineState
+from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_ON_EXIT
 from fogros2.provider.gcp import firewall, guest, images, instances, prices
 from fogros2.provider.gcp.account import Account, configured, ENDPOINT_VARIABLE
@@ -25,9 +25,9 @@ from fogros2.provider.vm.cloud import (
     Place,
     TAG_ATTEMPT,
     Vm,
-    VmCloud,
     VmId,
 )
+from fogros2.provider.vm.failures import unless_gone
 from fogros2.provider.vm.options import ipv4, SSH, VmOptions
 from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import cancellable
@@ -36,7 +36,7 @@ from fogros2.waiting import cancellable
 DEFAULT_REGION = 'us-central1'
 
 
-class ComputeEngine(VmCloud):
+class ComputeEngine(images.GoogleImages):
     """
     Compute Engine instances, each with its own firewall rules.
 
@@ -83,7 +83,6 @@ class ComputeEngine(VmCloud):
         return os.environ.get('CLOUDSDK_COMPUTE_REGION', '') or zone[:-2] or DEFAULT_REGION
 
     def searched_regions(self) -> list[str]:
-        """Return that one request answers for all regions."""
         return ['']
 
     # -- types and prices -----------------------------------------------------------------------
@@ -119,7 +118,6 @@ class ComputeEngine(VmCloud):
         return {name: cost for name, cost in costs.items() if cost is not None}
 
     def prices(self, region: str, name: str = '') -> dict[str, Decimal]:
-        """Return the prices on demand by Google's catalogue, if a key for it is set."""
         return self._priced(region, (name,) if name else (), False)
 
     def spot_prices(
@@ -150,12 +148,11 @@ class ComputeEngine(VmCloud):
 
     def get(self, region: str, vm: str) -> Optional[Vm]:
         project = vm.partition('/')[0]
-        try:
+        found: Mapping[str, Any] = {}
+        with unless_gone():
             found = self._account.call('GET', _path(vm), f'looking for {vm}')
-        except GoogleError as error:
-            if error.gone:
-                raise MachineNotFound(f'there is no {vm} any more') from error
-            raise
+        if not found:
+            raise MachineNotFound(f'there is no {vm} any more')
         self._account.labels[vm] = found['labelFingerprint'], found.get('labels', {})
         known = instances.vm_of(project, found)
         if known.state is MachineState.DELETED:
@@ -186,7 +183,6 @@ class ComputeEngine(VmCloud):
         return {kind: chosen[kind] for kind in types if kind in chosen}
 
     def begin(self, region: str, order: Order, created: list[str]) -> None:
-        """Create the firewall rules."""
         network = f'global/networks/{order.options.network}'
         tags = {**{key: value for key, value in order.tags.items() if key.startswith('fogros2-')},
                 'region': region}
@@ -204,12 +200,10 @@ class ComputeEngine(VmCloud):
     def undo_begin(
         self, region: str, attempt: str, created: Sequence[str],
     ) -> Iterator[tuple[str, Callable[[], None]]]:
-        """Yield the deletion of the firewall rules."""
         yield 'the firewall rules', lambda: firewall.delete(
             self._account, self._account.project, attempt)
 
     def places(self, region: str, order: Order) -> Iterator[str]:
-        """Yield the zones of the region that have one of the types."""
         types = self._types(region, order.options.types)
         yield from [order.options.zone] if order.options.zone else sorted(
             {str(entry['zone']) for entry in types})
@@ -241,7 +235,6 @@ class ComputeEngine(VmCloud):
                      if f'/regions/{place.region}/' in url), '')
 
     def end_command(self, tags: Mapping[str, str]) -> tuple[str, ...]:
-        """Return the deletion; an instance that is to be stopped shuts down."""
         return super().end_command(tags) if tags.get(TAG_ON_EXIT) == 'stop' \
             else guest.deletion(self._account.endpoint)
 
@@ -267,7 +260,7 @@ class ComputeEngine(VmCloud):
         return [found for found in tags if region in ('', found.get('region'))]
 
     def attempts(self, region: str) -> list[str]:
-        """Return the attempts with an instance, unless a stopped disk is all that is left."""
+        # of one that ended itself, a stopped disk is all that is left
         return [vm.tags.get(TAG_ATTEMPT, '') for vm in self._instances({})
                 if vm.state is not MachineState.DELETED]
 
@@ -308,19 +301,6 @@ class ComputeEngine(VmCloud):
 
     def start(self, machine: VmId) -> None:
         self._account.run('POST', f'{_path(machine.vm)}/start', f'starting {machine.vm}')
-
-    # -- images ---------------------------------------------------------------------------------
-
-    def bake(self, machine: VmId, name: str, dependencies: str) -> str:
-        vm = self.get(machine.region, machine.vm)
-        assert vm is not None
-        return images.bake(self._account, vm, name, dependencies)
-
-    def images(self, region: str) -> Iterable[Image]:
-        return images.images_in(self._account, region)
-
-    def delete_image(self, image_id: str) -> None:
-        images.delete(self._account, image_id)
 
 
 def _path(vm: str) -> str:

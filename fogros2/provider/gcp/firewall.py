@@ -15,8 +15,8 @@ from typing import Any
 
 from fogros2.errors import ProviderError
 from fogros2.provider.gcp.account import Account
-from fogros2.provider.gcp.failures import GoogleError
 from fogros2.provider.vm.cloud import own_name, TAG_SSH_FROM
+from fogros2.provider.vm.failures import unless_gone
 from fogros2.provider.vm.options import ipv4, SSH
 
 ALLOW, DENY = 1000, 2000
@@ -70,13 +70,12 @@ def allow(
     if not ipv4(sources):
         account.remove(f'{base}/{name}', what)
         return
-    try:
+    deny: Mapping[str, Any] = {}
+    with unless_gone():
         deny = account.call('GET', f'{base}/{own_name(attempt)}-deny', what)
-    except GoogleError as error:
-        if not error.gone:
-            raise
+    if not deny:
         raise ProviderError('the machine has no firewall rules any more',
-                            'ros2 fog list shows whether it is there') from error
+                            'ros2 fog list shows whether it is there')
     tags = tags_of(deny)
     more = tags.get(TAG_SSH_FROM, '').split() if port == SSH else []
     body = rule(attempt, f'tcp-{port}', deny['network'], tags, ipv4([*sources, *more]), 'tcp',
