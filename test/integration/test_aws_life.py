@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 from decimal import Decimal
 import gzip
@@ -25,7 +24,6 @@ from fogros2.errors import (
     MachineNotFound,
     PrerequisiteError,
     ProviderError,
-    Unsupported,
 )
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_DEPENDENCIES, TAG_NAME
@@ -167,28 +165,6 @@ def test_networks_that_were_named_stay_allowed_with_the_robot(aws):
     assert ports(machine_id)['tcp 22'] == ['198.51.100.64/26', '198.51.100.7/32']
 
 
-def test_a_machine_stops_and_starts(aws):
-    spec, request = ask(on_exit='stop')
-    machine_id = aws.provider.create(spec, request)
-    aws.provider.stop(machine_id)
-    machine = aws.provider.describe(machine_id)
-    assert machine.state is MachineState.STOPPED and machine.shell is None
-    assert [m.state for m in aws.provider.find({})] == [MachineState.STOPPED]
-    aws.provider.start(machine_id)
-    assert aws.provider.describe(machine_id).state is MachineState.RUNNING
-    behaviour = ec2().describe_instance_attribute(
-        InstanceId=machine_id.split('/')[1], Attribute='instanceInitiatedShutdownBehavior')
-    assert behaviour['InstanceInitiatedShutdownBehavior']['Value'] == 'stop'
-
-
-def test_a_spot_machine_can_not_be_stopped(aws):
-    spec, request = ask(spot=True, max_price=0.5)
-    machine_id = aws.provider.create(spec, request)
-    assert aws.provider.describe(machine_id).kind == 't3.medium spot'
-    with pytest.raises(Unsupported, match='spot'):
-        aws.provider.stop(machine_id)
-
-
 def test_resources_of_a_machine_are_deleted_with_it(aws):
     spec, request = ask()
     machine_id = aws.provider.create(spec, request)
@@ -236,15 +212,6 @@ def test_a_region_that_is_closed_to_us_hides_no_other(aws, monkeypatch):
     aws.refuse('DescribeInstances', 'UnauthorizedOperation')
     with pytest.raises(AwsError, match='ec2:DescribeInstances'):
         list(aws.provider.find({}))
-
-
-def test_eight_machines_at_once_are_eight(aws):
-    with ThreadPoolExecutor(8) as pool:
-        made = list(pool.map(lambda n: aws.provider.create(*ask(f'm{n}')), range(8)))
-        assert len(set(made)) == 8
-        assert len(left()['groups']) == 8
-        list(pool.map(aws.provider.destroy, made))
-    assert left() == NOTHING
 
 
 # -- images -------------------------------------------------------------------------------------
@@ -552,15 +519,6 @@ def test_only_a_spot_machine_is_asked_for_its_notice(aws):
     assert aws.provider.capabilities_of(spot).preemption_notice
 
 
-def test_requests_that_aws_throttles_are_made_again(aws):
-    aws.refuse('RunInstances', 'RequestLimitExceeded', 'RequestLimitExceeded')
-    machine_id = aws.provider.create(*ask())
-    assert left()['instances'] == [machine_id.split('/')[1]]
-    assert aws.count()['ec2:RunInstances'] == 1
-    token, = {params['ClientToken'] for params in aws.asked('RunInstances')}
-    assert token
-
-
 def test_a_group_in_use_is_deleted_as_soon_as_it_is_free(aws):
     machine_id = aws.provider.create(*ask())
     aws.refuse('DeleteSecurityGroup', 'DependencyViolation', 'DependencyViolation')
@@ -606,31 +564,6 @@ def test_next_type_keeps_to_the_price_cap(aws, monkeypatch):
     machine_id = aws.provider.create(*ask('other', instance_types=['t3.large']))
     found = aws.provider.describe(machine_id)
     assert (found.kind, found.cost_per_hour) == ('t3.large', None)
-
-
-def test_full_region_leads_to_the_next_and_keeps_nothing(aws):
-    aws.refuse('RunInstances', *['InsufficientInstanceCapacity'] * 4)
-    machine_id = aws.provider.create(*ask(region=HOME, regions=[AWAY]))
-    assert machine_id.startswith(f'aws:{AWAY}/')
-    assert left(HOME) == NOTHING
-    assert len(left(AWAY)['instances']) == 1
-
-
-def test_no_room_anywhere_is_the_error_and_nothing_is_left(aws):
-    aws.refuse('RunInstances', *['InsufficientInstanceCapacity'] * 20)
-    with pytest.raises(AwsError, match='instance_types='):
-        aws.provider.create(*ask(region=HOME, regions=[AWAY]))
-    assert left(HOME) == left(AWAY) == NOTHING
-
-
-def test_a_launch_that_ends_meanwhile_tries_no_further_place(aws):
-    spec, request = ask()
-    cancel = threading.Event()
-    aws.provider.cancel = cancel
-    cancel.set()
-    with pytest.raises(Cancelled):
-        aws.provider.create(spec, request)
-    assert left() == NOTHING
 
 
 def test_a_region_to_go_on_in_that_lacks_the_type_is_passed_over(aws):

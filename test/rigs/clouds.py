@@ -13,12 +13,32 @@ from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
 import subprocess
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Optional
 
 from fogros2.provider.vm.provider import VmProvider
 from fogros2.waiting import wait_until
 from rigs.computers.box import Box, Call, Instance
 from rigs.launched import Launched, ros2
+
+#: A talker on a machine, and a listener on the robot, which says so when the machine goes.
+LAUNCH = '''\
+from fogros2 import {machine}, CloudNode, FogROSLaunchDescription, MachineInterrupted
+from launch import EventHandler
+from launch.actions import LogInfo, RegisterEventHandler
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    machine = {machine}(name={name!r}, robot_timeout=6, **{options!r})
+    words = {{'package': 'fogros2_examples', 'output': 'screen'}}
+    return FogROSLaunchDescription([
+        RegisterEventHandler(EventHandler(
+            matcher=lambda event: isinstance(event, MachineInterrupted),
+            entities=[LogInfo(msg='on our own')])),
+        CloudNode(machine=machine, executable='talker', **words),
+        Node(executable='listener', **words),
+    ])
+'''
 
 
 class Cloud(abc.ABC):
@@ -135,6 +155,12 @@ class Robot:
         """Start the cloud's example of a talker."""
         return self.launch('fogros2_examples', f'talker.{self.cloud.name}.launch.py',
                            f'name:={name}', *words, **variables)
+
+    def own(self, name: str, options: Optional[Mapping[str, Any]] = None, **variables: str,
+            ) -> Launched:
+        """Start a launch file with a talker on a machine that has these options."""
+        return self.launch(self.write(f'{name}.launch.py', LAUNCH.format(
+            machine=self.cloud.machine, name=name, options=dict(options or {}))), **variables)
 
     def ros2(self, *words: str, timeout: float = 60.0, **variables: str,
              ) -> subprocess.CompletedProcess[str]:

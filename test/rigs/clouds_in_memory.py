@@ -32,6 +32,8 @@ class Memory(abc.ABC):
     #: Options of a machine, and the type to try next.
     options: ClassVar[Mapping[str, Any]]
     more: ClassVar[Mapping[str, Any]]
+    #: Another region.
+    away: ClassVar[str]
     #: The requests that create something, and how each can fail; see ``fail``.
     steps: ClassVar[Sequence[tuple[str, str]]]
     #: The most requests that list the machines of all regions.
@@ -83,7 +85,7 @@ class Aws(Memory):
 
     fixture, name = 'moto_aws', 'aws'
     options = {'ec2_instance_type': 't3.medium', 'disk_size': 10}
-    more = {'instance_types': ['t3.large']}
+    more, away = {'instance_types': ['t3.large']}, 'us-east-1'
     steps = tuple((step, how) for step in (
         'CreateSecurityGroup', 'AuthorizeSecurityGroupIngress', 'ImportKeyPair', 'RunInstances')
         for how in ('refused', 'lost'))
@@ -149,7 +151,7 @@ class Azure(Memory):
 
     fixture, name = 'azure_service', 'azure'
     options = {'vm_size': 'Standard_B2als_v2', 'region': 'westeurope'}
-    more = {'vm_sizes': ['Standard_D2s_v5']}
+    more, away = {'vm_sizes': ['Standard_D2s_v5']}, 'eastus'
     #: Groups and schedules are there at once.
     steps = tuple((step, how) for step in (
         'resourcegroups', 'networksecuritygroups', 'publicipaddresses', 'virtualnetworks',
@@ -207,7 +209,7 @@ class Gcp(Memory):
 
     fixture, name = 'gce', 'gcp'
     options = {'region': 'europe-west3', 'disk_size': 10}
-    more = {'machine_types': ['n2-standard-2']}
+    more, away = {'machine_types': ['n2-standard-2']}, 'us-central1'
     steps = tuple((step, how) for step in ('firewalls.insert', 'instances.insert')
                   for how in ('refused', 'late', 'lost'))
     listing = 1

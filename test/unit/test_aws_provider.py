@@ -588,14 +588,6 @@ def test_whether_somebody_set_aws_up_is_seen_without_boto3(monkeypatch, tmp_path
     assert clients.configured()
 
 
-def test_nothing_of_boto3_is_loaded_by_looking_at_the_provider():
-    code = ('import sys; from fogros2.plugin_system import load; '
-            "p = load('fogros2.provider', 'aws'); p(); "
-            "assert not {'boto3', 'botocore'} & set(sys.modules); print(p.name)")
-    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
-    assert result.stdout == 'aws\n', result.stderr
-
-
 # -- rights -------------------------------------------------------------------------------------
 
 
