@@ -72,8 +72,8 @@ class Cloud(abc.ABC):
     faults: ClassVar[Sequence[tuple[str, Mapping[str, Any], bool]]]
 
     @abc.abstractmethod
-    def open(self) -> Box:
-        """Return a box that is not open yet."""
+    def open(self, **words: Any) -> Box:
+        """Return a box, made with these words, that is not open yet."""
 
     @abc.abstractmethod
     def provider(self) -> VmProvider:
@@ -225,10 +225,10 @@ class Aws(Cloud):
             ('InvalidParameterValue', 'RunInstances', True),
             ('UnauthorizedOperation', 'CreateTags', False)))
 
-    def open(self) -> Box:
+    def open(self, **words: Any) -> Box:
         """Return a box."""
         from rigs.ec2 import Ec2Box
-        return Ec2Box()
+        return Ec2Box(**words)
 
     def provider(self) -> VmProvider:
         """Return the provider."""
@@ -363,10 +363,10 @@ class Gcp(Cloud):
     def __init__(self, project: str = 'robots') -> None:
         self._project = project
 
-    def open(self) -> Box:
+    def open(self, **words: Any) -> Box:
         """Return a box with the project."""
         from rigs.gce import GceBox
-        return GceBox(project=self._project)
+        return GceBox(project=self._project, **words)
 
     def provider(self) -> VmProvider:
         """Return the provider."""
@@ -458,10 +458,10 @@ class Azure(Cloud):
             ('publicIPAddresses', True), ('virtualNetworks', False),
             ('networkInterfaces', False), ('virtualMachines', False), ('virtualMachines', True)))
 
-    def open(self) -> Box:
+    def open(self, **words: Any) -> Box:
         """Return a box."""
         from rigs.azure.box import AzureBox
-        return AzureBox()
+        return AzureBox(**words)
 
     def provider(self) -> VmProvider:
         """Return a provider that remembers nothing of earlier tests."""

@@ -124,7 +124,7 @@ def test_regions_share_one_answer_of_the_catalogue(catalogue):
     found = GCPProvider().offers(wants(arch='x86_64'), ['europe-west3', 'europe-west1'])
     assert found.chosen.region == 'europe-west3'
     asked = [call for call in catalogue.api.calls if call.action == 'services.skus.list']
-    assert len(asked) == 3  # pages
+    assert len(asked) == 4  # pages
 
 
 def test_refused_key_is_not_in_the_error(catalogue, monkeypatch):
