@@ -151,7 +151,8 @@ def test_one_l4_is_found_in_the_cloud_that_has_it(
     # 8 vCPUs, 32 GB, one L4
     assert line.split()[:3] == ['g2-standard-8', 'gcp', 'europe-west3'] and '$1.0982' in line
     assert '12 ms' in line and 'azure: no Azure type in westeurope has 8 CPUs, 32 GB' in said.err
-    asked = {'arch': 'x86_64', 'min_cpu': 8, 'min_memory_gb': 32, 'gpu': 'L4', 'max_round_trip_ms': 20.0}
+    asked = {'arch': 'x86_64', 'min_cpu': 8, 'min_memory_gb': 32, 'gpu': 'L4',
+             'max_round_trip_ms': 20.0}
     ((offer, place),) = Cheapest().places(MachineSpec('planner', 'cheapest', asked))
     assert (offer.type.name, place.provider) == ('g2-standard-8', 'gcp')
 
