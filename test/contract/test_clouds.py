@@ -127,6 +127,7 @@ def test_spot_machine_can_not_be_stopped(memory):
 
 
 def test_launch_takes_few_requests(memory):
+    memory.hurry()
     machine, _ = create(memory)
     provider = memory.provider()
     provider.reachable(machine, name='planner', timeout=10.0)

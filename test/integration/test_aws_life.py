@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 import dataclasses
 from decimal import Decimal
 import gzip
@@ -13,8 +12,6 @@ import threading
 import uuid
 
 import boto3
-import botocore.endpoint
-import botocore.session
 import pytest
 
 from fogros2.errors import (
@@ -33,7 +30,6 @@ from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.aws.failures import AwsError
 from fogros2.provider.vm import user_data
 from fogros2.testing.provider_contract import PUBLIC_KEY
-from fogros2.waiting import wait_until
 from rigs.ec2 import iam
 from rigs.ec2.watched import ec2, left, NOTHING, Watched
 
@@ -392,32 +388,17 @@ def test_leftovers_of_a_full_region_are_reported(aws):
 # -- cancelled ----------------------------------------------------------------------------------
 
 
-class Pauses:
-    """Botocore's pauses before it asks again, which last until a test ends them."""
+class InPause(threading.Event):
+    """An event that is set in the pause after a throttled call, as by a Ctrl-C."""
 
-    def __init__(self) -> None:
-        self.over = threading.Event()
-        #: Whether one has ended.
-        self.ended = False
-        self._begun = threading.Event()
+    def __init__(self, aws):
+        super().__init__()
+        self._aws = aws
 
-    def sleep(self, seconds: float) -> None:
-        self._begun.set()
-        self.over.wait(30.0)
-        self.ended = True
-
-    def cancel(self) -> threading.Event:
-        """Return an event that is set in the next one, as by a Ctrl-C."""
-        self._begun = threading.Event()
-        return self._begun
-
-
-@pytest.fixture
-def pauses(monkeypatch) -> Iterator[Pauses]:
-    pauses = Pauses()
-    monkeypatch.setattr(botocore.endpoint, 'time', pauses)
-    yield pauses
-    pauses.over.set()
+    def wait(self, timeout=None):
+        if self._aws.sent:
+            self.set()
+        return super().wait(0.01)
 
 
 THROTTLED = ['RequestLimitExceeded'] * 40
@@ -425,52 +406,42 @@ THROTTLED = ['RequestLimitExceeded'] * 40
 
 @pytest.mark.parametrize('operation', [
     'DescribeInstanceTypes', 'ImportKeyPair', 'RunInstances'])
-def test_the_end_of_a_launch_gets_through_a_throttled_call(aws, pauses, operation):
+def test_the_end_of_a_launch_gets_through_a_throttled_call(aws, operation):
     aws.refuse(operation, *THROTTLED)
     spec, request = ask()
-    aws.provider.cancel = pauses.cancel()
+    aws.provider.cancel = InPause(aws)
     with pytest.raises(Cancelled) as caught:
         aws.provider.create(spec, request)
-    assert not pauses.ended
+    assert aws.sent == ['RequestLimitExceeded']
     assert caught.value.refused and not caught.value.undo_failures
     assert left() == NOTHING
-    # and what was left of it makes nothing
-    sent = len(aws.sent)
-    aws.refusals.clear()
-    pauses.over.set()
-    assert not [thread for thread in threading.enumerate()
-                if thread.name == 'fog-aws-call' and not thread.daemon]
-    wait_until(lambda: 'fog-aws-call' not in {t.name for t in threading.enumerate()},
-               timeout=20.0, what='the calls that are left to end')
-    assert len(aws.sent) == sent and left() == NOTHING
 
 
-def test_the_end_of_a_launch_gets_through_choices_and_looks(aws, pauses):
+def test_the_end_of_a_launch_gets_through_choices_and_looks(aws):
     machine_id = aws.provider.create(*ask())
     aws.refuse('DescribeInstances', *THROTTLED)
-    aws.provider.cancel = pauses.cancel()
+    aws.provider.cancel = InPause(aws)
     with pytest.raises(Cancelled):
         aws.provider.reachable(machine_id, name='planner', timeout=60.0)
     aws.refuse('DescribeInstanceTypes', *THROTTLED)
-    aws.provider.cancel = pauses.cancel()
+    aws.sent.clear()
+    aws.provider.cancel = InPause(aws)
     with pytest.raises(Cancelled):
         aws.provider.resolve(ask(ec2_instance_type='cheapest')[0])
-    assert not pauses.ended
     # from then on everything is the way down, and has its time
     aws.refusals.clear()
-    pauses.over.set()
     aws.refuse('TerminateInstances', 'RequestLimitExceeded')
     aws.provider.allow(machine_id, 22, ['198.51.100.7/32'])
     aws.provider.destroy(machine_id)
     assert left() == NOTHING
 
 
-def test_cancelled_search_waits_for_no_region(aws, pauses):
+def test_cancelled_search_waits_for_no_region(aws):
     aws.refuse('DescribeInstances', *THROTTLED)
-    aws.provider.cancel = pauses.cancel()
+    aws.provider.cancel = InPause(aws)
     with pytest.raises(Cancelled):
         list(aws.provider.find({}))
-    assert not pauses.ended
+    assert len(aws.sent) <= 2  # there are two regions
 
 
 def test_instance_in_creation_is_known_at_the_launchs_end(aws):
@@ -584,7 +555,7 @@ def test_types_that_a_region_lacks_are_skipped(aws):
 
 
 def test_a_fault_of_aws_leaves_open_whether_there_is_a_machine(aws, monkeypatch):
-    monkeypatch.setattr('fogros2.provider.aws.clients.ATTEMPTS', 2)
+    monkeypatch.setattr('fogros2.provider.vm.account.ATTEMPTS', 2)
     aws.refuse('RunInstances', *['InternalError'] * 2, status=500)
     with pytest.raises(AwsError) as caught:
         aws.provider.create(*ask())

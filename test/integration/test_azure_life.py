@@ -91,7 +91,7 @@ def test_deleted_machine_that_azure_still_lists_is_not_found(robot):
 
 
 def test_interrupted_creation_is_taken_up_where_it_was(robot, monkeypatch):
-    monkeypatch.setattr('fogros2.provider.vm.rest.ATTEMPTS', 1)
+    monkeypatch.setattr('fogros2.provider.vm.account.ATTEMPTS', 1)
     request = robot.request()
     robot.azure.faults.append(Fault('InternalServerError', 500, 'PUT', 'virtualMachines', times=0))
     # the process dies there, without its undo

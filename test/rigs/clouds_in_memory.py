@@ -54,6 +54,9 @@ class Memory(abc.ABC):
     def calls(self) -> int:
         """Return the number of requests so far."""
 
+    def hurry(self) -> None:
+        """Let operations take no time: each look at one is a request."""
+
     @abc.abstractmethod
     def fail(self, step: str, how: str) -> None:
         """
@@ -173,11 +176,15 @@ class Azure(Memory):
         """Return the number of requests."""
         return len(self.served.calls)
 
+    def hurry(self) -> None:
+        """Let operations take no time."""
+        self.served.delay = 0.0
+
     def fail(self, step: str, how: str) -> None:
         """Order an error; without the right to assign roles there is a schedule."""
         from rigs.azure import service
         self.served.rights = service.CONTRIBUTOR
-        self.patch.setattr('fogros2.provider.vm.rest.ATTEMPTS', 1)
+        self.patch.setattr('fogros2.provider.vm.account.ATTEMPTS', 1)
         self.served.faults.append(service.Fault(
             'SomethingIsWrong', 500 if how == 'lost' else 400, 'PUT', step, times=0,
             late=how == 'late', after=how == 'lost'))
@@ -233,7 +240,7 @@ class Gcp(Memory):
 
     def fail(self, step: str, how: str) -> None:
         """Order an error; a code in capitals is that of an operation."""
-        self.patch.setattr('fogros2.provider.vm.rest.ATTEMPTS', 1)
+        self.patch.setattr('fogros2.provider.vm.account.ATTEMPTS', 1)
         code = {'refused': 'forbidden', 'late': 'INTERNAL_ERROR', 'lost': 'internalError'}[how]
         self._order(code, step, 0, after=how == 'lost')
 

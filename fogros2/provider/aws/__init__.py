@@ -2,7 +2,7 @@
 """
 EC2 instances, by boto3.
 
-In reading order: ``options``, ``failures`` (AWS's refusals), ``retry`` and ``clients`` (calls),
+In reading order: ``options``, ``failures`` (AWS's refusals), ``clients`` (calls),
 ``instances``, ``network``, ``ending``, ``prices``, ``images``, ``cloud`` (the adapter).
 """
 

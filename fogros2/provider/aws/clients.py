@@ -12,15 +12,12 @@ import time
 from typing import Any, Optional, TypeVar
 
 from fogros2.errors import FogError, PrerequisiteError
-from fogros2.provider.aws import retry
 from fogros2.provider.aws.failures import translated
-from fogros2.provider.vm import cloud as vm
+from fogros2.provider.vm import account as vm
 from fogros2.provider.vm.failures import unless_gone
 
 T = TypeVar('T')
 
-#: Attempts of one call, the first included; the pauses between them grow (adaptive mode).
-ATTEMPTS = 8
 CONNECT_TIMEOUT, READ_TIMEOUT = 5.0, 30.0
 #: Seconds for which EC2 may not report a new instance.
 SETTLING = 60.0
@@ -77,7 +74,7 @@ class Account(vm.Account):
         self.doors: dict[str, tuple[str, Mapping[str, Any]]] = {}
         #: Ids of the disks that are deleted with instances that this process has seen run.
         self.disks: dict[str, set[str]] = {}
-        self.clients: dict[tuple[str, str, bool], Any] = {}
+        self._clients: dict[tuple[str, str, bool], Any] = {}
         # boto3 creates clients of one session in one thread only; their use is thread-safe
         self._lock = threading.RLock()
 
@@ -135,19 +132,19 @@ class Account(vm.Account):
         :param hasty: short time-outs and few attempts, because a user waits for the answer.
         """
         with self._lock:
-            found = self.clients.get((service, region, hasty))
+            found = self._clients.get((service, region, hasty))
             if found is None:
                 session = self.session()
                 from botocore.config import Config
                 config = Config(
-                    retries={'mode': 'adaptive', 'total_max_attempts': 2 if hasty else ATTEMPTS},
+                    # ``repeated`` makes them again: nothing can end the pauses of boto3
+                    retries={'mode': 'standard', 'total_max_attempts': 1},
                     connect_timeout=3.0 if hasty else CONNECT_TIMEOUT,
                     read_timeout=5.0 if hasty else READ_TIMEOUT,
                     user_agent_extra='fogros2', max_pool_connections=50)
                 with translated(f"reaching AWS's {service}", region):
                     found = session.client(service, region_name=region, config=config)
-                retry.teach(found)
-                self.clients[(service, region, hasty)] = found
+                self._clients[(service, region, hasty)] = found
             return found
 
     def call(
@@ -164,7 +161,7 @@ class Account(vm.Account):
             answer: Mapping[str, Any] = getattr(client, operation)(**parameters)
             return answer
 
-        return self._ask(ask, service, region, what)
+        return self._ask(ask, service, region, operation, what)
 
     def remove(self, region: str, operation: str, what: str, **parameters: Any) -> None:
         """Make a call of EC2 that deletes something; it may be deleted already."""
@@ -180,17 +177,17 @@ class Account(vm.Account):
             return [entry for page in client.get_paginator(operation).paginate(**parameters)
                     for entry in page[key]]
 
-        yield from self._ask(ask, service, region, what)
+        yield from self._ask(ask, service, region, operation, what)
 
     def _ask(
-        self, ask: Callable[[Any], T], service: str, region: str, what: str,
+        self, ask: Callable[[Any], T], service: str, region: str, operation: str, what: str,
     ) -> T:
         def asked() -> T:
             client = self.client(service, region, hasty=self.hasty)
             with translated(what, region, decode=lambda message: self._decode(region, message)):
                 return ask(client)
 
-        return retry.unless(self.cancel, asked, what)
+        return self.repeated(asked, what, reads=operation.startswith(('describe_', 'get_')))
 
     def _decode(self, region: str, message: str) -> str:
         """Return an encoded authorization failure as JSON, '' if that isn't allowed either."""

@@ -46,12 +46,6 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Endings):
     def __init__(self, account: Optional[Account] = None) -> None:
         self._account: Account = account or clients.usual()
 
-    def lasting(self) -> Ec2:
-        """Return an adapter with its own clients, which the throttling of others does not slow."""
-        other = super().lasting()
-        other._account.clients = {}
-        return other
-
     # -- the account ----------------------------------------------------------------------------
 
     def check_credentials(self) -> None:

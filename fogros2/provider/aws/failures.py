@@ -15,7 +15,7 @@ import re
 from typing import Any, ClassVar, Optional
 
 from fogros2.errors import FogError, PrerequisiteError, ProviderError
-from fogros2.provider.vm.failures import CodedError, Failure, LENGTH
+from fogros2.provider.vm.failures import CodedError, Failure, LENGTH, Silent
 
 _LOG_IN = 'aws sso login, or new keys: aws configure'
 _QUOTA = 'ask for more at Service Quotas (EC2, in this region), or take another type or region'
@@ -224,7 +224,8 @@ def _unsent(error: BaseException, what: str, region: str) -> FogError:
         if isinstance(error, kinds):
             return PrerequisiteError(f'{where} failed: {reason}', hint)
     if isinstance(error, (known.HTTPClientError, known.ConnectionError)):
-        return PrerequisiteError(
+        return Silent(
             f'{where} failed: AWS does not answer: {said}',
-            'does region= exist, and is there a way to the Internet (a proxy, AWS_ENDPOINT_URL)?')
+            'does region= exist, and is there a way to the Internet (a proxy, AWS_ENDPOINT_URL)?',
+            unsent=not isinstance(error, (known.ReadTimeoutError, known.ConnectionClosedError)))
     return ProviderError(f'{where} failed: {said}')

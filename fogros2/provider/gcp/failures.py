@@ -37,8 +37,7 @@ _FAILURES = {
         '', 'give it the roles of doc/gcp.md', denied=True)),
     **dict.fromkeys(('NOT_FOUND', 'RESOURCE_NOT_FOUND'), Failure(gone=True)),
     'RESOURCE_IN_USE_BY_ANOTHER_RESOURCE': Failure('', 'ros2 fog delete again in a minute'),
-    'BACKEND_ERROR': Failure(
-        '', 'try again; https://status.cloud.google.com has what is known', temporary=True),
+    'BACKEND_ERROR': Failure('', 'try again; https://status.cloud.google.com has what is known'),
 }
 
 

@@ -41,8 +41,6 @@ SETTLED = 900.0
 _LOGGER = logging.getLogger(__name__)
 
 Adapter = TypeVar('Adapter', bound='VmCloud')
-Own = TypeVar('Own', bound='Account')
-T = TypeVar('T')
 
 
 class CloudError(ProviderError):
@@ -176,31 +174,6 @@ def own_tags(
             TAG_ATTEMPT: attempt_of(request.token), TAG_USER: options.user,
             TAG_DEPENDENCIES: request.dependencies, TAG_SSH_FROM: ' '.join(options.ssh_from)}
     return {key: value for key, value in tags.items() if value}
-
-
-class Account:
-    """The user's account at a cloud; thread-safe."""
-
-    #: Set when the launch ends; calls then raise Cancelled.
-    cancel: Optional[threading.Event] = None
-    #: Short time-outs and few attempts, because a user waits for the answer.
-    hasty = False
-
-    def __init__(self) -> None:
-        self._known: dict[str, Any] = {}
-
-    def having(self: Own, cancel: Optional[threading.Event], *, hasty: bool = False) -> Own:
-        """Return this account for calls that end with ``cancel``; it shares what is known."""
-        other = copy.copy(self)
-        other.cancel, other.hasty = cancel, hasty
-        return other
-
-    def once(self, key: str, ask: Callable[[], T]) -> T:
-        """Return the answer to a question that is asked once in this process."""
-        if key not in self._known:
-            self._known[key] = ask()
-        found: T = self._known[key]
-        return found
 
 
 class VmCloud(abc.ABC):

@@ -23,7 +23,7 @@ class Failure(NamedTuple):
     :param full: no capacity in this zone; the quota of this region is used up.
     :param gone: the resource does not exist (any more).
     :param denied: the credentials must not do that.
-    :param temporary: the same request may succeed later.
+    :param temporary: the cloud did nothing, and the same request may succeed later.
     """
 
     reason: str = ''
@@ -52,7 +52,7 @@ class CodedError(CloudError):
         known = self.known(code)
         super().__init__(message, hint, full=known.full, gone=known.gone, denied=known.denied)
         self.code = code
-        fault = status >= 500 and not self.full
+        fault = status >= 500 and not self.full and not known.temporary
         self.temporary = fault or status == 429 or known.temporary
         # after a fault of the cloud, the request may have had its effect
         self.refused = not fault

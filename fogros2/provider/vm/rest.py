@@ -1,25 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests to a cloud's REST API: session, token, retries, time-outs, errors as FogErrors."""
+"""Requests to a cloud's REST API: session, token, time-outs, errors as FogErrors."""
 
 from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
 import functools
-import threading
 from typing import Any, ClassVar, NamedTuple, Optional
 
-from fogros2.errors import Cancelled, FogError
-from fogros2.provider.vm.cloud import Account
+from fogros2.errors import FogError
+from fogros2.provider.vm.account import Account, ON_ITS_WAY
 from fogros2.provider.vm.failures import CodedError, not_the_cloud, one_line, Silent
-from fogros2.waiting import cancellable
-
-#: Attempts of a request that the cloud throttles or that fails there; without any answer, two.
-ATTEMPTS = 6
-#: Seconds of the first pause between attempts, which doubles, and of the longest.
-PAUSE, LONGEST = 1.0, 20.0
-#: Seconds to wait for the answer to a sent request, which may create something.
-ON_ITS_WAY = 4.0
 
 
 class Answer(NamedTuple):
@@ -64,32 +55,13 @@ class RestAccount(Account, abc.ABC):
         query: Optional[Mapping[str, str]] = None, timeout: float = 30.0, grace: bool = True,
     ) -> Answer:
         """
-        Make one request, again after a temporary failure, and return its answer.
+        Make one request and return its answer; see :meth:`repeated`.
 
-        :param what: completes '... failed'.
-        :param repeatable: the same request has its effect once, however often it is sent.
         :param grace: wait for the answer to a sent request after a cancel.
-        :raises FogError: with ``refused`` set to False if it may have had an effect.
         """
-        unsure = False
-        for attempt in range(1, ATTEMPTS + 1):
-            try:
-                return cancellable(
-                    lambda: self._send(method, url, what, body, query, timeout), self.cancel,
-                    what=what, grace=lambda: ON_ITS_WAY if grace and method != 'GET' else 0.0)
-            except (CodedError, Silent) as error:
-                unsure = unsure or not error.refused
-                error.refused = not unsure
-                silent = isinstance(error, Silent)
-                if not error.temporary or silent and not repeatable \
-                        or attempt >= (2 if silent or self.hasty else ATTEMPTS):
-                    raise
-                pause = PAUSE * 2 ** (attempt - 1) if error.pause is None else error.pause
-            except FogError as error:
-                error.refused = not unsure and not isinstance(error, Cancelled)
-                raise
-            (self.cancel or threading.Event()).wait(min(pause, LONGEST))
-        raise AssertionError('the last attempt returns or raises')
+        return self.repeated(
+            lambda: self._send(method, url, what, body, query, timeout), what,
+            reads=method == 'GET', repeatable=repeatable, grace=ON_ITS_WAY if grace else 0.0)
 
     def _send(
         self, method: str, url: str, what: str, body: Any, query: Optional[Mapping[str, str]],
@@ -98,8 +70,6 @@ class RestAccount(Account, abc.ABC):
         import requests
 
         head = {'Authorization': f'Bearer {self.token(what)}'}
-        if self.cancel is not None and self.cancel.is_set():
-            raise Cancelled(what)  # nobody waits for this thread
         try:
             answer = _session().request(
                 method, url, params=query, json=body, headers=head, allow_redirects=False,

@@ -122,8 +122,9 @@ def test_kept_machine_is_baked_listed_and_deleted_elsewhere(cloud, robot, box, n
     assert run.ended() == 0, run.text
     (kept,) = box.alive()
     box.run(kept.id, 'echo baked >/root/baked; sync')
-    assert robot.fog('image', name, '--dry-run')
-    assert robot.fog('image', 'list', '--json').strip() in ('', '[]')
+    shown = robot.ros2('fog', 'image', name, '--dry-run')
+    assert shown.returncode == 0 and f'would make an image of {name}' in shown.stderr
+    assert robot.fog('image', 'list', '--json').strip() == '[]'
     robot.fog('image', name)
     # a computer that knows nothing of this robot's machines finds this one, and ends it
     elsewhere = {'FOGROS2_STATE_HOME': str(robot.home / 'elsewhere')}
