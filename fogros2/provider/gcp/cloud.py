@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import copy
 from decimal import Decimal
 import os
@@ -12,12 +12,12 @@ from typing import Any, ClassVar, Optional
 from fogros2.errors import ConfigurationError, MachineNotFound
 from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_ON_EXIT
-from fogros2.provider.gcp import firewall, guest, images, instances, prices
+from fogros2.provider.gcp import guest, images, instances, prices
 from fogros2.provider.gcp.account import Account, configured, ENDPOINT_VARIABLE
 from fogros2.provider.gcp.failures import GoogleError
+from fogros2.provider.gcp.firewall import GoogleFirewall
 from fogros2.provider.gcp.options import Options
 from fogros2.provider.offers import MachineType
-from fogros2.provider.vm.address import ADDRESS_VARIABLE
 from fogros2.provider.vm.cloud import (
     CloudError,
     Order,
@@ -28,7 +28,7 @@ from fogros2.provider.vm.cloud import (
     VmId,
 )
 from fogros2.provider.vm.failures import unless_gone
-from fogros2.provider.vm.options import ipv4, SSH, VmOptions
+from fogros2.provider.vm.options import VmOptions
 from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import cancellable
 
@@ -36,7 +36,7 @@ from fogros2.waiting import cancellable
 DEFAULT_REGION = 'us-central1'
 
 
-class ComputeEngine(images.GoogleImages):
+class ComputeEngine(images.GoogleImages, GoogleFirewall):
     """
     Compute Engine instances, each with its own firewall rules.
 
@@ -182,27 +182,6 @@ class ComputeEngine(images.GoogleImages):
             entry['path'], entry['size'] = found[key]
         return {kind: chosen[kind] for kind in types if kind in chosen}
 
-    def begin(self, region: str, order: Order, created: list[str]) -> None:
-        network = f'global/networks/{order.options.network}'
-        tags = {**{key: value for key, value in order.tags.items() if key.startswith('fogros2-')},
-                'region': region}
-        sources = ipv4(order.sources)
-        if not sources:
-            raise ConfigurationError(
-                'machines at Google have IPv4 addresses, and the robot has none',
-                f'{ADDRESS_VARIABLE}= or ssh_from= names an address or a network of IPv4')
-        firewall.create(self._account, [
-            firewall.rule(order.attempt, 'deny', network, tags, firewall.ANYONE),
-            firewall.rule(order.attempt, 'vpn', network, tags, firewall.ANYONE, 'udp',
-                          order.request.vpn_port),
-            firewall.rule(order.attempt, f'tcp-{SSH}', network, tags, sources, 'tcp', SSH)])
-
-    def undo_begin(
-        self, region: str, attempt: str, created: Sequence[str],
-    ) -> Iterator[tuple[str, Callable[[], None]]]:
-        yield 'the firewall rules', lambda: firewall.delete(
-            self._account, self._account.project, attempt)
-
     def places(self, region: str, order: Order) -> Iterator[str]:
         types = self._types(region, order.options.types)
         yield from [order.options.zone] if order.options.zone else sorted(
@@ -242,7 +221,7 @@ class ComputeEngine(images.GoogleImages):
         """Delete an instance with its disk, then its firewall rules."""
         self._account.remove(_path(machine.vm), f'deleting {machine.vm}')
         self._account.labels.pop(machine.vm, None)
-        firewall.delete(self._account, machine.vm.partition('/')[0], machine.attempt)
+        self._drop_rules(machine.vm.partition('/')[0], machine.attempt)
 
     def end_attempt(self, region: str, attempt: str) -> None:
         for vm in self._instances({TAG_ATTEMPT: attempt}):
@@ -251,21 +230,12 @@ class ComputeEngine(images.GoogleImages):
     def sweep(self, region: str, attempt: str) -> None:
         """Delete an instance that ended itself, and the firewall rules."""
         self.end_attempt(region, attempt)
-        firewall.delete(self._account, self._account.project, attempt)
-
-    def remains(self, region: str) -> list[dict[str, str]]:
-        tags = [firewall.tags_of(found) for found in self._account.pages(
-            f'{self._account.project}/global/firewalls', 'looking for what is left',
-            filter='name eq fogros2-.*')]
-        return [found for found in tags if region in ('', found.get('region'))]
+        self._drop_rules(self._account.project, attempt)
 
     def attempts(self, region: str) -> list[str]:
         # of one that ended itself, a stopped disk is all that is left
         return [vm.tags.get(TAG_ATTEMPT, '') for vm in self._instances({})
                 if vm.state is not MachineState.DELETED]
-
-    def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
-        firewall.allow(self._account, machine.vm.partition('/')[0], machine.attempt, port, sources)
 
     def set_tags(self, machine: VmId, tags: Mapping[str, str]) -> None:
         """Replace labels, which Google takes only as a whole and with their fingerprint."""

@@ -76,4 +76,4 @@ def test_instance_ends_whose_robot_vanished_early(robot, box, name, tmp_path):
     assert deleted.returncode == 0, deleted.stdout + deleted.stderr
     assert {kind: len(names) for kind, names in robot.things().items()} in (
         {}, {'groups': 1, 'keys': 1})
-    robot.clear()
+    robot.cloud.clear(box)
