@@ -99,16 +99,19 @@ class GoogleFirewall(VmCloud):
         if not ipv4(sources):
             self._account.remove(f'{base}/{name}', what)
             return
-        deny: Mapping[str, Any] = {}
-        with unless_gone():
-            deny = self._account.call('GET', f'{base}/{own}-deny', what)
-        if not deny:
+        found: Mapping[str, Any] = {}
+        for one in (name, f'{own}-deny'):
+            with unless_gone():
+                found = found or self._account.call('GET', f'{base}/{one}', what)
+        if not found:
             raise ProviderError('the machine has no firewall rules any more',
                                 'ros2 fog list shows whether it is there')
-        tags = tags_of(deny)
+        tags = tags_of(found)
         more = tags.get(TAG_SSH_FROM, '').split() if port == SSH else []
-        body = rule(machine.attempt, f'tcp-{port}', deny['network'], tags,
+        body = rule(machine.attempt, f'tcp-{port}', found['network'], tags,
                     ipv4([*sources, *more]), 'tcp', port)
-        if self._account.create(base, what, body):
+        if found['name'] != name:
+            self._account.create(base, what, body)
+        elif sorted(found['sourceRanges']) != body['sourceRanges']:
             self._account.run('PATCH', f'{base}/{name}', what,
                               body={'name': name, 'sourceRanges': body['sourceRanges']})
