@@ -138,6 +138,21 @@ def test_launch_takes_few_requests(memory):
     assert memory.calls() <= 25
 
 
+def test_launch_that_waits_for_the_boot_changes_no_rule(memory):
+    provider, spec = memory.provider(), MachineSpec('planner', memory.name, memory.options)
+    machine = provider.create(spec, request_for(spec))
+    here, elsewhere = ['198.51.100.7/32'], ['203.0.113.9/32']
+    before = memory.calls()
+    provider.allow(machine, 22, here)
+    assert memory.calls() == before
+    provider.allow(machine, 22, elsewhere)
+    changed = memory.calls()
+    provider.allow(machine, 22, here)
+    assert before < changed < memory.calls()
+    provider.destroy(machine)
+    gone(memory)
+
+
 def test_list_of_all_regions_takes_few_requests(memory):
     here, there = create(memory)[0], create(memory, 'mapper', region=memory.away)[0]
     before = memory.calls()

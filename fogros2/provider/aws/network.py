@@ -90,6 +90,7 @@ class Ec2Network(VmCloud):
                     *([ssh] if order.sources else [])])
             if order.sources:
                 self._account.doors[order.attempt] = (group, ssh)
+                self._account.admitted[order.attempt] = sorted(map(cidr, order.sources))
 
     def undo_begin(
         self, region: str, attempt: str, created: Sequence[str],
@@ -132,6 +133,8 @@ class Ec2Network(VmCloud):
 
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
         """Let only ``sources`` reach a TCP port, beside the networks of ``ssh_from=``."""
+        if port == SSH and self._account.admits(machine.attempt, sorted(map(cidr, sources))):
+            return
         region, door = machine.region, self._account.doors.pop(machine.attempt, None)
         if door is not None and not sources and port == SSH:
             # the first change of a group that this process has created: no look-up is needed

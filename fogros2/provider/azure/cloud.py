@@ -226,6 +226,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
             subnet = known.subnet if network is None else str(
                 network.result()['properties']['subnets'][0]['id'])
             public = address.result()
+            self._account.admitted[order.attempt] = ipv4(order.sources)
             nic = put('networkInterfaces', {
                 'networkSecurityGroup': {'id': firewall.result()['id']},
                 'ipConfigurations': [{'name': 'machine', 'properties': {
@@ -349,6 +350,8 @@ class Azure(prices.AzurePrices, images.AzureImages):
     # -- changes of a machine -------------------------------------------------------------------
 
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
+        if port == SSH and self._account.admits(machine.attempt, ipv4(sources)):
+            return
         what, name = f'changing port {port} of {machine.vm}', machine.vm
         path = self._account.path(
             name, f'{_NET}/networkSecurityGroups/{name}/securityRules/tcp-{port}')

@@ -71,8 +71,10 @@ class GoogleFirewall(VmCloud):
             rule(order.attempt, f'tcp-{SSH}', network, tags, sources, 'tcp', SSH)]
         base = f'{self._account.project}/global/firewalls'
         with ThreadPoolExecutor(len(rules), 'fog-firewall') as pool:
-            list(pool.map(lambda body: self._account.create(
-                base, f'creating the firewall rule {body["name"]}', body), rules))
+            *_, existed = pool.map(lambda body: self._account.create(
+                base, f'creating the firewall rule {body["name"]}', body), rules)
+        if not existed:
+            self._account.admitted[order.attempt] = sources
 
     def undo_begin(
         self, region: str, attempt: str, created: Sequence[str],
@@ -94,6 +96,8 @@ class GoogleFirewall(VmCloud):
 
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
         """Let only ``sources`` reach a TCP port, beside the networks of ``ssh_from=``."""
+        if port == SSH and self._account.admits(machine.attempt, ipv4(sources)):
+            return
         base, own = f'{machine.vm.partition("/")[0]}/global/firewalls', own_name(machine.attempt)
         name, what = f'{own}-tcp-{port}', f'{"opening" if sources else "closing"} port {port}'
         if not ipv4(sources):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import copy
 import threading
 from typing import Any, Optional, TypeVar
@@ -33,6 +33,8 @@ class Account:
 
     def __init__(self) -> None:
         self._known: dict[str, Any] = {}
+        #: Networks to which this process has opened the SSH port of a new machine, by attempt.
+        self.admitted: dict[str, list[str]] = {}
 
     def having(self: Own, cancel: Optional[threading.Event], *, hasty: bool = False) -> Own:
         """Return this account for calls that end with ``cancel``; it shares what is known."""
@@ -46,6 +48,17 @@ class Account:
             self._known[key] = ask()
         found: T = self._known[key]
         return found
+
+    def admits(self, attempt: str, networks: Sequence[str]) -> bool:
+        """
+        Return whether a machine's SSH port is as this process has made it: open to ``networks``.
+
+        A launch asks again while a machine boots. With other networks, the port is changed next.
+        """
+        if networks and self.admitted.get(attempt) == [*networks]:
+            return True
+        self.admitted.pop(attempt, None)
+        return False
 
     def repeated(
         self, send: Callable[[], T], what: str, *, reads: bool, repeatable: bool = True,
