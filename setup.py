@@ -70,6 +70,8 @@ setup(
     # folders with an __init__.py: a test compares them with plugin_system.OWN_PACKAGES
     packages=find_packages(),
     package_data={'fogros2': ['py.typed'], 'fogros2.host': ['locked.txt'],
+                  **{f'fogros2.provider.{name}': ['regions.csv']
+                     for name in ('aws', 'azure', 'gcp')},
                   'fogros2_monitor': ['dashboard/page.html']},
     data_files=list(data_files()),
     install_requires=['setuptools', 'cryptography', 'paramiko', 'PyYAML'],

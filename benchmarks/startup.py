@@ -2,13 +2,13 @@
 """
 How long a launch on a rented machine takes from ``ros2 launch`` to the first message.
 
-Against EC2 in a box (``rigs.ec2``), whose instances boot as slowly as configured.
-*Our share* is what is left without the boot (from RunInstances until the SSH server answers) and
-without the installation of ROS 2 on an image that has none. The instances are this computer's own
-containers: where many boot at once they share its cores, as EC2's wouldn't. The robot's CPU is
-that of its launch and of what that runs.
+Against a cloud in a box (``rigs.clouds``), whose machines boot as slowly as configured.
+*Our share* is what is left without the boot (from the request for a machine until the SSH server
+answers) and without the installation of ROS 2 on an image that has none. The machines are this
+computer's own containers: where many boot at once they share its cores, as a cloud's wouldn't.
+The robot's CPU is that of its launch and of what that runs.
 
-    python benchmarks/startup.py [--provider aws|kubernetes] [--runs 3]
+    python benchmarks/startup.py [--provider aws|azure|gcp|kubernetes] [--runs 3]
 
 For pods see ``startup_kubernetes``.
 """
@@ -29,19 +29,23 @@ import time
 from figures import Row, write
 import startup_kubernetes
 
-from rigs.ec2 import Ec2Box
+from fogros2.plugin_system import load
+from rigs.clouds import Cloud, CLOUDS
+from rigs.computers.box import Box
 from rigs.launched import launching, ros2
 
-REGION = 'us-east-1'
 DELAYS = (0.0, 20.0)
 MANY = 8
+BOXES = {'aws': 'EC2', 'azure': 'Azure', 'gcp': 'Compute Engine'}
+#: What the paper has for AWS, by image.
+PUBLISHED = {'default': '275 s', 'custom': '85 s'}
 
 LAUNCH = """\
-from fogros2 import AWSCloudInstance, CloudNode, FogROSLaunchDescription
+from fogros2 import {machine}, CloudNode, FogROSLaunchDescription
 
 
 def generate_launch_description():
-    machines = [AWSCloudInstance(name=f'bench-{{n}}') for n in range({number})]
+    machines = [{machine}(name=f'bench-{{n}}') for n in range({number})]
     return FogROSLaunchDescription([
         CloudNode(machine=machine, package='fogros2_examples', executable='talker',
                   output='screen') for machine in machines])
@@ -49,13 +53,14 @@ def generate_launch_description():
 
 
 class Robot:
-    """A robot beside a box, with a home of its own."""
+    """A robot beside a cloud in a box, with a home of its own."""
 
-    def __init__(self, box: Ec2Box, home: Path) -> None:
+    def __init__(self, cloud: Cloud, box: Box, home: Path) -> None:
+        self.cloud = cloud
         self.box = box
         self.home = home
         self.environment: Mapping[str, str] = {
-            **os.environ, **box.environment(REGION), 'FOGROS2_AWS_CHECKIP': box.checkip,
+            **os.environ, **cloud.variables(box, home), 'FOGROS2_AWS_CHECKIP': box.checkip,
             'HOME': str(home), 'FOGROS2_STATE_HOME': str(home / 'state'),
             'ROS_LOG_DIR': str(home / 'log'), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
@@ -72,13 +77,13 @@ class Robot:
         """
         Launch the talker until the first message is heard.
 
-        :returns: seconds in all, of the boot, of the installation; requests to AWS, the end too.
+        :returns: seconds in all, of the boot, of the installation; requests, the end too.
         """
         self.box.forget_calls()
         with launching() as launch:
             begin = time.perf_counter()
-            run = launch('fogros2_examples', 'talker.aws.launch.py', 'count:=1', *words,
-                         environment=self.environment, prefix=self.box.on_robot([]))
+            run = launch('fogros2_examples', f'talker.{self.cloud.name}.launch.py', 'count:=1',
+                         *words, environment=self.environment, prefix=self.box.on_robot([]))
             run.wait_for('I heard: ', timeout=300.0)
             total = time.perf_counter() - begin
             if run.ended(120.0) != 0:
@@ -86,12 +91,12 @@ class Robot:
         newest = self.box.instances()[-1]
         found = re.search(r'ROS 2 +([0-9.]+) s \((.*)\)', run.text)
         installed = float(found[1]) if found and 'installed' in found[2] else 0.0
-        return total, newest.ready - newest.asked, installed, len(self.box.calls())
+        return total, newest.ready - newest.asked, installed, len(self.cloud.asked(self.box))
 
     def machines(self, number: int) -> tuple[float, float]:
         """Return the seconds until the nodes of ``number`` machines run, and the launch's CPU."""
         path = self.home / 'many.launch.py'
-        path.write_text(LAUNCH.format(number=number))
+        path.write_text(LAUNCH.format(machine=self.cloud.machine, number=number))
         with launching() as launch:
             begin = time.perf_counter()
             run = launch(str(path), environment=self.environment, prefix=self.box.on_robot([]))
@@ -111,20 +116,22 @@ def cpu(pid: int) -> float:
 
 
 @contextlib.contextmanager
-def robot(*, bare: bool) -> Iterator[Robot]:
+def robot(provider: str = 'aws', *, bare: bool) -> Iterator[Robot]:
     """
     Yield a robot beside a new box.
 
+    :param provider: name of the cloud.
     :param bare: the box's Ubuntu has no ROS 2; else it has the robot's, as a made image would.
     """
-    with tempfile.TemporaryDirectory() as home, Ec2Box(mounts=() if bare else None) as box:
-        yield Robot(box, Path(home))
+    cloud = CLOUDS[provider]()
+    with tempfile.TemporaryDirectory() as home, cloud.open(mounts=() if bare else None) as box:
+        yield Robot(cloud, box, Path(home))
 
 
-def start(runs: int) -> Iterator[Row]:
+def start(provider: str, runs: int) -> Iterator[Row]:
     """Yield what it takes to start on a fresh image, and on one that was baked of the first."""
     calls = []
-    with robot(bare=True) as here:
+    with robot(provider, bare=True) as here:
         for image in ('default', 'custom'):
             for delay in DELAYS:
                 here.box.set_boot_delay(delay)
@@ -135,7 +142,7 @@ def start(runs: int) -> Iterator[Row]:
                 share = statistics.median(t - b - i for t, b, i, _ in taken)
                 what = f'{image} image, boot delay {delay:g} s'
                 yield Row(f'{what}: to the first message', total, 's', runs=runs,
-                          published='275 s' if image == 'default' else '85 s')
+                          published=PUBLISHED[image] if provider == 'aws' else '')
                 if installed:
                     yield Row(f'{what}: of it ROS 2 installed', installed, 's', runs=runs)
                 yield Row(f'{what}: our share', share, 's', 6.0 if image == 'default' else 4.0,
@@ -145,7 +152,7 @@ def start(runs: int) -> Iterator[Row]:
                 here.talker('name:=baked', 'on_exit:=keep')
                 here.fog('image', 'baked')
                 here.fog('delete', '--yes', 'baked')
-        yield Row('requests to AWS in a launch, at most', max(calls), 'requests', 25.0,
+        yield Row('requests to the cloud in a launch, at most', max(calls), 'requests', 25.0,
                   runs=len(calls))
         yield from listing(here, runs)
 
@@ -157,15 +164,19 @@ def listing(here: Robot, runs: int) -> Iterator[Row]:
     for _ in range(runs):
         here.box.forget_calls()
         taken.append(here.fog('list'))
-    regions = Counter(call.region for call in here.box.calls())
+    calls = [call for call in here.box.calls() if call.service]
+    # AWS is asked in each region, and the others once for all
+    regions = Counter(call.region for call in calls) if here.cloud.listing > 2 \
+        else Counter(dict.fromkeys(load('fogros2.provider', here.cloud.name).region_names(), 0))
     yield Row(f'ros2 fog list, {len(regions)} regions', statistics.median(taken), 's', 2.0,
               runs=runs)
-    yield Row('ros2 fog list, a region', max(regions.values()), 'requests', 2.0, runs=runs)
+    yield Row('ros2 fog list, a region', max(*regions.values(), 0) or len(calls), 'requests', 2.0,
+              runs=runs)
 
 
-def several(runs: int) -> Iterator[Row]:
+def several(provider: str, runs: int) -> Iterator[Row]:
     """Yield how much longer many machines take than one."""
-    with robot(bare=False) as here:
+    with robot(provider, bare=False) as here:
         here.machines(1)
         for delay in DELAYS:
             here.box.set_boot_delay(delay)
@@ -184,14 +195,16 @@ def several(runs: int) -> Iterator[Row]:
 def main() -> None:
     """Take the figures of a provider."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--provider', choices=['aws', 'kubernetes'], default='aws')
+    parser.add_argument('--provider', choices=[*CLOUDS, 'kubernetes'], default='aws')
     parser.add_argument('--runs', type=int, default=3)
     arguments = parser.parse_args()
     if arguments.provider == 'kubernetes':
         startup_kubernetes.measure(arguments.runs)
         return
-    write(f'startup_{arguments.provider}', 'From ros2 launch to the first message, EC2 in a box',
-          [*start(arguments.runs), *several(arguments.runs)])
+    write(f'startup_{arguments.provider}',
+          f'From ros2 launch to the first message, {BOXES[arguments.provider]} in a box',
+          [*start(arguments.provider, arguments.runs),
+           *several(arguments.provider, arguments.runs)])
 
 
 if __name__ == '__main__':

@@ -161,7 +161,7 @@ def loopback_only(monkeypatch: pytest.MonkeyPatch) -> None:
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     """Poll clouds without the pauses that real ones need."""
     from fogros2 import waiting
-    from fogros2.provider.vm import rest
+    from fogros2.provider.vm import account
 
     def wait_until(probe: Any, **options: Any) -> Any:
         return waiting.wait_until(probe, **{**options, 'first': 0.0, 'interval': 0.02})
@@ -169,8 +169,8 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in [found for name, found in sys.modules.items()
                    if name.startswith('fogros2.provider.') and hasattr(found, 'wait_until')]:
         monkeypatch.setattr(module, 'wait_until', wait_until)
-    monkeypatch.setattr(rest, 'PAUSE', 0.02)
-    monkeypatch.setattr(rest, 'LONGEST', 0.2)
+    monkeypatch.setattr(account, 'PAUSE', 0.02)
+    monkeypatch.setattr(account, 'LONGEST', 0.2)
 
 
 @pytest.fixture

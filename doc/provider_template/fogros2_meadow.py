@@ -58,6 +58,11 @@ class Meadow(VmCloud):
     #: Region of ``whoami`` if no region is configured.
     base_region = 'north'
 
+    @staticmethod
+    def configured() -> bool:
+        """Return whether there are credentials."""
+        return 'MEADOW_TOKEN' in os.environ
+
     def check_credentials(self) -> None:
         """Raise PrerequisiteError if there are none; make no request."""
         if 'MEADOW_TOKEN' not in os.environ:
@@ -117,21 +122,9 @@ class MeadowProvider(VmProvider):
     """Machines at Meadow."""
 
     name = 'meadow'
+    adapter = Meadow
     #: Lacks stop, images, preemption_notice and application_port.
     capabilities = VmProvider.capabilities  # dataclasses.replace(..., stop=True) adds one
-
-    def __init__(self) -> None:
-        super().__init__(Meadow())
-
-    @classmethod
-    def configured(cls) -> bool:
-        """Return whether there are credentials."""
-        return 'MEADOW_TOKEN' in os.environ
-
-    @classmethod
-    def region_names(cls) -> Sequence[str]:
-        """Return the regions."""
-        return tuple(TABLE)
 
     def check(self, spec: MachineSpec) -> None:
         """Refuse what Meadow does not have."""

@@ -3,16 +3,22 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 import logging
+import subprocess
+import sys
+import threading
 import time
 
 import pytest
 
-from fogros2.errors import FogError, ProviderError
+from fogros2.errors import Cancelled, FogError, ProviderError, Unsupported
 from fogros2.model import MachineSpec
+from fogros2.plugin_system import load
 from fogros2.provider import TAG_ON_EXIT, TAG_ROBOT
 from fogros2.provider.vm import cloud
 from fogros2.testing import ProviderContract, request_for
+from fogros2.testing.provider_contract import PUBLIC_KEY
 from fogros2.waiting import wait_until
 from rigs.clouds_in_memory import DAMAGED, MEMORIES
 
@@ -85,11 +91,94 @@ def test_no_room_anywhere_is_the_error(memory):
     gone(memory)
 
 
-def test_list_of_all_regions_takes_few_requests(memory):
-    machines = {create(memory, name)[0] for name in ('planner', 'mapper')}
+def test_full_region_leads_to_the_next(memory):
+    memory.fill(1)
+    machine, _ = create(memory, regions=[memory.away])
+    assert memory.provider().describe(machine).region == memory.away
+    memory.provider().destroy(machine)
+    gone(memory)
+
+
+def test_launch_that_has_ended_creates_nothing(memory):
+    provider, spec = memory.provider(), MachineSpec('planner', memory.name, memory.options)
+    provider.cancel = threading.Event()
+    provider.cancel.set()
+    with pytest.raises(Cancelled):
+        provider.create(spec, request_for(spec))
+    assert not memory.left()
+
+
+def test_eight_machines_at_once_are_eight(memory):
+    with ThreadPoolExecutor(8) as pool:
+        made = list(pool.map(lambda number: create(memory, f'm{number}')[0], range(8)))
+        assert {machine.id for machine in memory.provider().find({})} == set(made)
+        assert len(set(made)) == 8
+        list(pool.map(memory.provider().destroy, made))
+    gone(memory)
+
+
+def test_spot_machine_can_not_be_stopped(memory):
+    machine, _ = create(memory, spot=True)
+    assert memory.provider().describe(machine).kind.endswith(' spot')
+    with pytest.raises(Unsupported, match='spot'):
+        memory.provider().stop(machine)
+    memory.provider().destroy(machine)
+    gone(memory)
+
+
+def test_launch_takes_few_requests(memory):
+    memory.hurry()
+    machine, _ = create(memory)
+    provider = memory.provider()
+    provider.reachable(machine, name='planner', timeout=10.0)
+    provider.pin(machine, PUBLIC_KEY)
+    provider.allow(machine, 22, [])
+    provider.destroy(machine)
+    gone(memory)
+    assert memory.calls() <= 25
+
+
+def test_launch_that_waits_for_the_boot_changes_no_rule(memory):
+    provider, spec = memory.provider(), MachineSpec('planner', memory.name, memory.options)
+    machine = provider.create(spec, request_for(spec))
+    here, elsewhere = ['198.51.100.7/32'], ['203.0.113.9/32']
     before = memory.calls()
-    assert {machine.id for machine in memory.provider().find({})} == machines
+    provider.allow(machine, 22, here)
+    assert memory.calls() == before
+    provider.allow(machine, 22, elsewhere)
+    changed = memory.calls()
+    provider.allow(machine, 22, here)
+    assert before < changed < memory.calls()
+    provider.destroy(machine)
+    gone(memory)
+
+
+def test_list_of_all_regions_takes_few_requests(memory):
+    here, there = create(memory)[0], create(memory, 'mapper', region=memory.away)[0]
+    before = memory.calls()
+    assert {machine.id for machine in memory.provider().find({})} == {here, there}
     assert memory.calls() - before <= memory.listing
+    provider = memory.provider()
+    provider.search_in([memory.away])
+    assert [machine.id for machine in provider.find({})] == [there]
+
+
+@pytest.mark.parametrize('name', MEMORIES)
+def test_cloud_is_described_without_its_library(name):
+    program = ('import sys; from fogros2.plugin_system import load; '
+               f'p = load("fogros2.provider", {name!r}); p(); p.configured(); p.region_names(); '
+               'print(sorted({module.split(".")[0] for module in sys.modules} & '
+               '{"azure", "boto3", "botocore", "google", "googleapiclient", "msal", "requests"}))')
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
+                          timeout=60)
+    assert done.stdout == '[]\n', done.stderr
+
+
+@pytest.mark.parametrize('name', MEMORIES)
+def test_regions_have_places_on_the_globe(name):
+    table = load('fogros2.provider', name).adapter.regions.table
+    for latitude, longitude, place, _ in table.values():
+        assert -90 < latitude < 90 and -180 <= longitude <= 180 and place
 
 
 def test_leftovers_go_when_they_have_settled(memory, monkeypatch):

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import base64
-from collections import Counter
 import dataclasses
 from decimal import Decimal
 import gzip
@@ -22,7 +21,6 @@ from fogros2.errors import (
     ConfigurationError,
     FogError,
     MachineNotFound,
-    NameTaken,
     PrerequisiteError,
     ProviderError,
 )
@@ -83,32 +81,6 @@ def robot(azure_service):
 # -- the whole way ------------------------------------------------------------------------------
 
 
-def test_a_life_takes_few_requests_and_leaves_nothing(robot):
-    robot.azure.delay = 0.0
-    machine_id = robot.create()
-    machine = robot.reach(machine_id)
-    assert machine.note == '' and machine.cost_per_hour == Decimal('0.0376')
-    robot.provider.pin(machine_id, PUBLIC_KEY)
-    robot.provider.allow(machine_id, 22, [])
-    robot.provider.destroy(machine_id)
-    assert robot.azure.groups == {}
-    # the role stays: it belongs to the subscription
-    assert [key for key in robot.azure.resources if '/roledefinitions/' not in key] == []
-    # once in a subscription, there are two more for the role of machines
-    assert len(robot.azure.calls) <= 25, Counter(
-        (call.action, call.service) for call in robot.azure.calls)
-
-
-def test_list_takes_two_requests_for_all_regions(robot):
-    one = robot.create()
-    two = robot.provider.create(robot.spec('mapper', region=AWAY), robot.request())
-    robot.azure.calls.clear()
-    assert {machine.id for machine in robot.provider.find({})} == {one, two}
-    assert len(robot.azure.calls) == 2
-    robot.provider.search_in([AWAY])
-    assert [machine.id for machine in robot.provider.find({})] == [two]
-
-
 def test_deleted_machine_that_azure_still_lists_is_not_found(robot):
     machine_id = robot.create()
     robot.provider.destroy(machine_id)
@@ -118,18 +90,8 @@ def test_deleted_machine_that_azure_still_lists_is_not_found(robot):
         robot.provider.describe(machine_id)
 
 
-def test_repeated_request_makes_the_same_names(robot):
-    request = robot.request()
-    first = robot.provider.create(robot.spec(), request)
-    before = set(robot.azure.resources)
-    assert robot.provider.create(robot.spec(), request) == first
-    assert set(robot.azure.resources) == before
-    with pytest.raises(NameTaken):
-        robot.create()
-
-
 def test_interrupted_creation_is_taken_up_where_it_was(robot, monkeypatch):
-    monkeypatch.setattr('fogros2.provider.vm.rest.ATTEMPTS', 1)
+    monkeypatch.setattr('fogros2.provider.vm.account.ATTEMPTS', 1)
     request = robot.request()
     robot.azure.faults.append(Fault('InternalServerError', 500, 'PUT', 'virtualMachines', times=0))
     # the process dies there, without its undo
@@ -202,25 +164,6 @@ def test_no_room_leads_to_the_next_size(robot, code, late):
                what='the first to be deleted')
     robot.provider.destroy(machine_id)
     assert robot.azure.groups == {}
-
-
-def test_full_region_leads_to_the_next(robot):
-    robot.azure.cores = 2
-    other = robot.create()
-    machine_id = robot.provider.create(robot.spec('mapper', regions=[AWAY]), robot.request())
-    assert robot.provider.describe(machine_id).region == AWAY
-    for one in (other, machine_id):
-        robot.provider.destroy(one)
-    robot.gone()
-
-
-def test_no_room_anywhere_is_the_error(robot):
-    robot.azure.faults.append(Fault('AllocationFailed', 409, 'PUT', 'virtualMachines', times=0,
-                                    late=True))
-    with pytest.raises(ProviderError, match='no free machine of this size') as caught:
-        robot.create(vm_sizes=[LARGE], regions=[AWAY])
-    assert caught.value.refused
-    robot.gone()
 
 
 def test_size_that_the_subscription_may_not_use_is_skipped(robot):

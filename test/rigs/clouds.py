@@ -13,12 +13,32 @@ from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
 import subprocess
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Optional
 
 from fogros2.provider.vm.provider import VmProvider
 from fogros2.waiting import wait_until
 from rigs.computers.box import Box, Call, Instance
 from rigs.launched import Launched, ros2
+
+#: A talker on a machine, and a listener on the robot, which says so when the machine goes.
+LAUNCH = '''\
+from fogros2 import {machine}, CloudNode, FogROSLaunchDescription, MachineInterrupted
+from launch import EventHandler
+from launch.actions import LogInfo, RegisterEventHandler
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    machine = {machine}(name={name!r}, robot_timeout=6, **{options!r})
+    words = {{'package': 'fogros2_examples', 'output': 'screen'}}
+    return FogROSLaunchDescription([
+        RegisterEventHandler(EventHandler(
+            matcher=lambda event: isinstance(event, MachineInterrupted),
+            entities=[LogInfo(msg='on our own')])),
+        CloudNode(machine=machine, executable='talker', **words),
+        Node(executable='listener', **words),
+    ])
+'''
 
 
 class Cloud(abc.ABC):
@@ -52,8 +72,8 @@ class Cloud(abc.ABC):
     faults: ClassVar[Sequence[tuple[str, Mapping[str, Any], bool]]]
 
     @abc.abstractmethod
-    def open(self) -> Box:
-        """Return a box that is not open yet."""
+    def open(self, **words: Any) -> Box:
+        """Return a box, made with these words, that is not open yet."""
 
     @abc.abstractmethod
     def provider(self) -> VmProvider:
@@ -136,6 +156,12 @@ class Robot:
         return self.launch('fogros2_examples', f'talker.{self.cloud.name}.launch.py',
                            f'name:={name}', *words, **variables)
 
+    def own(self, name: str, options: Optional[Mapping[str, Any]] = None, **variables: str,
+            ) -> Launched:
+        """Start a launch file with a talker on a machine that has these options."""
+        return self.launch(self.write(f'{name}.launch.py', LAUNCH.format(
+            machine=self.cloud.machine, name=name, options=dict(options or {}))), **variables)
+
     def ros2(self, *words: str, timeout: float = 60.0, **variables: str,
              ) -> subprocess.CompletedProcess[str]:
         """Run ``ros2`` on the robot."""
@@ -199,10 +225,10 @@ class Aws(Cloud):
             ('InvalidParameterValue', 'RunInstances', True),
             ('UnauthorizedOperation', 'CreateTags', False)))
 
-    def open(self) -> Box:
+    def open(self, **words: Any) -> Box:
         """Return a box."""
         from rigs.ec2 import Ec2Box
-        return Ec2Box()
+        return Ec2Box(**words)
 
     def provider(self) -> VmProvider:
         """Return the provider."""
@@ -337,10 +363,10 @@ class Gcp(Cloud):
     def __init__(self, project: str = 'robots') -> None:
         self._project = project
 
-    def open(self) -> Box:
+    def open(self, **words: Any) -> Box:
         """Return a box with the project."""
         from rigs.gce import GceBox
-        return GceBox(project=self._project)
+        return GceBox(project=self._project, **words)
 
     def provider(self) -> VmProvider:
         """Return the provider."""
@@ -432,16 +458,17 @@ class Azure(Cloud):
             ('publicIPAddresses', True), ('virtualNetworks', False),
             ('networkInterfaces', False), ('virtualMachines', False), ('virtualMachines', True)))
 
-    def open(self) -> Box:
+    def open(self, **words: Any) -> Box:
         """Return a box."""
         from rigs.azure.box import AzureBox
-        return AzureBox()
+        return AzureBox(**words)
 
     def provider(self) -> VmProvider:
         """Return a provider that remembers nothing of earlier tests."""
         from fogros2.provider.azure import AzureProvider
         from fogros2.provider.azure.account import Account
-        return AzureProvider(Account())
+        from fogros2.provider.azure.cloud import Azure
+        return AzureProvider(Azure(Account()))
 
     def variables(self, box: Any, folder: Path, *, here: bool = False) -> dict[str, str]:
         """Return the variables of a managed identity."""

@@ -32,6 +32,8 @@ class Memory(abc.ABC):
     #: Options of a machine, and the type to try next.
     options: ClassVar[Mapping[str, Any]]
     more: ClassVar[Mapping[str, Any]]
+    #: Another region.
+    away: ClassVar[str]
     #: The requests that create something, and how each can fail; see ``fail``.
     steps: ClassVar[Sequence[tuple[str, str]]]
     #: The most requests that list the machines of all regions.
@@ -51,6 +53,9 @@ class Memory(abc.ABC):
     @abc.abstractmethod
     def calls(self) -> int:
         """Return the number of requests so far."""
+
+    def hurry(self) -> None:
+        """Let operations take no time: each look at one is a request."""
 
     @abc.abstractmethod
     def fail(self, step: str, how: str) -> None:
@@ -83,7 +88,7 @@ class Aws(Memory):
 
     fixture, name = 'moto_aws', 'aws'
     options = {'ec2_instance_type': 't3.medium', 'disk_size': 10}
-    more = {'instance_types': ['t3.large']}
+    more, away = {'instance_types': ['t3.large']}, 'us-east-1'
     steps = tuple((step, how) for step in (
         'CreateSecurityGroup', 'AuthorizeSecurityGroupIngress', 'ImportKeyPair', 'RunInstances')
         for how in ('refused', 'lost'))
@@ -149,7 +154,7 @@ class Azure(Memory):
 
     fixture, name = 'azure_service', 'azure'
     options = {'vm_size': 'Standard_B2als_v2', 'region': 'westeurope'}
-    more = {'vm_sizes': ['Standard_D2s_v5']}
+    more, away = {'vm_sizes': ['Standard_D2s_v5']}, 'eastus'
     #: Groups and schedules are there at once.
     steps = tuple((step, how) for step in (
         'resourcegroups', 'networksecuritygroups', 'publicipaddresses', 'virtualnetworks',
@@ -171,11 +176,15 @@ class Azure(Memory):
         """Return the number of requests."""
         return len(self.served.calls)
 
+    def hurry(self) -> None:
+        """Let operations take no time."""
+        self.served.delay = 0.0
+
     def fail(self, step: str, how: str) -> None:
         """Order an error; without the right to assign roles there is a schedule."""
         from rigs.azure import service
         self.served.rights = service.CONTRIBUTOR
-        self.patch.setattr('fogros2.provider.vm.rest.ATTEMPTS', 1)
+        self.patch.setattr('fogros2.provider.vm.account.ATTEMPTS', 1)
         self.served.faults.append(service.Fault(
             'SomethingIsWrong', 500 if how == 'lost' else 400, 'PUT', step, times=0,
             late=how == 'late', after=how == 'lost'))
@@ -207,7 +216,7 @@ class Gcp(Memory):
 
     fixture, name = 'gce', 'gcp'
     options = {'region': 'europe-west3', 'disk_size': 10}
-    more = {'machine_types': ['n2-standard-2']}
+    more, away = {'machine_types': ['n2-standard-2']}, 'us-central1'
     steps = tuple((step, how) for step in ('firewalls.insert', 'instances.insert')
                   for how in ('refused', 'late', 'lost'))
     listing = 1
@@ -231,7 +240,7 @@ class Gcp(Memory):
 
     def fail(self, step: str, how: str) -> None:
         """Order an error; a code in capitals is that of an operation."""
-        self.patch.setattr('fogros2.provider.vm.rest.ATTEMPTS', 1)
+        self.patch.setattr('fogros2.provider.vm.account.ATTEMPTS', 1)
         code = {'refused': 'forbidden', 'late': 'INTERNAL_ERROR', 'lost': 'internalError'}[how]
         self._order(code, step, 0, after=how == 'lost')
 

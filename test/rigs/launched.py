@@ -65,6 +65,12 @@ class Launched:
         """The lines it has logged as errors."""
         return [line.rstrip() for line in list(self.said) if '[ERROR]' in line]
 
+    @property
+    def clean(self) -> bool:
+        """Whether nothing that it has said would worry a user; Ctrl-C is a warning to launch."""
+        others = self.text.replace('[WARNING] [launch]: user interrupted with ctrl-c', '')
+        return self.errors == [] and 'WARNING' not in others and 'Traceback' not in others
+
     def wait_for(self, words: str, *, times: int = 1, timeout: float = 60.0) -> None:
         """
         Wait until lines with ``words`` came.

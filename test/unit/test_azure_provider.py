@@ -8,8 +8,6 @@ import dataclasses
 from decimal import Decimal
 import json
 import re
-import subprocess
-import sys
 
 import pytest
 
@@ -19,7 +17,6 @@ from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider.azure import account, ending, failures, machines, prices
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
-from fogros2.provider.azure.regions import REGIONS
 from fogros2.provider.vm.cloud import Order, Place
 from rigs.azure import catalogue, schema
 
@@ -209,16 +206,3 @@ def test_subscription_is_that_of_the_environment_or_of_the_login(monkeypatch, tm
     assert account.configured() and account.subscription() == 'two'
     monkeypatch.setenv('AZURE_SUBSCRIPTION_ID', 'three')
     assert account.subscription() == 'three'
-
-
-def test_regions_have_places_on_the_globe():
-    for latitude, longitude, place, _ in REGIONS.values():
-        assert -90 < latitude < 90 and -180 <= longitude <= 180 and place
-
-
-def test_no_library_of_azure_is_imported_before_a_request():
-    code = ('import sys; from fogros2.provider.azure import AzureProvider; AzureProvider(); '
-            "print([name for name in sys.modules if name.split('.')[0] in ('azure', 'msal', "
-            "'requests')])")
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
-    assert done.stdout == '[]\n', done.stderr

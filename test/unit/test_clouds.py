@@ -137,8 +137,24 @@ def test_one_table_has_the_prices_of_all_clouds(
         '  12 ms',
         'Standard_D2s_v5    azure     westeurope    2     8 GB    x86_64  Intel  $0.0960  $0.0192'
         '  46 ms',
-        '6 more cost as much or more (--limit 0)']
+        '8 more cost as much or more (--limit 0)']
     assert said.err == ''
+
+
+def test_one_l4_is_found_in_the_cloud_that_has_it(
+    two_clouds: Any, capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run('--min-cpu', '8', '--min-memory', '32', '--gpu', 'L4', '--arch', 'x86_64',
+               '--provider', 'all') == 0
+    said = capsys.readouterr()
+    (line,) = said.out.splitlines()[2:]
+    # 8 vCPUs, 32 GB, one L4
+    assert line.split()[:3] == ['g2-standard-8', 'gcp', 'europe-west3'] and '$1.0982' in line
+    assert '12 ms' in line and 'azure: no Azure type in westeurope has 8 CPUs, 32 GB' in said.err
+    asked = {'arch': 'x86_64', 'min_cpu': 8, 'min_memory_gb': 32, 'gpu': 'L4',
+             'max_round_trip_ms': 20.0}
+    ((offer, place),) = Cheapest().places(MachineSpec('planner', 'cheapest', asked))
+    assert (offer.type.name, place.provider) == ('g2-standard-8', 'gcp')
 
 
 def test_spot_price_and_round_trip_are_in_json(

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import math
 import socket
 import threading
@@ -11,14 +12,15 @@ import time
 import pytest
 
 from fogros2.errors import PrerequisiteError, ProviderError
-from fogros2.provider.aws.regions import api_host, REGIONS
+from fogros2.provider.aws.cloud import api_host, Ec2
 from fogros2.provider.offers import Region
 from fogros2.provider.vm import regions
 
+REGIONS = Ec2.regions.table
 AWS = regions.Regions('AWS', REGIONS, api_host)
 
 
-def connector(seconds: dict[str, list[float]]) -> regions.Connector:
+def connector(seconds: dict[str, list[float]]) -> Callable[[str, int, float], float]:
     """Return one that takes these times for each region in turn; inf is no connection."""
     left = {api_host(name): list(times) for name, times in seconds.items()}
 
@@ -32,23 +34,34 @@ def connector(seconds: dict[str, list[float]]) -> regions.Connector:
     return connect
 
 
-def test_the_median_decides_and_not_the_mean_nor_the_best() -> None:
-    found = AWS.measure(['us-west-1', 'us-west-2', 'eu-west-1'], connect=connector({
+@pytest.fixture
+def network(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Return what changes the network: how it connects, and other values of the module."""
+    def changed(connect_time: Callable[[str, int, float], float], **values: object) -> None:
+        for name, value in {'connect_time': connect_time, **values}.items():
+            monkeypatch.setattr(regions, name, value)
+    return changed
+
+
+def test_the_median_decides_and_not_the_mean_nor_the_best(network: Callable[..., None]) -> None:
+    network(connector({
         'us-west-1': [0.010, 0.040, 0.041], 'us-west-2': [0.020, 0.021, 1.9],
         'eu-west-1': [0.150, 0.150, 0.150]}))
+    found = AWS.measure(['us-west-1', 'us-west-2', 'eu-west-1'])
     assert [(one.region, round(one.milliseconds or 0)) for one in found] == [
         ('us-west-2', 21), ('us-west-1', 40), ('eu-west-1', 150)]
     assert found[0].place == 'Oregon'
 
 
-def test_regions_that_do_not_answer_come_last() -> None:
-    found = AWS.measure(['us-west-1', 'us-west-2', 'sa-east-1'], connect=connector({
+def test_regions_that_do_not_answer_come_last(network: Callable[..., None]) -> None:
+    network(connector({
         'us-west-1': [5.0], 'us-west-2': [0.3, 3.0], 'sa-east-1': [0.2, 0.2, 0.2]}))
+    found = AWS.measure(['us-west-1', 'us-west-2', 'sa-east-1'])
     assert [(one.region, one.milliseconds) for one in found] == [
         ('sa-east-1', 200.0), ('us-west-2', 300.0), ('us-west-1', None)]
 
 
-def test_hanging_region_does_not_delay_the_others() -> None:
+def test_hanging_region_does_not_delay_the_others(network: Callable[..., None]) -> None:
     over = threading.Event()
 
     def connect(host: str, port: int, timeout: float) -> float:
@@ -56,14 +69,15 @@ def test_hanging_region_does_not_delay_the_others() -> None:
             over.wait(30)
         return 0.05
 
+    network(connect, DEADLINE=0.2)
     begin = time.monotonic()
-    found = AWS.measure(['us-east-1', 'us-west-1'], connect=connect, deadline=0.2)
+    found = AWS.measure(['us-east-1', 'us-west-1'])
     assert time.monotonic() - begin < 5
     assert [one.region for one in found] == ['us-west-1', 'us-east-1']
     over.set()
 
 
-def test_nearest_region_does_not_wait_for_far_ones() -> None:
+def test_nearest_region_does_not_wait_for_far_ones(network: Callable[..., None]) -> None:
     over = threading.Event()
 
     def connect(host: str, port: int, timeout: float) -> float:
@@ -71,48 +85,52 @@ def test_nearest_region_does_not_wait_for_far_ones() -> None:
             over.wait(30)
         return 0.05
 
+    network(connect, DEADLINE=20.0)
     begin = time.monotonic()
-    found = AWS.measure(['us-east-1', 'us-west-1', 'xx'], connect=connect, deadline=20,
-                            grace=0.1)
+    found = AWS.measure(['us-east-1', 'us-west-1', 'xx'], grace=0.1)
     assert time.monotonic() - begin < 10
     assert found[0].region == 'us-west-1' and found[-1].milliseconds is None
     over.set()
 
 
-def test_all_are_asked_at_once() -> None:
+def test_all_are_asked_at_once(network: Callable[..., None]) -> None:
     together = threading.Barrier(len(AWS.enabled), timeout=20)
 
     def connect(host: str, port: int, timeout: float) -> float:
         together.wait()
         return 0.1
 
-    found = AWS.measure(connect=connect, attempts=1, deadline=30)
+    network(connect, ATTEMPTS=1, DEADLINE=30.0)
+    found = AWS.measure(AWS.enabled)
     assert {one.milliseconds for one in found} == {100.0} and len(found) == len(AWS.enabled)
 
 
-def test_geolocation_only_where_nobody_answers() -> None:
+def test_geolocation_only_where_nobody_answers(network: Callable[..., None]) -> None:
     asked = []
 
     def locate() -> tuple[float, float]:
         asked.append(1)
         return 48.2, 16.4  # Vienna
 
-    measured = AWS.ranked(['us-west-1', 'eu-central-1'], locate=locate, connect=connector({
-        'us-west-1': [0.1] * 3}))
+    network(connector({'us-west-1': [0.1] * 3}), geolocate=locate)
+    measured = AWS.ranked(['us-west-1', 'eu-central-1'])
     assert measured[0].region == 'us-west-1' and not asked
-    placed = AWS.ranked(connect=connector({}), locate=locate)
+    network(connector({}))
+    placed = AWS.ranked()
     assert placed[0] == Region('eu-central-1', 'Frankfurt', None, placed[0].distance_km)
     assert placed[0].distance_km == pytest.approx(600, abs=30) and asked
 
 
-def test_table_without_any_answer_is_an_error() -> None:
+def test_table_without_any_answer_is_an_error(network: Callable[..., None]) -> None:
     def lost() -> tuple[float, float]:
         raise ProviderError('nobody knows')
 
+    network(connector({}), geolocate=lost)
     with pytest.raises(ProviderError, match='none of 2 AWS regions answers; nobody knows'):
-        AWS.ranked(['us-west-1', 'us-west-2'], connect=connector({}), locate=lost)
+        AWS.ranked(['us-west-1', 'us-west-2'])
+    network(connector({}), geolocate=lambda: (0.0, 0.0))
     with pytest.raises(ProviderError, match='xx-1'):
-        AWS.ranked(['xx-1'], connect=connector({}), locate=lambda: (0.0, 0.0))
+        AWS.ranked(['xx-1'])
 
 
 def test_the_nearest_is_measured_once(monkeypatch: pytest.MonkeyPatch) -> None:

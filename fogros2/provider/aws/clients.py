@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
-import copy
 import os
 from pathlib import Path
 import threading
@@ -13,13 +12,12 @@ import time
 from typing import Any, Optional, TypeVar
 
 from fogros2.errors import FogError, PrerequisiteError
-from fogros2.provider.aws import retry
-from fogros2.provider.aws.failures import AwsError, translated
+from fogros2.provider.aws.failures import translated
+from fogros2.provider.vm import account as vm
+from fogros2.provider.vm.failures import unless_gone
 
 T = TypeVar('T')
 
-#: Attempts of one call, the first included; the pauses between them grow (adaptive mode).
-ATTEMPTS = 8
 CONNECT_TIMEOUT, READ_TIMEOUT = 5.0, 30.0
 #: Seconds for which EC2 may not report a new instance.
 SETTLING = 60.0
@@ -57,7 +55,7 @@ def usual() -> Account:
         return _accounts[settings]
 
 
-class Account:
+class Account(vm.Account):
     """
     An AWS account as boto3 finds it (variables, files, roles); thread-safe.
 
@@ -67,6 +65,7 @@ class Account:
     """
 
     def __init__(self, session: Optional[Any] = None) -> None:
+        super().__init__()
         self._session = session
         #: Instances that this process has created, and when (``time.monotonic``).
         self.made: dict[str, float] = {}
@@ -78,33 +77,16 @@ class Account:
         self._clients: dict[tuple[str, str, bool], Any] = {}
         # boto3 creates clients of one session in one thread only; their use is thread-safe
         self._lock = threading.RLock()
-        self._cancel: Optional[threading.Event] = None
-        self._hasty = False
 
-    def hasty(self) -> Account:
-        """Return this account with short time-outs and few attempts."""
-        other = copy.copy(self)
-        other._hasty = True
-        return other
-
-    def until(self, cancel: Optional[threading.Event]) -> Account:
-        """Return this account with calls that raise Cancelled once ``cancel`` is set."""
+    def having(self, cancel: Optional[threading.Event], *, hasty: bool = False) -> Account:
+        """Return this account for calls that end with ``cancel``, with the same session."""
         self.session()
-        other = copy.copy(self)
-        other._cancel = cancel
-        return other
+        return super().having(cancel, hasty=hasty)
 
     def just_made(self, instance: str) -> bool:
         """Return whether EC2 may not report an instance yet that this process has created."""
         made = self.made.get(instance)
         return made is not None and time.monotonic() - made < SETTLING
-
-    def apart(self) -> Account:
-        """Return this account with its own clients, which the others' throttling does not slow."""
-        self.session()
-        other = copy.copy(self)
-        other._clients = {}
-        return other
 
     def session(self) -> Any:
         """
@@ -155,13 +137,13 @@ class Account:
                 session = self.session()
                 from botocore.config import Config
                 config = Config(
-                    retries={'mode': 'adaptive', 'total_max_attempts': 2 if hasty else ATTEMPTS},
+                    # ``repeated`` makes them again: nothing can end the pauses of boto3
+                    retries={'mode': 'standard', 'total_max_attempts': 1},
                     connect_timeout=3.0 if hasty else CONNECT_TIMEOUT,
                     read_timeout=5.0 if hasty else READ_TIMEOUT,
                     user_agent_extra='fogros2', max_pool_connections=50)
                 with translated(f"reaching AWS's {service}", region):
                     found = session.client(service, region_name=region, config=config)
-                retry.teach(found)
                 self._clients[(service, region, hasty)] = found
             return found
 
@@ -179,15 +161,12 @@ class Account:
             answer: Mapping[str, Any] = getattr(client, operation)(**parameters)
             return answer
 
-        return self._ask(ask, service, region, what)
+        return self._ask(ask, service, region, operation, what)
 
     def remove(self, region: str, operation: str, what: str, **parameters: Any) -> None:
         """Make a call of EC2 that deletes something; it may be deleted already."""
-        try:
+        with unless_gone():
             self.call('ec2', region, operation, what, **parameters)
-        except AwsError as error:
-            if not error.gone:
-                raise
 
     def pages(
         self, service: str, region: str, operation: str, key: str, what: str,
@@ -198,17 +177,17 @@ class Account:
             return [entry for page in client.get_paginator(operation).paginate(**parameters)
                     for entry in page[key]]
 
-        yield from self._ask(ask, service, region, what)
+        yield from self._ask(ask, service, region, operation, what)
 
     def _ask(
-        self, ask: Callable[[Any], T], service: str, region: str, what: str,
+        self, ask: Callable[[Any], T], service: str, region: str, operation: str, what: str,
     ) -> T:
         def asked() -> T:
-            client = self.client(service, region, hasty=self._hasty)
+            client = self.client(service, region, hasty=self.hasty)
             with translated(what, region, decode=lambda message: self._decode(region, message)):
                 return ask(client)
 
-        return retry.unless(self._cancel, asked, what)
+        return self.repeated(asked, what, reads=operation.startswith(('describe_', 'get_')))
 
     def _decode(self, region: str, message: str) -> str:
         """Return an encoded authorization failure as JSON, '' if that isn't allowed either."""

@@ -3,27 +3,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-import threading
+from collections.abc import Mapping, Sequence
 import time
 from typing import Any, ClassVar, Optional
 
 from fogros2.errors import MachineNotFound
-from fogros2.model import Image, MachineSpec
-from fogros2.provider.aws import clients, ending, images, instances, network
+from fogros2.model import MachineSpec
+from fogros2.provider.aws import clients, images, instances
 from fogros2.provider.aws.clients import Account
-from fogros2.provider.aws.failures import AwsError
+from fogros2.provider.aws.ending import Ec2Endings
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import Ec2Prices
-from fogros2.provider.aws.regions import api_host, REGIONS
 from fogros2.provider.offers import MachineType
-from fogros2.provider.vm.cloud import Order, own_name, Place, Vm, VmId
+from fogros2.provider.vm.cloud import Order, Place, Vm, VmId
+from fogros2.provider.vm.failures import unless_gone
 from fogros2.provider.vm.options import VmOptions
-from fogros2.provider.vm.regions import Regions
+from fogros2.provider.vm.regions import read_table, Regions
 
 
-class Ec2(Ec2Prices):
+def api_host(region: str) -> str:
+    """Return the host of a region's EC2 API, which is in the region."""
+    suffix = '.cn' if region.startswith('cn-') else ''
+    return f'ec2.{region}.amazonaws.com{suffix}'
+
+
+class Ec2(Ec2Prices, images.Ec2Images, Ec2Endings):
     """
     EC2 instances, each with its own security group and key pair.
 
@@ -33,28 +37,14 @@ class Ec2(Ec2Prices):
     name: ClassVar[str] = 'aws'
     title: ClassVar[str] = 'AWS'
     options: ClassVar[type[VmOptions]] = Options
-    regions: ClassVar[Regions] = Regions('AWS', REGIONS, api_host)
+    regions: ClassVar[Regions] = Regions('AWS', read_table(__file__), api_host)
     id_form: ClassVar[str] = 'i-[0-9a-f]+'
     base_region: ClassVar[str] = 'us-east-1'
     regions_variable: ClassVar[str] = 'FOGROS2_AWS_REGIONS'
+    configured = staticmethod(clients.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
-        self._account = account or clients.usual()
-
-    def _with(self, account: Account) -> Ec2:
-        other = super().until(None)
-        other._account = account
-        return other
-
-    def until(self, cancel: Optional[threading.Event]) -> Ec2:
-        return self if cancel is None else self._with(self._account.until(cancel))
-
-    def lasting(self) -> Ec2:
-        """Return an adapter with its own clients, which the throttling of others does not slow."""
-        return self._with(self._account.apart())
-
-    def hasty(self) -> Ec2:
-        return self._with(self._account.hasty())
+        self._account: Account = account or clients.usual()
 
     # -- the account ----------------------------------------------------------------------------
 
@@ -63,16 +53,14 @@ class Ec2(Ec2Prices):
 
     def whoami(self, region: str) -> str:
         """Return the account; no policy can refuse this request."""
-        told = self._account.hasty().call(
+        told = self._account.having(self.cancel, hasty=True).call(
             'sts', region, 'get_caller_identity', 'asking AWS who we are')
         return f'account {told["Account"]}, {str(told["Arn"]).split(":")[-1]}, {region}'
 
     def default_region(self) -> str:
-        """Return the region of the AWS configuration."""
         return self._account.region()
 
     def enabled_regions(self) -> list[str]:
-        """Return the regions that the account has enabled; one request."""
         answer = self._account.call(
             'ec2', self.default_region() or self.base_region, 'describe_regions',
             'asking for the regions of the account')
@@ -84,22 +72,15 @@ class Ec2(Ec2Prices):
     # -- machines -------------------------------------------------------------------------------
 
     def find(self, region: str, tags: Mapping[str, str]) -> list[Vm]:
-        found = instances.instances_in(self._account.pages(
-            'ec2', region, 'describe_instances', 'Reservations', 'looking for machines',
-            Filters=[*instances.tag_filters(tags),
-                     {'Name': 'instance-state-name', 'Values': list(instances.ALIVE)}]))
-        return [instances.vm_of(region, instance) for instance in found]
+        return [instances.vm_of(region, instance) for instance in self._instances(
+            region, tags, 'looking for machines', instances.in_states(instances.ALIVE))]
 
     def get(self, region: str, vm: str) -> Optional[Vm]:
-        """Return an instance, None for a new one that EC2 does not report yet."""
-        try:
+        found: list[Mapping[str, Any]] = []
+        with unless_gone():
             found = instances.instances_in(self._account.call(
                 'ec2', region, 'describe_instances', f'looking for {vm}',
                 InstanceIds=[vm])['Reservations'])
-        except AwsError as error:
-            if not error.gone:
-                raise
-            found = []
         if not found:
             if self._account.just_made(vm):
                 return None
@@ -121,47 +102,6 @@ class Ec2(Ec2Prices):
             chosen[kind.name] = found[key]
         return chosen
 
-    def begin(self, region: str, order: Order, created: list[str]) -> None:
-        """Create the security group and import the key, in parallel."""
-        subnet, name = order.options.subnet, order.spec.name
-        vpc = network.vpc_of(self._account, region, subnet) if subnet else ''
-        with ThreadPoolExecutor(1, 'fog-aws') as pool:
-            importing = pool.submit(self._import_key, region, order)
-            created.append(network.create_group(
-                self._account, region, attempt=order.attempt, name=name, vpc=vpc,
-                tags=order.tags))
-            network.open_group(
-                self._account, region, created[0], attempt=order.attempt, name=name,
-                vpn_port=order.request.vpn_port, sources=order.sources)
-            importing.result()
-
-    def _import_key(self, region: str, order: Order) -> None:
-        try:
-            self._account.call(
-                'ec2', region, 'import_key_pair',
-                f"importing the login key of '{order.spec.name}'",
-                KeyName=own_name(order.attempt),
-                PublicKeyMaterial=order.request.authorized_key.encode(),
-                TagSpecifications=[{
-                    'ResourceType': 'key-pair', 'Tags': instances.tag_list(order.tags)}])
-        except AwsError as error:
-            if error.code != 'InvalidKeyPair.Duplicate':
-                raise
-
-    def undo_begin(
-        self, region: str, attempt: str, created: Sequence[str],
-    ) -> Iterator[tuple[str, Callable[[], None]]]:
-        """Yield the deletion of the key and of the group."""
-        yield 'the login key', lambda: ending.drop_key(self._account, region, attempt)
-        yield 'the security group', lambda: ending.drop_groups(
-            self._account, region, attempt, known=created, timeout=120.0)
-
-    def places(self, region: str, order: Order) -> Iterator[str]:
-        """Yield the subnet that is named; else EC2's choice, then the default VPC's subnets."""
-        yield order.options.subnet
-        if not order.options.subnet:
-            yield from network.default_subnets(self._account, region)
-
     def insert(
         self, place: Place, order: Order, prepared: Any, created: Sequence[str],
         tags: Mapping[str, str],
@@ -173,24 +113,6 @@ class Ec2(Ec2Prices):
         vm = str(answer['Instances'][0]['InstanceId'])
         self._account.made[vm] = time.monotonic()
         return vm
-
-    def delete(self, machine: VmId) -> None:
-        ending.destroy(self._account, machine)
-
-    def end_attempt(self, region: str, attempt: str) -> None:
-        ending.end_instances(self._account, region, attempt)
-
-    def sweep(self, region: str, attempt: str) -> None:
-        ending.sweep(self._account, region, attempt)
-
-    def remains(self, region: str) -> list[dict[str, str]]:
-        return ending.remains(self._account, region)
-
-    def attempts(self, region: str) -> list[str]:
-        return ending.attempts(self._account, region)
-
-    def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
-        network.allow(self._account, machine.region, machine.attempt, port, sources)
 
     def set_tags(self, machine: VmId, tags: Mapping[str, str]) -> None:
         self._call(machine, 'create_tags', f'writing tags of {machine.vm}',
@@ -210,18 +132,3 @@ class Ec2(Ec2Prices):
 
     def _call(self, machine: VmId, operation: str, what: str, **words: Any) -> None:
         self._account.call('ec2', machine.region, operation, what, **words)
-
-    # -- images ---------------------------------------------------------------------------------
-
-    def bake(self, machine: VmId, name: str, dependencies: str) -> str:
-        vm = self.get(machine.region, machine.vm)
-        if vm is None:
-            raise MachineNotFound(f'EC2 does not know {machine.vm} yet', 'try again')
-        return images.bake(self._account, vm, name, dependencies)
-
-    def images(self, region: str) -> Iterable[Image]:
-        return images.images_in(self._account, region)
-
-    def delete_image(self, image_id: str) -> None:
-        """Deregister an AMI, and delete its snapshots."""
-        images.delete(self._account, image_id)

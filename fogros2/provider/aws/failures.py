@@ -8,35 +8,14 @@ common errors of all AWS services.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import json
 import re
 from typing import Any, ClassVar, Optional
 
 from fogros2.errors import FogError, PrerequisiteError, ProviderError
-from fogros2.provider.vm.failures import CodedError, Failure, LENGTH
-
-#: No capacity in this zone; another zone may have some.
-NO_ROOM_IN_ZONE = frozenset({
-    'InsufficientInstanceCapacity', 'InsufficientHostCapacity', 'InsufficientCapacity',
-    'InsufficientFreeAddressesInSubnet', 'Unsupported', 'UnfulfillableCapacity',
-    'SpotMaxPriceTooLow',
-})
-#: The account's quota in this region is used up; another type or region may have some.
-NO_ROOM_IN_REGION = frozenset({
-    'VcpuLimitExceeded', 'InstanceLimitExceeded', 'MaxSpotInstanceCountExceeded',
-    'SpotInstanceCountExceeded',
-})
-NO_ROOM = NO_ROOM_IN_ZONE | NO_ROOM_IN_REGION
-#: The resource does not exist (any more).
-GONE = frozenset({
-    'InvalidInstanceID.NotFound', 'InvalidInstanceID.Malformed', 'InvalidGroup.NotFound',
-    'InvalidGroupId.Malformed', 'InvalidKeyPair.NotFound', 'InvalidAMIID.NotFound',
-    'InvalidAMIID.Malformed', 'InvalidAMIID.Unavailable', 'InvalidSnapshot.NotFound',
-    'InvalidVolume.NotFound', 'InvalidAllocationID.NotFound',
-})
-
+from fogros2.provider.vm.failures import CodedError, Failure, LENGTH, Silent
 
 _LOG_IN = 'aws sso login, or new keys: aws configure'
 _QUOTA = 'ask for more at Service Quotas (EC2, in this region), or take another type or region'
@@ -71,22 +50,24 @@ _FAILURES = {
     'InvalidInstanceType': Failure(
         'the region has no such instance type', 'ros2 fog price shows what it has'),
     'Unsupported': Failure(
-        '', 'the type may not be offered in this zone: ros2 fog price, or another region='),
+        '', 'the type may not be offered in this zone: ros2 fog price, or another region=',
+        full='zone'),
     'InvalidAMIID.NotFound': Failure(
         'there is no such image in this region',
-        'an AMI belongs to one region; leave ami_image= out for Ubuntu 24.04'),
-    'InvalidAMIID.Malformed': Failure('that is no id of an image', 'ami_image= takes ami-...'),
+        'an AMI belongs to one region; leave ami_image= out for Ubuntu 24.04', gone=True),
+    'InvalidAMIID.Malformed': Failure(
+        'that is no id of an image', 'ami_image= takes ami-...', gone=True),
     'InvalidAMIID.Unavailable': Failure(
-        'the image is not ready, or was deleted', 'ros2 fog image list'),
+        'the image is not ready, or was deleted', 'ros2 fog image list', gone=True),
     **dict.fromkeys(('VPCIdNotSpecified', 'DefaultVpcDoesNotExist'), Failure(
         'the account has no default VPC in this region',
         'aws ec2 create-default-vpc, or name a subnet=')),
     'InvalidSubnetID.NotFound': Failure('there is no such subnet in this region',
                                         'check subnet= and region='),
     'InvalidGroup.NotFound': Failure('there is no such security group in this VPC',
-                                     'check security_groups= and subnet='),
+                                     'check security_groups= and subnet=', gone=True),
     'InvalidGroupId.Malformed': Failure('that is no id of a security group',
-                                        'security_groups= takes sg-...'),
+                                        'security_groups= takes sg-...', gone=True),
     'InvalidKey.Format': Failure('', 'the login key has to be an Ed25519 or RSA key'),
     'IdempotentParameterMismatch': Failure(
         'another machine was asked for under the same token', 'start the launch again'),
@@ -95,14 +76,18 @@ _FAILURES = {
     # how much of it
     'InsufficientInstanceCapacity': Failure(
         'AWS has no free machine of this type here at the moment',
-        'try later, or give more types and places: instance_types=, regions='),
-    'VcpuLimitExceeded': Failure("the account's quota of vCPUs is used up", _QUOTA),
-    'InstanceLimitExceeded': Failure("the account's quota of instances is used up", _QUOTA),
-    'MaxSpotInstanceCountExceeded': Failure(
-        "the account's quota of spot instances is used up", _QUOTA),
+        'try later, or give more types and places: instance_types=, regions=', full='zone'),
+    **dict.fromkeys(('InsufficientHostCapacity', 'InsufficientCapacity', 'UnfulfillableCapacity',
+                     'InsufficientFreeAddressesInSubnet'), Failure(full='zone')),
+    'VcpuLimitExceeded': Failure(
+        "the account's quota of vCPUs is used up", _QUOTA, full='region'),
+    'InstanceLimitExceeded': Failure(
+        "the account's quota of instances is used up", _QUOTA, full='region'),
+    **dict.fromkeys(('MaxSpotInstanceCountExceeded', 'SpotInstanceCountExceeded'), Failure(
+        "the account's quota of spot instances is used up", _QUOTA, full='region')),
     'SpotMaxPriceTooLow': Failure(
         'the spot price is above max_price= at the moment',
-        'ros2 fog price --spot shows it; spot=False takes a machine on demand'),
+        'ros2 fog price --spot shows it; spot=False takes a machine on demand', full='zone'),
     'VolumeLimitExceeded': Failure("the account's quota of disks is used up", _QUOTA),
     'SecurityGroupLimitExceeded': Failure(
         "the account's quota of security groups is used up", 'ros2 fog gc, or ask for more'),
@@ -111,17 +96,23 @@ _FAILURES = {
     'DependencyViolation': Failure('something uses it still', 'ros2 fog delete again in a minute'),
     'AddressLimitExceeded': Failure('', _QUOTA),
     # AWS itself
-    **dict.fromkeys(('RequestLimitExceeded', 'Throttling', 'ThrottlingException'), Failure(
-        'AWS asks for fewer requests', 'try again in a minute')),
+    **dict.fromkeys(('RequestLimitExceeded', 'Throttling', 'ThrottlingException',
+                     'RequestThrottled', 'EC2ThrottledException', 'TooManyRequestsException'),
+                    Failure('AWS asks for fewer requests', 'try again in a minute',
+                            temporary=True)),
     **dict.fromkeys(('InternalError', 'InternalFailure'), Failure(
         '', 'try again; https://health.aws.amazon.com has what is known')),
     **dict.fromkeys(('ServiceUnavailable', 'Unavailable'), Failure('', 'try again in a minute')),
     'ParameterNotFound': Failure(
         'AWS names no such image in this region', 'name one with ami_image='),
+    # the policy of the credentials, or of their organisation
+    **dict.fromkeys(('UnauthorizedOperation', 'AccessDenied', 'AccessDeniedException',
+                     'UnauthorizedException'), Failure(denied=True)),
+    **dict.fromkeys(('InvalidInstanceID.NotFound', 'InvalidInstanceID.Malformed',
+                     'InvalidKeyPair.NotFound', 'InvalidSnapshot.NotFound',
+                     'InvalidVolume.NotFound', 'InvalidAllocationID.NotFound'),
+                    Failure(gone=True)),
 }
-#: The policy of the credentials, or of their organisation, does not allow the request.
-DENIED = ('UnauthorizedOperation', 'AccessDenied', 'AccessDeniedException',
-          'UnauthorizedException')
 _ACTION = re.compile(r'not authorized to perform:? ([A-Za-z0-9-]+:[A-Za-z0-9*]+)')
 _ENCODED = re.compile(r'[Ee]ncoded authorization failure message: *([\w-]+)')
 
@@ -131,10 +122,6 @@ class AwsError(CodedError):
 
     TITLE: ClassVar[str] = 'AWS'
     FAILURES: ClassVar[Mapping[str, Failure]] = _FAILURES
-    NO_ROOM_IN_ZONE: ClassVar[Collection[str]] = NO_ROOM_IN_ZONE
-    NO_ROOM_IN_REGION: ClassVar[Collection[str]] = NO_ROOM_IN_REGION
-    GONE: ClassVar[Collection[str]] = GONE
-    DENIED: ClassVar[Collection[str]] = DENIED
 
 
 @contextlib.contextmanager
@@ -173,12 +160,12 @@ def refused(
     code, said = str(details.get('Code', '')), _plain(str(details.get('Message', '')))
     status = (response.get('ResponseMetadata') or {}).get('HTTPStatusCode', 400)
     where = f'{what} in {region}' if region else what
-    if code in DENIED:
+    if AwsError.known(code).denied:
         action = denied_action(said, operation, decode)
         return AwsError(f'{where} failed: the policy of these credentials does not allow {action}',
                         f'add {action} to it: doc/aws.md has the whole policy', code=code)
     error = AwsError.of(code, said, where, status)
-    if code.startswith('Invalid') and said and _FAILURES.get(code, Failure('', '')).reason:
+    if code.startswith('Invalid') and said and AwsError.known(code).reason:
         error.args = (f'{error.args[0]} ({said[:160].rstrip(".")})',)
     return error
 
@@ -237,7 +224,8 @@ def _unsent(error: BaseException, what: str, region: str) -> FogError:
         if isinstance(error, kinds):
             return PrerequisiteError(f'{where} failed: {reason}', hint)
     if isinstance(error, (known.HTTPClientError, known.ConnectionError)):
-        return PrerequisiteError(
+        return Silent(
             f'{where} failed: AWS does not answer: {said}',
-            'does region= exist, and is there a way to the Internet (a proxy, AWS_ENDPOINT_URL)?')
+            'does region= exist, and is there a way to the Internet (a proxy, AWS_ENDPOINT_URL)?',
+            unsent=not isinstance(error, (known.ReadTimeoutError, known.ConnectionClosedError)))
     return ProviderError(f'{where} failed: {said}')

@@ -8,7 +8,7 @@ import re
 import time
 from typing import Any, Optional
 
-from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
+from fogros2.errors import ConfigurationError, MachineNotFound
 from fogros2.model import Image
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.aws.clients import Account
@@ -17,7 +17,8 @@ from fogros2.provider.aws.instances import tag_list, tags_of
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import instance_type
 from fogros2.provider.offers import MachineType
-from fogros2.provider.vm.cloud import TAG_BAKED, TAG_USER, Vm, when
+from fogros2.provider.vm.cloud import TAG_BAKED, TAG_USER, VmCloud, VmId, when
+from fogros2.provider.vm.images import check_baked, image_parts, image_tags
 
 #: Public parameters of AWS's parameter store, by architecture; ROS 2 Jazzy is for Ubuntu 24.04.
 UBUNTU = {
@@ -34,7 +35,6 @@ DEEP_LEARNING = {
              'base-oss-nvidia-driver-gpu-ubuntu-24.04/latest/ami-id',
 }
 _STATES = {'invalid': 'failed', 'error': 'failed', 'transient': 'pending'}
-_ID = re.compile(r'aws:([a-z0-9-]+)/(ami-[0-9a-f]+)')
 
 
 def kinds(account: Account, region: str, names: list[str]) -> list[MachineType]:
@@ -140,68 +140,60 @@ def _baked(
     return max(fitting, key=lambda image: str(image.get('CreationDate', '')), default=None)
 
 
-def bake(account: Account, vm: Vm, name: str, dependencies: str) -> str:
-    """
-    Make an image of an instance without a reboot, and return its id.
+class Ec2Images(VmCloud):
+    """The part of EC2 that makes images of machines."""
 
-    Files of the last half minute may be missing, unless ``sync`` ran on the machine before.
-    """
-    tags = {'Name': name, TAG_BAKED: name, TAG_USER: vm.tags.get(TAG_USER, ''),
-            TAG_DEPENDENCIES: dependencies}
-    listed = tag_list({key: value for key, value in tags.items() if value})
-    # names are unique in a region
-    stamp = time.strftime('%Y%m%d-%H%M%S', time.gmtime())
-    plain = re.sub(r"[^A-Za-z0-9()\[\] ./'@_-]", '-', name)[:80]
-    answer = account.call(
-        'ec2', vm.region, 'create_image', f"making the image '{name}'",
-        InstanceId=vm.id, Name=f'fogros2-{plain}-{stamp}', NoReboot=True,
-        Description=f'FogROS2: {plain}',
-        TagSpecifications=[{'ResourceType': 'image', 'Tags': listed},
-                           {'ResourceType': 'snapshot', 'Tags': listed}])
-    return f'aws:{vm.region}/{answer["ImageId"]}'
+    _account: Account
 
+    def bake(self, machine: VmId, name: str, dependencies: str) -> str:
+        # without a reboot, files of the last half minute may be missing, unless ``sync`` ran
+        vm = self.get(machine.region, machine.vm)
+        if vm is None:
+            raise MachineNotFound(f'EC2 does not know {machine.vm} yet', 'try again')
+        listed = tag_list({'Name': name, **image_tags(name, vm.tags, dependencies)})
+        # names are unique in a region
+        stamp = time.strftime('%Y%m%d-%H%M%S', time.gmtime())
+        plain = re.sub(r"[^A-Za-z0-9()\[\] ./'@_-]", '-', name)[:80]
+        answer = self._account.call(
+            'ec2', vm.region, 'create_image', f"making the image '{name}'",
+            InstanceId=vm.id, Name=f'fogros2-{plain}-{stamp}', NoReboot=True,
+            Description=f'FogROS2: {plain}',
+            TagSpecifications=[{'ResourceType': 'image', 'Tags': listed},
+                               {'ResourceType': 'snapshot', 'Tags': listed}])
+        return f'aws:{vm.region}/{answer["ImageId"]}'
 
-def images_in(account: Account, region: str) -> Iterator[Image]:
-    """Yield the images of FogROS2 in a region."""
-    for entry in account.pages(
-            'ec2', region, 'describe_images', 'Images', 'looking for images', Owners=['self'],
-            Filters=[{'Name': 'tag-key', 'Values': [TAG_BAKED]}]):
-        tags = tags_of(entry)
-        sizes = [int(mapping.get('Ebs', {}).get('VolumeSize') or 0)
-                 for mapping in entry.get('BlockDeviceMappings') or ()]
-        state = str(entry.get('State', ''))
-        yield Image(
-            f'aws:{region}/{entry["ImageId"]}', tags.get(TAG_BAKED, ''), 'aws', region,
-            created=when(entry.get('CreationDate')), size_gb=sum(sizes) or None,
-            state=_STATES.get(state, state), dependencies=tags.get(TAG_DEPENDENCIES, ''),
-            tags=tags)
+    def images(self, region: str) -> Iterator[Image]:
+        for entry in self._account.pages(
+                'ec2', region, 'describe_images', 'Images', 'looking for images', Owners=['self'],
+                Filters=[{'Name': 'tag-key', 'Values': [TAG_BAKED]}]):
+            tags = tags_of(entry)
+            sizes = [int(mapping.get('Ebs', {}).get('VolumeSize') or 0)
+                     for mapping in entry.get('BlockDeviceMappings') or ()]
+            state = str(entry.get('State', ''))
+            yield Image(
+                f'aws:{region}/{entry["ImageId"]}', tags.get(TAG_BAKED, ''), 'aws', region,
+                created=when(entry.get('CreationDate')), size_gb=sum(sizes) or None,
+                state=_STATES.get(state, state), dependencies=tags.get(TAG_DEPENDENCIES, ''),
+                tags=tags)
 
-
-def delete(account: Account, image_id: str) -> None:
-    """
-    Delete an image and its snapshots, also those that an earlier attempt left.
-
-    :raises MachineNotFound: the id is not an image's.
-    """
-    parts = _ID.fullmatch(image_id)
-    if parts is None:
-        raise MachineNotFound(f"'{image_id}' is no image at AWS", 'ros2 fog image list')
-    region, identity = parts.groups()
-    what = f'deleting the image {identity}'
-    found = account.call('ec2', region, 'describe_images', what, Owners=['self'],
-                         Filters=[{'Name': 'image-id', 'Values': [identity]}])['Images']
-    snapshots = {str(mapping['Ebs']['SnapshotId'])
-                 for image in found for mapping in image.get('BlockDeviceMappings') or ()
-                 if mapping.get('Ebs', {}).get('SnapshotId')}
-    if found and TAG_BAKED not in tags_of(found[0]):
-        raise ProviderError(f'{identity} in {region} is no image of FogROS2',
-                            'ros2 fog image list shows those that are')
-    # EC2 writes the image's id into the description of its snapshots
-    snapshots |= {str(entry['SnapshotId']) for entry in account.pages(
-        'ec2', region, 'describe_snapshots', 'Snapshots', what, OwnerIds=['self'],
-        Filters=[{'Name': 'description', 'Values': [f'*for {identity}*']},
-                 {'Name': 'tag-key', 'Values': [TAG_BAKED]}])}
-    if found:
-        account.remove(region, 'deregister_image', what, ImageId=identity)
-    for snapshot in sorted(snapshots):
-        account.remove(region, 'delete_snapshot', what, SnapshotId=snapshot)
+    def delete_image(self, image_id: str) -> None:
+        """Delete an image and its snapshots, also those that an earlier attempt left."""
+        account = self._account
+        region, identity = image_parts(image_id, 'aws:([a-z0-9-]+)/(ami-[0-9a-f]+)')
+        what = f'deleting the image {identity}'
+        found = account.call('ec2', region, 'describe_images', what, Owners=['self'],
+                             Filters=[{'Name': 'image-id', 'Values': [identity]}])['Images']
+        snapshots = {str(mapping['Ebs']['SnapshotId'])
+                     for image in found for mapping in image.get('BlockDeviceMappings') or ()
+                     if mapping.get('Ebs', {}).get('SnapshotId')}
+        if found:
+            check_baked(tags_of(found[0]), f'{identity} in {region}')
+        # EC2 writes the image's id into the description of its snapshots
+        snapshots |= {str(entry['SnapshotId']) for entry in account.pages(
+            'ec2', region, 'describe_snapshots', 'Snapshots', what, OwnerIds=['self'],
+            Filters=[{'Name': 'description', 'Values': [f'*for {identity}*']},
+                     {'Name': 'tag-key', 'Values': [TAG_BAKED]}])}
+        if found:
+            account.remove(region, 'deregister_image', what, ImageId=identity)
+        for snapshot in sorted(snapshots):
+            account.remove(region, 'delete_snapshot', what, SnapshotId=snapshot)

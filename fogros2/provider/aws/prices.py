@@ -12,10 +12,8 @@ from typing import Any, Optional
 
 from fogros2.errors import ProviderError
 from fogros2.provider.aws.clients import Account
-from fogros2.provider.aws.regions import REGIONS
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import VmCloud
-from fogros2.provider.vm.regions import distance_km
 
 #: The regions that have a pricing API.
 PRICING_REGIONS = ('us-east-1', 'eu-central-1', 'ap-south-1')
@@ -33,12 +31,10 @@ class Ec2Prices(VmCloud):
     _account: Account
 
     def account_key(self) -> str:
-        """Return what distinguishes this account and endpoint from others in the cache."""
         return '|'.join(os.environ.get(name, '') for name in (
             'AWS_ENDPOINT_URL', 'AWS_ENDPOINT_URL_EC2', 'AWS_ENDPOINT_URL_PRICING', 'AWS_PROFILE'))
 
     def types(self, region: str) -> Iterator[MachineType]:
-        """Yield the current types that run Linux on x86_64 or arm64."""
         for entry in self._account.pages(
                 'ec2', region, 'describe_instance_types', 'InstanceTypes',
                 'asking for the instance types', Filters=[
@@ -49,7 +45,6 @@ class Ec2Prices(VmCloud):
                 yield kind
 
     def zones(self, region: str) -> dict[str, list[str]]:
-        """Return the zones of a region that have each type."""
         found: dict[str, list[str]] = {}
         for entry in self._account.pages(
                 'ec2', region, 'describe_instance_type_offerings', 'InstanceTypeOfferings',
@@ -58,11 +53,13 @@ class Ec2Prices(VmCloud):
         return {name: sorted(places) for name, places in found.items()}
 
     def prices(self, region: str, name: str = '') -> dict[str, Decimal]:
-        """Return the prices on demand in US dollars per hour, by type; of one type if named."""
         wanted = {**ON_DEMAND, 'regionCode': region, **({'instanceType': name} if name else {})}
         found: dict[str, Decimal] = {}
+        place = self.regions.table.get(region)
+        near = self.regions.by_distance(PRICING_REGIONS, place[:2])[0].region if place \
+            else PRICING_REGIONS[0]
         for text in self._account.pages(
-                'pricing', pricing_region(region), 'get_products', 'PriceList',
+                'pricing', near, 'get_products', 'PriceList',
                 'asking for the prices', ServiceCode='AmazonEC2', FormatVersion='aws_v1',
                 Filters=[{'Type': 'TERM_MATCH', 'Field': field, 'Value': value}
                          for field, value in wanted.items()]):
@@ -73,7 +70,6 @@ class Ec2Prices(VmCloud):
     def spot_prices(
         self, region: str, names: Optional[Sequence[str]],
     ) -> dict[str, dict[str, Decimal]]:
-        """Return the newest spot prices in US dollars per hour, by type and zone."""
         found: dict[str, dict[str, Decimal]] = {}
         newest: dict[tuple[str, str], float] = {}
         # a history from now on has only the current prices
@@ -90,14 +86,6 @@ class Ec2Prices(VmCloud):
                 newest[name, zone] = when
                 found.setdefault(name, {})[zone] = Decimal(entry['SpotPrice'])
         return found
-
-
-def pricing_region(region: str) -> str:
-    """Return the region with the nearest pricing API."""
-    if region not in REGIONS:
-        return PRICING_REGIONS[0]
-    here = REGIONS[region][:2]
-    return min(PRICING_REGIONS, key=lambda name: distance_km(here, REGIONS[name][:2]))
 
 
 def instance_type(entry: Mapping[str, Any]) -> Optional[MachineType]:

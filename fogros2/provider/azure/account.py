@@ -11,8 +11,8 @@ import threading
 from typing import Any, ClassVar, Optional
 
 from fogros2.errors import FogError, PrerequisiteError, ProviderError
-from fogros2.provider.azure.failures import AzureError, refusal
-from fogros2.provider.vm.failures import one_line
+from fogros2.provider.azure.failures import refusal
+from fogros2.provider.vm.failures import one_line, unless_gone
 from fogros2.provider.vm.rest import Answer, RestAccount
 from fogros2.waiting import wait_until
 
@@ -78,6 +78,8 @@ class Account(RestAccount):
         super().__init__()
         self._credential = credential
         self._lock = threading.Lock()
+        #: Machines that this process has just created, as Azure reports them.
+        self.seen: dict[str, Mapping[str, Any]] = {}
 
     def credential(self) -> Any:
         """
@@ -148,7 +150,7 @@ class Account(RestAccount):
 
         while url:
             try:
-                answer = requests.get(url, params=query, timeout=5.0 if self._hasty else 30.0)
+                answer = requests.get(url, params=query, timeout=5.0 if self.hasty else 30.0)
                 answer.raise_for_status()
                 found = answer.json()
                 yield from found['Items']
@@ -161,11 +163,8 @@ class Account(RestAccount):
         query: Optional[Mapping[str, str]] = None,
     ) -> None:
         """Delete something; it may be deleted already."""
-        try:
+        with unless_gone():
             self.call('DELETE', path, what, wait=wait, query=query)
-        except AzureError as error:
-            if not error.gone:
-                raise
 
     def _over(self, there: str, what: str) -> bool:
         """Return whether an operation has succeeded; raise its error."""
@@ -185,7 +184,6 @@ class Account(RestAccount):
         return self.ask(method, url, what, body, query=query, repeatable=method != 'POST')
 
     def refusal(self, status: int, body: Any, what: str) -> FogError:
-        """Return the error for a refusal."""
         return refusal(status, body, what)
 
     def token(self, what: str) -> str:

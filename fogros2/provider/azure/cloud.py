@@ -19,14 +19,13 @@ import time
 from typing import Any, ClassVar, Optional
 
 from fogros2.errors import ConfigurationError, FogError, MachineNotFound, ProviderError
-from fogros2.model import Image, MachineSpec, MachineState
+from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_EXPIRES
 from fogros2.provider.azure import ending, images, machines, prices
-from fogros2.provider.azure.account import Account, subscription
-from fogros2.provider.azure.failures import AzureError, refusal
+from fogros2.provider.azure.account import Account, configured, subscription
+from fogros2.provider.azure.failures import refusal
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
-from fogros2.provider.azure.regions import api_host, REGIONS
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import (
     Order,
@@ -39,9 +38,9 @@ from fogros2.provider.vm.cloud import (
     Vm,
     VmId,
 )
+from fogros2.provider.vm.failures import unless_gone
 from fogros2.provider.vm.options import ipv4, SSH, VmOptions
-from fogros2.provider.vm.regions import Regions
-from fogros2.provider.vm.rest import RestCloud
+from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import wait_until
 
 _VMS = 'providers/Microsoft.Compute/virtualMachines'
@@ -54,7 +53,7 @@ ALLOCATION = 300.0
 _USUAL = Account()
 
 
-class Azure(prices.AzurePrices, RestCloud):
+class Azure(prices.AzurePrices, images.AzureImages):
     """
     Virtual machines of Azure.
 
@@ -64,10 +63,13 @@ class Azure(prices.AzurePrices, RestCloud):
     name: ClassVar[str] = 'azure'
     title: ClassVar[str] = 'Azure'
     options: ClassVar[type[VmOptions]] = Options
-    regions: ClassVar[Regions] = Regions('Azure', REGIONS, api_host)
+    regions: ClassVar[Regions] = Regions(
+        'Azure', read_table(__file__),
+        lambda region: f'{region}.handler.control.monitor.azure.com')
     id_form: ClassVar[str] = 'fogros2-[0-9a-f]{16}-[0-9a-f]{8}'
     base_region: ClassVar[str] = 'westeurope'
     regions_variable: ClassVar[str] = 'FOGROS2_AZURE_REGIONS'
+    configured = staticmethod(configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
         self._account = account or _USUAL
@@ -77,7 +79,6 @@ class Azure(prices.AzurePrices, RestCloud):
     # -- the account ----------------------------------------------------------------------------
 
     def check_credentials(self) -> None:
-        """Check that a subscription is named, and that azure-identity is installed."""
         subscription()
         self._account.credential()
 
@@ -121,13 +122,13 @@ class Azure(prices.AzurePrices, RestCloud):
                 for entry in found]
 
     def get(self, region: str, vm: str) -> Optional[Vm]:
-        try:
-            # what insert has just seen is reported once
-            found = machines.vm_of(self._account.known.pop(f'vm {vm}', None) or self._entry(vm))
-        except AzureError as error:
-            if not error.gone:
-                raise
-            raise MachineNotFound(f'there is no {vm} in {region} any more') from error
+        # what insert has just seen is reported once
+        entry = self._account.seen.pop(vm, {})
+        with unless_gone():
+            entry = entry or self._entry(vm)
+        if not entry:
+            raise MachineNotFound(f'there is no {vm} in {region} any more')
+        found = machines.vm_of(entry)
         if found.state is MachineState.DELETED:
             raise MachineNotFound(f'{vm} in {region} is being deleted')
         return dataclasses.replace(found, note=self._notes.get(vm, ''))
@@ -168,13 +169,10 @@ class Azure(prices.AzurePrices, RestCloud):
     def _subnet(self, group: str, region: str) -> str:
         """Return a subnet of the user's own group in a region, '' if there is none."""
         found: list[Mapping[str, Any]] = []
-        try:
+        with unless_gone():  # pull request 109 creates the group
             found += self._account.pages(
                 self._account.path(group, f'{_NET}/virtualNetworks'),
                 f'looking for a network in {group}') if group else ()
-        except AzureError as error:
-            if not error.gone:  # pull request 109 creates the group
-                raise
         return next((str(subnet['id']) for network in found if prices.is_in(network, region)
                      for subnet in network['properties'].get('subnets') or ()
                      if not subnet['properties'].get('delegations')), '')
@@ -182,7 +180,6 @@ class Azure(prices.AzurePrices, RestCloud):
     def undo_begin(
         self, region: str, attempt: str, created: Sequence[str],
     ) -> Iterator[tuple[str, Callable[[], None]]]:
-        """Yield the deletion of the groups that this process has created."""
         yield 'the resource group', lambda: self._drop(attempt, created)
 
     def insert(
@@ -229,6 +226,7 @@ class Azure(prices.AzurePrices, RestCloud):
             subnet = known.subnet if network is None else str(
                 network.result()['properties']['subnets'][0]['id'])
             public = address.result()
+            self._account.admitted[order.attempt] = ipv4(order.sources)
             nic = put('networkInterfaces', {
                 'networkSecurityGroup': {'id': firewall.result()['id']},
                 'ipConfigurations': [{'name': 'machine', 'properties': {
@@ -242,7 +240,7 @@ class Azure(prices.AzurePrices, RestCloud):
         what = f"creating '{order.spec.name}' ({place.kind})"
         self._account.call('PUT', self._vm(name), what,
                            machines.request(place, order, known, str(nic['id']), tags))
-        entry = self._account.known[f'vm {name}'] = self._allocated(name, what)
+        entry = self._account.seen[name] = self._allocated(name, what)
         self._guard(name, place.region, order, known, entry)
         if known.nvidia:
             self._install_driver(name, place.region)
@@ -315,25 +313,22 @@ class Azure(prices.AzurePrices, RestCloud):
 
         def drop(name: str) -> None:
             path = self._account.path(name)
-            if name not in listed:
-                try:
-                    found = self._account.call('GET', path, f'looking for the group {name}')
-                except AzureError as error:
-                    if error.gone:
-                        return
-                    raise
-                if (found.get('tags') or {}).get(TAG_ATTEMPT) != attempt:
+            with unless_gone():
+                tags = {} if name in listed else self._account.call(
+                    'GET', path, f'looking for the group {name}').get('tags') or {}
+                if name not in listed and tags.get(TAG_ATTEMPT) != attempt:
                     raise ProviderError(f'the group {name} has no tag of FogROS2, and stays',
                                         'FogROS2 deletes only groups that it created')
-            self._account.delete(path, f'deleting the group {name}', wait=wait,
-                                 query={'forceDeletionTypes': 'Microsoft.Compute/virtualMachines'})
+                self._account.delete(
+                    path, f'deleting the group {name}', wait=wait,
+                    query={'forceDeletionTypes': 'Microsoft.Compute/virtualMachines'})
 
         chosen = sorted(name for name in {*names, *listed} if empty is None or name in empty)
         with ThreadPoolExecutor(max(1, min(8, len(chosen))), 'fog-azure') as pool:
             list(pool.map(drop, chosen))
 
     def delete(self, machine: VmId) -> None:
-        self._account.known.pop(f'vm {machine.vm}', None)
+        self._account.seen.pop(machine.vm, None)
         self._drop(machine.attempt, [machine.vm], wait=True)
 
     def end_attempt(self, region: str, attempt: str) -> None:
@@ -355,7 +350,8 @@ class Azure(prices.AzurePrices, RestCloud):
     # -- changes of a machine -------------------------------------------------------------------
 
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
-        """Replace the rule of a port, or delete it."""
+        if port == SSH and self._account.admits(machine.attempt, ipv4(sources)):
+            return
         what, name = f'changing port {port} of {machine.vm}', machine.vm
         path = self._account.path(
             name, f'{_NET}/networkSecurityGroups/{name}/securityRules/tcp-{port}')
@@ -381,17 +377,14 @@ class Azure(prices.AzurePrices, RestCloud):
                             time.time() + spec.lifetime)
 
     def stop(self, machine: VmId) -> None:
-        """Deallocate a machine; its disk and its address stay, and are billed."""
-        self._account.known.pop(f'vm {machine.vm}', None)
+        self._account.seen.pop(machine.vm, None)
         self._account.call('POST', self._vm(machine.vm, '/deallocate'), f'stopping {machine.vm}')
 
     def start(self, machine: VmId) -> None:
-        """Start a machine; return when Azure has found room for it."""
         self._account.call('POST', self._vm(machine.vm, '/start'), f'starting {machine.vm}',
                            wait=True)
 
     def end_command(self, tags: Mapping[str, str]) -> tuple[str, ...]:
-        """Return the command by which a machine deletes its group, or deallocates itself."""
         return ending.end_command()
 
     # -- images ---------------------------------------------------------------------------------
@@ -401,10 +394,3 @@ class Azure(prices.AzurePrices, RestCloud):
         size = self.sizes(machine.region)[entry['properties']['hardwareProfile']['vmSize']]
         return images.bake(self._account, machine, entry, prices.machine_type(size),
                            prices.generation(size), name, dependencies)
-
-    def images(self, region: str) -> Iterable[Image]:
-        return images.images_in(self._account, region)
-
-    def delete_image(self, image_id: str) -> None:
-        """Delete an image with its group."""
-        images.delete(self._account, image_id)

@@ -82,11 +82,9 @@ def end_command() -> tuple[str, ...]:
 
 def may_assign(account: Account) -> bool:
     """Return whether the user may assign roles in the subscription; asked once in a process."""
-    if 'assign' not in account.known:
-        account.known['assign'] = any(map(grants, account.pages(
-            account.path(rest='providers/Microsoft.Authorization/permissions'),
-            'asking for the rights of these credentials')))
-    return bool(account.known['assign'])
+    return account.once('assign', lambda: any(map(grants, account.pages(
+        account.path(rest='providers/Microsoft.Authorization/permissions'),
+        'asking for the rights of these credentials'))))
 
 
 def grants(permission: Mapping[str, Any]) -> bool:

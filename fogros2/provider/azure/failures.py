@@ -8,31 +8,15 @@ allocation failures" in Azure's documentation.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 import re
 from typing import Any, ClassVar
 
 from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.vm.failures import CodedError, Failure, one_line
 
-#: No capacity for this size here.
-NO_ROOM = frozenset({
-    'AllocationFailed', 'ZonalAllocationFailed', 'OverconstrainedAllocationRequest',
-    'OverconstrainedZonalAllocationRequest', 'SkuNotAvailable', 'SpotNotAvailable',
-    'BadRequestMaxPriceTooLow'})
-#: The subscription's quota in this region is used up; another size or region may have some.
-NO_QUOTA = frozenset({
-    'QuotaExceeded', 'PublicIPCountLimitReached', 'VirtualNetworkCountLimitReached',
-    'NetworkSecurityGroupCountLimitReached', 'RegionalCoresQuotaExceeded'})
-GONE = frozenset({
-    'ResourceNotFound', 'ResourceGroupNotFound', 'NotFound', 'ParentResourceNotFound',
-    'ResourceGroupBeingDeleted'})
-DENIED = frozenset({
-    'AuthorizationFailed', 'LinkedAuthorizationFailed', 'RequestDisallowedByPolicy'})
 _MORE = 'ask for more at Quotas in the Azure portal, or take another vm_size= or region'
 _LOG_IN = 'az login, or new values of AZURE_CLIENT_ID and AZURE_CLIENT_SECRET'
-
-
 _FAILURES = {
     **dict.fromkeys(('InvalidAuthenticationToken', 'ExpiredAuthenticationToken',
                      'InvalidAuthenticationTokenTenant', 'AuthenticationFailed',
@@ -45,22 +29,30 @@ _FAILURES = {
         '', 'is the subscription active, and paid for?', PrerequisiteError)),
     'MissingSubscriptionRegistration': Failure(
         '', 'az provider register --namespace with the name above, once', PrerequisiteError),
-    'RequestDisallowedByPolicy': Failure('', 'ask who has assigned the policy'),
+    'RequestDisallowedByPolicy': Failure('', 'ask who has assigned the policy', denied=True),
+    **dict.fromkeys(('AuthorizationFailed', 'LinkedAuthorizationFailed'), Failure(denied=True)),
     'SkuNotAvailable': Failure(
-        '', 'try later, or give more sizes and regions: vm_sizes=, regions='),
-    **dict.fromkeys(NO_ROOM - {'SkuNotAvailable', 'BadRequestMaxPriceTooLow'}, Failure(
+        '', 'try later, or give more sizes and regions: vm_sizes=, regions=', full='zone'),
+    **dict.fromkeys(('AllocationFailed', 'ZonalAllocationFailed', 'SpotNotAvailable',
+                     'OverconstrainedAllocationRequest',
+                     'OverconstrainedZonalAllocationRequest'), Failure(
         'Azure has no free machine of this size here at the moment',
-        'try later, or give more sizes and regions: vm_sizes=, regions=')),
+        'try later, or give more sizes and regions: vm_sizes=, regions=', full='zone')),
     'BadRequestMaxPriceTooLow': Failure(
         'the spot price is above max_price= at the moment',
-        'ros2 fog price --spot shows it; spot=False takes a machine on demand'),
-    **dict.fromkeys(NO_QUOTA, Failure("the subscription's quota is used up", _MORE)),
+        'ros2 fog price --spot shows it; spot=False takes a machine on demand', full='zone'),
+    **dict.fromkeys(('QuotaExceeded', 'PublicIPCountLimitReached', 'RegionalCoresQuotaExceeded',
+                     'VirtualNetworkCountLimitReached', 'NetworkSecurityGroupCountLimitReached'),
+                    Failure("the subscription's quota is used up", _MORE, full='region')),
+    **dict.fromkeys(('ResourceNotFound', 'ResourceGroupNotFound', 'NotFound',
+                     'ParentResourceNotFound'), Failure(gone=True)),
     **dict.fromkeys(('PlatformImageNotFound', 'ImageNotFound', 'GalleryImageNotFound'), Failure(
         'there is no such image in this region', 'leave image= out for Ubuntu 24.04')),
     'LocationNotAvailableForResourceType': Failure(
         '', 'another region=: ros2 fog regions shows them'),
     'ResourceGroupBeingDeleted': Failure(
-        'Azure is still deleting the machine of this request', 'start the launch again'),
+        'Azure is still deleting the machine of this request', 'start the launch again',
+        gone=True),
     'ScopeLocked': Failure('', 'remove the lock: az lock list'),
     **dict.fromkeys(('TooManyRequests', 'OperationNotAllowed'), Failure(
         '', 'try again in a minute')),
@@ -72,10 +64,6 @@ class AzureError(CodedError):
 
     TITLE: ClassVar[str] = 'Azure'
     FAILURES: ClassVar[Mapping[str, Failure]] = _FAILURES
-    NO_ROOM_IN_ZONE: ClassVar[Collection[str]] = NO_ROOM
-    NO_ROOM_IN_REGION: ClassVar[Collection[str]] = NO_QUOTA
-    GONE: ClassVar[Collection[str]] = GONE
-    DENIED: ClassVar[Collection[str]] = DENIED
 
 
 def refusal(status: int, body: Any, what: str) -> FogError:
@@ -92,7 +80,7 @@ def refusal(status: int, body: Any, what: str) -> FogError:
             code, said = part['code'], one_line(part.get('message', ''))
     if code == 'OperationNotAllowed' and 'quota' in said.lower():
         code = 'QuotaExceeded'
-    if code in DENIED and code != 'RequestDisallowedByPolicy':
+    if AzureError.known(code).denied and code != 'RequestDisallowedByPolicy':
         action = re.search(r"perform action '([\w./]+)'", said)
         missing = action[1] if action else 'this'
         return AzureError(f'{what} failed: these credentials have no role that allows {missing}',

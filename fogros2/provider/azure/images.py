@@ -8,25 +8,24 @@ cloud-init treats a new machine's id as a first boot, so no machine is 'generali
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-import re
 import secrets
 import time
 from typing import Any
 
-from fogros2.errors import FogError, MachineNotFound, ProviderError
+from fogros2.errors import FogError
 from fogros2.model import Image
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.azure.account import Account
-from fogros2.provider.azure.failures import AzureError
 from fogros2.provider.azure.machines import region_of
 from fogros2.provider.azure.options import Options
 from fogros2.provider.offers import MachineType
-from fogros2.provider.vm.cloud import made_at, TAG_BAKED, TAG_MADE, TAG_USER, VmId
+from fogros2.provider.vm.cloud import made_at, TAG_BAKED, TAG_MADE, TAG_USER, VmCloud, VmId
+from fogros2.provider.vm.failures import unless_gone
+from fogros2.provider.vm.images import check_baked, image_parts, image_tags
 
 #: Tag of an image's group with what its machines need to have.
 TAG_KIND = 'fogros2-kind'
 _STATES = {'Succeeded': 'available', 'Failed': 'failed'}
-_ID = re.compile(r'azure:([a-z0-9]+)/(fogros2-image-[0-9a-f]{12})')
 _COMPUTE = 'providers/Microsoft.Compute'
 
 
@@ -46,9 +45,8 @@ def bake(
     :param entry: the machine as Azure describes it.
     """
     region, group = machine.region, f'fogros2-image-{secrets.token_hex(6)}'
-    tags = {TAG_BAKED: name, TAG_DEPENDENCIES: dependencies, TAG_MADE: str(int(time.time())),
-            TAG_USER: entry['tags'].get(TAG_USER, ''), TAG_KIND: f'{kind.arch} {generation}'}
-    tags = {key: value for key, value in tags.items() if value}
+    tags = {**image_tags(name, entry['tags'], dependencies), TAG_MADE: str(int(time.time())),
+            TAG_KIND: f'{kind.arch} {generation}'}
     version = _version(account, group)
     definition, gallery = version.rsplit('/', 2)[0], version.rsplit('/', 4)[0]
     snapshot = account.path(group, f'{_COMPUTE}/snapshots/machine')
@@ -83,23 +81,10 @@ def _groups(account: Account, region: str, query: str) -> list[Mapping[str, Any]
 
 
 def _state(account: Account, group: str) -> str:
-    try:
+    with unless_gone():
         found = account.call('GET', _version(account, group), f'looking for the image {group}')
-    except AzureError as error:
-        if not error.gone:
-            raise
-        return 'failed'
-    return _STATES.get(found['properties']['provisioningState'], 'pending')
-
-
-def images_in(account: Account, region: str) -> Iterator[Image]:
-    """Yield the images of FogROS2, of all regions if ``region`` is ''."""
-    for group in _groups(account, region, f"tagName eq '{TAG_BAKED}'"):
-        tags, name = group['tags'], str(group['name'])
-        yield Image(
-            f'azure:{region_of(group)}/{name}', tags[TAG_BAKED], 'azure', region_of(group),
-            created=made_at(tags) or None, state=_state(account, name),
-            dependencies=tags.get(TAG_DEPENDENCIES, ''), tags=tags)
+        return _STATES.get(found['properties']['provisioningState'], 'pending')
+    return 'failed'
 
 
 def baked(
@@ -120,23 +105,22 @@ def baked(
     return found
 
 
-def delete(account: Account, image_id: str) -> None:
-    """
-    Delete an image with its group; it may be deleted already.
+class AzureImages(VmCloud):
+    """The part of Azure that makes images of machines."""
 
-    :raises MachineNotFound: the id is not an image's.
-    """
-    parts = _ID.fullmatch(image_id)
-    if parts is None:
-        raise MachineNotFound(f"'{image_id}' is no image at Azure", 'ros2 fog image list')
-    path, what = account.path(parts[2]), f'deleting the image {parts[2]}'
-    try:
-        found = account.call('GET', path, what)
-    except AzureError as error:
-        if not error.gone:
-            raise
-        return
-    if TAG_BAKED not in (found.get('tags') or {}):
-        raise ProviderError(f'{parts[2]} is no image of FogROS2',
-                            'ros2 fog image list shows those that are')
-    account.delete(path, what, wait=True)
+    _account: Account
+
+    def images(self, region: str) -> Iterator[Image]:
+        for group in _groups(self._account, region, f"tagName eq '{TAG_BAKED}'"):
+            tags, name = group['tags'], str(group['name'])
+            yield Image(
+                f'azure:{region_of(group)}/{name}', tags[TAG_BAKED], 'azure', region_of(group),
+                created=made_at(tags) or None, state=_state(self._account, name),
+                dependencies=tags.get(TAG_DEPENDENCIES, ''), tags=tags)
+
+    def delete_image(self, image_id: str) -> None:
+        _, group = image_parts(image_id, 'azure:([a-z0-9]+)/(fogros2-image-[0-9a-f]{12})')
+        path, what = self._account.path(group), f'deleting the image {group}'
+        with unless_gone():
+            check_baked(self._account.call('GET', path, what).get('tags') or {}, group)
+            self._account.delete(path, what, wait=True)

@@ -29,55 +29,41 @@ class AzurePrices(VmCloud):
     _account: Account
 
     def account_key(self) -> str:
-        """Return what distinguishes this account and endpoint from others in the cache."""
         return '|'.join((endpoint(), os.environ.get(PRICES_VARIABLE, ''),
                          os.environ.get('AZURE_SUBSCRIPTION_ID', '')))
 
     def sizes(self, region: str) -> dict[str, Mapping[str, Any]]:
         """Return the sizes that the subscription may use in a region; asked once in a process."""
-        key = f'sizes {region}'
-        if key not in self._account.known:
-            self._account.known[key] = {
-                entry['name']: entry for entry in self._account.pages(
-                    self._account.path(rest='providers/Microsoft.Compute/skus'),
-                    f'asking for the sizes in {region}',
-                    **{'$filter': f"location eq '{region}'"})
-                if entry['resourceType'] == 'virtualMachines' and not any(
-                    limit.get('type') == 'Location' for limit in entry.get('restrictions') or ())}
-        found: dict[str, Mapping[str, Any]] = self._account.known[key]
-        return found
+        return self._account.once(f'sizes {region}', lambda: {
+            entry['name']: entry for entry in self._account.pages(
+                self._account.path(rest='providers/Microsoft.Compute/skus'),
+                f'asking for the sizes in {region}', **{'$filter': f"location eq '{region}'"})
+            if entry['resourceType'] == 'virtualMachines' and not any(
+                limit.get('type') == 'Location' for limit in entry.get('restrictions') or ())})
 
     def types(self, region: str) -> Iterator[MachineType]:
-        """Yield the types that run Linux on x86_64 or arm64."""
         yield from map(machine_type, self.sizes(region).values())
 
     def zones(self, region: str) -> dict[str, list[str]]:
-        """Return the region as the only zone of each size: Azure chooses one."""
         return {name: [region] for name in self.sizes(region)}
 
     def prices(self, region: str, name: str = '') -> dict[str, Decimal]:
-        """Return the prices on demand in US dollars per hour, by type; of one type if named."""
         return {kind: price for kind, price, spot in self._retail(region, name) if not spot}
 
     def spot_prices(
         self, region: str, names: Optional[Sequence[str]],
     ) -> dict[str, dict[str, Decimal]]:
-        """Return the spot prices in US dollars per hour; they are the same in all zones."""
         one = names[0] if names and len(names) == 1 else ''
         return {kind: {region: price} for kind, price, spot in self._retail(region, one) if spot}
 
     def _retail(self, region: str, name: str) -> list[tuple[str, Decimal, bool]]:
         # one list has both kinds of prices
-        key = f'prices {region} {name}'
-        if key not in self._account.known:
-            query = (f"serviceName eq 'Virtual Machines' and priceType eq 'Consumption' and "
-                     f"armRegionName eq '{region}'" + f" and armSkuName eq '{name}'" * bool(name))
-            self._account.known[key] = [
-                price for entry in self._account.public(
-                    os.environ.get(PRICES_VARIABLE, PRICES), f'asking for the prices in {region}',
-                    {'$filter': query}) if (price := retail_price(entry)) is not None]
-        found: list[tuple[str, Decimal, bool]] = self._account.known[key]
-        return found
+        query = (f"serviceName eq 'Virtual Machines' and priceType eq 'Consumption' and "
+                 f"armRegionName eq '{region}'" + f" and armSkuName eq '{name}'" * bool(name))
+        return self._account.once(f'prices {region} {name}', lambda: [
+            price for entry in self._account.public(
+                os.environ.get(PRICES_VARIABLE, PRICES), f'asking for the prices in {region}',
+                {'$filter': query}) if (price := retail_price(entry)) is not None])
 
 
 def capabilities(entry: Mapping[str, Any]) -> dict[str, str]:

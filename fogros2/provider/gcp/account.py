@@ -16,7 +16,7 @@ import warnings
 
 from fogros2.errors import DeadlineExceeded, FogError, PrerequisiteError
 from fogros2.provider.gcp import failures
-from fogros2.provider.gcp.failures import GoogleError
+from fogros2.provider.vm.failures import tolerated, unless_gone
 from fogros2.provider.vm.rest import RestAccount
 
 #: The API, and gcloud's own variable that names another address.
@@ -66,7 +66,6 @@ class _Login:
         self._lock = threading.Lock()
 
     def token(self) -> str:
-        """Return a token that is valid."""
         with self._lock:
             if not self._credentials.valid:
                 self._credentials.refresh(self._request)
@@ -136,7 +135,6 @@ class Account(RestAccount):
         _ = self.project
 
     def token(self, what: str) -> str:
-        """Return a token."""
         login = self._opened()
         from google.auth.exceptions import GoogleAuthError, TransportError
         try:
@@ -150,7 +148,6 @@ class Account(RestAccount):
             ) from error
 
     def refusal(self, status: int, body: Any, what: str) -> FogError:
-        """Return the error for a refusal."""
         return failures.refused(status, body, what)
 
     def call(
@@ -201,21 +198,15 @@ class Account(RestAccount):
 
     def create(self, path: str, what: str, body: Any, **query: str) -> bool:
         """Create something; return whether it was there already, from an earlier attempt."""
-        try:
+        with tolerated('ALREADY_EXISTS', 'RESOURCE_ALREADY_EXISTS'):
             self.run('POST', path, what, body=body, **query)
-        except GoogleError as error:
-            if error.code not in ('ALREADY_EXISTS', 'RESOURCE_ALREADY_EXISTS'):
-                raise
-            return True
-        return False
+            return False
+        return True
 
     def remove(self, path: str, what: str) -> None:
         """Delete something, which may be deleted already; return when it is gone."""
-        try:
+        with unless_gone():
             self.run('DELETE', path, what)
-        except GoogleError as error:
-            if not error.gone:
-                raise
 
     def pages(self, path: str, what: str, **query: str) -> Iterator[Mapping[str, Any]]:
         """Yield the entries of all pages of a list, or of a list over all zones."""

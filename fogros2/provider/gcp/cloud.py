@@ -3,22 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import copy
 from decimal import Decimal
 import os
 from typing import Any, ClassVar, Optional
 
 from fogros2.errors import ConfigurationError, MachineNotFound
-from fogros2.model import Image, MachineSpec, MachineState
+from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_ON_EXIT
-from fogros2.provider.gcp import firewall, guest, images, instances, prices
-from fogros2.provider.gcp.account import Account, ENDPOINT_VARIABLE
+from fogros2.provider.gcp import guest, images, instances, prices
+from fogros2.provider.gcp.account import Account, configured, ENDPOINT_VARIABLE
 from fogros2.provider.gcp.failures import GoogleError
+from fogros2.provider.gcp.firewall import GoogleFirewall
 from fogros2.provider.gcp.options import Options
-from fogros2.provider.gcp.regions import api_host, REGIONS
 from fogros2.provider.offers import MachineType
-from fogros2.provider.vm.address import ADDRESS_VARIABLE
 from fogros2.provider.vm.cloud import (
     CloudError,
     Order,
@@ -28,16 +27,16 @@ from fogros2.provider.vm.cloud import (
     Vm,
     VmId,
 )
-from fogros2.provider.vm.options import ipv4, SSH, VmOptions
-from fogros2.provider.vm.regions import Regions
-from fogros2.provider.vm.rest import RestCloud
+from fogros2.provider.vm.failures import unless_gone
+from fogros2.provider.vm.options import VmOptions
+from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import cancellable
 
 #: The region of FogROS2's default zone.
 DEFAULT_REGION = 'us-central1'
 
 
-class ComputeEngine(RestCloud):
+class ComputeEngine(images.GoogleImages, GoogleFirewall):
     """
     Compute Engine instances, each with its own firewall rules.
 
@@ -47,11 +46,14 @@ class ComputeEngine(RestCloud):
     name: ClassVar[str] = 'gcp'
     title: ClassVar[str] = 'Google Cloud'
     options: ClassVar[type[VmOptions]] = Options
-    regions: ClassVar[Regions] = Regions('Google Cloud', REGIONS, api_host)
+    regions: ClassVar[Regions] = Regions(
+        'Google Cloud', read_table(__file__),
+        lambda region: f'compute.{region}.rep.googleapis.com')
     #: Project, zone and name.
     id_form: ClassVar[str] = r'[a-z0-9.:-]+/[a-z0-9-]+/fogros2-[0-9a-f]{16}'
     base_region: ClassVar[str] = DEFAULT_REGION
     regions_variable: ClassVar[str] = 'FOGROS2_GCP_REGIONS'
+    configured = staticmethod(configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
         self._account: Account = account or Account()
@@ -81,7 +83,6 @@ class ComputeEngine(RestCloud):
         return os.environ.get('CLOUDSDK_COMPUTE_REGION', '') or zone[:-2] or DEFAULT_REGION
 
     def searched_regions(self) -> list[str]:
-        """Return that one request answers for all regions."""
         return ['']
 
     # -- types and prices -----------------------------------------------------------------------
@@ -91,16 +92,13 @@ class ComputeEngine(RestCloud):
 
     def _types(self, region: str, names: Sequence[str]) -> list[Mapping[str, Any]]:
         """Return the types of every zone of a region; all types if none is named."""
-        key, known = ' '.join((self._account.project, region, *names)), self._account.known
-        if key not in known:
-            kinds = ' OR '.join(f'(name = "{name}")' for name in names)
-            zones = ' OR '.join(f'(zone = "{region}-{letter}")' for letter in 'abcdef')
-            known[key] = list(self._account.pages(
-                f'{self._account.project}/aggregated/machineTypes', 'asking for the machine types',
-                maxResults='500',
-                filter=f'({kinds}) AND ({zones})' if names else f'({zones})'))
-        found: list[Mapping[str, Any]] = known[key]
-        return found
+        kinds = ' OR '.join(f'(name = "{name}")' for name in names)
+        zones = ' OR '.join(f'(zone = "{region}-{letter}")' for letter in 'abcdef')
+        project = self._account.project
+        return self._account.once(' '.join((project, region, *names)), lambda: list(
+            self._account.pages(
+                f'{project}/aggregated/machineTypes', 'asking for the machine types',
+                maxResults='500', filter=f'({kinds}) AND ({zones})' if names else f'({zones})')))
 
     def types(self, region: str) -> list[MachineType]:
         found = {entry['name']: entry for entry in self._types(region, ())}
@@ -120,7 +118,6 @@ class ComputeEngine(RestCloud):
         return {name: cost for name, cost in costs.items() if cost is not None}
 
     def prices(self, region: str, name: str = '') -> dict[str, Decimal]:
-        """Return the prices on demand by Google's catalogue, if a key for it is set."""
         return self._priced(region, (name,) if name else (), False)
 
     def spot_prices(
@@ -151,12 +148,11 @@ class ComputeEngine(RestCloud):
 
     def get(self, region: str, vm: str) -> Optional[Vm]:
         project = vm.partition('/')[0]
-        try:
+        found: Mapping[str, Any] = {}
+        with unless_gone():
             found = self._account.call('GET', _path(vm), f'looking for {vm}')
-        except GoogleError as error:
-            if error.gone:
-                raise MachineNotFound(f'there is no {vm} any more') from error
-            raise
+        if not found:
+            raise MachineNotFound(f'there is no {vm} any more')
         self._account.labels[vm] = found['labelFingerprint'], found.get('labels', {})
         known = instances.vm_of(project, found)
         if known.state is MachineState.DELETED:
@@ -186,31 +182,7 @@ class ComputeEngine(RestCloud):
             entry['path'], entry['size'] = found[key]
         return {kind: chosen[kind] for kind in types if kind in chosen}
 
-    def begin(self, region: str, order: Order, created: list[str]) -> None:
-        """Create the firewall rules."""
-        network = f'global/networks/{order.options.network}'
-        tags = {**{key: value for key, value in order.tags.items() if key.startswith('fogros2-')},
-                'region': region}
-        sources = ipv4(order.sources)
-        if not sources:
-            raise ConfigurationError(
-                'machines at Google have IPv4 addresses, and the robot has none',
-                f'{ADDRESS_VARIABLE}= or ssh_from= names an address or a network of IPv4')
-        firewall.create(self._account, [
-            firewall.rule(order.attempt, 'deny', network, tags, firewall.ANYONE),
-            firewall.rule(order.attempt, 'vpn', network, tags, firewall.ANYONE, 'udp',
-                          order.request.vpn_port),
-            firewall.rule(order.attempt, f'tcp-{SSH}', network, tags, sources, 'tcp', SSH)])
-
-    def undo_begin(
-        self, region: str, attempt: str, created: Sequence[str],
-    ) -> Iterator[tuple[str, Callable[[], None]]]:
-        """Yield the deletion of the firewall rules."""
-        yield 'the firewall rules', lambda: firewall.delete(
-            self._account, self._account.project, attempt)
-
     def places(self, region: str, order: Order) -> Iterator[str]:
-        """Yield the zones of the region that have one of the types."""
         types = self._types(region, order.options.types)
         yield from [order.options.zone] if order.options.zone else sorted(
             {str(entry['zone']) for entry in types})
@@ -242,7 +214,6 @@ class ComputeEngine(RestCloud):
                      if f'/regions/{place.region}/' in url), '')
 
     def end_command(self, tags: Mapping[str, str]) -> tuple[str, ...]:
-        """Return the deletion; an instance that is to be stopped shuts down."""
         return super().end_command(tags) if tags.get(TAG_ON_EXIT) == 'stop' \
             else guest.deletion(self._account.endpoint)
 
@@ -250,7 +221,7 @@ class ComputeEngine(RestCloud):
         """Delete an instance with its disk, then its firewall rules."""
         self._account.remove(_path(machine.vm), f'deleting {machine.vm}')
         self._account.labels.pop(machine.vm, None)
-        firewall.delete(self._account, machine.vm.partition('/')[0], machine.attempt)
+        self._drop_rules(machine.vm.partition('/')[0], machine.attempt)
 
     def end_attempt(self, region: str, attempt: str) -> None:
         for vm in self._instances({TAG_ATTEMPT: attempt}):
@@ -259,21 +230,12 @@ class ComputeEngine(RestCloud):
     def sweep(self, region: str, attempt: str) -> None:
         """Delete an instance that ended itself, and the firewall rules."""
         self.end_attempt(region, attempt)
-        firewall.delete(self._account, self._account.project, attempt)
-
-    def remains(self, region: str) -> list[dict[str, str]]:
-        tags = [firewall.tags_of(found) for found in self._account.pages(
-            f'{self._account.project}/global/firewalls', 'looking for what is left',
-            filter='name eq fogros2-.*')]
-        return [found for found in tags if region in ('', found.get('region'))]
+        self._drop_rules(self._account.project, attempt)
 
     def attempts(self, region: str) -> list[str]:
-        """Return the attempts with an instance, unless a stopped disk is all that is left."""
+        # of one that ended itself, a stopped disk is all that is left
         return [vm.tags.get(TAG_ATTEMPT, '') for vm in self._instances({})
                 if vm.state is not MachineState.DELETED]
-
-    def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
-        firewall.allow(self._account, machine.vm.partition('/')[0], machine.attempt, port, sources)
 
     def set_tags(self, machine: VmId, tags: Mapping[str, str]) -> None:
         """Replace labels, which Google takes only as a whole and with their fingerprint."""
@@ -309,19 +271,6 @@ class ComputeEngine(RestCloud):
 
     def start(self, machine: VmId) -> None:
         self._account.run('POST', f'{_path(machine.vm)}/start', f'starting {machine.vm}')
-
-    # -- images ---------------------------------------------------------------------------------
-
-    def bake(self, machine: VmId, name: str, dependencies: str) -> str:
-        vm = self.get(machine.region, machine.vm)
-        assert vm is not None
-        return images.bake(self._account, vm, name, dependencies)
-
-    def images(self, region: str) -> Iterable[Image]:
-        return images.images_in(self._account, region)
-
-    def delete_image(self, image_id: str) -> None:
-        images.delete(self._account, image_id)
 
 
 def _path(vm: str) -> str:

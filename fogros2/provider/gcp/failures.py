@@ -8,20 +8,13 @@ A request is refused with a *reason* in camel case, and an operation that fails 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 import re
 from typing import Any, ClassVar
 
 from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.vm.failures import CodedError, Failure, not_the_cloud, one_line
 
-#: No capacity in this zone; another zone may have some.
-NO_ROOM_IN_ZONE = frozenset({
-    'ZONE_RESOURCE_POOL_EXHAUSTED', 'ZONE_RESOURCE_POOL_EXHAUSTED_WITH_DETAILS', 'STOCKOUT',
-    'RESOURCE_POOL_EXHAUSTED', 'UNSUPPORTED_OPERATION'})
-#: The project's quota is used up; another type or region may have some.
-NO_ROOM_IN_REGION = frozenset({'QUOTA_EXCEEDED', 'LIMIT_EXCEEDED'})
-_QUOTA = Failure('', 'ask for more at IAM & Admin, Quotas, or take another type or region')
 _FAILURES = {
     'AUTH_ERROR': Failure(
         'Google does not take these credentials', 'gcloud auth application-default login',
@@ -30,13 +23,19 @@ _FAILURES = {
         'the project has not enabled the Compute Engine API',
         'gcloud services enable compute.googleapis.com', PrerequisiteError),
     'PROJECT_NOT_FOUND': Failure('', 'check project_id=', PrerequisiteError),
-    **dict.fromkeys(NO_ROOM_IN_ZONE, Failure(
+    **dict.fromkeys(('ZONE_RESOURCE_POOL_EXHAUSTED', 'ZONE_RESOURCE_POOL_EXHAUSTED_WITH_DETAILS',
+                     'STOCKOUT', 'RESOURCE_POOL_EXHAUSTED', 'UNSUPPORTED_OPERATION'), Failure(
         'Google has no free machine of this type here at the moment',
-        'try later, or give more types and places: machine_types=, regions=')),
-    **dict.fromkeys(NO_ROOM_IN_REGION, _QUOTA),
-    'RATE_LIMIT_EXCEEDED': Failure('Google asks for fewer requests', 'try again in a minute'),
-    'FORBIDDEN': Failure('', 'give it the roles of doc/gcp.md'),
-    'PERMISSIONS_ERROR': Failure('', 'give it the roles of doc/gcp.md'),
+        'try later, or give more types and places: machine_types=, regions=', full='zone')),
+    **dict.fromkeys(('QUOTA_EXCEEDED', 'LIMIT_EXCEEDED'), Failure(
+        '', 'ask for more at IAM & Admin, Quotas, or take another type or region',
+        full='region')),
+    'RATE_LIMIT_EXCEEDED': Failure(
+        'Google asks for fewer requests', 'try again in a minute', temporary=True),
+    **dict.fromkeys(('USER_RATE_LIMIT_EXCEEDED', 'RESOURCE_NOT_READY'), Failure(temporary=True)),
+    **dict.fromkeys(('FORBIDDEN', 'PERMISSIONS_ERROR'), Failure(
+        '', 'give it the roles of doc/gcp.md', denied=True)),
+    **dict.fromkeys(('NOT_FOUND', 'RESOURCE_NOT_FOUND'), Failure(gone=True)),
     'RESOURCE_IN_USE_BY_ANOTHER_RESOURCE': Failure('', 'ros2 fog delete again in a minute'),
     'BACKEND_ERROR': Failure('', 'try again; https://status.cloud.google.com has what is known'),
 }
@@ -47,12 +46,6 @@ class GoogleError(CodedError):
 
     TITLE: ClassVar[str] = 'Google'
     FAILURES: ClassVar[Mapping[str, Failure]] = _FAILURES
-    NO_ROOM_IN_ZONE: ClassVar[Collection[str]] = NO_ROOM_IN_ZONE
-    NO_ROOM_IN_REGION: ClassVar[Collection[str]] = NO_ROOM_IN_REGION
-    GONE: ClassVar[Collection[str]] = ('NOT_FOUND', 'RESOURCE_NOT_FOUND')
-    DENIED: ClassVar[Collection[str]] = ('FORBIDDEN', 'PERMISSIONS_ERROR')
-    TEMPORARY: ClassVar[Collection[str]] = (
-        'RATE_LIMIT_EXCEEDED', 'USER_RATE_LIMIT_EXCEEDED', 'RESOURCE_NOT_READY', 'BACKEND_ERROR')
 
 
 def refused(status: int, answer: Any, what: str) -> FogError:

@@ -8,15 +8,16 @@ Google's default network admits SSH from everywhere, and everything from inside,
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import json
 from typing import Any
 
-from fogros2.errors import ProviderError
+from fogros2.errors import ConfigurationError, ProviderError
 from fogros2.provider.gcp.account import Account
-from fogros2.provider.gcp.failures import GoogleError
-from fogros2.provider.vm.cloud import own_name, TAG_SSH_FROM
+from fogros2.provider.vm.address import ADDRESS_VARIABLE
+from fogros2.provider.vm.cloud import Order, own_name, TAG_SSH_FROM, VmCloud, VmId
+from fogros2.provider.vm.failures import unless_gone
 from fogros2.provider.vm.options import ipv4, SSH
 
 ALLOW, DENY = 1000, 2000
@@ -49,47 +50,72 @@ def tags_of(found: Mapping[str, Any]) -> dict[str, str]:
         return {}
 
 
-def create(account: Account, rules: Sequence[Mapping[str, Any]]) -> None:
-    """Create rules at the same time; those of an earlier attempt are used again."""
-    with ThreadPoolExecutor(max(1, len(rules)), 'fog-firewall') as pool:
-        list(pool.map(lambda body: account.create(
-            f'{account.project}/global/firewalls',
-            f'creating the firewall rule {body["name"]}', body), rules))
+class GoogleFirewall(VmCloud):
+    """The part of Compute Engine that has firewall rules."""
 
+    _account: Account
 
-def allow(
-    account: Account, project: str, attempt: str, port: int, sources: Sequence[str],
-) -> None:
-    """
-    Let only ``sources`` reach a TCP port; none closes it.
+    def begin(self, region: str, order: Order, created: list[str]) -> None:
+        """Create the rules at the same time; those of an earlier attempt are used again."""
+        network = f'global/networks/{order.options.network}'
+        tags = {**{key: value for key, value in order.tags.items() if key.startswith('fogros2-')},
+                'region': region}
+        sources = ipv4(order.sources)
+        if not sources:
+            raise ConfigurationError(
+                'machines at Google have IPv4 addresses, and the robot has none',
+                f'{ADDRESS_VARIABLE}= or ssh_from= names an address or a network of IPv4')
+        rules = [
+            rule(order.attempt, 'deny', network, tags, ANYONE),
+            rule(order.attempt, 'vpn', network, tags, ANYONE, 'udp', order.request.vpn_port),
+            rule(order.attempt, f'tcp-{SSH}', network, tags, sources, 'tcp', SSH)]
+        base = f'{self._account.project}/global/firewalls'
+        with ThreadPoolExecutor(len(rules), 'fog-firewall') as pool:
+            *_, existed = pool.map(lambda body: self._account.create(
+                base, f'creating the firewall rule {body["name"]}', body), rules)
+        if not existed:
+            self._account.admitted[order.attempt] = sources
 
-    The networks of ``ssh_from=`` are admitted together with the others.
-    """
-    base, name = f'{project}/global/firewalls', f'{own_name(attempt)}-tcp-{port}'
-    what = f'{"opening" if sources else "closing"} port {port}'
-    if not ipv4(sources):
-        account.remove(f'{base}/{name}', what)
-        return
-    try:
-        deny = account.call('GET', f'{base}/{own_name(attempt)}-deny', what)
-    except GoogleError as error:
-        if not error.gone:
-            raise
-        raise ProviderError('the machine has no firewall rules any more',
-                            'ros2 fog list shows whether it is there') from error
-    tags = tags_of(deny)
-    more = tags.get(TAG_SSH_FROM, '').split() if port == SSH else []
-    body = rule(attempt, f'tcp-{port}', deny['network'], tags, ipv4([*sources, *more]), 'tcp',
-                port)
-    if account.create(base, what, body):
-        account.run('PATCH', f'{base}/{name}', what,
-                    body={'name': name, 'sourceRanges': body['sourceRanges']})
+    def undo_begin(
+        self, region: str, attempt: str, created: Sequence[str],
+    ) -> Iterator[tuple[str, Callable[[], None]]]:
+        yield 'the firewall rules', lambda: self._drop_rules(self._account.project, attempt)
 
+    def _drop_rules(self, project: str, attempt: str) -> None:
+        base, what = f'{project}/global/firewalls', 'deleting the firewall rules'
+        names = [str(found['name']) for found in self._account.pages(
+            base, what, filter=f'name eq {own_name(attempt)}-.*')]
+        with ThreadPoolExecutor(max(1, len(names)), 'fog-firewall') as pool:
+            list(pool.map(lambda name: self._account.remove(f'{base}/{name}', what), names))
 
-def delete(account: Account, project: str, attempt: str) -> None:
-    """Delete all rules of an attempt."""
-    base, what = f'{project}/global/firewalls', 'deleting the firewall rules'
-    names = [str(found['name']) for found in account.pages(
-        base, what, filter=f'name eq {own_name(attempt)}-.*')]
-    with ThreadPoolExecutor(max(1, len(names)), 'fog-firewall') as pool:
-        list(pool.map(lambda name: account.remove(f'{base}/{name}', what), names))
+    def remains(self, region: str) -> list[dict[str, str]]:
+        tags = [tags_of(found) for found in self._account.pages(
+            f'{self._account.project}/global/firewalls', 'looking for what is left',
+            filter='name eq fogros2-.*')]
+        return [found for found in tags if region in ('', found.get('region'))]
+
+    def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
+        """Let only ``sources`` reach a TCP port, beside the networks of ``ssh_from=``."""
+        if port == SSH and self._account.admits(machine.attempt, ipv4(sources)):
+            return
+        base, own = f'{machine.vm.partition("/")[0]}/global/firewalls', own_name(machine.attempt)
+        name, what = f'{own}-tcp-{port}', f'{"opening" if sources else "closing"} port {port}'
+        if not ipv4(sources):
+            self._account.remove(f'{base}/{name}', what)
+            return
+        found: Mapping[str, Any] = {}
+        for one in (name, f'{own}-deny'):
+            with unless_gone():
+                found = found or self._account.call('GET', f'{base}/{one}', what)
+        if not found:
+            raise ProviderError('the machine has no firewall rules any more',
+                                'ros2 fog list shows whether it is there')
+        tags = tags_of(found)
+        more = tags.get(TAG_SSH_FROM, '').split() if port == SSH else []
+        body = rule(machine.attempt, f'tcp-{port}', found['network'], tags,
+                    ipv4([*sources, *more]), 'tcp', port)
+        if found['name'] != name:
+            self._account.create(base, what, body)
+        elif sorted(found['sourceRanges']) != body['sourceRanges']:
+            self._account.run('PATCH', f'{base}/{name}', what,
+                              body={'name': name, 'sourceRanges': body['sourceRanges']})

@@ -8,14 +8,15 @@ import re
 import time
 from typing import Any
 
-from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
+from fogros2.errors import ConfigurationError
 from fogros2.model import Image
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.gcp.account import Account
-from fogros2.provider.gcp.failures import GoogleError
 from fogros2.provider.gcp.instances import RULES
 from fogros2.provider.gcp.options import Options
-from fogros2.provider.vm.cloud import TAG_BAKED, TAG_USER, Vm, when
+from fogros2.provider.vm.cloud import TAG_BAKED, TAG_USER, VmCloud, VmId, when
+from fogros2.provider.vm.failures import unless_gone
+from fogros2.provider.vm.images import check_baked, image_parts, image_tags
 
 #: Families of images, by architecture; ROS 2 Jazzy is for Ubuntu 24.04.
 UBUNTU = 'projects/ubuntu-os-cloud/global/images/family/ubuntu-2404-lts-'
@@ -53,14 +54,13 @@ def _named(account: Account, name: str, arch: str) -> tuple[str, int]:
     short = name.removeprefix('global/images/')
     path = name if name.startswith('projects/') \
         else f'projects/{account.project}/global/images/{short}'
-    try:
+    image: Mapping[str, Any] = {}
+    with unless_gone():
         image = account.call('GET', path.removeprefix('projects/'),
                              f'looking for the image {name}')
-    except GoogleError as error:
-        if not error.gone:
-            raise
+    if not image:
         raise ConfigurationError(f"there is no image '{name}'",
-                                 'leave ami_image= out for Ubuntu 24.04') from error
+                                 'leave ami_image= out for Ubuntu 24.04')
     if image.get('architecture', arch).lower() != arch:
         raise ConfigurationError(
             f"the image '{name}' is for {image['architecture']} processors, and the machine has "
@@ -68,52 +68,42 @@ def _named(account: Account, name: str, arch: str) -> tuple[str, int]:
     return path, int(image.get('diskSizeGb', 10))
 
 
-def bake(account: Account, vm: Vm, name: str, dependencies: str) -> str:
-    """Make an image of the disk of a running instance, and return its id."""
-    project, zone, instance = vm.id.split('/')
-    stamp = time.strftime('%Y%m%d-%H%M%S', time.gmtime())
-    plain = re.sub('[^a-z0-9-]', '-', name.lower())[:36]
-    own = f'fogros2-{plain}-{stamp}'
-    tags = {TAG_BAKED: name, TAG_USER: vm.tags.get(TAG_USER, ''), TAG_DEPENDENCIES: dependencies}
-    account.call(
-        'POST', f'{project}/global/images', f"making the image '{name}'", forceCreate='true',
-        body={'name': own, 'sourceDisk': f'projects/{project}/zones/{zone}/disks/{instance}',
-              'labels': RULES.encode({key: value for key, value in tags.items() if value}),
-              'storageLocations': [vm.region]})
-    return f'gcp:{vm.region}/{project}/{own}'
+class GoogleImages(VmCloud):
+    """The part of Compute Engine that makes images of machines."""
 
+    _account: Account
 
-def images_in(account: Account, region: str) -> Iterator[Image]:
-    """Yield the images of FogROS2 in a region; '' for all regions."""
-    for entry in account.pages(f'{account.project}/global/images', 'looking for images',
-                               filter=f'labels.{TAG_BAKED}:*'):
-        where, tags = entry.get('storageLocations', [''])[0], RULES.decode(entry['labels'])
-        if region in ('', where):
-            yield Image(
-                f'gcp:{where}/{account.project}/{entry["name"]}', tags.get(TAG_BAKED, ''), 'gcp',
-                where, created=when(entry.get('creationTimestamp')),
-                size_gb=int(entry.get('diskSizeGb', 0)) or None,
-                state=_STATES.get(entry['status'], entry['status'].lower()),
-                dependencies=tags.get(TAG_DEPENDENCIES, ''), tags=tags)
+    def bake(self, machine: VmId, name: str, dependencies: str) -> str:
+        vm = self.get(machine.region, machine.vm)
+        assert vm is not None
+        project, zone, instance = vm.id.split('/')
+        stamp = time.strftime('%Y%m%d-%H%M%S', time.gmtime())
+        plain = re.sub('[^a-z0-9-]', '-', name.lower())[:36]
+        own = f'fogros2-{plain}-{stamp}'
+        self._account.call(
+            'POST', f'{project}/global/images', f"making the image '{name}'", forceCreate='true',
+            body={'name': own, 'sourceDisk': f'projects/{project}/zones/{zone}/disks/{instance}',
+                  'labels': RULES.encode(image_tags(name, vm.tags, dependencies)),
+                  'storageLocations': [vm.region]})
+        return f'gcp:{vm.region}/{project}/{own}'
 
+    def images(self, region: str) -> Iterator[Image]:
+        project = self._account.project
+        for entry in self._account.pages(f'{project}/global/images', 'looking for images',
+                                         filter=f'labels.{TAG_BAKED}:*'):
+            where, tags = entry.get('storageLocations', [''])[0], RULES.decode(entry['labels'])
+            if region in ('', where):
+                yield Image(
+                    f'gcp:{where}/{project}/{entry["name"]}', tags.get(TAG_BAKED, ''), 'gcp',
+                    where, created=when(entry.get('creationTimestamp')),
+                    size_gb=int(entry.get('diskSizeGb', 0)) or None,
+                    state=_STATES.get(entry['status'], entry['status'].lower()),
+                    dependencies=tags.get(TAG_DEPENDENCIES, ''), tags=tags)
 
-def delete(account: Account, image_id: str) -> None:
-    """
-    Delete an image.
-
-    :raises MachineNotFound: the id is not an image's.
-    """
-    parts = re.fullmatch(r'gcp:([a-z0-9-]*)/([a-z0-9.:-]+)/([a-z0-9-]+)', image_id)
-    if parts is None:
-        raise MachineNotFound(f"'{image_id}' is no image at Google", 'ros2 fog image list')
-    path, what = f'{parts[2]}/global/images/{parts[3]}', f'deleting the image {parts[3]}'
-    try:
-        found: Mapping[str, Any] = account.call('GET', path, what)
-    except GoogleError as error:
-        if error.gone:
-            return
-        raise
-    if TAG_BAKED not in found.get('labels', {}):
-        raise ProviderError(f'{parts[3]} is no image of FogROS2',
-                            'ros2 fog image list shows those that are')
-    account.remove(path, what)
+    def delete_image(self, image_id: str) -> None:
+        _, project, name = image_parts(
+            image_id, r'gcp:([a-z0-9-]*)/([a-z0-9.:-]+)/([a-z0-9-]+)')
+        path, what = f'{project}/global/images/{name}', f'deleting the image {name}'
+        with unless_gone():
+            check_baked(self._account.call('GET', path, what).get('labels', {}), name)
+            self._account.remove(path, what)

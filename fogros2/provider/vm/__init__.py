@@ -5,6 +5,7 @@ What every cloud of virtual machines needs; a cloud supplies an adapter.
 In reading order: ``options`` (of every virtual machine), ``host_key`` and ``user_data`` (the
 boot), ``address`` (the robot's public address), ``labels`` (tags by a cloud's character rules),
 ``regions`` (distances), ``cloud`` (the adapter that a cloud implements), ``failures`` (errors of
-clouds that give a code), ``rest`` (requests to a cloud's REST API), ``market`` (types and prices),
-``creation`` (fail-over over regions, types and zones), ``provider`` (the Provider).
+clouds that give a code), ``account`` (retries), ``images`` (ids and tags), ``rest`` (requests to a
+REST API), ``market`` (types and prices), ``creation`` (fail-over over regions, types and zones),
+``provider`` (the Provider).
 """

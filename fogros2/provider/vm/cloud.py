@@ -197,11 +197,22 @@ class VmCloud(abc.ABC):
     regions_variable: ClassVar[str] = ''
     #: Set when the launch ends; calls then raise Cancelled.
     cancel: Optional[threading.Event] = None
+    #: An ``Account``, if the cloud's requests go through one.
+    _account: Any = None
 
-    def until(self: Adapter, cancel: Optional[threading.Event]) -> Adapter:
+    @staticmethod
+    def configured() -> bool:
+        """Return whether the cloud is set up here; read only files and variables."""
+        return True
+
+    def until(
+        self: Adapter, cancel: Optional[threading.Event], *, hasty: bool = False,
+    ) -> Adapter:
         """Return an adapter whose calls raise Cancelled once ``cancel`` is set."""
         other = copy.copy(self)
         other.cancel = cancel
+        if self._account is not None:
+            other._account = self._account.having(cancel, hasty=hasty)
         return other
 
     def lasting(self: Adapter) -> Adapter:
@@ -210,7 +221,7 @@ class VmCloud(abc.ABC):
 
     def hasty(self: Adapter) -> Adapter:
         """Return an adapter with short time-outs, for values that are only displayed."""
-        return self
+        return self.until(self.cancel, hasty=True)
 
     # -- the account ----------------------------------------------------------------------------
 

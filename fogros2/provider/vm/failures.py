@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from typing import ClassVar, NamedTuple, Optional
+from collections.abc import Iterator, Mapping
+import contextlib
+from typing import ClassVar, Literal, NamedTuple, Optional
 
 from fogros2.errors import FogError, PrerequisiteError, ProviderError
 from fogros2.provider.vm.cloud import CloudError
@@ -14,16 +15,29 @@ LENGTH = 300
 
 
 class Failure(NamedTuple):
-    """The meaning of a code: a reason ('' keeps the cloud's own), a remedy, the kind of error."""
+    """
+    The meaning of a code.
 
-    reason: str
-    hint: str
+    :param reason: '' keeps the cloud's own words.
+    :param kind: of the error; only a CodedError has what follows.
+    :param full: no capacity in this zone; the quota of this region is used up.
+    :param gone: the resource does not exist (any more).
+    :param denied: the credentials must not do that.
+    :param temporary: the cloud did nothing, and the same request may succeed later.
+    """
+
+    reason: str = ''
+    hint: str = ''
     kind: type[FogError] = ProviderError
+    full: Literal['', 'zone', 'region'] = ''
+    gone: bool = False
+    denied: bool = False
+    temporary: bool = False
 
 
 class CodedError(CloudError):
     """
-    A cloud refused with ``code``; a cloud's subclass has the tables.
+    A cloud refused with ``code``; a cloud's subclass has the table.
 
     :ivar temporary: the cloud did nothing, or has a fault, and the same request may succeed.
     :ivar pause: seconds after which the cloud asks for the next attempt, if it says so.
@@ -31,27 +45,23 @@ class CodedError(CloudError):
 
     TITLE: ClassVar[str]
     FAILURES: ClassVar[Mapping[str, Failure]]
-    #: No capacity in this zone; the quota of this region is used up.
-    NO_ROOM_IN_ZONE: ClassVar[Collection[str]] = ()
-    NO_ROOM_IN_REGION: ClassVar[Collection[str]] = ()
-    #: The resource does not exist (any more); the credentials must not do that.
-    GONE: ClassVar[Collection[str]] = ()
-    DENIED: ClassVar[Collection[str]] = ()
-    TEMPORARY: ClassVar[Collection[str]] = ()
 
     def __init__(
         self, message: str, hint: str = '', *, code: str = '', status: int = 400,
     ) -> None:
-        super().__init__(
-            message, hint, gone=code in self.GONE, denied=code in self.DENIED,
-            full='zone' if code in self.NO_ROOM_IN_ZONE else
-            'region' if code in self.NO_ROOM_IN_REGION else '')
+        known = self.known(code)
+        super().__init__(message, hint, full=known.full, gone=known.gone, denied=known.denied)
         self.code = code
-        fault = status >= 500 and not self.full
-        self.temporary = fault or status == 429 or code in self.TEMPORARY
+        fault = status >= 500 and not self.full and not known.temporary
+        self.temporary = fault or status == 429 or known.temporary
         # after a fault of the cloud, the request may have had its effect
         self.refused = not fault
         self.pause: Optional[float] = None
+
+    @classmethod
+    def known(cls, code: str) -> Failure:
+        """Return the meaning of a code, an empty one for an unknown code."""
+        return cls.FAILURES.get(code, Failure())
 
     @classmethod
     def of(cls, code: str, said: str, what: str, status: int = 400) -> FogError:
@@ -62,7 +72,7 @@ class CodedError(CloudError):
         :param what: completes '... failed'.
         :param status: of HTTP.
         """
-        known = cls.FAILURES.get(code) or Failure('', '')
+        known = cls.known(code)
         reason = known.reason or said or code or f'{cls.TITLE} gave no reason'
         message = f'{what} failed: {reason}' + f' [{code}]' * bool(code and code not in reason)
         if known.kind is ProviderError:
@@ -70,6 +80,26 @@ class CodedError(CloudError):
         found = known.kind(message, known.hint)
         found.refused = status < 500
         return found
+
+
+@contextlib.contextmanager
+def unless_gone() -> Iterator[None]:
+    """Ignore in the block that a resource does not exist (any more)."""
+    try:
+        yield
+    except CloudError as error:
+        if not error.gone:
+            raise
+
+
+@contextlib.contextmanager
+def tolerated(*codes: str) -> Iterator[None]:
+    """Ignore these codes of a refusal in the block."""
+    try:
+        yield
+    except CodedError as error:
+        if error.code not in codes:
+            raise
 
 
 class Silent(PrerequisiteError):

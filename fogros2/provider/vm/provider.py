@@ -62,18 +62,29 @@ class VmProvider(Provider):
     """
     Virtual machines of one cloud.
 
-    :param cloud: the adapter; its calls are not cancelled.
+    :param cloud: None for an adapter with the account of this computer's user.
     """
 
+    #: The class of the adapter.
+    adapter: ClassVar[type[VmCloud]]
     capabilities: ClassVar[Capabilities] = Capabilities(
         firewall=True, one_time_host_key=True, choices=True, adopt=True, regions=True,
         prices=True, agent_directory=AGENT_DIRECTORY, agent_program=AGENT_PROGRAM)
 
-    def __init__(self, cloud: VmCloud) -> None:
-        self._cloud = cloud
+    def __init__(self, cloud: Optional[VmCloud] = None) -> None:
+        # its calls are not cancelled
+        self._cloud = cloud or self.adapter()
         self._searched: tuple[str, ...] = ()
         #: Notes for people, by the cloud's id of the machine.
         self._notes: dict[str, str] = {}
+
+    @classmethod
+    def configured(cls) -> bool:
+        return cls.adapter.configured()
+
+    @classmethod
+    def region_names(cls) -> Sequence[str]:
+        return tuple(cls.adapter.regions.table)
 
     def _until(self) -> VmCloud:
         """Return the adapter for a call that ends with the launch; later calls are clean-up."""
@@ -83,11 +94,9 @@ class VmProvider(Provider):
     # -- before a machine exists ----------------------------------------------------------------
 
     def answers(self) -> str:
-        """Ask for the account."""
         return self._cloud.whoami(self._base())
 
     def check(self, spec: MachineSpec) -> None:
-        """Check options and credentials without a request."""
         options = self._cloud.options.of(spec)
         self._cloud.account(options).check_credentials()
         region = self._region(options)
@@ -95,10 +104,6 @@ class VmProvider(Provider):
             options.in_region(one)
 
     def resolve(self, spec: MachineSpec) -> MachineSpec:
-        """Choose region and type; refuse a type that costs more than ``max_price``."""
-        return self._resolved(spec)
-
-    def _resolved(self, spec: MachineSpec) -> MachineSpec:
         options = self._cloud.options.of(spec)
         chosen: dict[str, Any] = {}
         region = self._region(options)
@@ -140,7 +145,6 @@ class VmProvider(Provider):
                 *([f'without room there {", ".join(filter(None, more))}'] if any(more) else [])]
 
     def architecture(self, spec: MachineSpec) -> str:
-        """Return the architecture of the types that a resolved spec may use, if it is one."""
         options = self._cloud.options.parse(spec.options)
         region = self._region(options)
         arches = {kind.arch for kind in self._cloud.account(options).named_types(
@@ -170,10 +174,9 @@ class VmProvider(Provider):
     # -- a machine's life -----------------------------------------------------------------------
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
-        """Request a machine where there is capacity; a failure leaves nothing behind."""
         cancel, options = self.cancel, self._cloud.options.of(spec)
         if options.chooses_type or self._region(options) == NEAREST:
-            spec = self._resolved(spec)
+            spec = self.resolve(spec)
             options = self._cloud.options.of(spec)
         cloud = self._cloud.account(options)
         creation = Creation(
@@ -186,13 +189,11 @@ class VmProvider(Provider):
         return self._text(machine)
 
     def adopt(self, machine_id: str, spec: MachineSpec, tags: Mapping[str, str]) -> None:
-        """Replace tags, and what happens when the machine shuts itself down."""
         machine, cloud = self._id(machine_id), self._until()
         cloud.set_tags(machine, tags)
         cloud.set_ending(machine, spec)
 
     def describe(self, machine_id: str) -> Machine:
-        """Return the current state of a machine."""
         machine = self._id(machine_id)
         found = self._until().get(machine.region, machine.vm)
         if found is None:
@@ -248,13 +249,11 @@ class VmProvider(Provider):
             what=f"'{name}' ({machine.vm}) to run")
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
-        """Yield the machines with all of ``tags``, of all regions at the same time."""
         cloud = self._until()
         for found in self._everywhere(cloud, lambda region: list(cloud.find(region, tags))):
             yield from map(self.machine_of, found)
 
     def destroy(self, machine_id: str) -> None:
-        """Delete a machine and everything that was created for it."""
         try:
             machine = self._id(machine_id)
         except MachineNotFound:
@@ -262,7 +261,6 @@ class VmProvider(Provider):
         self._cloud.delete(machine)
 
     def stop(self, machine_id: str) -> None:
-        """Stop a machine; its disk stays, and is billed."""
         machine = self._id(machine_id)
         found = self._cloud.get(machine.region, machine.vm)
         if found is not None and found.spot:
@@ -271,7 +269,6 @@ class VmProvider(Provider):
         self._cloud.stop(machine)
 
     def start(self, machine_id: str) -> None:
-        """Start a stopped machine; wait for one that is still stopping."""
         machine = self._id(machine_id)
 
         def stopped() -> bool:
@@ -283,7 +280,6 @@ class VmProvider(Provider):
         self._cloud.start(machine)
 
     def tidy(self, dead: Collection[str] = ()) -> list[str]:
-        """Delete the firewalls and keys of machines that ended by themselves."""
         attempts = {attempt_of(token) for token in dead}
 
         def ask(region: str) -> list[str]:
@@ -297,7 +293,6 @@ class VmProvider(Provider):
     # -- its network ----------------------------------------------------------------------------
 
     def robot_address(self) -> str:
-        """Return this computer's public address, or the one that the user has named."""
         ending = self.cancel is None or self.cancel.is_set()
         return self._address(None if ending else self.cancel)
 
@@ -306,51 +301,42 @@ class VmProvider(Provider):
                            grace=lambda: 0.0)
 
     def allow(self, machine_id: str, port: int, sources: Sequence[str]) -> None:
-        """Change the machine's own firewall."""
         # a port is closed even if the launch ends
         cloud = self._until() if sources else self._cloud
         cloud.set_firewall(self._id(machine_id), port, _ROBOT_ADDRESS.with_ipv6(sources))
 
     def pin(self, machine_id: str, host_key: str) -> None:
-        """Store the machine's new host key in its tags."""
         self._until().set_tags(
             self._id(machine_id), {TAG_HOST_KEY: ' '.join(host_key.split()[:2])})
 
     # -- images ---------------------------------------------------------------------------------
 
     def bake(self, machine_id: str, name: str, dependencies: str) -> str:
-        """Make an image of a machine, which continues to run."""
         return self._cloud.bake(self._id(machine_id), name, dependencies)
 
     def images(self) -> Iterable[Image]:
-        """Return the images of FogROS2 of all regions."""
         cloud = self._until()
         found = self._everywhere(cloud, lambda region: list(cloud.images(region)))
         return [image for images in found for image in images]
 
     def delete_image(self, image_id: str) -> None:
-        """Delete an image and its snapshots."""
         self._cloud.delete_image(image_id)
 
     # -- regions and prices ---------------------------------------------------------------------
 
     def nearest(self, names: Sequence[str] = ()) -> str:
-        """Return the region with the fastest response."""
         return self._cloud.regions.nearest(names)
 
     def regions(self, names: Sequence[str] = (), *, every: bool = False) -> list[Region]:
-        """Measure the regions."""
         self._cloud.regions.check(names)
         return self._cloud.regions.ranked(names, every=every)
 
     def search_in(self, regions: Sequence[str]) -> None:
-        """Search these regions from now on; 'all': every region of the account."""
         self._searched = tuple(regions)
 
     def offers(
         self, wanted: Wants, regions: Sequence[str] = (), *, refresh: bool = False,
     ) -> Offers:
-        """Return the types that fit, with prices on demand and spot prices."""
         cloud = self._cloud.until(self.cancel)
         # checked first: a measurement takes seconds, and is useless without credentials
         cloud.check_credentials()
@@ -364,7 +350,6 @@ class VmProvider(Provider):
         return Market(cloud, refresh=refresh).choose(named, wanted, spot_too=True)
 
     def taking(self, spec: MachineSpec, offer: Offer) -> MachineSpec:
-        """Return the spec with the offer's region and type, and options that all clouds have."""
         kept = {name: spec.options[name] for name in EVERYWHERE if name in spec.options}
         return dataclasses.replace(spec, provider=self.name, wanted=spec.options, options={
             **kept, 'region': offer.region, self._cloud.options.TYPE: offer.type.name})

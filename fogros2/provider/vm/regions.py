@@ -8,7 +8,9 @@ The resulting table is Table VI of the FogROS2 paper.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+import csv
 import math
+from pathlib import Path
 import socket
 import statistics
 import threading
@@ -33,10 +35,6 @@ GEOLOCATION_URL = 'https://ipinfo.io/json'
 
 #: Latitude and longitude in degrees, a place for people, whether every account may use it.
 Table = Mapping[str, tuple[float, float, str, bool]]
-#: Returns the seconds of a TCP connection to a host and port, or raises an OSError.
-Connector = Callable[[str, int, float], float]
-#: Returns this computer's latitude and longitude in degrees.
-Locator = Callable[[], tuple[float, float]]
 
 
 def connect_time(host: str, port: int, timeout: float) -> float:
@@ -88,6 +86,18 @@ def distance_km(one: tuple[float, float], other: tuple[float, float]) -> float:
     return 2 * 6371.0 * math.asin(math.sqrt(min(1.0, half)))
 
 
+def read_table(beside: str) -> Table:
+    """
+    Read ``regions.csv``, in which places are in degrees.
+
+    :param beside: a file of the same folder.
+    """
+    with Path(beside).with_name('regions.csv').open(encoding='utf-8', newline='') as lines:
+        _, *rows = csv.reader(lines)
+    return {name: (float(latitude), float(longitude), place, everybody == 'yes')
+            for name, latitude, longitude, place, everybody in rows}
+
+
 class Regions:
     """
     The regions of one cloud; thread-safe.
@@ -105,29 +115,24 @@ class Regions:
         self._lock = threading.Lock()
         self._nearest: dict[tuple[str, ...], str] = {}
 
-    def measure(
-        self, regions: Optional[Iterable[str]] = None, *, connect: Optional[Connector] = None,
-        attempts: int = ATTEMPTS, timeout: float = CONNECT_TIMEOUT, deadline: float = DEADLINE,
-        grace: Optional[float] = None,
-    ) -> list[Region]:
+    def measure(self, regions: Iterable[str], *, grace: Optional[float] = None) -> list[Region]:
         """
         Return the regions, the nearest first, those without an answer last.
 
-        All regions are asked at the same time, each ``attempts`` times in a row. After
-        ``deadline`` seconds, a region counts with the answers that it has given.
+        All regions are asked at the same time, each ``ATTEMPTS`` times in a row. After
+        ``DEADLINE`` seconds, a region counts with the answers that it has given.
 
         :param grace: seconds to wait for the others once one region has given all its answers,
             for a caller that needs only the nearest.
         """
-        names = list(dict.fromkeys(self.enabled if regions is None else regions))
-        connect = connect or connect_time
+        names, connect = list(dict.fromkeys(regions)), connect_time
         times: dict[str, list[float]] = {name: [] for name in names}
         left = threading.Semaphore(0)
 
         def ask(region: str) -> None:
             try:
-                for _ in range(attempts):
-                    times[region].append(connect(self._host(region), 443, timeout))
+                for _ in range(ATTEMPTS):
+                    times[region].append(connect(self._host(region), 443, CONNECT_TIMEOUT))
             except OSError:
                 pass  # earlier measurements count
             finally:
@@ -136,11 +141,11 @@ class Regions:
         for name in names:
             # no pool: the interpreter's exit would wait for its threads
             threading.Thread(target=ask, args=(name,), name=f'fog-{name}', daemon=True).start()
-        end = time.monotonic() + deadline
+        end = time.monotonic() + DEADLINE
         for _ in names:
             if not left.acquire(timeout=max(0.0, end - time.monotonic())):
                 break
-            if grace is not None and any(len(list(times[name])) == attempts for name in names):
+            if grace is not None and any(len(list(times[name])) == ATTEMPTS for name in names):
                 end = min(end, time.monotonic() + grace)
                 grace = None
         measured = [Region(name, self.place(name), _median(list(times[name]))) for name in names]
@@ -167,9 +172,7 @@ class Regions:
             others, self.table[region][:2])][:NEIGHBOURS]
 
     def ranked(
-        self, regions: Sequence[str] = (), *, every: bool = False,
-        connect: Optional[Connector] = None, locate: Optional[Locator] = None,
-        grace: Optional[float] = None,
+        self, regions: Sequence[str] = (), *, every: bool = False, grace: Optional[float] = None,
     ) -> list[Region]:
         """
         Return regions, the nearest first: measured, or by geolocation if none answers.
@@ -180,11 +183,11 @@ class Regions:
         :raises ProviderError: no region answers, and this computer's location is unknown.
         """
         names = list(regions or (self.table if every else self.enabled))
-        measured = self.measure(names, connect=connect, grace=grace)
+        measured = self.measure(names, grace=grace)
         if any(one.milliseconds is not None for one in measured):
             return measured
         try:
-            placed = self.by_distance(names, (locate or geolocate)())
+            placed = self.by_distance(names, geolocate())
         except ProviderError as error:
             raise ProviderError(
                 f'none of {len(names)} {self._title} regions answers; {error.args[0]}',

@@ -1,29 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests to a cloud's REST API: session, token, retries, time-outs, errors as FogErrors."""
+"""Requests to a cloud's REST API: session, token, time-outs, errors as FogErrors."""
 
 from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
-import copy
 import functools
-import threading
-from typing import Any, ClassVar, NamedTuple, Optional, TypeVar
+from typing import Any, ClassVar, NamedTuple, Optional
 
-from fogros2.errors import Cancelled, FogError
-from fogros2.provider.vm.cloud import VmCloud
+from fogros2.errors import FogError
+from fogros2.provider.vm.account import Account, ON_ITS_WAY
 from fogros2.provider.vm.failures import CodedError, not_the_cloud, one_line, Silent
-from fogros2.waiting import cancellable
-
-#: Attempts of a request that the cloud throttles or that fails there; without any answer, two.
-ATTEMPTS = 6
-#: Seconds of the first pause between attempts, which doubles, and of the longest.
-PAUSE, LONGEST = 1.0, 20.0
-#: Seconds to wait for the answer to a sent request, which may create something.
-ON_ITS_WAY = 4.0
-
-Own = TypeVar('Own', bound='RestAccount')
-Cloud = TypeVar('Cloud', bound='RestCloud')
 
 
 class Answer(NamedTuple):
@@ -44,29 +31,12 @@ def _session() -> Any:
     return session
 
 
-class RestAccount(abc.ABC):
-    """The user's account at a cloud with a REST API; thread-safe."""
+class RestAccount(Account, abc.ABC):
+    """The user's account at a cloud with a REST API."""
 
     TITLE: ClassVar[str]
     #: Names another address of the API.
     ENDPOINT_VARIABLE: ClassVar[str]
-    #: Set when the launch ends; calls then raise Cancelled.
-    cancel: Optional[threading.Event] = None
-    _hasty = False
-
-    def __init__(self) -> None:
-        #: What was asked once for this process, such as the types of a region.
-        self.known: dict[str, Any] = {}
-
-    def having(self: Own, cancel: Optional[threading.Event], *, hasty: bool = False) -> Own:
-        """
-        Return this account with calls that raise Cancelled once ``cancel`` is set.
-
-        :param hasty: short time-outs and few attempts, because a user waits for the answer.
-        """
-        other = copy.copy(self)
-        other.cancel, other._hasty = cancel, hasty
-        return other
 
     @abc.abstractmethod
     def token(self, what: str) -> str:
@@ -85,32 +55,13 @@ class RestAccount(abc.ABC):
         query: Optional[Mapping[str, str]] = None, timeout: float = 30.0, grace: bool = True,
     ) -> Answer:
         """
-        Make one request, again after a temporary failure, and return its answer.
+        Make one request and return its answer; see :meth:`repeated`.
 
-        :param what: completes '... failed'.
-        :param repeatable: the same request has its effect once, however often it is sent.
         :param grace: wait for the answer to a sent request after a cancel.
-        :raises FogError: with ``refused`` set to False if it may have had an effect.
         """
-        unsure = False
-        for attempt in range(1, ATTEMPTS + 1):
-            try:
-                return cancellable(
-                    lambda: self._send(method, url, what, body, query, timeout), self.cancel,
-                    what=what, grace=lambda: ON_ITS_WAY if grace and method != 'GET' else 0.0)
-            except (CodedError, Silent) as error:
-                unsure = unsure or not error.refused
-                error.refused = not unsure
-                silent = isinstance(error, Silent)
-                if not error.temporary or silent and not repeatable \
-                        or attempt >= (2 if silent or self._hasty else ATTEMPTS):
-                    raise
-                pause = PAUSE * 2 ** (attempt - 1) if error.pause is None else error.pause
-            except FogError as error:
-                error.refused = not unsure and not isinstance(error, Cancelled)
-                raise
-            (self.cancel or threading.Event()).wait(min(pause, LONGEST))
-        raise AssertionError('the last attempt returns or raises')
+        return self.repeated(
+            lambda: self._send(method, url, what, body, query, timeout), what,
+            reads=method == 'GET', repeatable=repeatable, grace=ON_ITS_WAY if grace else 0.0)
 
     def _send(
         self, method: str, url: str, what: str, body: Any, query: Optional[Mapping[str, str]],
@@ -119,12 +70,10 @@ class RestAccount(abc.ABC):
         import requests
 
         head = {'Authorization': f'Bearer {self.token(what)}'}
-        if self.cancel is not None and self.cancel.is_set():
-            raise Cancelled(what)  # nobody waits for this thread
         try:
             answer = _session().request(
                 method, url, params=query, json=body, headers=head, allow_redirects=False,
-                timeout=(5.0, 5.0 if self._hasty else timeout))
+                timeout=(5.0, 5.0 if self.hasty else timeout))
         except requests.RequestException as error:
             raise self.silent(error, what, isinstance(error, requests.ConnectTimeout)) from error
         try:
@@ -146,21 +95,3 @@ class RestAccount(abc.ABC):
         return Silent(
             f'{what} failed: {self.TITLE} does not answer: {one_line(error)}',
             f'is there a way to the Internet (a proxy, {self.ENDPOINT_VARIABLE})?', unsent=unsent)
-
-
-class RestCloud(VmCloud):
-    """A cloud whose adapter makes all requests by a RestAccount."""
-
-    _account: Any  #: a RestAccount
-
-    def until(self: Cloud, cancel: Optional[threading.Event]) -> Cloud:
-        """Return an adapter whose calls raise Cancelled once ``cancel`` is set."""
-        other = super().until(cancel)
-        other._account = self._account.having(cancel)
-        return other
-
-    def hasty(self: Cloud) -> Cloud:
-        """Return an adapter with short time-outs."""
-        other = super().until(self.cancel)
-        other._account = self._account.having(self.cancel, hasty=True)
-        return other

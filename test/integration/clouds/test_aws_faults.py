@@ -17,21 +17,7 @@ from rigs.colcon_workspace import colcon_workspace
 CLOUDS = ('aws',)
 pytestmark = pytest.mark.soak
 
-LAUNCH = '''\
-from fogros2 import AWSCloudInstance, CloudNode, FogROSLaunchDescription
-from launch_ros.actions import Node
-
-
-def generate_launch_description():
-    machine = AWSCloudInstance(name={name!r}, robot_timeout=6, **{options!r})
-    words = {{'package': 'fogros2_examples', 'output': 'screen'}}
-    return FogROSLaunchDescription([
-        CloudNode(machine=machine, executable='talker', **words),
-        Node(executable='listener', **words),
-    ])
-'''
-
-#: The same, with little patience for the boot.
+#: A launch with little patience for the boot.
 BOOTING = '''\
 import sys
 from fogros2.deploy import Launch
@@ -57,9 +43,9 @@ def test_instance_ends_whose_robot_vanished_early(robot, box, name, tmp_path):
     phases = {
         'install': {'ami_image': installing, 'bootstrap': 'apt'},
         'sync': {'ami_image': syncing, 'ros_workspace': str(tmp_path / 'workspace')}}
-    runs = {phase: robot.launch(
-        robot.write(f'{phase}.launch.py', LAUNCH.format(name=f'{name}-{phase}', options=options)),
-        **(variables if phase == 'sync' else {})) for phase, options in phases.items()}
+    runs = {phase: robot.own(
+        f'{name}-{phase}', options, **(variables if phase == 'sync' else {}))
+        for phase, options in phases.items()}
     booting = subprocess.Popen(
         box.on_robot([sys.executable, '-c', BOOTING, f'{name}-boot']),
         env=robot.environment(), start_new_session=True)
@@ -90,4 +76,4 @@ def test_instance_ends_whose_robot_vanished_early(robot, box, name, tmp_path):
     assert deleted.returncode == 0, deleted.stdout + deleted.stderr
     assert {kind: len(names) for kind, names in robot.things().items()} in (
         {}, {'groups': 1, 'keys': 1})
-    robot.clear()
+    robot.cloud.clear(box)

@@ -11,12 +11,6 @@ CLOUDS = ('aws',)
 pytestmark = pytest.mark.timeout(120)
 
 
-def clean(run):
-    """Return whether it said nothing that would worry anybody; Ctrl-C is a warning to launch."""
-    others = run.text.replace('[WARNING] [launch]: user interrupted with ctrl-c', '')
-    return run.errors == [] and 'WARNING' not in others and 'Traceback' not in others
-
-
 @pytest.mark.soak  # the choice by FogROS2's own launch file is the same
 def test_the_nearest_region_and_the_cheapest_type(robot, box, name):
     shown = robot.ros2('launch', 'fogros2_examples', 'talker.auto_aws.launch.py', '-s')
@@ -25,7 +19,7 @@ def test_the_nearest_region_and_the_cheapest_type(robot, box, name):
     run = robot.launch('fogros2_examples', 'talker.auto_aws.launch.py', f'name:={name}',
                        'count:=1')
     assert run.ended() == 0, run.text
-    assert clean(run), run.text
+    assert run.clean, run.text
     (instance,) = [found for found in box.instances()
                    if found.tags.get('fogros2-name') == name]
     # what answers, and the cheapest there with 2 vCPUs and 4 GiB of this computer's kind
@@ -41,6 +35,6 @@ def test_a_robot_that_moves_during_the_boot_is_let_in(robot, box, name):
     box.move_robot()
     try:
         assert run.ended(90) == 0, run.text
-        assert clean(run), run.text
+        assert run.clean, run.text
     finally:
         box.move_robot(back=True)

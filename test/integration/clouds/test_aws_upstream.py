@@ -71,12 +71,6 @@ def generate_launch_description():
 """
 
 
-def clean(run):
-    """Return whether it said nothing that would worry anybody; Ctrl-C is a warning to launch."""
-    others = run.text.replace('[WARNING] [launch]: user interrupted with ctrl-c', '')
-    return run.errors == [] and 'WARNING' not in others and 'Traceback' not in others
-
-
 def talks(robot, box, path, **variables):
     """Launch a file until the robot hears the machine, end it, and return its instance."""
     run = robot.launch(str(path), **variables)
@@ -84,7 +78,7 @@ def talks(robot, box, path, **variables):
     (instance,) = box.alive()
     run.interrupt()
     assert run.ended() == 0, run.text
-    assert clean(run), run.text
+    assert run.clean, run.text
     return instance
 
 
@@ -140,7 +134,7 @@ def test_the_image_and_the_type_follow_the_region(robot, box, name):
     run = robot.launch('fogros2_examples', 'talker.regions.aws.launch.py', f'name:={name}',
                        'count:=1')
     assert run.ended() == 0, run.text
-    assert clean(run), run.text
+    assert run.clean, run.text
     (instance,) = [found for found in box.instances()
                    if found.tags.get('fogros2-name') == name]
     assert (instance.region, instance.image, instance.type) in (

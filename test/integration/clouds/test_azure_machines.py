@@ -15,34 +15,9 @@ from fogros2.waiting import wait_until
 CLOUDS = ('azure',)
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(120)]
 
-LAUNCH = """\
-from fogros2 import AzureCloudInstance, CloudNode, FogROSLaunchDescription, MachineInterrupted
-from launch import EventHandler
-from launch.actions import LogInfo, RegisterEventHandler
-from launch_ros.actions import Node
-
-
-def generate_launch_description():
-    machine = AzureCloudInstance(name={name!r}, robot_timeout=6, **{options!r})
-    words = {{'package': 'fogros2_examples', 'output': 'screen'}}
-    return FogROSLaunchDescription([
-        RegisterEventHandler(EventHandler(
-            matcher=lambda event: isinstance(event, MachineInterrupted),
-            entities=[LogInfo(msg='on our own')])),
-        CloudNode(machine=machine, executable='talker', **words),
-        Node(executable='listener', **words),
-    ])
-"""
-
-
-@pytest.fixture
-def ending(box, machine):
-    """Return the machine's end command, which names the box as the machine reaches it."""
-    return shlex.join((*machine.end_command[:-1], box.inside))
-
 
 def test_killed_robot_s_machine_deletes_its_group(robot, box, name):
-    run = robot.launch(robot.write('run.launch.py', LAUNCH.format(name=name, options={})))
+    run = robot.own(name)
     run.wait_for('I heard: ')
     run.kill()
     wait_until(lambda: not robot.things(), timeout=60, what='the group to be deleted')
@@ -55,7 +30,7 @@ def test_killed_robot_s_machine_deletes_its_group(robot, box, name):
 
 def test_machine_without_the_right_is_off_and_billed(robot, box, name):
     box.set_rights(owner=False)
-    run = robot.launch(robot.write('run.launch.py', LAUNCH.format(name=name, options={})))
+    run = robot.own(name)
     run.wait_for('I heard: ')
     # the lifetime is eight hours
     assert 'powers itself off and is billed' in run.text and 'at most $0.30' in run.text
@@ -68,7 +43,7 @@ def test_machine_without_the_right_is_off_and_billed(robot, box, name):
     assert robot.things() == []
 
 
-def test_machine_waits_until_its_role_works(provider, box, make, name):
+def test_machine_waits_until_its_role_works(cloud, box, make, name):
     box.set_rights(owner=True, propagation=600.0)
     machine = make(name)
     (instance,) = box.alive()
@@ -76,18 +51,19 @@ def test_machine_waits_until_its_role_works(provider, box, make, name):
     young = dataclasses.replace(machine, end_command=tuple(
         word.replace('/proc/uptime', '/tmp/uptime') for word in machine.end_command))
     box.run(instance.id, 'echo 60.0 60.0 >/tmp/uptime')
-    assert 'status=1' in box.run(instance.id, f'{ending(box, young)} || echo status=$?')
+    ends = shlex.join(cloud.end_command(box, young.end_command))
+    assert 'status=1' in box.run(instance.id, f'{ends} || echo status=$?')
     box.set_rights(owner=True)
-    assert 'status' not in box.run(instance.id, f'{ending(box, young)} || echo status=$?',
+    assert 'status' not in box.run(instance.id, f'{ends} || echo status=$?',
                                    check=False)
     wait_until(lambda: not box.things()['groups'], timeout=20, what='its group to be deleted')
 
 
-def test_machine_that_stops_at_its_end_deallocates_itself(provider, box, make, name):
+def test_machine_that_stops_at_its_end_deallocates_itself(cloud, provider, box, make, name):
     machine = make(name, on_exit='stop')
     (instance,) = box.alive()
     box.run(instance.id, 'echo kept >/root/kept')
-    box.run(instance.id, ending(box, machine), check=False)
+    box.run(instance.id, shlex.join(cloud.end_command(box, machine.end_command)), check=False)
     box.wait_for(instance.id, 'deallocated')
     assert provider.describe(machine.id).state is MachineState.STOPPED
     provider.start(machine.id)
@@ -99,7 +75,7 @@ def test_machine_that_stops_at_its_end_deallocates_itself(provider, box, make, n
         provider.describe(machine.id)
 
 
-def test_machine_may_do_nothing_else(provider, box, make, name):
+def test_machine_may_do_nothing_else(cloud, provider, box, make, name):
     one, two = make(f'{name}-a'), make(f'{name}-b')
     instance = next(i for i in box.alive() if i.tags['fogros2-name'] == f'{name}-a')
     # its command, with the other machine's group
@@ -108,7 +84,7 @@ def test_machine_may_do_nothing_else(provider, box, make, name):
         f"me['resourceId'].split('/resourceGroups/')[0] + '/resourceGroups/"
         f"{two.id.split('/')[1]}'").replace('subprocess.run', 'print')
         for word in one.end_command))
-    box.run(instance.id, ending(box, changed), check=False)
+    box.run(instance.id, shlex.join(cloud.end_command(box, changed.end_command)), check=False)
     assert box.calls()[-1].error == 'AuthorizationFailed'
     assert len(box.things()['groups']) == 2
     for machine in (one, two):

@@ -15,6 +15,7 @@ import botocore.session
 
 from fogros2.provider.aws import AWSProvider, instances
 from fogros2.provider.aws.clients import Account
+from fogros2.provider.aws.cloud import Ec2
 
 #: Knows the services' models, which take longest to read, for all tests.
 LOADER = botocore.session.get_session().get_component('data_loader')
@@ -41,7 +42,7 @@ class Watched:
         session.events.register('provide-client-params', self._called)
         session.events.register('before-send', self._sent)
         self.account = Account(session)
-        self.provider = AWSProvider(self.account)
+        self.provider = AWSProvider(Ec2(self.account))
 
     def _called(self, params: Any, model: Any, **words: Any) -> None:
         self.calls.append((f'{model.service_model.endpoint_prefix}:{model.name}', dict(params)))

@@ -16,9 +16,10 @@ TYPES: dict[str, tuple[int, int, str, tuple[str, int]]] = {
     'n1-standard-4': (4, 15360, 'X86_64', ('', 0)),
     'n2-standard-2': (2, 8192, 'X86_64', ('', 0)), 'c4-standard-2': (2, 7168, 'X86_64', ('', 0)),
     't2a-standard-1': (1, 4096, 'ARM64', ('', 0)),
-    'g2-standard-4': (4, 16384, 'X86_64', ('nvidia-l4', 1))}
+    'g2-standard-4': (4, 16384, 'X86_64', ('nvidia-l4', 1)),
+    'g2-standard-8': (8, 32768, 'X86_64', ('nvidia-l4', 1))}
 #: Types that only one zone of a region has.
-RARE = {'g2-standard-4': 'b', 't2a-standard-1': 'a'}
+RARE = {'g2-standard-4': 'b', 'g2-standard-8': 'b', 't2a-standard-1': 'a'}
 ACCELERATORS = ('nvidia-tesla-t4', 'nvidia-l4')
 DISK_TYPES = ('pd-standard', 'pd-balanced', 'pd-ssd', 'hyperdisk-balanced')
 #: Public images: project, name, family, architecture, size in GB.
@@ -75,6 +76,9 @@ SKUS = (
     ('N2 Instance Core running in Frankfurt', 'europe-west3', '0.04073000'),
     ('N2 Instance Ram running in Frankfurt', 'europe-west3', '0.00545800'),
     ('Nvidia Tesla T4 GPU running in Frankfurt', 'europe-west3', '0.41000000'),
+    ('G2 Instance Core running in Frankfurt', 'europe-west3', '0.03220000'),
+    ('G2 Instance Ram running in Frankfurt', 'europe-west3', '0.00377000'),
+    ('Nvidia L4 GPU running in Frankfurt', 'europe-west3', '0.72000000'),
     ('E2 Custom Instance Core running in Frankfurt', 'europe-west3', '9.00000000'),
     ('N2 Sole Tenancy Instance Core running in Frankfurt', 'europe-west3', '9.00000000'),
     ('Commitment v1: N2 Cpu in Frankfurt for 1 Year', 'europe-west3', '9.00000000'),

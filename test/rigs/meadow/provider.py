@@ -199,13 +199,6 @@ class MeadowProvider(VmProvider):
     """Machines at Meadow."""
 
     name = 'meadow'
+    adapter = Meadow
     capabilities: ClassVar[Capabilities] = dataclasses.replace(
         VmProvider.capabilities, stop=True)
-
-    def __init__(self) -> None:
-        super().__init__(Meadow())
-
-    @classmethod
-    def region_names(cls) -> Sequence[str]:
-        """Return the regions."""
-        return tuple(Meadow.regions.table)

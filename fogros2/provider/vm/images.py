@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images of machines that FogROS2 has made: their ids and tags."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import re
+
+from fogros2.errors import MachineNotFound, ProviderError
+from fogros2.provider import TAG_DEPENDENCIES
+from fogros2.provider.vm.cloud import TAG_BAKED, TAG_USER
+
+
+def image_tags(name: str, machine: Mapping[str, str], dependencies: str) -> dict[str, str]:
+    """Return the tags of an image of a machine with the tags ``machine``."""
+    tags = {TAG_BAKED: name, TAG_USER: machine.get(TAG_USER, ''), TAG_DEPENDENCIES: dependencies}
+    return {key: value for key, value in tags.items() if value}
+
+
+def image_parts(image_id: str, form: str) -> tuple[str, ...]:
+    """
+    Return the groups of a regular expression in the id of an image.
+
+    :raises MachineNotFound: the id is not an image's.
+    """
+    parts = re.fullmatch(form, image_id)
+    if parts is None:
+        raise MachineNotFound(f"'{image_id}' is no image of {form.partition(':')[0]}",
+                              'ros2 fog image list')
+    return parts.groups()
+
+
+def check_baked(tags: Mapping[str, str], name: str) -> None:
+    """
+    Check that an image may be deleted.
+
+    :raises ProviderError: FogROS2 has not made it.
+    """
+    if TAG_BAKED not in tags:
+        raise ProviderError(f'{name} is no image of FogROS2',
+                            'ros2 fog image list shows those that are')
