@@ -6,7 +6,8 @@ Transport images as H.264, by a codec without ROS and two nodes.
 ``codec`` all others, ``stills`` JPEG and PNG. ``worker`` runs work in a thread. ``pacing`` limits
 images in flight, ``rate`` estimates a link, ``control`` adapts the encoder to all links,
 ``repair`` corrects losses, ``turns`` lets nodes send in turn, ``memory`` keeps freed memory.
-``acknowledgement`` waits for readers. ``message`` converts ROS messages, ``lazy`` is the base of
-both nodes. ``receivers`` and ``senders`` do their work by codec, for the nodes ``decoder`` and
-``encoder``.
+``acknowledgement`` waits for readers. ``sharing`` divides the bandwidth of a link among streams.
+``message`` converts ROS messages, ``lazy`` is the base of both nodes, ``budget`` keeps a stream
+within its share. ``receivers`` and ``senders`` do their work by codec, for the nodes
+``decoder`` and ``encoder``.
 """

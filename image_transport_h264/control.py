@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from collections import deque
 import dataclasses
+import math
 from typing import Optional
 
 from image_transport_h264.codec import Settings
-from image_transport_h264.rate import Governor
+from image_transport_h264.rate import Governor, LEAST_BITRATE, LEAST_BITS
 
 #: Seconds after which a silent receiver no longer limits the others.
 SILENT = 3.0
@@ -32,6 +33,8 @@ class Control:
 
     def __init__(self, asked: Settings, max_rate: float = 0.0, adapt: bool = True) -> None:
         self.asked, self.max_rate, self.adapt = asked, max_rate, adapt
+        #: The stream's share of its links in bits per second.
+        self.share = math.inf
         self._governors: dict[int, Governor] = {}
         self._sent: deque[tuple[float, int]] = deque()
         self._interval = 1 / 30
@@ -42,6 +45,11 @@ class Control:
     def round_trip(self) -> float:
         """The recent minimum round trip of the slowest receiver in seconds; 0: unknown."""
         return max((governor.round_trip for governor in self._governors.values()), default=0.0)
+
+    @property
+    def latency(self) -> float:
+        """The recent time of a packet to the slowest receiver in seconds; 0: unknown."""
+        return max((governor.latency for governor in self._governors.values()), default=0.0)
 
     def ask(self, asked: Settings, max_rate: float, adapt: bool) -> None:
         """Set the user's settings from now on."""
@@ -77,9 +85,10 @@ class Control:
         # Ask every governor, because the call also makes a governor forget lost packets.
         # After a stall, images arrive in a burst, whose intervals are not their rate.
         since = max(now - self._last_sent, 0.9 * self._interval)
+        fits = since * self.share >= 0.8 * LEAST_BITS * pixels or since > 1.0
         said = [governor.may_send(now, pixels, since)
                 for governor in self._governors.values()]
-        return all(said) or not self.adapt
+        return fits and (all(said) or not self.adapt)
 
     def settings(self, current: Settings, now: float) -> Settings:
         """
@@ -93,18 +102,22 @@ class Control:
         wanted = self.asked.bitrate
         if self.adapt:
             wanted = min([wanted, *(g.bitrate for g in self._governors.values())])
+        wanted = int(max(LEAST_BITRATE, min(wanted, self.share)))
         same = dataclasses.replace(
             self.asked, bitrate=current.bitrate, rate=current.rate) == current
         if same and wanted >= current.bitrate:
             more = wanted > WORTH * current.bitrate or wanted == self.asked.bitrate
             if wanted == current.bitrate or not more or used < BINDING * current.bitrate:
                 return current
+        elif same and wanted * WORTH > current.bitrate and used < BINDING * wanted:
+            return current
         rate = min(1000.0, max(1.0, 1 / max(self._interval, 0.001)))
         return dataclasses.replace(self.asked, bitrate=wanted, rate=rate)
 
     def protects(self, now: float) -> bool:
         """Return whether to repeat packets in pieces: a link loses packets, and has room."""
-        return any(governor.loses(now) and self._used() * ROOM < governor.bitrate
+        used = self._used() * ROOM
+        return any(governor.loses(now) and used < min(governor.bitrate, self.share)
                    for governor in self._governors.values())
 
     def sent(self, sequence: int, size: int, now: float) -> None:

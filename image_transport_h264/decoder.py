@@ -13,6 +13,7 @@ from typing import Optional
 
 from sensor_msgs.msg import CameraInfo, Image
 
+from image_transport_h264.budget import Announcement
 from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Relay, run
 from image_transport_h264.message import CAMERA_INFO, camera_info_topic
 from image_transport_h264.receivers import make_receiver
@@ -27,6 +28,7 @@ class DecoderNode(LazyNode):
         codec = str(self.declare_parameter('codec', 'h264').value)
         stream = str(self.declare_parameter('stream', '').value) or f'{topic}/{codec}'
         self._images = self.offer(Image, topic, IMAGE_QOS, self._listeners_changed)
+        self._announcement = Announcement(self, stream)
         self._receiver = make_receiver(
             self, codec, stream, functools.partial(self.put_out, self._images))
         self._infos: Optional[Relay] = None
@@ -42,7 +44,7 @@ class DecoderNode(LazyNode):
         super().destroy_node()
 
     def _listeners_changed(self) -> None:
-        self._receiver.want(self._images.get_subscription_count() > 0)
+        self._receiver.want(self._announcement.want(self._images.get_subscription_count() > 0))
 
 
 def main() -> None:

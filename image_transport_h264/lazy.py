@@ -36,6 +36,8 @@ IMAGE_QOS = _qos(2)
 FEEDBACK_QOS = _qos(8, ReliabilityPolicy.BEST_EFFORT)
 PIECES_QOS = _qos(128, ReliabilityPolicy.BEST_EFFORT)
 REQUEST_QOS = _qos(1)
+#: A message that later subscribers receive too.
+LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 #: Time-out of a message's acknowledgement in seconds; a reader that hangs delays the others.
 LONGEST = 2.0

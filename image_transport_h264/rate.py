@@ -56,6 +56,8 @@ class Governor:
         self.ceiling = ceiling
         self.bitrate = ceiling
         self.heard: Optional[float] = None
+        #: Recent mean time of a packet from the sender to the receiver in seconds.
+        self.latency = 0.0
         self._sent: deque[_Sent] = deque()
         self._trips: deque[tuple[float, float]] = deque()
         self._arrivals: deque[tuple[float, int]] = deque()
@@ -102,6 +104,8 @@ class Governor:
             return
         trip = now - sent.when
         self._trips.append((now, trip))
+        # the way back has no queue, and takes half of the quickest round trip
+        self.latency += 0.1 * (trip - self.round_trip / 2 - self.latency)
         while self._trips[0][0] < now - MEMORY:
             self._trips.popleft()
         self._arrivals.append((now, sent.bits))

@@ -18,6 +18,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Empty, Header, UInt8MultiArray, UInt64MultiArray
 
 from image_transport_h264 import message, stills
+from image_transport_h264.budget import AHEAD, Budget
 from image_transport_h264.codec import CodecError, Encoder, Packet, Settings
 from image_transport_h264.control import Control
 from image_transport_h264.lazy import (
@@ -29,6 +30,7 @@ from image_transport_h264.lazy import (
 )
 from image_transport_h264.message import FEEDBACK, KEY_REQUEST, PIECES
 from image_transport_h264.pacing import MOST, Pace, Sent
+from image_transport_h264.rate import LEAST_BITS
 from image_transport_h264.repair import pieces
 
 CODECS = ('h264', 'jpeg', 'png', 'raw')
@@ -81,6 +83,8 @@ class PictureSender(Sender):
         self._node = node
         self._publisher = node.offer(kind, stream, STREAM_QOS, changed)
         self.publishers = [self._publisher]
+        self._budget = Budget(node, stream, self.listeners)
+        self._latency = 0.0
         self._pace = Pace()
         self._waiters = ThreadPoolExecutor(MOST, 'acknowledgement')
         self._under_way: list[Future[tuple[Sent, float, bool]]] = []
@@ -91,8 +95,12 @@ class PictureSender(Sender):
 
     def _put(self, message: Any) -> None:
         """Publish a message, and wait until the next one may be sent."""
-        if len(message.data) >= LARGE:
+        self._budget.pace()
+        begin, size = time.monotonic(), len(message.data)
+        self._budget.sent(size, 8.0 * size, self._latency)
+        if size >= LARGE:
             self._node.put_through(self._publisher, message)
+            self._latency = time.monotonic() - begin
             return
         self._settle()
         sent = self._pace.sent(time.monotonic())
@@ -113,6 +121,7 @@ class PictureSender(Sender):
             sent, when, arrived = future.result()
             if arrived:
                 self._pace.acknowledged(sent, when)
+                self._latency = when - sent.when - self._pace.quickest / 2
             else:
                 self._pace.expired(when)
 
@@ -180,6 +189,7 @@ class VideoSender(Sender):
         self._changed = changed
         self._video = node.offer(CompressedImage, stream, STREAM_QOS, self._matched)
         self.publishers = [self._video]
+        self._budget = Budget(node, stream, self.listeners)
         self._others: list[tuple[Publisher, Any, Callable[[Any, Header, Packet], Any]]] = []
         # Also publish the packets as the messages of other packages, where these are installed.
         base = stream.rpartition('/')[0]
@@ -240,9 +250,11 @@ class VideoSender(Sender):
 
     def send(self, image: Image) -> None:
         """Encode and publish the image, unless the rate control skips it."""
+        self._budget.pace(AHEAD)
         now = time.monotonic()
         picture = message.picture(image)
         with self._lock:
+            self._control.share = self._budget.share
             if not self._control.due(now, picture.width * picture.height):
                 return
             self._encoder.settings = self._control.settings(self._encoder.settings, now)
@@ -257,6 +269,7 @@ class VideoSender(Sender):
         if packet.format == 'ffv1':
             # An incomplete deep picture is useless, so the middleware repeats lost parts; the
             # wait for the acknowledgement limits the rate to the link's.
+            self._budget.sent(len(packet.data), 8.0 * len(packet.data), 0.0)
             self._node.put_through(self._video, message.compressed(image.header, packet))
             return
         with self._lock:
@@ -266,11 +279,13 @@ class VideoSender(Sender):
             again = pieces(packet.tag.stream, packet.tag.sequence,
                            message.with_header(image.header, packet.data))
         left = time.monotonic()
+        size = len(packet.data) + sum(map(len, again))
         with self._lock:
             if packet.key:
                 self._last_key = left
-            self._control.sent(
-                packet.tag.sequence, len(packet.data) + sum(map(len, again)), left)
+            self._control.sent(packet.tag.sequence, size, left)
+            floor = LEAST_BITS * picture.width * picture.height * self._encoder.settings.rate
+            self._budget.sent(size, floor, self._control.latency, self._control.asked.bitrate)
         # Pieces first: after a loss, the packet is then complete one datagram later.
         for piece in again:
             self._node.put_out(self._pieces, UInt8MultiArray(data=message.octets(piece)))

@@ -57,6 +57,8 @@ class Control:
         self._clouds: deque[tuple[int, float, Coded]] = deque(maxlen=2)
         self._recent: deque[float] = deque(maxlen=IN_A_ROW)
         self._calm_since = -1e9
+        #: Seconds of the last cloud from the encoder to the slowest decoder.
+        self.latency = 0.0
 
     def arrived(self, now: float) -> bool:
         """Record that a cloud has arrived from the publisher; return whether to send it."""
@@ -92,6 +94,7 @@ class Control:
             self._pace.acknowledged(self._parts.popleft()[1], now)
         while self._clouds and self._clouds[0][0] <= done:
             _, when, coded = self._clouds.popleft()
+            self.latency = now - when - self._pace.quickest / 2
             self._adapt(coded, max(now - when - self._pace.quickest, 1e-3), now)
 
     def forget(self) -> None:

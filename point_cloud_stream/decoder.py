@@ -15,6 +15,7 @@ from rcl_interfaces.msg import ParameterDescriptor
 from sensor_msgs.msg import CompressedImage, PointCloud2, PointField
 from std_msgs.msg import Header, UInt64MultiArray
 
+from image_transport_h264.budget import Announcement
 from image_transport_h264.lazy import IMAGE_QOS, LazyNode, run, STREAM_QOS, Tap
 from image_transport_h264.worker import Worker
 from point_cloud_stream.cloud import CloudError, MAX_BYTES
@@ -31,6 +32,7 @@ class DecoderNode(LazyNode):
         stream = str(self.declare_parameter('stream', '').value) or f'{topic}/{FORMAT}'
         self._max_bytes = int(self.declare_parameter('max_bytes', MAX_BYTES, ParameterDescriptor(
             description='larger clouds are not decoded', read_only=True)).value)
+        self._announcement = Announcement(self, stream)
         self._assembler = Assembler(self._max_bytes)
         self._identity = secrets.randbits(63)
         self._feedback = self.create_publisher(
@@ -47,7 +49,7 @@ class DecoderNode(LazyNode):
         super().destroy_node()
 
     def _matched(self) -> None:
-        self._parts.want(self._points.get_subscription_count() > 0)
+        self._parts.want(self._announcement.want(self._points.get_subscription_count() > 0))
 
     def _part(self, part: CompressedImage) -> None:
         acknowledge, whole = self._assembler.add(bytes(part.data))

@@ -18,6 +18,7 @@ from rcl_interfaces.msg import ParameterDescriptor
 from sensor_msgs.msg import CompressedImage, PointCloud2
 from std_msgs.msg import UInt64MultiArray
 
+from image_transport_h264.budget import Budget
 from image_transport_h264.lazy import IMAGE_QOS, LazyNode, run, STREAM_QOS, Tap
 from image_transport_h264.worker import Worker
 from point_cloud_stream.cloud import CloudError, Field, Layout
@@ -50,6 +51,7 @@ class EncoderNode(LazyNode):
         self._worker: Worker[PointCloud2] = Worker('encode', self._send, self.fail)
         self._clouds = Tap(self, PointCloud2, topic, IMAGE_QOS, self._take)
         self._publisher = self.offer(CompressedImage, stream, STREAM_QOS, self._matched)
+        self._budget = Budget(self, stream, self._publisher.get_subscription_count)
         self.create_subscription(
             UInt64MultiArray, f'{stream}/{FEEDBACK}', self._heard, STREAM_QOS)
         self._matched()
@@ -89,7 +91,7 @@ class EncoderNode(LazyNode):
     # --- in the worker's thread
 
     def _send(self, cloud: PointCloud2) -> None:
-        """Encode and publish a cloud, part by part as the link takes them."""
+        """Encode and publish a cloud, part by part as share and link take them."""
         try:
             coded = encode(_layout(cloud), cloud.data, self._control.resolution, self._drop)
         except CloudError as error:
@@ -100,12 +102,15 @@ class EncoderNode(LazyNode):
         with self._news:
             self._control.sending(self._part + len(parts), coded, time.monotonic())
         for part in parts:
+            self._budget.pace()
             with self._news:
                 if not self._news.wait_for(self._control.may_send, GIVE_UP):
                     self._control.give_up(time.monotonic())
                     return
                 self._part += 1
                 self._control.sent(self._part, time.monotonic())
+            self._budget.sent(len(part), 8.0 * len(coded.data), self._control.latency,
+                              short=self._control.resolution > self._control.asked)
             self.put_out(self._publisher, CompressedImage(
                 header=cloud.header, format=FORMAT, data=array.array('B', part)))
 

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     SomeMachine = Union['CloudInstance', SomeSubstitutionsType]
 
 _UNITS = {'s': 1.0, 'm': 60.0, 'h': 3600.0, 'd': 86400.0}
+_PREFIXES = {'': 1.0, 'k': 1e3, 'M': 1e6, 'G': 1e9}
 _DURATION = re.compile(r'(?:\d+(?:\.\d+)?[smhd])+')
 
 
@@ -81,6 +82,8 @@ class CloudInstance:
     :param max_replacements: how often on_interrupt='replace' replaces the machine in a launch.
     :param checkpoint: folder of its nodes, such as '$HOME/map', that a replacement takes over.
     :param checkpoint_interval: time between two copies of the folder to the robot.
+    :param bandwidth: what its streams may use of the link in each direction, such as '10Mbit/s';
+        they share it by need and priority.
     :param monitor_allow: networks (CIDR) from which external clients may connect to the Foxglove
         bridge, by TLS and with a token.
     :param options: the provider's own options; subclasses set it.
@@ -105,6 +108,7 @@ class CloudInstance:
         max_replacements: Value = DEFAULT_REPLACEMENTS,
         checkpoint: Optional[SomeSubstitutionsType] = None,
         checkpoint_interval: Value = DEFAULT_CHECKPOINT_INTERVAL,
+        bandwidth: Optional[Value] = None,
         monitor_allow: Optional[Sequence[SomeSubstitutionsType]] = None,
         apt: Optional[Sequence[SomeSubstitutionsType]] = None,
         pip: Optional[Sequence[SomeSubstitutionsType]] = None,
@@ -128,6 +132,7 @@ class CloudInstance:
             'checkpoint_interval': checkpoint_interval,
             **({} if on_loss_after is None else {'on_loss_after': on_loss_after}),
             **({} if checkpoint is None else {'checkpoint': checkpoint}),
+            **({} if bandwidth is None else {'bandwidth': bandwidth}),
         }
         self._environment = dict(environment or {})
         self._options = {k: v for k, v in (options or {}).items() if v is not None}
@@ -444,6 +449,20 @@ def parse_duration(what: str, value: Union[str, int, float]) -> float:
     return seconds
 
 
+def parse_bandwidth(what: str, value: Union[str, int, float]) -> float:
+    """
+    Convert text such as '10Mbit/s', or a number of bits per second, to bits per second.
+
+    :raises ConfigurationError: no bandwidth, or less than 100 kbit/s.
+    """
+    match = re.fullmatch(r'(\d+(?:\.\d+)?) ?([kMG]?)bit/s|(\d+(?:\.\d+)?)', str(value).strip())
+    bits = 0.0 if match is None else float(match[1] or match[3]) * _PREFIXES[match[2] or '']
+    if not 1e5 <= bits <= 1e12:
+        raise ConfigurationError(f'{what}={value!r} is no bandwidth from 100 kbit/s to 1 Tbit/s',
+                                 "write '500kbit/s', '10Mbit/s' or '1Gbit/s'")
+    return bits
+
+
 def _check_loss(settings: Mapping[str, Any]) -> None:
     """
     Check that a lost machine has stopped its nodes before they start elsewhere.
@@ -514,4 +533,5 @@ _CHECKS: dict[str, Any] = {
     'max_replacements': _count,
     'checkpoint': check_folder,
     'checkpoint_interval': parse_duration,
+    'bandwidth': parse_bandwidth,
 }

@@ -14,7 +14,8 @@ from fogros2.model import NodeSpec, Stream
 class PointCloud(ImageTransport):
     """Send ``/points`` as ``/points/pointcloud``."""
 
-    options = frozenset({'drop_fields', 'lossless', 'max_bytes', 'max_rate', 'resolution'})
+    options = frozenset(
+        'drop_fields lossless max_bytes max_rate priority resolution'.split())
 
     def check(self) -> None:
         """Check for NumPy and zstandard."""

@@ -28,15 +28,20 @@ _DECODER_PARAMETERS = ('show_damage', 'encoding')
 #: Suffix that FogROS2 appends to the name of a streamed topic on machines.
 _CLOUD = '/cloud'
 #: Options of all streams that use this project's nodes.
-OPTIONS = frozenset({'camera_info', *_DECODER_PARAMETERS})
+OPTIONS = frozenset({'camera_info', 'priority', *_DECODER_PARAMETERS})
 
 
 def check(stream: Stream) -> None:
     """
     Check that a stream is possible.
 
-    :raises ConfigurationError: not a full topic name, or both ends on one host.
+    :raises ConfigurationError: not a full topic name, both ends on one host, or an invalid
+        priority.
     """
+    priority = stream.options.get('priority', 1)
+    if not isinstance(priority, (int, float)) or not 0.01 <= priority <= 100:
+        raise ConfigurationError(f'{stream.topic}: priority={priority!r} is invalid',
+                                 'give a number from 0.01 to 100; the default is 1')
     if not TOPIC.fullmatch(stream.topic) or '__' in stream.topic:
         raise ConfigurationError(f"'{stream.topic}' is not the full name of a topic",
                                  "write it as ros2 topic list does, such as '/camera/image_raw'")
@@ -185,6 +190,8 @@ def python_node(
     local = local_topic(stream.topic, machine)
     label, full, between = names_of(stream, role, name)
     values: dict[str, Any] = {**parameters, 'stream': between}
+    if role == 'decoder' and stream.links:
+        values['links'] = ','.join(f'{link}={bits:.0f}' for link, bits in stream.links.items())
     if role == 'encoder' and local != stream.topic:
         values['topic'] = stream.topic
     for key, value in stream.options.items():

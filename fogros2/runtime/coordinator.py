@@ -295,6 +295,7 @@ class Coordinator:
                 raise ConfigurationError(
                     f"'{spec.name}' has a checkpoint, and nothing would restore it",
                     "add on_interrupt='replace', or leave checkpoint= out")
+            self._streams.bandwidths[spec.name] = spec.bandwidth
             session.rename(self._streams.remappings(spec.name))
             self._sessions[spec.name] = session
             self._new.append(session)

@@ -64,6 +64,8 @@ class Streams:
     """The streams of a launch, and the nodes of them that were returned already."""
 
     def __init__(self) -> None:
+        #: Bits per second of the links of machines, 0 for no limit.
+        self.bandwidths: dict[str, float] = {}
         self._streams: list[Stream] = []
         self._handed_out: set[str] = set()
 
@@ -78,7 +80,7 @@ class Streams:
         """
         several = list(self._streams)
         for entry in entries:
-            one = streams.stream(entry, machine)
+            one = self._linked(streams.stream(entry, machine))
             if one not in several:
                 for other in several:
                     _compare(one, other)
@@ -107,10 +109,10 @@ class Streams:
             if len(ends) == 2 or ends == {None}:
                 continue  # another machine's stream, or one that ends
             # keep the camera info's route: other nodes already use its name
-            moved = dataclasses.replace(
+            moved = self._linked(dataclasses.replace(
                 one, source=None if one.source == machine else one.source,
                 target=None if one.target == machine else one.target,
-                options={**one.options, 'camera_info': topics.carries_info(one)})
+                options={**one.options, 'camera_info': topics.carries_info(one)}))
             try:
                 for other in several:
                     _compare(moved, other)
@@ -123,6 +125,13 @@ class Streams:
         ended = sorted(before - self._nodes_elsewhere(machine))
         self._handed_out -= set(ended)
         return ended, self._not_handed_out(), left
+
+    def _linked(self, one: Stream) -> Stream:
+        """Return the stream with the limited links that it crosses."""
+        return dataclasses.replace(one, links={
+            topics.local_topic(f'/link_{way}', machine): bits
+            for machine, way in ((one.source, 'out'), (one.target, 'in'))
+            if machine is not None and (bits := self.bandwidths.get(machine))})
 
     def _not_handed_out(self) -> list[tuple[Optional[str], NodeSpec]]:
         """Return nodes that are needed and were not returned before; remember them as returned."""

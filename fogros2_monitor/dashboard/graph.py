@@ -33,6 +33,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
+from std_msgs.msg import Float64MultiArray
 
 from fogros2_monitor.dashboard.meter import Meter
 from fogros2_monitor.dashboard.ways import (
@@ -46,6 +47,7 @@ from fogros2_monitor.dashboard.ways import (
     Topic,
 )
 from fogros2_monitor.definitions import message_class
+from image_transport_h264.sharing import claim_of, UNLIMITED, VALID
 
 if TYPE_CHECKING:
     from fogros2_monitor.dashboard.cameras import Camera
@@ -92,6 +94,8 @@ class GraphNode(Node):
         self._pictures = False
         self._ears: dict[str, Optional[_Ear]] = {}
         self._cameras: dict[str, Camera] = {}
+        #: Time and contents of the last report of each stream about its share.
+        self._reports: dict[str, tuple[float, Any]] = {}
         self.create_timer(LOOK, self._look)
 
     def know(self, machines: dict[str, list[str]], *, pictures: bool) -> None:
@@ -175,7 +179,20 @@ class GraphNode(Node):
     def _stream(self, one: Stream) -> dict[str, Any]:
         note = '' if one.heard else 'nobody subscribes'
         return {'topic': one.topic, 'transport': one.transport, 'source': one.source,
-                'target': one.target, 'note': note, **self._rates(one.between)}
+                'target': one.target, 'note': note, **self._rates(one.between),
+                **self._share(one.between)}
+
+    def _share(self, between: str) -> dict[str, Any]:
+        """Return share (bits/s) and latency (s) of a stream, None if there is none or unknown."""
+        if between not in self._reports:
+            self._reports[between] = 0.0, None
+            self.create_subscription(
+                Float64MultiArray, f'{between}/share', lambda message: self._reports.update({
+                    between: (time.monotonic(), claim_of(message))}), _QOS)
+        when, report = self._reports[between]
+        claim = report[1] if report and time.monotonic() - when < VALID else None
+        return {'share': claim.share if claim and claim.share < UNLIMITED else None,
+                'latency': claim and claim.latency or None}
 
     def _crossing(self, one: Crossing) -> dict[str, Any]:
         return {'topic': one.topic, 'type': one.kind, 'from': one.sources, 'to': one.targets,

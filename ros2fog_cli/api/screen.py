@@ -11,7 +11,7 @@ from typing import Any, TextIO
 
 from ros2fog_cli.api import replicas
 from ros2fog_cli.api.follower import LogLine
-from ros2fog_cli.api.table import cost, duration, size, table
+from ros2fog_cli.api.table import cost, duration, shares, size, table
 
 #: Enter and leave the alternate screen; meanwhile the cursor is hidden and long lines are cut,
 #: as the number of characters is no limit (a character may be two columns wide).
@@ -85,7 +85,8 @@ def frame(
     crossing = _crossing(machine)
     if crossing:
         parts.append(('', ''))
-        parts += _table(('TOPIC', 'FROM', 'TO', 'HZ', 'BANDWIDTH'), crossing, column=0)
+        parts += _table(('TOPIC', 'FROM', 'TO', 'HZ', 'BANDWIDTH', 'SHARE', 'LATENCY'),
+                        crossing, column=0)
     room = rows - len(parts) - 1
     if lines and room > 0:
         parts.append(('', ''))
@@ -134,7 +135,7 @@ def _about(machine: dict[str, Any], now: float) -> Iterator[tuple[str, str]]:
                         + ('-' if beat is None else f'{duration(beat)} ago'))
 
 
-def _crossing(machine: dict[str, Any]) -> list[tuple[str, str, str, str, str]]:
+def _crossing(machine: dict[str, Any]) -> list[tuple[str, ...]]:
     """Return a row for each topic that crosses the VPN to or from a machine."""
     found = [(f"{one['topic']} ({one['transport']})", [one['source']], [one['target']], one)
              for one in machine.get('streams', [])]
@@ -142,7 +143,7 @@ def _crossing(machine: dict[str, Any]) -> list[tuple[str, str, str, str, str]]:
     return [
         (name, _hosts(sources), _hosts(targets),
          '-' if one['rate'] is None else f"{one['rate']:.1f}",
-         '-' if one['bandwidth'] is None else f"{size(one['bandwidth'])}/s")
+         '-' if one['bandwidth'] is None else f"{size(one['bandwidth'])}/s", *shares(one))
         for name, sources, targets, one in found
         if machine['name'] in (*sources, *targets)]
 

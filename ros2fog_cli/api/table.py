@@ -3,14 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 import shutil
 import sys
-from typing import Optional
+from typing import Any, Optional
 
 #: Shown for a missing value.
 NONE = '-'
+
+
+def shares(stream: Mapping[str, Any]) -> tuple[str, str]:
+    """Return a stream's share of its link, and its latency."""
+    share, latency = stream.get('share'), stream.get('latency')
+    return ('-' if share is None else f'{share / 1e6:.1f} Mbit/s',
+            '-' if latency is None else f'{1e3 * latency:.0f} ms')
 
 
 def table(

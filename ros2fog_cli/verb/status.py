@@ -108,7 +108,7 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
 
     from fogros2.clock import ClockOffset
     from ros2fog_cli.api import replicas
-    from ros2fog_cli.api.table import cost, duration, size, table
+    from ros2fog_cli.api.table import cost, duration, shares, size, table
     now = time.time()
     lines = [
         ('machine', f"{status['name']} ({status['provider']} {status['id'] or '-'})"),
@@ -166,10 +166,10 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
             for guest in status['guests']]))
     if status['streams']:
         print()
-        print(table(('STREAM', 'BY', 'FROM', 'TO', 'RATE', 'TRAFFIC'), [
+        print(table(('STREAM', 'BY', 'FROM', 'TO', 'RATE', 'TRAFFIC', 'SHARE', 'LATENCY'), [
             (one['topic'], one['transport'], one['source'] or 'robot', one['target'] or 'robot',
              one['note'] or ('-' if one['rate'] is None else f"{one['rate']:.1f}/s"),
-             '-' if one['bandwidth'] is None else f"{size(one['bandwidth'])}/s")
+             '-' if one['bandwidth'] is None else f"{size(one['bandwidth'])}/s", *shares(one))
             for one in status['streams']]))
 
 

@@ -89,6 +89,7 @@ XML_MACHINE = """
       disk_size="40" spot="true" min_memory_gb="7.5" gpu="L4" max_price="0.30"
       regions="eu-west-1, eu-west-2" ssh_from="[198.51.100.0/24]" instance_types="t3.large;t3.nano"
       instance_types-sep=";" on_exit="stop" lifetime="1h30m" robot_timeout="60"
+      bandwidth="10Mbit/s"
       launch_foxglove="false" ros_workspace="">
     <tags name="team" value="slam"/>
     <tags name="cost" value="42"/>
@@ -113,6 +114,7 @@ launch:
     on_exit: stop
     lifetime: 1h30m
     robot_timeout: 60
+    bandwidth: 10Mbit/s
     launch_foxglove: false
     ros_workspace: ''
     tags:
@@ -127,8 +129,8 @@ PYTHON_MACHINE = {
     'spot': True, 'min_memory_gb': 7.5, 'gpu': 'L4', 'max_price': 0.30,
     'regions': ['eu-west-1', 'eu-west-2'], 'ssh_from': ['198.51.100.0/24'],
     'instance_types': ['t3.large', 't3.nano'], 'on_exit': 'stop', 'lifetime': '1h30m',
-    'robot_timeout': 60, 'ros_workspace': '', 'tags': {'team': 'slam', 'cost': '42'},
-    'environment': {'RCUTILS_COLORIZED_OUTPUT': '1'}}
+    'robot_timeout': 60, 'bandwidth': '10Mbit/s', 'ros_workspace': '',
+    'tags': {'team': 'slam', 'cost': '42'}, 'environment': {'RCUTILS_COLORIZED_OUTPUT': '1'}}
 
 
 def test_machine_of_any_cloud_is_an_element():
@@ -180,7 +182,7 @@ EXAMPLES = {'text': ('nearest', 'nearest'), 'number': ('2', 2), 'bool': ('true',
             'text or mapping': ('ami-1', 'ami-1')}
 #: Where not every value will do.
 CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'on_loss_after': '5m',
-           'checkpoint': '$HOME/map',
+           'checkpoint': '$HOME/map', 'bandwidth': '10Mbit/s',
            'name': 'planner'}
 LISTS = {'monitor_allow': ('198.51.100.0/28,::1', ['198.51.100.0/28', '::1']),
          'apt': ('libzbar0, g++', ['libzbar0', 'g++']),

@@ -193,13 +193,14 @@ def test_machine_is_drawn_on_a_screen() -> None:
 def test_topics_across_the_vpn_are_drawn() -> None:
     shown = '\n'.join(screen.frame(machine(
         streams=[{'topic': '/camera', 'transport': 'h264', 'source': '', 'target': 'planner',
-                  'rate': 29.96, 'bandwidth': 81_000.0},
+                  'rate': 29.96, 'bandwidth': 81_000.0, 'share': 3.2e6, 'latency': 0.0123},
                  {'topic': '/map', 'transport': 'h264', 'source': 'one', 'target': 'two',
                   'rate': None, 'bandwidth': None}],
         topics=[{'topic': '/odom', 'from': ['planner', 'one'], 'to': [''], 'rate': None,
                  'bandwidth': None}]), [], 1100.0, rows=40))
-    assert re.search(r'^/camera \(h264\) +robot +planner +30\.0 +81\.0 kB/s$', shown, re.MULTILINE)
-    assert re.search(r'^/odom +planner, one +robot +- +-$', shown, re.MULTILINE)
+    assert re.search(r'^/camera \(h264\) +robot +planner +30\.0 +81\.0 kB/s +3\.2 Mbit/s +12 ms$',
+                     shown, re.MULTILINE)
+    assert re.search(r'^/odom +planner, one +robot +- +- +- +-$', shown, re.MULTILINE)
     assert '/map' not in shown
 
 

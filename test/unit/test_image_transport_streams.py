@@ -146,7 +146,7 @@ def test_what_republish_lacks_is_found_at_once(
      "/camera: streams by compressed have no 'quality' (did you mean 'jpeg_quality'?)"),
     (StreamTopic('/camera', 'compressed', xyz=3),
      "/camera: streams by compressed have no 'xyz' "
-     '(there are: camera_info, encoding, format, jpeg_quality, show_damage)')])
+     '(there are: camera_info, encoding, format, jpeg_quality, priority, show_damage)')])
 def test_an_unknown_parameter_gets_the_nearest_name(entry, said):
     with pytest.raises(ConfigurationError) as error:
         stream(entry, 'm')

@@ -160,3 +160,34 @@ def test_entries_are_resolved_when_executed() -> None:
 def test_plain_nonsense_is_found_at_once(entry: Any) -> None:
     with pytest.raises(ConfigurationError):
         streaming.check([entry])
+
+
+@pytest.mark.parametrize('priority', [0, -1, 101, float('nan'), 'high'])
+def test_invalid_priority_is_found_at_once(priority: Any) -> None:
+    with pytest.raises(ConfigurationError, match='priority'):
+        streaming.check([StreamTopic('/camera', priority=priority)])
+
+
+def parameters(node: NodeSpec) -> list[str]:
+    return [str(word) for word in node.arguments
+            if 'links' in str(word) or 'priority' in str(word)]
+
+
+def test_decoder_knows_the_links_that_have_a_bandwidth() -> None:
+    """The encoder is the same for all machines, so only decoders differ."""
+    several = streaming.Streams()
+    several.bandwidths.update({'m': 10e6, 'n': 5e6, 'other': 0.0})
+    found = {(host, node.name): parameters(node) for host, node in [
+        *several.add([StreamTopic('/camera', priority=2)], 'm'),
+        *several.add([StreamTopic('/map', source='m')], 'n'),
+        *several.add([StreamTopic('/camera', priority=2)], 'other'),
+        *several.add([StreamTopic('/seen', 'h264', 'to_robot')], 'm')]}
+    assert found == {
+        (None, 'camera_h264_encoder'): ['priority:=2'],
+        ('m', 'camera_h264_decoder'): ['links:="/fogros2/m/link_in=10000000"'],
+        ('other', 'camera_h264_decoder'): [],
+        ('m', 'map_h264_encoder'): [],
+        ('n', 'map_h264_decoder_from_m'): [
+            'links:="/fogros2/m/link_out=10000000,/fogros2/n/link_in=5000000"'],
+        ('m', 'seen_h264_encoder'): [],
+        (None, 'seen_h264_decoder_from_m'): ['links:="/fogros2/m/link_out=10000000"']}

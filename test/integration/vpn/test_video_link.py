@@ -35,19 +35,23 @@ def start(vpn: Any, host: str, *words: str) -> Any:
     return vpn.start(host, [sys.executable, *words], **environment)
 
 
-def stream(vpn: Any, *parameters: str, codec: str = 'h264', images: int = 30) -> Any:
+def stream(
+    vpn: Any, *parameters: str, codec: str = 'h264', images: int = 30, topic: str = '/camera',
+    links: str = '',
+) -> Any:
     """
     Start camera and encoder on the robot, decoder and viewer on the machine; return the viewer.
 
     :param images: so many have come when it returns.
     """
-    common = ['-p', f'codec:={codec}', '-p', f'stream:=/camera/{codec}']
+    common = ['-p', f'codec:={codec}', '-p', f'stream:={topic}/{codec}']
     scripts = ROOT / 'image_transport_h264/scripts'
-    start(vpn, 'robot', str(scripts / 'encoder'), '--ros-args', '-r', 'image:=/camera', *common,
+    start(vpn, 'robot', str(scripts / 'encoder'), '--ros-args', '-r', f'image:={topic}', *common,
           *parameters)
-    start(vpn, 'machine', str(scripts / 'decoder'), '--ros-args', '-r', 'image:=/seen', *common)
-    viewer = start(vpn, 'machine', str(HERE / 'video_node.py'), 'viewer')
-    start(vpn, 'robot', str(HERE / 'video_node.py'), 'camera').wait('ready', timeout=30.0)
+    start(vpn, 'machine', str(scripts / 'decoder'), '--ros-args', '-r', f'image:=/seen{topic}',
+          '-p', f'links:={links}', *common)
+    viewer = start(vpn, 'machine', str(HERE / 'video_node.py'), 'viewer', f'/seen{topic}')
+    start(vpn, 'robot', str(HERE / 'video_node.py'), 'camera', topic).wait('ready', timeout=30.0)
     viewer.wait('image', count=images, timeout=30.0)
     return viewer
 
@@ -77,6 +81,31 @@ def test_the_link_drops_from_10_to_1_megabit_and_returns(vpn: Any) -> None:
     back = during(viewer, time.monotonic() + 5.0, 2.0)
     assert len(back) > 45
     assert sorted(line['latency'] for line in back)[len(back) // 2] < 0.15
+
+
+def test_late_subscriber_of_a_budget_spoils_no_stream(vpn: Any) -> None:
+    """Each camera would take 3 of 4 Mbit/s: together they stay within them, and both go on."""
+    vpn.relay.tell({'rate': 5e6, 'queue': 1.0})
+    words = ('-p', 'quality:=14.0')
+    links = '/fogros2/machine/link_in=4e6'
+
+    def sent() -> int:
+        name = vpn.interfaces['robot'].name
+        return int(vpn.shell('robot', f'cat /sys/class/net/{name}/statistics/tx_bytes'))
+
+    left = stream(vpn, *words, topic='/left', links=links)
+    begin, before = time.monotonic(), sent()
+    right = stream(vpn, *words, topic='/right', links=links)
+    # the starts of the second pair are in this stretch, and the first seconds of its stream
+    both = during(left, begin, time.monotonic() - begin + 4.0)
+    seconds, size = time.monotonic() - begin, sent() - before
+    # without a budget it is 5 Mbit/s, and the queue of the link fills up
+    assert 8 * size / seconds < 4e6
+    arrivals = [line['arrival'] for line in both]
+    # 30 images a second on an idle computer; a busy one encodes fewer
+    assert len(arrivals) > 4 * seconds
+    assert max(after - one for one, after in zip(arrivals, arrivals[1:])) < 2.0
+    assert len(during(right, time.monotonic() - 5.0, 5.0)) > 20
 
 
 def test_large_images_take_turns_on_a_slow_link(vpn: Any) -> None:

@@ -3,7 +3,8 @@
 """
 The ends of a video stream for tests: ``camera`` publishes images, ``viewer`` takes them.
 
-With ``best_effort`` behind it the viewer takes the camera's own images, at 10 Hz.
+With ``best_effort`` behind it the viewer takes the camera's own images, at 10 Hz. A topic behind
+it, such as /left, replaces /camera, and /seen/left replaces /seen.
 
 The viewer prints a JSON object an image: its number, latency and arrival (s, on the monotonic
 clock that all network namespaces share), and for some how near it is to the original (dB).
@@ -37,6 +38,7 @@ def main() -> None:
     scene = Scene(WIDTH, HEIGHT, RATE)
     frames = [scene.frame(number) for number in range(FRAMES)]
     raw = sys.argv[2:] == ['best_effort']
+    topic = next((word for word in sys.argv[2:] if word.startswith('/')), None)
     qos = qos_profile_sensor_data if raw else 2
     rclpy.init(args=[])
     node = rclpy.create_node(sys.argv[1])
@@ -61,10 +63,10 @@ def main() -> None:
         print(json.dumps(told), flush=True)
 
     if sys.argv[1] == 'camera':
-        publisher = node.create_publisher(Image, '/camera', qos)
+        publisher = node.create_publisher(Image, topic or '/camera', qos)
         node.create_timer(0.1 if raw else 1 / RATE, shoot)
     else:
-        node.create_subscription(Image, '/camera' if raw else '/seen', view, qos)
+        node.create_subscription(Image, '/camera' if raw else topic or '/seen', view, qos)
     print(json.dumps({'ready': True}), flush=True)
     try:
         rclpy.spin(node)
