@@ -12,71 +12,46 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from fogros2.actions.cloud_group import CloudGroup as CloudGroup
-    from fogros2.actions.fog_machine import FogMachine as FogMachine
-    from fogros2.actions.foxglove import Foxglove as Foxglove
-    from fogros2.actions.launch_description import (
-        FogROSLaunchDescription as FogROSLaunchDescription,
-    )
-    from fogros2.actions.nodes import (
-        CloudNode as CloudNode,
-    )
-    from fogros2.actions.nodes import (
-        ComposableNodeContainer as ComposableNodeContainer,
-    )
-    from fogros2.actions.nodes import (
-        LifecycleNode as LifecycleNode,
-    )
-    from fogros2.actions.nodes import (
-        Node as Node,
-    )
-    from fogros2.actions.replicated import Replicated as Replicated
+    from fogros2.actions.cloud_group import CloudGroup
+    from fogros2.actions.fog_machine import FogMachine
+    from fogros2.actions.foxglove import Foxglove
+    from fogros2.actions.launch_description import FogROSLaunchDescription
+    from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, LifecycleNode, Node
+    from fogros2.actions.replicated import Replicated
     from fogros2.describe.choices import (
-        find_cheapest as find_cheapest,
-    )
-    from fogros2.describe.choices import (
-        find_cheapest_ec2_instance_type as find_cheapest_ec2_instance_type,
-    )
-    from fogros2.describe.choices import (
-        find_nearest_aws_region as find_nearest_aws_region,
-    )
-    from fogros2.describe.choices import (
-        nearest_aws_region_now as nearest_aws_region_now,
+        find_cheapest,
+        find_cheapest_ec2_instance_type,
+        find_nearest_aws_region,
+        nearest_aws_region_now,
     )
     from fogros2.describe.machines import (
-        CloudInstance as CloudInstance,
-    )
-    from fogros2.describe.machines import (
-        ContainerInstance as ContainerInstance,
-    )
-    from fogros2.describe.machines import (
-        JoinedMachine as JoinedMachine,
-    )
-    from fogros2.describe.machines import (
-        SSHInstance as SSHInstance,
+        CloudInstance,
+        ContainerInstance,
+        JoinedMachine,
+        SSHInstance,
     )
     from fogros2.describe.machines_cloud import (
-        AWSCloudInstance as AWSCloudInstance,
+        AWSCloudInstance,
+        AzureCloudInstance,
+        cheapest,
+        CheapestInstance,
+        GCPCloudInstance,
+        KubeInstance,
     )
-    from fogros2.describe.machines_cloud import (
-        AzureCloudInstance as AzureCloudInstance,
-    )
-    from fogros2.describe.machines_cloud import (
-        cheapest as cheapest,
-    )
-    from fogros2.describe.machines_cloud import (
-        CheapestInstance as CheapestInstance,
-    )
-    from fogros2.describe.machines_cloud import (
-        GCPCloudInstance as GCPCloudInstance,
-    )
-    from fogros2.describe.machines_cloud import (
-        KubeInstance as KubeInstance,
-    )
-    from fogros2.errors import FogError as FogError
-    from fogros2.image_transport.streams import StreamTopic as StreamTopic
-    from fogros2.runtime.interruption import MachineInterrupted as MachineInterrupted
+    from fogros2.errors import FogError
+    from fogros2.image_transport.streams import StreamTopic
+    from fogros2.runtime.interruption import MachineInterrupted
 
+#: Written out for type checkers, which do not run the module.
+__all__ = [
+    'AWSCloudInstance', 'AzureCloudInstance', 'CheapestInstance', 'CloudGroup',
+    'CloudInstance', 'CloudNode', 'ComposableNodeContainer', 'ContainerInstance', 'FogError',
+    'FogMachine', 'FogROSLaunchDescription', 'Foxglove', 'GCPCloudInstance', 'JoinedMachine',
+    'KubeInstance', 'LifecycleNode', 'MachineInterrupted', 'Node', 'Replicated', 'SSHInstance',
+    'StreamTopic', 'cheapest', 'ec2_instance_type_selection', 'find_cheapest',
+    'find_cheapest_ec2_instance_type', 'find_nearest_aws_region', 'nearest_aws_region_now',
+    'region_ami_selection',
+]
 #: The public names of each module.
 _NAMES = {
     'actions.cloud_group': 'CloudGroup',
@@ -100,7 +75,6 @@ _MODULES = {name: f'fogros2.{module}' for module, names in _NAMES.items()
             for name in names.split()}
 #: Modules that FogROS2 has in a package ``utils``: ``from fogros2 import region_ami_selection``.
 _FORMERLY_UTILS = ('ec2_instance_type_selection', 'region_ami_selection')
-__all__ = [*_MODULES, *_FORMERLY_UTILS]  # noqa: PLE0604
 
 
 def __getattr__(name: str) -> object:

@@ -145,8 +145,8 @@ class DeadlineExceeded(FogError):
 class Cancelled(FogError):
     """The launch was asked to end during this."""
 
-    def __init__(self, what: str = 'the deployment', hint: Optional[str] = None) -> None:
-        super().__init__(f'{what} was cancelled', hint or '')
+    def __init__(self, what: str = 'the deployment') -> None:
+        super().__init__(f'{what} was cancelled')
 
 
 def did_you_mean(

@@ -61,13 +61,13 @@ def _through_sudo(command: Command) -> bool:
     return command.sudo and os.geteuid() != 0
 
 
-def refresh_ticket(*, timeout: float = 10.0) -> bool:
+def refresh_ticket() -> bool:
     """
     Extend the time until sudo asks for a password again; return False if sudo refuses now.
 
     Without effect if sudo needs no password.
     """
-    return not sudo_trouble(timeout=timeout)
+    return not sudo_trouble()
 
 
 def ask_for_ticket(what: str) -> bool:

@@ -56,14 +56,6 @@ class Progress:
 
 
 @dataclasses.dataclass(frozen=True)
-class OutputLine:
-    """A line of output of a step's program on the machine, for the debug level."""
-
-    machine: str
-    line: str
-
-
-@dataclasses.dataclass(frozen=True)
 class ClockMeasured:
     """The offset of a machine's clock changed; ``warn`` when it exceeds the limit."""
 
@@ -89,8 +81,7 @@ class Silence:
     seconds: float
 
 
-Event = Union[
-    StepStarted, StepDone, StepFailed, Progress, OutputLine, ClockMeasured, Warned, Silence]
+Event = Union[StepStarted, StepDone, StepFailed, Progress, ClockMeasured, Warned, Silence]
 Reporter = Callable[[Event], None]
 
 

@@ -27,7 +27,6 @@ class Timeouts:
     vpn: float = 30.0
     agent: float = 30.0
     command: float = 60.0
-    delete: float = 300.0
 
 
 def wait_until(

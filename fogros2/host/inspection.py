@@ -10,7 +10,6 @@ from typing import Optional
 from fogros2.model import Command
 
 DISTRO = 'jazzy'
-RMW = 'rmw_cyclonedds_cpp'
 MIN_PYTHON = (3, 10)
 
 _PROBE = r"""

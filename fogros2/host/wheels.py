@@ -358,8 +358,8 @@ def _build(sources: Path, target: Path) -> str:
     return wheel.name
 
 
-def _forget_old(folder: Path, *, keep: Path, number: int = 3) -> None:
-    """Delete the sets of wheels that were not used lately."""
+def _forget_old(folder: Path, *, keep: Path) -> None:
+    """Delete the sets of wheels that were not used lately; three stay."""
     sets = [p for p in folder.iterdir() if p.is_dir() and not p.name.startswith('.') and p != keep]
-    for path in sorted(sets, key=lambda p: p.stat().st_mtime, reverse=True)[number - 1:]:
+    for path in sorted(sets, key=lambda p: p.stat().st_mtime, reverse=True)[2:]:
         shutil.rmtree(path, ignore_errors=True)

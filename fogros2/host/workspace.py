@@ -77,12 +77,6 @@ class Workspace:
             return not self.compiled
         return all(_build_type(path) == 'ament_python' for path in self.sources.values())
 
-    def executable(self, package: str, name: str) -> Optional[Path]:
-        """Return the path of an executable in the install space, None if it is not there."""
-        prefix = self.installed.get(package)
-        path = prefix / 'lib' / package / name if prefix else None
-        return path if path and path.is_file() and os.access(path, os.X_OK) else None
-
 
 @dataclasses.dataclass(frozen=True)
 class WorkspacePlan:
@@ -272,7 +266,6 @@ def transfer(
     shell: Shell, ways: Sequence[WorkspacePlan], *, timeouts: Timeouts,
     cancel: Optional[threading.Event] = None,
     on_progress: Optional[Callable[[int, int], None]] = None,
-    on_output: Optional[Callable[[str], None]] = None,
     before_build: Callable[[], object] = lambda: None,
 ) -> str:
     """
@@ -280,7 +273,6 @@ def transfer(
 
     :param ways: the workspaces, in the order in which they are sourced.
     :param on_progress: callback with the bytes sent and the total bytes.
-    :param on_output: callback for each line of the build's output.
     :param before_build: returns when the tools for the build are installed.
     :returns: what was done, in a few words.
     """
@@ -300,7 +292,7 @@ def transfer(
     if any(way.commands for way in ways):
         before_build()
     for command in [command for way in ways for command in way.commands]:
-        shell.run(command, timeout=timeouts.build, cancel=cancel, on_output=on_output)
+        shell.run(command, timeout=timeouts.build, cancel=cancel)
     sent = (f'{sum(report.files for report in reports)} files, '
             f'{_size(sum(report.bytes for report in reports))}')
     return ', '.join([sent, *(

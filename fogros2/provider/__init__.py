@@ -77,11 +77,6 @@ class Capabilities:
     application_port: int = 0
     preemption_notice: tuple[str, ...] = ()
 
-    @property
-    def boots_agent(self) -> bool:
-        """Whether ``create`` starts the agent at boot."""
-        return bool(self.agent_directory)
-
 
 class Provider(abc.ABC):
     """

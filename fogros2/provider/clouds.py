@@ -38,7 +38,7 @@ def clouds() -> tuple[list[str], list[str]]:
 def compare(
     wanted: Wants, names: Sequence[str] = (), regions: Sequence[str] = (), *,
     measure: bool = False, max_round_trip_ms: Optional[float] = None, refresh: bool = False,
-    cancel: Optional[threading.Event] = None, deadline: Optional[float] = None,
+    cancel: Optional[threading.Event] = None,
 ) -> Offers:
     """
     Return the offers of several clouds, the cheapest first.
@@ -47,7 +47,6 @@ def compare(
     :param regions: of any cloud, 'all' or 'nearest'; none for each cloud's configured region.
     :param measure: measure the round trip to each region.
     :param max_round_trip_ms: leave out regions that are further away; measures all regions.
-    :param deadline: seconds for each cloud.
     :returns: ``left_out`` names the clouds and regions that did not answer, or have no offer.
     :raises ConfigurationError: no cloud is set up here, or none of several has an offer.
     :raises FogError: the only cloud refused, or has no offer.
@@ -64,7 +63,7 @@ def compare(
                                  'ros2 fog regions --provider shows them')
     asked = {name: own for name, own in asked.items() if own or not regions}
     everywhere = ALL in regions or '*' in regions or max_round_trip_ms is not None
-    deadline = deadline or (DEADLINE_ALL if everywhere else DEADLINE)
+    deadline = DEADLINE_ALL if everywhere else DEADLINE
     late = threading.Event()
     with ThreadPoolExecutor(len(asked), 'fog-clouds') as pool:
         answers = {name: pool.submit(cancellable, functools.partial(

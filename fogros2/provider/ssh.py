@@ -131,11 +131,11 @@ class SSHProvider(Provider):
         """Do nothing: the launch did not create the computer."""
 
 
-def reach(host: str, port: int, timeout: float = _TIMEOUT) -> str:
+def reach(host: str, port: int) -> str:
     """
     Return the address at which a TCP port answers.
 
     :raises OSError: no answer.
     """
-    with socket.create_connection((host, port), timeout=timeout) as connection:
+    with socket.create_connection((host, port), timeout=_TIMEOUT) as connection:
         return str(connection.getpeername()[0])

@@ -13,7 +13,6 @@ import launch.logging
 from fogros2.report import (
     ClockMeasured,
     Event,
-    OutputLine,
     Progress,
     Silence,
     StepDone,
@@ -66,8 +65,6 @@ class Console:
                     self._logger.warning(f'{what}: {event.reason}')
             elif isinstance(event, Progress):
                 self._running[event.machine, event.step] = _bar(event)
-            elif isinstance(event, OutputLine):
-                self._logger.debug(f'{_where(event.machine)}: {event.line}')
             elif isinstance(event, ClockMeasured) and event.warn:
                 what = (f"the clock of '{event.machine}' is {event.offset}, so TF look-ups and "
                         'stamp matching between the two fail')

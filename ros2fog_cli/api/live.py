@@ -44,11 +44,11 @@ class Live:
     """
 
     def __init__(
-        self, store: Optional[Store] = None, *, name: Optional[str] = None,
+        self, *, name: Optional[str] = None,
         regions: Optional[list[str]] = None, interval: float = 1.0, topics: bool = False,
         pictures: bool = False,
     ) -> None:
-        self.store = store or Store()
+        self.store = Store()
         self._name, self._regions, self._interval = name, regions, interval
         self._graphs = Graphs(self.store, pictures=pictures) if topics else None
         #: Machines by their keys, see :meth:`_key`.

@@ -70,8 +70,8 @@ def complete(prefix: str, **_: object) -> list[str]:
     """
     name, equals, rest = prefix.partition('=')
     if not equals:
-        from ros2fog_cli.verb import complete_names
-        return [f'{one}=' for one in [*complete_names(name), *(['*'] if not name else [])]]
+        from ros2fog_cli.verb import machine_names
+        return [f'{one}=' for one in [*machine_names(), '*'] if one.startswith(name)]
     from fogros2.describe import keywords
     before, comma, last = rest.rpartition(',')
     if not comma:

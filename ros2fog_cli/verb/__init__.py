@@ -6,9 +6,12 @@ from __future__ import annotations
 import abc
 import argparse
 import sys
-from typing import Optional, Union
+from typing import Optional, TYPE_CHECKING, Union
 
 from ros2cli.plugin_system import PLUGIN_SYSTEM_VERSION, satisfies_version
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
 
 
 class VerbExtension(abc.ABC):
@@ -34,51 +37,53 @@ class VerbExtension(abc.ABC):
         """Run the verb and return its exit status."""
 
 
+def complete(argument: argparse.Action, names: Callable[[], Iterable[str]]) -> None:
+    """Let the shell complete an argument with those of ``names()`` that begin like its text."""
+    argument.completer = (  # type: ignore[attr-defined]
+        lambda prefix, **_: [name for name in names() if name.startswith(prefix)])
+
+
 def add_name(parser: argparse.ArgumentParser, text: str = "the machine's name") -> None:
     """Add the argument ``name``, with completion from the machines that this robot knows."""
-    argument = parser.add_argument('name', help=text)
-    argument.completer = complete_names  # type: ignore[attr-defined]
+    complete(parser.add_argument('name', help=text), machine_names)
 
 
-def complete_names(
-    prefix: str, parsed_args: Optional[argparse.Namespace] = None, **_: object,
-) -> list[str]:
-    """Return the names of machines that begin with ``prefix``, without asking providers."""
+def machine_names() -> list[str]:
+    """Return the names of machines that this robot knows, without asking providers."""
     from fogros2.store import Store
-    return [record.name for record in Store().machines() if record.name.startswith(prefix)]
+    return [record.name for record in Store().machines()]
 
 
 def add_region(parser: argparse.ArgumentParser) -> None:
     """Add FogROS2's own ``--region``."""
-    argument = parser.add_argument(
+    complete(parser.add_argument(
         '--region', nargs='*', metavar='REGION',
-        help="regions to ask where a provider has some; 'all' for every one")
-    argument.completer = complete_regions  # type: ignore[attr-defined]
+        help="regions to ask where a provider has some; 'all' for every one"), region_names)
 
 
-def complete_regions(prefix: str, **_: object) -> list[str]:
-    """Return the regions that begin with ``prefix``, and 'all', without any request."""
+def region_names() -> list[str]:
+    """Return 'all' and the regions of all providers, without any request."""
     from fogros2 import plugin_system
     from fogros2.errors import FogError
     names = ['all']
-    for provider in plugin_system.names('fogros2.provider'):
+    for provider in provider_names():
         try:
             names += plugin_system.load('fogros2.provider', provider).region_names()
         except FogError:
             continue  # the verb reports a provider that cannot be loaded
-    return [name for name in names if name.startswith(prefix)]
+    return names
 
 
-def complete_providers(prefix: str, **_: object) -> list[str]:
-    """Return the providers that begin with ``prefix``, without loading them."""
+def provider_names() -> list[str]:
+    """Return the names of the providers, without loading them."""
     from fogros2 import plugin_system
-    return [name for name in plugin_system.names('fogros2.provider') if name.startswith(prefix)]
+    return plugin_system.names('fogros2.provider')
 
 
-def complete_clouds(prefix: str, **_: object) -> list[str]:
-    """Return 'all' and the providers with prices that begin with ``prefix``."""
+def cloud_names() -> list[str]:
+    """Return 'all' and the providers with prices."""
     from fogros2.provider.clouds import clouds
-    return [name for name in ('all', *sum(clouds(), [])) if name.startswith(prefix)]
+    return ['all', *sum(clouds(), [])]
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from ros2fog_cli.verb import add_region, agreed, complete_names, VerbExtension, warn
+from ros2fog_cli.verb import add_region, agreed, complete, machine_names, VerbExtension, warn
 
 
 class DeleteVerb(VerbExtension):
@@ -14,9 +14,7 @@ class DeleteVerb(VerbExtension):
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
         name = parser.add_argument('name', help="the machine's name, or 'all' for this robot's")
-        name.completer = (  # type: ignore[attr-defined]
-            lambda prefix, **words: [
-                *complete_names(prefix, **words), *(['all'] if 'all'.startswith(prefix) else [])])
+        complete(name, lambda: [*machine_names(), 'all'])
         add_region(parser)
         parser.add_argument('--yes', '-y', action='store_true', help="don't ask for confirmation")
         parser.add_argument('--dry-run', action='store_true', help='print what would be deleted')

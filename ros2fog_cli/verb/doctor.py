@@ -8,7 +8,7 @@ import dataclasses
 import json
 import sys
 
-from ros2fog_cli.verb import add_json, complete_providers, VerbExtension
+from ros2fog_cli.verb import add_json, complete, provider_names, VerbExtension
 
 _MARKS = {'ok': ' ok ', 'warning': 'warn', 'failed': 'FAIL'}
 _COLOURS = {'ok': '32', 'warning': '33', 'failed': '31'}
@@ -20,10 +20,10 @@ class DoctorVerb(VerbExtension):
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
         add_json(parser)
-        provider = parser.add_argument(
+        complete(parser.add_argument(
             '--provider', nargs='+', default=[], metavar='NAME',
-            help='provider that must work; others are checked if they are configured')
-        provider.completer = complete_providers  # type: ignore[attr-defined]
+            help='provider that must work; others are checked if they are configured'),
+                 provider_names)
         parser.add_argument('--lan-seconds', type=float, default=1.5, metavar='SECONDS',
                             help='how long to search the LAN for ROS 2 (0: not at all)')
 

@@ -12,7 +12,8 @@ from ros2fog_cli.verb import (
     add_json,
     add_region,
     agreed,
-    complete_names,
+    complete,
+    machine_names,
     VerbExtension,
     warn,
 )
@@ -34,10 +35,7 @@ class ImageVerb(VerbExtension):
             'first', metavar='list | delete | create | NAME',
             help="'list', 'delete' with ids or names of images, 'create' for pods (see "
                  "'ros2 fog image create -h'), or a machine to make an image of")
-        first.completer = (  # type: ignore[attr-defined]
-            lambda prefix, **more: [
-                *complete_names(prefix, **more),
-                *(word for word in ('list', 'delete', 'create') if word.startswith(prefix))])
+        complete(first, lambda: [*machine_names(), 'list', 'delete', 'create'])
         _add_options(parser)
         parser.add_argument('rest', nargs=argparse.REMAINDER, metavar='...',
                             help='more names or ids; options may be anywhere')

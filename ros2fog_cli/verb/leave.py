@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from ros2fog_cli.verb import VerbExtension
+from ros2fog_cli.verb import complete, VerbExtension
 
 
 class LeaveVerb(VerbExtension):
@@ -13,8 +13,7 @@ class LeaveVerb(VerbExtension):
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
-        argument = parser.add_argument('name', help="the machine's name")
-        argument.completer = complete_joined  # type: ignore[attr-defined]
+        complete(parser.add_argument('name', help="the machine's name"), joined_names)
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Delete this computer's end of the VPN."""
@@ -25,8 +24,8 @@ class LeaveVerb(VerbExtension):
         return 0
 
 
-def complete_joined(prefix: str, **_: object) -> list[str]:
-    """Return the machines that this computer has joined and that begin with ``prefix``."""
+def joined_names() -> list[str]:
+    """Return the names of the machines that this computer has joined."""
     from fogros2 import invitation
     from fogros2.store import Store
-    return [name for name in invitation.joined(Store()) if name.startswith(prefix)]
+    return list(invitation.joined(Store()))

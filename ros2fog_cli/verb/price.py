@@ -8,8 +8,9 @@ import json
 
 from ros2fog_cli.verb import (
     add_json,
-    complete_clouds,
-    complete_regions,
+    cloud_names,
+    complete,
+    region_names,
     VerbExtension,
     warn,
 )
@@ -36,7 +37,7 @@ class PriceVerb(VerbExtension):
             '--region', nargs='*', metavar='REGION',
             help="of any cloud, 'all' for every one, 'nearest' for that of each cloud (default: "
             'the configured region of each)')
-        region.completer = complete_regions  # type: ignore[attr-defined]
+        complete(region, region_names)
         parser.add_argument('--limit', type=int, default=10, metavar='N',
                             help='rows to show, 0 for all (default: 10)')
         parser.add_argument('--replicas', type=int, metavar='N',
@@ -46,7 +47,7 @@ class PriceVerb(VerbExtension):
         provider = parser.add_argument(
             '--provider', metavar='PROVIDER', default='all',
             help="whose prices (default: 'all' that are set up)")
-        provider.completer = complete_clouds  # type: ignore[attr-defined]
+        complete(provider, cloud_names)
         add_json(parser)
 
     def main(self, *, args: argparse.Namespace) -> int:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from ros2fog_cli.verb import add_json, complete_providers, complete_regions, VerbExtension
+from ros2fog_cli.verb import add_json, complete, provider_names, region_names, VerbExtension
 
 
 class RegionsVerb(VerbExtension):
@@ -14,14 +14,12 @@ class RegionsVerb(VerbExtension):
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
-        region = parser.add_argument('region', nargs='*', help='these alone')
-        region.completer = complete_regions  # type: ignore[attr-defined]
+        complete(parser.add_argument('region', nargs='*', help='these alone'), region_names)
         parser.add_argument('--all', action='store_true',
                             help='also those that an account has to enable first')
-        provider = parser.add_argument(
+        complete(parser.add_argument(
             '--provider', metavar='PROVIDER',
-            help='whose regions (default: the first one that is set up)')
-        provider.completer = complete_providers  # type: ignore[attr-defined]
+            help='whose regions (default: the first one that is set up)'), provider_names)
         add_json(parser)
 
     def main(self, *, args: argparse.Namespace) -> int:

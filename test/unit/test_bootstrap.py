@@ -172,7 +172,7 @@ installed 0123
         programs=frozenset({'rsync', 'sudo'}), ros={'jazzy': '/opt/ros/jazzy'},
         rmw={'jazzy': ('rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp')},
         free_bytes=1 << 20, routes=('10.0.0.0/24',), installed=frozenset({'0123'}))
-    assert facts.has_rmw(host.RMW)
+    assert facts.has_rmw('rmw_cyclonedds_cpp')
 
 
 def test_facts_of_nothing_are_defaults() -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterable, Mapping
 import dataclasses
 from decimal import Decimal
@@ -613,12 +614,15 @@ def test_invalid_machine_name_is_refused(name: str) -> None:
 
 
 def test_names_are_completed_without_asking_providers(monkeypatch: pytest.MonkeyPatch) -> None:
-    from ros2fog_cli.verb import complete_names
+    from ros2fog_cli.verb import add_name
     monkeypatch.setattr(Memory, 'find', lambda *a: 1 / 0)
     record('alpha')
     record('beta')
-    assert complete_names('', None) == ['alpha', 'beta']  # type: ignore[arg-type]
-    assert complete_names('al', None) == ['alpha']  # type: ignore[arg-type]
+    parser = argparse.ArgumentParser()
+    add_name(parser)
+    completer: Any = parser._actions[-1].completer  # type: ignore[attr-defined]
+    assert completer('', parsed_args=None) == ['alpha', 'beta']
+    assert completer('al', parsed_args=None) == ['alpha']
 
 
 @pytest.mark.parametrize(('seconds', 'text'), [

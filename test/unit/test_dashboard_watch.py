@@ -20,7 +20,6 @@ from fogros2.events import Status
 from fogros2.journal import Journal, Step
 from fogros2.report import (
     Event,
-    OutputLine,
     Progress,
     silent,
     step,
@@ -70,7 +69,7 @@ def test_journal_without_a_folder_stops_nothing(tmp_path: Path) -> None:
     folder.rmdir()  # as at the end of a launch
     with pytest.raises(ValueError, match='why'), step(keep, 'a', 'delete'):
         raise ValueError('why')
-    keep(OutputLine('a', 'not kept'))
+    keep(StepStarted('a', 'not kept'))
     assert not folder.exists()
 
 

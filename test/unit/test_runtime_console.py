@@ -12,7 +12,6 @@ import pytest
 from fogros2.clock import ClockOffset
 from fogros2.report import (
     ClockMeasured,
-    OutputLine,
     Progress,
     Silence,
     StepDone,
@@ -52,13 +51,11 @@ def test_lines(lines):
     launch.logging.launch_config.level = logging.DEBUG
     console = Console(io.StringIO())
     console(StepStarted('planner', 'sync'))
-    console(OutputLine('planner', 'building'))
     console(StepDone('planner', 'sync', 1.234, '3 files'))
     console(StepFailed('', 'VPN interface', 0.5, 'no TUN'))
     console(StepFailed('', 'VPN repair', 0.5, 'no TUN', fatal=False))
     assert lines == [
         ('DEBUG', 'planner: sync ...'),
-        ('DEBUG', 'planner: building'),
         ('INFO', 'planner: sync 1.23 s (3 files)'),
         ('INFO', 'robot: VPN interface failed after 0.50 s'),
         ('WARNING', 'robot: VPN repair failed after 0.50 s: no TUN')]

@@ -83,9 +83,6 @@ def test_finds_packages_of_source_and_install_space(root: Path) -> None:
     assert space.packages['alpha'] == root / 'install/alpha'
     assert space.python_only
     assert space.python == 'python3.12'
-    assert space.executable('alpha', 'node') == root / 'install/alpha/lib/alpha/node'
-    assert space.executable('alpha', 'other') is None
-    assert space.executable('beta', 'node') is None
 
 
 def test_merged_install_space(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 import re
 from typing import Any
 
@@ -79,9 +79,7 @@ def refused(error: ApiError, what: str, namespace: str) -> ProviderError:
                          error.hint or of_refusal(message, namespace))
 
 
-def missing_rights(
-    rules: Iterable[Mapping[str, Any]], rights: Sequence[Right] = RIGHTS,
-) -> list[str]:
+def missing_rights(rules: Iterable[Mapping[str, Any]]) -> list[str]:
     """
     Return the rights that a robot needs and a user lacks, such as 'create pods/exec'.
 
@@ -99,7 +97,7 @@ def missing_rights(
             for rule in allowed)
 
     return [f'{verb} {resource}{f".{group}" if group else ""}'
-            for group, resource, verbs in rights for verb in verbs
+            for group, resource, verbs in RIGHTS for verb in verbs
             if not may(group, resource, verb)]
 
 

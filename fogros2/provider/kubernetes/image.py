@@ -13,7 +13,6 @@ import dataclasses
 import os
 from pathlib import Path
 import re
-import threading
 from typing import Optional
 from xml.sax.saxutils import escape
 
@@ -28,6 +27,8 @@ ENGINES = {'podman': 'podman', 'docker': 'docker.io', 'buildah': 'buildah'}
 NAME = 'fogros2'
 CONTAINERFILE = 'Containerfile'
 MANIFEST = 'package.xml'
+#: Seconds for the build, and for the push.
+STEP_TIMEOUT = 3600.0
 
 _REGISTRY = re.compile(r'[a-z0-9][a-z0-9.-]*(:[0-9]+)?(/[a-z0-9._-]+)*')
 _WORD = re.compile(r'[A-Za-z0-9][A-Za-z0-9.+:_-]*')
@@ -163,8 +164,7 @@ def commands(what: Recipe, folder: Path, program: str, *, push: bool = True) -> 
 
 
 def build(
-    what: Recipe, folder: Path, *, program: str, push: bool = True, timeout: float = 3600.0,
-    cancel: Optional[threading.Event] = None,
+    what: Recipe, folder: Path, *, program: str, push: bool = True,
     on_output: Optional[Callable[[str], None]] = None,
 ) -> str:
     """
@@ -172,15 +172,14 @@ def build(
 
     :param folder: folder for the Containerfile, which stays there.
     :param program: result of ``engine``.
-    :param timeout: time-out of each step in seconds.
     :param on_output: callback for each line of the program's output.
     :raises ProviderError: the build failed, or the registry refused the image.
     """
     write(what, folder)
     for command in commands(what, folder, program, push=push):
         try:
-            process.run(dataclasses.replace(command, environment=_login()), timeout=timeout,
-                        cancel=cancel, on_output=on_output)
+            process.run(dataclasses.replace(command, environment=_login()), timeout=STEP_TIMEOUT,
+                        on_output=on_output)
         except CommandError as error:
             said = error.result.stderr
             image = what.reference if command.argv[1] == 'push' else what.base

@@ -32,7 +32,7 @@ def prefix(environment: Mapping[str, str] = os.environ) -> Optional[Path]:
     for each in environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
         folder = Path(each)
         if each and (folder / 'share/ament_index/resource_index/rmw_typesupport' /
-                     host.RMW).exists():
+                     'rmw_cyclonedds_cpp').exists():
             return folder.resolve()
     return None
 
