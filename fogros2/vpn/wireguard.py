@@ -199,7 +199,8 @@ class WireGuard(Vpn):
         lines = [_PATH, 'failed=0', *(f'{{ {undo}\n}} || failed=1' for undo in undos)]
         files = f'{shlex.quote(interface.key_file)} {_noted(interface)}'
         if not interface.firewall:
-            files += f' {_guests(interface)} {_guests(interface)}.json {_guests(interface)}.lock'
+            files += f' {_guests(interface)} {_guests(interface)}.json {_guests(interface)}.lock' \
+                     f' /run/{_name(interface)}.idle.json'
         lines += [f'rm -f {files} || failed=1', 'exit $failed']
         yield Command.script('\n'.join(lines), sudo=True, what=_what('take', interface, 'down'))
 

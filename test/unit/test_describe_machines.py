@@ -99,6 +99,7 @@ def test_substitutions_are_resolved_when_executed(context):
     (lambda: ContainerInstance(on_exit='keep'), "a machine with on_exit='keep' needs a name"),
     (lambda: ContainerInstance(lifetime='soon'), 'is no duration'),
     (lambda: ContainerInstance(robot_timeout=0), 'is no duration'),
+    (lambda: ContainerInstance(idle_timeout='soon'), "idle_timeout='soon' is no duration"),
     (lambda: CloudInstance(), 'CloudInstance is no machine yet'),
     (lambda: ContainerInstance(apt='libzbar0'), "apt='libzbar0' is no list (apt=['libzbar0'])"),
     (lambda: ContainerInstance(apt=['libzbar0 -y']), 'no name of a Debian package'),
