@@ -50,21 +50,28 @@ class Idle:
         self.timeout = timeout
         self.since = 0.0
         self.last: Optional[tuple[float, float, float]] = None
+        self.threads: dict[str, float] = {}
 
-    def sample(self, now: float, cpu: float, traffic: float, *, in_use: bool) -> bool:
+    def sample(
+        self, now: float, cpu: float, traffic: float, threads: dict[str, float], *,
+        connected: bool,
+    ) -> bool:
         """
         Take a sample; return whether the machine has been idle for the whole time-out.
 
         :param cpu: seconds that the nodes have computed so far. They decrease when processes
             end: then nobody knows what these have computed last, which counts as use.
         :param traffic: bytes that the VPN has carried so far.
-        :param in_use: whether it is in use anyhow: somebody has a terminal there, or a node waits
-            for the processor.
+        :param threads: by thread, the seconds that it has run or waited for a processor so far.
+        :param connected: whether somebody has a terminal there.
         """
         last, self.last = self.last, (now, cpu, traffic)
-        if last is None or in_use or not (
+        before, self.threads = self.threads, threads
+        if last is None or connected or not (
                 0 <= cpu - last[1] < CPU * (now - last[0])
-                and 0 <= traffic - last[2] < TRAFFIC * (now - last[0])):
+                and 0 <= traffic - last[2] < TRAFFIC * (now - last[0])
+                and all(seconds - before.get(thread, seconds) < READY * (now - last[0])
+                        for thread, seconds in threads.items())):
             self.since = now
         return now - self.since >= self.timeout
 
@@ -144,27 +151,23 @@ def has_terminal(user: int) -> bool:
 def main(interface: str, folder: str, timeout: float, token: str, run: str = '/run') -> bool:
     """Take one sample; return whether the machine is idle."""
     path, idle = Path(run, f'{interface}.idle.json'), Idle(timeout)
-    threads: dict[str, float] = {}
     with contextlib.suppress(FileNotFoundError):
         before, since, last, known = json.loads(path.read_text())
         if before == token:
-            idle.since, idle.last, threads = since, last, known
+            idle.since, idle.last, idle.threads = since, last, known
     user = os.stat(folder).st_uid
     try:
         with acting_as(user):
             nodes = marked(str(json.loads(Path(folder, 'watchdog.json').read_text())[0]))
     except (OSError, ValueError, LookupError, TypeError):
         return False  # the agent is being started again
-    cpu, now_ready, connected = computed(nodes), ready(nodes), has_terminal(user)
-    traffic, now = carried(interface), time.monotonic()
+    cpu, threads, connected = computed(nodes), ready(nodes), has_terminal(user)
+    traffic = carried(interface)
     if traffic is None:
         return False  # the VPN is being repaired, or the launch has ended
-    passed = now - idle.last[0] if idle.last else now
-    starved = any(seconds - threads.get(task, seconds) > READY * passed
-                  for task, seconds in now_ready.items())
-    found = idle.sample(now, cpu, traffic, in_use=connected or starved)
+    found = idle.sample(time.monotonic(), cpu, traffic, threads, connected=connected)
     aside = path.with_suffix('.new')
-    aside.write_text(json.dumps([token, idle.since, idle.last, now_ready]))
+    aside.write_text(json.dumps([token, idle.since, idle.last, idle.threads]))
     aside.replace(path)
     return found
 

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
+import json
 import os
 from pathlib import Path
 import pty
@@ -30,11 +32,17 @@ from fogros2.host.idle import (
 )
 from fogros2.waiting import wait_until
 
+#: What each interval between two samples had: its seconds, the seconds that all nodes computed,
+#: bytes in the VPN, and the most seconds that a thread ran or waited for a processor. Recorded of
+#: the machines of ``benchmarks/idle.py`` on a busy computer, whose nodes work or wait. Of nodes
+#: that wait, the interval of their start is left out.
+TRACES = json.loads(Path(__file__).with_name('idle_traces.json').read_text())
+
 
 def used(timeout: float, rows: list[tuple[float, float, float, bool]]) -> list[bool]:
     """Return the decisions for samples."""
     machine = Idle(timeout)
-    return [machine.sample(now, cpu, traffic, in_use=connected)
+    return [machine.sample(now, cpu, traffic, {}, connected=connected)
             for now, cpu, traffic, connected in rows]
 
 
@@ -62,7 +70,7 @@ def test_machine_without_use_is_idle_after_its_time(rows, decisions):
 def test_decision_is_that_of_the_whole_trace(timeout, steps):
     """It is idle if and only if the last use, by each interval alone, is ``timeout`` ago."""
     machine, now, cpu, traffic = Idle(timeout), 0.0, 0.0, 0.0
-    machine.sample(now, cpu, traffic, in_use=False)
+    machine.sample(now, cpu, traffic, {}, connected=False)
     last_use = now
     for seconds, share, rate, connected in steps:
         before = now, cpu, traffic
@@ -70,8 +78,21 @@ def test_decision_is_that_of_the_whole_trace(timeout, steps):
         passed = now - before[0]
         if connected or cpu - before[1] >= CPU * passed or traffic - before[2] >= TRAFFIC * passed:
             last_use = now
-        assert machine.sample(now, cpu, traffic, in_use=connected) == (
+        assert machine.sample(now, cpu, traffic, {}, connected=connected) == (
             now - last_use >= timeout)
+
+
+@given(strategies.sampled_from(sorted(TRACES)), strategies.integers(0, 99),
+       strategies.floats(3.01, 10))
+def test_recorded_machine_ends_only_without_use(name, begin, factor):
+    """Whatever the time-out, and wherever in the trace, which repeats, the watch begins."""
+    steps = itertools.islice(itertools.cycle(TRACES[name]), begin, begin + 200)
+    machine = Idle(factor * max(step[0] for step in TRACES[name]))
+    so_far, found = (0.0, 0.0, 0.0, 0.0), []
+    for step in [so_far, *steps]:
+        so_far = now, cpu, traffic, waited = tuple(a + b for a, b in zip(so_far, step))
+        found.append(machine.sample(now, cpu, traffic, {'7': waited}, connected=False))
+    assert any(found) is name.startswith('waits')
 
 
 def test_samples_count_processes_with_the_mark_alone():
