@@ -111,6 +111,13 @@ class PreemptionNotice(_Numbered):
     reason: str
 
 
+class MachineIdle(_Numbered):
+    """Nobody has used the machine for its ``idle_timeout``."""
+
+    event: Literal['idle']
+    reason: str
+
+
 class AgentEnding(_Numbered):
     """A signal ends the agent, and with it the nodes."""
 
@@ -155,7 +162,8 @@ class MachineLost(TypedDict):
 NodeEvent = Union[NodeStarted, NodeOutput, NodeExited, NodeRefused]
 #: Events that an agent sends; the robot makes the others itself.
 AgentEvent = Union[
-    NodeEvent, WatchdogFired, VpnRepaired, EndFailed, PreemptionNotice, AgentEnding, LaunchExited]
+    NodeEvent, WatchdogFired, VpnRepaired, EndFailed, PreemptionNotice, MachineIdle, AgentEnding,
+    LaunchExited]
 Event = Union[AgentEvent, ConnectionChanged, Gap, MachineLost]
 
 

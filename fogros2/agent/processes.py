@@ -27,7 +27,7 @@ COMMAND_TIMEOUT, CHECK_TIMEOUT = 30.0, 10.0
 SWEEP = ((0.0, signal.SIGINT), (3.0, signal.SIGTERM), (6.0, signal.SIGKILL))
 SWEEP_QUICKLY = ((0.0, signal.SIGINT), (0.4, signal.SIGTERM), (0.8, signal.SIGKILL))
 #: Events that a watch may send, and maximum bytes of the command's output in them.
-WATCHED = ('notice',)
+WATCHED = ('notice', 'idle')
 REASON = 2000
 #: The variable that marks the descendants of the launch process.
 MARK = 'FOGROS2_AGENT_MARK'
@@ -269,7 +269,7 @@ class Checks:
 
         :raises Refused: there is no such watch.
         """
-        what, argv = str(request['what']), words(request['argv'])
+        what, argv = request['what'], words(request['argv'])
         interval = max(0.05, float(request.get('interval', 5.0)))
         if what not in WATCHED or not argv:
             raise Refused(f"there is no watch for '{what}'", ', '.join(WATCHED))
@@ -290,7 +290,7 @@ class Checks:
             if status == 0:
                 del self.watched[what]
                 say(f'{what}: {reason}')
-                self.emit({'event': 'notice', 'reason': reason})
+                self.emit({'event': what, 'reason': reason})
             else:
                 self.loop.at(interval, look)
 

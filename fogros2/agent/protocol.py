@@ -14,9 +14,9 @@ A request is ``{"id": 1, "command": ..., ...}``. A reply is ``{"id": 1, "ok": tr
                still has the machine; the request may have been delayed until after a release.
 ``keep``       ``what``, ``alive`` argv, ``repair`` and ``down`` lists of argv, ``interval`` (s):
                health check with repair
-``watch``      ``what``, ``argv``, run as root every ``interval`` (s, default 5). When it exits
-               with 0, the agent sends one event named ``what``, with the output as ``reason``,
-               and ends the watch.
+``watch``      ``what`` (notice or idle), ``argv``, run as root every ``interval`` (s, default
+               5). When it exits with 0, the agent sends one event named ``what``, with the
+               output as ``reason``, and ends the watch.
 ``launch``     start the process that will run the nodes, ahead of time
 ``start``      ``nodes``: list of NodeSpec; nodes with a known id are ignored
 ``stop``       ``nodes``: ids, or null for all; replies at once, ``exited`` events follow

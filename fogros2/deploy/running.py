@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import contextlib
 import json
+from pathlib import Path
+import secrets
 import threading
 from typing import Any, Optional
 
@@ -17,6 +19,7 @@ from fogros2.deploy.steps.installing import Modules
 from fogros2.deploy.steps.watching import Watch
 from fogros2.errors import AgentError, FogError
 from fogros2.events import Event
+from fogros2.host import idle
 from fogros2.model import host_port, Machine, NodeSpec, to_json
 
 
@@ -65,6 +68,13 @@ class RunningMachine(Step):
         """
         nodes = self._modules.fitted(self._containers.inside(nodes))
         self.agent.request('start', nodes=json.loads(to_json(nodes)))
+        if self.spec.idle_timeout is not None:
+            # the time begins anew with each start
+            timeout = self.spec.idle_timeout
+            self.agent.request(
+                'watch', what='idle', interval=idle.interval(timeout),
+                argv=['python3', '-IS', '-c', Path(idle.__file__).read_text(), self.interface.name,
+                      self._job.directory, str(timeout), secrets.token_hex(4)])
 
     def stop(self, ids: Optional[Sequence[str]] = None) -> None:
         """Stop nodes by SIGINT, SIGTERM, SIGKILL in turn; all nodes if ``ids`` is None."""
@@ -166,6 +176,12 @@ class RunningMachine(Step):
         self._context.provider.destroy(self._job.machine_id)
         self._job.gone = self._job.deleted = True
         self._job.undo.close()
+
+    def end(self, reason: str) -> None:
+        """End the machine as its ``on_exit`` says; its further events are ignored."""
+        with self._lock:
+            self._lost = reason
+        self.close()
 
     def close(self) -> None:
         """End the machine as its ``on_exit`` says."""

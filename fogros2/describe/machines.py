@@ -65,6 +65,8 @@ class CloudInstance:
     :param robot_timeout: time without contact to the launch until the machine stops its nodes;
         seconds or as above. A machine that the launch has not reached yet ends 6 minutes after
         its boot (a pod: 10 minutes, or this time if it is longer).
+    :param idle_timeout: time without use after which the machine ends as ``on_exit`` says, while
+        the launch goes on; seconds or as above. See doc/howto/several_robots.md.
     :param bootstrap: how to install ROS 2 there: 'auto', 'apt', 'embedded', 'none'.
     :param environment: variables for every node on the machine; PYTHONPATH, PATH and other lists
         of folders are prepended to the machine's own.
@@ -101,6 +103,7 @@ class CloudInstance:
         on_exit: SomeSubstitutionsType = 'delete',
         lifetime: Value = DEFAULT_LIFETIME,
         robot_timeout: Value = DEFAULT_ROBOT_TIMEOUT,
+        idle_timeout: Optional[Value] = None,
         bootstrap: SomeSubstitutionsType = 'auto',
         environment: Optional[Mapping[str, SomeSubstitutionsType]] = None,
         on_interrupt: SomeSubstitutionsType = 'shutdown',
@@ -130,6 +133,7 @@ class CloudInstance:
             'bootstrap': bootstrap, 'on_interrupt': on_interrupt,
             'max_replacements': max_replacements,
             'checkpoint_interval': checkpoint_interval,
+            **({} if idle_timeout is None else {'idle_timeout': idle_timeout}),
             **({} if on_loss_after is None else {'on_loss_after': on_loss_after}),
             **({} if checkpoint is None else {'checkpoint': checkpoint}),
             **({} if bandwidth is None else {'bandwidth': bandwidth}),
@@ -529,6 +533,7 @@ _CHECKS: dict[str, Any] = {
     'on_interrupt': _choice(OnInterrupt),
     'lifetime': parse_duration,
     'robot_timeout': parse_duration,
+    'idle_timeout': parse_duration,
     'on_loss_after': parse_duration,
     'max_replacements': _count,
     'checkpoint': check_folder,

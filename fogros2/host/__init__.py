@@ -8,4 +8,5 @@ What a machine needs, and how the machine gets it.
 ``dependencies`` names the packages that nodes declare, ``undeclared`` finds imports that nodes do
 not declare. ``bootstrap`` installs ROS 2. ``container_scripts`` has the scripts that run
 containers, ``containers`` the commands with them. ``checkpoint`` has the snapshots of a folder.
+``idle`` decides, on the machine, when nobody uses it.
 """

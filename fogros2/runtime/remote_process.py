@@ -70,6 +70,12 @@ class RemoteProcess(private.RemoteStart):
             self, context, coordinator.base_environment, session.spec, coordinator.launch.id,
             self._fogros2_image, self._fogros2_image_options,
             coordinator.launch.provider(session.spec.provider).has_own_packages(session.spec))
+        if session.spec.idle_timeout is not None and (
+                self._fogros2_image or session.spec.containers):
+            raise ConfigurationError(
+                f"the machine '{session.spec.name}' has an idle_timeout and runs a container: "
+                'nothing measures what a container computes',
+                'leave idle_timeout= out, or run the nodes without containers')
         how = session.spec.on_interrupt
         if how != 'shutdown' and not session.replicated and not (
                 self._fogros2_image or isinstance(self, AddedProcess)):

@@ -55,12 +55,16 @@ class Run(Protocol):
     """The interface of a process to its session; the event loop makes all calls."""
 
     node: NodeSpec
+    complete: asyncio.Future[None]
     started: bool
     stopping: bool
     respawning: bool
 
     def on_event(self, event: Event) -> None:
         """Handle an event of the agent that names this process."""
+
+    def stop(self) -> None:
+        """Stop the process, as its time-outs say."""
 
     def end(self) -> None:
         """Stop waiting for events of the process: none will come."""
@@ -389,6 +393,10 @@ class Session:
             if event['event'] == 'started':
                 self._changed()
             return
+        if event['event'] == 'idle':
+            if self.spec.idle_timeout is not None:
+                self.request(self._end_idle)
+            return
         if event['event'] == 'notice' or event['event'] == 'lost':
             self._interrupted(event['event'] == 'lost', event['reason'] or 'no reason')
             return
@@ -435,6 +443,19 @@ class Session:
         self._held.clear()
         for run in list(self._runs.values()):
             run.move(stop=not self.lost and run not in ended)
+
+    async def _end_idle(self) -> None:
+        """End the machine and its processes, while the launch goes on: nobody uses it."""
+        if self.interrupted or self.running is None:
+            return
+        reason = f'nobody has used it for {self.spec.idle_timeout:g} s'
+        self._logger.info(f"{self.spec.name}: {reason}; on_exit='{self.spec.on_exit}'")
+        runs = list(self._runs.values())
+        for run in runs:
+            run.stop()
+        await asyncio.gather(*(run.complete for run in runs))
+        await self._in_thread(self.running.end, reason)
+        self._logger.info(f'{self.spec.name}: the machine has ended')
 
     # -- a new machine ---------------------------------------------------------------------------
 

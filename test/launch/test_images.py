@@ -65,6 +65,14 @@ def test_mounts_of_a_machine_may_be_one_argument(provider, given, mounts):
     assert action.machine.spec(context).options.get('mounts') == mounts
 
 
+def test_idle_machine_runs_no_containers(run, fake, caplog):
+    planner = ContainerInstance(name='planner', ros_workspace='', idle_timeout='1m')
+    assert run(LaunchDescription([CloudNode(
+        machine=planner, package='demo', executable='talker', image='ros:jazzy')])) == 1
+    assert "the machine 'planner' has an idle_timeout and runs a container" in caplog.text
+    assert fake.noted('up') == []
+
+
 @pytest.mark.parametrize(('overrides', 'more', 'why'), [
     (['*=robot'], {}, 'the robot runs this node itself'),
     ([], {'shell': True}, 'in a shell of the machine'),

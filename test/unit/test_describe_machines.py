@@ -106,6 +106,7 @@ def test_substitutions_are_resolved_when_executed(context):
     (lambda: ContainerInstance(bandwidth='10MB/s'), "bandwidth='10MB/s' is no bandwidth"),
     (lambda: ContainerInstance(bandwidth='10'), "bandwidth='10' is no bandwidth"),
     (lambda: ContainerInstance(bandwidth='nan'), 'is no bandwidth'),
+    (lambda: ContainerInstance(idle_timeout='soon'), "idle_timeout='soon' is no duration"),
     (lambda: CloudInstance(), 'CloudInstance is no machine yet'),
     (lambda: ContainerInstance(apt='libzbar0'), "apt='libzbar0' is no list (apt=['libzbar0'])"),
     (lambda: ContainerInstance(apt=['libzbar0 -y']), 'no name of a Debian package'),

@@ -20,7 +20,7 @@ def test_events_of_the_first_agent_are_valid():
     assert [events.event(event) for event in recorded] == recorded
     kinds = {typing.get_args(typing.get_type_hints(kind)['event'])[0]
              for kind in typing.get_args(events.AgentEvent)}
-    assert {event['event'] for event in recorded} == kinds
+    assert {event['event'] for event in recorded} == kinds - {'idle'}  # it knew no such event
 
 
 @pytest.mark.parametrize(('command', 'answer'), recorded_agent.answers())
