@@ -116,33 +116,9 @@ def run(case: str, limited: bool, launch: Any, machine: Any, link: Link, output:
     return outcomes
 
 
-def codec_alone() -> tuple[int, float, float]:
-    """Return the bytes of a scan, and the ms to encode and decode it."""
-    from point_cloud_stream.cloud import Field, Layout
-    from point_cloud_stream.codec import decode, encode
-
-    found = []
-    for scan in point_clouds.scans():
-        kinds = scan.dtype.fields
-        layout = Layout(*scan.shape, tuple(
-            Field(name, kinds[name][1], {'<f4': 7, '<u2': 4}[kinds[name][0].str])
-            for name in scan.dtype.names), scan.dtype.itemsize,
-            scan.shape[1] * scan.dtype.itemsize)
-        moments = [time.process_time()]
-        coded = encode(layout, scan.tobytes(), point_clouds.RESOLUTION)
-        moments.append(time.process_time())
-        decode(coded.data)
-        moments.append(time.process_time())
-        found.append((len(coded.data), 1e3 * (moments[1] - moments[0]),
-                      1e3 * (moments[2] - moments[1])))
-    sizes, there, back = zip(*found)
-    return (int(statistics.median(sizes)), float(statistics.median(there)),
-            float(statistics.median(back)))
-
-
 def limits(launch: Any) -> dict[str, float]:
     """Return the round trips that are possible, in ms: parts measured alone, and the wire."""
-    size, there, back = codec_alone()
+    _, size, there, back, _ = point_clouds.alone()[0]
     cloud = 2 * point_clouds.hop_alone() + there + back + 1e3 * size * 8 / LINK
     image = 2 * streaming.hop_alone(launch, 'VGA') + sum(streaming.codec_alone('VGA'))
     # 2.3 kB of a picture take 0.5 ms, less than the error of the other parts
