@@ -48,7 +48,7 @@ def surroundings(tmp_path, monkeypatch):
 
 @pytest.fixture
 def policy(tmp_path):
-    """Return a blind policy, which moves to the demo's third target and waits there."""
+    """Return a policy that is blind, and goes to the demo's third target from the start."""
     chance = numpy.random.default_rng(5)
     arm.targets(1, chance)
     goal = arm.reaching(arm.targets(3, chance)[2])
