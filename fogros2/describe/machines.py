@@ -66,7 +66,7 @@ class CloudInstance:
         seconds or as above. A machine that the launch has not reached yet ends 6 minutes after
         its boot (a pod: 10 minutes, or this time if it is longer).
     :param idle_timeout: time without use after which the machine ends as ``on_exit`` says, while
-        the launch goes on; seconds or as above. See doc/howto/several_robots.md.
+        the launch goes on; seconds or as above. See doc/howto/idle_machines.md.
     :param bootstrap: how to install ROS 2 there: 'auto', 'apt', 'embedded', 'none'.
     :param environment: variables for every node on the machine; PYTHONPATH, PATH and other lists
         of folders are prepended to the machine's own.
