@@ -16,7 +16,7 @@ from fogros2.provider.container.entry import AGENT_DIRECTORY
 from fogros2.waiting import wait_until
 from rigs.bare_computer import bare_computer
 from rigs.launched import Launched, launching, ros2
-from rigs.second_robot import HOST, NAT_ADDRESS, second, SecondRobot
+from rigs.second_robot import second, SecondRobot
 
 __all__ = ['second']
 
@@ -76,7 +76,7 @@ class First:
 
     def invited(self, second: SecondRobot, *options: str) -> str:
         key = second.run('ros2', 'fog', 'key').strip()
-        done = ros2('fog', 'invite', self.name, '--key', key, '--address', HOST, *options)
+        done = ros2('fog', 'invite', self.name, '--key', key, '--address', second.host, *options)
         assert done.returncode == 0, done.stdout + done.stderr
         return str(done.stdout).strip()
 
@@ -210,7 +210,8 @@ def test_invitation_that_is_not_valid_any_more_gets_no_answer(
     revoked = join(new)
     assert revoked.ended(120.0) == 1
     assert "'theirs' does not answer" in revoked.text, revoked.text
-    foreign = ros2('fog', 'invite', host.name, '--key', OTHER, '--address', HOST).stdout.strip()
+    foreign = ros2('fog', 'invite', host.name, '--key', OTHER, '--address',
+                   second.host).stdout.strip()
     stranger = join(foreign)
     assert stranger.ended(120.0) == 1
     assert 'this invitation is for another computer' in stranger.text, stranger.text
@@ -244,7 +245,7 @@ def test_guest_of_an_ssh_host_gets_what_its_nodes_need(
         launched = start(str(path))
         launched.wait_for('process started', timeout=300.0)
         gateway = second.reaches(engine, cloud_network)
-        computer.run(f'ip route add {NAT_ADDRESS} via {gateway}')
+        computer.run(f'ip route add {second.nat_address} via {gateway}')
         key = second.run('ros2', 'fog', 'key').strip()
         done = ros2('fog', 'invite', name, '--key', key)
         assert done.returncode == 0, done.stderr

@@ -14,7 +14,7 @@ from fogros2.model import Command
 from fogros2.process import run
 from fogros2.waiting import wait_until
 from rigs.launched import Launched, launching, ros2
-from rigs.second_robot import HOST, second, SecondRobot
+from rigs.second_robot import second, SecondRobot
 
 __all__ = ['second']
 
@@ -60,7 +60,7 @@ def fog(*words: str, status: int = 0) -> str:
 
 def invited(second: SecondRobot, *options: str) -> str:
     key = second.run('ros2', 'fog', 'key').strip()
-    return fog('invite', NAME, '--key', key, '--address', HOST, *options)
+    return fog('invite', NAME, '--key', key, '--address', second.host, *options)
 
 
 def test_second_robot_behind_nat_hears_and_is_heard(launch: Launched, second: SecondRobot) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS domains that one test at a time has, whatever runs beside it on this computer."""
+"""Numbers that one test at a time has, whatever runs beside it on this computer."""
 
 from __future__ import annotations
 
@@ -16,14 +16,20 @@ _next = itertools.count(os.getpid())
 
 
 @contextlib.contextmanager
-def taken() -> Iterator[str]:
-    """Have a domain until the end of the context, or of this process."""
+def number(what: str, count: int) -> Iterator[int]:
+    """Have one of ``count`` numbers until the end of the context, or of this process."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as lock:
-        for number in itertools.islice(_next, HIGHEST):
-            domain = str(1 + number % HIGHEST)
+        for each in itertools.islice(_next, count):
             with contextlib.suppress(OSError):
-                lock.bind(f'\0fogros2-test-domain-{domain}')
+                lock.bind(f'\0fogros2-test-{what}-{each % count}')
                 break
         else:
-            raise RuntimeError('other tests have all ROS domains')
-        yield domain
+            raise RuntimeError(f'other tests have all numbers of a {what}')
+        yield each % count
+
+
+@contextlib.contextmanager
+def taken() -> Iterator[str]:
+    """Have a ROS domain until the end of the context, or of this process."""
+    with number('domain', HIGHEST) as domain:
+        yield str(1 + domain)

@@ -4,7 +4,9 @@ A second robot on this computer: a network namespace behind a NAT of its own.
 
 ::
 
-    this computer 203.0.113.241 --- .242  NAT  192.168.78.1 --- .2  second robot
+    this computer 203.0.113.193 --- .194  NAT  192.168.78.1 --- .2  second robot
+
+Each has four addresses of its own, so that several tests run beside one another.
 """
 
 from __future__ import annotations
@@ -21,8 +23,10 @@ from fogros2 import invitation
 from fogros2.model import Command
 from fogros2.process import argv, run
 from fogros2.store import Store
+from rigs import domains
 
-HOST, NAT_ADDRESS = '203.0.113.241', '203.0.113.242'
+#: How many there are at a time: 203.0.113.192/26 has so many networks of four addresses.
+ROBOTS = 16
 #: No packet of another connection comes in, as with a home's router.
 NAT = """\
 table inet nat {
@@ -36,9 +40,14 @@ table inet nat {
 
 
 class SecondRobot:
-    """A computer with its own network, state folder and processes."""
+    """
+    A computer with its own network, state folder and processes.
 
-    def __init__(self, state: Path) -> None:
+    :param number: below ``ROBOTS``, another one for each.
+    """
+
+    def __init__(self, state: Path, number: int) -> None:
+        self.host, self.nat_address = (f'203.0.113.{192 + 4 * number + end}' for end in (1, 2))
         mark = f'fogs{os.getpid() % 100000}'
         self.spaces = [f'{mark}n', f'{mark}r']
         self.environment = {
@@ -51,16 +60,16 @@ class SecondRobot:
             self.ip('netns', 'add', space)
             self.ip('-n', space, 'link', 'set', 'lo', 'up')
         self.ip('link', 'add', nat, 'type', 'veth', 'peer', 'name', 'out', 'netns', nat)
-        self.ip('address', 'add', f'{HOST}/30', 'dev', nat)
+        self.ip('address', 'add', f'{self.host}/30', 'dev', nat)
         self.ip('link', 'set', nat, 'up')
         self.ip('link', 'add', 'in', 'netns', nat, 'type', 'veth',
                 'peer', 'name', 'e0', 'netns', robot)
         for space, name, address in (
-                (nat, 'out', '203.0.113.242/30'), (nat, 'in', '192.168.78.1/24'),
+                (nat, 'out', f'{self.nat_address}/30'), (nat, 'in', '192.168.78.1/24'),
                 (robot, 'e0', '192.168.78.2/24')):
             self.ip('-n', space, 'address', 'add', address, 'dev', name)
             self.ip('-n', space, 'link', 'set', name, 'up')
-        self.ip('-n', nat, 'route', 'add', 'default', 'via', HOST)
+        self.ip('-n', nat, 'route', 'add', 'default', 'via', self.host)
         self.ip('-n', robot, 'route', 'add', 'default', 'via', '192.168.78.1')
         run(Command(('ip', 'netns', 'exec', nat, 'sh', '-ec',
                      'echo 1 >/proc/sys/net/ipv4/ip_forward; nft -f -'), sudo=True,
@@ -112,9 +121,10 @@ class SecondRobot:
 def second(tmp_path: Path, tun: None) -> Iterator[SecondRobot]:
     if os.getuid():
         pytest.skip('needs root itself: sudo, the way into the second robot, keeps no variables')
-    robot = SecondRobot(tmp_path / 'second')
-    try:
-        robot.open()
-        yield robot
-    finally:
-        robot.close()
+    with domains.number('second-robot', ROBOTS) as number:
+        robot = SecondRobot(tmp_path / 'second', number)
+        try:
+            robot.open()
+            yield robot
+        finally:
+            robot.close()
