@@ -10,6 +10,7 @@ import uuid
 
 import pytest
 
+from fogros2.host import wheels
 from fogros2.model import Command
 from fogros2.process import run
 from fogros2.provider.container.entry import AGENT_DIRECTORY
@@ -237,6 +238,8 @@ def test_guest_of_an_ssh_host_gets_what_its_nodes_need(
     second: SecondRobot, join: Callable[..., Launched], tmp_path: Path, cloud_network: str,
     engine: str, nothing_left: None,
 ) -> None:
+    if not wheels.collect(tmp_path / 'wheels').embedded:
+        pytest.skip('this robot has ROS 2 and no embedded default to send')
     name = f'ssh-{uuid.uuid4().hex[:6]}'
     path = tmp_path / 'ssh.launch.py'
     with bare_computer(name, tmp_path / 'computer', cloud_network) as computer, \

@@ -49,7 +49,7 @@ def stream(
     start(vpn, 'robot', str(scripts / 'encoder'), '--ros-args', '-r', f'image:={topic}', *common,
           *parameters)
     start(vpn, 'machine', str(scripts / 'decoder'), '--ros-args', '-r', f'image:=/seen{topic}',
-          '-p', f'links:={links}', *common)
+          *(('-p', f'links:="{links}"') if links else ()), *common)
     viewer = start(vpn, 'machine', str(HERE / 'video_node.py'), 'viewer', f'/seen{topic}')
     start(vpn, 'robot', str(HERE / 'video_node.py'), 'camera', topic).wait('ready', timeout=30.0)
     viewer.wait('image', count=images, timeout=30.0)
