@@ -71,7 +71,7 @@ class Invitation:
     domain: int
     expires: float
     interface: str = ''
-    secret: str = ''
+    secret: str = dataclasses.field(default='', repr=False)
 
     def __post_init__(self) -> None:
         check_name(self.machine)
