@@ -311,14 +311,6 @@ def websocket(name: str, launch: Any, machine: Any, link: Link, output: Output, 
                    limit=1e3 * (sent / count * 8 / LINK + 2 * DELAY))
 
 
-class Here:
-    """In place of a launch, for nodes that are all on this computer."""
-
-    def robot_environment(self) -> dict[str, str]:
-        """Return the settings of DDS."""
-        return {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
-
-
 # --- all of it ----------------------------------------------------------------------------------
 
 def table(outcomes: list[Outcome], note: str) -> str:
@@ -365,7 +357,7 @@ def main() -> None:
     outcomes: list[Outcome] = []
     # three cameras share the cores; each image is handed on twice, as in ``streaming``
     share = len(CAMERAS) / min(len(CAMERAS), os.cpu_count() or 1)
-    parts = share * (2 * hop_alone(Here(), 'VGA') + sum(codec_alone('VGA')))
+    parts = share * (2 * hop_alone('VGA') + sum(codec_alone('VGA')))
     launch = Launch()
     link: Optional[Link] = None
     try:

@@ -116,11 +116,11 @@ def run(case: str, limited: bool, launch: Any, machine: Any, link: Link, output:
     return outcomes
 
 
-def limits(launch: Any) -> dict[str, float]:
+def limits() -> dict[str, float]:
     """Return the round trips that are possible, in ms: parts measured alone, and the wire."""
     _, size, there, back, _ = point_clouds.alone()[0]
     cloud = 2 * point_clouds.hop_alone() + there + back + 1e3 * size * 8 / LINK
-    image = 2 * streaming.hop_alone(launch, 'VGA') + sum(streaming.codec_alone('VGA'))
+    image = 2 * streaming.hop_alone('VGA') + sum(streaming.codec_alone('VGA'))
     # 2.3 kB of a picture take 0.5 ms, less than the error of the other parts
     return {stream: cloud if stream == 'points' else image for stream in STREAMS}
 
@@ -146,6 +146,7 @@ def main() -> None:
     count = arguments.count // 10 if arguments.short else arguments.count
     outcomes: list[Outcome] = []
     begin = time.monotonic()
+    parts = limits()
     launch = Launch()
     with contextlib.ExitStack() as stack:
         stack.callback(lambda: [print(error, file=sys.stderr) for error in launch.down()])
@@ -155,7 +156,6 @@ def main() -> None:
         machine.subscribe(output.heard)
         link = Link(launch, machine)
         stack.callback(link.close)
-        parts = limits(launch)
         for case, limited in (('budget of 40 Mbit/s', True), ('no budget', False)):
             outcomes += run(case, limited, launch, machine, link, output, count, parts)
     text = table(outcomes, f'{computer()}; {count} images of each camera, {count // 3} scans; '

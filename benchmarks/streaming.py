@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import array
 from collections import defaultdict, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 import contextlib
 import dataclasses
 import itertools
@@ -38,6 +38,8 @@ FOLDER = '/tmp/fogros2-bench'
 VIDEO = f'{FOLDER}/video'
 RATE = 30.0
 LINK = 10e6
+#: Settings of DDS for nodes that are all on this computer.
+THIS_COMPUTER = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 #: Frames rendered, and of those that arrive, how many apart are held against the original.
 FRAMES, SAMPLE = 60, 23
 #: Lines of output that are shown with an error.
@@ -486,12 +488,11 @@ def codec_alone(size: str) -> tuple[float, float]:
             1e3 * statistics.median(t[1] for t in times))
 
 
-def hop_alone(launch: Any, size: str) -> float:
+def hop_alone(size: str, settings: Mapping[str, str] = THIS_COMPUTER) -> float:
     """Return the median time of an image to a node on this computer and its answer, in ms."""
     width, height = SIZES[size]
     words = ['--width', str(width), '--height', str(height)]
-    environment = {**os.environ, **launch.robot_environment(), 'PYTHONPATH': str(ROOT),
-                   'ROS_DOMAIN_ID': '83'}
+    environment = {**os.environ, **settings, 'PYTHONPATH': str(ROOT), 'ROS_DOMAIN_ID': '83'}
     with tempfile.NamedTemporaryFile() as result:
         node = subprocess.Popen(
             [sys.executable, __file__, '--cloud', '--topic', '/camera', '--result', result.name,
@@ -510,7 +511,7 @@ def limit(launch: Any, outcome: Outcome) -> float:
     """Return what a round trip takes at the least, in ms: the sum of its parts."""
     encode, decode = codec_alone(outcome.case.size)
     # the image is handed on twice, the answer crosses once more than measured here
-    return (2 * hop_alone(launch, outcome.case.size) + encode + decode
+    return (2 * hop_alone(outcome.case.size, launch.robot_environment()) + encode + decode
             + 1e3 * outcome.size * 8 / LINK + 2e3 * outcome.case.delay)
 
 
