@@ -40,11 +40,11 @@ def generate_launch_description():
 """
 #: What a node does that is idle: listen, sleep, say a word a second.
 WAITS = ('listener', 'import time; time.sleep(1e6)', 'talker')
-#: What a node does that works: all the time, every two seconds, and by sending data.
+#: What a node does that works: all the time, every two seconds, and by sending as much as a video.
 _SEND = ('import os, socket, time\n'
          'to = os.environ["FOGROS2_VPN_ADDRESS"].rpartition(".")[0] + ".1", 9\n'
          'link = socket.socket(type=socket.SOCK_DGRAM)\n'
-         'while True:\n    link.sendto(bytes(1200), to); time.sleep(0.05)')
+         'while True:\n    link.sendto(bytes(1200), to); time.sleep(0.02)')
 WORKS = ('while True: pass',
          'import time\nwhile True:\n    end = time.process_time() + 0.15\n'
          '    while time.process_time() < end: pass\n    time.sleep(2)',

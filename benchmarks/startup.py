@@ -8,9 +8,10 @@ answers) and without the installation of ROS 2 on an image that has none. The ma
 computer's own containers: where many boot at once they share its cores, as a cloud's wouldn't.
 The robot's CPU is that of its launch and of what that runs.
 
-    python benchmarks/startup.py [--provider aws|azure|gcp|kubernetes] [--runs 3]
+    python benchmarks/startup.py [--provider aws|azure|gcp|kubernetes|all] [--runs 3]
 
-For pods see ``startup_kubernetes``.
+For pods see ``startup_kubernetes``. ``all`` takes the time of ``ros2 fog list`` for a user with
+accounts at all three clouds.
 """
 
 from __future__ import annotations
@@ -192,14 +193,43 @@ def several(provider: str, runs: int) -> Iterator[Row]:
             yield Row(f"{what}: the robot's CPU", spent_by_many / spent, 'times one', runs=runs)
 
 
+def list_all(runs: int) -> Iterator[Row]:
+    """Yield what it takes to look for machines in all regions of all clouds."""
+    with contextlib.ExitStack() as stack:
+        home = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        boxes = []
+        environment = {**os.environ, 'HOME': str(home), 'FOGROS2_STATE_HOME': str(home / 'state')}
+        for cloud in (kind() for kind in CLOUDS.values()):
+            boxes.append(stack.enter_context(cloud.open()))
+            # this computer reaches all boxes; the robot beside a box reaches that box alone
+            environment.update(cloud.variables(boxes[-1], home, here=True))
+        taken = []
+        for _ in range(runs + 1):
+            for box in boxes:
+                box.forget_calls()
+            begin = time.perf_counter()
+            done = ros2('fog', 'list', environment=environment, timeout=120.0)
+            taken.append(time.perf_counter() - begin)
+            if done.returncode != 0 or done.stderr:
+                raise SystemExit(f'ros2 fog list failed:\n{done.stdout}{done.stderr}')
+        requests = sum(sum(bool(call.service) for call in box.calls()) for box in boxes)
+    regions = sum(len(load('fogros2.provider', name).region_names()) for name in CLOUDS)
+    yield Row(f'ros2 fog list, {regions} regions of {len(CLOUDS)} clouds',
+              statistics.median(taken[1:]), 's', 2.0, runs=runs)
+    yield Row('requests', requests, 'requests', 2.0 * regions, runs=1)
+
+
 def main() -> None:
     """Take the figures of a provider."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--provider', choices=[*CLOUDS, 'kubernetes'], default='aws')
+    parser.add_argument('--provider', choices=[*CLOUDS, 'kubernetes', 'all'], default='aws')
     parser.add_argument('--runs', type=int, default=3)
     arguments = parser.parse_args()
     if arguments.provider == 'kubernetes':
         startup_kubernetes.measure(arguments.runs)
+        return
+    if arguments.provider == 'all':
+        write('startup_list', 'ros2 fog list over all clouds', list(list_all(arguments.runs)))
         return
     write(f'startup_{arguments.provider}',
           f'From ros2 launch to the first message, {BOXES[arguments.provider]} in a box',

@@ -29,8 +29,8 @@ from image_transport_h264.sharing import Claim, Link, LISTEN, MOST_LINKS, UNLIMI
 
 #: Seconds between two reports; window of the rate that a stream uses, and most messages in it.
 REPORT, USED_SECONDS, MOST_SENT = 0.25, 1.0, 2000
-#: Seconds by which a video may be ahead of its share: two full pictures. Minimum of a stream in
-#: bits per second while nothing is known about it.
+#: Seconds by which a stream may be ahead of its share: two full pictures, one cloud at 10 Hz.
+#: Minimum of a stream in bits per second while nothing is known about it.
 AHEAD, FLOOR = 0.1, 200_000.0
 _FIXED = ParameterDescriptor(read_only=True, dynamic_typing=True)
 
@@ -104,9 +104,9 @@ class Budget:
 
     # --- in the worker's thread
 
-    def pace(self, ahead: float = 0.0) -> None:
-        """Wait until the stream is at most so many seconds ahead of its share."""
-        time.sleep(min(LONGEST, max(0.0, self._free_at - ahead - time.monotonic())))
+    def pace(self) -> None:
+        """Wait until the stream is at most AHEAD of its share."""
+        time.sleep(min(LONGEST, max(0.0, self._free_at - AHEAD - time.monotonic())))
 
     def sent(self, size: int, floor: float, latency: float, ceiling: float = UNLIMITED,
              short: bool = False) -> None:

@@ -18,7 +18,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Empty, Header, UInt8MultiArray, UInt64MultiArray
 
 from image_transport_h264 import message, stills
-from image_transport_h264.budget import AHEAD, Budget
+from image_transport_h264.budget import Budget
 from image_transport_h264.codec import CodecError, Encoder, Packet, Settings
 from image_transport_h264.control import Control
 from image_transport_h264.lazy import (
@@ -250,7 +250,7 @@ class VideoSender(Sender):
 
     def send(self, image: Image) -> None:
         """Encode and publish the image, unless the rate control skips it."""
-        self._budget.pace(AHEAD)
+        self._budget.pace()
         now = time.monotonic()
         picture = message.picture(image)
         with self._lock:

@@ -39,9 +39,11 @@ class Policy(abc.ABC):
     A policy.
 
     :param runs_on: the hardware or server, for the log.
+    :param sizes: width and height to which an image may be scaled before, by name.
     """
 
     runs_on: str
+    sizes: Mapping[str, tuple[int, int]] = {}
 
     @abc.abstractmethod
     def run(self, seen: Mapping[str, Any]) -> Any:
@@ -78,11 +80,16 @@ class Onnx(Policy):
     def __init__(self, model: str | bytes, names: Sequence[str], providers: Sequence[str]) -> None:
         import onnxruntime
         there = [name for name in providers if name in onnxruntime.get_available_providers()]
+        options = onnxruntime.SessionOptions()
+        # the decoders of the streams need the processor between two observations
+        options.add_session_config_entry('session.intra_op.allow_spinning', '0')
         try:
-            self._session = onnxruntime.InferenceSession(model, providers=there)
+            self._session = onnxruntime.InferenceSession(model, options, providers=there)
         except Exception as error:
             raise BadPolicy(f'the ONNX model cannot be loaded: {error}') from error
         self._inputs = {one.name: one.shape for one in self._session.get_inputs()}
+        self.sizes = {name: (shape[3], shape[2]) for name, shape in self._inputs.items()
+                      if len(shape) == 4 and all(isinstance(size, int) for size in shape[2:])}
         missing = sorted(set(self._inputs) - set(names))
         if missing:
             raise BadPolicy(f"nothing for the model's inputs {', '.join(missing)}: there are "
@@ -92,15 +99,12 @@ class Onnx(Policy):
     def run(self, seen: Mapping[str, Any]) -> Any:
         """Run the model."""
         feed = {}
-        for name, shape in self._inputs.items():
+        for name in self._inputs:
             value = numpy.asarray(seen[name])
             if value.ndim == 3:
-                height, width = (size if isinstance(size, int) else there
-                                 for size, there in zip(shape[-2:], value.shape))
-                value = small(value, width, height)
+                value = small(value, *self.sizes.get(name, value.shape[1::-1]))
             feed[name] = value[None].astype(object if name == PROMPT else numpy.float32)
-        output = self._session.run(None, feed)[0]
-        return output[0] if output.ndim == 3 else output
+        return self._session.run(None, feed)[0][0]
 
 
 class Openpi(Policy):

@@ -99,13 +99,12 @@ class PolicyServer(Node):
 
     def answer(self) -> None:
         """Answer the newest observation, if there is a new one."""
-        found = self.matcher.newest() if self.policy else None
-        if found is None or self.policy is None:
+        if self.policy is None or (found := self.matcher.newest()) is None:
             return
         state = found[STATE]
         try:
             actions = self.policy.infer({
-                **{name: rgb(found[name]) for name in self.images},
+                **{name: rgb(found[name], self.policy.sizes.get(name)) for name in self.images},
                 **{name: angles_of(state, joints) for name, joints in self.states.items()},
                 PROMPT: self.task})
             if actions.shape[1] != len(self.joints):

@@ -40,14 +40,19 @@ def grey(image: Image) -> Pixels:
         pixels.reshape(image.height, image.width, channels), conversion), numpy.uint8)
 
 
-def rgb(image: Image) -> Pixels:
+def rgb(image: Image, size: Optional[tuple[int, int]] = None) -> Pixels:
     """
     Return the colours of an image, (height, width, 3) of red, green, blue.
 
+    :param size: width and height that the image is scaled to.
     :raises ValueError: the encoding has no brightness, or the fields contradict each other.
     """
     channels, conversion = _colours(image, 1)
     pixels = _rows(image, channels).reshape(image.height, image.width, channels)
+    if size:
+        # before the conversion, which then has fewer pixels; OpenCV drops a single channel
+        pixels = numpy.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), numpy.uint8)
+        pixels = pixels.reshape(size[1], size[0], channels)
     return pixels if conversion is None else numpy.asarray(
         cv2.cvtColor(pixels, conversion), numpy.uint8)
 

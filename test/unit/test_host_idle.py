@@ -23,8 +23,10 @@ from fogros2.host.idle import (
     carried,
     computed,
     CPU,
+    DISCOVERY,
     has_terminal,
     Idle,
+    machines,
     MARK,
     marked,
     ready,
@@ -62,6 +64,26 @@ def used(timeout: float, rows: list[tuple[float, float, float, bool]]) -> list[b
 ])
 def test_machine_without_use_is_idle_after_its_time(rows, decisions):
     assert used(10.0, rows) == decisions
+
+
+@pytest.mark.parametrize('discovery, decisions', [
+    (0, [False, False, False]), (4 * DISCOVERY, [False, False, True])])
+def test_discovery_of_other_machines_is_no_use(discovery, decisions):
+    """Recorded of a node that listens, on one of five machines: announcements every 3 s."""
+    machine = Idle(4.0)
+    assert [machine.sample(now, 0.13, traffic, {}, connected=False, discovery=discovery)
+            for now, traffic in ((0, 149312), (2.05, 174676), (4.18, 199552))] == decisions
+
+
+def test_other_machines_are_the_peers_but_the_robot(tmp_path, monkeypatch):
+    program = tmp_path / 'wg'
+    program.write_text('#!/bin/sh\n[ "$*" = "show fog0 peers" ] && printf "robot=\\nfirst=\\n"\n')
+    program.chmod(0o755)
+    monkeypatch.setenv('PATH', str(tmp_path), prepend=os.pathsep)
+    assert machines('fog0') == 1
+    assert machines('fog1') == 0
+    monkeypatch.setenv('PATH', '/nowhere')
+    assert machines('fog0') == 0
 
 
 @given(strategies.floats(1, 1000), strategies.lists(strategies.tuples(

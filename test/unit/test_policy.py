@@ -18,6 +18,7 @@ import pytest
 pytest.importorskip('onnxruntime', reason='ONNX Runtime is in the extra applications')
 pytest.importorskip('cv2', reason='OpenCV is in the extra applications')
 
+import cv2
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -91,6 +92,15 @@ def test_angles_are_those_of_the_named_joints():
 def test_images_of_all_encodings_become_rgb(encoding, pixel, expected):
     pixels = numpy.tile(numpy.array(pixel, numpy.uint8), (4, 6, 1))
     assert rgb(image(Header(), pixels, encoding))[3, 5].tolist() == expected
+
+
+@pytest.mark.parametrize('encoding', ['mono8', 'rgb8', 'bgr8', 'rgba8', 'bgra8'])
+def test_image_is_scaled_before_its_conversion(encoding):
+    channels = 1 if encoding == 'mono8' else len(encoding) - 1
+    pixels = numpy.random.default_rng(1).integers(0, 256, (48, 64, channels), numpy.uint8)
+    made = image(Header(), pixels, encoding)
+    after = cv2.resize(rgb(made), (8, 6), interpolation=cv2.INTER_AREA)
+    assert (rgb(made, (8, 6)) == after).all()
 
 
 @pytest.mark.parametrize('bad', [
