@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import array
 from collections.abc import Sequence
 
 from builtin_interfaces.msg import Duration
@@ -44,11 +45,12 @@ def chunk_message(
     :param rate: actions per second.
     """
     made = JointTrajectory(header=Header(stamp=time(stamp)), joint_names=list(joints))
-    for number, action in enumerate(actions.tolist()):
+    for number, action in enumerate(actions):
         after = round(number * SECOND / rate)
         made.points.append(JointTrajectoryPoint(
             time_from_start=Duration(sec=after // SECOND, nanosec=after % SECOND),
-            **{'velocities' if velocity else 'positions': action}))
+            # rclpy checks each number of a list, which takes 2 ms for 50 actions
+            **{'velocities' if velocity else 'positions': array.array('d', action)}))
     return made
 
 

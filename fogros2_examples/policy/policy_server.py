@@ -129,9 +129,8 @@ class PolicyServer(Node):
                 if self.taken == before:
                     break
             self.answer()
-            if self.slowdown > 1:
-                time.sleep((self.slowdown - 1) * (time.process_time() - spent))
-                spent = time.process_time()
+            time.sleep((self.slowdown - 1) * (time.process_time() - spent))
+            spent = time.process_time()
 
 
 def main() -> None:
