@@ -251,7 +251,7 @@ class Api:
                 header=[f'{name}: {value}' for name, value in self.headers().items()],
                 subprotocols=['v4.channel.k8s.io'], skip_utf8_validation=True, **options)
         except websocket.WebSocketBadStatusException as error:
-            data = error.resp_body or b''
+            data = getattr(error, 'resp_body', b'') or b''  # websocket-client 1.2 has none
             raise refusal(error.status_code, parsed(data), data) from error
         except (websocket.WebSocketException, OSError) as error:
             raise self._unreachable(error) from error

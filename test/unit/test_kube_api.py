@@ -300,6 +300,20 @@ def test_what_is_made_just_after_a_ctrl_c_is_known(api, server):
     assert api.request('POST', '/api/v1/pods', {}, cancel=cancel) == {'made': 'it'}
 
 
+@pytest.mark.parametrize('old', [False, True])
+def test_refused_exec_is_reported(api, server, monkeypatch, old):
+    """The client that Debian 12 has passes no body of the refusal on."""
+    import websocket
+    if old:
+        monkeypatch.setattr(websocket.WebSocketBadStatusException, 'resp_body', property(
+            lambda self: object.__getattribute__(self, 'absent'), lambda self, body: None),
+            raising=False)
+    server.answers = [(500, {'kind': 'Status', 'message': 'container not running'})]
+    error = raised(ApiError, lambda: api.execute('/exec', 'machine', ['true'], timeout=5.0))
+    assert error.status == 500
+    assert old or 'container not running' in str(error)
+
+
 def test_the_provider_is_there_without_the_client():
     """``ros2 fog list`` names it, and must not take the time that the client takes to load."""
     code = ('import sys; import fogros2.provider.kubernetes, fogros2.shell.kubernetes, '
