@@ -13,6 +13,7 @@ import socket
 import sys
 import threading
 from typing import TYPE_CHECKING
+import warnings
 
 from fogros2.errors import AuthenticationError, ConnectError, HostKeyError, PrerequisiteError
 from fogros2.model import Endpoint
@@ -64,7 +65,9 @@ def warm() -> threading.Thread:
 
 
 def _import() -> None:
-    with _IMPORT:
+    with _IMPORT, warnings.catch_warnings():
+        # the paramiko of Ubuntu 24.04 names a cipher of which a newer cryptography warns the user
+        warnings.simplefilter('ignore')
         if 'paramiko' not in sys.modules and 'invoke' not in sys.modules:
             # paramiko imports 'invoke' only for a keyword of ssh_config files, which this
             # project never reads, and works without it. The import takes a third of its time.
@@ -73,7 +76,7 @@ def _import() -> None:
                 import paramiko
             finally:
                 del sys.modules['invoke']
-    import paramiko
+        import paramiko
     # paramiko's threads log errors that we raise; without a handler, Python would print them.
     logger = logging.getLogger(paramiko.__name__)
     if logger.level == logging.NOTSET:

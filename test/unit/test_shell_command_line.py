@@ -98,3 +98,13 @@ def test_paramiko_is_imported_late_and_without_invoke():
         "assert 'paramiko' in sys.modules\n"
         "assert 'invoke' not in sys.modules\n")
     subprocess.run([sys.executable, '-c', code], check=True)
+
+
+def test_warnings_of_paramikos_import_are_not_shown(tmp_path):
+    """Its older versions name a cipher of which newer versions of cryptography warn."""
+    (tmp_path / 'paramiko.py').write_text(
+        "import warnings\nwarnings.warn('TripleDES has moved', UserWarning)\n")
+    code = 'from fogros2.shell import ssh_connection; ssh_connection.warm().join()'
+    done = subprocess.run([sys.executable, '-c', code], check=True, capture_output=True, text=True,
+                          env={**os.environ, 'PYTHONPATH': str(tmp_path)})
+    assert done.stderr == ''
