@@ -14,17 +14,7 @@ from fogros2.provider.vm.options import VmOptions
 
 @dataclasses.dataclass(frozen=True)
 class Options(VmOptions):
-    """
-    Options of an EC2 instance, in addition to those of every virtual machine.
-
-    :param ami_image: id of an image; '' for one that was baked with the same dependencies, else
-        Ubuntu 24.04 (with NVIDIA's driver for a type that has its GPUs).
-    :param ec2_instance_type: 't3.medium', or 'cheapest' that meets the requirements.
-    :param instance_types: further types to try, in this order, if there is no capacity for one.
-    :param iam_instance_profile: name or ARN of the profile with the instance's own AWS rights.
-    :param subnet: id; '' for one of the default VPC.
-    :param security_groups: ids of groups in addition to the instance's own.
-    """
+    """Options of an EC2 instance; see :class:`~fogros2.AWSCloudInstance`."""
 
     ami_image: str = ''
     ec2_instance_type: str = ''

@@ -18,15 +18,7 @@ _PART = r'[\w.-]+'
 
 @dataclasses.dataclass(frozen=True)
 class Options(VmOptions):
-    """
-    Options of a machine at Azure, in addition to those of every virtual machine.
-
-    :param image: 'publisher:offer:sku:version' of the Marketplace, or the resource id of an
-        image; '' for one that was baked with the same dependencies, else Ubuntu 24.04.
-    :param vm_size: 'Standard_B2als_v2', or 'cheapest' that meets the requirements.
-    :param vm_sizes: further sizes to try, in this order, if there is no capacity for one.
-    :param resource_group: the user's own group, whose virtual network the machine joins.
-    """
+    """Options of a machine at Azure; see :class:`~fogros2.AzureCloudInstance`."""
 
     image: str = ''
     vm_size: str = ''

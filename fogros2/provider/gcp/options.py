@@ -17,21 +17,7 @@ _PROJECT = r'([a-z][a-z0-9.-]*:)?[a-z][a-z0-9-]{4,61}[a-z0-9]'
 
 @dataclasses.dataclass(frozen=True)
 class Options(VmOptions):
-    """
-    Options of a Compute Engine instance, in addition to those of every virtual machine.
-
-    :param project_id: '' for the project of the user's credentials.
-    :param ami_image: ``projects/P/global/images/NAME`` or ``.../images/family/NAME``, or the name
-        of an image of the project; '' for one that was baked with the same dependencies, else
-        Ubuntu 24.04 (with NVIDIA's driver for a machine that has its GPUs).
-    :param zone: '' for any zone of the region.
-    :param machine_type: 'e2-medium', or 'cheapest' that meets the requirements.
-    :param machine_types: further types to try, in this order, if there is no capacity for one.
-    :param accelerators: GPUs to attach, such as 'nvidia-tesla-t4:2'.
-    :param service_account: email address of the account with the machine's own rights.
-    :param network: name of the VPC network.
-    :param labels: Google's labels for everything that is created.
-    """
+    """Options of a Compute Engine instance; see :class:`~fogros2.GCPCloudInstance`."""
 
     project_id: str = ''
     ami_image: str = ''

@@ -27,20 +27,10 @@ class VmOptions:
     """
     Options of a virtual machine. A cloud's subclass adds its own, and sets the class variables.
 
+    :class:`~fogros2.describe.machines_cloud.VmInstance` describes the options; '' and 0 stand for
+    one that a launch file leaves out.
+
     :param region: name, or 'nearest'; '' for the region of the user's configuration.
-    :param regions: further regions to try, in this order, if one has no capacity.
-    :param disk_size: GB.
-    :param spot: use a spot machine: cheaper, but the cloud may reclaim it.
-    :param arch: x86_64 or arm64.
-    :param min_cpu: minimum number of vCPUs; ``min_memory_gb`` is the minimum memory in GiB.
-    :param cpu_type: manufacturer of the processor: intel, amd, aws.
-    :param gpu: the number of GPUs, True, or part of the name of one; ``gpu_memory_gb`` is the
-        minimum memory of each GPU in GB.
-    :param max_price: maximum price in US dollars per hour; also the limit of a spot price.
-    :param tags: tags for everything that is created.
-    :param user: the image's login user.
-    :param ssh_from: networks (CIDR) that may reach the SSH port; none for this robot's public
-        address only.
     :param by_region: options with a value for each region, by name; ``in_region`` puts them into
         the other fields.
     """
