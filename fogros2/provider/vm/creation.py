@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import dataclasses
 from decimal import Decimal
+import functools
 import time
 from typing import Any, Optional
 
@@ -58,8 +59,7 @@ class Creation:
         self._request = request
         self._options = options
         self._sources = sources
-        self._ask_price = price
-        self._prices: dict[tuple[str, str], Optional[Decimal]] = {}
+        self._price = functools.cache(price)
         #: Whether a machine may exist although no answer said so.
         self._unsure = False
         #: Errors of undo steps.
@@ -195,11 +195,6 @@ class Creation:
             f"no machine for '{self._spec.name}' in {region} is known to cost at most "
             f'max_price={self._options.max_price}', 'ros2 fog price shows what there is',
             full='zone')
-
-    def _price(self, region: str, kind: str) -> Optional[Decimal]:
-        if (region, kind) not in self._prices:
-            self._prices[region, kind] = self._ask_price(region, kind)
-        return self._prices[region, kind]
 
     def _too_dear(self, price: Optional[Decimal]) -> bool:
         """Return whether a price may be above the limit; the cloud checks a spot price itself."""
