@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+import contextlib
 import dataclasses
 from decimal import Decimal
 import ipaddress
@@ -214,29 +215,21 @@ class VmOptions:
 
 
 def _value(name: str, value: Any, default: Any) -> Any:
-    if name == 'max_price':
-        return Decimal(repr(convert(name, _number(value), 0.0)))
     if name == 'ssh_from' and isinstance(value, str):
         value = (value,)
     if name == 'gpu' and isinstance(value, bool):
         return '1' if value else ''
-    if name == 'disk_size':
-        value = _number(value)
-        if isinstance(value, float) and value.is_integer():
-            value = int(value)
-    if isinstance(default, float):
-        value = _number(value)
-        if value == 0:
-            return 0.0
+    number = isinstance(default, float) or name in ('disk_size', 'max_price')
+    if number and isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            value = float(value)  # launch arguments are strings
+    if name == 'max_price':
+        return Decimal(repr(convert(name, value, 0.0)))
+    if isinstance(default, float) and value == 0:
+        return 0.0
+    if name == 'disk_size' and isinstance(value, float) and value.is_integer():
+        value = int(value)
     return convert(name, value, default)
-
-
-def _number(value: Any) -> Any:
-    """Return the number in a string, as launch arguments have it."""
-    try:
-        return float(value) if isinstance(value, str) else value
-    except ValueError:
-        return value
 
 
 def cidr(text: str) -> str:
