@@ -185,6 +185,7 @@ def test_known_problems_are_named_before_creation(robot, monkeypatch):
     with pytest.raises(PrerequisiteError, match='no such subscription'):
         robot.create()
     monkeypatch.setenv('IDENTITY_HEADER', 'wrong')
+    monkeypatch.setattr('fogros2.provider.azure.cloud._USUAL', Account())  # has no token yet
     with pytest.raises(PrerequisiteError, match='az login'):
         Robot(robot.azure).create()
 

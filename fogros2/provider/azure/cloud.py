@@ -198,7 +198,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
         except FogError:
             # the next place has a group of its own; what stays is undone at the end, or by gc
             with contextlib.suppress(FogError):
-                self.lasting()._drop(order.attempt, [name], empty=[name])
+                self.until(None)._drop(order.attempt, [name], empty=[name])
             raise
         return name
 

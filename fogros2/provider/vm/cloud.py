@@ -208,20 +208,17 @@ class VmCloud(abc.ABC):
     def until(
         self: Adapter, cancel: Optional[threading.Event], *, hasty: bool = False,
     ) -> Adapter:
-        """Return an adapter whose calls raise Cancelled once ``cancel`` is set."""
+        """
+        Return an adapter whose calls raise Cancelled once ``cancel`` is set.
+
+        :param cancel: None for clean-up, which continues after the launch's end.
+        :param hasty: use short time-outs, for values that are only displayed.
+        """
         other = copy.copy(self)
         other.cancel = cancel
         if self._account is not None:
             other._account = self._account.having(cancel, hasty=hasty)
         return other
-
-    def lasting(self: Adapter) -> Adapter:
-        """Return an adapter for clean-up, which ``cancel`` does not end."""
-        return self.until(None)
-
-    def hasty(self: Adapter) -> Adapter:
-        """Return an adapter with short time-outs, for values that are only displayed."""
-        return self.until(self.cancel, hasty=True)
 
     # -- the account ----------------------------------------------------------------------------
 

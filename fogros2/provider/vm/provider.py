@@ -167,7 +167,7 @@ class VmProvider(Provider):
         self, region: str, kind: str, options: VmOptions, cancel: Optional[threading.Event],
     ) -> Optional[Decimal]:
         with contextlib.suppress(FogError):
-            market = Market(self._cloud.account(options).until(cancel).hasty())
+            market = Market(self._cloud.account(options).until(cancel, hasty=True))
             return market.price_of(region, kind, spot=options.spot)
         return None
 
@@ -180,7 +180,7 @@ class VmProvider(Provider):
             options = self._cloud.options.of(spec)
         cloud = self._cloud.account(options)
         creation = Creation(
-            cloud.until(cancel), cloud.lasting(), spec, request, options,
+            cloud.until(cancel), cloud, spec, request, options,
             sources=lambda: _ROBOT_ADDRESS.with_ipv6([self._address(cancel)]),
             price=lambda region, kind: self._price(region, kind, options, cancel))
         machine = creation.run(list(dict.fromkeys([self._region(options), *options.regions])))
