@@ -43,34 +43,20 @@ def kinds(account: Account, region: str, names: list[str]) -> list[MachineType]:
 
     :raises ConfigurationError: it has none of them.
     """
-    try:
-        found = {entry['InstanceType']: entry for entry in account.call(
-            'ec2', region, 'describe_instance_types',
-            f'looking for the instance type {" or ".join(names)}',
-            InstanceTypes=names)['InstanceTypes']}
-    except AwsError as error:
-        if error.code != 'InvalidInstanceType':
-            raise
-        if len(names) > 1:
-            # one unknown type is an error for all of them
-            alone = [_kinds_if_any(account, region, name) for name in names]
-            some = [kind for each in alone for kind in each]
-            if some:
-                return some
-        raise ConfigurationError(str(error.args[0]), error.hint) from error
-    types = [instance_type(found[name]) for name in names if name in found]
-    fitting = [kind for kind in types if kind is not None]
+    found = {entry['InstanceType']: instance_type(entry) for entry in account.call(
+        'ec2', region, 'describe_instance_types',
+        f'looking for the instance type {" or ".join(names)}',
+        # a filter, because one unknown name among InstanceTypes is an error for all
+        Filters=[{'Name': 'instance-type', 'Values': names}])['InstanceTypes']}
+    if not found:
+        raise ConfigurationError(
+            f'looking for the instance type {" or ".join(names)} in {region} failed: the region '
+            'has no such instance type', 'ros2 fog price shows what it has')
+    fitting = [kind for name in names if (kind := found.get(name)) is not None]
     if not fitting:
         raise ConfigurationError(f'machines of the type {" or ".join(names)} run no Ubuntu',
                                  'take one with an x86_64 or arm64 processor')
     return fitting
-
-
-def _kinds_if_any(account: Account, region: str, name: str) -> list[MachineType]:
-    try:
-        return kinds(account, region, [name])
-    except ConfigurationError:
-        return []
 
 
 def has_nvidia(kind: MachineType) -> bool:
