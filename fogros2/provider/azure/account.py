@@ -78,8 +78,6 @@ class Account(RestAccount):
         super().__init__()
         self._credential = credential
         self._lock = threading.Lock()
-        #: Machines that this process has just created, as Azure reports them.
-        self.seen: dict[str, Mapping[str, Any]] = {}
 
     def credential(self) -> Any:
         """
