@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import time
-from typing import Any, ClassVar, Optional
+from typing import Any, Optional
 
 from fogros2.errors import MachineNotFound
 from fogros2.model import MachineSpec
@@ -17,7 +17,6 @@ from fogros2.provider.aws.prices import Ec2Prices
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import Order, Place, Vm, VmId
 from fogros2.provider.vm.failures import unless_gone
-from fogros2.provider.vm.options import VmOptions
 from fogros2.provider.vm.regions import read_table, Regions
 
 
@@ -34,13 +33,13 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Endings):
     :param account: the AWS account; None for the account of this computer's user.
     """
 
-    name: ClassVar[str] = 'aws'
-    title: ClassVar[str] = 'AWS'
-    options: ClassVar[type[VmOptions]] = Options
-    regions: ClassVar[Regions] = Regions('AWS', read_table(__file__), api_host)
-    id_form: ClassVar[str] = 'i-[0-9a-f]+'
-    base_region: ClassVar[str] = 'us-east-1'
-    regions_variable: ClassVar[str] = 'FOGROS2_AWS_REGIONS'
+    name = 'aws'
+    title = 'AWS'
+    options = Options
+    regions = Regions('AWS', read_table(__file__), api_host)
+    id_form = 'i-[0-9a-f]+'
+    base_region = 'us-east-1'
+    regions_variable = 'FOGROS2_AWS_REGIONS'
     configured = staticmethod(clients.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:

@@ -8,11 +8,11 @@ common errors of all AWS services.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 import contextlib
 import json
 import re
-from typing import Any, ClassVar, Optional
+from typing import Any, Optional
 
 from fogros2.errors import FogError, PrerequisiteError, ProviderError
 from fogros2.provider.vm.failures import CodedError, Failure, LENGTH, Silent
@@ -120,8 +120,8 @@ _ENCODED = re.compile(r'[Ee]ncoded authorization failure message: *([\w-]+)')
 class AwsError(CodedError):
     """AWS refused; ``code`` is its error code."""
 
-    TITLE: ClassVar[str] = 'AWS'
-    FAILURES: ClassVar[Mapping[str, Failure]] = _FAILURES
+    TITLE = 'AWS'
+    FAILURES = _FAILURES
 
 
 @contextlib.contextmanager

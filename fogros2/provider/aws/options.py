@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 import dataclasses
 import re
-from typing import ClassVar
 
 from fogros2.errors import ConfigurationError
 from fogros2.provider.vm.options import VmOptions
@@ -23,15 +21,15 @@ class Options(VmOptions):
     subnet: str = ''
     security_groups: tuple[str, ...] = ()
 
-    WHAT: ClassVar[str] = 'a machine at AWS'
-    TYPE: ClassVar[str] = 'ec2_instance_type'
-    TYPES: ClassVar[str] = 'instance_types'
-    DEFAULT_TYPE: ClassVar[str] = 't3.medium'
-    IMAGE: ClassVar[str] = 'ami_image'
-    BY_REGION: ClassVar[tuple[str, ...]] = ('ami_image', 'ec2_instance_type', 'subnet')
-    IN_ONE_REGION: ClassVar[tuple[str, ...]] = ('subnet',)
-    RESERVED: ClassVar[tuple[str, ...]] = ('aws:', 'fogros2-')
-    FORMS: ClassVar[Mapping[str, tuple[str, str]]] = {
+    WHAT = 'a machine at AWS'
+    TYPE = 'ec2_instance_type'
+    TYPES = 'instance_types'
+    DEFAULT_TYPE = 't3.medium'
+    IMAGE = 'ami_image'
+    BY_REGION = ('ami_image', 'ec2_instance_type', 'subnet')
+    IN_ONE_REGION = ('subnet',)
+    RESERVED = ('aws:', 'fogros2-')
+    FORMS = {
         'region': (r'nearest|[a-z]{2,4}(-[a-z]+)+-\d+', "'eu-central-1' or 'nearest'"),
         'ec2_instance_type': (r'cheapest|[a-z0-9-]+\.[a-z0-9-]+', "'t3.medium' or 'cheapest'"),
         'ami_image': (r'ami-[0-9a-f]+', 'ami-...'),

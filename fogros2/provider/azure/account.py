@@ -8,7 +8,7 @@ import json
 import os
 from pathlib import Path
 import threading
-from typing import Any, ClassVar, Optional
+from typing import Any, Optional
 
 from fogros2.errors import FogError, PrerequisiteError, ProviderError
 from fogros2.provider.azure.failures import refusal
@@ -71,8 +71,8 @@ class Account(RestAccount):
     :param credential: an azure-identity credential; None for the usual chain, made when needed.
     """
 
-    TITLE: ClassVar[str] = 'Azure'
-    ENDPOINT_VARIABLE: ClassVar[str] = ENDPOINT_VARIABLE
+    TITLE = 'Azure'
+    ENDPOINT_VARIABLE = ENDPOINT_VARIABLE
 
     def __init__(self, credential: Optional[Any] = None) -> None:
         super().__init__()

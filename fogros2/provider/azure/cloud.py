@@ -16,7 +16,7 @@ import dataclasses
 from decimal import Decimal
 import os
 import time
-from typing import Any, ClassVar, Optional
+from typing import Any, Optional
 
 from fogros2.errors import ConfigurationError, FogError, MachineNotFound, ProviderError
 from fogros2.model import MachineSpec, MachineState
@@ -39,7 +39,7 @@ from fogros2.provider.vm.cloud import (
     VmId,
 )
 from fogros2.provider.vm.failures import unless_gone
-from fogros2.provider.vm.options import ipv4, SSH, VmOptions
+from fogros2.provider.vm.options import ipv4, SSH
 from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import wait_until
 
@@ -60,15 +60,14 @@ class Azure(prices.AzurePrices, images.AzureImages):
     :param account: None for the account of this computer's user.
     """
 
-    name: ClassVar[str] = 'azure'
-    title: ClassVar[str] = 'Azure'
-    options: ClassVar[type[VmOptions]] = Options
-    regions: ClassVar[Regions] = Regions(
-        'Azure', read_table(__file__),
-        lambda region: f'{region}.handler.control.monitor.azure.com')
-    id_form: ClassVar[str] = 'fogros2-[0-9a-f]{16}-[0-9a-f]{8}'
-    base_region: ClassVar[str] = 'westeurope'
-    regions_variable: ClassVar[str] = 'FOGROS2_AZURE_REGIONS'
+    name = 'azure'
+    title = 'Azure'
+    options = Options
+    regions = Regions('Azure', read_table(__file__),
+                      lambda region: f'{region}.handler.control.monitor.azure.com')
+    id_form = 'fogros2-[0-9a-f]{16}-[0-9a-f]{8}'
+    base_region = 'westeurope'
+    regions_variable = 'FOGROS2_AZURE_REGIONS'
     configured = staticmethod(configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:

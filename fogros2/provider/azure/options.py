@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 import dataclasses
 import re
-from typing import ClassVar
 
 from fogros2.errors import ConfigurationError
 from fogros2.provider.vm.options import VmOptions
@@ -25,13 +23,13 @@ class Options(VmOptions):
     vm_sizes: tuple[str, ...] = ()
     resource_group: str = ''
 
-    WHAT: ClassVar[str] = 'a machine at Azure'
-    TYPE: ClassVar[str] = 'vm_size'
-    TYPES: ClassVar[str] = 'vm_sizes'
-    DEFAULT_TYPE: ClassVar[str] = 'Standard_B2als_v2'
-    BY_REGION: ClassVar[tuple[str, ...]] = ('image', 'vm_size')
-    RESERVED: ClassVar[tuple[str, ...]] = ('microsoft', 'azure', 'windows', 'fogros2-')
-    FORMS: ClassVar[Mapping[str, tuple[str, str]]] = {
+    WHAT = 'a machine at Azure'
+    TYPE = 'vm_size'
+    TYPES = 'vm_sizes'
+    DEFAULT_TYPE = 'Standard_B2als_v2'
+    BY_REGION = ('image', 'vm_size')
+    RESERVED = ('microsoft', 'azure', 'windows', 'fogros2-')
+    FORMS = {
         'region': (r'nearest|[a-z]+[0-9]?', "'westeurope' or 'nearest'"),
         'vm_size': (r'cheapest|[A-Z][A-Za-z0-9]*_[A-Za-z0-9_-]+', "'Standard_B2als_v2'"),
         'image': (rf'{OLD_UBUNTU}|{_PART}:{_PART}:{_PART}:{_PART}|/subscriptions/[\w./()-]+',

@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 import threading
 import time
-from typing import Any, cast, ClassVar
+from typing import Any, cast
 import uuid
 import warnings
 
@@ -85,8 +85,8 @@ class Account(RestAccount):
     :param project: '' for the project of the user's configuration.
     """
 
-    TITLE: ClassVar[str] = 'Google'
-    ENDPOINT_VARIABLE: ClassVar[str] = ENDPOINT_VARIABLE
+    TITLE = 'Google'
+    ENDPOINT_VARIABLE = ENDPOINT_VARIABLE
 
     def __init__(self, project: str = '') -> None:
         super().__init__()

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import copy
 from decimal import Decimal
 import os
-from typing import Any, ClassVar, Optional
+from typing import Any, Optional
 
 from fogros2.errors import ConfigurationError, MachineNotFound
 from fogros2.model import MachineSpec, MachineState
@@ -28,7 +28,6 @@ from fogros2.provider.vm.cloud import (
     VmId,
 )
 from fogros2.provider.vm.failures import unless_gone
-from fogros2.provider.vm.options import VmOptions
 from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import cancellable
 
@@ -43,16 +42,15 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
     :param account: None for the account of this computer's user.
     """
 
-    name: ClassVar[str] = 'gcp'
-    title: ClassVar[str] = 'Google Cloud'
-    options: ClassVar[type[VmOptions]] = Options
-    regions: ClassVar[Regions] = Regions(
-        'Google Cloud', read_table(__file__),
-        lambda region: f'compute.{region}.rep.googleapis.com')
+    name = 'gcp'
+    title = 'Google Cloud'
+    options = Options
+    regions = Regions('Google Cloud', read_table(__file__),
+                      lambda region: f'compute.{region}.rep.googleapis.com')
     #: Project, zone and name.
-    id_form: ClassVar[str] = r'[a-z0-9.:-]+/[a-z0-9-]+/fogros2-[0-9a-f]{16}'
-    base_region: ClassVar[str] = DEFAULT_REGION
-    regions_variable: ClassVar[str] = 'FOGROS2_GCP_REGIONS'
+    id_form = r'[a-z0-9.:-]+/[a-z0-9-]+/fogros2-[0-9a-f]{16}'
+    base_region = DEFAULT_REGION
+    regions_variable = 'FOGROS2_GCP_REGIONS'
     configured = staticmethod(configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:

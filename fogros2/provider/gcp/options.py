@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 import dataclasses
 import re
-from typing import Any, ClassVar
+from typing import Any
 
 from fogros2.errors import ConfigurationError
 from fogros2.provider.vm.options import VmOptions
@@ -29,11 +29,11 @@ class Options(VmOptions):
     network: str = 'default'
     labels: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
-    WHAT: ClassVar[str] = 'a machine at Google'
-    DEFAULT_TYPE: ClassVar[str] = 'e2-medium'
-    IN_ONE_REGION: ClassVar[tuple[str, ...]] = ('zone',)
-    DISK_SIZES: ClassVar[tuple[int, int]] = (10, 65536)
-    FORMS: ClassVar[Mapping[str, tuple[str, str]]] = {
+    WHAT = 'a machine at Google'
+    DEFAULT_TYPE = 'e2-medium'
+    IN_ONE_REGION = ('zone',)
+    DISK_SIZES = (10, 65536)
+    FORMS = {
         'region': (r'nearest|[a-z]+(-[a-z]+)+\d+', "'europe-west3' or 'nearest'"),
         'zone': (r'[a-z]+(-[a-z]+)+\d+-[a-z]', "'us-central1-a'"),
         'project_id': (_PROJECT, "the project's id, not its name or number"),
