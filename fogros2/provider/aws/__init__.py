@@ -3,7 +3,7 @@
 EC2 instances, by boto3.
 
 In reading order: ``options``, ``failures`` (AWS's refusals), ``clients`` (calls),
-``instances``, ``network``, ``ending``, ``prices``, ``images``, ``cloud`` (the adapter).
+``instances``, ``network``, ``prices``, ``images``, ``cloud`` (the adapter).
 """
 
 from __future__ import annotations

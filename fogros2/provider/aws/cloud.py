@@ -11,7 +11,7 @@ from fogros2.errors import MachineNotFound
 from fogros2.model import MachineSpec
 from fogros2.provider.aws import clients, images, instances
 from fogros2.provider.aws.clients import Account
-from fogros2.provider.aws.ending import Ec2Endings
+from fogros2.provider.aws.network import Ec2Network
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import Ec2Prices
 from fogros2.provider.offers import MachineType
@@ -26,7 +26,7 @@ def api_host(region: str) -> str:
     return f'ec2.{region}.amazonaws.com{suffix}'
 
 
-class Ec2(Ec2Prices, images.Ec2Images, Ec2Endings):
+class Ec2(Ec2Prices, images.Ec2Images, Ec2Network):
     """
     EC2 instances, each with its own security group and key pair.
 
