@@ -84,16 +84,7 @@ class Account(vm.Account):
         with self._lock:
             return self.once('session', _session)
 
-    def region(self) -> str:
-        """Return the region that the user's configuration names, '' for none."""
-        return str(os.environ.get('AWS_REGION') or self.session().region_name or '')
-
     def check_credentials(self) -> None:
-        """
-        Check that there are credentials, without a request to AWS.
-
-        :raises PrerequisiteError: there are none.
-        """
         session = self.session()
         with translated('looking for AWS credentials'):
             with self._lock:
@@ -131,7 +122,6 @@ class Account(vm.Account):
         Make one call and return its answer.
 
         :param operation: as boto3's method is called.
-        :param what: completes '... in eu-central-1 failed'.
         :raises FogError: see :func:`~fogros2.provider.aws.failures.translated`.
         """
         found: Mapping[str, Any] = self._ask(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import os
 import time
 from typing import Any, Optional
 
@@ -57,7 +58,7 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network):
         return f'account {told["Account"]}, {str(told["Arn"]).split(":")[-1]}, {region}'
 
     def default_region(self) -> str:
-        return self._account.region()
+        return str(os.environ.get('AWS_REGION') or self._account.session().region_name or '')
 
     def enabled_regions(self) -> list[str]:
         answer = self._account.call(
