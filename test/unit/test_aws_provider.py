@@ -517,7 +517,7 @@ def test_the_notice_of_a_spot_instance_is_asked_for_with_a_token(echo, answers, 
 
 def refused(code, message='', operation='RunInstances', decode=None):
     return failures.refused({'Error': {'Code': code, 'Message': message}}, operation,
-                            "creating 'planner'", 'eu-central-1', decode)
+                            "creating 'planner' in eu-central-1", decode)
 
 
 @pytest.mark.parametrize(('code', 'kind', 'words'), [
