@@ -34,7 +34,7 @@ from fogros2.provider.vm.cloud import (
 )
 from fogros2.provider.vm.host_key import one_time
 from fogros2.provider.vm.options import VmOptions
-from fogros2.provider.vm.user_data import user_data
+from fogros2.provider.vm.user_data import cloud_config, user_data
 
 #: Returns the price of a type in a region in US dollars per hour, None if unknown.
 Price = Callable[[str, str], Optional[Decimal]]
@@ -130,10 +130,10 @@ class Creation:
         agent = self._request.agent_config
         if agent:
             agent = {**agent, 'end_command': list(self._cloud.end_command(tags))}
-        return user_data(
+        return user_data(cloud_config(
             name=self._spec.name, user=options.user,
             authorized_key=self._request.authorized_key,
-            host_key=one_time(self._request.token), agent_config=agent)
+            host_key=one_time(self._request.token), agent_config=agent))
 
     def _make(self, region: str, order: Order, prepared: Mapping[str, Any]) -> VmId:
         created: list[str] = []
