@@ -26,7 +26,6 @@ from fogros2.provider.azure.account import Account, configured, subscription
 from fogros2.provider.azure.failures import refusal
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
-from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import (
     Order,
     own_name,
@@ -92,12 +91,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
         return named.lower().replace(' ', '')  # 'West Europe', too
 
     def searched_regions(self) -> list[str]:
-        """Return '': one request answers for all regions."""
         return ['']
-
-    def named_types(self, region: str, names: Sequence[str]) -> list[MachineType]:
-        sizes = self.sizes(region)
-        return [prices.machine_type(sizes[name]) for name in names if name in sizes]
 
     # -- machines -------------------------------------------------------------------------------
 
