@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
-import dataclasses
 from decimal import Decimal
 import os
 import time
@@ -71,8 +70,6 @@ class Azure(prices.AzurePrices, images.AzureImages):
 
     def __init__(self, account: Optional[Account] = None) -> None:
         self._account = account or _USUAL
-        #: Notes about machines that this process has created, for people.
-        self._notes: dict[str, str] = {}
 
     # -- the account ----------------------------------------------------------------------------
 
@@ -123,7 +120,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
         found = machines.vm_of(entry)
         if found.state is MachineState.DELETED:
             raise MachineNotFound(f'{vm} in {region} is being deleted')
-        return dataclasses.replace(found, note=self._notes.get(vm, ''))
+        return found
 
     def _entry(self, vm: str) -> Mapping[str, Any]:
         found: Mapping[str, Any] = self._account.call(
@@ -261,10 +258,10 @@ class Azure(prices.AzurePrices, images.AzureImages):
         first = ending.schedule(self._account, name, region, end)
         price = Decimal(entry['tags'].get(TAG_PRICE, 0)) * int(first - time.time()) / 3600
         worst = f', at most ${price:.2f}' if price else ''
-        self._notes[name] = (
+        self.notes[name] = [
             'if this robot vanishes, the machine powers itself off and is billed until Azure '
             f'deallocates it at {time.strftime("%H:%M UTC", time.gmtime(first))}{worst} '
-            '(doc/azure.md)')
+            '(doc/azure.md)']
 
     def _install_driver(self, name: str, region: str) -> None:
         """Install NVIDIA's driver on a machine that runs, without waiting."""

@@ -75,8 +75,6 @@ class VmProvider(Provider):
         # its calls are not cancelled
         self._cloud = cloud or self.adapter()
         self._searched: tuple[str, ...] = ()
-        #: Notes for people, by the cloud's id of the machine.
-        self._notes: dict[str, str] = {}
 
     @classmethod
     def configured(cls) -> bool:
@@ -86,10 +84,12 @@ class VmProvider(Provider):
     def region_names(cls) -> Sequence[str]:
         return tuple(cls.adapter.regions.table)
 
+    def _cancel(self) -> Optional[threading.Event]:
+        """Return what ends a call together with the launch; later calls are clean-up."""
+        return None if self.cancel is None or self.cancel.is_set() else self.cancel
+
     def _until(self) -> VmCloud:
-        """Return the adapter for a call that ends with the launch; later calls are clean-up."""
-        ending = self.cancel is None or self.cancel.is_set()
-        return self._cloud if ending else self._cloud.until(self.cancel)
+        return self._cloud.until(self._cancel())
 
     # -- before a machine exists ----------------------------------------------------------------
 
@@ -184,8 +184,7 @@ class VmProvider(Provider):
             sources=lambda: _ROBOT_ADDRESS.with_ipv6([self._address(cancel)]),
             price=lambda region, kind: self._price(region, kind, options, cancel))
         machine = creation.run(list(dict.fromkeys([self._region(options), *options.regions])))
-        if creation.undo_failures:
-            self._notes[machine.vm] = '; '.join(map(str, creation.undo_failures))
+        cloud.notes[machine.vm] += map(str, creation.undo_failures)
         return self._text(machine)
 
     def adopt(self, machine_id: str, spec: MachineSpec, tags: Mapping[str, str]) -> None:
@@ -239,9 +238,8 @@ class VmProvider(Provider):
                     f'{vm.reason or f"{cloud.title} gives no reason"}',
                     f'the console of {cloud.title} has its system log')
             found = self.machine_of(vm)
-            notes = '; '.join(filter(None, (vm.note, self._notes.get(machine.vm))))
-            return dataclasses.replace(
-                found, id=machine_id, note=notes) if found.shell is not None else None
+            return dataclasses.replace(found, id=machine_id, note='; '.join(
+                cloud.notes[machine.vm])) if found.shell is not None else None
 
         # a cloud needs some ten seconds: few requests, but a fast machine is noticed soon
         return wait_until(
@@ -293,8 +291,7 @@ class VmProvider(Provider):
     # -- its network ----------------------------------------------------------------------------
 
     def robot_address(self) -> str:
-        ending = self.cancel is None or self.cancel.is_set()
-        return self._address(None if ending else self.cancel)
+        return self._address(self._cancel())
 
     def _address(self, cancel: Optional[threading.Event]) -> str:
         return cancellable(_ROBOT_ADDRESS, cancel, what="asking for the robot's address",
