@@ -65,36 +65,29 @@ def subscription() -> str:
 
 
 class Account(RestAccount):
-    """
-    The user's account, as azure-identity finds it.
-
-    :param credential: an azure-identity credential; None for the usual chain, made when needed.
-    """
+    """The user's account, with the usual chain of credentials of azure-identity."""
 
     TITLE = 'Azure'
     ENDPOINT_VARIABLE = ENDPOINT_VARIABLE
 
-    def __init__(self, credential: Optional[Any] = None) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self._credential = credential
         self._lock = threading.Lock()
 
     def credential(self) -> Any:
         """
-        Return the credential.
+        Return the credential, made when first needed.
 
         :raises PrerequisiteError: azure-identity is not installed.
         """
+        try:
+            from azure.identity import DefaultAzureCredential
+        except ImportError as error:
+            raise PrerequisiteError(
+                'machines at Azure take azure-identity, which is not installed',
+                'python3 -m pip install azure-identity requests') from error
         with self._lock:
-            if self._credential is None:
-                try:
-                    from azure.identity import DefaultAzureCredential
-                except ImportError as error:
-                    raise PrerequisiteError(
-                        'machines at Azure take azure-identity, which is not installed',
-                        'python3 -m pip install azure-identity requests') from error
-                self._credential = DefaultAzureCredential()
-            return self._credential
+            return self.once('credential', DefaultAzureCredential)
 
     def path(self, group: str = '', rest: str = '') -> str:
         """Return the path of a resource of a group, or of the subscription."""
@@ -109,7 +102,6 @@ class Account(RestAccount):
         Make one request and return the answer's JSON, None if it has none.
 
         :param path: below the endpoint, without the version.
-        :param what: completes '... failed'.
         :param wait: until a long-running operation is over.
         :raises FogError: see :func:`~fogros2.provider.azure.failures.refusal`.
         """
