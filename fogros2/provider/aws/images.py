@@ -22,18 +22,14 @@ from fogros2.provider.vm.images import check_baked, image_parts, image_tags
 
 #: Public parameters of AWS's parameter store, by architecture; ROS 2 Jazzy is for Ubuntu 24.04.
 UBUNTU = {
-    'x86_64': '/aws/service/canonical/ubuntu/server/24.04/stable/current/amd64/hvm/ebs-gp3/ami-id',
-    'arm64': '/aws/service/canonical/ubuntu/server/24.04/stable/current/arm64/hvm/ebs-gp3/ami-id',
-}
+    arch: f'/aws/service/canonical/ubuntu/server/24.04/stable/current/{name}/hvm/ebs-gp3/ami-id'
+    for arch, name in (('x86_64', 'amd64'), ('arm64', 'arm64'))}
 #: The name of its disk.
 ROOT_DEVICE = '/dev/sda1'
 #: The same with NVIDIA's driver in it.
 DEEP_LEARNING = {
-    'x86_64': '/aws/service/deeplearning/ami/x86_64/'
-              'base-oss-nvidia-driver-gpu-ubuntu-24.04/latest/ami-id',
-    'arm64': '/aws/service/deeplearning/ami/arm64/'
-             'base-oss-nvidia-driver-gpu-ubuntu-24.04/latest/ami-id',
-}
+    arch: f'/aws/service/deeplearning/ami/{arch}/base-oss-nvidia-driver-gpu-ubuntu-24.04/'
+          'latest/ami-id' for arch in UBUNTU}
 _STATES = {'invalid': 'failed', 'error': 'failed', 'transient': 'pending'}
 
 
