@@ -53,18 +53,15 @@ class Market:
 
         :raises FogError: the cloud refused, or does not answer.
         """
-        return list(self._kept(
-            f'types-{region}', lambda: list(self._source.types(region)), _read_types))
+        return list(self._kept(f'types-{region}', lambda: list(self._source.types(region))))
 
     def zones(self, region: str) -> dict[str, list[str]]:
         """Return the zones of a region that have each type."""
-        return dict(self._kept(
-            f'zones-{region}', lambda: self._source.zones(region), _read_zones))
+        return dict(self._kept(f'zones-{region}', lambda: self._source.zones(region)))
 
     def prices(self, region: str) -> dict[str, Decimal]:
         """Return the price of each type in US dollars per hour."""
-        return dict(self._kept(
-            f'prices-{region}', lambda: self._source.prices(region), _read_prices))
+        return dict(self._kept(f'prices-{region}', lambda: self._source.prices(region)))
 
     def price(self, region: str, name: str) -> Optional[Decimal]:
         """
@@ -72,10 +69,10 @@ class Market:
 
         One request, unless the whole list is known.
         """
-        listed: Optional[dict[str, Decimal]] = self._fresh(f'prices-{region}', _read_prices)
+        listed: Optional[dict[str, Decimal]] = self._fresh(f'prices-{region}')
         if listed is None:
             listed = self._kept(f'price-{region}-{name}',
-                                lambda: self._source.prices(region, name), _read_prices)
+                                lambda: self._source.prices(region, name))
         return listed.get(name)
 
     def spot(
@@ -88,9 +85,9 @@ class Market:
         """
         named = sorted(names) if names is not None and len(names) <= _NAMED_TYPES else None
         key = f'spot-{region}'
-        if named is not None and self._fresh(key, _read_spot) is None:
+        if named is not None and self._fresh(key) is None:
             key += '-' + hashlib.sha256(' '.join(named).encode()).hexdigest()[:12]
-        found = self._kept(key, lambda: self._source.spot_prices(region, named), _read_spot)
+        found = self._kept(key, lambda: self._source.spot_prices(region, named))
         return {name: zones for name, zones in found.items() if names is None or name in names}
 
     def price_of(self, region: str, name: str, *, spot: bool = False) -> Decimal:
@@ -158,7 +155,7 @@ class Market:
         where = regions[0] if len(regions) == 1 else f'{len(regions)} regions'
         if not found:
             gpus = {kind.gpu for region in regions
-                    for kind in self._fresh(f'types-{region}', _read_types) or ()}
+                    for kind in self._fresh(f'types-{region}') or ()}
             raise ConfigurationError(
                 f'no {self._source.title} type in {where} has {asked}',
                 f"GPUs there: {', '.join(sorted(filter(None, gpus))) or 'none'}" if asked.gpu else
@@ -177,16 +174,12 @@ class Market:
 
     # -- cache ----------------------------------------------------------------------------
 
-    def _kept(self, key: str, ask: Callable[[], Any], read: Callable[[Any], Any]) -> Any:
-        """
-        Return a cached answer, or make the request, in one thread at a time.
-
-        :param read: converts the answer from its JSON; an error means that the cache is damaged.
-        """
+    def _kept(self, key: str, ask: Callable[[], Any]) -> Any:
+        """Return a cached answer, or make the request, in one thread at a time."""
         with self._lock:
             lock = self._locks.setdefault(key, threading.Lock())
         with lock:
-            found = self._fresh(key, read)
+            found = self._fresh(key)
             if found is None:
                 found = self._known[key] = ask()
                 with contextlib.suppress(StoreError):  # the next launch takes longer
@@ -195,7 +188,7 @@ class Market:
                         'value': found}).encode())
             return found
 
-    def _fresh(self, key: str, read: Callable[[Any], Any]) -> Any:
+    def _fresh(self, key: str) -> Any:
         """Return an answer of less than a day ago, None if there is none."""
         if key not in self._known and not self._refresh:
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError,
@@ -203,27 +196,23 @@ class Market:
                 data = json.loads(self._path(key).read_text())
                 if data['source'] == self._source.account_key() \
                         and 0 <= self._clock() - float(data['time']) < CACHE_AGE:
-                    self._known[key] = read(data['value'])
+                    self._known[key] = _READ[key.partition('-')[0]](data['value'])
         return self._known.get(key)
 
     def _path(self, key: str) -> Path:
         return (self._cache or state_home() / 'cache' / self._source.name) / f'{key}.json'
 
 
-def _read_types(value: Any) -> list[MachineType]:
-    return [MachineType(**entry) for entry in value]
-
-
-def _read_zones(value: Any) -> dict[str, list[str]]:
-    return {name: [str(zone) for zone in zones] for name, zones in value.items()}
-
-
-def _read_prices(value: Any) -> dict[str, Decimal]:
+def _prices(value: Any) -> dict[str, Decimal]:
     return {name: Decimal(price) for name, price in value.items()}
 
 
-def _read_spot(value: Any) -> dict[str, dict[str, Decimal]]:
-    return {name: _read_prices(zones) for name, zones in value.items()}
+#: Convert the answers in files, by the first word of their keys; an error shows damage.
+_READ: Mapping[str, Callable[[Any], Any]] = {
+    'types': lambda value: [MachineType(**entry) for entry in value],
+    'zones': lambda value: {name: list(map(str, zones)) for name, zones in value.items()},
+    'spot': lambda value: {name: _prices(zones) for name, zones in value.items()},
+    'prices': _prices, 'price': _prices}
 
 
 def cheapest_zone(zones: Mapping[str, Decimal], among: Iterable[str]) -> Optional[Decimal]:
