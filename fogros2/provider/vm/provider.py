@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import dataclasses
 from decimal import Decimal, InvalidOperation
+import functools
 import os
 import re
 import threading
@@ -182,7 +183,8 @@ class VmProvider(Provider):
         creation = Creation(
             cloud.until(cancel), cloud, spec, request, options,
             sources=lambda: _ROBOT_ADDRESS.with_ipv6([self._address(cancel)]),
-            price=lambda region, kind: self._price(region, kind, options, cancel))
+            price=functools.cache(
+                lambda region, kind: self._price(region, kind, options, cancel)))
         machine = creation.run(list(dict.fromkeys([self._region(options), *options.regions])))
         cloud.notes[machine.vm] += map(str, creation.undo_failures)
         return self._text(machine)
@@ -352,9 +354,9 @@ class VmProvider(Provider):
             **kept, 'region': offer.region, self._cloud.options.TYPE: offer.type.name})
 
     def _named_regions(self) -> list[str]:
-        """Return the regions that the user has named: by an option, else by the variable."""
-        return list(self._searched) or os.environ.get(
-            self._cloud.regions_variable, '').replace(',', ' ').split()
+        """Return the regions that the user has named: by an option, else FOGROS2_AWS_REGIONS."""
+        variable = f'FOGROS2_{self.name.upper()}_REGIONS'
+        return list(self._searched) or os.environ.get(variable, '').replace(',', ' ').split()
 
     def _base(self) -> str:
         """Return a region for requests that belong to no region."""
