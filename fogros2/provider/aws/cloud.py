@@ -40,7 +40,6 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network):
     regions = Regions('AWS', read_table(__file__), api_host)
     id_form = 'i-[0-9a-f]+'
     base_region = 'us-east-1'
-    regions_variable = 'FOGROS2_AWS_REGIONS'
     configured = staticmethod(clients.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:

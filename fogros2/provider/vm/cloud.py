@@ -192,8 +192,6 @@ class VmCloud(abc.ABC):
     id_form: ClassVar[str]
     #: Region for requests that belong to no region.
     base_region: ClassVar[str]
-    #: Name of a variable that lists the regions to search, such as 'eu-central-1 us-east-1'.
-    regions_variable: ClassVar[str] = ''
     #: Notes for people about machines that this process has created, by the cloud's id.
     notes: ClassVar[dict[str, list[str]]] = collections.defaultdict(list)
     #: Set when the launch ends; calls then raise Cancelled.
