@@ -61,18 +61,15 @@ def tags_of(entry: Mapping[str, Any]) -> dict[str, str]:
 
 def tag_filters(tags: Mapping[str, str]) -> list[dict[str, Any]]:
     """Return filters for FogROS2's resources with all of ``tags``."""
-    return [{'Name': 'tag-key', 'Values': [TAG_ATTEMPT]},
-            *({'Name': f'tag:{key}', 'Values': [_literal(value)]} for key, value in tags.items())]
+    # a filter's value has * and ? as wildcards
+    return [{'Name': 'tag-key', 'Values': [TAG_ATTEMPT]}, *(
+        {'Name': f'tag:{key}', 'Values': [re.sub(r'([*?\\])', r'\\\1', value)]}
+        for key, value in tags.items())]
 
 
 def in_states(states: Iterable[str]) -> dict[str, Any]:
     """Return the filter for instances in these states."""
     return {'Name': 'instance-state-name', 'Values': list(states)}
-
-
-def _literal(text: str) -> str:
-    r"""Escape ``*``, ``?`` and ``\`` in the value of a filter."""
-    return re.sub(r'([*?\\])', r'\\\1', text)
 
 
 def run_request(

@@ -21,7 +21,7 @@ from fogros2.errors import ConfigurationError, FogError, MachineNotFound, Provid
 from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_EXPIRES
 from fogros2.provider.azure import ending, images, machines, prices
-from fogros2.provider.azure.account import Account, configured, subscription
+from fogros2.provider.azure.account import Account, configured, endpoint, subscription
 from fogros2.provider.azure.failures import refusal
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
@@ -65,7 +65,6 @@ class Azure(prices.AzurePrices, images.AzureImages):
                       lambda region: f'{region}.handler.control.monitor.azure.com')
     id_form = 'fogros2-[0-9a-f]{16}-[0-9a-f]{8}'
     base_region = 'westeurope'
-    regions_variable = 'FOGROS2_AZURE_REGIONS'
     configured = staticmethod(configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
@@ -371,7 +370,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
                            wait=True)
 
     def end_command(self, tags: Mapping[str, str]) -> tuple[str, ...]:
-        return ending.end_command()
+        return (*ending.END, endpoint())
 
     # -- images ---------------------------------------------------------------------------------
 

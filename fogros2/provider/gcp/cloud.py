@@ -41,7 +41,6 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
     #: Project, zone and name.
     id_form = r'[a-z0-9.:-]+/[a-z0-9-]+/fogros2-[0-9a-f]{16}'
     base_region = DEFAULT_REGION
-    regions_variable = 'FOGROS2_GCP_REGIONS'
     configured = staticmethod(configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
@@ -203,7 +202,7 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
 
     def end_command(self, tags: Mapping[str, str]) -> tuple[str, ...]:
         return super().end_command(tags) if tags.get(TAG_ON_EXIT) == 'stop' \
-            else guest.deletion(self._account.endpoint)
+            else (*guest.DELETE, self._account.endpoint)
 
     def delete(self, machine: VmId) -> None:
         """Delete an instance with its disk, then its firewall rules."""
