@@ -30,13 +30,54 @@ class Toleration(TypedDict, total=False):
     tolerationSeconds: int
 
 
-class AWSCloudInstance(CloudInstance):
+class VmInstance(CloudInstance):
+    """
+    A virtual machine of a cloud, created for the launch; each cloud's class adds keywords.
+
+    ``arch``, ``min_cpu``, ``min_memory_gb``, ``cpu_type``, ``gpu`` and ``gpu_memory_gb`` are the
+    requirements of the type, from which the launch chooses the cheapest if it names none.
+
+    :param spot: use a spot machine: cheaper, but the cloud may reclaim it. AWS gives two minutes'
+        notice, the others half a minute's.
+    :param arch: x86_64 or arm64.
+    :param min_cpu: minimum number of vCPUs.
+    :param min_memory_gb: minimum memory in GiB.
+    :param gpu: the number of GPUs, True for one, or part of the GPU's name, such as 'L4'.
+    :param gpu_memory_gb: minimum memory of each GPU in GB.
+    :param max_price: maximum price in US dollars per hour; at AWS and Azure also the limit of a
+        spot price.
+    :param tags: tags for everything that is created, in addition to FogROS2's own.
+    :param regions: further regions to try, in this order, if one has no capacity.
+    :param user: the image's login user.
+    :param ssh_from: networks (CIDR) that may reach the SSH port; None for this robot's public
+        address only.
+    """
+
+    def __init__(
+        self, *, spot: Optional[Bool] = None,
+        arch: Optional[SomeSubstitutionsType] = None,
+        min_cpu: Optional[Value] = None,
+        min_memory_gb: Optional[Value] = None,
+        gpu: Optional[Union[Value, bool]] = None,
+        gpu_memory_gb: Optional[Value] = None,
+        max_price: Optional[Union[Value, Decimal]] = None,
+        tags: Optional[Mapping[str, SomeSubstitutionsType]] = None,
+        regions: Optional[Sequence[SomeSubstitutionsType]] = None,
+        user: Optional[SomeSubstitutionsType] = None,
+        ssh_from: Optional[Sequence[SomeSubstitutionsType]] = None,
+        options: Optional[Mapping[str, Any]] = None, **common: Any,
+    ) -> None:
+        shared = options_of(VmInstance.__init__, locals())
+        super().__init__(options={**(options or {}), **shared}, **common)
+
+
+class AWSCloudInstance(VmInstance):
     """
     An EC2 instance, created for the launch.
 
     Defaults: the region of the user's AWS configuration, an image that ``ros2 fog`` has baked with
     what the launch needs or else Ubuntu 24.04, and the type t3.medium, or the cheapest type that
-    meets the requirements below.
+    meets the requirements.
 
     ``ami_image``, ``ec2_instance_type`` and ``subnet`` may depend on the region: a mapping such as
     ``{'us-west-1': 'ami-1', 'eu-west-1': 'ami-2'}`` has a value for each region, and the launch
@@ -45,25 +86,13 @@ class AWSCloudInstance(CloudInstance):
     :param ami_image: id of an image.
     :param region: such as 'eu-central-1'; 'nearest' for the region with the fastest response.
     :param ec2_instance_type: such as 't3.medium'; 'cheapest' for the cheapest type that meets
-        the requirements below.
+        the requirements.
     :param disk_size: GB; default 30.
-    :param spot: use a spot instance: cheaper, but AWS may reclaim it with two minutes' notice.
-    :param arch: x86_64 or arm64.
-    :param min_cpu: minimum number of vCPUs.
-    :param min_memory_gb: minimum memory in GiB.
     :param cpu_type: manufacturer of the processor: intel, amd, aws.
-    :param gpu: the number of GPUs, True for one, or part of the GPU's name.
-    :param gpu_memory_gb: minimum memory of each GPU in GB.
-    :param max_price: maximum price in US dollars per hour; also the limit of a spot price.
     :param iam_instance_profile: name or ARN of the profile with the instance's own AWS rights.
     :param subnet: subnet id; None for one of the default VPC.
     :param security_groups: ids of groups in addition to the instance's own.
-    :param tags: tags for everything that is created, in addition to FogROS2's own.
-    :param regions: further regions to try, in this order, if one has no capacity.
     :param instance_types: further types to try, in this order, if there is no capacity for one.
-    :param user: the image's login user.
-    :param ssh_from: networks (CIDR) that may reach the SSH port; None for this robot's public
-        address only.
     """
 
     provider = 'aws'
@@ -73,22 +102,11 @@ class AWSCloudInstance(CloudInstance):
         region: Optional[SomeSubstitutionsType] = None,
         ec2_instance_type: Optional[ByRegion] = None,
         disk_size: Optional[Value] = None, *,
-        spot: Optional[Bool] = None,
-        arch: Optional[SomeSubstitutionsType] = None,
-        min_cpu: Optional[Value] = None,
-        min_memory_gb: Optional[Value] = None,
         cpu_type: Optional[SomeSubstitutionsType] = None,
-        gpu: Optional[Union[Value, bool]] = None,
-        gpu_memory_gb: Optional[Value] = None,
-        max_price: Optional[Union[Value, Decimal]] = None,
         iam_instance_profile: Optional[SomeSubstitutionsType] = None,
         subnet: Optional[ByRegion] = None,
         security_groups: Optional[Sequence[SomeSubstitutionsType]] = None,
-        tags: Optional[Mapping[str, SomeSubstitutionsType]] = None,
-        regions: Optional[Sequence[SomeSubstitutionsType]] = None,
         instance_types: Optional[Sequence[SomeSubstitutionsType]] = None,
-        user: Optional[SomeSubstitutionsType] = None,
-        ssh_from: Optional[Sequence[SomeSubstitutionsType]] = None,
         **common: Any,
     ) -> None:
         super().__init__(options=options_of(AWSCloudInstance.__init__, locals()), **common)
@@ -112,7 +130,7 @@ class AWSCloudInstance(CloudInstance):
         }
 
 
-class GCPCloudInstance(CloudInstance):
+class GCPCloudInstance(VmInstance):
     """
     A Compute Engine instance, created for the launch.
 
@@ -124,27 +142,15 @@ class GCPCloudInstance(CloudInstance):
         of an image of the project.
     :param zone: such as 'us-central1-a'; None for any zone of the region with capacity.
     :param machine_type: such as 'e2-medium'; 'cheapest' for the cheapest type that meets the
-        requirements below.
+        requirements.
     :param disk_size: GB; default 30.
     :param region: such as 'europe-west3'; 'nearest' for the region with the fastest response.
-    :param spot: use a Spot VM: cheaper, but Google may reclaim it with 30 seconds' notice.
     :param accelerators: GPUs to attach to an N1 type, such as 'nvidia-tesla-t4:2'.
     :param service_account: email address of the account with the machine's own rights. With the
         right to delete the instance, the machine deletes itself when the robot is gone.
     :param network: name of the VPC network.
     :param labels: Google's labels for everything that is created.
-    :param arch: x86_64 or arm64.
-    :param min_cpu: minimum number of vCPUs.
-    :param min_memory_gb: minimum memory in GiB.
-    :param gpu: the number of GPUs, True for one, or part of the GPU's name.
-    :param gpu_memory_gb: minimum memory of each GPU in GB.
-    :param max_price: maximum price in US dollars per hour.
-    :param tags: tags with any characters, stored as labels.
-    :param regions: further regions to try, in this order, if one has no capacity.
     :param machine_types: further types to try, in this order, if there is no capacity for one.
-    :param user: the image's login user.
-    :param ssh_from: networks (CIDR) that may reach the SSH port; None for this robot's public
-        address only.
     """
 
     provider = 'gcp'
@@ -156,22 +162,11 @@ class GCPCloudInstance(CloudInstance):
         machine_type: Optional[SomeSubstitutionsType] = None,
         disk_size: Optional[Value] = None, *,
         region: Optional[SomeSubstitutionsType] = None,
-        spot: Optional[Bool] = None,
         accelerators: Optional[SomeSubstitutionsType] = None,
         service_account: Optional[SomeSubstitutionsType] = None,
         network: Optional[SomeSubstitutionsType] = None,
         labels: Optional[Mapping[str, SomeSubstitutionsType]] = None,
-        arch: Optional[SomeSubstitutionsType] = None,
-        min_cpu: Optional[Value] = None,
-        min_memory_gb: Optional[Value] = None,
-        gpu: Optional[Union[Value, bool]] = None,
-        gpu_memory_gb: Optional[Value] = None,
-        max_price: Optional[Union[Value, Decimal]] = None,
-        tags: Optional[Mapping[str, SomeSubstitutionsType]] = None,
-        regions: Optional[Sequence[SomeSubstitutionsType]] = None,
         machine_types: Optional[Sequence[SomeSubstitutionsType]] = None,
-        user: Optional[SomeSubstitutionsType] = None,
-        ssh_from: Optional[Sequence[SomeSubstitutionsType]] = None,
         **common: Any,
     ) -> None:
         super().__init__(options=options_of(GCPCloudInstance.__init__, locals()), **common)
@@ -188,49 +183,29 @@ class GCPCloudInstance(CloudInstance):
         }
 
 
-class CheapestInstance(CloudInstance):
+class CheapestInstance(VmInstance):
     """
     A virtual machine of the cloud with the cheapest offer, created for the launch.
 
     The launch compares the offers of all clouds that are set up on the robot. If a cloud has no
     capacity or quota for the cheapest, the launch takes the next offer, also of another cloud.
 
-    :param arch: x86_64 or arm64; None for the robot's own.
-    :param min_cpu: minimum number of vCPUs; default 2.
-    :param min_memory_gb: minimum memory in GiB; default 4.
+    Defaults: the robot's own architecture, 2 vCPUs and 4 GiB of memory.
+
     :param cpu_type: manufacturer of the processor: intel, amd, aws.
-    :param gpu: the number of GPUs, True for one, or part of the GPU's name, such as 'L4'.
-    :param gpu_memory_gb: minimum memory of each GPU in GB.
-    :param max_price: maximum price in US dollars per hour.
     :param max_round_trip_ms: maximum of the measured time to the region and back.
     :param providers: names of clouds, such as 'aws'; None for all that are set up.
     :param regions: names of regions of these clouds; None for all.
-    :param spot: use a spot machine, and compare spot prices.
     :param disk_size: GB; default 30.
-    :param tags: tags for everything that is created.
-    :param user: the image's login user.
-    :param ssh_from: networks (CIDR) that may reach the SSH port; None for this robot's public
-        address only.
     """
 
     provider = 'cheapest'
 
     def __init__(
-        self, *, arch: Optional[SomeSubstitutionsType] = None,
-        min_cpu: Optional[Value] = None,
-        min_memory_gb: Optional[Value] = None,
-        cpu_type: Optional[SomeSubstitutionsType] = None,
-        gpu: Optional[Union[Value, bool]] = None,
-        gpu_memory_gb: Optional[Value] = None,
-        max_price: Optional[Union[Value, Decimal]] = None,
+        self, *, cpu_type: Optional[SomeSubstitutionsType] = None,
         max_round_trip_ms: Optional[Value] = None,
         providers: Optional[Sequence[SomeSubstitutionsType]] = None,
-        regions: Optional[Sequence[SomeSubstitutionsType]] = None,
-        spot: Optional[Bool] = None,
         disk_size: Optional[Value] = None,
-        tags: Optional[Mapping[str, SomeSubstitutionsType]] = None,
-        user: Optional[SomeSubstitutionsType] = None,
-        ssh_from: Optional[Sequence[SomeSubstitutionsType]] = None,
         **common: Any,
     ) -> None:
         super().__init__(options=options_of(CheapestInstance.__init__, locals()), **common)
@@ -301,13 +276,13 @@ class KubeInstance(CloudInstance):
         }
 
 
-class AzureCloudInstance(CloudInstance):
+class AzureCloudInstance(VmInstance):
     """
     A virtual machine of Azure, created for the launch in a resource group of its own.
 
     Defaults: the region of ``AZURE_DEFAULTS_LOCATION`` or else eastus, an image that ``ros2 fog``
     has baked with what the launch needs or else Ubuntu 24.04, and the size Standard_B2als_v2, or
-    the cheapest size that meets the requirements below.
+    the cheapest size that meets the requirements.
 
     The keywords of FogROS2's pull request 109 have other names: ``zone`` is ``region``,
     ``machine_type`` is ``vm_size``, ``ami_image`` is ``image``.
@@ -321,22 +296,10 @@ class AzureCloudInstance(CloudInstance):
     :param region: such as 'westeurope'; 'nearest' for the region with the fastest response.
     :param location: the same as ``region``.
     :param vm_size: such as 'Standard_B2als_v2'; 'cheapest' for the cheapest size that meets the
-        requirements below.
+        requirements.
     :param image: 'publisher:offer:sku:version' of the Marketplace, or an image's resource id.
-    :param spot: use a spot machine: cheaper, but Azure may evict it with half a minute's notice.
-    :param arch: x86_64 or arm64.
-    :param min_cpu: minimum number of vCPUs.
-    :param min_memory_gb: minimum memory in GiB.
     :param cpu_type: manufacturer of the processor: intel, amd, arm.
-    :param gpu: the number of GPUs, True for one, or part of the GPU's name.
-    :param gpu_memory_gb: minimum memory of each GPU in GB.
-    :param max_price: maximum price in US dollars per hour; also the limit of a spot price.
-    :param tags: tags for everything that is created, in addition to FogROS2's own.
-    :param regions: further regions to try, in this order, if one has no capacity.
     :param vm_sizes: further sizes to try, in this order, if there is no capacity for one.
-    :param user: the login user.
-    :param ssh_from: networks (CIDR) that may reach the SSH port; None for this robot's public
-        address only.
     """
 
     provider = 'azure'
@@ -351,19 +314,8 @@ class AzureCloudInstance(CloudInstance):
         location: Optional[SomeSubstitutionsType] = None,
         vm_size: Optional[ByRegion] = None,
         image: Optional[ByRegion] = None,
-        spot: Optional[Bool] = None,
-        arch: Optional[SomeSubstitutionsType] = None,
-        min_cpu: Optional[Value] = None,
-        min_memory_gb: Optional[Value] = None,
         cpu_type: Optional[SomeSubstitutionsType] = None,
-        gpu: Optional[Union[Value, bool]] = None,
-        gpu_memory_gb: Optional[Value] = None,
-        max_price: Optional[Union[Value, Decimal]] = None,
-        tags: Optional[Mapping[str, SomeSubstitutionsType]] = None,
-        regions: Optional[Sequence[SomeSubstitutionsType]] = None,
         vm_sizes: Optional[Sequence[SomeSubstitutionsType]] = None,
-        user: Optional[SomeSubstitutionsType] = None,
-        ssh_from: Optional[Sequence[SomeSubstitutionsType]] = None,
         **common: Any,
     ) -> None:
         given = options_of(AzureCloudInstance.__init__, locals())

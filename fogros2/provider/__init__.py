@@ -153,7 +153,8 @@ class Provider(abc.ABC):
 
     def choices(self, asked: MachineSpec, chosen: MachineSpec) -> list[str]:
         """Describe for people what ``resolve`` has changed."""
-        return [f'{key} {" or ".join(map(str, value)) if _is_list(value) else value}'
+        return [f'{key} ' + (' or '.join(map(str, value)) if isinstance(value, (list, tuple))
+                             else str(value))
                 for key, value in sorted(chosen.options.items())
                 if asked.options.get(key) != value]
 
@@ -429,7 +430,3 @@ class Provider(abc.ABC):
         :param spec: of a machine of any cloud; the result has its options as ``wanted``.
         """
         raise Unsupported(f"provider '{self.name}' has no price list")
-
-
-def _is_list(value: object) -> bool:
-    return isinstance(value, (list, tuple))

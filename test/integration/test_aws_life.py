@@ -539,9 +539,9 @@ def test_next_type_keeps_to_the_price_cap(aws, monkeypatch):
 
 def test_a_region_to_go_on_in_that_lacks_the_type_is_passed_over(aws):
     aws.refuse('RunInstances', *['InsufficientInstanceCapacity'] * 20)
-    aws.refuse('DescribeInstanceTypes', None, 'InvalidInstanceType')
     with pytest.raises(AwsError, match='no free machine of this type'):
-        aws.provider.create(*ask(region=HOME, regions=[AWAY]))
+        aws.provider.create(*ask(region=HOME, regions=[AWAY], ec2_instance_type={
+            HOME: 't3.medium', AWAY: 't9.medium'}))
     assert left(HOME) == left(AWAY) == NOTHING
 
 

@@ -383,9 +383,7 @@ def test_the_one_time_host_key_is_a_key_pair_and_always_the_same(tmp_path):
 
 def test_user_data_fits_and_is_the_same_for_the_same_request():
     def data():
-        return boot.user_data(
-            name='planner', user='ubuntu', authorized_key='ssh-ed25519 AAAA robot',
-            host_key=one_time(TOKEN), agent_config=dict(REQUEST.agent_config))
+        return boot.user_data(config(**REQUEST.agent_config))
     # some room for what the agent learns yet
     assert len(data()) < boot.LIMIT - 512
     assert data() == data()
@@ -517,7 +515,7 @@ def test_the_notice_of_a_spot_instance_is_asked_for_with_a_token(echo, answers, 
 
 def refused(code, message='', operation='RunInstances', decode=None):
     return failures.refused({'Error': {'Code': code, 'Message': message}}, operation,
-                            "creating 'planner'", 'eu-central-1', decode)
+                            "creating 'planner' in eu-central-1", decode)
 
 
 @pytest.mark.parametrize(('code', 'kind', 'words'), [

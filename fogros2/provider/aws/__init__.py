@@ -3,25 +3,22 @@
 EC2 instances, by boto3.
 
 In reading order: ``options``, ``failures`` (AWS's refusals), ``clients`` (calls),
-``instances``, ``network``, ``ending``, ``prices``, ``images``, ``cloud`` (the adapter).
+``instances``, ``network``, ``prices``, ``images``, ``cloud`` (the adapter).
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
-from fogros2.provider import Capabilities
 from fogros2.provider.aws import instances
 from fogros2.provider.aws.cloud import Ec2
-from fogros2.provider.vm.cloud import VmCloud
 from fogros2.provider.vm.provider import VmProvider
 
 
 class AWSProvider(VmProvider):
     """EC2 instances."""
 
-    name: ClassVar[str] = Ec2.name
-    adapter: ClassVar[type[VmCloud]] = Ec2
-    capabilities: ClassVar[Capabilities] = dataclasses.replace(
+    name = Ec2.name
+    adapter = Ec2
+    capabilities = dataclasses.replace(
         VmProvider.capabilities, stop=True, images=True, preemption_notice=instances.NOTICE)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
+import functools
 import os
 from pathlib import Path
 import threading
@@ -36,23 +37,14 @@ def configured() -> bool:
                for variable, usual in _FILES.items())
 
 
-_accounts: dict[tuple[tuple[str, str], ...], Account] = {}
-_accounts_lock = threading.Lock()
-
-
 def usual() -> Account:
     """
     Return the account of this computer's user, the same for all callers in this process.
 
     A session and its clients take half a second to create.
     """
-    settings = tuple(sorted((name, value) for name, value in os.environ.items()
+    return _account(*sorted((name, value) for name, value in os.environ.items()
                             if name.startswith('AWS_') or name == 'HOME'))
-    with _accounts_lock:
-        if settings not in _accounts:
-            _accounts.clear()
-            _accounts[settings] = Account()
-        return _accounts[settings]
 
 
 class Account(vm.Account):
@@ -66,7 +58,8 @@ class Account(vm.Account):
 
     def __init__(self, session: Optional[Any] = None) -> None:
         super().__init__()
-        self._session = session
+        if session is not None:
+            self._known['session'] = session
         #: Instances that this process has created, and when (``time.monotonic``).
         self.made: dict[str, float] = {}
         #: Security groups that this process has created and not changed since, by attempt: the
@@ -74,14 +67,8 @@ class Account(vm.Account):
         self.doors: dict[str, tuple[str, Mapping[str, Any]]] = {}
         #: Ids of the disks that are deleted with instances that this process has seen run.
         self.disks: dict[str, set[str]] = {}
-        self._clients: dict[tuple[str, str, bool], Any] = {}
         # boto3 creates clients of one session in one thread only; their use is thread-safe
         self._lock = threading.RLock()
-
-    def having(self, cancel: Optional[threading.Event], *, hasty: bool = False) -> Account:
-        """Return this account for calls that end with ``cancel``, with the same session."""
-        self.session()
-        return super().having(cancel, hasty=hasty)
 
     def just_made(self, instance: str) -> bool:
         """Return whether EC2 may not report an instance yet that this process has created."""
@@ -95,27 +82,9 @@ class Account(vm.Account):
         :raises PrerequisiteError: boto3 is not installed, or its configuration is not readable.
         """
         with self._lock:
-            if self._session is None:
-                try:
-                    import boto3
-                except ImportError as error:
-                    raise PrerequisiteError(
-                        'machines at AWS take boto3, which is not installed',
-                        'python3 -m pip install boto3') from error
-                with translated('reading the AWS configuration'):
-                    self._session = boto3.session.Session()
-            return self._session
-
-    def region(self) -> str:
-        """Return the region that the user's configuration names, '' for none."""
-        return str(os.environ.get('AWS_REGION') or self.session().region_name or '')
+            return self.once('session', _session)
 
     def check_credentials(self) -> None:
-        """
-        Check that there are credentials, without a request to AWS.
-
-        :raises PrerequisiteError: there are none.
-        """
         session = self.session()
         with translated('looking for AWS credentials'):
             with self._lock:
@@ -131,21 +100,20 @@ class Account(vm.Account):
 
         :param hasty: short time-outs and few attempts, because a user waits for the answer.
         """
+        def made() -> Any:
+            session = self.session()
+            from botocore.config import Config
+            config = Config(
+                # ``repeated`` makes them again: nothing can end the pauses of boto3
+                retries={'mode': 'standard', 'total_max_attempts': 1},
+                connect_timeout=3.0 if hasty else CONNECT_TIMEOUT,
+                read_timeout=5.0 if hasty else READ_TIMEOUT,
+                user_agent_extra='fogros2', max_pool_connections=50)
+            with translated(f"reaching AWS's {service}", region):
+                return session.client(service, region_name=region, config=config)
+
         with self._lock:
-            found = self._clients.get((service, region, hasty))
-            if found is None:
-                session = self.session()
-                from botocore.config import Config
-                config = Config(
-                    # ``repeated`` makes them again: nothing can end the pauses of boto3
-                    retries={'mode': 'standard', 'total_max_attempts': 1},
-                    connect_timeout=3.0 if hasty else CONNECT_TIMEOUT,
-                    read_timeout=5.0 if hasty else READ_TIMEOUT,
-                    user_agent_extra='fogros2', max_pool_connections=50)
-                with translated(f"reaching AWS's {service}", region):
-                    found = session.client(service, region_name=region, config=config)
-                self._clients[(service, region, hasty)] = found
-            return found
+            return self.once(f'{service} {region} {hasty}', made)
 
     def call(
         self, service: str, region: str, operation: str, what: str, **parameters: Any,
@@ -154,14 +122,12 @@ class Account(vm.Account):
         Make one call and return its answer.
 
         :param operation: as boto3's method is called.
-        :param what: completes '... in eu-central-1 failed'.
         :raises FogError: see :func:`~fogros2.provider.aws.failures.translated`.
         """
-        def ask(client: Any) -> Mapping[str, Any]:
-            answer: Mapping[str, Any] = getattr(client, operation)(**parameters)
-            return answer
-
-        return self._ask(ask, service, region, operation, what)
+        found: Mapping[str, Any] = self._ask(
+            lambda client: getattr(client, operation)(**parameters), service, region, operation,
+            what)
+        return found
 
     def remove(self, region: str, operation: str, what: str, **parameters: Any) -> None:
         """Make a call of EC2 that deletes something; it may be deleted already."""
@@ -196,3 +162,19 @@ class Account(vm.Account):
                 EncodedMessage=message)
             return str(answer['DecodedMessage'])
         return ''
+
+
+@functools.lru_cache(maxsize=1)
+def _account(*settings: tuple[str, str]) -> Account:
+    """Return the account for these values of AWS's variables."""
+    return Account()
+
+
+def _session() -> Any:
+    try:
+        import boto3
+    except ImportError as error:
+        raise PrerequisiteError('machines at AWS take boto3, which is not installed',
+                                'python3 -m pip install boto3') from error
+    with translated('reading the AWS configuration'):
+        return boto3.session.Session()

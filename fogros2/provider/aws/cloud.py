@@ -4,20 +4,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import os
 import time
-from typing import Any, ClassVar, Optional
+from typing import Any, Optional
 
 from fogros2.errors import MachineNotFound
 from fogros2.model import MachineSpec
 from fogros2.provider.aws import clients, images, instances
 from fogros2.provider.aws.clients import Account
-from fogros2.provider.aws.ending import Ec2Endings
+from fogros2.provider.aws.network import Ec2Network
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import Ec2Prices
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import Order, Place, Vm, VmId
 from fogros2.provider.vm.failures import unless_gone
-from fogros2.provider.vm.options import VmOptions
 from fogros2.provider.vm.regions import read_table, Regions
 
 
@@ -27,20 +27,19 @@ def api_host(region: str) -> str:
     return f'ec2.{region}.amazonaws.com{suffix}'
 
 
-class Ec2(Ec2Prices, images.Ec2Images, Ec2Endings):
+class Ec2(Ec2Prices, images.Ec2Images, Ec2Network):
     """
     EC2 instances, each with its own security group and key pair.
 
     :param account: the AWS account; None for the account of this computer's user.
     """
 
-    name: ClassVar[str] = 'aws'
-    title: ClassVar[str] = 'AWS'
-    options: ClassVar[type[VmOptions]] = Options
-    regions: ClassVar[Regions] = Regions('AWS', read_table(__file__), api_host)
-    id_form: ClassVar[str] = 'i-[0-9a-f]+'
-    base_region: ClassVar[str] = 'us-east-1'
-    regions_variable: ClassVar[str] = 'FOGROS2_AWS_REGIONS'
+    name = 'aws'
+    title = 'AWS'
+    options = Options
+    regions = Regions('AWS', read_table(__file__), api_host)
+    id_form = 'i-[0-9a-f]+'
+    base_region = 'us-east-1'
     configured = staticmethod(clients.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
@@ -58,7 +57,7 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Endings):
         return f'account {told["Account"]}, {str(told["Arn"]).split(":")[-1]}, {region}'
 
     def default_region(self) -> str:
-        return self._account.region()
+        return str(os.environ.get('AWS_REGION') or self._account.session().region_name or '')
 
     def enabled_regions(self) -> list[str]:
         answer = self._account.call(

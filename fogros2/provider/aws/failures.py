@@ -8,14 +8,14 @@ common errors of all AWS services.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 import contextlib
 import json
 import re
-from typing import Any, ClassVar, Optional
+from typing import Any, Optional
 
 from fogros2.errors import FogError, PrerequisiteError, ProviderError
-from fogros2.provider.vm.failures import CodedError, Failure, LENGTH, Silent
+from fogros2.provider.vm.failures import CodedError, Failure, LENGTH, not_the_cloud, Silent
 
 _LOG_IN = 'aws sso login, or new keys: aws configure'
 _QUOTA = 'ask for more at Service Quotas (EC2, in this region), or take another type or region'
@@ -68,11 +68,8 @@ _FAILURES = {
                                      'check security_groups= and subnet=', gone=True),
     'InvalidGroupId.Malformed': Failure('that is no id of a security group',
                                         'security_groups= takes sg-...', gone=True),
-    'InvalidKey.Format': Failure('', 'the login key has to be an Ed25519 or RSA key'),
     'IdempotentParameterMismatch': Failure(
         'another machine was asked for under the same token', 'start the launch again'),
-    'InvalidAMIName.Duplicate': Failure(
-        'there is an image of that name', 'ros2 fog image delete, or another name'),
     # how much of it
     'InsufficientInstanceCapacity': Failure(
         'AWS has no free machine of this type here at the moment',
@@ -94,7 +91,6 @@ _FAILURES = {
     'RulesPerSecurityGroupLimitExceeded': Failure('', 'fewer addresses in ssh_from='),
     'IncorrectInstanceState': Failure('', 'ros2 fog list shows its state'),
     'DependencyViolation': Failure('something uses it still', 'ros2 fog delete again in a minute'),
-    'AddressLimitExceeded': Failure('', _QUOTA),
     # AWS itself
     **dict.fromkeys(('RequestLimitExceeded', 'Throttling', 'ThrottlingException',
                      'RequestThrottled', 'EC2ThrottledException', 'TooManyRequestsException'),
@@ -113,6 +109,20 @@ _FAILURES = {
                      'InvalidVolume.NotFound', 'InvalidAllocationID.NotFound'),
                     Failure(gone=True)),
 }
+#: Errors of botocore without an answer: reason ({} is botocore's own), and hint.
+_UNSENT = {
+    'NoCredentialsError': ('there are no AWS credentials on this computer',
+                           'aws configure, or set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY'),
+    'PartialCredentialsError': ('the AWS credentials are incomplete: {}', 'aws configure'),
+    'ProfileNotFound': ('{}', 'aws configure list-profiles shows them; AWS_PROFILE'),
+    **dict.fromkeys(('SSOError', 'TokenRetrievalError'), (
+        'the AWS login is over: {}', 'aws sso login')),
+    **dict.fromkeys(('CredentialRetrievalError', 'MetadataRetrievalError'), (
+        "the AWS credentials can't be had: {}", 'aws sts get-caller-identity')),
+    **dict.fromkeys(('NoRegionError', 'InvalidRegionError'), (
+        '{}', "region='eu-central-1', or aws configure")),
+    **dict.fromkeys(('ConfigParseError', 'ConfigNotFound'), ('{}', 'check ~/.aws/config')),
+}
 _ACTION = re.compile(r'not authorized to perform:? ([A-Za-z0-9-]+:[A-Za-z0-9*]+)')
 _ENCODED = re.compile(r'[Ee]ncoded authorization failure message: *([\w-]+)')
 
@@ -120,8 +130,8 @@ _ENCODED = re.compile(r'[Ee]ncoded authorization failure message: *([\w-]+)')
 class AwsError(CodedError):
     """AWS refused; ``code`` is its error code."""
 
-    TITLE: ClassVar[str] = 'AWS'
-    FAILURES: ClassVar[Mapping[str, Failure]] = _FAILURES
+    TITLE = 'AWS'
+    FAILURES = _FAILURES
 
 
 @contextlib.contextmanager
@@ -139,27 +149,24 @@ def translated(
     from botocore import exceptions
     from botocore.parsers import ResponseParserError
 
+    where = f'{what} in {region}' if region else what
     try:
         yield
     except exceptions.ClientError as error:
-        raise refused(error.response, error.operation_name, what, region, decode) from error
+        raise refused(error.response, error.operation_name, where, decode) from error
     except ResponseParserError as error:
-        raise PrerequisiteError(
-            f'{what}{f" in {region}" if region else ""} failed: what answered is not AWS',
-            'is there a proxy, or a page to log in to this network?') from error
+        raise not_the_cloud('AWS', where) from error
     except exceptions.BotoCoreError as error:
-        raise _unsent(error, what, region) from error
+        raise _unsent(error, where) from error
 
 
 def refused(
-    response: Any, operation: str, what: str, region: str,
-    decode: Optional[Callable[[str], str]] = None,
+    response: Any, operation: str, where: str, decode: Optional[Callable[[str], str]] = None,
 ) -> FogError:
     """Return the error for a refusal; ``response`` as botocore has it."""
     details = response.get('Error') or {}
     code, said = str(details.get('Code', '')), _plain(str(details.get('Message', '')))
     status = (response.get('ResponseMetadata') or {}).get('HTTPStatusCode', 400)
-    where = f'{what} in {region}' if region else what
     if AwsError.known(code).denied:
         action = denied_action(said, operation, decode)
         return AwsError(f'{where} failed: the policy of these credentials does not allow {action}',
@@ -200,29 +207,15 @@ def denied_action(
     return f'{service}:{operation}'
 
 
-def _unsent(error: BaseException, what: str, region: str) -> FogError:
+def _unsent(error: BaseException, where: str) -> FogError:
     """Return the error for a request without an answer."""
     from botocore import exceptions as known
 
-    where = f'{what} in {region}' if region else what
     said = ' '.join(str(error).split())
-    hints: tuple[tuple[tuple[type[BaseException], ...], str, str], ...] = (
-        ((known.NoCredentialsError,), 'there are no AWS credentials on this computer',
-         'aws configure, or set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY'),
-        ((known.PartialCredentialsError,), f'the AWS credentials are incomplete: {said}',
-         'aws configure'),
-        ((known.ProfileNotFound,), said, 'aws configure list-profiles shows them; AWS_PROFILE'),
-        ((known.SSOError, known.TokenRetrievalError), f'the AWS login is over: {said}',
-         'aws sso login'),
-        ((known.CredentialRetrievalError, known.MetadataRetrievalError),
-         f"the AWS credentials can't be had: {said}", 'aws sts get-caller-identity'),
-        ((known.NoRegionError, known.InvalidRegionError), said or 'no region is named',
-         "region='eu-central-1', or aws configure"),
-        ((known.ConfigParseError, known.ConfigNotFound), said, 'check ~/.aws/config'),
-    )
-    for kinds, reason, hint in hints:
-        if isinstance(error, kinds):
-            return PrerequisiteError(f'{where} failed: {reason}', hint)
+    for kind in type(error).__mro__:
+        if kind.__name__ in _UNSENT:
+            reason, hint = _UNSENT[kind.__name__]
+            return PrerequisiteError(f'{where} failed: {reason.format(said)}', hint)
     if isinstance(error, (known.HTTPClientError, known.ConnectionError)):
         return Silent(
             f'{where} failed: AWS does not answer: {said}',

@@ -22,18 +22,14 @@ from fogros2.provider.vm.images import check_baked, image_parts, image_tags
 
 #: Public parameters of AWS's parameter store, by architecture; ROS 2 Jazzy is for Ubuntu 24.04.
 UBUNTU = {
-    'x86_64': '/aws/service/canonical/ubuntu/server/24.04/stable/current/amd64/hvm/ebs-gp3/ami-id',
-    'arm64': '/aws/service/canonical/ubuntu/server/24.04/stable/current/arm64/hvm/ebs-gp3/ami-id',
-}
+    arch: f'/aws/service/canonical/ubuntu/server/24.04/stable/current/{name}/hvm/ebs-gp3/ami-id'
+    for arch, name in (('x86_64', 'amd64'), ('arm64', 'arm64'))}
 #: The name of its disk.
 ROOT_DEVICE = '/dev/sda1'
 #: The same with NVIDIA's driver in it.
 DEEP_LEARNING = {
-    'x86_64': '/aws/service/deeplearning/ami/x86_64/'
-              'base-oss-nvidia-driver-gpu-ubuntu-24.04/latest/ami-id',
-    'arm64': '/aws/service/deeplearning/ami/arm64/'
-             'base-oss-nvidia-driver-gpu-ubuntu-24.04/latest/ami-id',
-}
+    arch: f'/aws/service/deeplearning/ami/{arch}/base-oss-nvidia-driver-gpu-ubuntu-24.04/'
+          'latest/ami-id' for arch in UBUNTU}
 _STATES = {'invalid': 'failed', 'error': 'failed', 'transient': 'pending'}
 
 
@@ -43,34 +39,20 @@ def kinds(account: Account, region: str, names: list[str]) -> list[MachineType]:
 
     :raises ConfigurationError: it has none of them.
     """
-    try:
-        found = {entry['InstanceType']: entry for entry in account.call(
-            'ec2', region, 'describe_instance_types',
-            f'looking for the instance type {" or ".join(names)}',
-            InstanceTypes=names)['InstanceTypes']}
-    except AwsError as error:
-        if error.code != 'InvalidInstanceType':
-            raise
-        if len(names) > 1:
-            # one unknown type is an error for all of them
-            alone = [_kinds_if_any(account, region, name) for name in names]
-            some = [kind for each in alone for kind in each]
-            if some:
-                return some
-        raise ConfigurationError(str(error.args[0]), error.hint) from error
-    types = [instance_type(found[name]) for name in names if name in found]
-    fitting = [kind for kind in types if kind is not None]
+    found = {entry['InstanceType']: instance_type(entry) for entry in account.call(
+        'ec2', region, 'describe_instance_types',
+        f'looking for the instance type {" or ".join(names)}',
+        # a filter, because one unknown name among InstanceTypes is an error for all
+        Filters=[{'Name': 'instance-type', 'Values': names}])['InstanceTypes']}
+    if not found:
+        raise ConfigurationError(
+            f'looking for the instance type {" or ".join(names)} in {region} failed: the region '
+            'has no such instance type', 'ros2 fog price shows what it has')
+    fitting = [kind for name in names if (kind := found.get(name)) is not None]
     if not fitting:
         raise ConfigurationError(f'machines of the type {" or ".join(names)} run no Ubuntu',
                                  'take one with an x86_64 or arm64 processor')
     return fitting
-
-
-def _kinds_if_any(account: Account, region: str, name: str) -> list[MachineType]:
-    try:
-        return kinds(account, region, [name])
-    except ConfigurationError:
-        return []
 
 
 def has_nvidia(kind: MachineType) -> bool:

@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-import datetime
 import re
 from typing import Any, Optional
 
 from fogros2.model import MachineSpec, MachineState
 from fogros2.provider.aws.options import Options
-from fogros2.provider.vm.cloud import Order, own_name, Place, TAG_ATTEMPT, TAG_DISK, Vm
+from fogros2.provider.vm.cloud import Order, own_name, Place, TAG_ATTEMPT, TAG_DISK, Vm, when
 
 STATES = {
     'pending': MachineState.PENDING,
@@ -62,18 +61,15 @@ def tags_of(entry: Mapping[str, Any]) -> dict[str, str]:
 
 def tag_filters(tags: Mapping[str, str]) -> list[dict[str, Any]]:
     """Return filters for FogROS2's resources with all of ``tags``."""
-    return [{'Name': 'tag-key', 'Values': [TAG_ATTEMPT]},
-            *({'Name': f'tag:{key}', 'Values': [_literal(value)]} for key, value in tags.items())]
+    # a filter's value has * and ? as wildcards
+    return [{'Name': 'tag-key', 'Values': [TAG_ATTEMPT]}, *(
+        {'Name': f'tag:{key}', 'Values': [re.sub(r'([*?\\])', r'\\\1', value)]}
+        for key, value in tags.items())]
 
 
 def in_states(states: Iterable[str]) -> dict[str, Any]:
     """Return the filter for instances in these states."""
     return {'Name': 'instance-state-name', 'Values': list(states)}
-
-
-def _literal(text: str) -> str:
-    r"""Escape ``*``, ``?`` and ``\`` in the value of a filter."""
-    return re.sub(r'([*?\\])', r'\\\1', text)
 
 
 def run_request(
@@ -159,11 +155,10 @@ def address_of(instance: Mapping[str, Any]) -> str:
 
     Without a public address it is the private one, to which the user has made a route.
     """
-    for interface in instance.get('NetworkInterfaces') or ():
-        for address in interface.get('Ipv6Addresses') or ():
-            if not instance.get('PublicIpAddress'):
-                return str(address['Ipv6Address'])
-    return str(instance.get('PublicIpAddress') or instance.get('PrivateIpAddress') or '')
+    six = [address['Ipv6Address'] for interface in instance.get('NetworkInterfaces') or ()
+           for address in interface.get('Ipv6Addresses') or ()]
+    return str(instance.get('PublicIpAddress') or next(iter(six), '')
+               or instance.get('PrivateIpAddress') or '')
 
 
 def own_disks(instance: Mapping[str, Any]) -> set[str]:
@@ -176,8 +171,8 @@ def own_disks(instance: Mapping[str, Any]) -> set[str]:
 def reason_of(instance: Mapping[str, Any]) -> str:
     """Return why an instance ended, in EC2's words."""
     reason = instance.get('StateReason') or {}
-    words = [str(reason.get('Message') or ''), str(reason.get('Code') or '')]
-    return next((word for word in words if word), str(instance.get('StateTransitionReason') or ''))
+    return str(reason.get('Message') or reason.get('Code')
+               or instance.get('StateTransitionReason') or '')
 
 
 def instances_in(reservations: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -187,7 +182,4 @@ def instances_in(reservations: Iterable[Mapping[str, Any]]) -> list[Mapping[str,
 
 def _stopped(instance: Mapping[str, Any]) -> Optional[float]:
     found = _STOPPED.search(str(instance.get('StateTransitionReason') or ''))
-    if found is None:
-        return None
-    when = datetime.datetime.strptime(found[1], '%Y-%m-%d %H:%M:%S')
-    return when.replace(tzinfo=datetime.timezone.utc).timestamp()
+    return when(f'{found[1]}Z') if found else None

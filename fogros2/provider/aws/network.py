@@ -1,26 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A machine's own security group, the firewall that decides who reaches it, and its login key.
+What a machine has besides its instance: security group (the firewall) and login key; its end.
 
 Each machine has its own group. So a launch can close the SSH port of one machine while it needs
-another's, and the group can be deleted with its machine.
+another's, and the group can be deleted with its machine. An instance without the machine's tag
+is never ended.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, Optional
 
 from fogros2.errors import ConfigurationError, ProviderError
+from fogros2.provider.aws import instances
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.failures import AwsError
-from fogros2.provider.aws.instances import tag_list, tags_of
-from fogros2.provider.vm.cloud import Order, own_name, TAG_SSH_FROM, VmCloud, VmId
+from fogros2.provider.vm.cloud import Order, own_name, TAG_ATTEMPT, TAG_SSH_FROM, VmCloud, VmId
 from fogros2.provider.vm.failures import tolerated
 from fogros2.provider.vm.options import cidr, SSH
 from fogros2.waiting import wait_until
 
+#: Time-out in seconds for the end of an instance; usually it takes half a minute.
+TIMEOUT = 300.0
 #: Sources of WireGuard's port: robots and machines roam, and WireGuard answers only known keys.
 ANYONE = {'IpRanges': [{'CidrIp': '0.0.0.0/0'}], 'Ipv6Ranges': [{'CidrIpv6': '::/0'}]}
 
@@ -45,7 +48,7 @@ def sources_of(group: Mapping[str, Any], port: int) -> set[str]:
 
 
 class Ec2Network(VmCloud):
-    """The part of EC2 that has groups, keys and subnets."""
+    """The part of EC2 that has groups, keys and subnets, and deletes machines."""
 
     _account: Account
 
@@ -65,7 +68,8 @@ class Ec2Network(VmCloud):
                 f"importing the login key of '{order.spec.name}'",
                 KeyName=own_name(order.attempt),
                 PublicKeyMaterial=order.request.authorized_key.encode(),
-                TagSpecifications=[{'ResourceType': 'key-pair', 'Tags': tag_list(order.tags)}])
+                TagSpecifications=[{
+                    'ResourceType': 'key-pair', 'Tags': instances.tag_list(order.tags)}])
 
     def _create_group(self, region: str, order: Order, vpc: str) -> str:
         """Create a machine's group and return its id; reuse that of an earlier attempt."""
@@ -75,7 +79,7 @@ class Ec2Network(VmCloud):
                 'ec2', region, 'create_security_group', f"making the security group of '{name}'",
                 GroupName=own_name(order.attempt), Description=f'FogROS2 machine {name}', **where,
                 TagSpecifications=[{
-                    'ResourceType': 'security-group', 'Tags': tag_list(order.tags)}],
+                    'ResourceType': 'security-group', 'Tags': instances.tag_list(order.tags)}],
             )['GroupId'])
         return str(self._groups(region, order.attempt)[0]['GroupId'])
 
@@ -149,7 +153,7 @@ class Ec2Network(VmCloud):
                                 'ros2 fog list shows whether it is there')
         wanted = {cidr(source) for source in sources}
         if wanted and port == SSH:
-            wanted |= set(tags_of(groups[0]).get(TAG_SSH_FROM, '').split())
+            wanted |= set(instances.tags_of(groups[0]).get(TAG_SSH_FROM, '').split())
         now = sources_of(groups[0], port)
         for operation, what, networks, repeated in (
                 ('authorize_security_group_ingress', 'opening', wanted - now,
@@ -188,3 +192,97 @@ class Ec2Network(VmCloud):
                 Filters=[{'Name': 'default-for-az', 'Values': ['true']}])['Subnets']
             yield from (str(subnet['SubnetId']) for subnet in sorted(
                 found, key=lambda entry: str(entry['AvailabilityZone'])))
+
+    # -- its end --------------------------------------------------------------------------------
+
+    def delete(self, machine: VmId) -> None:
+        # no look-up is needed for what this process has created
+        if (machine.vm in self._account.made or self._there(machine)) \
+                and self._terminate(machine):
+            wait_until(
+                lambda: not self._there(machine), timeout=TIMEOUT, first=1.5, interval=3.0,
+                longest=15.0, hint='ros2 fog delete again later',
+                what=f'{machine.vm} in {machine.region} to be terminated')
+        self._account.made.pop(machine.vm, None)
+        self._account.doors.pop(machine.attempt, None)
+        # EC2 reports these for a while, although they are being deleted
+        gone = self._account.disks.pop(machine.vm, set())
+        self.sweep(machine.region, machine.attempt, gone=gone)
+
+    def _terminate(self, machine: VmId) -> bool:
+        """Terminate an instance; return whether its end has to be awaited."""
+        def ask() -> Optional[list[Mapping[str, Any]]]:
+            try:
+                return list(self._account.call(
+                    'ec2', machine.region, 'terminate_instances', f'ending {machine.vm}',
+                    InstanceIds=[machine.vm])['TerminatingInstances'])
+            except AwsError as error:
+                if not error.gone:
+                    raise
+                # EC2 may not report a new instance yet, which would continue to run
+                return None if self._account.just_made(machine.vm) else []
+
+        told = wait_until(ask, timeout=TIMEOUT, interval=1.0, longest=5.0,
+                          what=f'{machine.vm} in {machine.region} to be known')
+        return any(entry['CurrentState']['Name'] != 'terminated' for entry in told)
+
+    def _there(self, machine: VmId) -> bool:
+        # filters: an id that EC2 does not know would be an error
+        found = self._instances(
+            machine.region, {TAG_ATTEMPT: machine.attempt}, f'watching {machine.vm} end',
+            {'Name': 'instance-id', 'Values': [machine.vm]})
+        for instance in found:
+            self._account.disks.setdefault(machine.vm, set()).update(
+                instances.own_disks(instance))
+        return any(instance['State']['Name'] != 'terminated' for instance in found)
+
+    def _instances(
+        self, region: str, tags: Mapping[str, str], what: str, *filters: Mapping[str, Any],
+    ) -> list[Mapping[str, Any]]:
+        """Return the instances of FogROS2 with all of ``tags``, in EC2's form."""
+        return instances.instances_in(self._account.pages(
+            'ec2', region, 'describe_instances', 'Reservations', what,
+            Filters=[*instances.tag_filters(tags), *filters]))
+
+    def sweep(self, region: str, attempt: str, *, gone: Collection[str] = ()) -> None:
+        account = self._account
+        self._drop_key(region, attempt)
+        left = [str(entry['ResourceId']) for entry in account.pages(
+            'ec2', region, 'describe_tags', 'Tags', 'looking for what is left',
+            Filters=[{'Name': 'key', 'Values': [TAG_ATTEMPT]},
+                     {'Name': 'value', 'Values': [attempt]}])]
+        # EC2 reports tags a little late; the group's name is reliable
+        self._drop_groups(region, attempt, [each for each in left if each.startswith('sg-')],
+                          timeout=TIMEOUT)
+        for address in left:
+            if address.startswith('eipalloc-'):
+                account.remove(region, 'release_address', 'releasing an address',
+                               AllocationId=address)
+        found: Iterable[Mapping[str, Any]] = account.call(
+            'ec2', region, 'describe_volumes', 'looking for disks',
+            Filters=[{'Name': f'tag:{TAG_ATTEMPT}', 'Values': [attempt]},
+                     {'Name': 'status', 'Values': ['available', 'error']}],
+        )['Volumes'] if any(each.startswith('vol-') and each not in gone for each in left) else ()
+        for disk in found:
+            account.remove(region, 'delete_volume', 'deleting a disk', VolumeId=disk['VolumeId'])
+
+    def end_attempt(self, region: str, attempt: str) -> None:
+        found = self._instances(region, {TAG_ATTEMPT: attempt}, 'looking for what was made',
+                                instances.in_states(instances.ALIVE))
+        if found:
+            self._account.remove(region, 'terminate_instances', 'ending what was made',
+                                 InstanceIds=[instance['InstanceId'] for instance in found])
+
+    def remains(self, region: str) -> list[dict[str, str]]:
+        # the end of a machine deletes its disk and address, but not its group and key
+        entries = [
+            *self._account.pages('ec2', region, 'describe_security_groups', 'SecurityGroups',
+                                 'looking for what is left', Filters=instances.tag_filters({})),
+            *self._account.call('ec2', region, 'describe_key_pairs', 'looking for what is left',
+                                Filters=instances.tag_filters({}))['KeyPairs']]
+        return [instances.tags_of(entry) for entry in entries]
+
+    def attempts(self, region: str) -> list[str]:
+        return [instances.tags_of(found)[TAG_ATTEMPT] for found in self._instances(
+            region, {}, 'looking for machines',
+            instances.in_states([*instances.ALIVE, 'shutting-down']))]

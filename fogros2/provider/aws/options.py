@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 import dataclasses
 import re
-from typing import ClassVar
 
 from fogros2.errors import ConfigurationError
 from fogros2.provider.vm.options import VmOptions
@@ -14,17 +12,7 @@ from fogros2.provider.vm.options import VmOptions
 
 @dataclasses.dataclass(frozen=True)
 class Options(VmOptions):
-    """
-    Options of an EC2 instance, in addition to those of every virtual machine.
-
-    :param ami_image: id of an image; '' for one that was baked with the same dependencies, else
-        Ubuntu 24.04 (with NVIDIA's driver for a type that has its GPUs).
-    :param ec2_instance_type: 't3.medium', or 'cheapest' that meets the requirements.
-    :param instance_types: further types to try, in this order, if there is no capacity for one.
-    :param iam_instance_profile: name or ARN of the profile with the instance's own AWS rights.
-    :param subnet: id; '' for one of the default VPC.
-    :param security_groups: ids of groups in addition to the instance's own.
-    """
+    """Options of an EC2 instance; see :class:`~fogros2.AWSCloudInstance`."""
 
     ami_image: str = ''
     ec2_instance_type: str = ''
@@ -33,15 +21,15 @@ class Options(VmOptions):
     subnet: str = ''
     security_groups: tuple[str, ...] = ()
 
-    WHAT: ClassVar[str] = 'a machine at AWS'
-    TYPE: ClassVar[str] = 'ec2_instance_type'
-    TYPES: ClassVar[str] = 'instance_types'
-    DEFAULT_TYPE: ClassVar[str] = 't3.medium'
-    IMAGE: ClassVar[str] = 'ami_image'
-    BY_REGION: ClassVar[tuple[str, ...]] = ('ami_image', 'ec2_instance_type', 'subnet')
-    IN_ONE_REGION: ClassVar[tuple[str, ...]] = ('subnet',)
-    RESERVED: ClassVar[tuple[str, ...]] = ('aws:', 'fogros2-')
-    FORMS: ClassVar[Mapping[str, tuple[str, str]]] = {
+    WHAT = 'a machine at AWS'
+    TYPE = 'ec2_instance_type'
+    TYPES = 'instance_types'
+    DEFAULT_TYPE = 't3.medium'
+    IMAGE = 'ami_image'
+    BY_REGION = ('ami_image', 'ec2_instance_type', 'subnet')
+    IN_ONE_REGION = ('subnet',)
+    RESERVED = ('aws:', 'fogros2-')
+    FORMS = {
         'region': (r'nearest|[a-z]{2,4}(-[a-z]+)+-\d+', "'eu-central-1' or 'nearest'"),
         'ec2_instance_type': (r'cheapest|[a-z0-9-]+\.[a-z0-9-]+', "'t3.medium' or 'cheapest'"),
         'ami_image': (r'ami-[0-9a-f]+', 'ami-...'),

@@ -71,7 +71,6 @@ class Ec2Prices(VmCloud):
         self, region: str, names: Optional[Sequence[str]],
     ) -> dict[str, dict[str, Decimal]]:
         found: dict[str, dict[str, Decimal]] = {}
-        newest: dict[tuple[str, str], float] = {}
         # a history from now on has only the current prices
         arguments: dict[str, Any] = {
             'StartTime': time.time(), 'ProductDescriptions': [SPOT_PRODUCT]}
@@ -80,11 +79,9 @@ class Ec2Prices(VmCloud):
         for entry in self._account.pages(
                 'ec2', region, 'describe_spot_price_history', 'SpotPriceHistory',
                 'asking for the spot prices', **arguments):
-            name, zone = entry['InstanceType'], entry['AvailabilityZone']
-            when = entry['Timestamp'].timestamp()
-            if when >= newest.get((name, zone), when):
-                newest[name, zone] = when
-                found.setdefault(name, {})[zone] = Decimal(entry['SpotPrice'])
+            # should there be more, the newest comes first
+            found.setdefault(entry['InstanceType'], {}).setdefault(
+                entry['AvailabilityZone'], Decimal(entry['SpotPrice']))
         return found
 
 

@@ -8,7 +8,7 @@ import json
 import os
 from pathlib import Path
 import threading
-from typing import Any, ClassVar, Optional
+from typing import Any, Optional
 
 from fogros2.errors import FogError, PrerequisiteError, ProviderError
 from fogros2.provider.azure.failures import refusal
@@ -65,38 +65,29 @@ def subscription() -> str:
 
 
 class Account(RestAccount):
-    """
-    The user's account, as azure-identity finds it.
+    """The user's account, with the usual chain of credentials of azure-identity."""
 
-    :param credential: an azure-identity credential; None for the usual chain, made when needed.
-    """
+    TITLE = 'Azure'
+    ENDPOINT_VARIABLE = ENDPOINT_VARIABLE
 
-    TITLE: ClassVar[str] = 'Azure'
-    ENDPOINT_VARIABLE: ClassVar[str] = ENDPOINT_VARIABLE
-
-    def __init__(self, credential: Optional[Any] = None) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self._credential = credential
         self._lock = threading.Lock()
-        #: Machines that this process has just created, as Azure reports them.
-        self.seen: dict[str, Mapping[str, Any]] = {}
 
     def credential(self) -> Any:
         """
-        Return the credential.
+        Return the credential, made when first needed.
 
         :raises PrerequisiteError: azure-identity is not installed.
         """
+        try:
+            from azure.identity import DefaultAzureCredential
+        except ImportError as error:
+            raise PrerequisiteError(
+                'machines at Azure take azure-identity, which is not installed',
+                'python3 -m pip install azure-identity requests') from error
         with self._lock:
-            if self._credential is None:
-                try:
-                    from azure.identity import DefaultAzureCredential
-                except ImportError as error:
-                    raise PrerequisiteError(
-                        'machines at Azure take azure-identity, which is not installed',
-                        'python3 -m pip install azure-identity requests') from error
-                self._credential = DefaultAzureCredential()
-            return self._credential
+            return self.once('credential', DefaultAzureCredential)
 
     def path(self, group: str = '', rest: str = '') -> str:
         """Return the path of a resource of a group, or of the subscription."""
@@ -111,7 +102,6 @@ class Account(RestAccount):
         Make one request and return the answer's JSON, None if it has none.
 
         :param path: below the endpoint, without the version.
-        :param what: completes '... failed'.
         :param wait: until a long-running operation is over.
         :raises FogError: see :func:`~fogros2.provider.azure.failures.refusal`.
         """

@@ -12,21 +12,19 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
-import dataclasses
 from decimal import Decimal
 import os
 import time
-from typing import Any, ClassVar, Optional
+from typing import Any, Optional
 
 from fogros2.errors import ConfigurationError, FogError, MachineNotFound, ProviderError
 from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_EXPIRES
 from fogros2.provider.azure import ending, images, machines, prices
-from fogros2.provider.azure.account import Account, configured, subscription
+from fogros2.provider.azure.account import Account, configured, endpoint, subscription
 from fogros2.provider.azure.failures import refusal
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
-from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import (
     Order,
     own_name,
@@ -39,7 +37,7 @@ from fogros2.provider.vm.cloud import (
     VmId,
 )
 from fogros2.provider.vm.failures import unless_gone
-from fogros2.provider.vm.options import ipv4, SSH, VmOptions
+from fogros2.provider.vm.options import ipv4, SSH
 from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import wait_until
 
@@ -60,21 +58,17 @@ class Azure(prices.AzurePrices, images.AzureImages):
     :param account: None for the account of this computer's user.
     """
 
-    name: ClassVar[str] = 'azure'
-    title: ClassVar[str] = 'Azure'
-    options: ClassVar[type[VmOptions]] = Options
-    regions: ClassVar[Regions] = Regions(
-        'Azure', read_table(__file__),
-        lambda region: f'{region}.handler.control.monitor.azure.com')
-    id_form: ClassVar[str] = 'fogros2-[0-9a-f]{16}-[0-9a-f]{8}'
-    base_region: ClassVar[str] = 'westeurope'
-    regions_variable: ClassVar[str] = 'FOGROS2_AZURE_REGIONS'
+    name = 'azure'
+    title = 'Azure'
+    options = Options
+    regions = Regions('Azure', read_table(__file__),
+                      lambda region: f'{region}.handler.control.monitor.azure.com')
+    id_form = 'fogros2-[0-9a-f]{16}-[0-9a-f]{8}'
+    base_region = 'westeurope'
     configured = staticmethod(configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
         self._account = account or _USUAL
-        #: Notes about machines that this process has created, for people.
-        self._notes: dict[str, str] = {}
 
     # -- the account ----------------------------------------------------------------------------
 
@@ -93,12 +87,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
         return named.lower().replace(' ', '')  # 'West Europe', too
 
     def searched_regions(self) -> list[str]:
-        """Return '': one request answers for all regions."""
         return ['']
-
-    def named_types(self, region: str, names: Sequence[str]) -> list[MachineType]:
-        sizes = self.sizes(region)
-        return [prices.machine_type(sizes[name]) for name in names if name in sizes]
 
     # -- machines -------------------------------------------------------------------------------
 
@@ -122,16 +111,15 @@ class Azure(prices.AzurePrices, images.AzureImages):
                 for entry in found]
 
     def get(self, region: str, vm: str) -> Optional[Vm]:
-        # what insert has just seen is reported once
-        entry = self._account.seen.pop(vm, {})
+        entry: Mapping[str, Any] = {}
         with unless_gone():
-            entry = entry or self._entry(vm)
+            entry = self._entry(vm)
         if not entry:
             raise MachineNotFound(f'there is no {vm} in {region} any more')
         found = machines.vm_of(entry)
         if found.state is MachineState.DELETED:
             raise MachineNotFound(f'{vm} in {region} is being deleted')
-        return dataclasses.replace(found, note=self._notes.get(vm, ''))
+        return found
 
     def _entry(self, vm: str) -> Mapping[str, Any]:
         found: Mapping[str, Any] = self._account.call(
@@ -198,7 +186,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
         except FogError:
             # the next place has a group of its own; what stays is undone at the end, or by gc
             with contextlib.suppress(FogError):
-                self.lasting()._drop(order.attempt, [name], empty=[name])
+                self.until(None)._drop_groups(order.attempt, [name])
             raise
         return name
 
@@ -240,8 +228,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
         what = f"creating '{order.spec.name}' ({place.kind})"
         self._account.call('PUT', self._vm(name), what,
                            machines.request(place, order, known, str(nic['id']), tags))
-        entry = self._account.seen[name] = self._allocated(name, what)
-        self._guard(name, place.region, order, known, entry)
+        self._guard(name, place.region, order, known, self._allocated(name, what))
         if known.nvidia:
             self._install_driver(name, place.region)
 
@@ -270,10 +257,10 @@ class Azure(prices.AzurePrices, images.AzureImages):
         first = ending.schedule(self._account, name, region, end)
         price = Decimal(entry['tags'].get(TAG_PRICE, 0)) * int(first - time.time()) / 3600
         worst = f', at most ${price:.2f}' if price else ''
-        self._notes[name] = (
+        self.notes[name] = [
             'if this robot vanishes, the machine powers itself off and is billed until Azure '
             f'deallocates it at {time.strftime("%H:%M UTC", time.gmtime(first))}{worst} '
-            '(doc/azure.md)')
+            '(doc/azure.md)']
 
     def _install_driver(self, name: str, region: str) -> None:
         """Install NVIDIA's driver on a machine that runs, without waiting."""
@@ -298,37 +285,36 @@ class Azure(prices.AzurePrices, images.AzureImages):
                 if (found := (group.get('tags') or {}).get(TAG_ATTEMPT, ''))
                 and attempt in ('', found) and str(group['name']).startswith(own_name(found))]
 
-    def _drop(
-        self, attempt: str, names: Iterable[str] = (), *, wait: bool = False,
-        empty: Optional[Collection[str]] = None,
-    ) -> None:
+    def _drop(self, attempt: str, names: Iterable[str] = (), *, wait: bool = False) -> None:
         """
-        Delete the groups of an attempt with everything in them.
+        Delete all groups of an attempt with everything in them.
 
         :param names: groups that a list may not have yet.
-        :param empty: only these of the groups.
-        :raises ProviderError: a group of this name is not FogROS2's, and stays.
         """
         listed = {str(group['name']) for group in self._groups(attempt)}
+        self._drop_groups(attempt, {*names, *listed}, wait=wait)
 
+    def _drop_groups(self, attempt: str, names: Collection[str], *, wait: bool = False) -> None:
+        """
+        Delete groups with everything in them.
+
+        :raises ProviderError: a group of this name is not FogROS2's, and stays.
+        """
         def drop(name: str) -> None:
             path = self._account.path(name)
             with unless_gone():
-                tags = {} if name in listed else self._account.call(
-                    'GET', path, f'looking for the group {name}').get('tags') or {}
-                if name not in listed and tags.get(TAG_ATTEMPT) != attempt:
+                found = self._account.call('GET', path, f'looking for the group {name}')
+                if (found.get('tags') or {}).get(TAG_ATTEMPT) != attempt:
                     raise ProviderError(f'the group {name} has no tag of FogROS2, and stays',
                                         'FogROS2 deletes only groups that it created')
                 self._account.delete(
                     path, f'deleting the group {name}', wait=wait,
                     query={'forceDeletionTypes': 'Microsoft.Compute/virtualMachines'})
 
-        chosen = sorted(name for name in {*names, *listed} if empty is None or name in empty)
-        with ThreadPoolExecutor(max(1, min(8, len(chosen))), 'fog-azure') as pool:
-            list(pool.map(drop, chosen))
+        with ThreadPoolExecutor(8, 'fog-azure') as pool:
+            list(pool.map(drop, names))
 
     def delete(self, machine: VmId) -> None:
-        self._account.seen.pop(machine.vm, None)
         self._drop(machine.attempt, [machine.vm], wait=True)
 
     def end_attempt(self, region: str, attempt: str) -> None:
@@ -338,14 +324,14 @@ class Azure(prices.AzurePrices, images.AzureImages):
         """Return the tags of the groups in which no machine is left, as after an eviction."""
         return [group['tags'] for group in self._empty(region)]
 
-    def _empty(self, region: str) -> list[Mapping[str, Any]]:
+    def _empty(self, region: str, attempt: str = '') -> list[Mapping[str, Any]]:
         there = {str(entry['id']).split('/')[4].lower() for entry in self._all('')}
-        return [group for group in self._groups() if prices.is_in(group, region)
+        return [group for group in self._groups(attempt) if prices.is_in(group, region)
                 and str(group['name']).lower() not in there]
 
     def sweep(self, region: str, attempt: str) -> None:
         """Delete the groups of an attempt that have no machine."""
-        self._drop(attempt, empty=[str(group['name']) for group in self._empty(region)])
+        self._drop_groups(attempt, [str(one['name']) for one in self._empty(region, attempt)])
 
     # -- changes of a machine -------------------------------------------------------------------
 
@@ -377,7 +363,6 @@ class Azure(prices.AzurePrices, images.AzureImages):
                             time.time() + spec.lifetime)
 
     def stop(self, machine: VmId) -> None:
-        self._account.seen.pop(machine.vm, None)
         self._account.call('POST', self._vm(machine.vm, '/deallocate'), f'stopping {machine.vm}')
 
     def start(self, machine: VmId) -> None:
@@ -385,7 +370,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
                            wait=True)
 
     def end_command(self, tags: Mapping[str, str]) -> tuple[str, ...]:
-        return ending.end_command()
+        return (*ending.END, endpoint())
 
     # -- images ---------------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ from typing import Any
 import uuid
 
 from fogros2.errors import DeadlineExceeded, FogError
-from fogros2.provider.azure.account import Account, endpoint, subscription
+from fogros2.provider.azure.account import Account, subscription
 from fogros2.provider.azure.failures import AzureError
 from fogros2.waiting import Periodic, wait_until
 
@@ -29,9 +29,10 @@ ROLE = 20.0
 #: Seconds before which a schedule of a time of day has to be set anew.
 DAY = 86400.0 - 3600.0
 
-# The agent runs the command again when it fails. A role needs minutes until it works (403), and a
-# machine without an identity gets no token (400): such a machine can only power itself off.
-_END = """\
+#: With the API's address as argument, ends the machine, and its billing if it can. The agent runs
+#: the command again when it fails. A role needs minutes until it works (403), and a machine
+#: without an identity gets no token (400): such a machine can only power itself off.
+END = ('python3', '-ISc', """\
 import json, sys, subprocess, urllib.error, urllib.request
 meta = 'http://169.254.169.254/metadata/'
 def ask(url, method='GET', **head):
@@ -56,7 +57,7 @@ except urllib.error.HTTPError as error:
 except OSError:
     sys.exit(1)
 subprocess.run(['shutdown', '-h', 'now'])
-"""
+""")
 
 _NOTICE = """\
 import json, sys, urllib.request
@@ -73,11 +74,6 @@ sys.exit(not found)
 """
 #: Its success is the notice of a spot machine's eviction, and its output has the time.
 NOTICE = ('python3', '-ISc', _NOTICE)
-
-
-def end_command() -> tuple[str, ...]:
-    """Return the command by which a machine ends itself, and its billing if it can."""
-    return ('python3', '-ISc', _END, endpoint())
 
 
 def may_assign(account: Account) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import re
-from typing import Any, ClassVar
+from typing import Any
 
 from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.vm.failures import CodedError, Failure, one_line
@@ -62,8 +62,8 @@ _FAILURES = {
 class AzureError(CodedError):
     """Azure refused; ``code`` is its error code."""
 
-    TITLE: ClassVar[str] = 'Azure'
-    FAILURES: ClassVar[Mapping[str, Failure]] = _FAILURES
+    TITLE = 'Azure'
+    FAILURES = _FAILURES
 
 
 def refusal(status: int, body: Any, what: str) -> FogError:

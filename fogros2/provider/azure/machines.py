@@ -137,18 +137,14 @@ def vm_of(entry: Mapping[str, Any], statuses: Sequence[Mapping[str, Any]] = ()) 
         state = MachineState.PENDING  # asked to start
     image = properties.get('storageProfile', {}).get('imageReference', {})
     group = str(entry['id']).split('/')[4]
+    private_ip, _, network = tags.get(TAG_PRIVATE, '').partition(' ')
     return Vm(
         # the machine's own name is that of its group
         group.lower(), region_of(entry), state, tags, billed=words.get('PowerState') == 'stopped',
         kind=str(properties.get('hardwareProfile', {}).get('vmSize', '')),
         spot=properties.get('priority') == 'Spot', address=tags.get(TAG_ADDRESS, ''),
-        private_network=_network(tags), private_ip=tags.get(TAG_PRIVATE, '').partition(' ')[0],
+        private_network=network and f'azure:{network}', private_ip=private_ip,
         created=when(properties.get('timeCreated')),
         image=str(image.get('id') or ':'.join(filter(None, (
             str(image.get(part, '')) for part in ('publisher', 'offer', 'sku', 'version'))))),
         reason='; '.join(str(status['message']) for status in statuses if status.get('message')))
-
-
-def _network(tags: Mapping[str, str]) -> str:
-    network = tags.get(TAG_PRIVATE, '').partition(' ')[2]
-    return f'azure:{network}' if network else ''

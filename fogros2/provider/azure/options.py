@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 import dataclasses
 import re
-from typing import ClassVar
 
 from fogros2.errors import ConfigurationError
 from fogros2.provider.vm.options import VmOptions
@@ -18,28 +16,20 @@ _PART = r'[\w.-]+'
 
 @dataclasses.dataclass(frozen=True)
 class Options(VmOptions):
-    """
-    Options of a machine at Azure, in addition to those of every virtual machine.
-
-    :param image: 'publisher:offer:sku:version' of the Marketplace, or the resource id of an
-        image; '' for one that was baked with the same dependencies, else Ubuntu 24.04.
-    :param vm_size: 'Standard_B2als_v2', or 'cheapest' that meets the requirements.
-    :param vm_sizes: further sizes to try, in this order, if there is no capacity for one.
-    :param resource_group: the user's own group, whose virtual network the machine joins.
-    """
+    """Options of a machine at Azure; see :class:`~fogros2.AzureCloudInstance`."""
 
     image: str = ''
     vm_size: str = ''
     vm_sizes: tuple[str, ...] = ()
     resource_group: str = ''
 
-    WHAT: ClassVar[str] = 'a machine at Azure'
-    TYPE: ClassVar[str] = 'vm_size'
-    TYPES: ClassVar[str] = 'vm_sizes'
-    DEFAULT_TYPE: ClassVar[str] = 'Standard_B2als_v2'
-    BY_REGION: ClassVar[tuple[str, ...]] = ('image', 'vm_size')
-    RESERVED: ClassVar[tuple[str, ...]] = ('microsoft', 'azure', 'windows', 'fogros2-')
-    FORMS: ClassVar[Mapping[str, tuple[str, str]]] = {
+    WHAT = 'a machine at Azure'
+    TYPE = 'vm_size'
+    TYPES = 'vm_sizes'
+    DEFAULT_TYPE = 'Standard_B2als_v2'
+    BY_REGION = ('image', 'vm_size')
+    RESERVED = ('microsoft', 'azure', 'windows', 'fogros2-')
+    FORMS = {
         'region': (r'nearest|[a-z]+[0-9]?', "'westeurope' or 'nearest'"),
         'vm_size': (r'cheapest|[A-Z][A-Za-z0-9]*_[A-Za-z0-9_-]+', "'Standard_B2als_v2'"),
         'image': (rf'{OLD_UBUNTU}|{_PART}:{_PART}:{_PART}:{_PART}|/subscriptions/[\w./()-]+',

@@ -44,9 +44,6 @@ class AzurePrices(VmCloud):
     def types(self, region: str) -> Iterator[MachineType]:
         yield from map(machine_type, self.sizes(region).values())
 
-    def zones(self, region: str) -> dict[str, list[str]]:
-        return {name: [region] for name in self.sizes(region)}
-
     def prices(self, region: str, name: str = '') -> dict[str, Decimal]:
         return {kind: price for kind, price, spot in self._retail(region, name) if not spot}
 

@@ -10,19 +10,16 @@ In reading order: ``options``, ``guest`` (commands on the machine), ``failures``
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
-from fogros2.provider import Capabilities
 from fogros2.provider.gcp import guest
 from fogros2.provider.gcp.cloud import ComputeEngine
-from fogros2.provider.vm.cloud import VmCloud
 from fogros2.provider.vm.provider import VmProvider
 
 
 class GCPProvider(VmProvider):
     """Compute Engine instances."""
 
-    name: ClassVar[str] = ComputeEngine.name
-    adapter: ClassVar[type[VmCloud]] = ComputeEngine
-    capabilities: ClassVar[Capabilities] = dataclasses.replace(
+    name = ComputeEngine.name
+    adapter = ComputeEngine
+    capabilities = dataclasses.replace(
         VmProvider.capabilities, stop=True, images=True, preemption_notice=guest.NOTICE)

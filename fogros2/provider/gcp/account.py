@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 import threading
 import time
-from typing import Any, cast, ClassVar
+from typing import Any, cast
 import uuid
 import warnings
 
@@ -41,41 +41,34 @@ def configured() -> bool:
     return _credentials().is_file()
 
 
-class _Login:
-    """The credentials of this computer's user, with the project of their configuration."""
-
-    def __init__(self) -> None:
-        try:
-            import google.auth
-            from google.auth.exceptions import GoogleAuthError
-            from google.auth.transport import requests as transport
-        except ImportError as error:
-            raise PrerequisiteError(
-                'machines at Google take google-auth and requests, which are not installed',
-                'python3 -m pip install google-auth requests') from error
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter('ignore')  # of credentials of a person
-                # any, because the library has types for a part of it
-                self._credentials, project = cast(Any, google.auth).default(scopes=_SCOPES)
-        except GoogleAuthError as error:
-            raise PrerequisiteError(f"the Google credentials can't be read: {error}",
-                                    'gcloud auth application-default login') from error
-        self.project = str(project or '')
-        self._request = cast(Any, transport).Request()
-        self._lock = threading.Lock()
-
-    def token(self) -> str:
-        with self._lock:
-            if not self._credentials.valid:
-                self._credentials.refresh(self._request)
-            return str(self._credentials.token)
-
-
 @functools.lru_cache(maxsize=4)
-def _login(*settings: str) -> _Login:
-    """Return the login for these values of ``_VARIABLES``, once for all callers."""
-    return _Login()
+def _login(*settings: str) -> tuple[Any, str]:
+    """
+    Return the credentials of this computer's user, and the project of their configuration.
+
+    :param settings: the values of ``_VARIABLES``.
+    """
+    try:
+        import google.auth
+        from google.auth.exceptions import GoogleAuthError
+        import google.auth.transport.requests
+    except ImportError as error:
+        raise PrerequisiteError(
+            'machines at Google take google-auth and requests, which are not installed',
+            'python3 -m pip install google-auth requests') from error
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')  # of credentials of a person
+            # any, because the library has types for a part of it
+            credentials, project = cast(Any, google.auth).default(scopes=_SCOPES)
+    except GoogleAuthError as error:
+        raise PrerequisiteError(f"the Google credentials can't be read: {error}",
+                                'gcloud auth application-default login') from error
+    return credentials, str(project or '')
+
+
+#: Held while a token is renewed.
+_RENEWING = threading.Lock()
 
 
 class Account(RestAccount):
@@ -85,14 +78,12 @@ class Account(RestAccount):
     :param project: '' for the project of the user's configuration.
     """
 
-    TITLE: ClassVar[str] = 'Google'
-    ENDPOINT_VARIABLE: ClassVar[str] = ENDPOINT_VARIABLE
+    TITLE = 'Google'
+    ENDPOINT_VARIABLE = ENDPOINT_VARIABLE
 
     def __init__(self, project: str = '') -> None:
         super().__init__()
         self._project = project
-        #: Fingerprint of the labels of instances, by id, as last reported.
-        self.labels: dict[str, tuple[str, Mapping[str, str]]] = {}
 
     def of_project(self, project: str) -> Account:
         """Return the account of another project; '' for the same."""
@@ -100,7 +91,7 @@ class Account(RestAccount):
         other._project = project or self._project
         return other
 
-    def _opened(self) -> _Login:
+    def _opened(self) -> tuple[Any, str]:
         if not configured():
             raise PrerequisiteError(
                 'there are no Google credentials on this computer',
@@ -119,26 +110,25 @@ class Account(RestAccount):
 
         :raises PrerequisiteError: there are no credentials, or nobody has named a project.
         """
-        project = self._project or self._opened().project
+        project = self._project or self._opened()[1]
         if not project:
             raise PrerequisiteError('no project of Google Cloud is named',
                                     "project_id='...', or set GOOGLE_CLOUD_PROJECT")
         return project
 
     def check(self) -> None:
-        """
-        Check that there are credentials and a project, without a request.
-
-        :raises PrerequisiteError: something is missing.
-        """
         self._opened()
         _ = self.project
 
     def token(self, what: str) -> str:
-        login = self._opened()
+        credentials, _ = self._opened()
         from google.auth.exceptions import GoogleAuthError, TransportError
+        from google.auth.transport.requests import Request
         try:
-            return login.token()
+            with _RENEWING:
+                if not credentials.valid:
+                    credentials.refresh(cast(Any, Request)())
+            return str(credentials.token)
         except TransportError as error:
             raise self.silent(error, what) from error
         except GoogleAuthError as error:
@@ -157,7 +147,6 @@ class Account(RestAccount):
         Make one request and return its answer.
 
         :param path: below ``projects/``.
-        :param what: completes '... failed'.
         :raises GoogleError: Google refused; ``refused`` is False if it may have had an effect.
         :raises PrerequisiteError: no credentials, bad ones, no route to Google.
         """

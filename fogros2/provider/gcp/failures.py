@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import re
-from typing import Any, ClassVar
+from typing import Any
 
 from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.vm.failures import CodedError, Failure, not_the_cloud, one_line
@@ -44,8 +44,8 @@ _FAILURES = {
 class GoogleError(CodedError):
     """Google refused; ``code`` is its error code, in capitals."""
 
-    TITLE: ClassVar[str] = 'Google'
-    FAILURES: ClassVar[Mapping[str, Failure]] = _FAILURES
+    TITLE = 'Google'
+    FAILURES = _FAILURES
 
 
 def refused(status: int, answer: Any, what: str) -> FogError:

@@ -24,9 +24,9 @@ try:
 except OSError:
     sys.exit(1)
 """)
-# A guest that shuts itself down is only stopped, and its disk is billed. With a service account
-# that may delete the instance, it deletes itself.
-_DELETE = _ASK + """\
+#: With the API's address as argument, deletes the instance if its service account may, or else
+#: shuts it down: such an instance is only stopped, and its disk is billed.
+DELETE = ('python3', '-ISc', _ASK + """\
 try:
     import json, urllib.request
     token = json.loads(ask('instance/service-accounts/default/token'))['access_token']
@@ -38,9 +38,4 @@ try:
 except (OSError, ValueError, KeyError):
     pass
 os.execvp('shutdown', ['shutdown', '-h', 'now'])
-"""
-
-
-def deletion(endpoint: str) -> tuple[str, ...]:
-    """Return the command by which an instance deletes itself, or else shuts down."""
-    return ('python3', '-ISc', _DELETE, endpoint)
+""")

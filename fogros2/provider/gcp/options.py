@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 import dataclasses
 import re
-from typing import Any, ClassVar
+from typing import Any
 
 from fogros2.errors import ConfigurationError
 from fogros2.provider.vm.options import VmOptions
@@ -17,21 +17,7 @@ _PROJECT = r'([a-z][a-z0-9.-]*:)?[a-z][a-z0-9-]{4,61}[a-z0-9]'
 
 @dataclasses.dataclass(frozen=True)
 class Options(VmOptions):
-    """
-    Options of a Compute Engine instance, in addition to those of every virtual machine.
-
-    :param project_id: '' for the project of the user's credentials.
-    :param ami_image: ``projects/P/global/images/NAME`` or ``.../images/family/NAME``, or the name
-        of an image of the project; '' for one that was baked with the same dependencies, else
-        Ubuntu 24.04 (with NVIDIA's driver for a machine that has its GPUs).
-    :param zone: '' for any zone of the region.
-    :param machine_type: 'e2-medium', or 'cheapest' that meets the requirements.
-    :param machine_types: further types to try, in this order, if there is no capacity for one.
-    :param accelerators: GPUs to attach, such as 'nvidia-tesla-t4:2'.
-    :param service_account: email address of the account with the machine's own rights.
-    :param network: name of the VPC network.
-    :param labels: Google's labels for everything that is created.
-    """
+    """Options of a Compute Engine instance; see :class:`~fogros2.GCPCloudInstance`."""
 
     project_id: str = ''
     ami_image: str = ''
@@ -43,11 +29,11 @@ class Options(VmOptions):
     network: str = 'default'
     labels: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
-    WHAT: ClassVar[str] = 'a machine at Google'
-    DEFAULT_TYPE: ClassVar[str] = 'e2-medium'
-    IN_ONE_REGION: ClassVar[tuple[str, ...]] = ('zone',)
-    DISK_SIZES: ClassVar[tuple[int, int]] = (10, 65536)
-    FORMS: ClassVar[Mapping[str, tuple[str, str]]] = {
+    WHAT = 'a machine at Google'
+    DEFAULT_TYPE = 'e2-medium'
+    IN_ONE_REGION = ('zone',)
+    DISK_SIZES = (10, 65536)
+    FORMS = {
         'region': (r'nearest|[a-z]+(-[a-z]+)+\d+', "'europe-west3' or 'nearest'"),
         'zone': (r'[a-z]+(-[a-z]+)+\d+-[a-z]', "'us-central1-a'"),
         'project_id': (_PROJECT, "the project's id, not its name or number"),

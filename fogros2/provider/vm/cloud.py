@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import abc
+import collections
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 import copy
 import dataclasses
@@ -47,7 +48,7 @@ class CloudError(ProviderError):
     """
     A cloud refused a request.
 
-    :param full: no capacity in this zone, or in this region; another one may have some.
+    :param full: no capacity in this zone, or the quota of this region is used up.
     :param gone: the resource does not exist (any more).
     :param denied: these credentials must not do that.
     """
@@ -91,7 +92,6 @@ class Vm:
     :param billed: it is stopped, and costs as much as a running one.
     :param key: the cloud's name of its login key.
     :param reason: why it ended, in the cloud's words.
-    :param note: a warning for people, shown when the machine is reached.
     """
 
     id: str
@@ -108,7 +108,6 @@ class Vm:
     image: str = ''
     key: str = ''
     reason: str = ''
-    note: str = ''
     billed: bool = False
 
 
@@ -193,8 +192,8 @@ class VmCloud(abc.ABC):
     id_form: ClassVar[str]
     #: Region for requests that belong to no region.
     base_region: ClassVar[str]
-    #: Name of a variable that lists the regions to search, such as 'eu-central-1 us-east-1'.
-    regions_variable: ClassVar[str] = ''
+    #: Notes for people about machines that this process has created, by the cloud's id.
+    notes: ClassVar[dict[str, list[str]]] = collections.defaultdict(list)
     #: Set when the launch ends; calls then raise Cancelled.
     cancel: Optional[threading.Event] = None
     #: An ``Account``, if the cloud's requests go through one.
@@ -208,20 +207,17 @@ class VmCloud(abc.ABC):
     def until(
         self: Adapter, cancel: Optional[threading.Event], *, hasty: bool = False,
     ) -> Adapter:
-        """Return an adapter whose calls raise Cancelled once ``cancel`` is set."""
+        """
+        Return an adapter whose calls raise Cancelled once ``cancel`` is set.
+
+        :param cancel: None for clean-up, which continues after the launch's end.
+        :param hasty: use short time-outs, for values that are only displayed.
+        """
         other = copy.copy(self)
         other.cancel = cancel
         if self._account is not None:
             other._account = self._account.having(cancel, hasty=hasty)
         return other
-
-    def lasting(self: Adapter) -> Adapter:
-        """Return an adapter for clean-up, which ``cancel`` does not end."""
-        return self.until(None)
-
-    def hasty(self: Adapter) -> Adapter:
-        """Return an adapter with short time-outs, for values that are only displayed."""
-        return self.until(self.cancel, hasty=True)
 
     # -- the account ----------------------------------------------------------------------------
 

@@ -33,12 +33,10 @@ from fogros2.provider.vm.cloud import (
 )
 from fogros2.provider.vm.host_key import one_time
 from fogros2.provider.vm.options import VmOptions
-from fogros2.provider.vm.user_data import user_data
-
-#: Returns the price of a type in a region in US dollars per hour, None if unknown.
-Price = Callable[[str, str], Optional[Decimal]]
+from fogros2.provider.vm.user_data import cloud_config, user_data
 
 
+@dataclasses.dataclass
 class Creation:
     """
     One request for a machine, over regions, types and zones.
@@ -46,24 +44,21 @@ class Creation:
     :param cloud: its calls end with the launch.
     :param lasting: the same cloud for clean-up, which continues after the launch's end.
     :param sources: returns the networks that may log in, if ``ssh_from=`` names none.
+    :param price: returns the price of a type, given its region and name, in US dollars per hour;
+        None if it is unknown.
+    :param unsure: whether a machine may exist although no answer said so.
+    :param undo_failures: errors of undo steps.
     """
 
-    def __init__(
-        self, cloud: VmCloud, lasting: VmCloud, spec: MachineSpec, request: CreateRequest,
-        options: VmOptions, *, sources: Callable[[], list[str]], price: Price,
-    ) -> None:
-        self._cloud = cloud
-        self._lasting = lasting
-        self._spec = spec
-        self._request = request
-        self._options = options
-        self._sources = sources
-        self._ask_price = price
-        self._prices: dict[tuple[str, str], Optional[Decimal]] = {}
-        #: Whether a machine may exist although no answer said so.
-        self._unsure = False
-        #: Errors of undo steps.
-        self.undo_failures: list[FogError] = []
+    cloud: VmCloud
+    lasting: VmCloud
+    spec: MachineSpec
+    request: CreateRequest
+    options: VmOptions
+    sources: Callable[[], list[str]]
+    price: Callable[[str, str], Optional[Decimal]]
+    unsure: bool = False
+    undo_failures: list[FogError] = dataclasses.field(default_factory=list)
 
     def run(self, regions: list[str]) -> VmId:
         """
@@ -75,7 +70,7 @@ class Creation:
         try:
             return self._in_regions(regions)
         except FogError as error:
-            error.refused = not self._unsure
+            error.refused = not self.unsure
             error.undo_failures = tuple(self.undo_failures)
             raise
 
@@ -83,7 +78,7 @@ class Creation:
         first: Optional[CloudError] = None
         for region in regions:
             try:
-                return self._in_region(region, self._options.in_region(region))
+                return self._in_region(region, self.options.in_region(region))
             except ConfigurationError:
                 if first is None:
                     raise
@@ -96,14 +91,14 @@ class Creation:
         raise first
 
     def _in_region(self, region: str, options: VmOptions) -> VmId:
-        tags = own_tags(self._spec, self._request, options)
+        tags = own_tags(self.spec, self.request, options)
         with ThreadPoolExecutor(4, 'fog-vm') as pool:
             # all look-ups come before the first creation, at the same time
             there = pool.submit(self._existing, region, tags[TAG_ATTEMPT])
-            sources = pool.submit(lambda: list(options.ssh_from) or self._sources())
+            sources = pool.submit(lambda: list(options.ssh_from) or self.sources())
             data = pool.submit(self._user_data, options, tags)
-            order = Order(self._spec, self._request, options, tags, b'', ())
-            prepared = pool.submit(self._cloud.prepare, region, order, options.types)
+            order = Order(self.spec, self.request, options, tags, b'', ())
+            prepared = pool.submit(self.cloud.prepare, region, order, options.types)
             found = there.result()
             if found is not None:
                 return found
@@ -114,7 +109,7 @@ class Creation:
 
     def _existing(self, region: str, attempt: str) -> Optional[VmId]:
         """Return the machine that an earlier call with this token created, or None."""
-        found = [*self._cloud.find(region, {TAG_NAME: self._spec.name})]
+        found = [*self.cloud.find(region, {TAG_NAME: self.spec.name})]
         for vm in found:
             if vm.tags[TAG_ATTEMPT] == attempt:
                 return VmId(region, vm.id, attempt)
@@ -122,18 +117,18 @@ class Creation:
             owner = vm.tags.get(TAG_ROBOT, '')
             whose = f" of the robot '{owner}'" if owner else ''
             raise NameTaken(
-                f"there is a machine '{self._spec.name}'{whose} in {region} already",
-                f'give the machine another name=, or: ros2 fog delete {self._spec.name}')
+                f"there is a machine '{self.spec.name}'{whose} in {region} already",
+                f'give the machine another name=, or: ros2 fog delete {self.spec.name}')
         return None
 
     def _user_data(self, options: VmOptions, tags: Mapping[str, str]) -> bytes:
-        agent = self._request.agent_config
+        agent = self.request.agent_config
         if agent:
-            agent = {**agent, 'end_command': list(self._cloud.end_command(tags))}
-        return user_data(
-            name=self._spec.name, user=options.user,
-            authorized_key=self._request.authorized_key,
-            host_key=one_time(self._request.token), agent_config=agent)
+            agent = {**agent, 'end_command': list(self.cloud.end_command(tags))}
+        return user_data(cloud_config(
+            name=self.spec.name, user=options.user,
+            authorized_key=self.request.authorized_key,
+            host_key=one_time(self.request.token), agent_config=agent))
 
     def _make(self, region: str, order: Order, prepared: Mapping[str, Any]) -> VmId:
         created: list[str] = []
@@ -141,7 +136,7 @@ class Creation:
             undo.callback(self._undo_begin, region, order.attempt, created)
             # the answer to a successful request may be lost
             undo.callback(self._undo, region, 'the instance', self._end, region, order.attempt)
-            self._cloud.begin(region, dataclasses.replace(
+            self.cloud.begin(region, dataclasses.replace(
                 order, tags={**order.tags, TAG_MADE: str(int(time.time()))}), created)
             vm = self._first_with_room(region, order, prepared, created)
             undo.pop_all()
@@ -149,13 +144,13 @@ class Creation:
 
     def _end(self, region: str, attempt: str) -> None:
         try:
-            self._lasting.end_attempt(region, attempt)
+            self.lasting.end_attempt(region, attempt)
         except FogError:
-            self._unsure = True  # the caller may find the machine by its tags
+            self.unsure = True  # the caller may find the machine by its tags
             raise
 
     def _undo_begin(self, region: str, attempt: str, created: list[str]) -> None:
-        for what, undo in self._lasting.undo_begin(region, attempt, created):
+        for what, undo in self.lasting.undo_begin(region, attempt, created):
             self._undo(region, what, undo)
 
     def _undo(self, region: str, what: str, undo: Callable[..., None], *words: str) -> None:
@@ -164,7 +159,7 @@ class Creation:
             undo(*words)
         except FogError as error:
             self.undo_failures.append(ProviderError(
-                f"{what} of '{self._spec.name}' in {region} may be left: {error.args[0]}",
+                f"{what} of '{self.spec.name}' in {region} may be left: {error.args[0]}",
                 'ros2 fog gc deletes it, a quarter of an hour after it was made'))
 
     def _first_with_room(
@@ -172,19 +167,19 @@ class Creation:
     ) -> str:
         refused: Optional[CloudError] = None
         full: set[str] = set()
-        tags = {**order.tags, TAG_HOST_KEY: one_time(self._request.token).public}
+        tags = {**order.tags, TAG_HOST_KEY: one_time(self.request.token).public}
         for place in self._places(region, order, list(prepared)):
             if place.kind in full:
                 continue
-            price = self._price(region, place.kind)
+            price = self.price(region, place.kind)
             if self._too_dear(price):
                 continue
             priced = {} if price is None else {TAG_PRICE: str(price)}
             try:
-                return self._cloud.insert(
+                return self.cloud.insert(
                     place, order, prepared[place.kind], created, {**tags, **priced})
             except FogError as error:
-                self._unsure = self._unsure or not error.refused
+                self.unsure = self.unsure or not error.refused
                 if not isinstance(error, CloudError) or not error.full:
                     raise
                 # a quota holds for the whole region, a lack of machines for a zone
@@ -192,26 +187,21 @@ class Creation:
                     full.add(place.kind)
                 refused = error
         raise refused or CloudError(
-            f"no machine for '{self._spec.name}' in {region} is known to cost at most "
-            f'max_price={self._options.max_price}', 'ros2 fog price shows what there is',
+            f"no machine for '{self.spec.name}' in {region} is known to cost at most "
+            f'max_price={self.options.max_price}', 'ros2 fog price shows what there is',
             full='zone')
-
-    def _price(self, region: str, kind: str) -> Optional[Decimal]:
-        if (region, kind) not in self._prices:
-            self._prices[region, kind] = self._ask_price(region, kind)
-        return self._prices[region, kind]
 
     def _too_dear(self, price: Optional[Decimal]) -> bool:
         """Return whether a price may be above the limit; the cloud checks a spot price itself."""
-        limit = self._options.max_price
+        limit = self.options.max_price
         if limit is None:
             return False
-        return not self._options.spot if price is None else price > limit
+        return not self.options.spot if price is None else price > limit
 
     def _places(self, region: str, order: Order, types: list[str]) -> Iterator[Place]:
         """Yield the places: all zones of the first type, then of the next."""
         zones: list[str] = []
-        more = iter(self._cloud.places(region, order))
+        more = iter(self.cloud.places(region, order))
         for kind in types:
             yield from [Place(region, kind, zone) for zone in zones]
             for zone in more:  # only while the first type is tried

@@ -19,10 +19,7 @@ class Failure(NamedTuple):
     The meaning of a code.
 
     :param reason: '' keeps the cloud's own words.
-    :param kind: of the error; only a CodedError has what follows.
-    :param full: no capacity in this zone; the quota of this region is used up.
-    :param gone: the resource does not exist (any more).
-    :param denied: the credentials must not do that.
+    :param kind: of the error; only a CodedError has what follows: see :class:`CloudError`.
     :param temporary: the cloud did nothing, and the same request may succeed later.
     """
 
@@ -69,8 +66,7 @@ class CodedError(CloudError):
         Return the error for a code.
 
         :param said: the cloud's own words, in one line.
-        :param what: completes '... failed'.
-        :param status: of HTTP.
+        :param what: see :meth:`~fogros2.provider.vm.account.Account.repeated`.
         """
         known = cls.known(code)
         reason = known.reason or said or code or f'{cls.TITLE} gave no reason'
@@ -121,7 +117,8 @@ def one_line(text: object) -> str:
     return ' '.join(str(text).split())[:LENGTH]
 
 
-def not_the_cloud(title: str, what: str, status: int) -> FogError:
+def not_the_cloud(title: str, what: str, status: object = '') -> FogError:
     """Return the error for an answer that only another server can have given."""
-    return PrerequisiteError(f'{what} failed: what answered is not {title} (HTTP {status})',
+    known = f' (HTTP {status})' if status else ''
+    return PrerequisiteError(f'{what} failed: what answered is not {title}{known}',
                              'is there a proxy, or a page to log in to this network?')

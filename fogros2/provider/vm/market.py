@@ -6,8 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
-import dataclasses
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 import hashlib
 import json
 from pathlib import Path
@@ -16,6 +15,7 @@ import time
 from typing import Any, Optional, Union
 
 from fogros2.errors import ConfigurationError, FogError, ProviderError, StoreError
+from fogros2.model import to_json
 from fogros2.provider.offers import fits, MachineType, Offer, Offers, ranked, Wants
 from fogros2.provider.vm.cloud import VmCloud
 from fogros2.store import state_home, write_private
@@ -53,9 +53,7 @@ class Market:
 
         :raises FogError: the cloud refused, or does not answer.
         """
-        found = self._kept(f'types-{region}', lambda: [
-            dataclasses.asdict(kind) for kind in self._source.types(region)])
-        return [MachineType(**kind) for kind in found]
+        return list(self._kept(f'types-{region}', lambda: list(self._source.types(region))))
 
     def zones(self, region: str) -> dict[str, list[str]]:
         """Return the zones of a region that have each type."""
@@ -63,8 +61,7 @@ class Market:
 
     def prices(self, region: str) -> dict[str, Decimal]:
         """Return the price of each type in US dollars per hour."""
-        found = self._kept(f'prices-{region}', lambda: _plain(self._source.prices(region)))
-        return {name: Decimal(price) for name, price in found.items()}
+        return dict(self._kept(f'prices-{region}', lambda: self._source.prices(region)))
 
     def price(self, region: str, name: str) -> Optional[Decimal]:
         """
@@ -72,11 +69,11 @@ class Market:
 
         One request, unless the whole list is known.
         """
-        listed = self._fresh(f'prices-{region}')
+        listed: Optional[dict[str, Decimal]] = self._fresh(f'prices-{region}')
         if listed is None:
             listed = self._kept(f'price-{region}-{name}',
-                                lambda: _plain(self._source.prices(region, name)))
-        return Decimal(listed[name]) if name in listed else None
+                                lambda: self._source.prices(region, name))
+        return listed.get(name)
 
     def spot(
         self, region: str, names: Optional[Sequence[str]] = None,
@@ -90,11 +87,8 @@ class Market:
         key = f'spot-{region}'
         if named is not None and self._fresh(key) is None:
             key += '-' + hashlib.sha256(' '.join(named).encode()).hexdigest()[:12]
-        found = self._kept(key, lambda: {
-            name: _plain(zones)
-            for name, zones in self._source.spot_prices(region, named).items()})
-        return {name: {zone: Decimal(price) for zone, price in zones.items()}
-                for name, zones in found.items() if names is None or name in names}
+        found = self._kept(key, lambda: self._source.spot_prices(region, named))
+        return {name: zones for name, zones in found.items() if names is None or name in names}
 
     def price_of(self, region: str, name: str, *, spot: bool = False) -> Decimal:
         """
@@ -160,7 +154,7 @@ class Market:
             raise failed[0][1]
         where = regions[0] if len(regions) == 1 else f'{len(regions)} regions'
         if not found:
-            gpus = {str(kind['gpu']) for region in regions
+            gpus = {kind.gpu for region in regions
                     for kind in self._fresh(f'types-{region}') or ()}
             raise ConfigurationError(
                 f'no {self._source.title} type in {where} has {asked}',
@@ -188,53 +182,37 @@ class Market:
             found = self._fresh(key)
             if found is None:
                 found = self._known[key] = ask()
-                self._keep(key, found)
+                with contextlib.suppress(StoreError):  # the next launch takes longer
+                    write_private(self._path(key), to_json({
+                        'source': self._source.account_key(), 'time': self._clock(),
+                        'value': found}).encode())
             return found
 
     def _fresh(self, key: str) -> Any:
         """Return an answer of less than a day ago, None if there is none."""
-        if key in self._known:
-            return self._known[key]
-        if self._refresh:
-            return None
-        try:
-            data = json.loads(self._path(key).read_text())
-            if data['source'] != self._source.account_key() \
-                    or not 0 <= self._clock() - float(data['time']) < CACHE_AGE:
-                return None
-            found = _checked(key, data['value'])
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, InvalidOperation):
-            return None  # missing or damaged
-        self._known[key] = found
-        return found
-
-    def _keep(self, key: str, value: Any) -> None:
-        with contextlib.suppress(StoreError):  # without a cache the next launch takes longer
-            write_private(self._path(key), json.dumps({
-                'source': self._source.account_key(), 'time': self._clock(),
-                'value': value}).encode())
+        if key not in self._known and not self._refresh:
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError,
+                                     ArithmeticError):  # missing or damaged
+                data = json.loads(self._path(key).read_text())
+                if data['source'] == self._source.account_key() \
+                        and 0 <= self._clock() - float(data['time']) < CACHE_AGE:
+                    self._known[key] = _READ[key.partition('-')[0]](data['value'])
+        return self._known.get(key)
 
     def _path(self, key: str) -> Path:
         return (self._cache or state_home() / 'cache' / self._source.name) / f'{key}.json'
 
 
-def _checked(key: str, value: Any) -> Any:
-    """Return a cached value; raise an error if its form is not that of its key."""
-    kind = key.partition('-')[0]
-    if kind == 'types':
-        return [dataclasses.asdict(MachineType(**entry)) for entry in value]
-    for entry in value.values():
-        if kind == 'zones':
-            if not all(isinstance(zone, str) for zone in entry):
-                raise TypeError(key)
-        else:
-            for price in entry.values() if kind == 'spot' else (entry,):
-                Decimal(price)
-    return value
+def _prices(value: Any) -> dict[str, Decimal]:
+    return {name: Decimal(price) for name, price in value.items()}
 
 
-def _plain(prices: Mapping[str, Decimal]) -> dict[str, str]:
-    return {name: str(price) for name, price in prices.items()}
+#: Convert the answers in files, by the first word of their keys; an error shows damage.
+_READ: Mapping[str, Callable[[Any], Any]] = {
+    'types': lambda value: [MachineType(**entry) for entry in value],
+    'zones': lambda value: {name: list(map(str, zones)) for name, zones in value.items()},
+    'spot': lambda value: {name: _prices(zones) for name, zones in value.items()},
+    'prices': _prices, 'price': _prices}
 
 
 def cheapest_zone(zones: Mapping[str, Decimal], among: Iterable[str]) -> Optional[Decimal]:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+import contextlib
 import dataclasses
 from decimal import Decimal
 import ipaddress
@@ -27,20 +28,10 @@ class VmOptions:
     """
     Options of a virtual machine. A cloud's subclass adds its own, and sets the class variables.
 
+    :class:`~fogros2.describe.machines_cloud.VmInstance` describes the options; '' and 0 stand for
+    one that a launch file leaves out.
+
     :param region: name, or 'nearest'; '' for the region of the user's configuration.
-    :param regions: further regions to try, in this order, if one has no capacity.
-    :param disk_size: GB.
-    :param spot: use a spot machine: cheaper, but the cloud may reclaim it.
-    :param arch: x86_64 or arm64.
-    :param min_cpu: minimum number of vCPUs; ``min_memory_gb`` is the minimum memory in GiB.
-    :param cpu_type: manufacturer of the processor: intel, amd, aws.
-    :param gpu: the number of GPUs, True, or part of the name of one; ``gpu_memory_gb`` is the
-        minimum memory of each GPU in GB.
-    :param max_price: maximum price in US dollars per hour; also the limit of a spot price.
-    :param tags: tags for everything that is created.
-    :param user: the image's login user.
-    :param ssh_from: networks (CIDR) that may reach the SSH port; none for this robot's public
-        address only.
     :param by_region: options with a value for each region, by name; ``in_region`` puts them into
         the other fields.
     """
@@ -224,29 +215,21 @@ class VmOptions:
 
 
 def _value(name: str, value: Any, default: Any) -> Any:
-    if name == 'max_price':
-        return Decimal(repr(convert(name, _number(value), 0.0)))
     if name == 'ssh_from' and isinstance(value, str):
         value = (value,)
     if name == 'gpu' and isinstance(value, bool):
         return '1' if value else ''
-    if name == 'disk_size':
-        value = _number(value)
-        if isinstance(value, float) and value.is_integer():
-            value = int(value)
-    if isinstance(default, float):
-        value = _number(value)
-        if value == 0:
-            return 0.0
+    number = isinstance(default, float) or name in ('disk_size', 'max_price')
+    if number and isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            value = float(value)  # launch arguments are strings
+    if name == 'max_price':
+        return Decimal(repr(convert(name, value, 0.0)))
+    if isinstance(default, float) and value == 0:
+        return 0.0
+    if name == 'disk_size' and isinstance(value, float) and value.is_integer():
+        value = int(value)
     return convert(name, value, default)
-
-
-def _number(value: Any) -> Any:
-    """Return the number in a string, as launch arguments have it."""
-    try:
-        return float(value) if isinstance(value, str) else value
-    except ValueError:
-        return value
 
 
 def cidr(text: str) -> str:

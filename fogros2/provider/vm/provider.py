@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import dataclasses
 from decimal import Decimal, InvalidOperation
+import functools
 import os
 import re
 import threading
@@ -75,8 +76,6 @@ class VmProvider(Provider):
         # its calls are not cancelled
         self._cloud = cloud or self.adapter()
         self._searched: tuple[str, ...] = ()
-        #: Notes for people, by the cloud's id of the machine.
-        self._notes: dict[str, str] = {}
 
     @classmethod
     def configured(cls) -> bool:
@@ -86,10 +85,12 @@ class VmProvider(Provider):
     def region_names(cls) -> Sequence[str]:
         return tuple(cls.adapter.regions.table)
 
+    def _cancel(self) -> Optional[threading.Event]:
+        """Return what ends a call together with the launch; later calls are clean-up."""
+        return None if self.cancel is None or self.cancel.is_set() else self.cancel
+
     def _until(self) -> VmCloud:
-        """Return the adapter for a call that ends with the launch; later calls are clean-up."""
-        ending = self.cancel is None or self.cancel.is_set()
-        return self._cloud if ending else self._cloud.until(self.cancel)
+        return self._cloud.until(self._cancel())
 
     # -- before a machine exists ----------------------------------------------------------------
 
@@ -167,7 +168,7 @@ class VmProvider(Provider):
         self, region: str, kind: str, options: VmOptions, cancel: Optional[threading.Event],
     ) -> Optional[Decimal]:
         with contextlib.suppress(FogError):
-            market = Market(self._cloud.account(options).until(cancel).hasty())
+            market = Market(self._cloud.account(options).until(cancel, hasty=True))
             return market.price_of(region, kind, spot=options.spot)
         return None
 
@@ -180,12 +181,12 @@ class VmProvider(Provider):
             options = self._cloud.options.of(spec)
         cloud = self._cloud.account(options)
         creation = Creation(
-            cloud.until(cancel), cloud.lasting(), spec, request, options,
+            cloud.until(cancel), cloud, spec, request, options,
             sources=lambda: _ROBOT_ADDRESS.with_ipv6([self._address(cancel)]),
-            price=lambda region, kind: self._price(region, kind, options, cancel))
+            price=functools.cache(
+                lambda region, kind: self._price(region, kind, options, cancel)))
         machine = creation.run(list(dict.fromkeys([self._region(options), *options.regions])))
-        if creation.undo_failures:
-            self._notes[machine.vm] = '; '.join(map(str, creation.undo_failures))
+        cloud.notes[machine.vm] += map(str, creation.undo_failures)
         return self._text(machine)
 
     def adopt(self, machine_id: str, spec: MachineSpec, tags: Mapping[str, str]) -> None:
@@ -239,9 +240,8 @@ class VmProvider(Provider):
                     f'{vm.reason or f"{cloud.title} gives no reason"}',
                     f'the console of {cloud.title} has its system log')
             found = self.machine_of(vm)
-            notes = '; '.join(filter(None, (vm.note, self._notes.get(machine.vm))))
-            return dataclasses.replace(
-                found, id=machine_id, note=notes) if found.shell is not None else None
+            return dataclasses.replace(found, id=machine_id, note='; '.join(
+                cloud.notes[machine.vm])) if found.shell is not None else None
 
         # a cloud needs some ten seconds: few requests, but a fast machine is noticed soon
         return wait_until(
@@ -293,8 +293,7 @@ class VmProvider(Provider):
     # -- its network ----------------------------------------------------------------------------
 
     def robot_address(self) -> str:
-        ending = self.cancel is None or self.cancel.is_set()
-        return self._address(None if ending else self.cancel)
+        return self._address(self._cancel())
 
     def _address(self, cancel: Optional[threading.Event]) -> str:
         return cancellable(_ROBOT_ADDRESS, cancel, what="asking for the robot's address",
@@ -355,9 +354,9 @@ class VmProvider(Provider):
             **kept, 'region': offer.region, self._cloud.options.TYPE: offer.type.name})
 
     def _named_regions(self) -> list[str]:
-        """Return the regions that the user has named: by an option, else by the variable."""
-        return list(self._searched) or os.environ.get(
-            self._cloud.regions_variable, '').replace(',', ' ').split()
+        """Return the regions that the user has named: by an option, else FOGROS2_AWS_REGIONS."""
+        variable = f'FOGROS2_{self.name.upper()}_REGIONS'
+        return list(self._searched) or os.environ.get(variable, '').replace(',', ' ').split()
 
     def _base(self) -> str:
         """Return a region for requests that belong to no region."""

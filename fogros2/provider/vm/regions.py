@@ -148,7 +148,8 @@ class Regions:
             if grace is not None and any(len(list(times[name])) == ATTEMPTS for name in names):
                 end = min(end, time.monotonic() + grace)
                 grace = None
-        measured = [Region(name, self.place(name), _median(list(times[name]))) for name in names]
+        measured = [Region(name, self.place(name), 1000 * statistics.median(times[name])
+                           if times[name] else None) for name in names]
         return sorted(measured, key=lambda one: (
             math.inf if one.milliseconds is None else one.milliseconds, one.region))
 
@@ -220,7 +221,3 @@ class Regions:
             if names not in self._nearest:
                 self._nearest[names] = self.ranked(names, grace=GRACE)[0].region
             return self._nearest[names]
-
-
-def _median(seconds: Sequence[float]) -> Optional[float]:
-    return 1000 * statistics.median(seconds) if seconds else None

@@ -95,23 +95,17 @@ apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends \\
 """
 
 
-def user_data(
-    *, name: str, user: str, authorized_key: str, host_key: HostKey,
-    agent_config: Mapping[str, Any],
-) -> bytes:
+def user_data(config: Mapping[str, Any]) -> bytes:
     """
-    Return a machine's user data; the same bytes for the same arguments.
+    Return a #cloud-config as user data; the same bytes for the same one.
 
-    :param agent_config: the agent's configuration; empty for a machine without an agent.
     :raises ProviderError: longer than the limit of the clouds.
     """
-    config = cloud_config(name=name, user=user, authorized_key=authorized_key,
-                          host_key=host_key, agent_config=agent_config)
     text = '#cloud-config\n' + json.dumps(config, ensure_ascii=False)
     data = gzip.compress(text.encode(), 9, mtime=0)
     if len(data) > LIMIT:
-        raise ProviderError(
-            f"the user data of '{name}' has {len(data)} bytes, and a cloud takes {LIMIT}")
+        raise ProviderError(f"the user data of '{config['hostname']}' has {len(data)} bytes, and "
+                            f'a cloud takes {LIMIT}')
     return data
 
 
@@ -119,7 +113,11 @@ def cloud_config(
     *, name: str, user: str, authorized_key: str, host_key: HostKey,
     agent_config: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return the #cloud-config as a dictionary; see :func:`user_data`."""
+    """
+    Return a machine's #cloud-config as a dictionary.
+
+    :param agent_config: the agent's configuration; empty for a machine without an agent.
+    """
     config: dict[str, Any] = {
         'hostname': name,
         'manage_etc_hosts': 'localhost',
