@@ -4,17 +4,16 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import contextlib
 import functools
-from pathlib import Path
 import threading
 import time
 from typing import Generic, Optional, TypeVar
 
 from fogros2.errors import Cancelled, ConnectError, DeadlineExceeded, FogError
-from fogros2.model import Command, Endpoint, Result, SyncReport
-from fogros2.shell import command_line, Stream, sync, terminal
+from fogros2.model import Command, Endpoint, Result
+from fogros2.shell import command_line, relay, Stream, sync, terminal
 from fogros2.shell.lines import Channel, Connection, LineStream, Output
 from fogros2.waiting import cancellable, wait_until
 
@@ -26,7 +25,7 @@ _INLINE = 1 << 16
 Link = TypeVar('Link', bound=Connection)
 
 
-class RemoteShell(abc.ABC, Generic[Link]):
+class RemoteShell(sync.RsyncShell, Generic[Link]):
     """
     A Shell for endpoints of one kind; a subclass opens connections and channels.
 
@@ -42,6 +41,7 @@ class RemoteShell(abc.ABC, Generic[Link]):
     ) -> None:
         self.endpoint = endpoint
         self.name = name
+        self.where = f"'{name}'"
         self.user = user
         self._timeout = timeout
         self._lock = threading.Lock()
@@ -182,7 +182,7 @@ class RemoteShell(abc.ABC, Generic[Link]):
         finally:
             channel.close()
         result = Result(returncode, *output.text(), time.monotonic() - begin)
-        return command_line.checked(command, result, f"'{self.name}'") if check else result
+        return command_line.checked(command, result, self.where) if check else result
 
     def _collect(
         self, channel: Channel, output: Output, deadline: float,
@@ -232,27 +232,8 @@ class RemoteShell(abc.ABC, Generic[Link]):
         raise ConnectError(f"the connection to '{self.name}' was lost while "
                            f'{_what(command)} ran there', "check the robot's network")
 
-    def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
-        """Write a file atomically, and create its folders; see the protocol."""
-        self.run(command_line.writing(data, target, mode), timeout=timeout)
-
-    def sync(
-        self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
-        includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
-        on_progress: Optional[Callable[[int, int], None]] = None,
-    ) -> SyncReport:
-        """Make the folder ``target`` on the machine equal to ``source``; see the protocol."""
-        return sync.to_machine(
-            self, source, target, excludes=excludes, includes=includes, timeout=timeout,
-            cancel=cancel, on_progress=on_progress)
-
-    def fetch(
-        self, source: str, target: Path, *, known: Optional[Path], timeout: float,
-        cancel: Optional[threading.Event] = None,
-    ) -> None:
-        """Make the local folder ``target`` equal to the machine's ``source``; see the protocol."""
-        sync.fetch(self.name, self.start, source, target, known=known, timeout=timeout,
-                   cancel=cancel)
+    def _remote_shell(self) -> contextlib.AbstractContextManager[tuple[str, list[FogError]]]:
+        return relay.remote_shell(self.start)
 
     def open(self, command: Command) -> Stream:
         """Start a program on the machine; closing the returned stream ends the program."""

@@ -25,7 +25,7 @@ def test_includes_come_before_excludes():
 
 
 def test_openssh_is_pinned_as_we_are():
-    with sync.open_ssh(PINNED) as rsh:
+    with sync.open_ssh(PINNED) as (rsh, _):
         words = rsh.split()
         for option in ('StrictHostKeyChecking=yes', 'BatchMode=yes', 'IdentitiesOnly=yes',
                        'GlobalKnownHostsFile=/dev/null', 'HostKeyAlias=machine',
@@ -44,7 +44,7 @@ def test_openssh_accepts_the_known_hosts_of_home(tmp_path, monkeypatch):
     (tmp_path / '.ssh').mkdir()
     key = f'ecdsa-sha2-nistp256 {paramiko.ECDSAKey.generate().get_base64()}'
     (tmp_path / '.ssh/known_hosts').write_text(f'[host.example]:2222 {key}\n')
-    with sync.open_ssh(Endpoint('ssh', 'host.example', 2222, 'fog')) as rsh:
+    with sync.open_ssh(Endpoint('ssh', 'host.example', 2222, 'fog')) as (rsh, _):
         assert 'HostKeyAlias=machine' in rsh and 'StrictHostKeyChecking=yes' in rsh
         known, = (Path(w.partition('=')[2]) for w in rsh.split()
                   if w.startswith('UserKnownHostsFile='))
@@ -99,8 +99,10 @@ def test_large_folders_are_told_from_small_ones(tmp_path):
     assert not sync.is_large(tmp_path, 1000)
 
 
-@pytest.mark.parametrize('target, folder', [
+@pytest.mark.parametrize('folder, there', [
     ('/ws', '/ws/'), ('~/ws/src', 'ws/src/'), ('~/', './'),
 ])
-def test_folders_begin_in_the_home(target, folder):
-    assert sync.remote_folder(target) == folder
+def test_folders_begin_in_the_home(folder, there, monkeypatch):
+    monkeypatch.setenv('HOME', '/home/robot')
+    assert sync.place(folder, 'ssh') == f'machine:{there}'
+    assert sync.place(folder, '').rstrip('/') == folder.replace('~', '/home/robot').rstrip('/')
