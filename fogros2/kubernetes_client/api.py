@@ -314,9 +314,7 @@ class Watch:
                 return response
             data = response.read(decode_content=True)
             response.release_conn()
-        except Unreachable:
-            return None
-        except http_errors():
+        except (Unreachable, *http_errors()):
             return None
         said = refusal(response.status, parsed(data), data)
         if said.status != 410 and not api.passing(said):
@@ -374,6 +372,22 @@ def _wake(response: Any) -> None:
     if held is None:
         held = response._fp.fp.raw._sock
     held.shutdown(socket.SHUT_RDWR)
+
+
+def existing(
+    api: Api, path: str, cancel: Optional[threading.Event] = None,
+) -> Optional[dict[str, Any]]:
+    """
+    Return an object of the cluster, None if there is none.
+
+    :raises ApiError: the API server refused for another reason.
+    """
+    try:
+        return api.request('GET', path, cancel=cancel)
+    except ApiError as error:
+        if error.status != 404:
+            raise
+        return None
 
 
 _apis: dict[tuple[str, str], Api] = {}

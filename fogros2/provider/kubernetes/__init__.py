@@ -5,8 +5,8 @@ Run machines as pods: a Job for each, which owns the pod and its Service, and en
 ``options`` parses what a launch file asks for, ``names`` has names, ids and tags. ``boot`` is the
 first process of a pod, ``manifests`` describes Job, pod and Service. ``hints`` explains refusals,
 ``pods`` reads the state of Jobs and pods, ``start`` waits for a pod. ``exposure`` and ``ways``
-find how UDP reaches the pod, ``publishing`` opens TCP ports, ``ending`` deletes everything.
-``image`` builds images.
+find how UDP reaches the pod, and open TCP ports, ``ending`` deletes everything. ``image`` builds
+images.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from fogros2.errors import (
     NameTaken,
     PrerequisiteError,
 )
-from fogros2.kubernetes_client import Api, ApiError, items, path, selector
+from fogros2.kubernetes_client import Api, ApiError, existing, items, path, selector
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider, TAG_ON_EXIT
 from fogros2.provider.kubernetes import boot, ending, hints, manifests, names, pods, ways
-from fogros2.provider.kubernetes.hints import refused
+from fogros2.provider.kubernetes.hints import explained, refused
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.provider.kubernetes.options import Options
 from fogros2.provider.kubernetes.start import Start
@@ -138,8 +138,7 @@ class KubernetesProvider(Provider):
             if existing is None:
                 raise refused(error, f"the pod of '{spec.name}'", namespace) from error
         job = existing or self._make_job(api, namespace, spec, request, options)
-        machine_id = str(MachineId(namespace, str(job['metadata']['name']),
-                                   str(job['metadata']['uid']), api.context))
+        machine_id = str(MachineId.of(job, api.context))
         try:
             service = ways.make(api, namespace, spec, request, options, job, self.cancel)
         except BaseException:
@@ -209,7 +208,7 @@ class KubernetesProvider(Provider):
             job = merged(job, change)
         if change and names.tags_of(job).get(TAG_ON_EXIT) == 'keep':
             # Later launches read it.
-            with _translated(f"the Job of '{name}'", where.namespace):
+            with explained(f"the Job of '{name}'", where.namespace):
                 job = api.request(
                     'PATCH', path('jobs', where.namespace, where.job), change, cancel=cancel)
         return self._machine(api, where, job, pod)
@@ -247,11 +246,9 @@ class KubernetesProvider(Provider):
                 wanted = [job for job in jobs if tags.items() <= names.tags_of(job).items()]
                 found = items(self._ask(api, 'pods', namespace, labels)) if wanted else ()
                 for job in wanted:
-                    meta = job['metadata']
-                    if meta['uid'] not in seen:
-                        seen.add(str(meta['uid']))
-                        where = MachineId(str(meta['namespace']), str(meta['name']),
-                                          str(meta['uid']), api.context)
+                    where = MachineId.of(job, api.context)
+                    if where.uid not in seen:
+                        seen.add(where.uid)
                         yield self._machine(api, where, job, pods.pod_of(job, found))
 
     def _jobs(self, api: Api, labels: str) -> Iterator[tuple[str, list[dict[str, Any]]]]:
@@ -264,7 +261,7 @@ class KubernetesProvider(Provider):
         namespaces = {api.namespace, *(
             space for context, space in self._places if context in ('', api.context))}
         for namespace in sorted(namespaces):
-            with _translated('listing the machines', namespace):
+            with explained('listing the machines', namespace):
                 yield namespace, list(items(self._ask(api, 'jobs', namespace, labels)))
 
     def _ask(self, api: Api, kind: str, namespace: str, labels: str) -> dict[str, Any]:
@@ -276,23 +273,22 @@ class KubernetesProvider(Provider):
         api = kubernetes_client.connect(where.context)
         for known in (self._made, self._services, self._pods):
             known.pop(machine_id, None)
-        with _translated(f"deleting '{where.job}'", where.namespace):
+        with explained(f"deleting '{where.job}'", where.namespace):
             ending.end(api, where)
 
     def open_port(
         self, machine: Machine, port: int, sources: Sequence[str],
     ) -> tuple[str, int]:
-        """Make a Service for a TCP port, or remove it; loads what it takes when asked alone."""
-        from fogros2.provider.kubernetes import publishing
+        """Make a Service for a TCP port, or remove it."""
         where = MachineId.parse(machine.id)
         api = kubernetes_client.connect(where.context)
         if not sources:
-            publishing.close(api, where, port)
+            ways.close_port(api, where, port)
             return machine.vpn_host, port
         pod = pods.pod_of(self._job(api, where), self._pods_of(api, where))
         if pod is None:
             raise MachineNotFound(f"the pod of '{where.job}' is gone")
-        return publishing.open_port(api, where, machine, pod, port, sources, self.cancel)
+        return ways.open_port(api, where, machine, pod, port, sources, self.cancel)
 
     # -- shared by the methods above ------------------------------------------------------------
 
@@ -304,18 +300,14 @@ class KubernetesProvider(Provider):
         return api, namespace
 
     def _job(self, api: Api, where: MachineId) -> dict[str, Any]:
-        try:
-            job = api.request('GET', path('jobs', where.namespace, where.job))
-        except ApiError as error:
-            if error.status == 404:
-                raise MachineNotFound(f"'{where.job}' does not exist any more") from error
-            raise refused(error, f"reading '{where.job}'", where.namespace) from error
-        if job['metadata']['uid'] != where.uid:
+        with explained(f"reading '{where.job}'", where.namespace):
+            job = existing(api, path('jobs', where.namespace, where.job))
+        if job is None or job['metadata']['uid'] != where.uid:
             raise MachineNotFound(f"'{where.job}' does not exist any more")
         return job
 
     def _pods_of(self, api: Api, where: MachineId) -> list[dict[str, Any]]:
-        with _translated('listing pods', where.namespace):
+        with explained('listing pods', where.namespace):
             return list(items(self._ask(
                 api, 'pods', where.namespace, selector({names.MACHINE: where.job}))))
 
@@ -367,11 +359,3 @@ def kind_of(job: Mapping[str, Any]) -> str:
     limits = (container.get('resources') or {}).get('limits') or {}
     words = [f'{value} {name}' for name, value in sorted(limits.items())]
     return ', '.join([*words, str(container['image']).rpartition('/')[2]])
-
-
-@contextlib.contextmanager
-def _translated(what: str, namespace: str) -> Iterator[None]:
-    try:
-        yield
-    except ApiError as error:
-        raise refused(error, what, namespace) from error
