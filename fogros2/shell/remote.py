@@ -232,7 +232,7 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
         raise ConnectError(f"the connection to '{self.name}' was lost while "
                            f'{_what(command)} ran there', "check the robot's network")
 
-    def _remote_shell(self) -> contextlib.AbstractContextManager[tuple[str, list[FogError]]]:
+    def _remote_shell(self) -> contextlib.AbstractContextManager[sync.RemoteShell]:
         return relay.remote_shell(self.start)
 
     def open(self, command: Command) -> Stream:

@@ -43,6 +43,10 @@ _LOST = (10, 12, 255)
 _NOT_WRITTEN = 11
 
 
+#: The value of rsync's ``-e``, '' for this computer; the files that rsync inherits; errors.
+RemoteShell = tuple[str, Sequence[int], list[FogError]]
+
+
 class RsyncShell(abc.ABC):
     """The methods of a Shell that copy files and folders; a subclass runs commands."""
 
@@ -59,8 +63,8 @@ class RsyncShell(abc.ABC):
         """Run a command on the machine, and wait for its end; see the protocol."""
 
     @abc.abstractmethod
-    def _remote_shell(self) -> contextlib.AbstractContextManager[tuple[str, list[FogError]]]:
-        """Return the value of rsync's ``-e``, '' for this computer; and a list for errors."""
+    def _remote_shell(self) -> contextlib.AbstractContextManager[RemoteShell]:
+        """Return how rsync reaches the machine."""
 
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
         """Write a file atomically, and create its folders; see the protocol."""
@@ -85,12 +89,13 @@ class RsyncShell(abc.ABC):
             raise missing_there(self.where)
         bulk = not there and self.endpoint.kind == 'ssh' \
             and process.which('ssh') is not None and is_large(source, BULK)
-        with open_ssh(self.endpoint) if bulk else self._remote_shell() as (rsh, failures):
+        with open_ssh(self.endpoint) if bulk else self._remote_shell() as (rsh, files, failures):
             result = process.run(
                 rsync(source, place(target, rsh), excludes=excludes, includes=includes, rsh=rsh,
                       compress=bulk, progress=on_progress is not None),
                 timeout=max(0.1, timeout - (time.monotonic() - begin)), cancel=cancel,
-                check=False, on_output=None if on_progress is None else Progress(on_progress))
+                check=False, inherited=files,
+                on_output=None if on_progress is None else Progress(on_progress))
         if failures:
             raise failures[0]
         if result.returncode not in (0, VANISHED):
@@ -109,12 +114,12 @@ class RsyncShell(abc.ABC):
         process.require(['rsync'])
         words = ['rsync', '-rltp', '-s', '--delete', '--safe-links', '--chmod=u-s,g-s']
         words += [f'--link-dest={known.resolve()}'] if known is not None else []
-        with self._remote_shell() as (rsh, failures):
+        with self._remote_shell() as (rsh, files, failures):
             words += ['-e', rsh] if rsh else []
             result = process.run(
                 Command((*words, '--', place(source, rsh), f'{target}/'),
                         environment={'LC_ALL': 'C'}, what='rsync'),
-                timeout=timeout, cancel=cancel, check=False)
+                timeout=timeout, cancel=cancel, check=False, inherited=files)
         if failures:
             raise failures[0]
         if result.returncode != 0:
@@ -256,11 +261,9 @@ def explained(result: Result, source: Path, where: str) -> FogError:
 
 
 @contextlib.contextmanager
-def open_ssh(endpoint: Endpoint) -> Iterator[tuple[str, list[FogError]]]:
+def open_ssh(endpoint: Endpoint) -> Iterator[RemoteShell]:
     """
-    Yield the value of rsync's ``-e`` for a connection of OpenSSH with the same pinned host key.
-
-    The list of errors stays empty: rsync reports them.
+    Yield a remote shell by a connection of OpenSSH with the same pinned host key.
 
     :raises HostKeyError: known_hosts cannot be read.
     :raises PrerequisiteError: the temporary file with the host key cannot be created.
@@ -289,7 +292,7 @@ def open_ssh(endpoint: Endpoint) -> Iterator[tuple[str, list[FogError]]]:
         known.flush()
         words += ['-o', 'HostKeyAlias=machine', '-o', f'UserKnownHostsFile={known.name}',
                   '-o', 'GlobalKnownHostsFile=/dev/null']
-        yield ' '.join(_word(word) for word in words), []
+        yield ' '.join(_word(word) for word in words), (), []
 
 
 def _word(word: str) -> str:
