@@ -314,7 +314,9 @@ class Watch:
                 return response
             data = response.read(decode_content=True)
             response.release_conn()
-        except (Unreachable, *http_errors()):
+        except Unreachable:
+            return None
+        except http_errors():
             return None
         said = refusal(response.status, parsed(data), data)
         if said.status != 410 and not api.passing(said):

@@ -58,7 +58,7 @@ def run(name: str, words: Sequence[str] = ()) -> NoReturn:
     :raises ConfigurationError: no running launch uses the machine, or there is no such program.
     """
     folder, variables = launch_of(name, Store())
-    words = words or [os.environ.get('SHELL') or '/bin/sh']
+    words = list(words) or [os.environ.get('SHELL') or '/bin/sh']
     if Path(words[0]).name == 'bash' and len(words) == 1:
         # .bashrc may set the same variables, so the exports come after it.
         start = folder / f'{name}.bashrc'
