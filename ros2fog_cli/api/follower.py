@@ -11,14 +11,13 @@ import threading
 import time
 from typing import Any, Optional
 
-from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
-from fogros2.errors import ConnectError, FogError
+from fogros2.errors import FogError
 from fogros2.events import Event, Status
 from fogros2.model import Command
 from fogros2.shell import Shell
 from fogros2.store import Record
-from ros2fog_cli.api import machines, reach
+from ros2fog_cli.api import reach
 from ros2fog_cli.api.log import describe
 from ros2fog_cli.api.machines import Entry
 
@@ -32,17 +31,6 @@ VPN_INTERVAL = 2.0
 _WORDS = 32_768
 
 Changed = Callable[[], None]
-
-
-@dataclasses.dataclass(frozen=True)
-class LogLine:
-    """A line of a machine's log; ``number`` counts from 1, ``time`` is seconds since the epoch."""
-
-    number: int
-    time: float
-    node: str
-    error: bool
-    text: str
 
 
 class Follower:
@@ -61,7 +49,7 @@ class Follower:
         self._changed = changed
         self._interval = interval
         self._lock = threading.Lock()
-        self._lines: deque[LogLine] = deque(maxlen=LINES)
+        self._lines: deque[dict[str, Any]] = deque(maxlen=LINES)
         self._number = self._seq = 0
         self._vpn_at = -1e9
         self._pids: tuple[int, ...] = ()
@@ -99,10 +87,14 @@ class Follower:
         """The number of the newest log line."""
         return self._number
 
-    def lines(self, after: int) -> list[LogLine]:
-        """Return the log lines with a number above ``after``."""
+    def lines(self, after: int) -> list[dict[str, Any]]:
+        """
+        Return the log lines with a number above ``after``, as JSON values.
+
+        ``number`` counts from 1, ``time`` is in seconds since the epoch; ``node`` may be ''.
+        """
         with self._lock:
-            return [line for line in self._lines if line.number > after]
+            return [line for line in self._lines if line['number'] > after]
 
     # -- the thread -----------------------------------------------------------------------------
 
@@ -125,17 +117,8 @@ class Follower:
                 pause = min(1.5 * pause, LONGEST_RETRY)
 
     def _connect(self, undo: contextlib.ExitStack) -> tuple[AgentClient, Shell]:
-        entry = self._entry
-        to = reach.endpoint(entry)
-        if machines.load(entry.provider).capabilities.firewall:
-            # Reading the state must not open a port.
-            inside = reach.through_vpn(entry, to)
-            if inside is None:
-                raise ConnectError(f"'{entry.name}' can't be reached through the VPN")
-            to = inside
-        shell = shells.connect(to, name=entry.name, timeout=10.0)
-        undo.callback(shell.close)
-        client = reach.agent(entry, shell)
+        shell = undo.enter_context(reach.session(self._entry, timeout=10.0, opens=False))
+        client = reach.agent(self._entry, shell)
         undo.callback(client.close)
         following = client.status(timeout=15.0)['next']
         if following <= self._seq:
@@ -177,9 +160,10 @@ class Follower:
         with self._lock:
             for line in text.splitlines():
                 self._number += 1
-                self._lines.append(LogLine(
-                    self._number, at if isinstance(at, (int, float)) else time.time(),
-                    str(event.get('name', '')), error, line[:WIDTH]))
+                self._lines.append({
+                    'number': self._number, 'node': str(event.get('name', '')), 'error': error,
+                    'time': at if isinstance(at, (int, float)) else time.time(),
+                    'text': line[:WIDTH]})
         self._changed()
 
 

@@ -10,7 +10,6 @@ import os
 from typing import Any, TextIO
 
 from ros2fog_cli.api import replicas
-from ros2fog_cli.api.follower import LogLine
 from ros2fog_cli.api.table import cost, duration, shares, size, table
 
 #: Enter and leave the alternate screen; meanwhile the cursor is hidden and long lines are cut,
@@ -51,7 +50,7 @@ def clean(text: str) -> str:
 
 
 def frame(
-    machine: dict[str, Any], lines: Sequence[LogLine], now: float, *, columns: int = 80,
+    machine: dict[str, Any], lines: Sequence[dict[str, Any]], now: float, *, columns: int = 80,
     rows: int = 24, paint: Paint = plain,
 ) -> list[str]:
     """
@@ -90,7 +89,7 @@ def frame(
     room = rows - len(parts) - 1
     if lines and room > 0:
         parts.append(('', ''))
-        parts += [(f'[{line.node}] {line.text}' if line.node else line.text, 'dim')
+        parts += [(f"[{line['node']}] {line['text']}" if line['node'] else line['text'], 'dim')
                   for line in lines[-room:]]
     # Clean and cut the text before it is painted: escape sequences take no columns.
     return [paint(clean(text)[:columns], style) for text, style in parts[:rows]]

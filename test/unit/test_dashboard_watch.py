@@ -29,7 +29,7 @@ from fogros2.report import (
 )
 from rigs import recorded_agent
 from ros2fog_cli.api import screen
-from ros2fog_cli.api.follower import agent_state, LogLine, node_name, rates
+from ros2fog_cli.api.follower import agent_state, node_name, rates
 from ros2fog_cli.api.reach import Link
 from ros2fog_cli.api.shown import as_json, phase
 
@@ -172,7 +172,7 @@ def machine(**changes: Any) -> dict[str, Any]:
 
 
 def test_machine_is_drawn_on_a_screen() -> None:
-    lines = [LogLine(n, 1.0, 'slam-1', False, f'line {n}') for n in range(1, 100)]
+    lines = [{'node': 'slam-1', 'text': f'line {n}'} for n in range(1, 100)]
     shown = screen.frame(machine(), lines, 1100.0, columns=90, rows=20)
     text = '\n'.join(shown)
     assert len(shown) == 20
@@ -209,7 +209,7 @@ def test_topics_option_needs_watch() -> None:
 
 def test_output_of_a_node_has_no_escape_sequences() -> None:
     bad = '\x1b]0;owned\x07\x1b[2J\x9b31mred\r\n'
-    lines = [LogLine(1, 1.0, f'n{bad}', True, f'before {bad}after')]
+    lines = [{'node': f'n{bad}', 'text': f'before {bad}after'}]
     shown = screen.frame(machine(problems=[bad], nodes=[
         {**machine()['nodes'][0], 'name': bad}]), lines, 1100.0, rows=40)
     assert 'owned' in '\n'.join(shown)
