@@ -6,7 +6,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable
 import contextlib
-import functools
+import getpass
 import threading
 import time
 from typing import Generic, Optional, TypeVar
@@ -14,7 +14,7 @@ from typing import Generic, Optional, TypeVar
 from fogros2.errors import Cancelled, ConnectError, DeadlineExceeded, FogError
 from fogros2.model import Command, Endpoint, Result
 from fogros2.shell import command_line, relay, Stream, sync, terminal
-from fogros2.shell.lines import Channel, Connection, LineStream, Output
+from fogros2.shell.lines import Channel, Connection, LineStream, Output, take_errors
 from fogros2.waiting import cancellable, wait_until
 
 #: Seconds to wait for further output after a command's end, as its children may still write.
@@ -36,13 +36,11 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
     #: Whether to end the input of a command that gets none; else its command line does that.
     ends_empty_input = True
 
-    def __init__(
-        self, endpoint: Endpoint, *, name: str, user: str, timeout: float,
-    ) -> None:
+    def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
         self.endpoint = endpoint
         self.name = name
         self.where = f"'{name}'"
-        self.user = user
+        self.user = endpoint.user or getpass.getuser()
         self._timeout = timeout
         self._lock = threading.Lock()
         self._connection: Optional[Link] = None
@@ -51,29 +49,25 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
         self._closings = 0
 
     @abc.abstractmethod
-    def _connect(self, timeout: float, cancel: Optional[threading.Event]) -> Link:
+    def _connect(self, timeout: float) -> Link:
         """
-        Open a connection.
+        Open a connection, in a thread that a cancel abandons.
 
         :raises ConnectError: the machine cannot be reached.
         """
 
     @abc.abstractmethod
     def _start(
-        self, connection: Link, command: Command | str, timeout: float,
-        cancel: Optional[threading.Event],
+        self, connection: Link, command: Command | str | None, timeout: float,
+        cancel: Optional[threading.Event] = None, size: Optional[tuple[int, int, str]] = None,
     ) -> Channel:
         """
-        Start a command, or a command line; a lost connection is closed before the error.
+        Start a command or a command line; a lost connection is closed before the error.
 
+        :param command: None: start the login shell.
+        :param size: of the command's terminal, see ``terminal.size``; None: no terminal.
         :raises ConnectError: the connection is lost, or gives no channel.
         """
-
-    @abc.abstractmethod
-    def _start_in_terminal(
-        self, command: Optional[Command], size: Optional[tuple[int, int, str]],
-    ) -> Channel:
-        """Start a command or the login shell; ``size`` is the result of ``terminal.size``."""
 
     def _abandon(self, command: Command, output: Output) -> None:
         """End a command whose channel is open, if closing the channel does not end it."""
@@ -104,7 +98,9 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
             connection, closings = self._known()
             if connection is not None:
                 return connection
-            connection = self._connect(max(0.5, until - time.monotonic()), cancel)
+            connection = cancellable(
+                lambda: self._connect(max(0.5, until - time.monotonic())), cancel,
+                what=f"connecting to '{self.name}'", late=lambda late: late.close())
             with self._lock:
                 if closings == self._closings:
                     self._connection = connection
@@ -240,28 +236,14 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
         channel = self.start(command)
         _feed(channel, command.input, end=False)
         channel.settimeout(None)
-        return LineStream(channel, self.name, functools.partial(take_errors, channel))
+        return LineStream(channel, self.name)
 
     def interactive(self, command: Optional[Command] = None) -> int:
         """Connect the user's terminal to the login shell, or to ``command``."""
         size = terminal.size()
-        return terminal.attach(self._start_in_terminal(command, size), keys=size is not None)
-
-
-def connecting(
-    connect: Callable[[], Link], cancel: Optional[threading.Event], name: str,
-) -> Link:
-    """Call ``connect``, which a cancel abandons; a connection that comes later is closed."""
-    return cancellable(connect, cancel, what=f"connecting to '{name}'",
-                       late=lambda late: late.close())
-
-
-def take_errors(channel: Channel) -> bytes:
-    """Return the standard error that has arrived; unread, it would stop the program."""
-    parts = []
-    while channel.recv_stderr_ready():
-        parts.append(channel.recv_stderr(1 << 16))
-    return b''.join(parts)
+        channel = self._start(
+            self._connected(self._timeout), command, self._timeout, size=size)
+        return terminal.attach(channel, keys=size is not None)
 
 
 def _what(command: Command) -> str:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import getpass
 import os
 from pathlib import Path
 import socket
@@ -109,14 +108,14 @@ class Here(multiplexed.MultiplexedShell):
     """A shell by a multiplexer on this computer."""
 
     def __init__(self) -> None:
-        super().__init__(Endpoint('guest'), name='here', user=getpass.getuser(), timeout=10.0)
+        super().__init__(Endpoint('guest'), name='here', timeout=10.0)
         ours, theirs = socket.socketpair()
         with theirs:
             self.child = subprocess.Popen([sys.executable, multiplexer.__file__],
                                           stdin=theirs, stdout=theirs)
         self.link = multiplexed.Link(ours, self.name, self.user)
 
-    def _connect(self, timeout: float, cancel: object) -> multiplexed.Link:
+    def _connect(self, timeout: float) -> multiplexed.Link:
         return self.link
 
 
