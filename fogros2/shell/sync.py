@@ -31,7 +31,7 @@ from fogros2.errors import (
     WorkspaceError,
 )
 from fogros2.model import Command, Endpoint, Result, SyncReport
-from fogros2.shell import command_line, ssh_connection
+from fogros2.shell import command_line, Shell, ssh_connection
 
 #: Bytes from which a separate connection of OpenSSH is faster.
 BULK = 64 << 20
@@ -47,20 +47,12 @@ _NOT_WRITTEN = 11
 RemoteShell = tuple[str, Sequence[int], list[FogError]]
 
 
-class RsyncShell(abc.ABC):
+class RsyncShell(Shell):
     """The methods of a Shell that copy files and folders; a subclass runs commands."""
 
     endpoint: Endpoint
     #: The machine, for messages.
     where: str
-
-    @abc.abstractmethod
-    def run(
-        self, command: Command, *, timeout: float, check: bool = True,
-        cancel: Optional[threading.Event] = None,
-        on_output: Optional[Callable[[str], None]] = None,
-    ) -> Result:
-        """Run a command on the machine, and wait for its end; see the protocol."""
 
     @abc.abstractmethod
     def _remote_shell(self) -> contextlib.AbstractContextManager[RemoteShell]:
