@@ -74,7 +74,8 @@ class WireGuard(Vpn):
     """
     Commands for a WireGuard interface; they need root and the programs of ``PACKAGES``.
 
-    :param domain: ROS_DOMAIN_ID, whose DDS ports an interface with a firewall admits.
+    :param domain: ROS_DOMAIN_ID, whose DDS ports an interface with a firewall admits; the DDS
+        plugin checks that there are such ports.
     :param ports: further ranges of UDP ports to admit, as (first, last).
     :param asked: IPv4 addresses that the user configured for the robot's nodes to ask.
     """
@@ -82,8 +83,6 @@ class WireGuard(Vpn):
     def __init__(
         self, domain: int = 0, ports: Sequence[tuple[int, int]] = (), asked: Sequence[str] = (),
     ) -> None:
-        if not 0 <= domain <= (65535 - PORT_BASE) // PORTS_PER_DOMAIN:
-            raise ConfigurationError(f'ROS_DOMAIN_ID {domain} has no DDS ports', 'use 0 to 101')
         self.domain = domain
         self.ports = (dds_ports(domain), *ports)
         self.asked = tuple(asked)
