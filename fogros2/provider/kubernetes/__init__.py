@@ -28,6 +28,7 @@ from fogros2.kubernetes_client import Api, ApiError, existing, items, path, sele
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider, TAG_ON_EXIT
 from fogros2.provider.kubernetes import boot, ending, hints, manifests, names, pods, ways
+from fogros2.provider.kubernetes.exposure import Exposure
 from fogros2.provider.kubernetes.hints import explained, refused
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.provider.kubernetes.options import Options
@@ -196,7 +197,7 @@ class KubernetesProvider(Provider):
         cancel = self.cancel or threading.Event()
         begin = time.monotonic()
         job = self._made.get(machine_id) or self._job(api, where)
-        pod = Start(api, where, job, name=name).wait(timeout=timeout, cancel=cancel)
+        pod = Start(api, where, job, name=name, cancel=cancel).wait(timeout)
         self._pods[machine_id] = str(pod['metadata']['uid'])
         change = self._again(machine_id, job)
         exposure = ways.known(job)
@@ -205,13 +206,12 @@ class KubernetesProvider(Provider):
                 api, where, job, pod, service=self._services.get(machine_id), cancel=cancel,
                 timeout=max(1.0, timeout - (time.monotonic() - begin)))
             change['metadata'] = {'annotations': {names.EXPOSURE: str(exposure)}}
-            job = merged(job, change)
         if change and names.tags_of(job).get(TAG_ON_EXIT) == 'keep':
             # Later launches read it.
             with explained(f"the Job of '{name}'", where.namespace):
-                job = api.request(
+                api.request(
                     'PATCH', path('jobs', where.namespace, where.job), change, cancel=cancel)
-        return self._machine(api, where, job, pod)
+        return self._machine(api, where, job, pod, exposure)
 
     def _again(self, machine_id: str, job: Mapping[str, Any]) -> dict[str, Any]:
         """Return the change that gives a kept machine another lifetime."""
@@ -313,8 +313,9 @@ class KubernetesProvider(Provider):
 
     def _machine(
         self, api: Api, where: MachineId, job: Mapping[str, Any],
-        pod: Optional[Mapping[str, Any]],
+        pod: Optional[Mapping[str, Any]], exposure: Optional[Exposure] = None,
     ) -> Machine:
+        exposure = exposure or ways.known(job)
         state = pods.state_of(job, pod)
         tags = names.tags_of(job)
         status = (pod or {}).get('status') or {}
@@ -324,7 +325,6 @@ class KubernetesProvider(Provider):
                 'kubernetes', names.endpoint_host(
                     where.namespace, str(pod['metadata']['name']), where.context),
                 0, names.annotation(job, names.LOGIN))
-        exposure = ways.known(job)
         address = str(status.get('podIP') or '')
         return Machine(
             id=str(where), name=tags.get('fogros2-name', where.job), provider=self.name,
@@ -337,14 +337,6 @@ class KubernetesProvider(Provider):
             image=str(container_of(job)['image']),
             tags=tags, end_command=boot.END_COMMAND,
             note='' if exposure is None else exposure.words())
-
-
-def merged(job: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a Job with changed annotations, as the cluster would return it."""
-    meta = job['metadata']
-    notes = {**(meta.get('annotations') or {}),
-             **((change.get('metadata') or {}).get('annotations') or {})}
-    return {**job, 'metadata': {**meta, 'annotations': notes}}
 
 
 def container_of(job: Mapping[str, Any]) -> Mapping[str, Any]:

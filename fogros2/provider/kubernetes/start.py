@@ -31,6 +31,7 @@ class Start:
 
     def __init__(
         self, api: Api, where: MachineId, job: Mapping[str, Any], *, name: str,
+        cancel: threading.Event,
     ) -> None:
         self._api = api
         self._where = where
@@ -41,21 +42,20 @@ class Start:
         self._since = 0.0
         self._scales_up = False
         self._next_events = time.monotonic() + QUIET
-        self._cancel: Optional[threading.Event] = None
+        self._cancel = cancel
 
-    def wait(self, *, timeout: float, cancel: threading.Event) -> dict[str, Any]:
+    def wait(self, timeout: float) -> dict[str, Any]:
         """
         Return the pod as soon as its container runs.
 
         :raises ProviderError: the pod cannot run; with the event's text.
         :raises DeadlineExceeded: the pod did not run in time.
         """
-        self._cancel = cancel
         try:
             with hints.explained('to let the pods be watched', self._where.namespace):
                 return self._api.follow(
                     path('pods', self._where.namespace), self._look, tick=self._tick,
-                    again=self._again, timeout=timeout, cancel=cancel,
+                    again=self._again, timeout=timeout, cancel=self._cancel,
                     what=f"the pod of '{self._name}' to run",
                     labelSelector=selector({names.MACHINE: self._where.job}))
         except DeadlineExceeded as error:
