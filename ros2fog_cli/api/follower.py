@@ -23,8 +23,8 @@ from ros2fog_cli.api.machines import Entry
 
 #: Number of log lines to keep, and longest line in characters.
 LINES, WIDTH = 500, 2000
-#: Shortest and longest pause between two attempts to connect, in seconds.
-RETRY, LONGEST_RETRY = 2.0, 15.0
+#: Pause between two attempts to connect, in seconds.
+RETRY = 5.0
 #: Seconds between two looks at the VPN. sudo, where it is needed, logs each look.
 VPN_INTERVAL = 2.0
 #: Bytes to read of a process's command line.
@@ -54,29 +54,23 @@ class Follower:
         self._vpn_at = -1e9
         self._pids: tuple[int, ...] = ()
         self.vpn: Optional[dict[str, Any]] = None
-        self.agent: Optional[dict[str, Any]] = None
+        self.agent: Optional[Status] = None
         self.problems: dict[str, str] = {}
         #: Names of the machine's nodes in the ROS graph.
         self.names: tuple[str, ...] = ()
-        self._stopped, self._watched = threading.Event(), threading.Event()
-        self._watched.set()
+        self._stopped = threading.Event()
         self._thread = threading.Thread(
             target=self._run, name=f'fog-follow-{entry.name}', daemon=True)
         self._thread.start()
 
-    def know(self, entry: Entry, *, watched: bool = True) -> None:
-        """Update the machine's entry; pause while nobody watches (``watched`` is False)."""
+    def know(self, entry: Entry) -> None:
+        """Update the machine's entry."""
         if entry.record is not None:
             self._entry, self._record = entry, entry.record
-        if watched:
-            self._watched.set()
-        else:
-            self._watched.clear()
 
     def stop(self) -> None:
         """Stop the thread; it closes the connection soon after."""
         self._stopped.set()
-        self._watched.set()
 
     def join(self, timeout: float) -> None:
         """Wait up to ``timeout`` seconds until the connection is closed."""
@@ -99,22 +93,19 @@ class Follower:
     # -- the thread -----------------------------------------------------------------------------
 
     def _run(self) -> None:
-        pause = RETRY
-        while self._watched.wait() and not self._stopped.is_set():
+        while not self._stopped.is_set():
             try:
                 with contextlib.ExitStack() as undo:
                     client, shell = self._connect(undo)
-                    while self._watched.is_set() and not self._stopped.is_set():
+                    while not self._stopped.is_set():
                         self._ask(client, shell)
-                        pause = RETRY
                         self._stopped.wait(self._interval)
             except FogError as error:
                 self.problems['agent'] = str(error)
                 self.agent = None
                 self._look_at_vpn()
                 self._changed()
-                self._stopped.wait(pause)
-                pause = min(1.5 * pause, LONGEST_RETRY)
+                self._stopped.wait(RETRY)
 
     def _connect(self, undo: contextlib.ExitStack) -> tuple[AgentClient, Shell]:
         shell = undo.enter_context(reach.session(self._entry, timeout=10.0, opens=False))
@@ -127,9 +118,9 @@ class Follower:
         return client, shell
 
     def _ask(self, client: AgentClient, shell: Shell) -> None:
-        agent = agent_state(client.status(timeout=15.0))
+        agent = client.status(timeout=15.0)
         self.problems.pop('agent', None)
-        pids = tuple(sorted(node['pid'] for node in agent['nodes'] if node['pid']))
+        pids = tuple(sorted(node['pid'] for node in agent['nodes'] if node['pid'] is not None))
         if pids != self._pids:
             self.names = graph_names(shell, pids)
             self._pids = pids
@@ -165,21 +156,6 @@ class Follower:
                     'time': at if isinstance(at, (int, float)) else time.time(),
                     'text': line[:WIDTH]})
         self._changed()
-
-
-def agent_state(status: Status) -> dict[str, Any]:
-    """
-    Return the part of an agent's status that the screens show.
-
-    ``since`` is in seconds since the epoch, ``heartbeat_age`` in seconds, ``rss`` in bytes.
-    """
-    return {
-        'since': status['since'], 'rss': 1000 * status['rss_kb'],
-        'heartbeat_age': status['heartbeat_age'],
-        'nodes': [{
-            'name': node['name'], 'state': node['state'], 'pid': node['pid'] or 0,
-            'returncode': node['returncode'], 'restarts': node['restarts'],
-            'error': node.get('error', '')} for node in status['nodes']]}
 
 
 def rates(before: Optional[dict[str, Any]], link: reach.Link, now: float) -> dict[str, Any]:

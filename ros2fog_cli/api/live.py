@@ -91,8 +91,6 @@ class Live:
         for follower in followers:
             follower.join(2.0)
         self._threads[0].join(5.0)
-        for launch in self._launches.values():
-            launch.close()
         if self._graphs is not None:
             self._graphs.close()
 
@@ -171,11 +169,8 @@ class Live:
         while not self._stopped.is_set():
             self._wake.clear()
             self._look()
-            if self.watched:
-                self._wake.wait(LOOK)
-                continue
-            # The update above has already stopped the measurements; present() wakes this thread.
-            self._wake.wait()
+            # While nobody watches, the measurements are stopped; present() wakes this thread.
+            self._wake.wait(LOOK if self.watched else None)
 
     def _keep_asking(self) -> None:
         while not self._stopped.wait(LOOK):
@@ -260,9 +255,6 @@ class Live:
             launch.read(path)
         for name, launch in list(self._launches.items()):
             if name not in there:
-                if launch.file is not None:
-                    launch.read(folder / name)
-                    launch.close()
                 launch.alive = False
                 launch.ended = launch.ended or now
                 if now - launch.ended > KEPT:
@@ -281,16 +273,15 @@ class Live:
                 self.store.root / 'launches' / shown.launch, shown.entry.name))
         if not there:
             shown.ended = shown.ended or now
-        up = there and record is not None and record.launch_alive and bool(record.agent) and (
-            not (launch and launch.steps) or phase(shown.steps) == 'running')
-        if up and shown.follower is None:
+        if not (self.watched and there and record is not None and record.launch_alive):
+            if shown.follower is not None:
+                shown.follower.stop()
+                shown.follower = None
+        elif shown.follower is not None:
+            shown.follower.know(shown.entry)
+        elif record.agent and (
+                not (launch and launch.steps) or phase(shown.steps) == 'running'):
             shown.follower = Follower(shown.entry, self._wake.set, self._interval)
-        elif up and shown.follower is not None:
-            shown.follower.know(shown.entry, watched=self.watched)
-        elif shown.follower is not None and (
-                record is None or not record.launch_alive or not there):
-            shown.follower.stop()
-            shown.follower = None
 
     # -- as JSON --------------------------------------------------------------------------------
 

@@ -300,20 +300,11 @@ def _ask(
         found = []
     # it may have no tags, or not be able to search where the machine is
     ids = {machine.id for machine in found}
-    return found + _described(
-        provider, [r for r in records if r.provider == name and r.machine_id not in ids])
-
-
-def _described(provider: Provider, records: Sequence[Record]) -> list[Machine]:
-    """Return the machines that the store knows, and a search did not find."""
-    machines = []
     for record in records:
-        if record.machine_id is not None:
-            try:
-                machines.append(provider.describe(record.machine_id))
-            except MachineNotFound:
-                continue
-    return machines
+        if record.provider == name and record.machine_id and record.machine_id not in ids:
+            with contextlib.suppress(MachineNotFound):
+                found.append(provider.describe(record.machine_id))
+    return found
 
 
 def load(name: str, regions: Optional[Sequence[str]] = None) -> Provider:

@@ -85,22 +85,17 @@ def session(
     """
     to = endpoint(entry, user)
     with contextlib.ExitStack() as undo:
-        if firewalled(entry):
+        if machines.load(entry.provider).capabilities.firewall:
             inside = through_vpn(entry, to)
             if inside is not None:
                 to = inside
             elif not opens:
                 raise ConnectError(f"'{entry.name}' can't be reached through the VPN")
-            elif entry.own:
+            elif entry.own and entry.machine is not None:
                 _open(entry, to.port, undo)
         found = shells.connect(to, name=entry.name, timeout=timeout)
         undo.callback(found.close)
         yield found
-
-
-def firewalled(entry: Entry) -> bool:
-    """Return whether the machine's provider has a firewall."""
-    return entry.machine is not None and machines.load(entry.provider).capabilities.firewall
 
 
 def through_vpn(
