@@ -109,10 +109,7 @@ class WireGuard(Vpn):
 
         The filter exists before the interface.
         """
-        steps = self._steps(interface, peers)
-        yield Command.script(
-            '\n'.join([_PATH, *(step.do for step in steps)]), sudo=True,
-            what=_what('set', interface, 'up'))
+        yield self._script(interface, peers, _what('set', interface, 'up'))
 
     def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """Yield the commands that set the peers, and keep the sessions of remaining ones."""
@@ -158,10 +155,7 @@ class WireGuard(Vpn):
 
         Peers without an endpoint get the one that the health check noted last.
         """
-        steps = self._steps(interface, peers, recall=True)
-        yield Command.script(
-            '\n'.join([_PATH, *(step.do for step in steps)]), sudo=True,
-            what=_what('repair', interface))
+        yield self._script(interface, peers, _what('repair', interface), recall=True)
 
     def status(self, interface: VpnInterface) -> Command:
         """Return a command that prints only counters: ``dump`` would print the private key."""
@@ -212,6 +206,13 @@ class WireGuard(Vpn):
                 f'if [ -e {_guests(interface)}.json ] && found=$({look}) && '
                 f'[ "$found" != "[]" ]; then\n  : >{_left(interface)}\n  exit 0\nfi\n'
                 f'{command.argv[-1]}')))
+
+    def _script(
+        self, interface: VpnInterface, peers: Sequence[Peer], what: str, *, recall: bool = False,
+    ) -> Command:
+        steps = self._steps(interface, peers, recall=recall)
+        return Command.script(
+            '\n'.join([_PATH, *(step.do for step in steps)]), sudo=True, what=what)
 
     def _steps(
         self, interface: VpnInterface, peers: Sequence[Peer], *, recall: bool = False,

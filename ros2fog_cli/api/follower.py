@@ -188,12 +188,9 @@ def graph_names(shell: Shell, pids: tuple[int, ...]) -> tuple[str, ...]:
         'sh', '-c', 'for p; do echo; head -c "$0" "/proc/$p/cmdline" 2>/dev/null | '
         r"tr '\n\0' '\001\n'; done", str(_WORDS), *map(str, pids)),
         what='look at the processes'), timeout=15.0, check=False)
-    names = set()
-    for words in result.stdout.split('\n\n'):
-        name = node_name([word for word in words.split('\n') if word])
-        if name:
-            names.add(name)
-    return tuple(sorted(names))
+    names = {node_name([word for word in words.split('\n') if word])
+             for words in result.stdout.split('\n\n')}
+    return tuple(sorted(names - {''}))
 
 
 def node_name(words: list[str]) -> str:

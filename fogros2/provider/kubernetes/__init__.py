@@ -11,7 +11,7 @@ images.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import threading
 import time
@@ -55,12 +55,9 @@ class KubernetesProvider(Provider):
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._reviewing = threading.Lock()
-        self._trying = threading.Lock()
-        #: When the cluster last admitted a pod, by its namespace and what it asks for.
-        self._admitted: dict[str, float] = {}
-        #: When this user last had all rights, by context and namespace.
-        self._reviewed: dict[tuple[str, str], float] = {}
+        self._asking = threading.Lock()
+        #: When the cluster last agreed: that this user has all rights, or to a pod.
+        self._agreed: dict[object, float] = {}
         #: Contexts and namespaces in launch files.
         self._places: set[tuple[str, str]] = set()
         self._lifetimes: dict[str, float] = {}
@@ -90,24 +87,24 @@ class KubernetesProvider(Provider):
                 "use on_exit='keep' or 'delete'")
         api, namespace = self._place(options)
         self._lifetimes[names.job_name(spec.name)] = spec.lifetime
-        self._check_rights(api, namespace)
+        self._once((api.context, namespace), lambda: self._check_rights(api, namespace))
+
+    def _once(self, what: object, ask: Callable[[], object]) -> None:
+        """Ask the cluster, once for all machines of a launch; ``ask`` raises if it refuses."""
+        with self._asking:
+            if time.monotonic() - self._agreed.get(what, -_SURE) >= _SURE:
+                ask()
+                self._agreed[what] = time.monotonic()
 
     def _check_rights(self, api: Api, namespace: str) -> None:
-        """Check this user's rights, once for all machines of a launch."""
-        with self._reviewing:
-            when = self._reviewed.get((api.context, namespace))
-            if when is not None and time.monotonic() - when < _SURE:
-                return
-            review = api.request(
-                'POST', _REVIEW, {'spec': {'namespace': namespace}}, timeout=_FIRST)
-            status = review.get('status') or {}
-            lacking = hints.missing_rights(status.get('resourceRules') or ())
-            # If the authorizer cannot list all rules, the requests themselves show what lacks.
-            if lacking and not status.get('incomplete'):
-                raise PrerequisiteError(
-                    f"this user may not {', '.join(lacking)} in namespace '{namespace}' of "
-                    f'{api.server}', 'deploy/kubernetes/role.yaml has all that a robot needs')
-            self._reviewed[api.context, namespace] = time.monotonic()
+        review = api.request('POST', _REVIEW, {'spec': {'namespace': namespace}}, timeout=_FIRST)
+        status = review.get('status') or {}
+        lacking = hints.missing_rights(status.get('resourceRules') or ())
+        # If the authorizer cannot list all rules, the requests themselves show what lacks.
+        if lacking and not status.get('incomplete'):
+            raise PrerequisiteError(
+                f"this user may not {', '.join(lacking)} in namespace '{namespace}' of "
+                f'{api.server}', 'deploy/kubernetes/role.yaml has all that a robot needs')
 
     def architecture(self, spec: MachineSpec) -> str:
         """Return the architecture in ``node_selector``, or of all nodes with its labels."""
@@ -132,7 +129,12 @@ class KubernetesProvider(Provider):
         self._lifetimes[names.job_name(spec.name)] = spec.lifetime
         existing = None
         try:
-            self._try_admission(api, namespace, spec, request, options)
+            # Pods of one kind differ only by their names.
+            self._once(
+                f'{api.context} {namespace} {request.dependencies} {options}',
+                lambda: api.request(
+                    'POST', path('pods', namespace), manifests.pod(spec, request, options),
+                    dryRun='All', cancel=self.cancel))
         except ApiError as error:
             # The first attempt with this token may have used the quota.
             existing = self._existing(api, namespace, spec, request)
@@ -148,19 +150,6 @@ class KubernetesProvider(Provider):
         self._made[machine_id] = job
         self._services[machine_id] = service
         return machine_id
-
-    def _try_admission(
-        self, api: Api, namespace: str, spec: MachineSpec, request: CreateRequest,
-        options: Options,
-    ) -> None:
-        """Check the pod's admission, once for all pods that differ only by their names."""
-        kind = f'{api.context} {namespace} {request.dependencies} {options}'
-        with self._trying:
-            if time.monotonic() - self._admitted.get(kind, -_SURE) < _SURE:
-                return
-            api.request('POST', path('pods', namespace), manifests.pod(spec, request, options),
-                        dryRun='All', cancel=self.cancel)
-            self._admitted[kind] = time.monotonic()
 
     def _make_job(
         self, api: Api, namespace: str, spec: MachineSpec, request: CreateRequest,
