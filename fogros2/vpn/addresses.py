@@ -100,7 +100,7 @@ def used_networks() -> Command:
 
 def parse_used(output: str) -> list[str]:
     """
-    Parse the output of :func:`used_networks` to networks in CIDR form.
+    Parse the output of :func:`used_networks`, JSON lines, to networks in CIDR form.
 
     :raises VpnError: the output is not that of ``ip``.
     """
