@@ -35,6 +35,7 @@ def argv(command: Command) -> list[str]:
 
 def start(
     command: Command, *, environment: Mapping[str, str], stdin: int, stderr: int,
+    inherited: Sequence[int] = (),
 ) -> subprocess.Popen[bytes]:
     """
     Start a command on this computer, with a pipe as standard output; do not wait for it.
@@ -49,7 +50,7 @@ def start(
     words = argv(command)
     if not _through_sudo(command):
         return subprocess.Popen(words, env=environment, stdin=stdin, stdout=subprocess.PIPE,
-                                stderr=stderr, start_new_session=True)
+                                stderr=stderr, start_new_session=True, pass_fds=inherited)
     if sys.version_info >= (3, 11):
         return subprocess.Popen(words, env=environment, stdin=stdin, stdout=subprocess.PIPE,
                                 stderr=stderr, process_group=0)
@@ -134,6 +135,7 @@ def run(
     check: bool = True,
     cancel: Optional[threading.Event] = None,
     on_output: Optional[Callable[[str], None]] = None,
+    inherited: Sequence[int] = (),
 ) -> Result:
     """
     Run a command on this computer and wait for it; Ctrl-C does not reach it (see ``start``).
@@ -141,6 +143,7 @@ def run(
     :param timeout: seconds after which the command's whole process group is killed.
     :param check: raise CommandError for an exit status other than zero.
     :param on_output: receives each line of standard output when it is printed.
+    :param inherited: file descriptors that the command inherits; not with ``sudo``.
     :raises CommandError: it failed and ``check`` is set.
     :raises DeadlineExceeded: it timed out.
     :raises Cancelled: ``cancel`` was set while it ran.
@@ -153,7 +156,8 @@ def run(
     try:
         with _file_of(command.input) if command.input else open(os.devnull, 'rb') as stdin:
             child = start(
-                command, environment=environment, stdin=stdin.fileno(), stderr=subprocess.PIPE)
+                command, environment=environment, stdin=stdin.fileno(), stderr=subprocess.PIPE,
+                inherited=inherited)
     except FileNotFoundError as error:
         raise PrerequisiteError(
             f'{words[0]} not found on this computer',

@@ -30,52 +30,41 @@ PULL = 900.0
 READY = 30.0
 
 
-class Application:
+def start(
+    image: str, port: int, ended: threading.Event, undo: contextlib.ExitStack,
+) -> None:
     """
-    One container of the web application.
+    Start the container of the web application; download its image first if necessary.
 
     :param port: loopback port of the application.
     :param ended: event that cancels the start.
+    :param undo: gets the call that removes the container.
+    :raises FogError: the container cannot start.
     """
+    engine = container_engine.select('auto', image)
+    call = functools.partial(engine.call, what='run the web application', cancel=ended)
+    # A fixed name, so that a container that survived a crash is replaced.
+    name = f'fogros2-application-{port}'
+    remove = functools.partial(
+        engine.call, 'rm', '-f', name, what='stop the web application', check=False)
+    if call('image', 'inspect', image, check=False).returncode != 0:
+        say(f'getting {image}')
+        call('pull', '-q', image, timeout=PULL)
+    remove()
+    undo.callback(remove)
+    # Lichtblick's server has this file capability, and does not start without it.
+    call('run', '-d', '--name', name, '--stop-timeout', '0',
+         '--cap-drop', 'all', '--cap-add', 'NET_BIND_SERVICE',
+         '--security-opt', 'no-new-privileges', *container_engine.limits(),
+         '-p', f'127.0.0.1:{port}:{INSIDE}', image)
+    wait_until(lambda: _listens(port), timeout=READY, cancel=ended,
+               what=f'{image} to listen on its port {INSIDE}')
 
-    def __init__(self, image: str, port: int, ended: threading.Event) -> None:
-        self._image = image
-        self._port = port
-        self._ended = ended
-        # A fixed name, so that a container that survived a crash is replaced.
-        self._name = f'fogros2-application-{port}'
-        self._engine: Optional[container_engine.Engine] = None
 
-    def start(self) -> None:
-        """
-        Start the container; download its image first if necessary.
-
-        :raises FogError: the container cannot start.
-        """
-        engine = self._engine = container_engine.select('auto', self._image)
-        call = functools.partial(engine.call, what='run the web application', cancel=self._ended)
-        if call('image', 'inspect', self._image, check=False).returncode != 0:
-            say(f'getting {self._image}')
-            call('pull', '-q', self._image, timeout=PULL)
-        self.stop()
-        # Lichtblick's server has this file capability, and does not start without it.
-        call('run', '-d', '--name', self._name, '--stop-timeout', '0',
-             '--cap-drop', 'all', '--cap-add', 'NET_BIND_SERVICE',
-             '--security-opt', 'no-new-privileges', *container_engine.limits(),
-             '-p', f'127.0.0.1:{self._port}:{INSIDE}', self._image)
-        wait_until(self._listens, timeout=READY, cancel=self._ended,
-                   what=f'{self._image} to listen on its port {INSIDE}')
-
-    def stop(self) -> None:
-        """Remove the container, if there is one."""
-        if self._engine is not None:
-            self._engine.call('rm', '-f', self._name, what='stop the web application', check=False)
-
-    def _listens(self) -> Optional[bool]:
-        with contextlib.suppress(OSError), socket.create_connection(
-                ('127.0.0.1', self._port), timeout=1.0):
-            return True
-        return None
+def _listens(port: int) -> bool:
+    with contextlib.suppress(OSError), socket.create_connection(('127.0.0.1', port), timeout=1.0):
+        return True
+    return False
 
 
 def main(arguments: Optional[Sequence[str]] = None) -> None:
@@ -89,23 +78,15 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
     threading.Thread(target=_until_eof, args=(ended,), daemon=True).start()
-    application = Application(options.image, options.port, ended)
-    try:
-        _start(application, options.name)
+    with contextlib.ExitStack() as undo:
+        try:
+            start(options.image, options.port, ended, undo)
+            say(f'the web application is there: ros2 fog monitor {options.name}')
+        except Cancelled:
+            pass
+        except FogError as error:
+            say(f'no web application here: {error}')
         ended.wait()
-    finally:
-        application.stop()
-
-
-def _start(application: Application, name: str) -> None:
-    """Start the application, and report how to open it or why there is none."""
-    try:
-        application.start()
-        say(f'the web application is there: ros2 fog monitor {name}')
-    except Cancelled:
-        pass
-    except FogError as error:
-        say(f'no web application here: {error}')
 
 
 def say(text: str) -> None:

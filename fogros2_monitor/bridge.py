@@ -59,7 +59,6 @@ class _Topic:
             name, schema=schema, message_encoding='protobuf' if video else 'cdr',
             context=node.viewers)
         self._subscription: Optional[Subscription] = None
-        self._latched = False
         self._fits: tuple[Any, Any] = (None, None)
         self._requests: Optional[Publisher] = None
         if video:
@@ -75,7 +74,7 @@ class _Topic:
         self.viewers.add(viewer)
         if self._requests is not None:
             self._requests.publish(Empty())
-        if self._subscription is not None and self._latched:
+        if self._subscription is not None and self._fits[0] == DurabilityPolicy.TRANSIENT_LOCAL:
             # Only a new subscription receives latched messages again. The other viewers receive
             # them twice, which does no harm for a latched topic.
             self._unsubscribe()
@@ -105,7 +104,6 @@ class _Topic:
 
     def _subscribe(self) -> None:
         qos = fitting(self._node, self._name)
-        self._latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self._fits = qos.durability, qos.reliability
         if self.video:
             self._subscription = self._node.create_subscription(

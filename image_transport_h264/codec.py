@@ -126,11 +126,6 @@ class Packet:
     data: bytes
     tag: Tag
 
-    @property
-    def key(self) -> bool:
-        """Whether decoding can start with this packet."""
-        return self.tag.key
-
 
 class Encoder:
     """Encode pictures of one topic; size and encoding may change between pictures."""

@@ -38,11 +38,6 @@ class DecoderNode(LazyNode):
         self._listeners_changed()
         self.get_logger().info(f'{stream} ({codec}) comes in as {topic}')
 
-    def destroy_node(self) -> None:
-        """Stop the worker, then destroy the node."""
-        self._receiver.stop()
-        super().destroy_node()
-
     def _listeners_changed(self) -> None:
         self._receiver.want(self._announcement.want(self._images.get_subscription_count() > 0))
 

@@ -17,7 +17,6 @@ from sensor_msgs.msg import CameraInfo, Image
 from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Relay, run, Tap
 from image_transport_h264.message import CAMERA_INFO, camera_info_topic
 from image_transport_h264.senders import make_sender
-from image_transport_h264.worker import Worker
 
 #: Seconds until the node reports a topic without a publisher.
 PATIENCE = 5.0
@@ -32,8 +31,8 @@ class EncoderNode(LazyNode):
         codec = str(self.declare_parameter('codec', 'h264').value)
         stream = str(self.declare_parameter('stream', '').value) or f'{topic}/{codec}'
         self._sender = make_sender(self, codec, stream, self._listeners_changed)
-        self._worker: Worker[Image] = Worker('encode', self._sender.send, self.fail)
-        self._images = Tap(self, Image, topic, IMAGE_QOS, self._worker.put)
+        worker = self.start_worker('encode', self._sender.send)
+        self._images = Tap(self, Image, topic, IMAGE_QOS, worker.put)
         # Many cameras publish no CameraInfo, so subscribe to it only on request.
         self._infos: Optional[Relay] = None
         if self.declare_parameter('camera_info', True).value:
@@ -43,11 +42,6 @@ class EncoderNode(LazyNode):
         named = str(self.declare_parameter('topic', '').value) or topic
         self._look = self.create_timer(PATIENCE, lambda: self._look_for_images(topic, named))
         self.get_logger().info(f'{topic} goes out as {stream} ({codec})')
-
-    def destroy_node(self) -> None:
-        """Stop the worker, then destroy the node."""
-        self._worker.stop()
-        super().destroy_node()
 
     def _look_for_images(self, topic: str, named: str) -> None:
         """Warn once if nobody publishes images, and name the most similar topic with images."""

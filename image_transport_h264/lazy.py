@@ -19,6 +19,7 @@ from rclpy.subscription import Subscription
 from image_transport_h264 import memory
 from image_transport_h264.acknowledgement import wait_for_all_acked
 from image_transport_h264.turns import Turns
+from image_transport_h264.worker import Worker
 
 
 def _qos(
@@ -86,10 +87,20 @@ class LazyNode(Node):
         self._complained: set[str] = set()
         self._complaining = threading.Lock()
         self._turns = Turns()
+        self._workers: list[Worker[Any]] = []
         self.failed = False
 
+    def start_worker(
+        self, name: str, work: Callable[[Any], None], waiting: int = 1,
+    ) -> Worker[Any]:
+        """Start a worker thread, which shuts the process down if it fails; see ``Worker``."""
+        self._workers.append(Worker(name, work, self.fail, waiting))
+        return self._workers[-1]
+
     def destroy_node(self) -> None:
-        """Destroy the node after its worker has stopped."""
+        """Stop the workers, then destroy the node."""
+        for worker in self._workers:
+            worker.stop()
         self._turns.close()
         super().destroy_node()
 
@@ -175,11 +186,6 @@ class Tap:
         self._qos, self._heard, self._adapt = qos, heard, adapt
         self._subscription: Optional[Subscription] = None
         self._reliability: Optional[ReliabilityPolicy] = None
-
-    @property
-    def open(self) -> bool:
-        """Whether the tap is subscribed."""
-        return self._subscription is not None
 
     def want(self, wanted: bool) -> None:
         """Subscribe or unsubscribe; call this in the executor's thread."""

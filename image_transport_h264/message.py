@@ -83,7 +83,7 @@ def ffmpeg_packet(kind: Any, header: Header, packet: Packet) -> Any:
     tag = packet.tag
     return kind(
         header=header, width=tag.width, height=tag.height,
-        encoding=f'h264;yuv420p;bgr8;{tag.encoding}', pts=tag.sequence, flags=int(packet.key),
+        encoding=f'h264;yuv420p;bgr8;{tag.encoding}', pts=tag.sequence, flags=int(tag.key),
         is_bigendian=tag.is_bigendian, data=octets(packet.data))
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable
 import functools
 import secrets
-import threading
 import time
 from typing import Any, Optional
 
@@ -30,7 +29,6 @@ from image_transport_h264.lazy import (
 from image_transport_h264.message import FEEDBACK, KEY_REQUEST, PIECES
 from image_transport_h264.picture import MAX_PIXELS
 from image_transport_h264.repair import Assembler
-from image_transport_h264.worker import Worker
 
 Publish = Callable[[Image], None]
 #: A packet, with its tag if it is to be acknowledged when it is decoded.
@@ -47,20 +45,16 @@ class Receiver:
     """
     Receive a stream, in the executor's thread and in a worker thread.
 
-    :param taps: the subscriptions, which pass messages to ``worker``.
+    :param taps: the subscriptions.
     """
 
-    def __init__(self, worker: Worker[Any], *taps: Tap) -> None:
-        self._worker, self._taps = worker, taps
+    def __init__(self, *taps: Tap) -> None:
+        self._taps = taps
 
     def want(self, wanted: bool) -> None:
         """Subscribe to the stream, or unsubscribe."""
         for tap in self._taps:
             tap.want(wanted)
-
-    def stop(self) -> None:
-        """Stop the worker thread."""
-        self._worker.stop()
 
 
 def make_receiver(node: LazyNode, codec: str, stream: str, publish: Publish) -> Receiver:
@@ -78,8 +72,7 @@ def make_receiver(node: LazyNode, codec: str, stream: str, publish: Publish) -> 
         work = functools.partial(_decode_still, node, publish, _max_pixels(node))
     elif codec != 'raw':
         raise ValueError(f"codec '{codec}' is not one of h264, jpeg, png, raw")
-    worker: Worker[Any] = Worker('decode', work, node.fail)
-    return Receiver(worker, Tap(node, kind, stream, IMAGE_QOS, worker.put))
+    return Receiver(Tap(node, kind, stream, IMAGE_QOS, node.start_worker('decode', work).put))
 
 
 def _max_pixels(node: LazyNode) -> int:
@@ -115,17 +108,15 @@ class VideoReceiver(Receiver):
         self._requests = node.create_publisher(Empty, f'{stream}/{KEY_REQUEST}', REQUEST_QOS)
         self._feedback = node.create_publisher(
             UInt64MultiArray, f'{stream}/{FEEDBACK}', FEEDBACK_QOS)
-        worker: Worker[Coded] = Worker('decode', self._decode, node.fail, WAITING)
+        self._worker = node.start_worker('decode', self._decode, WAITING)
         self._assembler = Assembler()
         self._counted: Optional[Tag] = None
-        self._acknowledged: Optional[Tag] = None
         self._lost = 0
-        self._acknowledging = threading.Lock()
         # Reliable, because a deep picture would never arrive completely otherwise.
         self._tap = Tap(node, CompressedImage, stream, STREAM_QOS, self._whole, adapt=False)
         pieces = Tap(node, UInt8MultiArray, f'{stream}/{PIECES}', PIECES_QOS, self._piece,
                      adapt=False)
-        super().__init__(worker, self._tap, pieces)
+        super().__init__(self._tap, pieces)
 
     def _whole(self, coded: CompressedImage) -> None:
         data = bytes(coded.data)
@@ -158,13 +149,8 @@ class VideoReceiver(Receiver):
             self._acknowledge(tag)
 
     def _acknowledge(self, tag: Tag) -> None:
-        with self._acknowledging:
-            if self._acknowledged == tag:
-                return
-            self._acknowledged = tag
-            lost = self._lost
         self._node.put_out(self._feedback, UInt64MultiArray(
-            data=[self._identity, tag.sequence, lost]))
+            data=[self._identity, tag.sequence, self._lost]))
 
     def _decode(self, coded: Coded) -> None:
         header, data, unacknowledged = coded

@@ -11,7 +11,7 @@ import threading
 import time
 from typing import Any
 
-from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CompressedImage, Image
@@ -89,22 +89,18 @@ class PictureSender(Sender):
         self._waiters = ThreadPoolExecutor(MOST, 'acknowledgement')
         self._under_way: list[Future[tuple[Sent, float, bool]]] = []
 
-    def send(self, image: Image) -> None:
-        """Publish the image."""
-        self._put(image)
-
-    def _put(self, message: Any) -> None:
-        """Publish a message, and wait until the next one may be sent."""
+    def send(self, image: Any) -> None:
+        """Publish an image, raw or compressed, and wait until the next one may be sent."""
         self._budget.pace()
-        begin, size = time.monotonic(), len(message.data)
+        begin, size = time.monotonic(), len(image.data)
         self._budget.sent(size, 8.0 * size, self._latency)
         if size >= LARGE:
-            self._node.put_through(self._publisher, message)
+            self._node.put_through(self._publisher, image)
             self._latency = time.monotonic() - begin
             return
         self._settle()
         sent = self._pace.sent(time.monotonic())
-        self._node.put_out(self._publisher, message)
+        self._node.put_out(self._publisher, image)
         self._under_way.append(self._waiters.submit(self._acknowledged, sent))
         while not self._pace.may_send():
             wait(self._under_way, return_when=FIRST_COMPLETED)
@@ -134,27 +130,19 @@ class StillSender(PictureSender):
     ) -> None:
         super().__init__(node, CompressedImage, stream, changed)
         self._kind: stills.Format = 'jpeg' if codec == 'jpeg' else 'png'
-        self._quality = int(node.declare_parameter('jpeg_quality', 80).value)
-        node.add_on_set_parameters_callback(self._set)
+        node.declare_parameter('jpeg_quality', 80, ParameterDescriptor(
+            integer_range=[IntegerRange(from_value=1, to_value=100, step=1)]))
 
     def send(self, image: Image) -> None:
         """Encode and publish the image."""
         try:
-            form, data = stills.encode(message.picture(image), self._kind, self._quality)
+            form, data = stills.encode(message.picture(image), self._kind,
+                                       self._node.get_parameter('jpeg_quality').value)
         except CodecError as error:
             self._node.complain(error.cause, f'image not sent: {error}')
             return
-        self._put(CompressedImage(
+        super().send(CompressedImage(
             header=image.header, format=form, data=message.octets(data)))
-
-    def _set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        for parameter in parameters:
-            if parameter.name == 'jpeg_quality':
-                if not 1 <= parameter.value <= 100:
-                    return SetParametersResult(
-                        successful=False, reason='jpeg_quality is between 1 and 100')
-                self._quality = parameter.value
-        return SetParametersResult(successful=True)
 
 
 #: name, default, description
@@ -281,7 +269,7 @@ class VideoSender(Sender):
         left = time.monotonic()
         size = len(packet.data) + sum(map(len, again))
         with self._lock:
-            if packet.key:
+            if packet.tag.key:
                 self._last_key = left
             self._control.sent(packet.tag.sequence, size, left)
             floor = LEAST_BITS * picture.width * picture.height * self._encoder.settings.rate

@@ -38,23 +38,27 @@ def encode(picture: Picture, kind: Format, quality: int = 80) -> tuple[str, byte
     :raises BadPicture: the fields are invalid, or the format cannot hold the encoding.
     """
     picture.check()
-    layout = picture.layout
-    pixels = _pixels(picture, layout)
+    pixels = bgr(picture)
     if kind == 'jpeg' and pixels.dtype != numpy.uint8:
         raise BadPicture(f"JPEG can't hold {picture.encoding}", f'encoding {picture.encoding!r}')
-    if layout.av_format in _TO_BGR:
-        pixels = cv2.cvtColor(pixels, _TO_BGR[layout.av_format])
-    if kind == 'jpeg':
-        if layout.alpha:
-            pixels = numpy.ascontiguousarray(pixels[:, :, :3])
-        options = [cv2.IMWRITE_JPEG_QUALITY, quality]
-    else:
-        options = [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
+    target = 'bgr8' if pixels.ndim == 3 else picture.encoding
+    return f'{picture.encoding}; {kind} compressed {target}', coded(pixels, kind, quality)
+
+
+def coded(pixels: Pixels, kind: Format, quality: int) -> bytes:
+    """
+    Return an array of OpenCV's as JPEG or PNG; JPEG has no alpha channel.
+
+    :raises BadPicture: OpenCV fails.
+    """
+    if kind == 'jpeg' and pixels.ndim == 3:
+        pixels = numpy.ascontiguousarray(pixels[:, :, :3])
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == 'jpeg' else \
+        [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
     whole, data = cv2.imencode('.jpg' if kind == 'jpeg' else '.png', pixels, options)
     if not whole:
-        raise BadPicture(f'{kind} of {picture.width}x{picture.height} failed', kind)
-    target = 'bgr8' if pixels.ndim == 3 else picture.encoding
-    return f'{picture.encoding}; {kind} compressed {target}', data.tobytes()
+        raise BadPicture(f'{kind} of {pixels.shape[1]}x{pixels.shape[0]} failed', kind)
+    return bytes(data.tobytes())
 
 
 def decode(form: str, data: Buffer, max_pixels: int = MAX_PIXELS) -> Picture:
@@ -116,7 +120,13 @@ def size(data: bytes) -> tuple[int, int]:
     raise Damaged('neither JPEG nor PNG', 'damage')
 
 
-def _pixels(picture: Picture, layout: Layout) -> Pixels:
+def bgr(picture: Picture) -> Pixels:
+    """
+    Return a checked picture as an array of OpenCV's: grey, BGR or BGRA.
+
+    :raises BadPicture: OpenCV has no such pixels.
+    """
+    layout = picture.layout
     rows = numpy.ascontiguousarray(picture.rows())
     if layout.kind == 'deep':
         if layout.pixel_bytes != 2:
@@ -126,7 +136,9 @@ def _pixels(picture: Picture, layout: Layout) -> Pixels:
         return values.astype(numpy.uint16)
     if layout.kind == 'grey':
         return rows
-    return rows.reshape(picture.height, picture.width, layout.pixel_bytes)
+    pixels = rows.reshape(picture.height, picture.width, layout.pixel_bytes)
+    code = _TO_BGR.get(layout.av_format)
+    return pixels if code is None else cv2.cvtColor(pixels, code)
 
 
 def _as(pixels: Pixels, layout: Layout) -> Pixels:

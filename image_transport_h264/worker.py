@@ -24,8 +24,7 @@ class Worker(Generic[Item]):
         waiting: int = 1,
     ) -> None:
         self._work, self._failed = work, failed
-        self._items: deque[Item] = deque()
-        self._waiting = waiting
+        self._items: deque[Item] = deque(maxlen=waiting)
         self._news = threading.Condition()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -34,8 +33,6 @@ class Worker(Generic[Item]):
     def put(self, item: Item) -> None:
         """Queue an item, and return at once."""
         with self._news:
-            if len(self._items) == self._waiting:
-                self._items.popleft()
             self._items.append(item)
             self._news.notify()
 

@@ -17,7 +17,6 @@ from std_msgs.msg import Header, UInt64MultiArray
 
 from image_transport_h264.budget import Announcement
 from image_transport_h264.lazy import IMAGE_QOS, LazyNode, run, STREAM_QOS, Tap
-from image_transport_h264.worker import Worker
 from point_cloud_stream.cloud import CloudError, MAX_BYTES
 from point_cloud_stream.codec import decode, FORMAT
 from point_cloud_stream.parts import Assembler, FEEDBACK
@@ -37,16 +36,11 @@ class DecoderNode(LazyNode):
         self._identity = secrets.randbits(63)
         self._feedback = self.create_publisher(
             UInt64MultiArray, f'{stream}/{FEEDBACK}', STREAM_QOS)
-        self._worker: Worker[tuple[Header, bytes]] = Worker('decode', self._decode, self.fail)
+        self._worker = self.start_worker('decode', self._decode)
         self._parts = Tap(self, CompressedImage, stream, STREAM_QOS, self._part, adapt=False)
         self._points = self.offer(PointCloud2, topic, IMAGE_QOS, self._matched)
         self._matched()
         self.get_logger().info(f'{stream} comes in as {topic}')
-
-    def destroy_node(self) -> None:
-        """Stop the worker, then destroy the node."""
-        self._worker.stop()
-        super().destroy_node()
 
     def _matched(self) -> None:
         self._parts.want(self._announcement.want(self._points.get_subscription_count() > 0))
@@ -66,14 +60,13 @@ class DecoderNode(LazyNode):
         except CloudError as error:
             self.complain(str(error), f'cloud not shown: {error}')
             return
-        values = array.array('B')
-        values.frombytes(octets.data)
         self.put_out(self._points, PointCloud2(
             header=header, height=layout.height, width=layout.width, fields=[
                 PointField(name=each.name, offset=each.offset, datatype=each.datatype,
                            count=each.count) for each in layout.fields],
             is_bigendian=layout.is_bigendian, point_step=layout.point_step,
-            row_step=layout.row_step, is_dense=layout.is_dense, data=values))
+            row_step=layout.row_step, is_dense=layout.is_dense,
+            data=array.array('B', octets.tobytes())))
 
 
 def main() -> None:

@@ -20,7 +20,6 @@ from std_msgs.msg import UInt64MultiArray
 
 from image_transport_h264.budget import Budget
 from image_transport_h264.lazy import IMAGE_QOS, LazyNode, run, STREAM_QOS, Tap
-from image_transport_h264.worker import Worker
 from point_cloud_stream.cloud import CloudError, Field, Layout
 from point_cloud_stream.codec import encode, FORMAT
 from point_cloud_stream.control import Control, GIVE_UP
@@ -48,7 +47,7 @@ class EncoderNode(LazyNode):
         #: Guards the control; notified when a part may be sent.
         self._news = threading.Condition()
         self._known = 0
-        self._worker: Worker[PointCloud2] = Worker('encode', self._send, self.fail)
+        self._worker = self.start_worker('encode', self._send)
         self._clouds = Tap(self, PointCloud2, topic, IMAGE_QOS, self._take)
         self._publisher = self.offer(CompressedImage, stream, STREAM_QOS, self._matched)
         self._budget = Budget(self, stream, self._publisher.get_subscription_count)
@@ -56,11 +55,6 @@ class EncoderNode(LazyNode):
             UInt64MultiArray, f'{stream}/{FEEDBACK}', self._heard, STREAM_QOS)
         self._matched()
         self.get_logger().info(f'{topic} goes out as {stream}')
-
-    def destroy_node(self) -> None:
-        """Stop the worker, then destroy the node."""
-        self._worker.stop()
-        super().destroy_node()
 
     # --- in the executor's thread
 

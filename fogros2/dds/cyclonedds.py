@@ -79,7 +79,7 @@ class CycloneDds(DdsVendor):
 
     def asked(self, user: Mapping[str, str]) -> list[str]:
         """Return the hosts of ROS_STATIC_PEERS, and those of each ``<Peer>``."""
-        text = ''.join(_fragments(user.get('CYCLONEDDS_URI', '')))
+        text = ''.join(xml for _, xml in fragments(user.get('CYCLONEDDS_URI', '')))
         return [*static_peers(user), *re.findall(
             r'<Peer\b[^>]*\baddress=["\']([^"\':]+)', text, re.IGNORECASE)]
 
@@ -119,7 +119,7 @@ class CycloneDds(DdsVendor):
         :raises DdsError: the user's configuration cannot be read or extended, or blocks the
             announcements of machines.
         """
-        text = ''.join(_fragments(user.get('CYCLONEDDS_URI', '')))
+        text = ''.join(xml for _, xml in fragments(user.get('CYCLONEDDS_URI', '')))
         if '<NetworkInterfaceAddress' in text:
             raise DdsError(
                 "CYCLONEDDS_URI's NetworkInterfaceAddress excludes the VPN",
@@ -230,18 +230,22 @@ class CycloneDds(DdsVendor):
         return {'RMW_IMPLEMENTATION': self.rmw, 'CYCLONEDDS_URI': uri}
 
 
-def _fragments(uri: str) -> Iterator[str]:
-    """Yield the XML of each part of a CYCLONEDDS_URI: inline text, or the content of a file."""
+def fragments(uri: str) -> Iterator[tuple[str, str]]:
+    """
+    Yield each part of a CYCLONEDDS_URI: its path, or the begin of inline text; and its XML.
+
+    :raises DdsError: a file cannot be read.
+    """
     rest = uri.strip(' ,\n\t')
     while rest:
         if rest.startswith('<'):
             inline, end, rest = rest.partition('</CycloneDDS>')
-            yield inline + end
+            yield f'{inline[:60]}...', inline + end
         else:
             name, _, rest = rest.partition(',')
             path = Path(name.removeprefix('file://'))
             try:
-                yield path.read_text(errors='replace')
+                yield str(path), path.read_text(errors='replace')
             except OSError as error:
                 raise DdsError(
                     f"CYCLONEDDS_URI names {path}, which can't be read: {error.strerror}",

@@ -7,8 +7,8 @@ requests and watches objects.
 """
 
 from fogros2.kubernetes_client.answers import ApiError, items, path, selector, Unreachable
-from fogros2.kubernetes_client.api import Api, connect, DOUBT
+from fogros2.kubernetes_client.api import Api, connect, DOUBT, existing
 from fogros2.kubernetes_client.configuration import configured
 
-__all__ = ['Api', 'ApiError', 'configured', 'connect', 'DOUBT', 'items', 'path', 'selector',
-           'Unreachable']
+__all__ = ['Api', 'ApiError', 'configured', 'connect', 'DOUBT', 'existing', 'items', 'path',
+           'selector', 'Unreachable']

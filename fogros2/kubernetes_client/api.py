@@ -61,8 +61,6 @@ class Api:
 
     def __init__(self, context: str = '') -> None:
         self.context, self.namespace, self._client = kubeconfig.load(context)
-        #: Number of requests so far, for measurements.
-        self.calls = 0
         self._lost = -DOUBT
 
     @property
@@ -158,7 +156,6 @@ class Api:
         if body is not None:
             headers['content-type'] = 'application/merge-patch+json' \
                 if method == 'PATCH' else 'application/json'
-        self.calls += 1
         try:
             return self._client.rest_client.pool_manager.request(
                 method, self._url(path, query), headers=headers, preload_content=False,
@@ -234,7 +231,6 @@ class Api:
         """
         import websocket
 
-        self.calls += 1
         options: dict[str, Any] = {}
         configuration = self._client.configuration
         if proxy := configuration.proxy:
@@ -255,7 +251,6 @@ class Api:
             raise refusal(error.status_code, parsed(data), data) from error
         except (websocket.WebSocketException, OSError) as error:
             raise self._unreachable(error) from error
-
 
     def execute(
         self, path: str, container: str, command: Sequence[str], *, timeout: float,
@@ -374,6 +369,22 @@ def _wake(response: Any) -> None:
     if held is None:
         held = response._fp.fp.raw._sock
     held.shutdown(socket.SHUT_RDWR)
+
+
+def existing(
+    api: Api, path: str, cancel: Optional[threading.Event] = None,
+) -> Optional[dict[str, Any]]:
+    """
+    Return an object of the cluster, None if there is none.
+
+    :raises ApiError: the API server refused for another reason.
+    """
+    try:
+        return api.request('GET', path, cancel=cancel)
+    except ApiError as error:
+        if error.status != 404:
+            raise
+        return None
 
 
 _apis: dict[tuple[str, str], Api] = {}

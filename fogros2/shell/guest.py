@@ -13,14 +13,11 @@ import contextlib
 import hmac
 from pathlib import Path
 import socket
-import threading
-from typing import Optional
 
 from fogros2.errors import AuthenticationError, ConnectError
 from fogros2.events import clean
 from fogros2.model import Endpoint
 from fogros2.shell.multiplexed import Link, MultiplexedShell
-from fogros2.shell.remote import connecting
 
 #: Bytes of the challenge, and of the longest answer to its proof.
 _CHALLENGE, _LINE = 32, 300
@@ -36,13 +33,8 @@ class GuestShell(MultiplexedShell):
     :param timeout: seconds for which to try to connect.
     """
 
-    def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
-        super().__init__(endpoint, name=name, user=endpoint.user, timeout=timeout)
-
-    def _connect(self, timeout: float, cancel: Optional[threading.Event]) -> Link:
-        def connect() -> Link:
-            return Link(admitted(self.endpoint, self.name, timeout), self.name, self.user)
-        return connecting(connect, cancel, self.name)
+    def _connect(self, timeout: float) -> Link:
+        return Link(admitted(self.endpoint, self.name, timeout), self.name, self.user)
 
 
 def admitted(endpoint: Endpoint, name: str, timeout: float) -> socket.socket:

@@ -12,10 +12,8 @@ import threading
 from typing import Optional
 
 from fogros2.errors import ConnectError, DeadlineExceeded, FogError
-from fogros2.model import Endpoint
 from fogros2.shell.kubernetes_link import Link
 from fogros2.shell.multiplexed import MultiplexedShell
-from fogros2.shell.remote import connecting
 from fogros2.waiting import wait_until
 
 #: Time-out of one attempt to connect, in seconds.
@@ -35,24 +33,19 @@ class KubernetesShell(MultiplexedShell):
         """Start to import the client; see :func:`fogros2.shell.warm`."""
         threading.Thread(target=_load, name='fog-load', daemon=True).start()
 
-    def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
-        super().__init__(endpoint, name=name, user=endpoint.user or 'root', timeout=timeout)
-
-    def _connect(self, timeout: float, cancel: Optional[threading.Event]) -> Link:
+    def _connect(self, timeout: float) -> Link:
         """Open a connection; wait for an API server that restarts."""
         last: list[FogError] = []
 
         def attempt() -> Optional[Link]:
             try:
-                return connecting(
-                    lambda: Link(self.endpoint, name=self.name, timeout=min(timeout, _ATTEMPT)),
-                    cancel, self.name)
+                return Link(self.endpoint, name=self.name, timeout=min(timeout, _ATTEMPT))
             except (ConnectError, DeadlineExceeded) as error:
                 last[:] = [error]
                 return None
 
         try:
-            return wait_until(attempt, timeout=timeout, interval=0.1, cancel=cancel,
+            return wait_until(attempt, timeout=timeout, interval=0.1,
                               what=f"a connection to '{self.name}'")
         except DeadlineExceeded as error:
             raise last[0] if last else error from error

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 from pathlib import Path
 import ssl
@@ -80,7 +79,7 @@ class Link(multiplexed.Link):
 
     def _connect(self, timeout: float) -> websocket.WebSocket:
         """Start an ``exec``, and wait for the multiplexer's first frame."""
-        source = _source()
+        source = Path(mux.__file__).read_bytes()
         words = ['python3', '-ISc', _LOADER.format(size=len(source))]
         api = kubernetes_client.connect(self._context)
         try:
@@ -166,11 +165,6 @@ def parse_host(host: str) -> tuple[str, str, str]:
     if not namespace or not pod:
         raise ConnectError(f"'{host}' names no pod")
     return context, namespace, pod
-
-
-@functools.lru_cache(maxsize=1)
-def _source() -> bytes:
-    return Path(mux.__file__).read_bytes()
 
 
 def _bytes(data: str | bytes) -> bytes:

@@ -79,19 +79,24 @@ class Channel(Protocol):
         """Close the channel, which ends a running program."""
 
 
+def take_errors(channel: Channel) -> bytes:
+    """Return the standard error that has arrived; unread, it would stop the program."""
+    parts = []
+    while channel.recv_stderr_ready():
+        parts.append(channel.recv_stderr(1 << 16))
+    return b''.join(parts)
+
+
 class LineStream:
     """
     Standard input and output of a program on a machine, line by line.
 
     :param name: the machine's name, for messages.
-    :param discard_errors: callback that discards standard error; unread output would fill the
-        channel's window and stop the program.
     """
 
-    def __init__(self, channel: Channel, name: str, discard_errors: Callable[[], object]) -> None:
+    def __init__(self, channel: Channel, name: str) -> None:
         self._channel = channel
         self._name = name
-        self._discard_errors = discard_errors
         self._buffer = b''
 
     def write(self, data: bytes) -> None:
@@ -115,7 +120,7 @@ class LineStream:
             data = b''
             with contextlib.suppress(OSError, FogError):
                 data = self._channel.recv(_CHUNK)
-                self._discard_errors()
+                take_errors(self._channel)
             if not data:
                 self._buffer = b''
                 return b''.join(parts)

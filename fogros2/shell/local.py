@@ -3,22 +3,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+import contextlib
 import getpass
 import os
-from pathlib import Path
 import subprocess
 import threading
 from typing import Optional
 
 from fogros2 import process
 from fogros2.errors import ConnectError, PrerequisiteError
-from fogros2.model import Command, Endpoint, Result, SyncReport
-from fogros2.shell import command_line, Stream, sync
+from fogros2.model import Command, Endpoint, Result
+from fogros2.shell import Stream, sync
 
 
-class LocalShell:
+class LocalShell(sync.RsyncShell):
     """A Shell for endpoints of kind 'local'; it has no connection."""
+
+    where = process.HERE
 
     def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
         self.endpoint = endpoint
@@ -34,26 +36,8 @@ class LocalShell:
         return process.run(
             command, timeout=timeout, check=check, cancel=cancel, on_output=on_output)
 
-    def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
-        """Write a file atomically, and create its folders; see the protocol."""
-        process.run(command_line.writing(data, target, mode), timeout=timeout)
-
-    def sync(
-        self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
-        includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
-        on_progress: Optional[Callable[[int, int], None]] = None,
-    ) -> SyncReport:
-        """Make the folder ``target`` equal to ``source``; see the protocol."""
-        return sync.to_folder(
-            source, target, excludes=excludes, includes=includes, timeout=timeout,
-            cancel=cancel, on_progress=on_progress)
-
-    def fetch(
-        self, source: str, target: Path, *, known: Optional[Path], timeout: float,
-        cancel: Optional[threading.Event] = None,
-    ) -> None:
-        """Make the local folder ``target`` equal to the machine's ``source``; see the protocol."""
-        sync.fetch(self.name, None, source, target, known=known, timeout=timeout, cancel=cancel)
+    def _remote_shell(self) -> contextlib.AbstractContextManager[sync.RemoteShell]:
+        return contextlib.nullcontext(('', (), []))
 
     def open(self, command: Command) -> Stream:
         """Start a program; closing the returned stream ends the program."""

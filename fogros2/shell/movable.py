@@ -4,17 +4,25 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 import contextlib
-from pathlib import Path
 import threading
-from typing import Optional
+from typing import Any, Optional
 
-from fogros2.model import Command, Result, SyncReport
-from fogros2.shell import Shell, Stream
+from fogros2.model import Command
+from fogros2.shell import Shell
 
 #: Seconds to wait for the commands on a shell that is replaced.
 DRAIN = 3.0
+
+
+def _forwarded(name: str) -> Any:
+    """Return a method that calls the current shell's method of that name."""
+    def method(shell: MovableShell, *values: Any, **options: Any) -> Any:
+        with shell._current() as current:
+            return getattr(current, name)(*values, **options)
+
+    return method
 
 
 class MovableShell:
@@ -53,44 +61,8 @@ class MovableShell:
                 self._calls[id(shell)] -= 1
                 self._news.notify_all()
 
-    def run(
-        self, command: Command, *, timeout: float, check: bool = True,
-        cancel: Optional[threading.Event] = None,
-        on_output: Optional[Callable[[str], None]] = None,
-    ) -> Result:
-        """Run a command on the machine, and wait for its end; see the protocol."""
-        with self._current() as shell:
-            return shell.run(
-                command, timeout=timeout, check=check, cancel=cancel, on_output=on_output)
-
-    def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
-        """Write a file atomically, and create its folders; see the protocol."""
-        with self._current() as shell:
-            shell.put(data, target, mode=mode, timeout=timeout)
-
-    def sync(
-        self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
-        includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
-        on_progress: Optional[Callable[[int, int], None]] = None,
-    ) -> SyncReport:
-        """Make the folder ``target`` on the machine equal to ``source``; see the protocol."""
-        with self._current() as shell:
-            return shell.sync(
-                source, target, excludes=excludes, timeout=timeout, includes=includes,
-                cancel=cancel, on_progress=on_progress)
-
-    def fetch(
-        self, source: str, target: Path, *, known: Optional[Path], timeout: float,
-        cancel: Optional[threading.Event] = None,
-    ) -> None:
-        """Make the local folder ``target`` equal to the machine's ``source``; see the protocol."""
-        with self._current() as shell:
-            shell.fetch(source, target, known=known, timeout=timeout, cancel=cancel)
-
-    def open(self, command: Command) -> Stream:
-        """Start a program on the machine; closing the returned stream ends the program."""
-        with self._current() as shell:
-            return shell.open(command)
+    # Calls of the shell that is the current one when they begin; see the protocol.
+    run, put, sync, fetch, open = map(_forwarded, ('run', 'put', 'sync', 'fetch', 'open'))
 
     def interactive(self, command: Optional[Command] = None) -> int:
         """Connect the user's terminal to the login shell, or to ``command``."""

@@ -205,18 +205,19 @@ class Link:
         """Return whether new commands can start."""
         return self._error is None
 
-    def open(self, command: Command, *, terminal: Optional[tuple[int, int, str]] = None,
-             login: bool = False) -> Channel:
+    def open(
+        self, command: Optional[Command], terminal: Optional[tuple[int, int, str]] = None,
+    ) -> Channel:
         """
         Start a command on the machine.
 
+        :param command: None: the user's login shell.
         :param terminal: rows, columns and type of the command's terminal; None: no terminal.
-        :param login: start the user's login shell instead of the command.
         :raises ConnectError: the connection is lost.
         """
-        what = {
-            'argv': [] if login else list(command.argv), 'env': dict(command.environment),
-            'root': command.sudo, 'user': self._user, 'pty': terminal}
+        command = command or Command(())
+        what = {'argv': list(command.argv), 'env': dict(command.environment),
+                'root': command.sudo, 'user': self._user, 'pty': terminal}
         with self._lock:
             number, self._next = self._next, self._next + 1
             channel = Channel(self, number)
@@ -318,14 +319,8 @@ class MultiplexedShell(RemoteShell[Link]):
     """A Shell whose commands share one connection; a subclass connects."""
 
     def _start(
-        self, connection: Link, command: Command | str, timeout: float,
-        cancel: Optional[threading.Event],
+        self, connection: Link, command: Command | str | None, timeout: float,
+        cancel: Optional[threading.Event] = None, size: Optional[tuple[int, int, str]] = None,
     ) -> Channel:
         return connection.open(
-            Command(('sh', '-c', command)) if isinstance(command, str) else command)
-
-    def _start_in_terminal(
-        self, command: Optional[Command], size: Optional[tuple[int, int, str]],
-    ) -> Channel:
-        return self._connected(self._timeout).open(
-            command or Command(()), terminal=size, login=command is None)
+            Command(('sh', '-c', command)) if isinstance(command, str) else command, size)

@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import os
 from pathlib import Path
-import secrets
 import select
 import socket
-import struct
 import sys
 import threading
 
@@ -21,49 +19,34 @@ _HELPER = Path(__file__).with_name('rsh.py')
 
 
 @contextlib.contextmanager
-def remote_shell(start: Callable[[str], Channel]) -> Iterator[tuple[str, list[FogError]]]:
+def remote_shell(
+    start: Callable[[str], Channel],
+) -> Iterator[tuple[str, Sequence[int], list[FogError]]]:
     """
-    Yield the value of rsync's ``-e``, and a list that collects errors of the relay.
+    Yield the value of rsync's ``-e``, the files that rsync inherits, and a list for errors.
 
     :param start: function that starts a command line on the machine.
     """
     failures: list[FogError] = []
-    name = f'fogros2-{secrets.token_hex(16)}'
-    listener = socket.socket(socket.AF_UNIX)
-    listener.bind('\0' + name)
-    listener.listen(1)
+    ours, theirs = socket.socketpair()
     thread = threading.Thread(
-        target=_serve, args=(listener, start, failures), name='fog-rsync', daemon=True)
-    thread.start()
-    try:
-        yield f"'{sys.executable}' -I -S '{_HELPER}' {name}", failures
-    finally:
-        with contextlib.suppress(OSError):
-            listener.shutdown(socket.SHUT_RDWR)  # wakes accept() if rsync never connected
-        listener.close()
-        thread.join(5.0)
+        target=_serve, args=(ours, start, failures), name='fog-rsync', daemon=True)
+    with ours, theirs:
+        thread.start()
+        try:
+            yield (f"'{sys.executable}' -I -S '{_HELPER}' {theirs.fileno()}", [theirs.fileno()],
+                   failures)
+        finally:
+            theirs.shutdown(socket.SHUT_RDWR)  # wakes the thread if rsync never called its end
+            thread.join(5.0)
 
 
 def _serve(
-    listener: socket.socket, start: Callable[[str], Channel], failures: list[FogError],
-) -> None:
-    while True:
-        try:
-            link, _ = listener.accept()
-        except OSError:
-            return  # rsync ended before it connected
-        with link:
-            # Every account can list and connect to an abstract socket.
-            peer = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize('3i'))
-            if struct.unpack('3i', peer)[1] == os.geteuid():
-                _serve_rsync(link, start, failures)
-                return
-
-
-def _serve_rsync(
     link: socket.socket, start: Callable[[str], Channel], failures: list[FogError],
 ) -> None:
     line, streams, _, _ = socket.recv_fds(link, 1 << 16, 3)
+    for stream in streams:
+        os.set_blocking(stream, True)  # rsync may have set its own ends otherwise
     try:
         if len(streams) == 3:
             link.sendall(bytes([relay(start(line.decode()), *streams)]))

@@ -4,18 +4,17 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import contextlib
-import functools
-from pathlib import Path
+import getpass
 import threading
 import time
 from typing import Generic, Optional, TypeVar
 
 from fogros2.errors import Cancelled, ConnectError, DeadlineExceeded, FogError
-from fogros2.model import Command, Endpoint, Result, SyncReport
-from fogros2.shell import command_line, Stream, sync, terminal
-from fogros2.shell.lines import Channel, Connection, LineStream, Output
+from fogros2.model import Command, Endpoint, Result
+from fogros2.shell import command_line, relay, Stream, sync, terminal
+from fogros2.shell.lines import Channel, Connection, LineStream, Output, take_errors
 from fogros2.waiting import cancellable, wait_until
 
 #: Seconds to wait for further output after a command's end, as its children may still write.
@@ -26,7 +25,7 @@ _INLINE = 1 << 16
 Link = TypeVar('Link', bound=Connection)
 
 
-class RemoteShell(abc.ABC, Generic[Link]):
+class RemoteShell(sync.RsyncShell, Generic[Link]):
     """
     A Shell for endpoints of one kind; a subclass opens connections and channels.
 
@@ -37,12 +36,11 @@ class RemoteShell(abc.ABC, Generic[Link]):
     #: Whether to end the input of a command that gets none; else its command line does that.
     ends_empty_input = True
 
-    def __init__(
-        self, endpoint: Endpoint, *, name: str, user: str, timeout: float,
-    ) -> None:
+    def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
         self.endpoint = endpoint
         self.name = name
-        self.user = user
+        self.where = f"'{name}'"
+        self.user = endpoint.user or getpass.getuser()
         self._timeout = timeout
         self._lock = threading.Lock()
         self._connection: Optional[Link] = None
@@ -51,29 +49,25 @@ class RemoteShell(abc.ABC, Generic[Link]):
         self._closings = 0
 
     @abc.abstractmethod
-    def _connect(self, timeout: float, cancel: Optional[threading.Event]) -> Link:
+    def _connect(self, timeout: float) -> Link:
         """
-        Open a connection.
+        Open a connection, in a thread that a cancel abandons.
 
         :raises ConnectError: the machine cannot be reached.
         """
 
     @abc.abstractmethod
     def _start(
-        self, connection: Link, command: Command | str, timeout: float,
-        cancel: Optional[threading.Event],
+        self, connection: Link, command: Command | str | None, timeout: float,
+        cancel: Optional[threading.Event] = None, size: Optional[tuple[int, int, str]] = None,
     ) -> Channel:
         """
-        Start a command, or a command line; a lost connection is closed before the error.
+        Start a command or a command line; a lost connection is closed before the error.
 
+        :param command: None: start the login shell.
+        :param size: of the command's terminal, see ``terminal.size``; None: no terminal.
         :raises ConnectError: the connection is lost, or gives no channel.
         """
-
-    @abc.abstractmethod
-    def _start_in_terminal(
-        self, command: Optional[Command], size: Optional[tuple[int, int, str]],
-    ) -> Channel:
-        """Start a command or the login shell; ``size`` is the result of ``terminal.size``."""
 
     def _abandon(self, command: Command, output: Output) -> None:
         """End a command whose channel is open, if closing the channel does not end it."""
@@ -104,7 +98,9 @@ class RemoteShell(abc.ABC, Generic[Link]):
             connection, closings = self._known()
             if connection is not None:
                 return connection
-            connection = self._connect(max(0.5, until - time.monotonic()), cancel)
+            connection = cancellable(
+                lambda: self._connect(max(0.5, until - time.monotonic())), cancel,
+                what=f"connecting to '{self.name}'", late=lambda late: late.close())
             with self._lock:
                 if closings == self._closings:
                     self._connection = connection
@@ -182,7 +178,7 @@ class RemoteShell(abc.ABC, Generic[Link]):
         finally:
             channel.close()
         result = Result(returncode, *output.text(), time.monotonic() - begin)
-        return command_line.checked(command, result, f"'{self.name}'") if check else result
+        return command_line.checked(command, result, self.where) if check else result
 
     def _collect(
         self, channel: Channel, output: Output, deadline: float,
@@ -232,55 +228,22 @@ class RemoteShell(abc.ABC, Generic[Link]):
         raise ConnectError(f"the connection to '{self.name}' was lost while "
                            f'{_what(command)} ran there', "check the robot's network")
 
-    def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
-        """Write a file atomically, and create its folders; see the protocol."""
-        self.run(command_line.writing(data, target, mode), timeout=timeout)
-
-    def sync(
-        self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
-        includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
-        on_progress: Optional[Callable[[int, int], None]] = None,
-    ) -> SyncReport:
-        """Make the folder ``target`` on the machine equal to ``source``; see the protocol."""
-        return sync.to_machine(
-            self, source, target, excludes=excludes, includes=includes, timeout=timeout,
-            cancel=cancel, on_progress=on_progress)
-
-    def fetch(
-        self, source: str, target: Path, *, known: Optional[Path], timeout: float,
-        cancel: Optional[threading.Event] = None,
-    ) -> None:
-        """Make the local folder ``target`` equal to the machine's ``source``; see the protocol."""
-        sync.fetch(self.name, self.start, source, target, known=known, timeout=timeout,
-                   cancel=cancel)
+    def _remote_shell(self) -> contextlib.AbstractContextManager[sync.RemoteShell]:
+        return relay.remote_shell(self.start)
 
     def open(self, command: Command) -> Stream:
         """Start a program on the machine; closing the returned stream ends the program."""
         channel = self.start(command)
         _feed(channel, command.input, end=False)
         channel.settimeout(None)
-        return LineStream(channel, self.name, functools.partial(take_errors, channel))
+        return LineStream(channel, self.name)
 
     def interactive(self, command: Optional[Command] = None) -> int:
         """Connect the user's terminal to the login shell, or to ``command``."""
         size = terminal.size()
-        return terminal.attach(self._start_in_terminal(command, size), keys=size is not None)
-
-
-def connecting(
-    connect: Callable[[], Link], cancel: Optional[threading.Event], name: str,
-) -> Link:
-    """Call ``connect``, which a cancel abandons; a connection that comes later is closed."""
-    return cancellable(connect, cancel, what=f"connecting to '{name}'",
-                       late=lambda late: late.close())
-
-
-def take_errors(channel: Channel) -> bytes:
-    """Return the standard error that has arrived; unread, it would stop the program."""
-    parts = []
-    while channel.recv_stderr_ready():
-        parts.append(channel.recv_stderr(1 << 16))
-    return b''.join(parts)
+        channel = self._start(
+            self._connected(self._timeout), command, self._timeout, size=size)
+        return terminal.attach(channel, keys=size is not None)
 
 
 def _what(command: Command) -> str:

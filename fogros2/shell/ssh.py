@@ -9,10 +9,10 @@ import time
 from typing import Optional, TYPE_CHECKING
 
 from fogros2.errors import ConnectError, FogError
-from fogros2.model import Command, Endpoint
+from fogros2.model import Command
 from fogros2.shell import command_line, ssh_connection
 from fogros2.shell.lines import Channel, Output
-from fogros2.shell.remote import connecting, RemoteShell
+from fogros2.shell.remote import RemoteShell
 from fogros2.waiting import wait_until
 
 if TYPE_CHECKING:
@@ -34,21 +34,12 @@ class SSHShell(RemoteShell['paramiko.Transport']):
     # ended meanwhile; OpenSSH then closes the whole connection.
     ends_empty_input = False
 
-    @staticmethod
-    def warm() -> None:
-        """Start to import paramiko; see :func:`fogros2.shell.warm`."""
-        ssh_connection.warm()
+    #: Start to import paramiko; see :func:`fogros2.shell.warm`.
+    warm = staticmethod(ssh_connection.warm)
 
-    def __init__(self, endpoint: Endpoint, *, name: str, timeout: float = 30.0) -> None:
-        super().__init__(
-            endpoint, name=name, user=ssh_connection.user_of(endpoint), timeout=timeout)
-
-    def _connect(
-        self, timeout: float, cancel: Optional[threading.Event],
-    ) -> paramiko.Transport:
-        return connecting(
-            lambda: ssh_connection.connect(
-                self.endpoint, name=self.name, timeout=min(timeout, _ATTEMPT)), cancel, self.name)
+    def _connect(self, timeout: float) -> paramiko.Transport:
+        return ssh_connection.connect(
+            self.endpoint, name=self.name, timeout=min(timeout, _ATTEMPT))
 
     def _session(
         self, transport: paramiko.Transport, timeout: float,
@@ -82,41 +73,27 @@ class SSHShell(RemoteShell['paramiko.Transport']):
             what=f"a session on '{self.name}'", hint='raise MaxSessions of its SSH server')
 
     def _start(
-        self, connection: paramiko.Transport, command: Command | str, timeout: float,
-        cancel: Optional[threading.Event],
+        self, connection: paramiko.Transport, command: Command | str | None, timeout: float,
+        cancel: Optional[threading.Event] = None, size: Optional[tuple[int, int, str]] = None,
     ) -> Channel:
         import paramiko
 
-        line = command if isinstance(command, str) else \
-            command_line.remote_line(command, user=self.user)
         try:
             channel = self._session(connection, timeout, cancel)
-            channel.exec_command(line)
-            return channel
-        except (paramiko.SSHException, EOFError, OSError) as error:
-            # If another thread closed the connection, is_alive() may still return True.
-            if isinstance(error, (EOFError, OSError)) or not connection.is_alive():
-                self._drop(connection)
-            raise ConnectError(f"'{self.name}' can not start a command: {error}") from error
-
-    def _start_in_terminal(
-        self, command: Optional[Command], size: Optional[tuple[int, int, str]],
-    ) -> Channel:
-        import paramiko
-
-        channel = self._session(self._connected(self._timeout), self._timeout)
-        try:
             if size is not None:
                 rows, columns, kind = size
                 channel.get_pty(kind, columns, rows)
             if command is None:
                 channel.invoke_shell()
             else:
-                channel.exec_command(command_line.remote_line(command, user=self.user))
-        except (paramiko.SSHException, OSError) as error:
-            channel.close()
-            raise ConnectError(f"'{self.name}' gives no terminal: {error}") from error
-        return channel
+                channel.exec_command(command if isinstance(command, str) else
+                                     command_line.remote_line(command, user=self.user))
+            return channel
+        except (paramiko.SSHException, EOFError, OSError) as error:
+            # If another thread closed the connection, is_alive() may still return True.
+            if isinstance(error, (EOFError, OSError)) or not connection.is_alive():
+                self._drop(connection)
+            raise ConnectError(f"'{self.name}' can not start a command: {error}") from error
 
     def _announced(self, command: Command) -> str:
         line = command_line.announced_line(command, user=self.user)

@@ -9,6 +9,7 @@ goes over OpenSSH, whose ciphers take a third of the processor time of Python's.
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import os
@@ -17,7 +18,7 @@ import re
 import tempfile
 import threading
 import time
-from typing import Optional, Protocol
+from typing import Optional
 
 from fogros2 import process
 from fogros2.errors import (
@@ -30,7 +31,7 @@ from fogros2.errors import (
     WorkspaceError,
 )
 from fogros2.model import Command, Endpoint, Result, SyncReport
-from fogros2.shell import command_line, lines, relay, ssh_connection
+from fogros2.shell import command_line, Shell, ssh_connection
 
 #: Bytes from which a separate connection of OpenSSH is faster.
 BULK = 64 << 20
@@ -42,110 +43,80 @@ _LOST = (10, 12, 255)
 _NOT_WRITTEN = 11
 
 
-class Connection(Protocol):
-    """The part of a Shell that a sync needs."""
+#: The value of rsync's ``-e``, '' for this computer; the files that rsync inherits; errors.
+RemoteShell = tuple[str, Sequence[int], list[FogError]]
+
+
+class RsyncShell(Shell):
+    """The methods of a Shell that copy files and folders; a subclass runs commands."""
 
     endpoint: Endpoint
-    name: str
+    #: The machine, for messages.
+    where: str
 
-    def run(self, command: Command, *, timeout: float, check: bool = True,
-            cancel: Optional[threading.Event] = None) -> Result:
-        """Run a command on the machine."""
+    @abc.abstractmethod
+    def _remote_shell(self) -> contextlib.AbstractContextManager[RemoteShell]:
+        """Return how rsync reaches the machine."""
 
-    def start(self, line: str) -> lines.Channel:
-        """Start a command line on the machine."""
+    def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
+        """Write a file atomically, and create its folders; see the protocol."""
+        self.run(command_line.writing(data, target, mode), timeout=timeout)
 
-
-def to_machine(
-    shell: Connection, source: Path, target: str, *, excludes: Sequence[str],
-    includes: Sequence[str], timeout: float, cancel: Optional[threading.Event],
-    on_progress: Optional[Callable[[int, int], None]],
-) -> SyncReport:
-    """Make the folder ``target`` on a machine equal to ``source``; see the Shell protocol."""
-    begin = time.monotonic()
-    where = f"'{shell.name}'"
-    process.require(['rsync'])
-    check_source(source)
-    path = command_line.remote_path(target)
-    there = shell.run(
-        Command.script(
-            f'mkdir -p -- {path}; command -v rsync >/dev/null || echo no-rsync; '
-            f'ls -A -- {path} | head -n 1', what=f'making {target}'),
-        timeout=timeout, cancel=cancel).stdout.split()
-    if 'no-rsync' in there:
-        raise missing_there(where)
-    with contextlib.ExitStack() as undo:
-        failures: list[FogError] = []
-        bulk = not there and shell.endpoint.kind == 'ssh' \
+    def sync(
+        self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
+        includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
+        on_progress: Optional[Callable[[int, int], None]] = None,
+    ) -> SyncReport:
+        """Make the folder ``target`` on the machine equal to ``source``; see the protocol."""
+        begin = time.monotonic()
+        process.require(['rsync'])
+        check_source(source)
+        path = command_line.remote_path(target)
+        there = self.run(
+            Command.script(
+                f'mkdir -p -- {path}; command -v rsync >/dev/null || echo no-rsync; '
+                f'ls -A -- {path} | head -n 1', what=f'making {target}'),
+            timeout=timeout, cancel=cancel).stdout.split()
+        if 'no-rsync' in there:
+            raise missing_there(self.where)
+        bulk = not there and self.endpoint.kind == 'ssh' \
             and process.which('ssh') is not None and is_large(source, BULK)
-        if bulk:
-            rsh = undo.enter_context(open_ssh(shell.endpoint))
-        else:
-            rsh, failures = undo.enter_context(relay.remote_shell(shell.start))
-        result = process.run(
-            rsync(source, f'machine:{remote_folder(target)}', excludes=excludes,
-                  includes=includes, rsh=rsh, compress=bulk, progress=on_progress is not None),
-            timeout=max(0.1, timeout - (time.monotonic() - begin)), cancel=cancel, check=False,
-            on_output=None if on_progress is None else Progress(on_progress))
-    if failures:
-        raise failures[0]
-    return _report(result, source, where, begin)
+        with open_ssh(self.endpoint) if bulk else self._remote_shell() as (rsh, files, failures):
+            result = process.run(
+                rsync(source, place(target, rsh), excludes=excludes, includes=includes, rsh=rsh,
+                      compress=bulk, progress=on_progress is not None),
+                timeout=max(0.1, timeout - (time.monotonic() - begin)), cancel=cancel,
+                check=False, inherited=files,
+                on_output=None if on_progress is None else Progress(on_progress))
+        if failures:
+            raise failures[0]
+        if result.returncode not in (0, VANISHED):
+            raise explained(result, source, self.where)
+        return report(result.stdout, time.monotonic() - begin)
 
+    def fetch(
+        self, source: str, target: Path, *, known: Optional[Path], timeout: float,
+        cancel: Optional[threading.Event] = None,
+    ) -> None:
+        """
+        Make the local folder ``target`` equal to the machine's ``source``; see the protocol.
 
-def to_folder(
-    source: Path, target: str, *, excludes: Sequence[str], includes: Sequence[str],
-    timeout: float, cancel: Optional[threading.Event],
-    on_progress: Optional[Callable[[int, int], None]],
-) -> SyncReport:
-    """Make the folder ``target`` on this computer equal to ``source``."""
-    begin = time.monotonic()
-    process.require(['rsync'])
-    check_source(source)
-    folder = os.path.expanduser(target)
-    process.run(Command(('mkdir', '-p', '--', folder), what=f'making {target}'), timeout=timeout)
-    result = process.run(
-        rsync(source, folder, excludes=excludes, includes=includes,
-              progress=on_progress is not None),
-        timeout=timeout, cancel=cancel, check=False,
-        on_output=None if on_progress is None else Progress(on_progress))
-    return _report(result, source, process.HERE, begin)
-
-
-def fetch(
-    name: str, start: Optional[Callable[[str], lines.Channel]], source: str, target: Path, *,
-    known: Optional[Path], timeout: float, cancel: Optional[threading.Event],
-) -> None:
-    """
-    Make a local folder equal to one of a machine, or of this computer; see the Shell protocol.
-
-    The machine is not trusted: no special files, no links out of the folder, no set-uid bits.
-
-    :param start: starts a command line on the machine; None for this computer.
-    """
-    process.require(['rsync'])
-    words = ['rsync', '-rltp', '-s', '--delete', '--safe-links', '--chmod=u-s,g-s']
-    words += [f'--link-dest={known.resolve()}'] if known is not None else []
-    with contextlib.ExitStack() as undo:
-        failures: list[FogError] = []
-        path = f'{os.path.expanduser(source)}/'
-        if start is not None:
-            rsh, failures = undo.enter_context(relay.remote_shell(start))
-            words += ['-e', rsh]
-            path = f'machine:{remote_folder(source)}'
-        result = process.run(
-            Command((*words, '--', path, f'{target}/'), environment={'LC_ALL': 'C'},
-                    what='rsync'), timeout=timeout, cancel=cancel, check=False)
-    if failures:
-        raise failures[0]
-    if result.returncode != 0:
-        lost = result.returncode in _LOST and 'No space left' not in result.stderr
-        raise explained(result, Path(source), f"'{name}'" if lost else process.HERE)
-
-
-def _report(result: Result, source: Path, where: str, begin: float) -> SyncReport:
-    if result.returncode not in (0, VANISHED):
-        raise explained(result, source, where)
-    return report(result.stdout, time.monotonic() - begin)
+        The machine is not trusted: no special files, no links out of the folder, no set-uid bits.
+        """
+        process.require(['rsync'])
+        words = ['rsync', '-rltp', '-s', '--delete', '--safe-links', '--chmod=u-s,g-s']
+        words += [f'--link-dest={known.resolve()}'] if known is not None else []
+        with self._remote_shell() as (rsh, files, failures):
+            words += ['-e', rsh] if rsh else []
+            result = process.run(
+                Command((*words, '--', place(source, rsh), f'{target}/'),
+                        environment={'LC_ALL': 'C'}, what='rsync'),
+                timeout=timeout, cancel=cancel, check=False, inherited=files)
+        if failures:
+            raise failures[0]
+        if result.returncode != 0:
+            lost = result.returncode in _LOST and 'No space left' not in result.stderr
+            raise explained(result, Path(source), self.where if lost else process.HERE)
 
 
 def check_source(source: Path) -> None:
@@ -172,9 +143,12 @@ def is_large(source: Path, limit: int) -> bool:
     return False
 
 
-def remote_folder(target: str) -> str:
-    """Return a folder as rsync takes it, relative to the login user's home."""
-    return f"{target[2:] or '.'}/" if target.startswith('~/') else f'{target}/'
+def place(folder: str, rsh: str) -> str:
+    """Return a folder as rsync takes it: one of this computer, or of the host behind ``rsh``."""
+    if not rsh:
+        return f'{os.path.expanduser(folder)}/'
+    inside = folder.removeprefix('~/') or '.'  # rsync begins in the login user's home
+    return f'machine:{inside}/'
 
 
 def rsync(
@@ -279,9 +253,9 @@ def explained(result: Result, source: Path, where: str) -> FogError:
 
 
 @contextlib.contextmanager
-def open_ssh(endpoint: Endpoint) -> Iterator[str]:
+def open_ssh(endpoint: Endpoint) -> Iterator[RemoteShell]:
     """
-    Yield the value of rsync's ``-e`` for a connection of OpenSSH with the same pinned host key.
+    Yield a remote shell by a connection of OpenSSH with the same pinned host key.
 
     :raises HostKeyError: known_hosts cannot be read.
     :raises PrerequisiteError: the temporary file with the host key cannot be created.
@@ -310,7 +284,7 @@ def open_ssh(endpoint: Endpoint) -> Iterator[str]:
         known.flush()
         words += ['-o', 'HostKeyAlias=machine', '-o', f'UserKnownHostsFile={known.name}',
                   '-o', 'GlobalKnownHostsFile=/dev/null']
-        yield ' '.join(_word(word) for word in words)
+        yield ' '.join(_word(word) for word in words), (), []
 
 
 def _word(word: str) -> str:

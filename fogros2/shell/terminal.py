@@ -6,15 +6,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 import contextlib
 import os
-import signal
 import termios
 import threading
 import tty
-from types import FrameType
 from typing import Optional
 
 from fogros2.shell import relay
 from fogros2.shell.lines import Channel
+
+#: Seconds between two looks at the size of the terminal.
+LOOK = 0.1
 
 
 def size() -> Optional[tuple[int, int, str]]:
@@ -54,28 +55,21 @@ def _raw() -> Iterator[None]:
 @contextlib.contextmanager
 def _following_size(channel: Channel) -> Iterator[None]:
     """Send each new size of this terminal to the remote terminal during the block."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread can handle signals
-        return
-    changed, change = os.pipe()
+    ended = threading.Event()
 
-    def send() -> None:
-        while os.read(changed, 64):
-            with contextlib.suppress(Exception):  # the program or this terminal has ended
-                channel.resize_pty(*os.get_terminal_size(0))
+    def follow() -> None:
+        sent = None  # the size may have changed since the channel was opened
+        with contextlib.suppress(Exception):  # one of the two has ended
+            while not ended.wait(LOOK):
+                size = os.get_terminal_size(0)
+                if size != sent:
+                    channel.resize_pty(*size)
+                    sent = size
 
-    def resized(number: int, frame: Optional[FrameType]) -> None:
-        # it must not send: the thread that it interrupts may hold the lock of the connection
-        os.write(change, b'x')
-
-    thread = threading.Thread(target=send, name='fog-terminal-size', daemon=True)
+    thread = threading.Thread(target=follow, name='fog-terminal-size', daemon=True)
     thread.start()
-    before = signal.signal(signal.SIGWINCH, resized)
-    os.write(change, b'x')  # the size may have changed since the channel was opened
     try:
         yield
     finally:
-        signal.signal(signal.SIGWINCH, before)
-        os.close(change)  # ends the thread
+        ended.set()
         thread.join(5.0)
-        os.close(changed)

@@ -100,18 +100,14 @@ def used_networks() -> Command:
 
 def parse_used(output: str) -> list[str]:
     """
-    Parse the output of :func:`used_networks` to networks in CIDR form.
+    Parse the output of :func:`used_networks`, JSON lines, to networks in CIDR form.
 
     :raises VpnError: the output is not that of ``ip``.
     """
     found: set[str] = set()
-    decoder = json.JSONDecoder()
-    rest = output.strip()
     try:
-        while rest:
-            entries, end = decoder.raw_decode(rest)
-            rest = rest[end:].strip()
-            for entry in entries:
+        for line in output.splitlines():
+            for entry in json.loads(line):
                 # an interface that is down has addresses but no routes
                 for address in entry.get('addr_info', ()):
                     found.add(f"{address['local']}/{address['prefixlen']}")

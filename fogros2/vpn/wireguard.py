@@ -74,7 +74,8 @@ class WireGuard(Vpn):
     """
     Commands for a WireGuard interface; they need root and the programs of ``PACKAGES``.
 
-    :param domain: ROS_DOMAIN_ID, whose DDS ports an interface with a firewall admits.
+    :param domain: ROS_DOMAIN_ID, whose DDS ports an interface with a firewall admits; the DDS
+        plugin checks that there are such ports.
     :param ports: further ranges of UDP ports to admit, as (first, last).
     :param asked: IPv4 addresses that the user configured for the robot's nodes to ask.
     """
@@ -82,8 +83,6 @@ class WireGuard(Vpn):
     def __init__(
         self, domain: int = 0, ports: Sequence[tuple[int, int]] = (), asked: Sequence[str] = (),
     ) -> None:
-        if not 0 <= domain <= (65535 - PORT_BASE) // PORTS_PER_DOMAIN:
-            raise ConfigurationError(f'ROS_DOMAIN_ID {domain} has no DDS ports', 'use 0 to 101')
         self.domain = domain
         self.ports = (dds_ports(domain), *ports)
         self.asked = tuple(asked)
@@ -110,10 +109,7 @@ class WireGuard(Vpn):
 
         The filter exists before the interface.
         """
-        steps = self._steps(interface, peers)
-        yield Command.script(
-            '\n'.join([_PATH, *(step.do for step in steps)]), sudo=True,
-            what=_what('set', interface, 'up'))
+        yield self._script(interface, peers, _what('set', interface, 'up'))
 
     def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """Yield the commands that set the peers, and keep the sessions of remaining ones."""
@@ -159,10 +155,7 @@ class WireGuard(Vpn):
 
         Peers without an endpoint get the one that the health check noted last.
         """
-        steps = self._steps(interface, peers, recall=True)
-        yield Command.script(
-            '\n'.join([_PATH, *(step.do for step in steps)]), sudo=True,
-            what=_what('repair', interface))
+        yield self._script(interface, peers, _what('repair', interface), recall=True)
 
     def status(self, interface: VpnInterface) -> Command:
         """Return a command that prints only counters: ``dump`` would print the private key."""
@@ -213,6 +206,13 @@ class WireGuard(Vpn):
                 f'if [ -e {_guests(interface)}.json ] && found=$({look}) && '
                 f'[ "$found" != "[]" ]; then\n  : >{_left(interface)}\n  exit 0\nfi\n'
                 f'{command.argv[-1]}')))
+
+    def _script(
+        self, interface: VpnInterface, peers: Sequence[Peer], what: str, *, recall: bool = False,
+    ) -> Command:
+        steps = self._steps(interface, peers, recall=recall)
+        return Command.script(
+            '\n'.join([_PATH, *(step.do for step in steps)]), sudo=True, what=what)
 
     def _steps(
         self, interface: VpnInterface, peers: Sequence[Peer], *, recall: bool = False,

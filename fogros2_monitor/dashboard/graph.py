@@ -20,7 +20,6 @@ has no other subscriber, because that would start the encoder.
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 import os
 import sys
@@ -199,12 +198,12 @@ class GraphNode(Node):
                 'large': one.large, **self._rates(one.topic)}
 
 
-def _take_lines(node: GraphNode, ended: functools.partial[None]) -> None:
+def _take_lines(node: GraphNode) -> None:
     for line in sys.stdin:
         with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError):
             told = json.loads(line)
             node.know(told['machines'], pictures=bool(told['pictures']))
-    ended()
+    rclpy.try_shutdown()
 
 
 def main() -> None:
@@ -212,8 +211,7 @@ def main() -> None:
     os.nice(5)  # the nodes of the launch have priority
     rclpy.init(args=[])
     node = GraphNode()
-    threading.Thread(target=_take_lines, args=(
-        node, functools.partial(rclpy.try_shutdown)), daemon=True).start()
+    threading.Thread(target=_take_lines, args=(node,), daemon=True).start()
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):

@@ -9,12 +9,11 @@ import cv2
 import numpy
 from numpy.typing import NDArray
 
-from image_transport_h264.picture import BadPicture, Layout, Picture
+from image_transport_h264 import stills
+from image_transport_h264.picture import Picture
 
 #: Largest width of a picture in pixels, and JPEG quality.
 WIDTH, QUALITY = 640, 80
-_TO_BGR = {'rgb24': cv2.COLOR_RGB2BGR, 'rgba': cv2.COLOR_RGBA2BGR, 'bgra': cv2.COLOR_BGRA2BGR,
-           'uyvy422': cv2.COLOR_YUV2BGR_UYVY, 'yuyv422': cv2.COLOR_YUV2BGR_YUY2}
 
 Pixels = NDArray[Any]
 
@@ -26,23 +25,9 @@ def jpeg(picture: Picture) -> bytes:
     :raises BadPicture: the picture's fields contradict each other, or its encoding is unknown.
     """
     picture.check()
-    layout = picture.layout
-    rows = numpy.ascontiguousarray(picture.rows())
-    if layout.kind == 'deep':
-        pixels = _coloured(_smaller(_values(picture, layout, rows)))
-    elif layout.kind == 'grey':
-        pixels = _smaller(rows)
-    else:
-        pixels = rows.reshape(picture.height, picture.width, layout.pixel_bytes)
-        if layout.kind == 'rgb':
-            pixels = _smaller(pixels)
-        if layout.av_format in _TO_BGR:
-            pixels = cv2.cvtColor(pixels, _TO_BGR[layout.av_format])
-        pixels = _smaller(pixels)
-    whole, data = cv2.imencode('.jpg', pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    if not whole:
-        raise BadPicture(f'JPEG of {picture.width}x{picture.height} failed', 'jpeg')
-    return bytes(data.tobytes())
+    pixels = _coloured(_smaller(_values(picture))) if picture.layout.kind == 'deep' else \
+        _smaller(stills.bgr(picture))
+    return stills.coded(pixels, 'jpeg', QUALITY)
 
 
 def _smaller(pixels: Pixels) -> Pixels:
@@ -54,9 +39,10 @@ def _smaller(pixels: Pixels) -> Pixels:
     return smaller
 
 
-def _values(picture: Picture, layout: Layout, rows: Pixels) -> Pixels:
+def _values(picture: Picture) -> Pixels:
     order = '>' if picture.is_bigendian else '<'
     kind = {'32FC1': 'f4', '16SC1': 'i2'}.get(picture.encoding, 'u2')
+    rows = numpy.ascontiguousarray(picture.rows())
     values = rows.view(f'{order}{kind}').astype(numpy.float32)
     # Zero and infinity mark pixels without a distance.
     return numpy.where(numpy.isfinite(values) & (values != 0), values, numpy.nan)

@@ -375,7 +375,7 @@ def taken(but: str) -> list[str]:
         said = subprocess.run(('ip', '-json', '-4', *words), check=True, capture_output=True,
                               text=True, env=ENVIRONMENT, stdin=subprocess.DEVNULL).stdout
         text += json.dumps([entry for entry in json.loads(said or '[]')
-                            if but not in (entry.get('ifname'), entry.get('dev'))])
+                            if but not in (entry.get('ifname'), entry.get('dev'))]) + '\n'
     return addresses.parse_used(text)
 
 

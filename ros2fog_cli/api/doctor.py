@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 import functools
@@ -18,7 +18,7 @@ from typing import Literal, Optional
 import xml.etree.ElementTree as ElementTree
 
 from fogros2 import deploy, plan, plugin_system, process
-from fogros2.dds.cyclonedds import RECEIVE_BUFFER
+from fogros2.dds import cyclonedds
 from fogros2.errors import Cancelled, FogError, Unsupported
 from fogros2.host.inspection import DISTRO
 from fogros2.model import Command
@@ -240,31 +240,16 @@ def rmw() -> Check:
 def cyclone_uri() -> Check:
     """Check that the user's Cyclone configuration is readable; FogROS2 appends its own."""
     name, uri = 'CYCLONEDDS_URI', os.environ.get('CYCLONEDDS_URI', '').strip()
-    if not uri:
-        return Check(name, 'ok', 'not set')
-    for part in _fragments(uri):
-        path = part.removeprefix('file://')
-        try:
-            text = part if part.startswith('<') else Path(path).read_text()
-            ElementTree.fromstring(text)
-        except OSError as error:
-            return Check(name, 'failed', f'{path}: {error.strerror}', 'correct it, or unset it')
-        except ElementTree.ParseError as error:
-            what = f'{part[:60]}...' if part.startswith('<') else path
-            return Check(name, 'failed', f'{what} is no XML: {error}',
-                         'correct it, or unset it')
-    return Check(name, 'ok', 'readable; ours is appended')
-
-
-def _fragments(uri: str) -> Iterator[str]:
-    """Yield the comma-separated parts of CYCLONEDDS_URI; XML in it may contain commas."""
-    if uri.startswith('<'):
-        end = uri.rfind('>') + 1
-        yield uri[:end]
-        uri = uri[end:].lstrip(',')
-    for part in uri.split(','):
-        if part.strip():
-            yield part.strip()
+    try:
+        for place, text in cyclonedds.fragments(uri):
+            try:
+                ElementTree.fromstring(text)
+            except ElementTree.ParseError as error:
+                return Check(name, 'failed', f'{place} is no XML: {error}',
+                             'correct it, or unset it')
+    except FogError as error:
+        return _failed(name, error)
+    return Check(name, 'ok', 'readable; ours is appended' if uri else 'not set')
 
 
 def receive_buffer() -> Check:
@@ -274,10 +259,10 @@ def receive_buffer() -> Check:
         most = int(Path('/proc/sys/net/core/rmem_max').read_text())
     except (OSError, ValueError):
         return Check(name, 'warning', 'net.core.rmem_max can not be read here')
-    if most < RECEIVE_BUFFER:
+    if most < cyclonedds.RECEIVE_BUFFER:
         return Check(
             name, 'warning', f'net.core.rmem_max is {most}: large images get lost on their way',
-            f'sudo sysctl -w net.core.rmem_max={RECEIVE_BUFFER}')
+            f'sudo sysctl -w net.core.rmem_max={cyclonedds.RECEIVE_BUFFER}')
     return Check(name, 'ok', f'net.core.rmem_max is {most}')
 
 

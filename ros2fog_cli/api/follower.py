@@ -11,38 +11,26 @@ import threading
 import time
 from typing import Any, Optional
 
-from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
-from fogros2.errors import ConnectError, FogError
+from fogros2.errors import FogError
 from fogros2.events import Event, Status
 from fogros2.model import Command
 from fogros2.shell import Shell
 from fogros2.store import Record
-from ros2fog_cli.api import machines, reach
+from ros2fog_cli.api import reach
 from ros2fog_cli.api.log import describe
 from ros2fog_cli.api.machines import Entry
 
 #: Number of log lines to keep, and longest line in characters.
 LINES, WIDTH = 500, 2000
-#: Shortest and longest pause between two attempts to connect, in seconds.
-RETRY, LONGEST_RETRY = 2.0, 15.0
+#: Pause between two attempts to connect, in seconds.
+RETRY = 5.0
 #: Seconds between two looks at the VPN. sudo, where it is needed, logs each look.
 VPN_INTERVAL = 2.0
 #: Bytes to read of a process's command line.
 _WORDS = 32_768
 
 Changed = Callable[[], None]
-
-
-@dataclasses.dataclass(frozen=True)
-class LogLine:
-    """A line of a machine's log; ``number`` counts from 1, ``time`` is seconds since the epoch."""
-
-    number: int
-    time: float
-    node: str
-    error: bool
-    text: str
 
 
 class Follower:
@@ -61,34 +49,28 @@ class Follower:
         self._changed = changed
         self._interval = interval
         self._lock = threading.Lock()
-        self._lines: deque[LogLine] = deque(maxlen=LINES)
+        self._lines: deque[dict[str, Any]] = deque(maxlen=LINES)
         self._number = self._seq = 0
         self._vpn_at = -1e9
         self._pids: tuple[int, ...] = ()
         self.vpn: Optional[dict[str, Any]] = None
-        self.agent: Optional[dict[str, Any]] = None
+        self.agent: Optional[Status] = None
         self.problems: dict[str, str] = {}
         #: Names of the machine's nodes in the ROS graph.
         self.names: tuple[str, ...] = ()
-        self._stopped, self._watched = threading.Event(), threading.Event()
-        self._watched.set()
+        self._stopped = threading.Event()
         self._thread = threading.Thread(
             target=self._run, name=f'fog-follow-{entry.name}', daemon=True)
         self._thread.start()
 
-    def know(self, entry: Entry, *, watched: bool = True) -> None:
-        """Update the machine's entry; pause while nobody watches (``watched`` is False)."""
+    def know(self, entry: Entry) -> None:
+        """Update the machine's entry."""
         if entry.record is not None:
             self._entry, self._record = entry, entry.record
-        if watched:
-            self._watched.set()
-        else:
-            self._watched.clear()
 
     def stop(self) -> None:
         """Stop the thread; it closes the connection soon after."""
         self._stopped.set()
-        self._watched.set()
 
     def join(self, timeout: float) -> None:
         """Wait up to ``timeout`` seconds until the connection is closed."""
@@ -99,43 +81,35 @@ class Follower:
         """The number of the newest log line."""
         return self._number
 
-    def lines(self, after: int) -> list[LogLine]:
-        """Return the log lines with a number above ``after``."""
+    def lines(self, after: int) -> list[dict[str, Any]]:
+        """
+        Return the log lines with a number above ``after``, as JSON values.
+
+        ``number`` counts from 1, ``time`` is in seconds since the epoch; ``node`` may be ''.
+        """
         with self._lock:
-            return [line for line in self._lines if line.number > after]
+            return [line for line in self._lines if line['number'] > after]
 
     # -- the thread -----------------------------------------------------------------------------
 
     def _run(self) -> None:
-        pause = RETRY
-        while self._watched.wait() and not self._stopped.is_set():
+        while not self._stopped.is_set():
             try:
                 with contextlib.ExitStack() as undo:
                     client, shell = self._connect(undo)
-                    while self._watched.is_set() and not self._stopped.is_set():
+                    while not self._stopped.is_set():
                         self._ask(client, shell)
-                        pause = RETRY
                         self._stopped.wait(self._interval)
             except FogError as error:
                 self.problems['agent'] = str(error)
                 self.agent = None
                 self._look_at_vpn()
                 self._changed()
-                self._stopped.wait(pause)
-                pause = min(1.5 * pause, LONGEST_RETRY)
+                self._stopped.wait(RETRY)
 
     def _connect(self, undo: contextlib.ExitStack) -> tuple[AgentClient, Shell]:
-        entry = self._entry
-        to = reach.endpoint(entry)
-        if machines.load(entry.provider).capabilities.firewall:
-            # Reading the state must not open a port.
-            inside = reach.through_vpn(entry, to)
-            if inside is None:
-                raise ConnectError(f"'{entry.name}' can't be reached through the VPN")
-            to = inside
-        shell = shells.connect(to, name=entry.name, timeout=10.0)
-        undo.callback(shell.close)
-        client = reach.agent(entry, shell)
+        shell = undo.enter_context(reach.session(self._entry, timeout=10.0, opens=False))
+        client = reach.agent(self._entry, shell)
         undo.callback(client.close)
         following = client.status(timeout=15.0)['next']
         if following <= self._seq:
@@ -144,9 +118,9 @@ class Follower:
         return client, shell
 
     def _ask(self, client: AgentClient, shell: Shell) -> None:
-        agent = agent_state(client.status(timeout=15.0))
+        agent = client.status(timeout=15.0)
         self.problems.pop('agent', None)
-        pids = tuple(sorted(node['pid'] for node in agent['nodes'] if node['pid']))
+        pids = tuple(sorted(node['pid'] for node in agent['nodes'] if node['pid'] is not None))
         if pids != self._pids:
             self.names = graph_names(shell, pids)
             self._pids = pids
@@ -177,25 +151,11 @@ class Follower:
         with self._lock:
             for line in text.splitlines():
                 self._number += 1
-                self._lines.append(LogLine(
-                    self._number, at if isinstance(at, (int, float)) else time.time(),
-                    str(event.get('name', '')), error, line[:WIDTH]))
+                self._lines.append({
+                    'number': self._number, 'node': str(event.get('name', '')), 'error': error,
+                    'time': at if isinstance(at, (int, float)) else time.time(),
+                    'text': line[:WIDTH]})
         self._changed()
-
-
-def agent_state(status: Status) -> dict[str, Any]:
-    """
-    Return the part of an agent's status that the screens show.
-
-    ``since`` is in seconds since the epoch, ``heartbeat_age`` in seconds, ``rss`` in bytes.
-    """
-    return {
-        'since': status['since'], 'rss': 1000 * status['rss_kb'],
-        'heartbeat_age': status['heartbeat_age'],
-        'nodes': [{
-            'name': node['name'], 'state': node['state'], 'pid': node['pid'] or 0,
-            'returncode': node['returncode'], 'restarts': node['restarts'],
-            'error': node.get('error', '')} for node in status['nodes']]}
 
 
 def rates(before: Optional[dict[str, Any]], link: reach.Link, now: float) -> dict[str, Any]:
@@ -228,12 +188,9 @@ def graph_names(shell: Shell, pids: tuple[int, ...]) -> tuple[str, ...]:
         'sh', '-c', 'for p; do echo; head -c "$0" "/proc/$p/cmdline" 2>/dev/null | '
         r"tr '\n\0' '\001\n'; done", str(_WORDS), *map(str, pids)),
         what='look at the processes'), timeout=15.0, check=False)
-    names = set()
-    for words in result.stdout.split('\n\n'):
-        name = node_name([word for word in words.split('\n') if word])
-        if name:
-            names.add(name)
-    return tuple(sorted(names))
+    names = {node_name([word for word in words.split('\n') if word])
+             for words in result.stdout.split('\n\n')}
+    return tuple(sorted(names - {''}))
 
 
 def node_name(words: list[str]) -> str:

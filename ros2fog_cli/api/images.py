@@ -22,16 +22,6 @@ LOOK = 10.0
 READY, FAILED = 'available', ('failed', 'error', 'invalid')
 
 
-@dataclasses.dataclass(frozen=True)
-class Baking:
-    """An image in creation; ``dependencies`` is '' if launches will not find it automatically."""
-
-    id: str
-    name: str
-    provider: str
-    dependencies: str
-
-
 def flush(entry: Entry, warn: Warn) -> None:
     """Flush a machine's file system buffers, because an image contains only the disk."""
     if entry.machine is None or entry.machine.state is not MachineState.RUNNING:
@@ -43,9 +33,11 @@ def flush(entry: Entry, warn: Warn) -> None:
         warn(f"{entry.name}: what isn't on the disk yet may be missing in the image: {error}")
 
 
-def bake(entry: Entry, name: str = '', now: Optional[float] = None) -> Baking:
+def bake(entry: Entry, name: str = '', now: Optional[float] = None) -> Image:
     """
-    Start to create an image of a machine, and return at once.
+    Start to create an image of a machine, and return it at once.
+
+    Its ``dependencies`` are '' if launches will not find it automatically.
 
     :param name: name of the image; '': the machine's name and the time, because names are unique.
     :param now: the time in seconds since the epoch; None: the current time.
@@ -60,11 +52,11 @@ def bake(entry: Entry, name: str = '', now: Optional[float] = None) -> Baking:
         name = f'{entry.name}-image-{stamp}'
     dependencies = entry.machine.tags.get(TAG_DEPENDENCIES, '')
     made = machines.load(entry.provider).bake(entry.machine.id, name, dependencies)
-    return Baking(made, name, entry.provider, dependencies)
+    return Image(made, name, entry.provider, dependencies=dependencies)
 
 
 def wait(
-    baking: Baking, *, timeout: float = TIMEOUT,
+    baking: Image, *, timeout: float = TIMEOUT,
     look: Callable[[str, float], None] = lambda state, seconds: None,
 ) -> Image:
     """

@@ -8,7 +8,6 @@ watches, no provider and no agent is polled, and no launch is joined.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 import dataclasses
 import json
 import threading
@@ -16,9 +15,10 @@ import time
 from typing import Any, Optional
 
 from fogros2.errors import FogError, MachineNotFound
-from fogros2.store import Record, robot_name, Store
+from fogros2.model import Machine
+from fogros2.store import robot_name, Store
 from ros2fog_cli.api import endings, machines, replicas
-from ros2fog_cli.api.follower import Follower, LogLine
+from ros2fog_cli.api.follower import Follower
 from ros2fog_cli.api.graphs import Graphs
 from ros2fog_cli.api.machines import Entry
 from ros2fog_cli.api.shown import as_json, machine_json, phase, process_of, Shown, ShownLaunch
@@ -56,8 +56,10 @@ class Live:
         self._launches: dict[str, ShownLaunch] = {}
         self._warnings: list[str] = []
         self._asked = -1e9
-        self._known: frozenset[tuple[str, Optional[str]]] = frozenset()
-        self._entries: list[Entry] = []
+        #: Names and ids of records, at the last look and when the providers were asked.
+        self._known: set[tuple[str, Optional[str]]] = set()
+        self._answered = self._known
+        self._answers: dict[str, Optional[list[Machine]]] = {}
         self._lock = threading.RLock()
         self._news = threading.Condition(self._lock)
         self._wake, self._stopped = threading.Event(), threading.Event()
@@ -89,8 +91,6 @@ class Live:
         for follower in followers:
             follower.join(2.0)
         self._threads[0].join(5.0)
-        for launch in self._launches.values():
-            launch.close()
         if self._graphs is not None:
             self._graphs.close()
 
@@ -120,15 +120,11 @@ class Live:
                 lambda: self._version > after or self._stopped.is_set(), timeout)
             return {**self._state, 'now': time.time()}
 
-    def lines(self, key: str, after: int) -> list[LogLine]:
-        """Return the lines of a machine's log that follow line number ``after``."""
-        with self._lock:
-            shown = self._shown.get(key)
-        return shown.follower.lines(after) if shown and shown.follower else []
-
     def log(self, machine: str, after: int) -> list[dict[str, Any]]:
         """Return the lines of a machine's log after line number ``after``, as JSON values."""
-        return [dataclasses.asdict(line) for line in self.lines(machine, after)]
+        with self._lock:
+            shown = self._shown.get(machine)
+        return shown.follower.lines(after) if shown and shown.follower else []
 
     def picture(self, stream: str) -> Optional[bytes]:
         """Return the last picture of a stream, by the stream's id."""
@@ -173,11 +169,8 @@ class Live:
         while not self._stopped.is_set():
             self._wake.clear()
             self._look()
-            if self.watched:
-                self._wake.wait(LOOK)
-                continue
-            # The update above has already stopped the measurements; present() wakes this thread.
-            self._wake.wait()
+            # While nobody watches, the measurements are stopped; present() wakes this thread.
+            self._wake.wait(LOOK if self.watched else None)
 
     def _keep_asking(self) -> None:
         while not self._stopped.wait(LOOK):
@@ -185,25 +178,22 @@ class Live:
                     ASK if self._shown else ASK_SELDOM):
                 self._asked = time.monotonic()
                 warnings: list[str] = []
-                entries = machines.survey(warnings.append, name=self._name,
-                                          regions=self._regions, store=self.store,
-                                          cancel=self._stopped)
+                records = machines.recorded(self.store, self._name)
+                answers = machines.answers(
+                    warnings.append, records, self._name, self._regions, self._stopped)
                 with self._lock:
-                    self._entries, self._warnings = entries, warnings
+                    self._answers, self._warnings = answers, warnings
+                    self._answered = {
+                        (record.name, record.machine_id) for record in records.values()}
                 self._wake.set()
 
     def _look(self) -> None:
         """Update the state from the store, and wake the readers if the state changed."""
-        records = {record.name: record for record in self.store.machines()
-                   if self._name in (None, record.name)}
-        known = frozenset((record.name, record.machine_id) for record in records.values())
-        if known != self._known:
-            self._known, self._asked = known, -1e9
         now = time.time()
         with self._lock:
             self._look_at_launches(now)
             there = set()
-            for entry in (*map(self._entry, records.values()), *self._without_record(records)):
+            for entry in self._found():
                 key = self._key(entry)
                 shown = self._shown.setdefault(key, Shown(entry))
                 shown.entry, shown.ended = entry, 0.0
@@ -225,27 +215,22 @@ class Live:
                 self._state = {**state, 'version': self._version}
                 self._news.notify_all()
 
-    def _entry(self, record: Record) -> Entry:
-        """Return a record's entry, with the last answer of its provider."""
-        for entry in self._entries:
-            if entry.name == record.name and entry.own and (
-                    entry.machine is None or entry.machine.id == record.machine_id):
-                # A machine that the provider did not know yet has to be asked for again.
-                asked = entry.asked and (entry.machine is not None or entry.record is not None
-                                         and entry.record.machine_id == record.machine_id)
-                return dataclasses.replace(entry, record=record, asked=asked)
-        return Entry(record.name, record.provider or '?', None, record, False)
-
-    def _without_record(self, records: Mapping[str, Record]) -> list[Entry]:
-        """Return the machines of this robot that have no record here."""
+    def _found(self) -> list[Entry]:
+        """Return this robot's machines by the last answers; those with a record come first."""
+        records = machines.recorded(self.store, self._name)
+        known = {(record.name, record.machine_id) for record in records.values()}
+        if known != self._known:
+            self._known, self._asked = known, -1e9
         found = []
-        for entry in self._entries:
+        for entry in machines.combined(records, self._answers):
             record = records.get(entry.name)
-            # A record without an id, or with an id since the last answer, may be this machine's.
-            known = record is not None and record.machine_id in (None, entry.machine_id)
-            if entry.own and entry.record is None and not known:
+            # A machine that the provider did not know yet has to be asked for again.
+            if entry.machine is None and (entry.name, entry.machine_id) not in self._answered:
+                entry = dataclasses.replace(entry, asked=False)
+            # A record without an id may be that of a machine that the provider knows already.
+            if entry.own and (entry.record or record is None or record.machine_id):
                 found.append(entry)
-        return found
+        return sorted(found, key=lambda entry: entry.record is None)
 
     def _key(self, entry: Entry) -> str:
         """
@@ -270,9 +255,6 @@ class Live:
             launch.read(path)
         for name, launch in list(self._launches.items()):
             if name not in there:
-                if launch.file is not None:
-                    launch.read(folder / name)
-                    launch.close()
                 launch.alive = False
                 launch.ended = launch.ended or now
                 if now - launch.ended > KEPT:
@@ -291,16 +273,15 @@ class Live:
                 self.store.root / 'launches' / shown.launch, shown.entry.name))
         if not there:
             shown.ended = shown.ended or now
-        up = there and record is not None and record.launch_alive and bool(record.agent) and (
-            not (launch and launch.steps) or phase(shown.steps) == 'running')
-        if up and shown.follower is None:
+        if not (self.watched and there and record is not None and record.launch_alive):
+            if shown.follower is not None:
+                shown.follower.stop()
+                shown.follower = None
+        elif shown.follower is not None:
+            shown.follower.know(shown.entry)
+        elif record.agent and (
+                not (launch and launch.steps) or phase(shown.steps) == 'running'):
             shown.follower = Follower(shown.entry, self._wake.set, self._interval)
-        elif up and shown.follower is not None:
-            shown.follower.know(shown.entry, watched=self.watched)
-        elif shown.follower is not None and (
-                record is None or not record.launch_alive or not there):
-            shown.follower.stop()
-            shown.follower = None
 
     # -- as JSON --------------------------------------------------------------------------------
 

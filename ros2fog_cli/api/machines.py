@@ -50,13 +50,14 @@ class Entry:
     asked: bool = True
 
     @property
-    def _known(self) -> Machine:
+    def known(self) -> Machine:
+        """The provider's answer; a deleted machine without one."""
         return self.machine or _UNKNOWN
 
     @property
     def gone(self) -> bool:
         """Whether the provider no longer knows the machine, or reports it as deleted."""
-        return self.asked and self._known.state is MachineState.DELETED
+        return self.asked and self.known.state is MachineState.DELETED
 
     @property
     def state(self) -> str:
@@ -68,9 +69,9 @@ class Entry:
             return 'unknown'
         if self.gone:
             return 'gone'
-        text = str(self._known.state)
-        if self._known.state is MachineState.STOPPED:
-            return f"{text} ({'still billed' if self._known.billed else 'keeps its disk'})"
+        text = str(self.known.state)
+        if self.known.state is MachineState.STOPPED:
+            return f"{text} ({'still billed' if self.known.billed else 'keeps its disk'})"
         if self.record is None:
             return f'{text} (orphan)' if self.own else f'{text} (robot {self.robot})'
         if self.record.launch and not self.record.launch_alive:
@@ -81,7 +82,7 @@ class Entry:
     def robot(self) -> str:
         """The robot that created the machine, '' if unknown."""
         noted = '' if self.record is None else self.record.robot or robot_name()
-        return self._known.tags.get(TAG_ROBOT, noted)
+        return self.known.tags.get(TAG_ROBOT, noted)
 
     @property
     def own(self) -> bool:
@@ -91,15 +92,15 @@ class Entry:
     @property
     def created(self) -> Optional[float]:
         """When the machine was created, in seconds since the epoch."""
-        return self._known.created or (
+        return self.known.created or (
             self.record.created or None if self.record is not None else None)
 
     @property
     def expires(self) -> Optional[float]:
         """When the lifetime ends, in seconds since the epoch; None for a stopped machine."""
-        if self._known.state is MachineState.STOPPED:
+        if self.known.state is MachineState.STOPPED:
             return None
-        tag = self._known.tags.get(TAG_EXPIRES, '')
+        tag = self.known.tags.get(TAG_EXPIRES, '')
         known = [float(tag)] if tag.isdecimal() else []
         record = self.record
         if record is not None and record.armed:
@@ -108,13 +109,13 @@ class Entry:
         elif record is not None and record.created and not known:
             known.append(record.created + record.spec.lifetime)
         # a robot whose clock is wrong may note an end that is long before the beginning
-        begin = (self._known.created or 0.0) - CLOCK_TOLERANCE
+        begin = (self.known.created or 0.0) - CLOCK_TOLERANCE
         return max((at for at in known if at > begin), default=None)
 
     @property
     def address(self) -> str:
         """The host of the machine's shell, '' if there is none."""
-        shell = self._known.shell or (self.record.shell if self.record is not None else None)
+        shell = self.known.shell or (self.record.shell if self.record is not None else None)
         return shell.host if shell is not None else ''
 
     @property
@@ -130,17 +131,17 @@ class Entry:
         """The launch that uses the machine, or used it last."""
         if self.record is not None and self.record.launch:
             return self.record.launch
-        return self._known.tags.get(TAG_LAUNCH, '')
+        return self.known.tags.get(TAG_LAUNCH, '')
 
     @property
     def cost(self) -> Optional[Decimal]:
         """US dollars per hour; None if the machine does not run or its price is unknown."""
-        return self._known.cost_per_hour if self.runs else None
+        return self.known.cost_per_hour if self.runs else None
 
     @property
     def runs(self) -> bool:
         """Whether the provider bills the machine as a running one."""
-        return self._known.owned and (self._known.billed or self._known.state in (
+        return self.known.owned and (self.known.billed or self.known.state in (
             MachineState.PENDING, MachineState.RUNNING, MachineState.STOPPING))
 
     def spent(self, now: float) -> Optional[Decimal]:
@@ -149,16 +150,6 @@ class Entry:
         if rate is None or self.created is None:
             return None
         return rate * Decimal(max(0.0, now - self.created)) / 3600
-
-    @property
-    def region(self) -> str:
-        """Region, context or engine; '' if the provider names none."""
-        return self._known.region
-
-    @property
-    def kind(self) -> str:
-        """The kind of machine, such as an instance type; '' if the provider names none."""
-        return self._known.kind
 
     @property
     def machine_id(self) -> Optional[str]:
@@ -178,9 +169,9 @@ class Entry:
             'age': None if self.created is None else max(0.0, now - self.created),
             'address': self.address, 'expires': self.expires,
             'time_left': None if self.expires is None else self.expires - now,
-            'place': self.region, 'kind': self.kind,
-            'image': self._known.image or None, 'key': self._known.key or None,
-            'disk_gb': self._known.disk_gb,
+            'place': self.known.region, 'kind': self.known.kind,
+            'image': self.known.image or None, 'key': self.known.key or None,
+            'disk_gb': self.known.disk_gb,
             'monitor': self.monitor or None,
             'monitor_open': self.record.monitor_open or None
             if self.record is not None and self.monitor else None,
@@ -192,39 +183,56 @@ class Entry:
 
 def survey(
     warn: Warn, *, name: Optional[str] = None, regions: Optional[Sequence[str]] = None,
-    store: Optional[Store] = None, cancel: Optional[threading.Event] = None,
+    store: Optional[Store] = None,
 ) -> list[Entry]:
     """
-    Return all machines, or those named ``name``; ask all providers in parallel.
-
-    If a provider cannot be asked (no SDK, no credentials, no engine), warn, and return the
-    machines that the store knows. Skip a provider that is not configured here and that no record
-    names: loading its SDK takes longer than the answers of all others.
+    Return all machines, or those named ``name``, by all providers; Ctrl-C ends the search.
 
     :param regions: regions to search; providers with regions are then always asked.
-    :param cancel: event that ends the search; None: Ctrl-C ends it.
     """
-    records = {record.name: record for record in (store or Store()).machines()}
-    if name is not None:
-        records = {key: value for key, value in records.items() if key == name}
+    records = recorded(store or Store(), name)
+    with interruptible() as given_up:
+        return combined(records, answers(warn, records, name, regions, given_up))
+
+
+def recorded(store: Store, name: Optional[str] = None) -> dict[str, Record]:
+    """Return all records by their names, or the one named ``name``."""
+    return {record.name: record for record in store.machines() if name in (None, record.name)}
+
+
+def answers(
+    warn: Warn, records: Mapping[str, Record], name: Optional[str],
+    regions: Optional[Sequence[str]], cancel: threading.Event,
+) -> dict[str, Optional[list[Machine]]]:
+    """
+    Return each provider's machines, or those named ``name``; ask all in parallel.
+
+    If a provider cannot be asked (no SDK, no credentials, no engine), warn, and return None for
+    it. Skip a provider that is not configured here and that no record names: loading its SDK takes
+    longer than the answers of all others.
+    """
     tags = {} if name is None else {TAG_NAME: name}
     providers = plugin_system.names('fogros2.provider')
-    with contextlib.nullcontext(cancel) if cancel is not None else interruptible() as given_up:
-        answers = ask_all(warn, providers, lambda provider: _ask(
-            provider, tags, regions, records.values(), given_up))
+    return dict(zip(providers, ask_all(warn, providers, lambda provider: _ask(
+        provider, tags, regions, records.values(), cancel))))
+
+
+def combined(
+    records: Mapping[str, Record], answers: Mapping[str, Optional[list[Machine]]],
+) -> list[Entry]:
+    """Return the machines that the store or a provider knows."""
     entries: list[Entry] = []
     matched: set[str] = set()
-    for machines in answers:
+    for machines in answers.values():
         for machine in machines or []:
             record = _record_of(machine, records)
             if record is not None:
                 matched.add(record.name)
             entries.append(Entry(machine.name or machine.tags.get(TAG_NAME, ''),
                                  machine.provider, machine, record))
-    asked = {provider for provider, answer in zip(providers, answers) if answer is not None}
     for record in records.values():
         if record.name not in matched:
-            known = record.provider in asked or bool(record.damage)
+            known = answers.get(record.provider) is not None or bool(record.damage)
             entries.append(Entry(record.name, record.provider or '?', None, record, known))
     return sorted(entries, key=lambda entry: (entry.name, entry.provider))
 
@@ -292,20 +300,11 @@ def _ask(
         found = []
     # it may have no tags, or not be able to search where the machine is
     ids = {machine.id for machine in found}
-    return found + _described(
-        provider, [r for r in records if r.provider == name and r.machine_id not in ids])
-
-
-def _described(provider: Provider, records: Sequence[Record]) -> list[Machine]:
-    """Return the machines that the store knows, and a search did not find."""
-    machines = []
     for record in records:
-        if record.machine_id is not None:
-            try:
-                machines.append(provider.describe(record.machine_id))
-            except MachineNotFound:
-                continue
-    return machines
+        if record.provider == name and record.machine_id and record.machine_id not in ids:
+            with contextlib.suppress(MachineNotFound):
+                found.append(provider.describe(record.machine_id))
+    return found
 
 
 def load(name: str, regions: Optional[Sequence[str]] = None) -> Provider:

@@ -71,7 +71,7 @@ def endpoint(entry: Entry, user: Optional[str] = None) -> Endpoint:
 
 @contextlib.contextmanager
 def session(
-    entry: Entry, user: Optional[str] = None, timeout: float = 15.0,
+    entry: Entry, user: Optional[str] = None, timeout: float = 15.0, *, opens: bool = True,
 ) -> Iterator[Shell]:
     """
     Yield the machine's shell, which connects at the first use, and close it after the block.
@@ -80,24 +80,22 @@ def session(
     Otherwise open the firewall for this robot until the block ends. Never open the firewall of
     another robot's machine: that would lock out its own robot.
 
+    :param opens: False: never open the firewall.
     :raises FogError: the machine cannot be reached.
     """
     to = endpoint(entry, user)
     with contextlib.ExitStack() as undo:
-        if firewalled(entry):
+        if machines.load(entry.provider).capabilities.firewall:
             inside = through_vpn(entry, to)
             if inside is not None:
                 to = inside
-            elif entry.own:
+            elif not opens:
+                raise ConnectError(f"'{entry.name}' can't be reached through the VPN")
+            elif entry.own and entry.machine is not None:
                 _open(entry, to.port, undo)
         found = shells.connect(to, name=entry.name, timeout=timeout)
         undo.callback(found.close)
         yield found
-
-
-def firewalled(entry: Entry) -> bool:
-    """Return whether the machine's provider has a firewall."""
-    return entry.machine is not None and machines.load(entry.provider).capabilities.firewall
 
 
 def through_vpn(

@@ -10,8 +10,7 @@ import os
 from typing import Any, TextIO
 
 from ros2fog_cli.api import replicas
-from ros2fog_cli.api.follower import LogLine
-from ros2fog_cli.api.table import cost, duration, shares, size, table
+from ros2fog_cli.api.table import cost, duration, NODES, nodes, shares, size, table
 
 #: Enter and leave the alternate screen; meanwhile the cursor is hidden and long lines are cut,
 #: as the number of characters is no limit (a character may be two columns wide).
@@ -51,7 +50,7 @@ def clean(text: str) -> str:
 
 
 def frame(
-    machine: dict[str, Any], lines: Sequence[LogLine], now: float, *, columns: int = 80,
+    machine: dict[str, Any], lines: Sequence[dict[str, Any]], now: float, *, columns: int = 80,
     rows: int = 24, paint: Paint = plain,
 ) -> list[str]:
     """
@@ -75,10 +74,7 @@ def frame(
             for step in machine['steps']], column=1)
     if machine['nodes']:
         parts.append(('', ''))
-        parts += _table(('NODE', 'STATE', 'PID', 'EXIT', 'RESTARTS'), [
-            (str(node['name']), str(node['state']), str(node['pid'] or '-'),
-             '-' if node['returncode'] is None else str(node['returncode']),
-             str(node['restarts'] or 0)) for node in machine['nodes']], column=1)
+        parts += _table(NODES, nodes(machine['nodes']), column=1)
     if machine['replicas']:
         parts.append(('', ''))
         parts += _table(replicas.HEADER, list(map(replicas.row, machine['replicas'])), column=1)
@@ -90,7 +86,7 @@ def frame(
     room = rows - len(parts) - 1
     if lines and room > 0:
         parts.append(('', ''))
-        parts += [(f'[{line.node}] {line.text}' if line.node else line.text, 'dim')
+        parts += [(f"[{line['node']}] {line['text']}" if line['node'] else line['text'], 'dim')
                   for line in lines[-room:]]
     # Clean and cut the text before it is painted: escape sequences take no columns.
     return [paint(clean(text)[:columns], style) for text, style in parts[:rows]]

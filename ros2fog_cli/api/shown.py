@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+import contextlib
 import dataclasses
 import json
-import os
 from pathlib import Path
 import time
-from typing import Any, Optional, TextIO
+from typing import Any, Optional
 
 from fogros2 import journal
 from fogros2.clock import ClockOffset
@@ -52,8 +52,7 @@ class ShownLaunch:
 
     pid: int = 0
     alive: bool = True
-    #: The open journal: the launch deletes its folder, and the last lines must still be readable.
-    file: Optional[TextIO] = None
+    #: Bytes of the journal that were read.
     size: int = 0
     steps: tuple[journal.Step, ...] = ()
     clocks: Mapping[str, ClockOffset] = dataclasses.field(default_factory=dict)
@@ -61,23 +60,13 @@ class ShownLaunch:
 
     def read(self, folder: Path) -> None:
         """Read the journal again if it has grown."""
-        try:
-            if self.file is None:
-                self.file = open(folder / journal.FILE, errors='replace')
-            size = os.fstat(self.file.fileno()).st_size
+        path = folder / journal.FILE
+        with contextlib.suppress(OSError):  # there is no journal yet, or no more
+            size = path.stat().st_size
             if size != self.size:
+                lines = path.read_text(errors='replace').splitlines()
                 self.size = size
-                self.file.seek(0)
-                lines = self.file.read().splitlines()
                 self.steps, self.clocks = tuple(journal.steps(lines)), journal.clocks(lines)
-        except OSError:
-            return  # there is no journal yet
-
-    def close(self) -> None:
-        """Close the journal."""
-        if self.file is not None:
-            self.file.close()
-            self.file = None
 
 
 def machine_json(key: str, shown: Shown) -> dict[str, Any]:
@@ -96,7 +85,7 @@ def machine_json(key: str, shown: Shown) -> dict[str, Any]:
         'launch_pid': record.pid if record is not None and record.launch_alive else 0,
         'launch_alive': record is not None and record.launch_alive and not shown.ended,
         'created': entry.created, 'expires': entry.expires, 'ended': shown.ended or None,
-        'address': entry.address, 'place': entry.region, 'kind': entry.kind,
+        'address': entry.address, 'place': entry.known.region, 'kind': entry.known.kind,
         'cost_per_hour': None if entry.cost is None else str(entry.cost),
         'on_exit': record.spec.on_exit if record is not None else '',
         'bridge': record.monitor if record is not None else 0,
@@ -105,8 +94,12 @@ def machine_json(key: str, shown: Shown) -> dict[str, Any]:
         'clock': None if follower is None or shown.clock is None
         else {**dataclasses.asdict(shown.clock), 'text': str(shown.clock)},
         'agent': None if agent is None else {
-            key: agent[key] for key in ('since', 'rss', 'heartbeat_age')},
-        'nodes': [] if agent is None else agent['nodes'],
+            'since': agent['since'], 'rss': 1000 * agent['rss_kb'],
+            'heartbeat_age': agent['heartbeat_age']},
+        'nodes': [] if agent is None else [{
+            'name': node['name'], 'state': node['state'], 'pid': node['pid'] or 0,
+            'returncode': node['returncode'], 'restarts': node['restarts'],
+            'error': node.get('error', '')} for node in agent['nodes']],
         'replicas': list(shown.replicas),
         'problems': [f'{part}: {text}' for part, text in sorted(follower.problems.items())]
         if follower is not None else [],

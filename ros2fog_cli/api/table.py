@@ -9,6 +9,8 @@ import shutil
 import sys
 from typing import Any, Optional
 
+#: Columns of :func:`nodes`.
+NODES = ('NODE', 'STATE', 'PID', 'EXIT', 'RESTARTS')
 #: Shown for a missing value.
 NONE = '-'
 
@@ -18,6 +20,13 @@ def shares(stream: Mapping[str, Any]) -> tuple[str, str]:
     share, latency = stream.get('share'), stream.get('latency')
     return ('-' if share is None else f'{share / 1e6:.1f} Mbit/s',
             '-' if latency is None else f'{1e3 * latency:.0f} ms')
+
+
+def nodes(found: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Return the rows of nodes in an agent's status, for the columns ``NODES``."""
+    return [(node['name'], node['state'], str(node['pid'] or NONE),
+             NONE if node['returncode'] is None else str(node['returncode']),
+             str(node['restarts'])) for node in found]
 
 
 def table(

@@ -125,7 +125,7 @@ def _screen(live: Live, name: str, interval: float) -> None:
             if machine is None:
                 shown = [f'{name}: {_WAITING}']
             else:
-                shown = screen.frame(machine, live.lines(machine['key'], 0), state['now'],
+                shown = screen.frame(machine, live.log(machine['key'], 0), state['now'],
                                      columns=columns, rows=rows - 1, paint=paint)
             foot = f'{time.strftime("%H:%M:%S")}, each {interval:g} s; Ctrl-C leaves'
             draw([*shown, *[''] * (rows - 1 - len(shown)), paint(foot[:columns], 'dim')])

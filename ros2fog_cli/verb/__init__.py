@@ -91,6 +91,14 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON, for programs')
 
 
+def add_page(parser: argparse.ArgumentParser) -> None:
+    """Add the options of verbs that serve a page."""
+    parser.add_argument('--port', type=int, default=0,
+                        help='port of this computer (default: any free port)')
+    parser.add_argument('--no-browser', action='store_true',
+                        help='print the address, but start no browser')
+
+
 def warn(text: str) -> None:
     """Print a line to standard error."""
     print(text, file=sys.stderr)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from ros2fog_cli.verb import add_region, VerbExtension
+from ros2fog_cli.verb import add_page, add_region, VerbExtension
 
 
 class DashboardVerb(VerbExtension):
@@ -14,10 +14,7 @@ class DashboardVerb(VerbExtension):
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
         add_region(parser)
-        parser.add_argument('--port', type=int, default=0,
-                            help='port of this computer (default: any free port)')
-        parser.add_argument('--no-browser', action='store_true',
-                            help='print the address, but start no browser')
+        add_page(parser)
         parser.add_argument('--no-topics', action='store_true',
                             help='join no launch: measure no rates, take no pictures')
 

@@ -32,7 +32,8 @@ class ListVerb(VerbExtension):
         print(table.table(
             ('NAME', 'PROVIDER', 'PLACE', 'KIND', 'STATE', 'AGE', 'ADDRESS', 'TIME LEFT',
              'COST/H', 'COST'),
-            [(entry.name, entry.provider, entry.region or '-', entry.kind or '-', entry.state,
+            [(entry.name, entry.provider, entry.known.region or '-', entry.known.kind or '-',
+              entry.state,
               table.duration(None if entry.created is None else max(0.0, now - entry.created)),
               entry.address or '-',
               table.duration(None if entry.expires is None else entry.expires - now),

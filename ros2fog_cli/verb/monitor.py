@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from ros2fog_cli.verb import add_name, add_region, VerbExtension, warn
+from ros2fog_cli.verb import add_name, add_page, add_region, VerbExtension, warn
 
 if TYPE_CHECKING:
     from ros2fog_cli.api.machines import Entry
@@ -22,10 +22,7 @@ class MonitorVerb(VerbExtension):
         """Add the verb's arguments."""
         add_name(parser)
         add_region(parser)
-        parser.add_argument('--port', type=int, default=0,
-                            help='port of this computer (default: any free port)')
-        parser.add_argument('--no-browser', action='store_true',
-                            help='print the address, but start no browser')
+        add_page(parser)
         parser.add_argument('--share', action='store_true',
                             help='print the address, with its token, for the networks in '
                                  'monitor_allow=, and exit')

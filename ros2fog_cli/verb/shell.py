@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import NoReturn
 
 from ros2fog_cli.verb import add_name, VerbExtension
 
@@ -17,8 +18,8 @@ class ShellVerb(VerbExtension):
         parser.add_argument('command', nargs=argparse.REMAINDER,
                             help='-- and a command to run instead of a shell')
 
-    def main(self, *, args: argparse.Namespace) -> int:
-        """Run the shell, and return its exit status."""
+    def main(self, *, args: argparse.Namespace) -> NoReturn:
+        """Replace this process by the shell."""
         from ros2fog_cli.api import joining
         words = args.command[1:] if args.command[:1] == ['--'] else args.command
-        return joining.run(args.name, words)
+        joining.run(args.name, words)

@@ -108,7 +108,7 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
 
     from fogros2.clock import ClockOffset
     from ros2fog_cli.api import replicas
-    from ros2fog_cli.api.table import cost, duration, shares, size, table
+    from ros2fog_cli.api.table import cost, duration, NODES, nodes, shares, size, table
     now = time.time()
     lines = [
         ('machine', f"{status['name']} ({status['provider']} {status['id'] or '-'})"),
@@ -137,23 +137,18 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
     if status['clock'] is not None:
         lines.append(('clock', str(ClockOffset(**status['clock']))))
     if agent is not None:
-        heartbeat = agent.get('heartbeat_age')
+        heartbeat = agent['heartbeat_age']
         lines += [
-            ('agent', f"since {duration(max(0.0, now - float(agent.get('since') or now)))}, "
-                      f"{size(1000 * float(agent.get('rss_kb') or 0))}"),
+            ('agent', f"since {duration(max(0.0, now - agent['since']))}, "
+                      f"{size(1000 * agent['rss_kb'])}"),
             ('heartbeat', '-' if heartbeat is None else f'{duration(heartbeat)} ago'),
         ]
     width = max(len(name) for name, _ in lines)
     for name, value in lines:
         print(f'{name.ljust(width)}  {value}')
-    nodes = (agent or {}).get('nodes') or []
-    if nodes:
+    if agent is not None and agent['nodes']:
         print()
-        print(table(('NODE', 'STATE', 'PID', 'EXIT', 'RESTARTS'), [
-            (str(node.get('name', '')), str(node.get('state', '')),
-             str(node['pid']) if node.get('pid') else '-',
-             '-' if node.get('returncode') is None else str(node['returncode']),
-             str(node.get('restarts', 0))) for node in nodes]))
+        print(table(NODES, nodes(agent['nodes'])))
     if status['replicas']:
         print()
         print(table(replicas.HEADER, list(map(replicas.row, status['replicas']))))

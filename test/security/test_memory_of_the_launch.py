@@ -70,9 +70,11 @@ class Endless:
         part = next(self.data) if self.left > 0 else b'1]}}\\n'
         self.left -= len(part)
         return part
+    def recv_stderr_ready(self):
+        return False
     def close(self):
         pass
-stream = LineStream(Endless(), 'planner', bytes)
+stream = LineStream(Endless(), 'planner')
 # attack
 message = connection._parsed(stream.readline())
 print(message and len(message))

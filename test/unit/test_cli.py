@@ -7,11 +7,10 @@ import argparse
 from collections.abc import Iterable, Mapping
 import dataclasses
 from decimal import Decimal
-import functools
+import importlib.util
 import json
 import os
 from pathlib import Path
-import signal
 import subprocess
 import sys
 import time
@@ -500,7 +499,8 @@ def test_env_lets_a_terminal_join(capsys: pytest.CaptureFixture[str],
     assert run('env', 'a', '--json') == 0
     assert json.loads(capsys.readouterr().out)['RMW_IMPLEMENTATION'] == 'rmw_cyclonedds_cpp'
     # ROS 2's own ros2 has a daemon, which gets a port of this launch
-    monkeypatch.setattr(joining, 'has_daemon', lambda: True)
+    found = importlib.util.find_spec('os')
+    monkeypatch.setattr(joining.importlib.util, 'find_spec', lambda name: found)
     assert run('env', 'a') == 0
     shown = subprocess.run(['sh', '-c', f'{capsys.readouterr().out}\ncommand -v ros2'],
                            capture_output=True, text=True, check=True).stdout.strip()
@@ -511,74 +511,61 @@ def test_env_lets_a_terminal_join(capsys: pytest.CaptureFixture[str],
     assert 'no launch is running' in str(run('env', 'a'))
 
 
-@pytest.mark.parametrize('daemon', [False, True])
-def test_shell_runs_a_command_in_the_launch(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, daemon: bool,
-) -> None:
+@pytest.fixture
+def joined(monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder of a launch that runs with the machine 'a'."""
     monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
-    monkeypatch.setattr(joining, 'has_daemon', lambda: daemon)
+    machine('a')
+    record('a', **alive())
+    folder = Store().launch('abc123')
+    for name, text in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '42'), ('dds.xml', '<x/>')):
+        (folder / name).write_text(text)
+    return folder
+
+
+def become(*words: str, stdin: Path = Path(os.devnull)) -> int:
+    """Run the verb 'shell' in another process, and return the status of what it becomes."""
+    child = os.fork()
+    if child == 0:
+        os.dup2(os.open(stdin, os.O_RDONLY), 0)
+        run('shell', 'a', *words)
+        os._exit(99)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+@pytest.mark.parametrize('daemon', [False, True])
+def test_shell_becomes_a_command_in_the_launch(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, joined: Path, daemon: bool,
+) -> None:
+    found = importlib.util.find_spec('os' if daemon else 'no_such_module')
+    monkeypatch.setattr(joining.importlib.util, 'find_spec', lambda name: found)
+    script = 'echo "$ROS_DOMAIN_ID $RMW_IMPLEMENTATION"; command -v ros2; exit 5'
+    assert become('--', 'sh', '-c', script) == 5
+    first, where = capfd.readouterr().out.splitlines()
+    assert first == '42 rmw_cyclonedds_cpp'
+    # that of all terminals of the launch
+    assert (where == str(joined / 'bin' / 'ros2')) is daemon
+    assert "'no-such-program' can not be run" in str(run('shell', 'a', '--', 'no-such-program'))
+    assert become('--', 'sh', '-c', 'kill -KILL $$') == -9
+    # a program ends by a pipe without a reader, as it does without us
+    assert become('--', 'sh', '-c', 'kill -PIPE $$') == -13
+
+
+def test_shell_takes_a_launch_that_runs() -> None:
     machine('a')
     record('a', **alive())
     assert 'no launch is running' in str(run('shell', 'a', '--', 'true'))
-    for name, text in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '42'), ('dds.xml', '<x/>')):
-        (Store().launch('abc123') / name).write_text(text)
-    script = 'echo "$ROS_DOMAIN_ID $RMW_IMPLEMENTATION"; command -v ros2; exit 5'
-    assert run('shell', 'a', '--', 'sh', '-c', script) == 5
-    first, where = capfd.readouterr().out.splitlines()
-    assert first == '42 rmw_cyclonedds_cpp'
-    # that of a shell is gone with it
-    assert ('fogros2-shell-' in where) is daemon and Path(where).exists() is not daemon
-    assert "'no-such-program' can not be run" in str(run('shell', 'a', '--', 'no-such-program'))
-    assert run('shell', 'a', '--', 'sh', '-c', 'kill -KILL $$') == 128 + 9
 
 
-def test_shell_that_is_terminated_leaves_nothing(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+def test_shell_becomes_the_users_shell(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, joined: Path,
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
-    monkeypatch.setattr(joining, 'has_daemon', lambda: True)
-    machine('a')
-    record('a', **alive())
-    for name, text in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '42'), ('dds.xml', '<x/>')):
-        (Store().launch('abc123') / name).write_text(text)
-    handler = signal.getsignal(signal.SIGTERM)
-    script = f'echo $$ $(command -v ros2) >{tmp_path}/said; kill -TERM $PPID; exec sleep 60'
-    with pytest.raises(SystemExit, match='143'):
-        joining.run('a', ['sh', '-c', script])
-    pid, program = (tmp_path / 'said').read_text().split()
-    assert not Path('/proc', pid).exists() and not Path(program).exists()
-    assert signal.getsignal(signal.SIGTERM) is handler
-
-
-@pytest.mark.parametrize('ignored', ['TERM', 'TERM HUP'])
-def test_shell_ends_a_command_that_ignores_signals(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ignored: str,
-) -> None:
-    monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
-    monkeypatch.setattr(joining, 'TIMEOUT', 0.5)
-    machine('a')
-    record('a', **alive())
-    for name, text in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '42'), ('dds.xml', '<x/>')):
-        (Store().launch('abc123') / name).write_text(text)
-    script = f"trap '' {ignored}; echo $$ >{tmp_path}/said; kill -TERM $PPID; exec sleep 60"
-    with pytest.raises(SystemExit, match='143'):
-        joining.run('a', ['sh', '-c', script])
-    assert not Path('/proc', (tmp_path / 'said').read_text().strip()).exists()
-
-
-def test_shell_starts_the_users_shell(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
-) -> None:
-    monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
-    machine('a')
-    record('a', **alive())
-    for name, text in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '42'), ('dds.xml', '<x/>')):
-        (Store().launch('abc123') / name).write_text(text)
     shell = tmp_path / 'fish'
     shell.write_text('#!/bin/sh\necho "$0 $# $ROS_DOMAIN_ID"\n')
     shell.chmod(0o755)
     monkeypatch.setenv('SHELL', str(shell))
-    assert run('shell', 'a') == 0
+    assert become() == 0
     assert capfd.readouterr().out == f'{shell} 0 42\n'
     # bash reads .bashrc, and what that sets of ours comes before
     home = tmp_path / 'home'
@@ -588,10 +575,7 @@ def test_shell_starts_the_users_shell(
     monkeypatch.setenv('SHELL', '/bin/bash')
     typed = tmp_path / 'typed'
     typed.write_text('echo "$MINE $ROS_DOMAIN_ID $PS1"; exit 4\n')
-    with typed.open() as keyboard:
-        monkeypatch.setattr(joining.subprocess, 'Popen', functools.partial(
-            subprocess.Popen, stdin=keyboard))
-        assert run('shell', 'a') == 4
+    assert become(stdin=typed) == 4
     assert capfd.readouterr().out.startswith('yes 42 (a) ')
 
 

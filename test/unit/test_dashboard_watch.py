@@ -10,13 +10,13 @@ import re
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 from ros2cli.cli import main
 
 from fogros2 import events, journal
-from fogros2.events import Status
 from fogros2.journal import Journal, Step
 from fogros2.report import (
     Event,
@@ -29,9 +29,10 @@ from fogros2.report import (
 )
 from rigs import recorded_agent
 from ros2fog_cli.api import screen
-from ros2fog_cli.api.follower import agent_state, LogLine, node_name, rates
+from ros2fog_cli.api.follower import node_name, rates
+from ros2fog_cli.api.machines import Entry
 from ros2fog_cli.api.reach import Link
-from ros2fog_cli.api.shown import as_json, phase
+from ros2fog_cli.api.shown import as_json, machine_json, phase, Shown
 
 
 def read(folder: Path) -> list[Step]:
@@ -133,12 +134,13 @@ def test_status_of_an_agent_is_shown() -> None:
     nodes = [{'id': 'a/b', 'name': 'b', 'state': 'exited', 'pid': None, 'returncode': -9,
               'restarts': 1}]
     answer = recorded_agent.answer('status', since=5.5, rss_kb=16, nodes=nodes)
-    state = agent_state(cast(Status, events.answer('status', answer)))
-    assert state == {
-        'since': 5.5, 'rss': 16000, 'heartbeat_age': None, 'nodes': [
-            {'name': 'b', 'state': 'exited', 'pid': 0, 'returncode': -9, 'restarts': 1,
-             'error': ''}]}
-    shown = screen.frame(machine(agent=state, nodes=state['nodes']), [], 1100.0)
+    follower = SimpleNamespace(
+        agent=events.answer('status', answer), vpn=None, problems={}, last=0)
+    state = machine_json('a', Shown(Entry('a', 'memory'), cast(Any, follower)))
+    assert state['agent'] == {'since': 5.5, 'rss': 16000, 'heartbeat_age': None}
+    assert state['nodes'] == [{'name': 'b', 'state': 'exited', 'pid': 0, 'returncode': -9,
+                               'restarts': 1, 'error': ''}]
+    shown = screen.frame(machine(agent=state['agent'], nodes=state['nodes']), [], 1100.0)
     assert any('heartbeat -' in line for line in shown)
 
 
@@ -172,7 +174,7 @@ def machine(**changes: Any) -> dict[str, Any]:
 
 
 def test_machine_is_drawn_on_a_screen() -> None:
-    lines = [LogLine(n, 1.0, 'slam-1', False, f'line {n}') for n in range(1, 100)]
+    lines = [{'node': 'slam-1', 'text': f'line {n}'} for n in range(1, 100)]
     shown = screen.frame(machine(), lines, 1100.0, columns=90, rows=20)
     text = '\n'.join(shown)
     assert len(shown) == 20
@@ -209,7 +211,7 @@ def test_topics_option_needs_watch() -> None:
 
 def test_output_of_a_node_has_no_escape_sequences() -> None:
     bad = '\x1b]0;owned\x07\x1b[2J\x9b31mred\r\n'
-    lines = [LogLine(1, 1.0, f'n{bad}', True, f'before {bad}after')]
+    lines = [{'node': f'n{bad}', 'text': f'before {bad}after'}]
     shown = screen.frame(machine(problems=[bad], nodes=[
         {**machine()['nodes'][0], 'name': bad}]), lines, 1100.0, rows=40)
     assert 'owned' in '\n'.join(shown)

@@ -130,7 +130,7 @@ def test_depth_never_loses_a_bit(encoding: str) -> None:
     packet = encoder.encode(sent)
     got = shown(decoder, packet.data)
     assert packet.format == 'ffv1'
-    assert packet.key
+    assert packet.tag.key
     assert fields(got) == fields(sent)
     assert bytes(got.data) == sent.data
 
@@ -152,7 +152,7 @@ def test_size_and_encoding_change_midway() -> None:
             ('rgb8', 33, 77), ('bgr8', 64, 48)]
     for number, what in enumerate(plan):
         packet = encoder.encode(picture(*what, number))
-        assert packet.key == (what != last)
+        assert packet.tag.key == (what != last)
         assert packet.tag.sequence == number
         assert fields(shown(decoder, packet.data))[:3] == (what[1], what[2], what[0])
         last = what
@@ -175,7 +175,7 @@ def test_settings_change_midway() -> None:
 
 def test_key_on_demand_and_by_gop() -> None:
     encoder = Encoder(Settings(gop=5))
-    keys = [encoder.encode(picture('bgr8', 32, 32, n), key=n == 7, seconds=n / 30).key
+    keys = [encoder.encode(picture('bgr8', 32, 32, n), key=n == 7, seconds=n / 30).tag.key
             for n in range(14)]
     assert [n for n, key in enumerate(keys) if key] == [0, 5, 7, 12]
 
@@ -264,7 +264,7 @@ def test_bad_pictures_are_refused(change: dict[str, object], cause: str) -> None
     with pytest.raises(BadPicture) as caught:
         encoder.encode(Picture(**{**good, **change}))  # type: ignore[arg-type]
     assert caught.value.cause.startswith(cause)
-    assert encoder.encode(Picture(**good)).key  # type: ignore[arg-type]
+    assert encoder.encode(Picture(**good)).tag.key  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize('bad', [
@@ -309,7 +309,7 @@ def test_annex_b_as_foxglove_wants_it(size: tuple[int, int]) -> None:
         packet = encoder.encode(picture('bgr8', *size, number), key=number == 6)
         kinds = annexb.kinds(packet.data)
         assert packet.data.startswith((b'\0\0\0\1', b'\0\0\1'))
-        if packet.key:
+        if packet.tag.key:
             assert {annexb.SPS, annexb.PPS, annexb.IDR} <= set(kinds)
             assert kinds.index(annexb.SPS) < kinds.index(annexb.PPS) < kinds.index(annexb.IDR)
             assert annexb.SLICE not in kinds

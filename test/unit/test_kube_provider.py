@@ -278,7 +278,7 @@ def test_pods_that_differ_by_name_alone_are_tried_once(monkeypatch):
                 raise ApiError('no such Job', status=404)
             if asked == ['pods All']:
                 raise ApiError('exceeded quota', status=403)
-            return {'metadata': {'name': 'it', 'uid': 'its-uid'}}
+            return {'metadata': {'name': 'it', 'uid': 'its-uid', 'namespace': 'robots'}}
 
     cluster = Cluster()
     monkeypatch.setattr(kubernetes_client, 'connect', lambda context='': cluster)

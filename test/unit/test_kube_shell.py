@@ -295,7 +295,7 @@ def test_unread_output_stops_only_its_program(api, shell):
 
 def test_terminal_follows_the_users_size(api, shell):
     link = shell._connected(10.0)
-    channel = link.open(Command(('sh',)), terminal=(24, 80, 'xterm'))
+    channel = link.open(Command(('sh',)), (24, 80, 'xterm'))
 
     def answer(text: bytes, word: bytes) -> bytes:
         channel.sendall(text)

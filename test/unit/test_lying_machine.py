@@ -26,6 +26,9 @@ class Endless:
     def recv(self, size):
         return b'x' * size
 
+    def recv_stderr_ready(self):
+        return False
+
     def sendall(self, data):
         raise AssertionError(data)
 
@@ -36,7 +39,7 @@ class Endless:
 def test_a_line_without_an_end_fills_no_memory(monkeypatch):
     monkeypatch.setattr(lines, 'MAX_LINE', 1 << 20)
     channel = Endless()
-    assert lines.LineStream(channel, 'planner', bytes).readline() == b''
+    assert lines.LineStream(channel, 'planner').readline() == b''
     assert channel.closed
 
 
@@ -55,7 +58,7 @@ def test_a_connection_that_ends_while_a_line_is_written_is_gone(error, why):
     def sendall(data):
         raise error
 
-    stream = lines.LineStream(SimpleNamespace(sendall=sendall), 'planner', bytes)
+    stream = lines.LineStream(SimpleNamespace(sendall=sendall), 'planner')
     with pytest.raises(ConnectError, match=f"the connection to 'planner' is gone: {why}"):
         stream.write(b'line')
 

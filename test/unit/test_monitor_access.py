@@ -26,7 +26,7 @@ from fogros2.deploy.steps.creating import Creation
 from fogros2.describe import networks
 from fogros2.errors import AgentError, ConfigurationError, ProviderError
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState, Result, VpnInterface
-from fogros2.provider.kubernetes import publishing
+from fogros2.provider.kubernetes import manifests, ways
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.runtime import foxglove as runtime_foxglove
 from fogros2.runtime import republishers, streaming
@@ -205,12 +205,12 @@ def test_silent_connection_does_not_hold_up_the_browser():
 
 def test_service_of_a_pod_keeps_the_callers_addresses():
     where = MachineId('robots', 'fogros2-planner', 'u-1', '')
-    made = publishing.service('LoadBalancer', where, 8766, SOURCES)
+    made = manifests.port_service('LoadBalancer', where, 8766, SOURCES)
     assert made['metadata']['name'] == 'fogros2-planner-8766'
     assert made['metadata']['ownerReferences'][0]['uid'] == 'u-1'
     assert made['spec']['loadBalancerSourceRanges'] == list(SOURCES)
     assert made['spec']['externalTrafficPolicy'] == 'Local'
-    assert 'loadBalancerSourceRanges' not in publishing.service(
+    assert 'loadBalancerSourceRanges' not in manifests.port_service(
         'NodePort', where, 8766, SOURCES)['spec']
 
 
@@ -222,7 +222,7 @@ def test_service_that_cannot_be_removed_has_a_hint():
             raise ApiError('may not', status=403, reason='Forbidden')
 
     with pytest.raises(ProviderError, match="port 8766 of 'fogros2-planner' can't be closed"):
-        publishing.close(Api(), MachineId('robots', 'fogros2-planner', 'u-1', ''), 8766)
+        ways.close_port(Api(), MachineId('robots', 'fogros2-planner', 'u-1', ''), 8766)
 
 
 @pytest.fixture

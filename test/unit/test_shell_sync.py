@@ -3,14 +3,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 from pathlib import Path
+import socket
+import subprocess
+import sys
 
 import paramiko
 import pytest
 
 from fogros2.errors import CommandError, ConnectError, ShellError
 from fogros2.model import Endpoint, Result
-from fogros2.shell import sync
+from fogros2.shell import multiplexed, multiplexer, sync
 
 PINNED = Endpoint('ssh', '198.51.100.7', 2222, 'fog', 'ssh-ed25519 AAAA', '/keys/my key')
 
@@ -25,7 +30,7 @@ def test_includes_come_before_excludes():
 
 
 def test_openssh_is_pinned_as_we_are():
-    with sync.open_ssh(PINNED) as rsh:
+    with sync.open_ssh(PINNED) as (rsh, _, _):
         words = rsh.split()
         for option in ('StrictHostKeyChecking=yes', 'BatchMode=yes', 'IdentitiesOnly=yes',
                        'GlobalKnownHostsFile=/dev/null', 'HostKeyAlias=machine',
@@ -44,7 +49,7 @@ def test_openssh_accepts_the_known_hosts_of_home(tmp_path, monkeypatch):
     (tmp_path / '.ssh').mkdir()
     key = f'ecdsa-sha2-nistp256 {paramiko.ECDSAKey.generate().get_base64()}'
     (tmp_path / '.ssh/known_hosts').write_text(f'[host.example]:2222 {key}\n')
-    with sync.open_ssh(Endpoint('ssh', 'host.example', 2222, 'fog')) as rsh:
+    with sync.open_ssh(Endpoint('ssh', 'host.example', 2222, 'fog')) as (rsh, _, _):
         assert 'HostKeyAlias=machine' in rsh and 'StrictHostKeyChecking=yes' in rsh
         known, = (Path(w.partition('=')[2]) for w in rsh.split()
                   if w.startswith('UserKnownHostsFile='))
@@ -99,8 +104,49 @@ def test_large_folders_are_told_from_small_ones(tmp_path):
     assert not sync.is_large(tmp_path, 1000)
 
 
-@pytest.mark.parametrize('target, folder', [
+class Here(multiplexed.MultiplexedShell):
+    """A shell by a multiplexer on this computer."""
+
+    def __init__(self) -> None:
+        super().__init__(Endpoint('guest'), name='here', timeout=10.0)
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self.child = subprocess.Popen([sys.executable, multiplexer.__file__],
+                                          stdin=theirs, stdout=theirs)
+        self.link = multiplexed.Link(ours, self.name, self.user)
+
+    def _connect(self, timeout: float) -> multiplexed.Link:
+        return self.link
+
+
+@pytest.fixture
+def shell():
+    found = Here()
+    with contextlib.closing(found), found.child:
+        yield found
+        found.close()
+
+
+def test_large_folders_go_both_ways(shell, tmp_path):
+    """More than any buffer between: each end of rsync waits for the other."""
+    for name in ('source', 'back'):
+        (tmp_path / name).mkdir()
+    for number in range(20):
+        (tmp_path / f'source/{number}').write_bytes(os.urandom(300_000))
+    there = str(tmp_path / 'there')
+    assert shell.sync(tmp_path / 'source', there, excludes=[], timeout=60.0).files == 20
+    shell.fetch(there, tmp_path / 'back', known=None, timeout=60.0)
+    assert (tmp_path / 'back/19').read_bytes() == (tmp_path / 'source/19').read_bytes()
+    before = set(os.listdir('/proc/self/fd'))
+    with pytest.raises(CommandError, match='No such file'):
+        shell.fetch(f'{there}/nowhere', tmp_path / 'back', known=None, timeout=60.0)
+    assert set(os.listdir('/proc/self/fd')) == before
+
+
+@pytest.mark.parametrize('folder, there', [
     ('/ws', '/ws/'), ('~/ws/src', 'ws/src/'), ('~/', './'),
 ])
-def test_folders_begin_in_the_home(target, folder):
-    assert sync.remote_folder(target) == folder
+def test_folders_begin_in_the_home(folder, there, monkeypatch):
+    monkeypatch.setenv('HOME', '/home/robot')
+    assert sync.place(folder, 'ssh') == f'machine:{there}'
+    assert sync.place(folder, '').rstrip('/') == folder.replace('~', '/home/robot').rstrip('/')

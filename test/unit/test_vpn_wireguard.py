@@ -139,11 +139,6 @@ def test_the_filter_lets_in_the_ports_of_the_ros_domain(domain: int, ports: str)
     assert '-'.join(map(str, dds_ports(domain))) == ports
 
 
-def test_a_domain_without_ports_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match='ROS_DOMAIN_ID 233'):
-        WireGuard(233)
-
-
 def test_peers_get_their_own_address_and_one_the_announcements() -> None:
     other = Peer('tracker', OTHER, '198.18.7.3')
     text = script(*WireGuard().peers(ROBOT, [TO_MACHINE, other]))

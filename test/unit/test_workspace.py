@@ -14,8 +14,8 @@ import pytest
 from fogros2.errors import WorkspaceError
 from fogros2.host import workspace
 from fogros2.host.inspection import HostFacts, Python
-from fogros2.model import Command, Result, SyncReport
-from fogros2.shell import sync
+from fogros2.model import Command, Endpoint, Result, SyncReport
+from fogros2.shell.local import LocalShell
 from fogros2.testing.fakes import FakeShell
 from fogros2.waiting import Timeouts
 
@@ -266,8 +266,8 @@ class Elsewhere(FakeShell):
 
     def sync(self, source: Path, target: str, **arguments: object) -> SyncReport:
         """Send it by rsync."""
-        return sync.to_folder(source, f'{self.folder}{target}', **{  # type: ignore
-            'includes': (), 'on_progress': None, **arguments})
+        return LocalShell(Endpoint('local'), name='here').sync(
+            source, f'{self.folder}{target}', **arguments)  # type: ignore
 
 
 @pytest.fixture

@@ -5,13 +5,13 @@ Run machines as pods: a Job for each, which owns the pod and its Service, and en
 ``options`` parses what a launch file asks for, ``names`` has names, ids and tags. ``boot`` is the
 first process of a pod, ``manifests`` describes Job, pod and Service. ``hints`` explains refusals,
 ``pods`` reads the state of Jobs and pods, ``start`` waits for a pod. ``exposure`` and ``ways``
-find how UDP reaches the pod, ``publishing`` opens TCP ports, ``ending`` deletes everything.
-``image`` builds images.
+find how UDP reaches the pod, and open TCP ports, ``ending`` deletes everything. ``image`` builds
+images.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import threading
 import time
@@ -24,11 +24,12 @@ from fogros2.errors import (
     NameTaken,
     PrerequisiteError,
 )
-from fogros2.kubernetes_client import Api, ApiError, items, path, selector
+from fogros2.kubernetes_client import Api, ApiError, existing, items, path, selector
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider, TAG_ON_EXIT
 from fogros2.provider.kubernetes import boot, ending, hints, manifests, names, pods, ways
-from fogros2.provider.kubernetes.hints import refused
+from fogros2.provider.kubernetes.exposure import Exposure
+from fogros2.provider.kubernetes.hints import explained, refused
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.provider.kubernetes.options import Options
 from fogros2.provider.kubernetes.start import Start
@@ -54,12 +55,9 @@ class KubernetesProvider(Provider):
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._reviewing = threading.Lock()
-        self._trying = threading.Lock()
-        #: When the cluster last admitted a pod, by its namespace and what it asks for.
-        self._admitted: dict[str, float] = {}
-        #: When this user last had all rights, by context and namespace.
-        self._reviewed: dict[tuple[str, str], float] = {}
+        self._asking = threading.Lock()
+        #: When the cluster last agreed: that this user has all rights, or to a pod.
+        self._agreed: dict[object, float] = {}
         #: Contexts and namespaces in launch files.
         self._places: set[tuple[str, str]] = set()
         self._lifetimes: dict[str, float] = {}
@@ -89,24 +87,24 @@ class KubernetesProvider(Provider):
                 "use on_exit='keep' or 'delete'")
         api, namespace = self._place(options)
         self._lifetimes[names.job_name(spec.name)] = spec.lifetime
-        self._check_rights(api, namespace)
+        self._once((api.context, namespace), lambda: self._check_rights(api, namespace))
+
+    def _once(self, what: object, ask: Callable[[], object]) -> None:
+        """Ask the cluster, once for all machines of a launch; ``ask`` raises if it refuses."""
+        with self._asking:
+            if time.monotonic() - self._agreed.get(what, -_SURE) >= _SURE:
+                ask()
+                self._agreed[what] = time.monotonic()
 
     def _check_rights(self, api: Api, namespace: str) -> None:
-        """Check this user's rights, once for all machines of a launch."""
-        with self._reviewing:
-            when = self._reviewed.get((api.context, namespace))
-            if when is not None and time.monotonic() - when < _SURE:
-                return
-            review = api.request(
-                'POST', _REVIEW, {'spec': {'namespace': namespace}}, timeout=_FIRST)
-            status = review.get('status') or {}
-            lacking = hints.missing_rights(status.get('resourceRules') or ())
-            # If the authorizer cannot list all rules, the requests themselves show what lacks.
-            if lacking and not status.get('incomplete'):
-                raise PrerequisiteError(
-                    f"this user may not {', '.join(lacking)} in namespace '{namespace}' of "
-                    f'{api.server}', 'deploy/kubernetes/role.yaml has all that a robot needs')
-            self._reviewed[api.context, namespace] = time.monotonic()
+        review = api.request('POST', _REVIEW, {'spec': {'namespace': namespace}}, timeout=_FIRST)
+        status = review.get('status') or {}
+        lacking = hints.missing_rights(status.get('resourceRules') or ())
+        # If the authorizer cannot list all rules, the requests themselves show what lacks.
+        if lacking and not status.get('incomplete'):
+            raise PrerequisiteError(
+                f"this user may not {', '.join(lacking)} in namespace '{namespace}' of "
+                f'{api.server}', 'deploy/kubernetes/role.yaml has all that a robot needs')
 
     def architecture(self, spec: MachineSpec) -> str:
         """Return the architecture in ``node_selector``, or of all nodes with its labels."""
@@ -131,15 +129,19 @@ class KubernetesProvider(Provider):
         self._lifetimes[names.job_name(spec.name)] = spec.lifetime
         existing = None
         try:
-            self._try_admission(api, namespace, spec, request, options)
+            # Pods of one kind differ only by their names.
+            self._once(
+                f'{api.context} {namespace} {request.dependencies} {options}',
+                lambda: api.request(
+                    'POST', path('pods', namespace), manifests.pod(spec, request, options),
+                    dryRun='All', cancel=self.cancel))
         except ApiError as error:
             # The first attempt with this token may have used the quota.
             existing = self._existing(api, namespace, spec, request)
             if existing is None:
                 raise refused(error, f"the pod of '{spec.name}'", namespace) from error
         job = existing or self._make_job(api, namespace, spec, request, options)
-        machine_id = str(MachineId(namespace, str(job['metadata']['name']),
-                                   str(job['metadata']['uid']), api.context))
+        machine_id = str(MachineId.of(job, api.context))
         try:
             service = ways.make(api, namespace, spec, request, options, job, self.cancel)
         except BaseException:
@@ -148,19 +150,6 @@ class KubernetesProvider(Provider):
         self._made[machine_id] = job
         self._services[machine_id] = service
         return machine_id
-
-    def _try_admission(
-        self, api: Api, namespace: str, spec: MachineSpec, request: CreateRequest,
-        options: Options,
-    ) -> None:
-        """Check the pod's admission, once for all pods that differ only by their names."""
-        kind = f'{api.context} {namespace} {request.dependencies} {options}'
-        with self._trying:
-            if time.monotonic() - self._admitted.get(kind, -_SURE) < _SURE:
-                return
-            api.request('POST', path('pods', namespace), manifests.pod(spec, request, options),
-                        dryRun='All', cancel=self.cancel)
-            self._admitted[kind] = time.monotonic()
 
     def _make_job(
         self, api: Api, namespace: str, spec: MachineSpec, request: CreateRequest,
@@ -197,7 +186,7 @@ class KubernetesProvider(Provider):
         cancel = self.cancel or threading.Event()
         begin = time.monotonic()
         job = self._made.get(machine_id) or self._job(api, where)
-        pod = Start(api, where, job, name=name).wait(timeout=timeout, cancel=cancel)
+        pod = Start(api, where, job, name=name, cancel=cancel).wait(timeout)
         self._pods[machine_id] = str(pod['metadata']['uid'])
         change = self._again(machine_id, job)
         exposure = ways.known(job)
@@ -206,13 +195,12 @@ class KubernetesProvider(Provider):
                 api, where, job, pod, service=self._services.get(machine_id), cancel=cancel,
                 timeout=max(1.0, timeout - (time.monotonic() - begin)))
             change['metadata'] = {'annotations': {names.EXPOSURE: str(exposure)}}
-            job = merged(job, change)
         if change and names.tags_of(job).get(TAG_ON_EXIT) == 'keep':
             # Later launches read it.
-            with _translated(f"the Job of '{name}'", where.namespace):
-                job = api.request(
+            with explained(f"the Job of '{name}'", where.namespace):
+                api.request(
                     'PATCH', path('jobs', where.namespace, where.job), change, cancel=cancel)
-        return self._machine(api, where, job, pod)
+        return self._machine(api, where, job, pod, exposure)
 
     def _again(self, machine_id: str, job: Mapping[str, Any]) -> dict[str, Any]:
         """Return the change that gives a kept machine another lifetime."""
@@ -247,11 +235,9 @@ class KubernetesProvider(Provider):
                 wanted = [job for job in jobs if tags.items() <= names.tags_of(job).items()]
                 found = items(self._ask(api, 'pods', namespace, labels)) if wanted else ()
                 for job in wanted:
-                    meta = job['metadata']
-                    if meta['uid'] not in seen:
-                        seen.add(str(meta['uid']))
-                        where = MachineId(str(meta['namespace']), str(meta['name']),
-                                          str(meta['uid']), api.context)
+                    where = MachineId.of(job, api.context)
+                    if where.uid not in seen:
+                        seen.add(where.uid)
                         yield self._machine(api, where, job, pods.pod_of(job, found))
 
     def _jobs(self, api: Api, labels: str) -> Iterator[tuple[str, list[dict[str, Any]]]]:
@@ -264,7 +250,7 @@ class KubernetesProvider(Provider):
         namespaces = {api.namespace, *(
             space for context, space in self._places if context in ('', api.context))}
         for namespace in sorted(namespaces):
-            with _translated('listing the machines', namespace):
+            with explained('listing the machines', namespace):
                 yield namespace, list(items(self._ask(api, 'jobs', namespace, labels)))
 
     def _ask(self, api: Api, kind: str, namespace: str, labels: str) -> dict[str, Any]:
@@ -276,23 +262,22 @@ class KubernetesProvider(Provider):
         api = kubernetes_client.connect(where.context)
         for known in (self._made, self._services, self._pods):
             known.pop(machine_id, None)
-        with _translated(f"deleting '{where.job}'", where.namespace):
+        with explained(f"deleting '{where.job}'", where.namespace):
             ending.end(api, where)
 
     def open_port(
         self, machine: Machine, port: int, sources: Sequence[str],
     ) -> tuple[str, int]:
-        """Make a Service for a TCP port, or remove it; loads what it takes when asked alone."""
-        from fogros2.provider.kubernetes import publishing
+        """Make a Service for a TCP port, or remove it."""
         where = MachineId.parse(machine.id)
         api = kubernetes_client.connect(where.context)
         if not sources:
-            publishing.close(api, where, port)
+            ways.close_port(api, where, port)
             return machine.vpn_host, port
         pod = pods.pod_of(self._job(api, where), self._pods_of(api, where))
         if pod is None:
             raise MachineNotFound(f"the pod of '{where.job}' is gone")
-        return publishing.open_port(api, where, machine, pod, port, sources, self.cancel)
+        return ways.open_port(api, where, machine, pod, port, sources, self.cancel)
 
     # -- shared by the methods above ------------------------------------------------------------
 
@@ -304,25 +289,22 @@ class KubernetesProvider(Provider):
         return api, namespace
 
     def _job(self, api: Api, where: MachineId) -> dict[str, Any]:
-        try:
-            job = api.request('GET', path('jobs', where.namespace, where.job))
-        except ApiError as error:
-            if error.status == 404:
-                raise MachineNotFound(f"'{where.job}' does not exist any more") from error
-            raise refused(error, f"reading '{where.job}'", where.namespace) from error
-        if job['metadata']['uid'] != where.uid:
+        with explained(f"reading '{where.job}'", where.namespace):
+            job = existing(api, path('jobs', where.namespace, where.job))
+        if job is None or job['metadata']['uid'] != where.uid:
             raise MachineNotFound(f"'{where.job}' does not exist any more")
         return job
 
     def _pods_of(self, api: Api, where: MachineId) -> list[dict[str, Any]]:
-        with _translated('listing pods', where.namespace):
+        with explained('listing pods', where.namespace):
             return list(items(self._ask(
                 api, 'pods', where.namespace, selector({names.MACHINE: where.job}))))
 
     def _machine(
         self, api: Api, where: MachineId, job: Mapping[str, Any],
-        pod: Optional[Mapping[str, Any]],
+        pod: Optional[Mapping[str, Any]], exposure: Optional[Exposure] = None,
     ) -> Machine:
+        exposure = exposure or ways.known(job)
         state = pods.state_of(job, pod)
         tags = names.tags_of(job)
         status = (pod or {}).get('status') or {}
@@ -332,7 +314,6 @@ class KubernetesProvider(Provider):
                 'kubernetes', names.endpoint_host(
                     where.namespace, str(pod['metadata']['name']), where.context),
                 0, names.annotation(job, names.LOGIN))
-        exposure = ways.known(job)
         address = str(status.get('podIP') or '')
         return Machine(
             id=str(where), name=tags.get('fogros2-name', where.job), provider=self.name,
@@ -347,14 +328,6 @@ class KubernetesProvider(Provider):
             note='' if exposure is None else exposure.words())
 
 
-def merged(job: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a Job with changed annotations, as the cluster would return it."""
-    meta = job['metadata']
-    notes = {**(meta.get('annotations') or {}),
-             **((change.get('metadata') or {}).get('annotations') or {})}
-    return {**job, 'metadata': {**meta, 'annotations': notes}}
-
-
 def container_of(job: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the first container of a machine's pod, from its Job."""
     container: Mapping[str, Any] = job['spec']['template']['spec']['containers'][0]
@@ -367,11 +340,3 @@ def kind_of(job: Mapping[str, Any]) -> str:
     limits = (container.get('resources') or {}).get('limits') or {}
     words = [f'{value} {name}' for name, value in sorted(limits.items())]
     return ', '.join([*words, str(container['image']).rpartition('/')[2]])
-
-
-@contextlib.contextmanager
-def _translated(what: str, namespace: str) -> Iterator[None]:
-    try:
-        yield
-    except ApiError as error:
-        raise refused(error, what, namespace) from error

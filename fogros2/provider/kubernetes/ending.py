@@ -10,7 +10,7 @@ from typing import Any, Optional
 
 from fogros2 import kubernetes_client
 from fogros2.errors import ProviderError
-from fogros2.kubernetes_client import Api, ApiError, items, path, selector
+from fogros2.kubernetes_client import Api, ApiError, existing, items, path, selector
 from fogros2.provider.kubernetes import boot, names, pods
 from fogros2.provider.kubernetes.names import MachineId
 
@@ -43,13 +43,8 @@ def end(api: Api, where: MachineId) -> None:
     looked = time.monotonic()
 
     def gone() -> Optional[bool]:
-        try:
-            now = api.request('GET', target)
-        except ApiError as error:
-            if error.status == 404:
-                return True
-            raise
-        return True if now['metadata']['uid'] != where.uid else None
+        now = existing(api, target)
+        return True if now is None or now['metadata']['uid'] != where.uid else None
 
     def late() -> None:
         nonlocal looked

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+import contextlib
 import re
 from typing import Any
 
@@ -77,6 +78,15 @@ def refused(error: ApiError, what: str, namespace: str) -> ProviderError:
     message = str(error.args[0])
     return ProviderError(f'the cluster refused {what}: {message}',
                          error.hint or of_refusal(message, namespace))
+
+
+@contextlib.contextmanager
+def explained(what: str, namespace: str) -> Iterator[None]:
+    """Raise a refusal in the block as the error of :func:`refused`."""
+    try:
+        yield
+    except ApiError as error:
+        raise refused(error, what, namespace) from error
 
 
 def missing_rights(rules: Iterable[Mapping[str, Any]]) -> list[str]:

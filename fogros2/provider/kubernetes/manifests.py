@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import hashlib
 import json
 import math
@@ -163,6 +163,26 @@ def service(
     return owned_service(
         name, kind, name, uid, 'UDP', request.vpn_port,
         labels=names.labels(spec.name, request.tags), annotations=options.annotations)
+
+
+def port_service(
+    kind: str, where: names.MachineId, port: int, sources: Sequence[str],
+) -> dict[str, Any]:
+    """
+    Return the Service of a machine's TCP port, which the machine's Job owns.
+
+    It keeps the clients' addresses (``externalTrafficPolicy: Local``), because the server in the
+    pod checks them; a load balancer refuses other clients before.
+
+    :param kind: 'LoadBalancer' or 'NodePort'.
+    """
+    found = owned_service(
+        names.port_service(where, port), kind, where.job, where.uid, 'TCP', port,
+        labels={**names.MANAGED, names.MACHINE: where.job}, annotations={})
+    found['spec']['externalTrafficPolicy'] = 'Local'
+    if kind == 'LoadBalancer':
+        found['spec']['loadBalancerSourceRanges'] = list(sources)
+    return found
 
 
 def owned_service(

@@ -52,6 +52,12 @@ class MachineId:
         return f'{self.namespace}/{self.job}/{self.uid}@{self.context}'
 
     @classmethod
+    def of(cls, job: Mapping[str, Any], context: str) -> MachineId:
+        """Return the id of the machine of a Job."""
+        meta = job['metadata']
+        return cls(str(meta['namespace']), str(meta['name']), str(meta['uid']), context)
+
+    @classmethod
     def parse(cls, text: str) -> MachineId:
         """
         Parse an id.
@@ -68,6 +74,11 @@ def job_name(machine: str) -> str:
     """Return the name of a machine's Job; the API server refuses a second Job of that name."""
     # A label has up to 63 characters, and the name of the Job's pod has six more.
     return f'fogros2-{machine.lower()}'[:57].rstrip('-')
+
+
+def port_service(where: MachineId, port: int) -> str:
+    """Return the name of the Service of a machine's TCP port."""
+    return f'{where.job}-{port}'
 
 
 def labels(machine: str, tags: Mapping[str, str]) -> dict[str, str]:

@@ -9,7 +9,7 @@ import time
 from typing import Any, Optional
 
 from fogros2.errors import DeadlineExceeded, ProviderError
-from fogros2.kubernetes_client import Api, ApiError, items, path, selector
+from fogros2.kubernetes_client import Api, existing, items, path, selector
 from fogros2.model import MachineState
 from fogros2.provider.kubernetes import hints, names, pods
 from fogros2.provider.kubernetes.names import MachineId
@@ -31,6 +31,7 @@ class Start:
 
     def __init__(
         self, api: Api, where: MachineId, job: Mapping[str, Any], *, name: str,
+        cancel: threading.Event,
     ) -> None:
         self._api = api
         self._where = where
@@ -41,25 +42,22 @@ class Start:
         self._since = 0.0
         self._scales_up = False
         self._next_events = time.monotonic() + QUIET
-        self._cancel: Optional[threading.Event] = None
+        self._cancel = cancel
 
-    def wait(self, *, timeout: float, cancel: threading.Event) -> dict[str, Any]:
+    def wait(self, timeout: float) -> dict[str, Any]:
         """
         Return the pod as soon as its container runs.
 
         :raises ProviderError: the pod cannot run; with the event's text.
         :raises DeadlineExceeded: the pod did not run in time.
         """
-        self._cancel = cancel
         try:
-            return self._api.follow(
-                path('pods', self._where.namespace), self._look, tick=self._tick,
-                again=self._again, timeout=timeout, cancel=cancel,
-                what=f"the pod of '{self._name}' to run",
-                labelSelector=selector({names.MACHINE: self._where.job}))
-        except ApiError as error:
-            raise hints.refused(
-                error, 'to let the pods be watched', self._where.namespace) from error
+            with hints.explained('to let the pods be watched', self._where.namespace):
+                return self._api.follow(
+                    path('pods', self._where.namespace), self._look, tick=self._tick,
+                    again=self._again, timeout=timeout, cancel=self._cancel,
+                    what=f"the pod of '{self._name}' to run",
+                    labelSelector=selector({names.MACHINE: self._where.job}))
         except DeadlineExceeded as error:
             if self._trouble is None:
                 raise
@@ -93,14 +91,9 @@ class Start:
 
     def _again(self) -> None:
         """Check that the Job still exists, after a watch was lost."""
-        try:
-            self._api.request('GET', path('jobs', self._where.namespace, self._where.job),
-                              cancel=self._cancel)
-        except ApiError as error:
-            if error.status == 404:
-                raise ProviderError(f"'{self._name}' was deleted while it was coming up") \
-                    from error
-            raise
+        if existing(self._api, path('jobs', self._where.namespace, self._where.job),
+                    self._cancel) is None:
+            raise ProviderError(f"'{self._name}' was deleted while it was coming up")
 
     def _tick(self) -> None:
         now = time.monotonic()

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Create the Service of a machine's VPN, and find out whether UDP gets through."""
+"""Create the Service of a machine's VPN, find out whether UDP gets through; open TCP ports."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import contextlib
 import threading
 import time
 from typing import Any, Optional
 
 from fogros2.errors import DeadlineExceeded, NameTaken, ProviderError
-from fogros2.kubernetes_client import Api, ApiError, path, Unreachable
-from fogros2.model import CreateRequest, MachineSpec
+from fogros2.kubernetes_client import Api, ApiError, existing, path, Unreachable
+from fogros2.model import CreateRequest, Machine, MachineSpec
 from fogros2.provider.kubernetes import exposure, hints, manifests, names
 from fogros2.provider.kubernetes.exposure import Exposure
 from fogros2.provider.kubernetes.names import MachineId
@@ -46,7 +46,7 @@ def make(
         except ApiError as error:
             if error.reason != 'AlreadyExists':
                 raise
-        there = _read(api, f"{target}/{body['metadata']['name']}", cancel)
+        there = existing(api, f"{target}/{body['metadata']['name']}", cancel)
         # It belongs to an earlier attempt, or to an earlier Job with the name, with which the
         # cluster will delete it soon.
         return there if there is not None and owned(there, uid) else None
@@ -72,18 +72,6 @@ def owned(thing: Mapping[str, Any], uid: str) -> bool:
     meta = thing['metadata']
     return not meta.get('deletionTimestamp') and any(
         owner.get('uid') == uid for owner in meta.get('ownerReferences') or ())
-
-
-def _read(
-    api: Api, target: str, cancel: Optional[threading.Event],
-) -> Optional[dict[str, Any]]:
-    """Return an object, None if there is none."""
-    try:
-        return api.request('GET', target, cancel=cancel)
-    except ApiError as error:
-        if error.status != 404:
-            raise
-        return None
 
 
 def _service_kind(api: Api, expose: str, cancel: Optional[threading.Event]) -> str:
@@ -161,11 +149,8 @@ def find(
     if asked == 'pod_dials_robot':
         return Exposure('pod_dials_robot', '', 0, 'as asked')
     search = _Search(api, where, job, pod, cancel)
-    try:
+    with hints.explained(f"reading the Service of '{where.job}'", where.namespace):
         return search.run(asked, service or search.service(), timeout)
-    except ApiError as error:
-        raise hints.refused(
-            error, f"reading the Service of '{where.job}'", where.namespace) from error
 
 
 class _Search:
@@ -206,7 +191,7 @@ class _Search:
 
     def service(self) -> Optional[dict[str, Any]]:
         """Return the Service, None if there is none."""
-        found = _read(self._api, self._path, self._cancel)
+        found = existing(self._api, self._path, self._cancel)
         if found is None:
             self._failed.append('the cluster allows no Service')
         elif not owned(found, self._where.uid):
@@ -253,3 +238,41 @@ class _Search:
             return None
         why = '; '.join([*self._failed, f'the node {answer[0]} answers'])
         return Exposure('node_port', answer[0], port, why)
+
+
+def open_port(
+    api: Api, where: MachineId, machine: Machine, pod: Mapping[str, Any], port: int,
+    sources: Sequence[str], cancel: Optional[threading.Event],
+) -> tuple[str, int]:
+    """
+    Open a TCP port of a pod for some networks; return host and port for their computers.
+
+    :raises ProviderError: the cluster allows no Service, or makes no load balancer.
+    """
+    close_port(api, where, port)
+    what = f"port {port} of '{machine.name}'"
+    service = manifests.port_service(_service_kind(api, 'auto', cancel), where, port, sources)
+    try:
+        with hints.explained(f'a Service for {what}', where.namespace):
+            made = api.request('POST', path('services', where.namespace), service, cancel=cancel)
+            if service['spec']['type'] == 'LoadBalancer':
+                return load_balancer(api, where.namespace, service['metadata']['name'],
+                                     exposure.LOAD_BALANCER, cancel)[0], port
+    except DeadlineExceeded as error:
+        raise ProviderError(
+            f'the cluster created no load balancer for {what} in {exposure.LOAD_BALANCER:.0f} s',
+            'leave monitor_allow= out on this cluster') from error
+    return node_hosts(api, pod, cancel)[0], exposure.node_port(made)
+
+
+def close_port(api: Api, where: MachineId, port: int) -> None:
+    """Remove the Service of a port; idempotent."""
+    name = names.port_service(where, port)
+    try:
+        api.request('DELETE', path('services', where.namespace, name))
+    except ApiError as error:
+        if error.status != 404:
+            raise ProviderError(
+                f"port {port} of '{where.job}' can't be closed: {error.args[0]}",
+                hints.of_refusal(str(error.args[0]), where.namespace)
+                or f'kubectl delete service -n {where.namespace} {name}') from error
