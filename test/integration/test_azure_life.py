@@ -96,7 +96,7 @@ def test_interrupted_creation_is_taken_up_where_it_was(robot, monkeypatch):
     robot.azure.faults.append(Fault('InternalServerError', 500, 'PUT', 'virtualMachines', times=0))
     # the process dies there, without its undo
     with monkeypatch.context() as patch, pytest.raises(FogError):
-        patch.setattr('fogros2.provider.azure.cloud.Azure._drop_groups', lambda *_, **__: None)
+        patch.setattr('fogros2.provider.azure.cloud.Azure._drop', lambda *_, **__: None)
         robot.provider.create(robot.spec(), request)
     assert len(robot.azure.groups) == 1
     robot.azure.faults.clear()

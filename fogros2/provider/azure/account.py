@@ -73,6 +73,8 @@ class Account(RestAccount):
     def __init__(self) -> None:
         super().__init__()
         self._lock = threading.Lock()
+        #: Machines that this process has just created, as Azure reports them.
+        self.seen: dict[str, Mapping[str, Any]] = {}
 
     def credential(self) -> Any:
         """

@@ -111,9 +111,10 @@ class Azure(prices.AzurePrices, images.AzureImages):
                 for entry in found]
 
     def get(self, region: str, vm: str) -> Optional[Vm]:
-        entry: Mapping[str, Any] = {}
+        # what insert has just seen is reported once
+        entry = self._account.seen.pop(vm, {})
         with unless_gone():
-            entry = self._entry(vm)
+            entry = entry or self._entry(vm)
         if not entry:
             raise MachineNotFound(f'there is no {vm} in {region} any more')
         found = machines.vm_of(entry)
@@ -186,7 +187,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
         except FogError:
             # the next place has a group of its own; what stays is undone at the end, or by gc
             with contextlib.suppress(FogError):
-                self.until(None)._drop_groups(order.attempt, [name])
+                self.until(None)._drop(order.attempt, [name], empty=[name])
             raise
         return name
 
@@ -228,7 +229,8 @@ class Azure(prices.AzurePrices, images.AzureImages):
         what = f"creating '{order.spec.name}' ({place.kind})"
         self._account.call('PUT', self._vm(name), what,
                            machines.request(place, order, known, str(nic['id']), tags))
-        self._guard(name, place.region, order, known, self._allocated(name, what))
+        entry = self._account.seen[name] = self._allocated(name, what)
+        self._guard(name, place.region, order, known, entry)
         if known.nvidia:
             self._install_driver(name, place.region)
 
@@ -285,36 +287,37 @@ class Azure(prices.AzurePrices, images.AzureImages):
                 if (found := (group.get('tags') or {}).get(TAG_ATTEMPT, ''))
                 and attempt in ('', found) and str(group['name']).startswith(own_name(found))]
 
-    def _drop(self, attempt: str, names: Iterable[str] = (), *, wait: bool = False) -> None:
+    def _drop(
+        self, attempt: str, names: Iterable[str] = (), *, wait: bool = False,
+        empty: Optional[Collection[str]] = None,
+    ) -> None:
         """
-        Delete all groups of an attempt with everything in them.
+        Delete the groups of an attempt with everything in them.
 
         :param names: groups that a list may not have yet.
-        """
-        listed = {str(group['name']) for group in self._groups(attempt)}
-        self._drop_groups(attempt, {*names, *listed}, wait=wait)
-
-    def _drop_groups(self, attempt: str, names: Collection[str], *, wait: bool = False) -> None:
-        """
-        Delete groups with everything in them.
-
+        :param empty: only these of the groups.
         :raises ProviderError: a group of this name is not FogROS2's, and stays.
         """
+        listed = {str(group['name']) for group in self._groups(attempt)}
+
         def drop(name: str) -> None:
             path = self._account.path(name)
             with unless_gone():
-                found = self._account.call('GET', path, f'looking for the group {name}')
-                if (found.get('tags') or {}).get(TAG_ATTEMPT) != attempt:
+                tags = {} if name in listed else self._account.call(
+                    'GET', path, f'looking for the group {name}').get('tags') or {}
+                if name not in listed and tags.get(TAG_ATTEMPT) != attempt:
                     raise ProviderError(f'the group {name} has no tag of FogROS2, and stays',
                                         'FogROS2 deletes only groups that it created')
                 self._account.delete(
                     path, f'deleting the group {name}', wait=wait,
                     query={'forceDeletionTypes': 'Microsoft.Compute/virtualMachines'})
 
-        with ThreadPoolExecutor(8, 'fog-azure') as pool:
-            list(pool.map(drop, names))
+        chosen = sorted(name for name in {*names, *listed} if empty is None or name in empty)
+        with ThreadPoolExecutor(max(1, min(8, len(chosen))), 'fog-azure') as pool:
+            list(pool.map(drop, chosen))
 
     def delete(self, machine: VmId) -> None:
+        self._account.seen.pop(machine.vm, None)
         self._drop(machine.attempt, [machine.vm], wait=True)
 
     def end_attempt(self, region: str, attempt: str) -> None:
@@ -324,14 +327,14 @@ class Azure(prices.AzurePrices, images.AzureImages):
         """Return the tags of the groups in which no machine is left, as after an eviction."""
         return [group['tags'] for group in self._empty(region)]
 
-    def _empty(self, region: str, attempt: str = '') -> list[Mapping[str, Any]]:
+    def _empty(self, region: str) -> list[Mapping[str, Any]]:
         there = {str(entry['id']).split('/')[4].lower() for entry in self._all('')}
-        return [group for group in self._groups(attempt) if prices.is_in(group, region)
+        return [group for group in self._groups() if prices.is_in(group, region)
                 and str(group['name']).lower() not in there]
 
     def sweep(self, region: str, attempt: str) -> None:
         """Delete the groups of an attempt that have no machine."""
-        self._drop_groups(attempt, [str(one['name']) for one in self._empty(region, attempt)])
+        self._drop(attempt, empty=[str(group['name']) for group in self._empty(region)])
 
     # -- changes of a machine -------------------------------------------------------------------
 
@@ -363,6 +366,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
                             time.time() + spec.lifetime)
 
     def stop(self, machine: VmId) -> None:
+        self._account.seen.pop(machine.vm, None)
         self._account.call('POST', self._vm(machine.vm, '/deallocate'), f'stopping {machine.vm}')
 
     def start(self, machine: VmId) -> None:

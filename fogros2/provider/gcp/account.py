@@ -84,6 +84,8 @@ class Account(RestAccount):
     def __init__(self, project: str = '') -> None:
         super().__init__()
         self._project = project
+        #: Fingerprint of the labels of instances, by id, as last reported.
+        self.labels: dict[str, tuple[str, Mapping[str, str]]] = {}
 
     def of_project(self, project: str) -> Account:
         """Return the account of another project; '' for the same."""

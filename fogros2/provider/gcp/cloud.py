@@ -14,10 +14,19 @@ from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_ON_EXIT
 from fogros2.provider.gcp import guest, images, instances, prices
 from fogros2.provider.gcp.account import Account, configured, ENDPOINT_VARIABLE
+from fogros2.provider.gcp.failures import GoogleError
 from fogros2.provider.gcp.firewall import GoogleFirewall
 from fogros2.provider.gcp.options import Options
 from fogros2.provider.offers import MachineType
-from fogros2.provider.vm.cloud import CloudError, Order, own_name, Place, TAG_ATTEMPT, Vm, VmId
+from fogros2.provider.vm.cloud import (
+    CloudError,
+    Order,
+    own_name,
+    Place,
+    TAG_ATTEMPT,
+    Vm,
+    VmId,
+)
 from fogros2.provider.vm.failures import unless_gone
 from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import cancellable
@@ -141,6 +150,7 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
             found = self._account.call('GET', _path(vm), f'looking for {vm}')
         if not found:
             raise MachineNotFound(f'there is no {vm} any more')
+        self._account.labels[vm] = found['labelFingerprint'], found.get('labels', {})
         known = instances.vm_of(project, found)
         if known.state is MachineState.DELETED:
             raise MachineNotFound(f'{vm} has ended')
@@ -207,6 +217,7 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
     def delete(self, machine: VmId) -> None:
         """Delete an instance with its disk, then its firewall rules."""
         self._account.remove(_path(machine.vm), f'deleting {machine.vm}')
+        self._account.labels.pop(machine.vm, None)
         self._drop_rules(machine.vm.partition('/')[0], machine.attempt)
 
     def end_attempt(self, region: str, attempt: str) -> None:
@@ -225,13 +236,21 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
 
     def set_tags(self, machine: VmId, tags: Mapping[str, str]) -> None:
         """Replace labels, which Google takes only as a whole and with their fingerprint."""
-        path, what = _path(machine.vm), f'writing labels of {machine.vm}'
-        found = self._account.call('GET', path, what)
-        kept = {key: value for key, value in found.get('labels', {}).items()
-                if not any(key == tag or key.startswith(f'{tag}_') for tag in tags)}
-        self._account.run('POST', f'{path}/setLabels', what, body={
-            'labelFingerprint': found['labelFingerprint'],
-            'labels': {**kept, **instances.RULES.encode(tags)}})
+        for again in (True, False):
+            if machine.vm not in self._account.labels:
+                self.get(machine.region, machine.vm)
+            fingerprint, labels = self._account.labels.pop(machine.vm)
+            kept = {key: value for key, value in labels.items()
+                    if not any(key == tag or key.startswith(f'{tag}_') for tag in tags)}
+            try:
+                self._account.run(
+                    'POST', f'{_path(machine.vm)}/setLabels', f'writing labels of {machine.vm}',
+                    body={'labelFingerprint': fingerprint, 'labels': {
+                        **kept, **instances.RULES.encode(tags)}})
+                return
+            except GoogleError as error:
+                if error.code != 'CONDITION_NOT_MET' or not again:
+                    raise
 
     def set_ending(self, machine: VmId, spec: MachineSpec) -> None:
         """Change when Google ends an instance, which it takes for stopped instances only."""
