@@ -187,8 +187,7 @@ def _agent(record: Record, shell: Shell) -> Iterator[Optional[AgentClient]]:
             timeout=Timeouts().command, check=False).returncode != 0:
         yield None
         return
-    client = AgentClient(shell, record.agent, agent_path=record.agent_program,
-                         python=record.python)
+    client = AgentClient(shell, record.agent, agent_path=record.agent_program)
     try:
         yield client
     finally:

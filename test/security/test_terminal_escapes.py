@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import queue
 import re
-import threading
 from typing import Any
 
 import pytest
@@ -56,7 +55,7 @@ def received(sent: list[dict[str, Any]]) -> list[Any]:
     """Return the events as the robot's programs get them."""
     found: list[Any] = []
     shell: Any = Machine(sent)
-    client = AgentClient(shell, '/run/x', agent_path='/run/x/agent.py', cancel=threading.Event())
+    client = AgentClient(shell, '/run/x', agent_path='/run/x/agent.py')
     try:
         client.subscribe(found.append, since=1)
         wait_until(lambda: len(found) == len(sent) or None, timeout=10, what='the events')
