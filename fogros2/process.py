@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 import time
-from typing import BinaryIO, Optional
+from typing import Any, BinaryIO, Optional
 
 from fogros2.errors import Cancelled, CommandError, DeadlineExceeded, PrerequisiteError
 from fogros2.model import Command, Result
@@ -46,28 +46,16 @@ def start(
 
     :raises FileNotFoundError: there is no such program.
     """
-    words = argv(command)
-    if not _through_sudo(command):
-        return subprocess.Popen(words, env=environment, stdin=stdin, stdout=subprocess.PIPE,
-                                stderr=stderr, start_new_session=True)
-    if sys.version_info >= (3, 11):
-        return subprocess.Popen(words, env=environment, stdin=stdin, stdout=subprocess.PIPE,
-                                stderr=stderr, process_group=0)
-    return subprocess.Popen(words, env=environment, stdin=stdin, stdout=subprocess.PIPE,
-                            stderr=stderr, preexec_fn=os.setpgrp)
+    apart: dict[str, Any] = {'start_new_session': True}
+    if _through_sudo(command):
+        apart = {'process_group': 0} if sys.version_info >= (3, 11) else {
+            'preexec_fn': os.setpgrp}
+    return subprocess.Popen(argv(command), env=environment, stdin=stdin, stdout=subprocess.PIPE,
+                            stderr=stderr, **apart)
 
 
 def _through_sudo(command: Command) -> bool:
     return command.sudo and os.geteuid() != 0
-
-
-def refresh_ticket() -> bool:
-    """
-    Extend the time until sudo asks for a password again; return False if sudo refuses now.
-
-    Without effect if sudo needs no password.
-    """
-    return not sudo_trouble()
 
 
 def ask_for_ticket(what: str) -> bool:
@@ -88,7 +76,11 @@ def ask_for_ticket(what: str) -> bool:
 
 
 def sudo_trouble(*, timeout: float = 10.0) -> tuple[str, str] | None:
-    """Return why sudo refuses at the moment, and the remedy; None if it does not refuse."""
+    """
+    Return why sudo refuses at the moment, and the remedy; None if it does not refuse.
+
+    A call extends the time until sudo asks for a password again.
+    """
     if os.geteuid() == 0:
         return None
     asked = run(Command(('true',), sudo=True), timeout=timeout, check=False)
