@@ -113,9 +113,9 @@ class Containers(Step):
     def _ensure_engine(self) -> None:
         job = self._job
         timeouts = self._context.timeouts
-        if not self._engine and not job.run(containers.find(), timeout=timeouts.command).strip():
+        if not self._engine and not job.run(containers.FIND, timeout=timeouts.command).strip():
             try:
-                job.run(containers.install(), timeout=timeouts.install)
+                job.run(containers.INSTALL, timeout=timeouts.install)
             except CommandError as error:
                 raise PrerequisiteError(
                     f"'{job.name}' has neither podman nor docker, and podman can't be installed: "
