@@ -260,9 +260,3 @@ class RemoteRun:
         hint = f" ({event['hint']})" if event['hint'] else ''
         self._logger.error(f"process can't be started: {event['error']}{hint}")
         self.end()
-
-    def on_stdin(self, event: object) -> None:
-        """Refuse input: the connection to a machine has no channel for it."""
-        if self._here:
-            return
-        self._logger.error('a process on a machine takes no input from launch')
