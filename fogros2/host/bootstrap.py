@@ -31,7 +31,7 @@ from fogros2.host import wheels as wheel_cache
 from fogros2.host import workspace as workspaces
 from fogros2.host.inspection import DISTRO, HostFacts, MIN_PYTHON, Python
 from fogros2.model import Bootstrap, Command, MachineSpec, Result
-from fogros2.plan import DEFAULT_RMW, extended, PLAIN_VARIABLES, SYSTEM_PATH, Underlay
+from fogros2.plan import DEFAULT_RMW, extended, PATH_LISTS, PLAIN_VARIABLES, SYSTEM_PATH, Underlay
 from fogros2.shell import Shell
 
 #: The system for which ROS 2 Jazzy has packages.
@@ -56,10 +56,6 @@ APT_PACKAGES = (
     'wireguard-tools', 'rsync', 'iproute2', 'nftables',
     'sudo',  # for rosdep; images of ROS lack it
 )
-#: Variables with lists of folders; of the robot's folders, a machine has only those that are sent.
-_PATH_VARIABLES = (
-    'AMENT_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'LD_LIBRARY_PATH',
-    'PYTHONPATH', 'PATH')
 #: Variables that ROS's setup script sets.
 _ROS_VARIABLES = ('ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION')
 
@@ -289,17 +285,10 @@ def check_elsewhere(spec: MachineSpec, facts: HostFacts, robot: HostFacts) -> No
             f'run its nodes here with --machine {spec.name}=robot, or in a ContainerInstance')
 
 
-_probing = threading.Lock()
-_robot: dict[tuple[str, ...], HostFacts] = {}
-
-
+@functools.lru_cache(maxsize=None)
 def _robot_facts(prefixes: tuple[str, ...], timeout: float) -> HostFacts:
-    """Return the facts of this computer, probed once for all machines of a launch."""
-    with _probing:
-        if prefixes not in _robot:
-            _robot[prefixes] = host.parse_facts(
-                process.run(host.probe(prefixes), timeout=timeout).stdout)
-        return _robot[prefixes]
+    """Return the facts of this computer, probed once for the later machines of a launch."""
+    return host.parse_facts(process.run(host.probe(prefixes), timeout=timeout).stdout)
 
 
 def plan_alike(
@@ -456,7 +445,8 @@ def _merged(
     merged = {name: under.environment[name] for name in PLAIN_VARIABLES
               if name in under.environment and name not in _ROS_VARIABLES}
     below = tuple(f'{space.root}/' for space in chain)
-    for name in _PATH_VARIABLES:
+    for name in PATH_LISTS:
+        # of the robot's folders, a machine has only those that are sent
         entries = [entry for entry in under.environment.get(name, '').split(os.pathsep)
                    if entry.startswith(below)]
         own = install.environment.get(name)

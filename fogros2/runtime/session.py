@@ -16,9 +16,10 @@ from fogros2.describe import values
 from fogros2.errors import AgentError, ConfigurationError, FogError
 from fogros2.events import Event
 from fogros2.model import MachineSpec, NodeSpec
-from fogros2.runtime import streaming, uncompressed
+from fogros2.runtime import streaming
 from fogros2.runtime.backlog import Backlog
 from fogros2.runtime.checkpoints import Checkpoints
+from fogros2.runtime.node_spec import full_name
 from fogros2.runtime.replacer import Replacer
 from fogros2.shell import Shell
 
@@ -232,7 +233,7 @@ class Session:
 
     def node_names(self) -> list[str]:
         """Return the ROS names of the machine's nodes."""
-        return [uncompressed.node_name(run.node) for run in list(self._runs.values())]
+        return [full_name(run.node).rpartition('/')[2] for run in list(self._runs.values())]
 
     @property
     def shell(self) -> Optional[Shell]:
@@ -459,11 +460,8 @@ class Session:
 
     # -- a new machine ---------------------------------------------------------------------------
 
-    def halt_all(self) -> None:
+    async def halt_all(self) -> None:
         """Let the machine end all of its processes, because another machine continues them."""
-        self.request(self._halt_all)
-
-    async def _halt_all(self) -> None:
         if self.checkpoints:
             await self.checkpoints.ask()
         ended = [run for run, _ in self._held]
@@ -495,12 +493,9 @@ class Session:
             await self.checkpoints.save(self.running.shell, still=True)
         self.replacer.on('drained')
 
-    def move_halted(self) -> None:
+    async def move_halted(self) -> None:
         """Let processes start on the robot: the machine no longer runs them."""
         self._held.clear()
-        self.request(self._move_halted)
-
-    async def _move_halted(self) -> None:
         async with self._moves:
             if self.checkpoints:
                 await self.checkpoints.restore(self.checkpoints.robot)
