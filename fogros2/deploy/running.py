@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import contextlib
-import json
 from pathlib import Path
 import secrets
 import threading
@@ -20,7 +19,7 @@ from fogros2.deploy.steps.watching import Watch
 from fogros2.errors import AgentError, FogError
 from fogros2.events import Event
 from fogros2.host import idle
-from fogros2.model import host_port, Machine, NodeSpec, to_json
+from fogros2.model import host_port, Machine, NodeSpec
 
 
 class RunningMachine(Step):
@@ -67,7 +66,7 @@ class RunningMachine(Step):
         :raises PrerequisiteError: the machine cannot get their imports or their image.
         """
         nodes = self._modules.fitted(self._containers.inside(nodes))
-        self.agent.request('start', nodes=json.loads(to_json(nodes)))
+        self.agent.request('start', nodes=nodes)
         if self.spec.idle_timeout is not None:
             # the time begins anew with each start
             timeout = self.spec.idle_timeout
