@@ -23,6 +23,7 @@ from fogros2 import process
 from fogros2.errors import WorkspaceError
 from fogros2.host.inspection import DISTRO, HostFacts
 from fogros2.model import Command
+from fogros2.report import size
 from fogros2.shell import Shell
 from fogros2.waiting import Timeouts
 
@@ -294,17 +295,9 @@ def transfer(
     for command in [command for way in ways for command in way.commands]:
         shell.run(command, timeout=timeouts.build, cancel=cancel)
     sent = (f'{sum(report.files for report in reports)} files, '
-            f'{_size(sum(report.bytes for report in reports))}')
+            f'{size(sum(report.bytes for report in reports))}')
     return ', '.join([sent, *(
         f'built there: {way.reason}' for way in ways if way.commands)])
-
-
-def _size(number: float) -> str:
-    for unit in ('B', 'kB', 'MB'):
-        if number < 1000:
-            return f'{number:.3g} {unit}'
-        number /= 1000
-    return f'{number:.3g} GB'
 
 
 def _why_build(workspace: Workspace, machine: HostFacts, robot: HostFacts) -> str:

@@ -9,9 +9,10 @@ from decimal import Decimal
 import os
 from typing import Any, TextIO
 
+from fogros2.report import size
 from ros2fog_cli.api import replicas
 from ros2fog_cli.api.follower import LogLine
-from ros2fog_cli.api.table import cost, duration, shares, size, table
+from ros2fog_cli.api.table import cost, duration, shares, table
 
 #: Enter and leave the alternate screen; meanwhile the cursor is hidden and long lines are cut,
 #: as the number of characters is no limit (a character may be two columns wide).

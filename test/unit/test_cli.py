@@ -20,7 +20,7 @@ from typing import Any, Optional
 import pytest
 from ros2cli.cli import main
 
-from fogros2 import process
+from fogros2 import process, report
 from fogros2.deploy import robot
 from fogros2.errors import PrerequisiteError, ProviderError, Unsupported
 from fogros2.model import (
@@ -633,7 +633,7 @@ def test_durations_have_at_most_two_units(seconds: Optional[float], text: str) -
 
 
 def test_sizes_and_costs_have_units() -> None:
-    assert [table.size(n) for n in (0, 999, 1000, 1.5e9, 3e13)] == [
+    assert [report.size(n) for n in (0, 999, 1000, 1.5e9, 3e13)] == [
         '0 B', '999 B', '1.0 kB', '1.5 GB', '30.0 TB']
     assert table.cost(None) == '-' and table.cost(Decimal('1.5')) == '$1.5000'
 
