@@ -51,9 +51,9 @@ class AgentClient:
     A connection to a machine's agent that reconnects after a loss.
 
     One thread reads, and checks each message against ``fogros2.events``. It passes each event to
-    the subscribers, once and in order, and adds ``ConnectionChanged`` and ``Gap``. It gives up an
+    the subscriber, once and in order, and adds ``ConnectionChanged`` and ``Gap``. It gives up an
     agent that sends an invalid message, as one that is gone.
-    A subscriber must not make requests: its own thread would have to read their replies.
+    The subscriber must not make requests: its own thread would have to read their replies.
 
     :param shell: reaches the machine.
     :param directory: the agent's directory on the machine.
@@ -77,7 +77,7 @@ class AgentClient:
             # -IS: the agent needs only the standard library, and searching for more takes time
             ('python3', '-IS', agent_path, 'connect', '--directory', directory),
             what='reach the agent')
-        self._callbacks: list[EventCallback] = []
+        self._callback: Optional[EventCallback] = None
         self._closed = threading.Event()
         self._lock = threading.Lock()
         self._writing = threading.Lock()
@@ -173,21 +173,14 @@ class AgentClient:
         """Return the agent's state; see ``request``."""
         return cast(events.Status, self.request('status', timeout=timeout))
 
-    def subscribe(self, callback: EventCallback, since: Optional[int] = None) -> None:
+    def subscribe(self, callback: EventCallback, since: int) -> None:
         """
         Pass events to ``callback``, each once and in order, across lost connections.
 
-        The first subscriber decides where to begin; later ones join at the current event.
-
-        :param since: first seq, 1 for all that the agent has; None for new events only.
+        :param since: first seq, 1 for all that the agent has.
         :raises AgentError: as for ``request``.
         """
-        if since is None and self._next is None:
-            since = self.status()['next']
-        self._callbacks.append(callback)
-        if self._next is not None or since is None:
-            return
-        self._next = since
+        self._callback, self._next = callback, since
         self.connect()
         with self._lock:
             stream = self._stream
@@ -309,8 +302,8 @@ class AgentClient:
             self._tell({'event': 'gap', 'count': log['lost']})
 
     def _tell(self, event: events.Event) -> None:
-        for callback in self._callbacks:
-            callback(event)
+        if self._callback is not None:
+            self._callback(event)
 
     def _follow_on(self, stream: Stream) -> None:
         self._log_request = next(self._numbers)

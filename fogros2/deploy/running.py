@@ -47,7 +47,7 @@ class RunningMachine(Step):
         self._containers = containers
         self._warm = False
         self._lock = threading.Lock()
-        self._callbacks: list[EventCallback] = []
+        self._callback: Optional[EventCallback] = None
         self._lost = ''
         self._published: dict[int, tuple[str, int]] = {}
         job.undo.callback(Watch(
@@ -129,8 +129,7 @@ class RunningMachine(Step):
                 callback(event)
 
         with self._lock:
-            self._callbacks.append(callback)
-            lost = self._lost
+            self._callback, lost = callback, self._lost
         if lost:
             callback({'event': 'lost', 'reason': lost})
             return
@@ -158,9 +157,8 @@ class RunningMachine(Step):
 
     def _report_end(self, reason: str) -> None:
         with self._lock:
-            self._lost = reason
-            callbacks = list(self._callbacks)
-        for callback in callbacks:
+            self._lost, callback = reason, self._callback
+        if callback is not None:
             callback({'event': 'lost', 'reason': reason})
 
     def retire(self) -> None:
