@@ -75,7 +75,8 @@ class FakeProvider(Provider):
         self._polls = polls
         self._shell = shell
         self._lock = threading.Lock()
-        self._machines: dict[str, Machine] = {}
+        #: By id; a class may have them for all of its objects.
+        self.machines: dict[str, Machine] = getattr(self, 'machines', {})
         self._tokens: dict[str, str] = {}
         self._waits: dict[str, int] = {}
 
@@ -111,10 +112,10 @@ class FakeProvider(Provider):
             self._called('create')
             if request.token in self._tokens:
                 return self._tokens[request.token]
-            if any(m.name == spec.name for m in self._machines.values()):
+            if any(m.name == spec.name for m in self.machines.values()):
                 raise NameTaken(f"there is a fake machine '{spec.name}' already")
             machine_id = f'fake-{secrets.token_hex(4)}'
-            self._machines[machine_id] = Machine(
+            self.machines[machine_id] = Machine(
                 machine_id, spec.name, self.name, MachineState.PENDING, created=time.time(),
                 tags=dict(request.tags), end_command=('true',))
             self._tokens[request.token] = machine_id
@@ -132,7 +133,7 @@ class FakeProvider(Provider):
                     machine = dataclasses.replace(
                         machine, state=MachineState.RUNNING, shell=self._shell,
                         vpn_host=self._shell.host)
-                    self._machines[machine_id] = machine
+                    self.machines[machine_id] = machine
             key = self.host_keys.get(machine_id)
             if key is not None and machine.shell is not None:
                 return dataclasses.replace(
@@ -143,27 +144,27 @@ class FakeProvider(Provider):
         """Return the machines that have all of ``tags``."""
         with self._lock:
             self._called('find')
-            return [m for m in self._machines.values() if tags.items() <= m.tags.items()]
+            return [m for m in self.machines.values() if tags.items() <= m.tags.items()]
 
     def destroy(self, machine_id: str) -> None:
         """Delete a machine."""
         with self._lock:
             self._called('destroy')
-            self._machines.pop(machine_id, None)
+            self.machines.pop(machine_id, None)
             self._tokens = {t: i for t, i in self._tokens.items() if i != machine_id}
 
     def stop(self, machine_id: str) -> None:
         """Stop a machine."""
         with self._lock:
             self._called('stop')
-            self._machines[machine_id] = dataclasses.replace(
+            self.machines[machine_id] = dataclasses.replace(
                 self._found(machine_id), state=MachineState.STOPPED, shell=None)
 
     def start(self, machine_id: str) -> None:
         """Start a stopped machine."""
         with self._lock:
             self._called('start')
-            self._machines[machine_id] = dataclasses.replace(
+            self.machines[machine_id] = dataclasses.replace(
                 self._found(machine_id), state=MachineState.PENDING)
             self._waits[machine_id] = self._polls
 
@@ -189,9 +190,9 @@ class FakeProvider(Provider):
         self.host_keys[machine_id] = host_key
 
     def _found(self, machine_id: str) -> Machine:
-        if machine_id not in self._machines:
+        if machine_id not in self.machines:
             raise MachineNotFound(f"there is no fake machine '{machine_id}'")
-        return self._machines[machine_id]
+        return self.machines[machine_id]
 
     def _called(self, method: str) -> None:
         self.calls.append(method)

@@ -31,11 +31,11 @@ from fogros2.model import (
     Result,
     VpnInterface,
 )
-from fogros2.provider import TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
+from fogros2.provider import Capabilities, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.provider.container import ContainerProvider
 from fogros2.store import process_start, Record, robot_name, Store
-from fogros2.testing.fakes import FakeShell, FakeStream
-from fogros2.testing.plugins import instead, MemoryProvider
+from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream
+from fogros2.testing.plugins import instead
 from rigs import recorded_agent
 from ros2fog_cli.api import endings, joining, machines, table
 from ros2fog_cli.api.machines import Entry
@@ -43,10 +43,11 @@ from ros2fog_cli.api.machines import Entry
 NOW = 1_800_000_000.0
 
 
-class Memory(MemoryProvider):
+class Memory(FakeProvider):
     """A provider with its machines in a dictionary."""
 
     name = 'memory'
+    capabilities = Capabilities()
     machines: dict[str, Machine] = {}
     searched: list[str] = []
 

@@ -98,7 +98,7 @@ def test_next_launch_closes_the_port_of_a_killed_one(
         tmp_path, MachineSpec('planner', 'fake', on_exit='keep'), provider=provider)
     with context.store.lock('planner'):
         job.save(machine_id='fake-1', monitor=8765, monitor_open='198.51.100.9:8766')
-        provider._machines['fake-1'] = machine = Machine(
+        provider.machines['fake-1'] = machine = Machine(
             'fake-1', 'planner', 'fake', MachineState.RUNNING)
         Creation(context, job)._adopt(machine)
     assert provider.allowed == {('fake-1', 8766): []}
