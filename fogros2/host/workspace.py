@@ -367,7 +367,7 @@ def _sources(folder: Path) -> Iterator[tuple[str, Path]]:
     if {'COLCON_IGNORE', 'AMENT_IGNORE', 'CATKIN_IGNORE'} & names:
         return
     if 'package.xml' in names:
-        name = _package_name(folder / 'package.xml')
+        name = (_parsed(folder / 'package.xml').findtext('name') or '').strip()
         if name:
             yield name, folder
         return
@@ -375,10 +375,6 @@ def _sources(folder: Path) -> Iterator[tuple[str, Path]]:
         path = folder / entry
         if path.is_dir() and not entry.startswith('.'):
             yield from _sources(path)
-
-
-def _package_name(manifest: Path) -> str:
-    return (_parsed(manifest).findtext('name') or '').strip()
 
 
 def _parsed(manifest: Path) -> ElementTree.Element:
@@ -390,8 +386,7 @@ def _parsed(manifest: Path) -> ElementTree.Element:
 
 
 def _build_type(folder: Path) -> str:
-    export = ElementTree.parse(folder / 'package.xml').getroot().find('export')
-    return (export.findtext('build_type') or '').strip() if export is not None else ''
+    return (_parsed(folder / 'package.xml').findtext('export/build_type') or '').strip()
 
 
 def _inspect_installed(workspace: Workspace) -> Workspace:
