@@ -62,8 +62,6 @@ _MOUNTS = ('-v', '--volume', '--mount')
 _FOGROS2_SOURCE = re.compile(rf'(^|\b(?:source|src)=){FOGROS2_FILE}(?=[:,]|$)')
 #: Prints the machine's engine, or nothing if none works.
 FIND = Command.script(scripts.FIND, what='look for podman or docker')
-#: Installs an engine.
-INSTALL = Command.script(scripts.INSTALL, sudo=True, what='install podman')
 
 
 @dataclasses.dataclass(frozen=True)
