@@ -139,7 +139,6 @@ def run(
     :raises PrerequisiteError: the program is missing, or cannot be started.
     """
     words = argv(command)
-    begin = time.monotonic()
     path = _ENVIRONMENT.get('PATH', os.defpath)
     environment = {**_ENVIRONMENT, 'PATH': f'{path}:/usr/sbin:/sbin', **command.environment}
     try:
@@ -171,7 +170,7 @@ def run(
     threads = [threading.Thread(target=read, args=(name,), daemon=True) for name in output]
     for thread in threads:
         thread.start()
-    deadline = begin + timeout
+    deadline = time.monotonic() + timeout
     what = command.what or words[0]
     try:
         while True:
@@ -190,9 +189,8 @@ def run(
     for thread in threads:
         # a daemon that the command left may keep the pipe open
         thread.join(2.0)
-    result = Result(
-        child.returncode, output['stdout'].decode(errors='replace'),
-        output['stderr'].decode(errors='replace'), time.monotonic() - begin)
+    result = Result(child.returncode, output['stdout'].decode(errors='replace'),
+                    output['stderr'].decode(errors='replace'))
     if check and result.returncode != 0:
         hint = ''
         if command.sudo and 'password is required' in result.stderr:

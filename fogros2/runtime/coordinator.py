@@ -106,6 +106,7 @@ class Coordinator:
         self._whole = False
         self._sessions: dict[str, Session] = {}
         self._new: list[Session] = []
+        self._deployments: list[asyncio.Task[None]] = []
         self._begun = True
         self._late: set[str] = set()
         self._streams = streaming.Streams()
@@ -427,8 +428,7 @@ class Coordinator:
             task = context.asyncio_loop.create_task(self._bring_up(new))
             context.add_completion_future(task)
             task.add_done_callback(self._raise_in_launch)
-            for session in new:
-                session.deployment = task
+            self._deployments.append(task)
         self._open_gate()
 
     async def _bring_up(self, sessions: list[Session]) -> None:
@@ -522,8 +522,7 @@ class Coordinator:
         # the VPN interface must stay while a node runs
         sessions = self._sessions.values()
         futures = [private.completed(action) for action in processes.processes(self._context)]
-        await _all_done({
-            *futures, *(session.deployment for session in sessions), self._watched})
+        await _all_done({*futures, *self._deployments, self._watched})
         await _all_done({request for session in sessions for request in session.requests})
         for error in await self._in_thread(self.launch.down):
             self._fail(error)

@@ -181,7 +181,7 @@ class RemoteShell(abc.ABC, Generic[Link]):
             raise
         finally:
             channel.close()
-        result = Result(returncode, *output.text(), time.monotonic() - begin)
+        result = Result(returncode, *output.text())
         return command_line.checked(command, result, f"'{self.name}'") if check else result
 
     def _collect(

@@ -185,12 +185,12 @@ def test_equal_machines_are_created_once(run, fake, planner):
     assert len(fake.noted('up')) == 1 and planner.is_created and twin.is_created
 
 
-def test_steps_are_shown_and_summed_up(run, fake, planner, capfd):
+def test_steps_are_shown_once(run, fake, planner, capfd):
     fake.on_start = ends
     assert run(LaunchDescription([talker(planner)])) == 0
     output = capfd.readouterr().out
     assert '[INFO] [fogros2]: planner: machine 0.' in output and '(made of air)' in output
-    assert 'machine  step     seconds' in output
+    assert output.count('planner: machine') == 1
     assert '\r' not in output and '\x1b' not in output
 
 

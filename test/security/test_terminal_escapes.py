@@ -107,7 +107,7 @@ def test_no_output_of_a_command_controls_the_terminal(attack: str) -> None:
     out, err = output.text()
     assert harmless(err) and all(map(harmless, said)), ascii(err)
     assert out == f'{attack}\nend{attack}', 'programs read it'
-    for result in (Result(1, out, '', 0.0), Result(1, '', err, 0.0)):
+    for result in (Result(1, out, ''), Result(1, '', err)):
         with pytest.raises(CommandError) as failed:
             command_line.checked(Command(('x',)), result, "'planner'")
         assert harmless(str(failed.value)), ascii(str(failed.value))
