@@ -33,7 +33,7 @@ from fogros2.describe import values
 from fogros2.describe.keywords import ROBOT
 from fogros2.describe.machines import CloudInstance
 from fogros2.errors import Cancelled, ConfigurationError, did_you_mean, FogError
-from fogros2.launch_internals import private, processes
+from fogros2.launch_internals import private
 from fogros2.model import NodeSpec
 from fogros2.runtime import cost, interruption, republishers, signals, streaming, uncompressed
 from fogros2.runtime.checkpoints import Checkpoints
@@ -403,7 +403,7 @@ class Coordinator:
             kept.update(environment)
         # these are not changes of the launch file, so they must not be sent to machines
         self.base_environment.update(environment)
-        for action in processes.processes(self._context):
+        for action in private.processes(self._context):
             details, ended = action.process_details, private.completed(action)
             if details is None or ended is None or ended.done():
                 continue
@@ -521,7 +521,7 @@ class Coordinator:
     async def _take_down(self) -> None:
         # the VPN interface must stay while a node runs
         sessions = self._sessions.values()
-        futures = [private.completed(action) for action in processes.processes(self._context)]
+        futures = [private.completed(action) for action in private.processes(self._context)]
         await _all_done({*futures, *self._deployments, self._watched})
         await _all_done({request for session in sessions for request in session.requests})
         for error in await self._in_thread(self.launch.down):
