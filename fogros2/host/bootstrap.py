@@ -285,10 +285,17 @@ def check_elsewhere(spec: MachineSpec, facts: HostFacts, robot: HostFacts) -> No
             f'run its nodes here with --machine {spec.name}=robot, or in a ContainerInstance')
 
 
-@functools.lru_cache(maxsize=None)
+_probing = threading.Lock()
+_robot: dict[tuple[str, ...], HostFacts] = {}
+
+
 def _robot_facts(prefixes: tuple[str, ...], timeout: float) -> HostFacts:
-    """Return the facts of this computer, probed once for the later machines of a launch."""
-    return host.parse_facts(process.run(host.probe(prefixes), timeout=timeout).stdout)
+    """Return the facts of this computer, probed once for all machines of a launch."""
+    with _probing:
+        if prefixes not in _robot:
+            _robot[prefixes] = host.parse_facts(
+                process.run(host.probe(prefixes), timeout=timeout).stdout)
+        return _robot[prefixes]
 
 
 def plan_alike(
