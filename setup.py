@@ -145,12 +145,12 @@ setup(
             'rmw_zenoh_cpp = fogros2.dds.zenoh:Zenoh',
         ],
         'fogros2.image_transport': [
-            'compressed = fogros2.image_transport.compressed:Compressed',
+            'compressed = fogros2.image_transport.nodes:Compressed',
             'draco = fogros2.image_transport.republish:Draco',
             'ffmpeg = fogros2.image_transport.republish:Ffmpeg',
-            'h264 = fogros2.image_transport.h264:H264',
-            'pointcloud = fogros2.image_transport.pointcloud:PointCloud',
-            'raw = fogros2.image_transport.raw:Raw',
+            'h264 = fogros2.image_transport.nodes:H264',
+            'pointcloud = fogros2.image_transport.nodes:PointCloud',
+            'raw = fogros2.image_transport.nodes:Raw',
             'republished_compressed = '
             'fogros2.image_transport.republish:RepublishedCompressed',
             'theora = fogros2.image_transport.republish:Theora',

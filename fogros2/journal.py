@@ -8,6 +8,7 @@ The file has one JSON line per event. It is deleted with the folder when the lau
 from __future__ import annotations
 
 from collections.abc import Callable
+import contextlib
 import dataclasses
 import json
 import os
@@ -31,8 +32,6 @@ from fogros2.report import (
 FILE = 'steps.jsonl'
 #: Minimum interval in seconds between two progress lines of a step.
 PROGRESS_INTERVAL = 0.25
-#: Maximum number of events that wait for the folder.
-_WAITING = 1000
 
 
 class Journal:
@@ -43,7 +42,7 @@ class Journal:
     a launch must not stop the launch.
 
     :param report: receives each event.
-    :param folder: the launch's folder; events wait until it exists.
+    :param folder: the launch's folder; events before it exists are only passed on.
     """
 
     def __init__(
@@ -53,8 +52,6 @@ class Journal:
         self._folder = folder
         self._clock = clock
         self._lock = threading.Lock()
-        self._waiting: list[str] = []
-        self._begun = False
         self._told: dict[tuple[str, str], float] = {}
 
     def __call__(self, event: Event) -> None:
@@ -70,19 +67,10 @@ class Journal:
             line = self._line(event, now)
             if line is None:
                 return
-            if not self._begun and not self._folder.is_dir():
-                self._waiting = [*self._waiting, line][-_WAITING:]
-                return
-            lines, self._waiting, self._begun = [*self._waiting, line], [], True
-            try:
-                handle = os.open(self._folder / FILE,
-                                 os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
-                try:
-                    os.write(handle, ''.join(lines).encode())
-                finally:
-                    os.close(handle)
-            except OSError:
-                return
+            with contextlib.suppress(OSError), open(
+                    self._folder / FILE, 'a', encoding='utf-8',
+                    opener=lambda path, flags: os.open(path, flags, 0o600)) as file:
+                file.write(line)
 
     def _line(self, event: Event, now: float) -> Optional[str]:
         about: dict[str, Any]

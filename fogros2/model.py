@@ -252,12 +252,11 @@ class Command:
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """The result of a command: exit status, output as text, duration in seconds."""
+    """The result of a command: exit status, output as text."""
 
     returncode: int
     stdout: str
     stderr: str
-    seconds: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)

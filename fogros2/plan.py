@@ -24,7 +24,8 @@ DEFAULT_RMW = 'rmw_cyclonedds_cpp'
 #: The PATH of a login shell without the user's own additions.
 SYSTEM_PATH = '/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin'
 
-_PATH_VARIABLES = (
+#: Variables with lists of folders.
+PATH_LISTS = (
     'AMENT_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'PYTHONPATH',
     'LD_LIBRARY_PATH', 'PATH')
 #: Variables of the robot that are valid on any machine.
@@ -41,7 +42,7 @@ def extended(base: Mapping[str, str], given: Mapping[str, str]) -> dict[str, str
     :param base: variables that nodes need; ``given`` are those of the launch file.
     """
     longer = {name: os.pathsep.join(filter(None, [given[name], base[name]]))
-              for name in _PATH_VARIABLES if name in given and name in base}
+              for name in PATH_LISTS if name in given and name in base}
     return {**base, **given, **longer}
 
 
@@ -236,14 +237,14 @@ def underlay(
     :param prefix: the interpreter's prefix; a virtual environment belongs to the underlay.
     """
     ament = [p for p in environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
-    outside = [p for p in ament if not _below(p, workspaces)]
+    outside = [p for p in ament if not below(p, workspaces)]
     prefixes = list(dict.fromkeys([*outside, *([prefix] if prefix != '/usr' else [])]))
     kept = [*prefixes, *workspaces]
     variables = {}
-    for name in _PATH_VARIABLES:
+    for name in PATH_LISTS:
         entries = [
             entry for entry in environment.get(name, '').split(os.pathsep)
-            if entry and _below(entry, kept)]
+            if entry and below(entry, kept)]
         if name == 'PATH':
             entries = list(dict.fromkeys([*entries, os.path.dirname(ros2), SYSTEM_PATH]))
         if entries:
@@ -254,7 +255,8 @@ def underlay(
                     environment.get('RMW_IMPLEMENTATION') or DEFAULT_RMW)
 
 
-def _below(path: str, roots: Iterable[str]) -> bool:
+def below(path: str, roots: Iterable[str]) -> bool:
+    """Return whether a path is one of some folders, or below one."""
     return any(path == root or path.startswith(root.rstrip('/') + '/') for root in roots)
 
 

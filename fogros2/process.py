@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 import time
-from typing import BinaryIO, Optional
+from typing import Any, BinaryIO, Optional
 
 from fogros2.errors import Cancelled, CommandError, DeadlineExceeded, PrerequisiteError
 from fogros2.model import Command, Result
@@ -47,28 +47,16 @@ def start(
 
     :raises FileNotFoundError: there is no such program.
     """
-    words = argv(command)
-    if not _through_sudo(command):
-        return subprocess.Popen(words, env=environment, stdin=stdin, stdout=subprocess.PIPE,
-                                stderr=stderr, start_new_session=True, pass_fds=inherited)
-    if sys.version_info >= (3, 11):
-        return subprocess.Popen(words, env=environment, stdin=stdin, stdout=subprocess.PIPE,
-                                stderr=stderr, process_group=0)
-    return subprocess.Popen(words, env=environment, stdin=stdin, stdout=subprocess.PIPE,
-                            stderr=stderr, preexec_fn=os.setpgrp)
+    apart: dict[str, Any] = {'start_new_session': True, 'pass_fds': inherited}
+    if _through_sudo(command):
+        apart = {'process_group': 0} if sys.version_info >= (3, 11) else {
+            'preexec_fn': os.setpgrp}
+    return subprocess.Popen(argv(command), env=environment, stdin=stdin, stdout=subprocess.PIPE,
+                            stderr=stderr, **apart)
 
 
 def _through_sudo(command: Command) -> bool:
     return command.sudo and os.geteuid() != 0
-
-
-def refresh_ticket() -> bool:
-    """
-    Extend the time until sudo asks for a password again; return False if sudo refuses now.
-
-    Without effect if sudo needs no password.
-    """
-    return not sudo_trouble()
 
 
 def ask_for_ticket(what: str) -> bool:
@@ -89,7 +77,11 @@ def ask_for_ticket(what: str) -> bool:
 
 
 def sudo_trouble(*, timeout: float = 10.0) -> tuple[str, str] | None:
-    """Return why sudo refuses at the moment, and the remedy; None if it does not refuse."""
+    """
+    Return why sudo refuses at the moment, and the remedy; None if it does not refuse.
+
+    A call extends the time until sudo asks for a password again.
+    """
     if os.geteuid() == 0:
         return None
     asked = run(Command(('true',), sudo=True), timeout=timeout, check=False)
@@ -150,7 +142,6 @@ def run(
     :raises PrerequisiteError: the program is missing, or cannot be started.
     """
     words = argv(command)
-    begin = time.monotonic()
     path = _ENVIRONMENT.get('PATH', os.defpath)
     environment = {**_ENVIRONMENT, 'PATH': f'{path}:/usr/sbin:/sbin', **command.environment}
     try:
@@ -183,7 +174,7 @@ def run(
     threads = [threading.Thread(target=read, args=(name,), daemon=True) for name in output]
     for thread in threads:
         thread.start()
-    deadline = begin + timeout
+    deadline = time.monotonic() + timeout
     what = command.what or words[0]
     try:
         while True:
@@ -202,9 +193,8 @@ def run(
     for thread in threads:
         # a daemon that the command left may keep the pipe open
         thread.join(2.0)
-    result = Result(
-        child.returncode, output['stdout'].decode(errors='replace'),
-        output['stderr'].decode(errors='replace'), time.monotonic() - begin)
+    result = Result(child.returncode, output['stdout'].decode(errors='replace'),
+                    output['stderr'].decode(errors='replace'))
     if check and result.returncode != 0:
         hint = ''
         if command.sudo and 'password is required' in result.stderr:

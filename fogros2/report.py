@@ -85,6 +85,15 @@ Event = Union[StepStarted, StepDone, StepFailed, Progress, ClockMeasured, Warned
 Reporter = Callable[[Event], None]
 
 
+def size(number: float) -> str:
+    """Return bytes as text with a decimal unit."""
+    for unit in ('B', 'kB', 'MB', 'GB'):
+        if number < 1000:
+            return f'{number:.0f} {unit}' if unit == 'B' else f'{number:.1f} {unit}'
+        number /= 1000
+    return f'{number:.1f} TB'
+
+
 def silent(event: Event) -> None:
     """Ignore an event."""
 

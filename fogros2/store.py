@@ -114,7 +114,6 @@ class Record:
     :param public_key: the machine's VPN public key.
     :param robot_vpn: the robot's VPN interface.
     :param agent: the agent's folder on the machine.
-    :param python: interpreter on the machine that runs the agent.
     :param monitor: TCP port of its Foxglove bridge, 0 for none.
     :param monitor_open: where external clients reach that bridge (``host:port``), '' if they
         cannot.
@@ -142,7 +141,6 @@ class Record:
     robot_vpn: Optional[VpnInterface] = None
     agent: str = ''
     agent_program: str = ''
-    python: str = 'python3'
     monitor: int = 0
     monitor_open: str = ''
     damage: str = ''

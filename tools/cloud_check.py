@@ -74,7 +74,7 @@ def main() -> int:
         return 1
     if price is not None:
         seconds = time.monotonic() - begin
-        print(f'-- cost: at most ${cost.dollars(price * Decimal(seconds) / 3600)} '
+        print(f'-- cost: at most ${cost.short(price * Decimal(seconds) / 3600)} '
               f'({seconds:.0f} s at {plan.price(price)}), disk and traffic aside')
     problems = [f'left at {args.provider}: {machine.id}' for machine in left]
     if status != 0:

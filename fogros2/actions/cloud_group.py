@@ -14,7 +14,7 @@ from fogros2.describe.machines import checked
 from fogros2.launch_internals.wrapping import wrap
 from fogros2.runtime.coordinator import Coordinator
 from fogros2.runtime.remote_process import RemoteProcess, send, send_components
-from fogros2.runtime.republishers import RobotRepublisher
+from fogros2.runtime.republishers import AddedProcess
 
 if TYPE_CHECKING:
     from fogros2.describe.machines import SomeMachine
@@ -44,7 +44,6 @@ class CloudGroup(GroupAction):
             super().__init__(list(actions), **kwargs)
         self.machine = checked(machine)
         self.stream_topics = list(stream_topics)
-        self._streams: Sequence[Entry] = ()
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Execute the group: return its content, with remote processes in place of local ones."""
@@ -62,7 +61,7 @@ class CloudGroup(GroupAction):
                 not entity.condition.evaluate(context)):
             return  # launch skips it
         if isinstance(entity, ExecuteLocal) and not isinstance(
-                entity, (RemoteProcess, RobotRepublisher)):
+                entity, (RemoteProcess, AddedProcess)):
             send(entity, self._resolved, self._streams)
         else:
             send_components(entity, self._resolved, self._streams, context)

@@ -28,7 +28,7 @@ from fogros2.actions.fog_machine import FogMachine
 from fogros2.describe import keywords
 from fogros2.errors import ConfigurationError
 from fogros2.launch_internals import private
-from fogros2.launch_internals.wrapping import wrap
+from fogros2.launch_internals.wrapping import below, wrap
 from fogros2.model import RobotNodes
 from fogros2.runtime import streaming
 from fogros2.runtime.coordinator import Coordinator
@@ -130,9 +130,7 @@ def cloud_entities(
         if has_machine(entity):
             yield entity, sure
         if not isinstance(entity, IncludeLaunchDescription):
-            below = [entity.describe_sub_entities(), *(
-                some for _, some in entity.describe_conditional_sub_entities())]
-            for some in below:
+            for some in below(entity):
                 yield from cloud_entities(some, sure)
 
 

@@ -11,7 +11,7 @@ from launch.actions import IncludeLaunchDescription, OpaqueFunction
 
 from fogros2.actions.launch_description import cloud_entities, has_machine
 from fogros2.describe.overrides import Overrides
-from fogros2.launch_internals.wrapping import wrap
+from fogros2.launch_internals.wrapping import below, wrap
 from fogros2.runtime.coordinator import Coordinator
 
 if TYPE_CHECKING:
@@ -68,12 +68,11 @@ def _look_through(
     for entity in entities:
         if has_machine(entity) and entity.machine is not None:
             machines.append(entity.machine)
-        below = [entity.describe_sub_entities(), *(
-            some for _, some in entity.describe_conditional_sub_entities())]
-        for some in below:
+        for some in below(entity):
             whole = _look_through(some, machines) and whole
         if isinstance(entity, OpaqueFunction) or (
-                isinstance(entity, IncludeLaunchDescription) and not below[0]):
+                isinstance(entity, IncludeLaunchDescription)
+                and not entity.describe_sub_entities()):
             whole = False
     return whole
 

@@ -13,7 +13,6 @@ from launch.actions import GroupAction
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.describe import values
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport.streams import StreamTopic
 from fogros2.image_transport.topics import absolute, local_topic
 from fogros2.launch_internals import components
 from fogros2.runtime import replicas
@@ -104,8 +103,7 @@ class Replicated(Action):
         self, coordinator: Coordinator, namespace: str, outputs: Sequence[str],
     ) -> set[str]:
         """Return the topics that reach the machines as streams from the robot."""
-        entries = [entry if isinstance(entry, StreamTopic) else StreamTopic(*entry)
-                   for entry in coordinator.all_streams(self._stream_topics, namespace)]
+        entries = coordinator.all_streams(self._stream_topics, namespace)
         for entry in entries:
             if entry.topic in outputs:
                 raise ConfigurationError(

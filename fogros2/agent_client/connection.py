@@ -51,15 +51,13 @@ class AgentClient:
     A connection to a machine's agent that reconnects after a loss.
 
     One thread reads, and checks each message against ``fogros2.events``. It passes each event to
-    the subscribers, once and in order, and adds ``ConnectionChanged`` and ``Gap``. It gives up an
+    the subscriber, once and in order, and adds ``ConnectionChanged`` and ``Gap``. It gives up an
     agent that sends an invalid message, as one that is gone.
-    A subscriber must not make requests: its own thread would have to read their replies.
+    The subscriber must not make requests: its own thread would have to read their replies.
 
     :param shell: reaches the machine.
     :param directory: the agent's directory on the machine.
-    :param python: interpreter on the machine.
     :param agent_path: path of ``agent.py`` on the machine.
-    :param cancel: when set, requests raise Cancelled and no new connection is opened.
     :param silence: seconds without a byte, although a ping was sent, after which a connection
         counts as lost. TCP would need 15 minutes after the robot has changed networks.
     :param restart: seconds that an agent may need to restart.
@@ -71,18 +69,15 @@ class AgentClient:
         directory: str,
         *,
         agent_path: str,
-        python: str = 'python3',
-        cancel: Optional[threading.Event] = None,
         silence: float = SILENCE,
         restart: float = RESTART,
     ) -> None:
         self._shell = shell
         self._command = Command(
             # -IS: the agent needs only the standard library, and searching for more takes time
-            (python, '-IS', agent_path, 'connect', '--directory', directory),
+            ('python3', '-IS', agent_path, 'connect', '--directory', directory),
             what='reach the agent')
-        self._callbacks: list[EventCallback] = []
-        self._cancel = cancel or threading.Event()
+        self._callback: Optional[EventCallback] = None
         self._closed = threading.Event()
         self._lock = threading.Lock()
         self._writing = threading.Lock()
@@ -139,7 +134,6 @@ class AgentClient:
             than half of ``silence``, because a busy agent still answers pings.
         :raises AgentError: refused, with the agent's hint; or no agent is there (any more).
         :raises DeadlineExceeded: no reply in time.
-        :raises Cancelled: ``cancel`` was set.
         """
         if threading.current_thread() is self._thread:
             raise RuntimeError('a subscriber must not make requests')
@@ -158,8 +152,6 @@ class AgentClient:
         deadline = begin + timeout
         try:
             while not pending.done.wait(min(0.1, max(0.0, deadline - time.monotonic()))):
-                if self._cancel.is_set():
-                    raise Cancelled(f"'{command}' of the agent")
                 if time.monotonic() >= deadline:
                     raise DeadlineExceeded(
                         f"the agent didn't answer '{command}' within {timeout:g} s")
@@ -181,21 +173,14 @@ class AgentClient:
         """Return the agent's state; see ``request``."""
         return cast(events.Status, self.request('status', timeout=timeout))
 
-    def subscribe(self, callback: EventCallback, since: Optional[int] = None) -> None:
+    def subscribe(self, callback: EventCallback, since: int) -> None:
         """
         Pass events to ``callback``, each once and in order, across lost connections.
 
-        The first subscriber decides where to begin; later ones join at the current event.
-
-        :param since: first seq, 1 for all that the agent has; None for new events only.
+        :param since: first seq, 1 for all that the agent has.
         :raises AgentError: as for ``request``.
         """
-        if since is None and self._next is None:
-            since = self.status()['next']
-        self._callbacks.append(callback)
-        if self._next is not None or since is None:
-            return
-        self._next = since
+        self._callback, self._next = callback, since
         self.connect()
         with self._lock:
             stream = self._stream
@@ -317,8 +302,8 @@ class AgentClient:
             self._tell({'event': 'gap', 'count': log['lost']})
 
     def _tell(self, event: events.Event) -> None:
-        for callback in self._callbacks:
-            callback(event)
+        if self._callback is not None:
+            self._callback(event)
 
     def _follow_on(self, stream: Stream) -> None:
         self._log_request = next(self._numbers)
@@ -350,8 +335,6 @@ class AgentClient:
     def _reopen(self) -> None:
         """Reconnect, with increasing pauses, until the client is closed."""
         def attempt() -> Optional[Stream]:
-            if self._cancel.is_set():
-                raise Cancelled('the connection to the agent')
             with contextlib.suppress(ConnectError, DeadlineExceeded):
                 return self._shell.open(self._command)
             return None

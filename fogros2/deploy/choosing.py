@@ -39,10 +39,8 @@ class Choices:
         :raises FogError: nothing fits.
         """
         key = model.to_json(spec)
-        with self._lock:
-            known = self._resolved.get(key)
-        if known is not None:
-            return known
+        if key in self._resolved:
+            return self._resolved[key]
         provider = self._provider(spec.provider)
         if not provider.capabilities.choices:
             return spec
@@ -52,8 +50,7 @@ class Choices:
             price = self.price(chosen)
             if price is not None:
                 detail.append(plan.price(price))
-        with self._lock:
-            self._resolved[key] = chosen
+        self._resolved[key] = chosen
         return chosen
 
     def places(self, spec: MachineSpec) -> list[MachineSpec]:
@@ -67,17 +64,13 @@ class Choices:
         provider = self._provider(spec.provider)
         if not isinstance(provider, Cheapest):
             return [spec]
-        with self._lock:
-            known = self._places.get(spec.name)
-        if known is None:
+        if spec.name not in self._places:
             with step(self._report, spec.name, 'offers') as detail:
                 found = provider.places(spec)
                 detail += [str(offer) for offer, _ in found[:2]]
                 detail += [f'{len(found) - 2} more'] * (len(found) > 2)
-            known = [place for _, place in found]
-            with self._lock:
-                self._places[spec.name] = known
-        return known
+            self._places[spec.name] = [place for _, place in found]
+        return self._places[spec.name]
 
     def price(self, spec: MachineSpec) -> Optional[Decimal]:
         """Return the price of a machine in US dollars per hour, None if unknown."""

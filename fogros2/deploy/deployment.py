@@ -57,9 +57,12 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
         ros_step = pool.submit(installing.install_ros, context, job, planned.set_result)
         wait([planned, ros_step], return_when=FIRST_COMPLETED)
         # in parallel with the installation on the machine
-        with job.failing():
+        try:
             ros = planned.result() if planned.done() else ros_step.result()
             joining.avoid(ros.facts.routes)
+        except BaseException:
+            job.cancel.set()
+            raise
         modules = installing.Modules(context, job, ros)
         containers = Containers(context, job)
         vpn_step = pool.submit(joining.join)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 import contextlib
 import dataclasses
 import threading
@@ -68,15 +68,6 @@ class MachineJob:
         self._out_of_reach: Optional[bool] = None
         #: Set when the launch is cancelled, or when a step fails: parallel steps then end.
         self.cancel = Either(context.cancel)
-
-    @contextlib.contextmanager
-    def failing(self) -> Iterator[None]:
-        """Cancel the parallel steps if the block fails."""
-        try:
-            yield
-        except BaseException:
-            self.cancel.set()
-            raise
 
     def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
         """Report a step of this machine around a block; see :func:`fogros2.report.step`."""

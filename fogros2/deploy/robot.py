@@ -12,7 +12,7 @@ from typing import Optional
 
 from fogros2 import plan, plugin_system, process, ros2_daemon
 from fogros2.errors import PrerequisiteError
-from fogros2.model import Command, VpnInterface
+from fogros2.model import Command
 from fogros2.provider import Provider
 from fogros2.provider.cheapest import Cheapest
 from fogros2.report import Reporter, silent, step
@@ -95,9 +95,9 @@ def cleanup(record: Record, store: Store, report: Reporter = silent) -> None:
 
     :raises FogError: something could not be removed; the record then stays.
     """
-    if record.robot_vpn is not None and record.launch and not record.launch_alive:
+    if record.launch and not record.launch_alive:
         with step(report, record.name, 'VPN interface'):
-            take_down(store.launch(record.launch), record.robot_vpn, record.spec.vpn)
+            clear(store.root / 'launches' / record.launch)
     store.delete(record.name)
 
 
@@ -105,18 +105,14 @@ def clear(folder: Path) -> None:
     """
     Delete the VPN interface, firewall rules, key and folder of a dead launch.
 
+    The ROS 2 daemon that it had is stopped before.
+
     :raises FogError: a resource could not be deleted.
     """
     name = f'fog{folder.name}'
     interface = plan.robot_interface(
         folder.name, '127.0.0.0/24', 0, helped.key_of(name) or str(folder / 'vpn.key'), 0)
-    take_down(folder, interface, 'wireguard')
-
-
-def take_down(folder: Path, interface: Optional[VpnInterface], kind: str) -> None:
-    """Delete a launch's VPN interface and folder, and stop the ROS 2 daemon that it had."""
-    if interface is not None:
-        ros2_daemon.stop(folder)
-        vpn: Vpn = plugin_system.load('fogros2.vpn', kind)()
-        run(vpn.down(interface), timeout=Timeouts().vpn)
+    ros2_daemon.stop(folder)
+    vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')()
+    run(vpn.down(interface), timeout=Timeouts().vpn)
     shutil.rmtree(folder, ignore_errors=True)

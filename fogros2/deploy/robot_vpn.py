@@ -81,7 +81,7 @@ class RobotVpn:
         self._stop = threading.Event()
         self._poll_interval = POLL_INTERVAL
         # the helper needs no ticket; container machines then refresh one that is there
-        self._ticket = not helped.made(interface) or process.refresh_ticket()
+        self._ticket = not helped.made(interface) or process.sudo_trouble() is None
         self._ticket_valid = True
         self._ticket_refreshed = time.monotonic()
 
@@ -215,7 +215,7 @@ class RobotVpn:
 
     def _refresh_ticket(self) -> None:
         """Refresh sudo's ticket, so that the way down needs no password; warn if it has ended."""
-        before, self._ticket_valid = self._ticket_valid, process.refresh_ticket()
+        before, self._ticket_valid = self._ticket_valid, process.sudo_trouble() is None
         if before and not self._ticket_valid:
             self.report(StepFailed(
                 '', 'sudo ticket', 0.0,

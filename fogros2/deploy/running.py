@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import contextlib
-import json
 from pathlib import Path
 import secrets
 import threading
@@ -20,7 +19,7 @@ from fogros2.deploy.steps.watching import Watch
 from fogros2.errors import AgentError, FogError
 from fogros2.events import Event
 from fogros2.host import idle
-from fogros2.model import host_port, Machine, NodeSpec, to_json
+from fogros2.model import host_port, Machine, NodeSpec
 
 
 class RunningMachine(Step):
@@ -48,7 +47,7 @@ class RunningMachine(Step):
         self._containers = containers
         self._warm = False
         self._lock = threading.Lock()
-        self._callbacks: list[EventCallback] = []
+        self._callback: Optional[EventCallback] = None
         self._lost = ''
         self._published: dict[int, tuple[str, int]] = {}
         job.undo.callback(Watch(
@@ -67,7 +66,7 @@ class RunningMachine(Step):
         :raises PrerequisiteError: the machine cannot get their imports or their image.
         """
         nodes = self._modules.fitted(self._containers.inside(nodes))
-        self.agent.request('start', nodes=json.loads(to_json(nodes)))
+        self.agent.request('start', nodes=nodes)
         if self.spec.idle_timeout is not None:
             # the time begins anew with each start
             timeout = self.spec.idle_timeout
@@ -130,8 +129,7 @@ class RunningMachine(Step):
                 callback(event)
 
         with self._lock:
-            self._callbacks.append(callback)
-            lost = self._lost
+            self._callback, lost = callback, self._lost
         if lost:
             callback({'event': 'lost', 'reason': lost})
             return
@@ -159,9 +157,8 @@ class RunningMachine(Step):
 
     def _report_end(self, reason: str) -> None:
         with self._lock:
-            self._lost = reason
-            callbacks = list(self._callbacks)
-        for callback in callbacks:
+            self._lost, callback = reason, self._callback
+        if callback is not None:
             callback({'event': 'lost', 'reason': reason})
 
     def retire(self) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 import contextlib
 import inspect
 import re
-from typing import Any, Union
+from typing import Any
 
 from fogros2 import plugin_system
 from fogros2.describe import values
@@ -69,35 +69,18 @@ def read(keyword: Keyword, text: str) -> Any:
 
     :raises ConfigurationError: the text does not fit the keyword's kind.
     """
-    try:
-        return _read(keyword, text)
-    except ConfigurationError as error:
-        raise ConfigurationError(f'{keyword.name}: {error.args[0]}', error.hint) from error
-
-
-def _read(keyword: Keyword, text: str) -> Any:
-    if keyword.kind == 'bool':
-        return values.read_bool(text)
-    if keyword.kind == 'list':
-        return values.split(text)
-    if keyword.kind == 'scalar' and text.lower() in ('true', 'false'):
-        return values.read_bool(text)
-    if keyword.kind in ('number', 'scalar'):
-        return number(text)
-    if keyword.kind in ('mapping', 'table') or (
-            keyword.kind == 'text or mapping' and text.startswith('{')):
-        return _nested(keyword, text)
-    return text
-
-
-def number(text: str) -> Union[int, float, str]:
-    """Return the number in a text, or the text itself if it is no number, such as '8h'."""
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
+    with values.named(keyword.name):
+        if keyword.kind == 'bool' or keyword.kind == 'scalar' and text.lower() in (
+                'true', 'false'):
+            return values.read_bool(text)
+        if keyword.kind == 'list':
+            return values.split(text)
+        if keyword.kind in ('number', 'scalar'):
+            return values.number(text)
+        if keyword.kind in ('mapping', 'table') or (
+                keyword.kind == 'text or mapping' and text.startswith('{')):
+            return _nested(keyword, text)
+        return text
 
 
 def _nested(keyword: Keyword, text: str) -> Any:

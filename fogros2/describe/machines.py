@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-import contextlib
+from collections.abc import Mapping, Sequence
 import inspect
 import os
 import re
@@ -118,6 +117,7 @@ class CloudInstance:
         options: Optional[Mapping[str, Any]] = None,
         **unknown: object,
     ) -> None:
+        given = locals()
         if unknown:
             raise self._unknown(next(iter(unknown)))
         if not self.provider:
@@ -128,16 +128,7 @@ class CloudInstance:
         self._name = names.two_words() if name is None else name
         self._workspace = ros_workspace
         self._working_dir_base = working_dir_base
-        self._values: dict[str, Any] = {
-            'on_exit': on_exit, 'lifetime': lifetime, 'robot_timeout': robot_timeout,
-            'bootstrap': bootstrap, 'on_interrupt': on_interrupt,
-            'max_replacements': max_replacements,
-            'checkpoint_interval': checkpoint_interval,
-            **({} if idle_timeout is None else {'idle_timeout': idle_timeout}),
-            **({} if on_loss_after is None else {'on_loss_after': on_loss_after}),
-            **({} if checkpoint is None else {'checkpoint': checkpoint}),
-            **({} if bandwidth is None else {'bandwidth': bandwidth}),
-        }
+        self._values = {name: given[name] for name in _CHECKS if given[name] is not None}
         self._environment = dict(environment or {})
         self._options = {k: v for k, v in (options or {}).items() if v is not None}
         self._foxglove = launch_foxglove
@@ -148,7 +139,7 @@ class CloudInstance:
         self._running: Optional[RunningMachine] = None
         # values that are known already are checked where they are written
         for key, value in self._options.items():
-            with _named(key):
+            with values.named(key):
                 values.check_plain(value)
         if isinstance(self._name, str):
             check_name(self._name)
@@ -286,17 +277,14 @@ class CloudInstance:
             settings = {
                 key: _CHECKS[key](key, values.resolve(context, value))
                 for key, value in self._values.items()}
-            self._check_findable(settings['on_exit'])
-            _check_loss(settings)
             workspace = values.resolve(context, self._workspace)
             chain = find_workspaces(context.environment)
             if workspace is None:
                 workspace = next(iter(chain), None)
             elif workspace:
                 workspace = os.path.abspath(os.path.expanduser(workspace))
-            name = values.resolve(context, self._name)
-            self._spec = MachineSpec(
-                name=check_name(name),
+            spec = MachineSpec(
+                name=check_name(values.resolve(context, self._name)),
                 provider=self.provider,
                 options={
                     key: self._resolved(context, key, value)
@@ -311,6 +299,9 @@ class CloudInstance:
                 monitor_allow=networks.resolve(context, self._monitor_allow),
                 apt=self._wanted(context, 'apt'), pip=self._wanted(context, 'pip'),
                 **settings)
+            self._check_findable(spec.on_exit)
+            _check_loss(spec)
+            self._spec = spec
         return self._spec
 
     def _wanted(self, context: LaunchContext, program: str) -> tuple[str, ...]:
@@ -319,7 +310,7 @@ class CloudInstance:
         return tuple(dict.fromkeys(_PACKAGE_CHECKS[program](value) for value in wanted))
 
     def _resolved(self, context: LaunchContext, keyword: str, value: Any) -> Any:
-        with _named(keyword):
+        with values.named(keyword):
             return values.resolve_deferred(context, value)
 
     def _option(self, name: str) -> Any:
@@ -467,17 +458,16 @@ def parse_bandwidth(what: str, value: Union[str, int, float]) -> float:
     return bits
 
 
-def _check_loss(settings: Mapping[str, Any]) -> None:
+def _check_loss(spec: MachineSpec) -> None:
     """
     Check that a lost machine has stopped its nodes before they start elsewhere.
 
     :raises ConfigurationError: ``on_loss_after`` is too short.
     """
-    after = settings.get('on_loss_after')
-    if after is not None and after < settings['robot_timeout']:
+    if 0 < spec.on_loss_after < spec.robot_timeout:
         raise ConfigurationError(
-            f"on_loss_after={after:g} s is shorter than robot_timeout="
-            f"{settings['robot_timeout']:g} s: nodes may still run on a machine that is cut off",
+            f'on_loss_after={spec.on_loss_after:g} s is shorter than robot_timeout='
+            f'{spec.robot_timeout:g} s: nodes may still run on a machine that is cut off',
             'raise on_loss_after, or lower robot_timeout')
 
 
@@ -487,15 +477,6 @@ def _count(what: str, value: Union[str, int, float]) -> int:
         raise ConfigurationError(f'{what}={value!r} is no number of machines',
                                  'use a whole number from 1')
     return int(text)
-
-
-@contextlib.contextmanager
-def _named(keyword: str) -> Iterator[None]:
-    """Name the keyword in the error of a wrong value."""
-    try:
-        yield
-    except ConfigurationError as error:
-        raise ConfigurationError(f'{keyword}: {error.args[0]}', error.hint) from error
 
 
 def _choice(kind: Any) -> Any:
@@ -518,12 +499,7 @@ def _packages(program: str, given: Any) -> list[Union[values.Items, values.List]
 
     :raises ConfigurationError: not a list of packages.
     """
-    if isinstance(given, str):
-        raise ConfigurationError(f'{program}={given!r} is no list', f'{program}=[{given!r}]')
-    found = values.items(given)
-    for value in found if isinstance(found, values.Items) else ():
-        if isinstance(value, str):
-            _PACKAGE_CHECKS[program](value)
+    found = values.checked_items(program, given, _PACKAGE_CHECKS[program])
     return [] if found is None else [found]
 
 

@@ -16,19 +16,8 @@ _SUCH = "write networks such as '198.51.100.0/28', or addresses"
 
 
 def items(given: Any) -> Any:
-    """
-    Return networks as separate values, None for none; check those that are known already.
-
-    :raises ConfigurationError: a single text, or an invalid network.
-    """
-    if isinstance(given, str):
-        raise ConfigurationError(f'monitor_allow={given!r} is no list of networks', _SUCH)
-    found = values.items(given)
-    if isinstance(found, values.Items):
-        for value in found:
-            if isinstance(value, str):
-                normal(value)
-    return found
+    """Read a value of ``monitor_allow``; see :func:`values.checked_items`."""
+    return values.checked_items('monitor_allow', given, normal)
 
 
 def resolve(context: LaunchContext, networks: Any) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ import dataclasses
 import fnmatch
 from typing import Any, Optional, TYPE_CHECKING
 
-from fogros2.describe import keywords
+from fogros2.describe import keywords, values
 from fogros2.errors import ConfigurationError, did_you_mean
 
 if TYPE_CHECKING:
@@ -156,5 +156,5 @@ def _computer(text: str) -> dict[str, Any]:
     if not colon or host.endswith(']'):
         name, port = host, ''
     given = {'host': name.strip('[]'), 'user': user if at else None,
-             'port': keywords.number(port) if port else None}
+             'port': values.number(port) if port else None}
     return {key: value for key, value in given.items() if value is not None}

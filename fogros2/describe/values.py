@@ -4,16 +4,19 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+import contextlib
 from decimal import Decimal
 import os
-from typing import Any, Protocol, TYPE_CHECKING, Union
+from typing import Any, TYPE_CHECKING, Union
 
 from fogros2.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from launch import LaunchContext, SomeSubstitutionsType, Substitution
 
+#: Requests a value, in a thread, because that takes time; raises FogError.
+Deferred = Callable[[], str]
 _BOOLS = {'true': True, '1': True, 'false': False, '0': False}
 
 
@@ -52,6 +55,31 @@ def items(
     return List(values) if hasattr(values, 'perform') else Items(values)
 
 
+def checked_items(name: str, given: Any, check: Callable[[str], object]) -> Any:
+    """
+    Return the values of a list as separate items, None for none; check those that are known.
+
+    :param name: the keyword, for messages.
+    :raises ConfigurationError: a single text, or an invalid value.
+    """
+    if isinstance(given, str):
+        raise ConfigurationError(f'{name}={given!r} is no list', f'{name}=[{given!r}]')
+    found = items(given)
+    for value in found if isinstance(found, Items) else ():
+        if isinstance(value, str):
+            check(value)
+    return found
+
+
+@contextlib.contextmanager
+def named(keyword: str) -> Iterator[None]:
+    """Name the keyword in the error of a wrong value."""
+    try:
+        yield
+    except ConfigurationError as error:
+        raise ConfigurationError(f'{keyword}: {error.args[0]}', error.hint) from error
+
+
 def split(text: str) -> list[str]:
     """
     Split a text into values: ``a, b``, or YAML's ``[a, b]``; an empty text has none.
@@ -79,26 +107,15 @@ def read_yaml(text: str) -> Any:
         loader.dispose()
 
 
-class Deferred(Protocol):
-    """A value that takes time to obtain: the call makes the request, in a thread."""
-
-    def __call__(self) -> str:
-        """
-        Return the value; a second call returns the same.
-
-        :raises FogError: the request failed, or there is no such value.
-        """
-
-
 def resolve_deferred(context: LaunchContext, value: Any) -> Any:
-    """Resolve a value like ``resolve``, but return a slow value as a :class:`Deferred`."""
+    """Resolve a value like ``resolve``, but return a slow value as a ``Deferred``."""
     defer = getattr(value, 'defer', None)
     return resolve(context, value) if defer is None else defer(context)
 
 
 def await_all(options: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Call every :class:`Deferred` among options; run it in a thread.
+    Call every ``Deferred`` among options; run it in a thread.
 
     :raises FogError: a value cannot be obtained.
     """
@@ -159,16 +176,20 @@ def read_number(value: Any) -> Union[int, float]:
 
     :raises ConfigurationError: it is none.
     """
-    if isinstance(value, (int, float)):
-        return value
-    try:
-        return int(value) if isinstance(value, str) else float(value)
-    except ValueError:
-        pass
-    try:
-        return float(value)
-    except ValueError:
-        raise ConfigurationError(f'{value!r} is no number', 'such as 2 or 1.5') from None
+    found = number(value) if isinstance(value, str) else value
+    if isinstance(found, str):
+        raise ConfigurationError(f'{value!r} is no number', 'such as 2 or 1.5')
+    return found if isinstance(found, (int, float)) else float(found)
+
+
+def number(text: str) -> Union[int, float, str]:
+    """Return the number in a text, or the text itself if it is no number, such as '8h'."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
 
 
 def read_bool(value: Any) -> bool:

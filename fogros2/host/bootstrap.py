@@ -31,7 +31,7 @@ from fogros2.host import wheels as wheel_cache
 from fogros2.host import workspace as workspaces
 from fogros2.host.inspection import DISTRO, HostFacts, MIN_PYTHON, Python
 from fogros2.model import Bootstrap, Command, MachineSpec, Result
-from fogros2.plan import DEFAULT_RMW, extended, PLAIN_VARIABLES, SYSTEM_PATH, Underlay
+from fogros2.plan import DEFAULT_RMW, extended, PATH_LISTS, PLAIN_VARIABLES, SYSTEM_PATH, Underlay
 from fogros2.shell import Shell
 
 #: The system for which ROS 2 Jazzy has packages.
@@ -56,10 +56,6 @@ APT_PACKAGES = (
     'wireguard-tools', 'rsync', 'iproute2', 'nftables',
     'sudo',  # for rosdep; images of ROS lack it
 )
-#: Variables with lists of folders; of the robot's folders, a machine has only those that are sent.
-_PATH_VARIABLES = (
-    'AMENT_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'LD_LIBRARY_PATH',
-    'PYTHONPATH', 'PATH')
 #: Variables that ROS's setup script sets.
 _ROS_VARIABLES = ('ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION')
 
@@ -200,18 +196,18 @@ def ensure(
         if todo.install.kind == 'embedded':
             # The machine gets a copy of this environment.
             keys = needs.outside(keys, [sys.prefix])
+    install = todo.install
     if guest:
         ways, variables = workspaces.moved(
-            todo.install.workspaces, todo.install.environment, f'{facts.home}/ws', spec.name)
-        todo = dataclasses.replace(todo, install=dataclasses.replace(
-            todo.install, workspaces=ways, environment=variables))
-    folder = needs.PipFolder.of(spec, facts, keys)
+            install.workspaces, install.environment, f'{facts.home}/ws', spec.name)
+        install = dataclasses.replace(install, workspaces=ways, environment=variables)
+    folder = needs.pip_folder(spec, facts, keys)
     if spec.pip or keys:
-        todo = dataclasses.replace(todo, install=dataclasses.replace(
-            todo.install, environment=folder.found_by(todo.install.environment)))
+        install = dataclasses.replace(
+            install, environment=needs.with_pip_folder(folder, install.environment))
     for command in todo.tools:
         shell.run(command, timeout=timeout, cancel=cancel)
-    on_plan(todo.install)
+    on_plan(install)
     if todo.wheels_target:
         shell.run(Command(('mkdir', '-p', todo.wheels_target), what='make a folder for ROS 2'),
                   timeout=timeout, cancel=cancel)
@@ -220,14 +216,14 @@ def ensure(
     for command in todo.commands:
         shell.run(command, timeout=timeout, cancel=cancel)
     notes = [todo.note]
-    if (spec.apt or spec.pip or keys) and folder.done not in facts.installed:
-        notes += _complete(spec, todo, folder, keys, functools.partial(
+    if (spec.apt or spec.pip or keys) and os.path.basename(folder) not in facts.installed:
+        notes += _complete(spec, install, folder, keys, functools.partial(
             shell.run, timeout=timeout, cancel=cancel))
-    return todo.install, ', '.join(notes)
+    return install, ', '.join(notes)
 
 
 def _complete(
-    spec: MachineSpec, todo: Preparation, folder: needs.PipFolder, keys: Sequence[str],
+    spec: MachineSpec, install: RosInstall, folder: str, keys: Sequence[str],
     run: Callable[..., Result],
 ) -> list[str]:
     """
@@ -238,7 +234,7 @@ def _complete(
     :param run: function that runs a command on the machine.
     :raises PrerequisiteError: a package in the launch file cannot be installed.
     """
-    install, facts = todo.install, todo.install.facts
+    facts = install.facts
     environment = extended(install.environment, spec.environment)
     apt, pip, notes = spec.apt, spec.pip, []
     able = spec.bootstrap != 'none' and facts.root and 'apt-get' in facts.programs
@@ -246,7 +242,8 @@ def _complete(
     if left:
         asked = run(needs.resolve(left, environment, install.setup), check=False)
         if asked.returncode == needs.NO_ROSDEP and able:
-            run(apt_install([needs.rosdep_package(facts)], 'install rosdep'), check=False)
+            rosdep = 'python3-rosdep2' if facts.system == 'debian' else 'python3-rosdep'
+            run(apt_install([rosdep], 'install rosdep'), check=False)
             asked = run(needs.resolve(left, environment, install.setup), check=False)
         if asked.returncode == 0:
             more_apt, more_pip = needs.resolved(asked.stdout)
@@ -268,8 +265,7 @@ def _complete(
             notes.append(f"installed {', '.join(lacking)}")
     if not (apt or pip) and install.kind == 'ros':
         return notes
-    run(dataclasses.replace(folder, requirements=pip).fill(
-        install.environment, spec.environment, install.setup))
+    run(needs.fill(folder, pip, install.environment, spec.environment, install.setup))
     if pip:
         notes.append(f"installed {', '.join(pip)} by pip")
     return notes
@@ -456,7 +452,8 @@ def _merged(
     merged = {name: under.environment[name] for name in PLAIN_VARIABLES
               if name in under.environment and name not in _ROS_VARIABLES}
     below = tuple(f'{space.root}/' for space in chain)
-    for name in _PATH_VARIABLES:
+    for name in PATH_LISTS:
+        # of the robot's folders, a machine has only those that are sent
         entries = [entry for entry in under.environment.get(name, '').split(os.pathsep)
                    if entry.startswith(below)]
         own = install.environment.get(name)

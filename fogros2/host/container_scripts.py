@@ -13,12 +13,6 @@ FIND = ENGINE + """\
 [ "$engine" != podman ] || $as_root podman ps -q >/dev/null 2>&1 || engine=
 echo $engine
 """
-INSTALL = """\
-export DEBIAN_FRONTEND=noninteractive
-apt-get update -q
-apt-get install -q -y --no-install-recommends podman
-podman ps -q >/dev/null 2>&1 || apt-get install -q -y --no-install-recommends crun
-"""
 # Prints the engine's name of the image. An image of ROS without the launch's middleware (published
 # ones have only Fast DDS) gets a layer with it, once; not by 'build', which needs control groups.
 # The layer keeps the image's command and user; by default, a commit uses those of its container.

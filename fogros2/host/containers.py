@@ -60,6 +60,8 @@ _OWN_NETWORK = {'--ip', '--ip6', '--link', '--mac-address', '--network-alias', '
 FOGROS2_FILE = '/home/ubuntu/cyclonedds.xml'
 _MOUNTS = ('-v', '--volume', '--mount')
 _FOGROS2_SOURCE = re.compile(rf'(^|\b(?:source|src)=){FOGROS2_FILE}(?=[:,]|$)')
+#: Prints the machine's engine, or nothing if none works.
+FIND = Command.script(scripts.FIND, what='look for podman or docker')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -273,16 +275,6 @@ def reason(text: str) -> str:
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     errors = [line for line in lines if line.lower().startswith(('error', 'e: '))]
     return (errors or lines or ['no reason given'])[-1]
-
-
-def find() -> Command:
-    """Return the command that prints the machine's engine, or nothing if none works."""
-    return Command.script(scripts.FIND, what='look for podman or docker')
-
-
-def install() -> Command:
-    """Return the command that installs an engine."""
-    return Command.script(scripts.INSTALL, sudo=True, what='install podman')
 
 
 def fetch(image: str, rmw: str = '') -> Command:

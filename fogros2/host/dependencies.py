@@ -10,7 +10,6 @@ they replace no packages of the system, of ROS 2 or of this project (PEP 668).
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-import dataclasses
 import hashlib
 import json
 from pathlib import Path
@@ -136,11 +135,6 @@ def outside(names: Iterable[str], prefixes: Iterable[str]) -> tuple[str, ...]:
                  if not any((folder / name).exists() for folder in folders))
 
 
-def rosdep_package(facts: HostFacts) -> str:
-    """Return the Debian package of rosdep."""
-    return 'python3-rosdep2' if facts.system == 'debian' else 'python3-rosdep'
-
-
 def unknown(
     names: Sequence[str], environment: Mapping[str, str], setup: Sequence[str],
 ) -> Command:
@@ -181,61 +175,46 @@ def missing(names: Iterable[str]) -> Command:
                    what='look for apt packages')
 
 
-@dataclasses.dataclass(frozen=True)
-class PipFolder:
+def pip_folder(spec: MachineSpec, facts: HostFacts, names: Sequence[str] = ()) -> str:
     """
-    A folder on a machine with the packages of pip.
+    Return the path of a machine's folder with the packages of pip, below the user's home.
 
-    :param path: equal for equal requirements, so that they are installed once.
+    It is equal for equal requirements, so that they are installed once.
+
+    :param names: rosdep keys, some of which may need pip.
     """
+    need = json.dumps([sorted(spec.pip), sorted(names), sorted(spec.apt),
+                       *(python.version for python in facts.pythons)])
+    digits = hashlib.sha256(need.encode()).hexdigest()[:16]
+    return f'{facts.home}/.local/share/fogros2/pip-{digits}'
 
-    path: str
-    requirements: tuple[str, ...]
 
-    @classmethod
-    def of(
-        cls, spec: MachineSpec, facts: HostFacts, names: Sequence[str] = (),
-    ) -> PipFolder:
-        """
-        Return the folder of a machine, below the login user's home.
+def with_pip_folder(folder: str, environment: Mapping[str, str]) -> dict[str, str]:
+    """Return variables with which Python finds the packages of a folder after all others."""
+    before = environment.get('PYTHONPATH')
+    return {**environment, 'PYTHONPATH': f'{before}:{folder}/last' if before else f'{folder}/last'}
 
-        :param names: rosdep keys, some of which may need pip.
-        """
-        need = json.dumps([sorted(spec.pip), sorted(names), sorted(spec.apt),
-                           *(python.version for python in facts.pythons)])
-        digits = hashlib.sha256(need.encode()).hexdigest()[:16]
-        return cls(f'{facts.home}/.local/share/fogros2/pip-{digits}', spec.pip)
 
-    def found_by(self, environment: Mapping[str, str]) -> dict[str, str]:
-        """Return variables with which Python finds these packages after all others."""
-        own = f'{self.path}/last'
-        before = environment.get('PYTHONPATH')
-        return {**environment, 'PYTHONPATH': f'{before}:{own}' if before else own}
+def fill(
+    folder: str, requirements: Sequence[str], environment: Mapping[str, str],
+    given: Mapping[str, str], setup: Sequence[str],
+) -> Command:
+    """
+    Return the command that installs packages into a folder by one call of pip.
 
-    @property
-    def done(self) -> str:
-        """The name of the complete folder in ``HostFacts.installed``."""
-        return self.path.rpartition('/')[2]
-
-    def fill(
-        self, environment: Mapping[str, str], given: Mapping[str, str], setup: Sequence[str],
-    ) -> Command:
-        """
-        Return the command that installs the packages by one call of pip.
-
-        :param environment: variables of nodes there; ``given`` has those of the launch file.
-        """
-        names = ' '.join(name.replace('-', '_') for name in OURS)
-        script = modules.PIP.format(folder=shlex.quote(self.path)) if self.requirements else (
-            f'set -e\nmkdir -p {shlex.quote(self.path)}\ncd {shlex.quote(self.path)}\n')
-        script += (
-            (f'"$@" {shlex.join(self.requirements)}\n' if self.requirements else '') +
-            'rm -rf pip\n'
-            f'for name in {names}; do [ ! -e "site/$name" ] || {{\n'
-            "    echo \"one of the packages brings '$name', which is part of FogROS2\" >&2\n"
-            '    rm -rf site; exit 1; }\n'
-            'done\n'
-            f'mkdir -p last\nprintf %s {shlex.quote(_LAST_IN_PATH)} >last/sitecustomize.py\n'
-            ': >complete\n')
-        return modules.among_nodes(
-            plan.extended(environment, given), setup, script, 'install Python packages')
+    :param environment: variables of nodes there; ``given`` has those of the launch file.
+    """
+    names = ' '.join(name.replace('-', '_') for name in OURS)
+    script = modules.PIP.format(folder=shlex.quote(folder)) if requirements else (
+        f'set -e\nmkdir -p {shlex.quote(folder)}\ncd {shlex.quote(folder)}\n')
+    script += (
+        (f'"$@" {shlex.join(requirements)}\n' if requirements else '') +
+        'rm -rf pip\n'
+        f'for name in {names}; do [ ! -e "site/$name" ] || {{\n'
+        "    echo \"one of the packages brings '$name', which is part of FogROS2\" >&2\n"
+        '    rm -rf site; exit 1; }\n'
+        'done\n'
+        f'mkdir -p last\nprintf %s {shlex.quote(_LAST_IN_PATH)} >last/sitecustomize.py\n'
+        ': >complete\n')
+    return modules.among_nodes(
+        plan.extended(environment, given), setup, script, 'install Python packages')

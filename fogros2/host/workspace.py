@@ -23,6 +23,7 @@ from fogros2 import process
 from fogros2.errors import WorkspaceError
 from fogros2.host.inspection import DISTRO, HostFacts
 from fogros2.model import Command
+from fogros2.report import size
 from fogros2.shell import Shell
 from fogros2.waiting import Timeouts
 
@@ -294,17 +295,9 @@ def transfer(
     for command in [command for way in ways for command in way.commands]:
         shell.run(command, timeout=timeouts.build, cancel=cancel)
     sent = (f'{sum(report.files for report in reports)} files, '
-            f'{_size(sum(report.bytes for report in reports))}')
+            f'{size(sum(report.bytes for report in reports))}')
     return ', '.join([sent, *(
         f'built there: {way.reason}' for way in ways if way.commands)])
-
-
-def _size(number: float) -> str:
-    for unit in ('B', 'kB', 'MB'):
-        if number < 1000:
-            return f'{number:.3g} {unit}'
-        number /= 1000
-    return f'{number:.3g} GB'
 
 
 def _why_build(workspace: Workspace, machine: HostFacts, robot: HostFacts) -> str:
@@ -374,7 +367,7 @@ def _sources(folder: Path) -> Iterator[tuple[str, Path]]:
     if {'COLCON_IGNORE', 'AMENT_IGNORE', 'CATKIN_IGNORE'} & names:
         return
     if 'package.xml' in names:
-        name = _package_name(folder / 'package.xml')
+        name = (_parsed(folder / 'package.xml').findtext('name') or '').strip()
         if name:
             yield name, folder
         return
@@ -382,10 +375,6 @@ def _sources(folder: Path) -> Iterator[tuple[str, Path]]:
         path = folder / entry
         if path.is_dir() and not entry.startswith('.'):
             yield from _sources(path)
-
-
-def _package_name(manifest: Path) -> str:
-    return (_parsed(manifest).findtext('name') or '').strip()
 
 
 def _parsed(manifest: Path) -> ElementTree.Element:
@@ -397,8 +386,7 @@ def _parsed(manifest: Path) -> ElementTree.Element:
 
 
 def _build_type(folder: Path) -> str:
-    export = ElementTree.parse(folder / 'package.xml').getroot().find('export')
-    return (export.findtext('build_type') or '').strip() if export is not None else ''
+    return (_parsed(folder / 'package.xml').findtext('export/build_type') or '').strip()
 
 
 def _inspect_installed(workspace: Workspace) -> Workspace:

@@ -44,29 +44,25 @@ class Republish(ImageTransport):
 
     def encoder(self, stream: Stream) -> NodeSpec:
         """Return the ``republish`` node from raw."""
-        image = local_topic(stream.topic, stream.source)
-        return self._node(stream, 'encoder', stream.source, 'raw', self.plugin, 'out', {
-            'in': image})
+        return self._node(stream, 'encoder', stream.source, 'in', 'out')
 
     def decoder(self, stream: Stream) -> NodeSpec:
         """Return the ``republish`` node to raw."""
-        image = local_topic(stream.topic, stream.target)
-        return self._node(stream, 'decoder', stream.target, self.plugin, 'raw', 'in', {
-            'out': image})
+        return self._node(stream, 'decoder', stream.target, 'out', 'in')
 
     def _node(
-        self, stream: Stream, role: str, machine: Optional[str], source: str, target: str,
-        side: str, names: dict[str, str],
+        self, stream: Stream, role: str, machine: Optional[str], raw: str, encoded: str,
     ) -> NodeSpec:
+        """Return a node; ``raw`` and ``encoded`` are its sides, 'in' or 'out'."""
         check(stream)
         label, full, between = names_of(stream, role, self.plugin)
-        words = ['--ros-args', '-r', f'__node:={full}', '-p', f'in_transport:={source}',
-                 '-p', f'out_transport:={target}']
-        for old, new in {**names, f'{side}/{self.plugin}': between}.items():
-            words += ['-r', f'{old}:={new}']
+        image = local_topic(stream.topic, machine)
+        words = ['--ros-args', '-r', f'__node:={full}', '-p', f'{raw}_transport:=raw',
+                 '-p', f'{encoded}_transport:={self.plugin}', '-r', f'{raw}:={image}',
+                 '-r', f'{encoded}/{self.plugin}:={between}']
         if role == 'encoder':
             # cameras often publish best effort, which a reliable subscription would not receive
-            words += ['-p', f"qos_overrides.{names['in']}.subscription.reliability:=best_effort"]
+            words += ['-p', f'qos_overrides.{image}.subscription.reliability:=best_effort']
             for key, value in stream.options.items():
                 if key != 'camera_info':
                     name = key if '.' in key else f'{self._prefix(between)}.{key}'

@@ -50,9 +50,29 @@ class StreamTopic:
                             ('direction', direction), ('parameters', parameters)):
             object.__setattr__(self, name, value)
 
+    def but(self, **changes: Any) -> StreamTopic:
+        """Return the topic with other values."""
+        fields = {**vars(self), **changes}
+        parameters = fields.pop('parameters')
+        return StreamTopic(**fields, **parameters)
+
 
 #: A stream in a launch file.
 Entry = Union[StreamTopic, tuple[str, str]]
+
+
+def topic_of(entry: Entry) -> StreamTopic:
+    """
+    Return an entry as a StreamTopic.
+
+    :raises ConfigurationError: it is none, and no pair.
+    """
+    if isinstance(entry, tuple) and len(entry) == 2:
+        return StreamTopic(*entry)
+    if not isinstance(entry, StreamTopic):
+        raise ConfigurationError(f'{entry!r} is no topic to stream',
+                                 "write ('/camera', 'h264') or StreamTopic(...)")
+    return entry
 
 
 def stream(entry: Entry, machine: str) -> Stream:
@@ -64,11 +84,7 @@ def stream(entry: Entry, machine: str) -> Stream:
         direction or parameter; a topic that cannot be streamed.
     :raises PrerequisiteError: the robot lacks what its end of the stream needs.
     """
-    if isinstance(entry, tuple) and len(entry) == 2:
-        entry = StreamTopic(*entry)
-    if not isinstance(entry, StreamTopic):
-        raise ConfigurationError(f'{entry!r} is no topic to stream',
-                                 "write ('/camera', 'h264') or StreamTopic(...)")
+    entry = topic_of(entry)
     known = plugin_system.names(GROUP)
     if entry.transport not in known:
         raise ConfigurationError(

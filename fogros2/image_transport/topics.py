@@ -24,11 +24,11 @@ from fogros2.model import NodeSpec, Stream
 #: The full name of a topic or a service.
 TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 #: Options of a Stream that are parameters of the decoder, not of the encoder.
-_DECODER_PARAMETERS = ('show_damage', 'encoding')
+DECODER_PARAMETERS = ('show_damage', 'encoding')
 #: Suffix that FogROS2 appends to the name of a streamed topic on machines.
 _CLOUD = '/cloud'
 #: Options of all streams that use this project's nodes.
-OPTIONS = frozenset({'camera_info', 'priority', *_DECODER_PARAMETERS})
+OPTIONS = frozenset({'camera_info', 'priority', *DECODER_PARAMETERS})
 
 
 def check(stream: Stream) -> None:
@@ -157,36 +157,21 @@ def absolute(name: str, namespace: str) -> str:
 
 
 def node(
-    stream: Stream, *, role: str, codec: str, machine: Optional[str], name: str,
-) -> NodeSpec:
-    """
-    Return one node of this project's encoder and decoder pair for images.
-
-    :param role: 'encoder' or 'decoder'.
-    :param codec: value of the node's parameter ``codec``.
-    :param machine: the machine on which it runs, None for the robot.
-    :param name: last part of the stream's topic; viewers look for 'compressed' there.
-    :raises ConfigurationError: see ``check``; or an option that cannot be a parameter.
-    """
-    return python_node(
-        stream, role=role, machine=machine, name=name, package='image_transport_h264',
-        topic='image', options=_DECODER_PARAMETERS,
-        parameters={'codec': codec, 'camera_info': carries_info(stream)})
-
-
-def python_node(
-    stream: Stream, *, role: str, machine: Optional[str], name: str, package: str, topic: str,
+    stream: Stream, *, role: str, name: str, package: str, topic: str,
     options: Iterable[str], parameters: Mapping[str, Any],
 ) -> NodeSpec:
     """
     Return one node of a pair with the executables 'encoder' and 'decoder'.
 
+    :param role: 'encoder' or 'decoder'.
+    :param name: last part of the stream's topic; viewers look for 'compressed' there.
     :param topic: the nodes' name of the topic, which is remapped.
     :param options: the options of the stream that are parameters of the decoder.
     :param parameters: more parameters of the node.
-    :raises ConfigurationError: as of ``node``.
+    :raises ConfigurationError: see ``check``; or an option that cannot be a parameter.
     """
     check(stream)
+    machine = stream.source if role == 'encoder' else stream.target
     local = local_topic(stream.topic, machine)
     label, full, between = names_of(stream, role, name)
     values: dict[str, Any] = {**parameters, 'stream': between}

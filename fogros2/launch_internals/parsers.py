@@ -19,6 +19,7 @@ from launch.actions import IncludeLaunchDescription
 from launch.frontend import Entity, Parser
 
 from fogros2.launch_internals import private
+from fogros2.launch_internals.wrapping import below
 
 #: Creates the action of an element; None leaves the element to its usual parser.
 Read = Callable[[Entity, Parser], Optional[Action]]
@@ -26,18 +27,18 @@ Read = Callable[[Entity, Parser], Optional[Action]]
 
 def scoped(parser: Parser, read: Read) -> Parser:
     """Return a parser that asks ``read`` first, also in the files that it includes."""
-    below = copy.copy(parser)
+    inner = copy.copy(parser)
 
     def parse_action(entity: Entity) -> Action:
-        action = read(entity, below)
+        action = read(entity, inner)
         if action is None:
-            action = type(below).parse_action(below, entity)
+            action = type(inner).parse_action(inner, entity)
             if isinstance(action, IncludeLaunchDescription):
                 _reach([action], read)
         return action
 
-    vars(below)['parse_action'] = parse_action
-    return below
+    vars(inner)['parse_action'] = parse_action
+    return inner
 
 
 def _reach(entities: Iterable[LaunchDescriptionEntity], read: Read) -> None:
@@ -47,8 +48,7 @@ def _reach(entities: Iterable[LaunchDescriptionEntity], read: Read) -> None:
             private.replace_reader(
                 entity.launch_description_source, functools.partial(_read_file, read))
             continue
-        for some in [entity.describe_sub_entities(), *(
-                some for _, some in entity.describe_conditional_sub_entities())]:
+        for some in below(entity):
             _reach(some, read)
 
 

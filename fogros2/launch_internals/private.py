@@ -16,7 +16,7 @@ The names are those of Jazzy (launch 3.4), which the embedded default shares;
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 import contextlib
 import functools
 import signal
@@ -30,7 +30,7 @@ from launch import (
     LaunchDescriptionSource,
 )
 from launch.actions import ExecuteLocal, TimerAction
-from launch.events.process import ProcessExited
+from launch.events.process import ProcessExited, ShutdownProcess
 from launch.utilities import AsyncSafeSignalManager
 
 #: The method of ExecuteLocal that starts the process and awaits its end.
@@ -209,3 +209,35 @@ def signal_manager() -> Optional[AsyncSafeSignalManager]:
     name = '_AsyncSafeSignalManager__current'
     manager: Optional[AsyncSafeSignalManager] = getattr(AsyncSafeSignalManager, name)
     return manager
+
+
+class _Census(ShutdownProcess):
+    """Collect every process action; shut down none."""
+
+    def __init__(self, found: list[ExecuteLocal]) -> None:
+        def note(action: ExecuteLocal) -> bool:
+            found.append(action)
+            return False  # this process is not to be shut down
+
+        super().__init__(process_matcher=note)
+
+
+def processes(context: LaunchContext) -> list[ExecuteLocal]:
+    """
+    Return every process action that was executed, the robot's own included.
+
+    Each process action has a handler that asks an event's matcher about the action. The matcher
+    of this event notes the action and does not match. The function calls the handlers itself,
+    because the event queue would deliver the answer later.
+    """
+    found: list[ExecuteLocal] = []
+    census = _Census(found)
+    for handler in tuple(context._event_handlers):
+        if handler.matches(census):
+            context._push_locals()
+            entities = handler.handle(census, context)
+            for entity in entities if isinstance(entities, Iterable) else (entities,):
+                if entity is not None:
+                    entity.visit(context)
+            context._pop_locals()
+    return found

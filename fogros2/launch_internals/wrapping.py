@@ -62,6 +62,12 @@ class Wrapped(LaunchDescriptionEntity):
         return list(self._entity.describe_conditional_sub_entities())
 
 
+def below(entity: LaunchDescriptionEntity) -> list[Iterable[LaunchDescriptionEntity]]:
+    """Return the entity's sub-entities, and those of each of its conditions."""
+    return [entity.describe_sub_entities(), *(
+        some for _, some in entity.describe_conditional_sub_entities())]
+
+
 def wrap(entities: Any, apply: Apply) -> Optional[list[LaunchDescriptionEntity]]:
     """Wrap the result of a visit or a handler: None, an entity, or several."""
     if entities is None:

@@ -12,10 +12,8 @@ import time
 
 from fogros2.events import Event
 
-#: Maximum bytes of output that wait, and of one event beside its text.
+#: Maximum bytes of events that wait, and of one event beside its texts.
 LIMIT, OVERHEAD = 32 << 20, 1000
-#: Maximum number of other events that wait; no honest machine has as many.
-OTHERS = 10_000
 #: Events that launch may have to process before it gets more, and seconds until the next look.
 BUSY, PAUSE = 100, 0.01
 #: Seconds between two reports of dropped output.
@@ -26,7 +24,8 @@ class Backlog:
     """
     Events in order; where they come faster than launch takes them, the oldest output is dropped.
 
-    The machine's nodes are never blocked.
+    Other events are dropped only where no output waits: no honest machine has as many. The
+    machine's nodes are never blocked.
 
     :param deliver: gets each event, on the event loop.
     :param busy: returns the number of events that launch has to process.
@@ -39,27 +38,22 @@ class Backlog:
     ) -> None:
         self._loop, self._deliver, self._busy, self._dropped = loop, deliver, busy, dropped
         self._lock = threading.Lock()
-        self._outputs: deque[tuple[int, Event]] = deque()
-        self._others: deque[tuple[int, Event]] = deque()
-        self._number = self._size = self._lost = 0
+        self._events: deque[Event] = deque()
+        self._size = self._lost = 0
         self._scheduled = False
         self._reported = -REPORT
 
     def put(self, event: Event) -> None:
         """Add an event, from any thread; do nothing when launch's event loop is closed."""
         with self._lock:
-            self._number += 1
-            if event['event'] == 'output':
-                self._outputs.append((self._number, event))
-                self._size += _size(event)
-                while self._size > LIMIT:
-                    self._size -= _size(self._outputs.popleft()[1])
-                    self._lost += 1
-            else:
-                self._others.append((self._number, event))
-                if len(self._others) > OTHERS:
-                    self._others.popleft()
-                    self._lost += 1
+            self._events.append(event)
+            self._size += _size(event)
+            while self._size > LIMIT:
+                oldest = next((at for at, one in enumerate(self._events)
+                               if one['event'] == 'output'), 0)
+                self._size -= _size(self._events[oldest])
+                del self._events[oldest]
+                self._lost += 1
             if self._scheduled:
                 return
             self._scheduled = True
@@ -89,14 +83,13 @@ class Backlog:
     def _next(self) -> Event | None:
         """Remove and return the oldest event; None if none waits, and the next one schedules."""
         with self._lock:
-            queues = [queue for queue in (self._outputs, self._others) if queue]
-            if not queues:
+            if not self._events:
                 self._scheduled = False
                 return None
-            _, event = min(queues, key=lambda queue: queue[0][0]).popleft()
+            event = self._events.popleft()
             self._size -= _size(event)
             return event
 
 
 def _size(event: Event) -> int:
-    return sys.getsizeof(event['text']) + OVERHEAD if event['event'] == 'output' else 0
+    return OVERHEAD + sum(sys.getsizeof(text) for text in event.values() if isinstance(text, str))

@@ -16,6 +16,7 @@ from launch import LaunchContext
 from fogros2.errors import FogError
 from fogros2.host.checkpoint import Checkpoint
 from fogros2.model import Endpoint, MachineSpec, NodeSpec
+from fogros2.runtime.node_spec import full_name
 from fogros2.shell import connect, Shell
 
 #: Seconds that a node has to answer ``~/checkpoint``.
@@ -143,12 +144,3 @@ class Checkpoints:
                     if text != self._said and not self._context.is_shutdown:
                         self._logger.warning(text)
                     self._said = text
-
-
-def full_name(node: NodeSpec) -> str:
-    """Return the full ROS name of a node, from its arguments or its program."""
-    rules = dict(
-        argument.split(':=', 1) for argument in node.arguments
-        if isinstance(argument, str) and argument.startswith(('__node:=', '__ns:=')))
-    name = rules.get('__node', node.executable or node.name)
-    return f"{rules.get('__ns', '').rstrip('/')}/{name}"

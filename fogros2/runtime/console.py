@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Show the steps of a deployment in the terminal: one line each, a table at the end."""
+"""Show the steps of a deployment in the terminal: one line each."""
 
 from __future__ import annotations
 
 import logging
+import shutil
 import sys
 import threading
 from typing import Optional, TextIO
@@ -15,6 +16,7 @@ from fogros2.report import (
     Event,
     Progress,
     Silence,
+    size,
     StepDone,
     StepFailed,
     StepStarted,
@@ -35,7 +37,6 @@ class Console:
         self._logger = launch.logging.get_logger('fogros2')
         self._stream = stream or sys.stdout
         self._lock = threading.RLock()
-        self._done: list[StepDone] = []
         self._running: dict[tuple[str, str], str] = {}
         self._drawn = False
         self._live = self._stream.isatty()
@@ -51,7 +52,6 @@ class Console:
                 self._logger.debug(f'{_where(event.machine)}: {event.step} ...')
             elif isinstance(event, StepDone):
                 self._running.pop((event.machine, event.step), None)
-                self._done.append(event)
                 detail = f' ({event.detail})' if event.detail else ''
                 self._logger.info(
                     f'{_where(event.machine)}: {event.step} {event.seconds:.2f} s{detail}')
@@ -78,20 +78,6 @@ class Console:
             elif isinstance(event, Silence):
                 self._logger.info(f'{event.machine}: answers again')
             self._draw()
-
-    def table(self) -> None:
-        """Log the steps done since the last table, with their times."""
-        with self._lock:
-            done, self._done = self._done, []
-            if not done:
-                return
-            rows = [('machine', 'step', 'seconds')] + [
-                (_where(step.machine), step.step, f'{step.seconds:.2f}') for step in done]
-            widths = [max(len(row[column]) for row in rows) for column in range(3)]
-            lines = [
-                f'  {machine:{widths[0]}}  {step:{widths[1]}}  {seconds:>{widths[2]}}'
-                for machine, step, seconds in rows]
-            self._logger.info('\n'.join(['steps', *lines]))
 
     def close(self) -> None:
         """Remove the progress line."""
@@ -121,14 +107,9 @@ class Console:
             parts = [
                 f'{_where(machine)}: {step}{bar}'
                 for (machine, step), bar in self._running.items()]
-            self._stream.write('   '.join(parts)[:_columns(self._stream)])
+            self._stream.write('   '.join(parts)[:shutil.get_terminal_size().columns - 1])
             self._stream.flush()
             self._drawn = True
-
-
-def _columns(stream: TextIO) -> int:
-    import shutil
-    return shutil.get_terminal_size().columns - 1
 
 
 def _where(machine: str) -> str:
@@ -136,16 +117,8 @@ def _where(machine: str) -> str:
 
 
 def _bar(progress: Progress) -> str:
-    done = _bytes(progress.done)
+    done = size(progress.done)
     if not progress.total:
         return f' {done}'
     full = min(_WIDTH, _WIDTH * progress.done // progress.total)
-    return f" [{'#' * full}{'.' * (_WIDTH - full)}] {done} of {_bytes(progress.total)}"
-
-
-def _bytes(count: float) -> str:
-    for unit in ('B', 'kB', 'MB'):
-        if count < 1000:
-            return f'{count:.0f} {unit}' if unit == 'B' else f'{count:.1f} {unit}'
-        count /= 1000
-    return f'{count:.1f} GB'
+    return f" [{'#' * full}{'.' * (_WIDTH - full)}] {done} of {size(progress.total)}"

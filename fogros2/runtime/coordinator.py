@@ -33,7 +33,7 @@ from fogros2.describe import values
 from fogros2.describe.keywords import ROBOT
 from fogros2.describe.machines import CloudInstance
 from fogros2.errors import Cancelled, ConfigurationError, did_you_mean, FogError
-from fogros2.launch_internals import private, processes
+from fogros2.launch_internals import private
 from fogros2.model import NodeSpec
 from fogros2.runtime import cost, interruption, republishers, signals, streaming, uncompressed
 from fogros2.runtime.checkpoints import Checkpoints
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from fogros2.deploy import Launch
     from fogros2.describe.machines import SomeMachine
     from fogros2.describe.overrides import Overrides
-    from fogros2.image_transport.streams import Entry
+    from fogros2.image_transport.streams import Entry, StreamTopic
     from fogros2.model import MachineSpec
 
 #: Returns the process of a node on a machine, by the machine's name.
@@ -106,6 +106,7 @@ class Coordinator:
         self._whole = False
         self._sessions: dict[str, Session] = {}
         self._new: list[Session] = []
+        self._deployments: list[asyncio.Task[None]] = []
         self._begun = True
         self._late: set[str] = set()
         self._streams = streaming.Streams()
@@ -115,23 +116,16 @@ class Coordinator:
         self._down: Optional[asyncio.Task[None]] = None
         #: The watch for uncompressed images, which ends with the launch.
         self._watched: Optional[asyncio.Future[None]] = None
-        self._restore_signals: Callable[[], None] = _nothing
+        self._restore_signals: Callable[[], None] = lambda: None
         self._logger = launch.logging.get_logger('fogros2')
         context.extend_globals({_LOCAL: self})
-        for handler in (
-            EventHandler(
-                matcher=lambda event: isinstance(event, Begin),
-                entities=OpaqueFunction(function=self._on_begin)),
-            EventHandler(
-                matcher=lambda event: isinstance(event, Failed),
-                entities=OpaqueFunction(function=self._on_failed)),
-            # launch asks the handlers that were registered last first: those of launch files
-            EventHandler(
-                matcher=lambda event: isinstance(event, MachineInterrupted),
-                entities=OpaqueFunction(function=self._on_interrupted)),
-            OnShutdown(on_shutdown=self._on_shutdown),
-        ):
-            context.register_event_handler(handler)
+        # launch asks the handlers that were registered last first: those of launch files
+        for kind, function in ((Begin, self._on_begin), (Failed, self._on_failed),
+                               (MachineInterrupted, self._on_interrupted)):
+            context.register_event_handler(EventHandler(
+                matcher=functools.partial(_is, kind),
+                entities=OpaqueFunction(function=function)))
+        context.register_event_handler(OnShutdown(on_shutdown=self._on_shutdown))
 
     @classmethod
     def of(cls, context: LaunchContext) -> Coordinator:
@@ -321,7 +315,7 @@ class Coordinator:
         if entries:
             self._stream_everywhere.append((entries, namespace))
 
-    def resolve_streams(self, entries: Sequence[Entry], namespace: str) -> list[Entry]:
+    def resolve_streams(self, entries: Sequence[Entry], namespace: str) -> list[StreamTopic]:
         """
         Resolve streams; relative names are in the namespace.
 
@@ -331,9 +325,11 @@ class Coordinator:
         streaming.check(resolved)
         return resolved
 
-    def all_streams(self, entries: Iterable[Entry] = (), namespace: str = '/') -> list[Entry]:
+    def all_streams(
+        self, entries: Iterable[Entry] = (), namespace: str = '/',
+    ) -> list[StreamTopic]:
         """Return the streams of all machines, and further ones, all resolved."""
-        found: list[Entry] = []
+        found: list[StreamTopic] = []
         for everywhere, of in (*self._stream_everywhere, (list(entries), namespace)):
             found += self.resolve_streams(everywhere, of)
         return found
@@ -349,7 +345,7 @@ class Coordinator:
         return None if self.on_robot(name) else name
 
     def stream(
-        self, entries: Iterable[Entry], session: Session, on_machine: OnMachine,
+        self, entries: Iterable[StreamTopic], session: Session, on_machine: OnMachine,
     ) -> list[ExecuteLocal]:
         """
         Stream topics to and from a machine, in addition to the streams of all machines.
@@ -367,7 +363,7 @@ class Coordinator:
         self._on_machine = on_machine
         # another machine may be the source
         self._rename_topics()
-        return [republishers.RobotRepublisher(spec, session.came_up) if machine is None else
+        return [republishers.AddedProcess(spec, session.came_up) if machine is None else
                 on_machine(spec, machine) for machine, spec in new]
 
     def _rename_topics(self) -> None:
@@ -407,7 +403,7 @@ class Coordinator:
             kept.update(environment)
         # these are not changes of the launch file, so they must not be sent to machines
         self.base_environment.update(environment)
-        for action in processes.processes(self._context):
+        for action in private.processes(self._context):
             details, ended = action.process_details, private.completed(action)
             if details is None or ended is None or ended.done():
                 continue
@@ -432,8 +428,7 @@ class Coordinator:
             task = context.asyncio_loop.create_task(self._bring_up(new))
             context.add_completion_future(task)
             task.add_done_callback(self._raise_in_launch)
-            for session in new:
-                session.deployment = task
+            self._deployments.append(task)
         self._open_gate()
 
     async def _bring_up(self, sessions: list[Session]) -> None:
@@ -447,8 +442,6 @@ class Coordinator:
             self._fail(error)
             return
         await asyncio.gather(*(self._up(session) for session in sessions))
-        if self._console is not None and all(session.running for session in sessions):
-            self._console.table()
         if self._watched is None and not self._cancel.is_set():
             self._watched = self._in_thread(
                 uncompressed.watch, functools.partial(
@@ -497,10 +490,8 @@ class Coordinator:
         new = interruption.react(
             context.locals.event, session, self._streams, context, self._logger)
         self._rename_topics()
-        at_once: asyncio.Future[bool] = context.asyncio_loop.create_future()
-        at_once.set_result(True)
         return [
-            republishers.RobotRepublisher(spec, at_once) if name is None else
+            republishers.AddedProcess(spec) if name is None else
             self._on_machine(spec, name) for name, spec in new]
 
     # -- going down -----------------------------------------------------------------------------
@@ -530,9 +521,8 @@ class Coordinator:
     async def _take_down(self) -> None:
         # the VPN interface must stay while a node runs
         sessions = self._sessions.values()
-        futures = [private.completed(action) for action in processes.processes(self._context)]
-        await _all_done({
-            *futures, *(session.deployment for session in sessions), self._watched})
+        futures = [private.completed(action) for action in private.processes(self._context)]
+        await _all_done({*futures, *self._deployments, self._watched})
         await _all_done({request for session in sessions for request in session.requests})
         for error in await self._in_thread(self.launch.down):
             self._fail(error)
@@ -558,8 +548,8 @@ async def _all_done(futures: set[Optional[asyncio.Future[Any]]]) -> None:
         await asyncio.wait(waits)
 
 
-def _nothing() -> None:
-    """Do nothing."""
+def _is(kind: type[Event], event: Event) -> bool:
+    return isinstance(event, kind)
 
 
 def _make_launch(**arguments: Any) -> Launch:

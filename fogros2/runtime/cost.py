@@ -16,25 +16,16 @@ def lines(machines: Sequence[tuple[str, Decimal, float]]) -> list[str]:
     found = []
     total = Decimal(0)
     for name, price, seconds in machines:
-        cost = price * Decimal(seconds) / 3600
-        total += cost
-        found.append(f'{name}: {hours(seconds)} at ${price.normalize():f} an hour, '
-                     f'${dollars(cost)}')
+        hours = Decimal(seconds) / 3600
+        total += price * hours
+        found.append(f'{name}: {short(hours)} h at ${price.normalize():f} an hour, '
+                     f'${short(price * hours)}')
     if len(found) > 1:
-        found.append(f'all machines: ${dollars(total)}')
+        found.append(f'all machines: ${short(total)}')
     return found
 
 
-def hours(seconds: float) -> str:
-    """Format a time in hours, the unit of prices; a short time with two significant digits."""
-    return f'{_plain(Decimal(seconds) / 3600, below=Decimal("0.1"))} h'
-
-
-def dollars(cost: Decimal) -> str:
-    """Format US dollars with two decimals; a small sum with two significant digits."""
-    return _plain(cost, below=Decimal('0.1'))
-
-
-def _plain(value: Decimal, *, below: Decimal) -> str:
-    # two significant digits, without an exponent
-    return f'{Decimal(f"{value:.2g}"):f}' if 0 < value < below else f'{value:.2f}'
+def short(value: Decimal) -> str:
+    """Format hours or US dollars with two decimals; a small value with two significant digits."""
+    # without an exponent
+    return f'{Decimal(f"{value:.2g}"):f}' if 0 < value < Decimal('0.1') else f'{value:.2f}'

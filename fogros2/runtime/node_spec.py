@@ -166,6 +166,15 @@ def from_action(
     )
 
 
+def full_name(node: NodeSpec) -> str:
+    """Return the full ROS name of a node: its remapped name, or else its program's name."""
+    rules = dict(
+        argument.split(':=', 1) for argument in reversed(node.arguments)  # the first rule wins
+        if isinstance(argument, str) and argument.startswith(('__node:=', '__ns:=')))
+    name = rules.get('__node', node.executable or node.name)
+    return f"{rules.get('__ns', '').rstrip('/')}/{name}"
+
+
 def _environment(
     action: ExecuteLocal, context: LaunchContext, base: Mapping[str, str],
 ) -> dict[str, str]:
@@ -215,7 +224,8 @@ class Texts:
     def __init__(self, prefixes: Sequence[str], workspace: Optional[str]) -> None:
         self.prefixes = list(prefixes)
         roots = sorted(
-            {prefix.rstrip('/') for prefix in prefixes if not _below(prefix, workspace)},
+            {prefix.rstrip('/') for prefix in prefixes
+             if workspace is None or not plan.below(prefix, [workspace])},
             key=len, reverse=True)
         self._pattern = re.compile(
             r'(?<![\w.-])(?P<prefix>{})/(?P<kind>share|lib)/(?P<package>\w+)(?![\w.-])'.format(
@@ -236,8 +246,3 @@ class Texts:
         if not parts:
             return text
         return tuple(part for part in (*parts, text[begin:]) if part)
-
-
-def _below(path: str, folder: Optional[str]) -> bool:
-    return folder is not None and (path == folder or path.startswith(f'{folder}/'))
-

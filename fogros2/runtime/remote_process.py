@@ -9,20 +9,19 @@ from typing import Any, cast, Optional, TYPE_CHECKING
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal
-from launch.event_handlers import OnProcessIO
 
 from fogros2.errors import ConfigurationError
 from fogros2.host.checkpoint import check_folder
 from fogros2.launch_internals import components, private
 from fogros2.model import NodeSpec
-from fogros2.runtime import foxglove, node_spec, streaming
+from fogros2.runtime import foxglove, node_spec
 from fogros2.runtime.coordinator import Coordinator
 from fogros2.runtime.remote_run import RemoteRun
 from fogros2.runtime.republishers import AddedProcess
 
 if TYPE_CHECKING:
     from fogros2.describe.machines import SomeMachine
-    from fogros2.image_transport.streams import Entry
+    from fogros2.image_transport.streams import StreamTopic
     from fogros2.runtime.session import Session
 
 
@@ -36,7 +35,7 @@ class RemoteProcess(private.RemoteStart):
     """
 
     _fogros2_machine: SomeMachine
-    _fogros2_streams: Sequence[Entry] = ()
+    _fogros2_streams: Sequence[StreamTopic] = ()
     #: Container image that the process runs in, and more options for its ``docker run``.
     _fogros2_image = ''
     _fogros2_image_options: Sequence[str] = ()
@@ -110,7 +109,6 @@ class RemoteProcess(private.RemoteStart):
             self, context, self._fogros2_session, self._fogros2_node,
             self._come_here if self._fogros2_command is not None else None, self._go_back)
         private.set_transport(self, run)
-        context.register_event_handler(OnProcessIO(target_action=self, on_stdin=run.on_stdin))
         self._fogros2_session.submit(run)
         return [*(entities or ()), *self._republishers(context), *self._helpers(context)]
 
@@ -182,7 +180,7 @@ class RemoteProcess(private.RemoteStart):
 
 
 def send(
-    action: ExecuteLocal, machine: SomeMachine, streams: Sequence[Entry] = (),
+    action: ExecuteLocal, machine: SomeMachine, streams: Sequence[StreamTopic] = (),
 ) -> None:
     """
     Turn an action that has not been executed into one whose process runs on ``machine``.
@@ -211,7 +209,7 @@ def process_on(spec: NodeSpec, machine: str) -> ExecuteLocal:
 
 
 def send_components(
-    entity: LaunchDescriptionEntity, machine: SomeMachine, streams: Sequence[Entry],
+    entity: LaunchDescriptionEntity, machine: SomeMachine, streams: Sequence[StreamTopic],
     context: LaunchContext,
 ) -> None:
     """
@@ -233,7 +231,7 @@ def send_components(
 
 
 def _streams_to_machine(
-    streams: Sequence[Entry], coordinator: Coordinator, session: Session,
+    streams: Sequence[StreamTopic], coordinator: Coordinator, session: Session,
 ) -> list[ExecuteLocal]:
     """Return the republishers that a process on a machine needs and no earlier one needed."""
     if session.interrupted:
@@ -241,13 +239,16 @@ def _streams_to_machine(
     return coordinator.stream(streams, session, process_on)
 
 
-def _streams_to_robot(streams: Sequence[Entry], coordinator: Coordinator) -> list[ExecuteLocal]:
+def _streams_to_robot(
+    streams: Sequence[StreamTopic], coordinator: Coordinator,
+) -> list[ExecuteLocal]:
     """Return the republishers that bring other machines' topics to a process on the robot."""
     found: list[ExecuteLocal] = []
     for entry in streams:
-        if not isinstance(entry, tuple) and entry.source is not None:
+        if entry.source is not None:
             found += coordinator.stream(
-                [streaming.to_robot(entry)], coordinator.session(entry.source), process_on)
+                [entry.but(direction='to_robot', source=None)],
+                coordinator.session(entry.source), process_on)
     return found
 
 

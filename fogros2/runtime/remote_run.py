@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 import dataclasses
 import re
 import signal
-from typing import Any, Optional, TYPE_CHECKING, Union
+from typing import Any, Optional, Protocol, Union
 
 from launch import LaunchContext
 from launch.actions import ExecuteLocal
@@ -16,10 +16,8 @@ import launch.logging
 
 from fogros2.events import Event, NodeExited, NodeOutput, NodeRefused, NodeStarted
 from fogros2.launch_internals import private
-from fogros2.model import NodeSpec
-
-if TYPE_CHECKING:
-    from fogros2.runtime.session import Session
+from fogros2.model import MachineSpec, NodeSpec
+from fogros2.runtime.replacer import Replacer
 
 #: Messages of Qt, GTK and Tk that there is no screen.
 _NO_SCREEN = re.compile(
@@ -27,6 +25,25 @@ _NO_SCREEN = re.compile(
     r'no \$DISPLAY environment variable', re.IGNORECASE)
 #: Seconds that the machine has, beyond a process's own time-outs, to report its end.
 GRACE = 10.0
+
+
+class Home(Protocol):
+    """The machine of a process; the event loop makes all calls."""
+
+    spec: MachineSpec
+    replacer: Optional[Replacer]
+
+    def signal(self, run: RemoteRun, name: str) -> None:
+        """Send a process a signal."""
+
+    def stop(self, run: RemoteRun) -> bool:
+        """Stop a process; return False if it does not run there and never will."""
+
+    def forget(self, run: RemoteRun) -> None:
+        """Remove a process that has ended."""
+
+    def halted(self, run: RemoteRun) -> bool:
+        """Note that a process has left its machine; return whether it must not start elsewhere."""
 
 
 class RemoteRun:
@@ -40,7 +57,7 @@ class RemoteRun:
     """
 
     def __init__(
-        self, action: ExecuteLocal, context: LaunchContext, session: Session, node: NodeSpec,
+        self, action: ExecuteLocal, context: LaunchContext, session: Home, node: NodeSpec,
         come_here: Optional[Callable[[LaunchContext], None]],
         go_back: Callable[[RemoteRun], Awaitable[None]],
     ) -> None:
@@ -260,9 +277,3 @@ class RemoteRun:
         hint = f" ({event['hint']})" if event['hint'] else ''
         self._logger.error(f"process can't be started: {event['error']}{hint}")
         self.end()
-
-    def on_stdin(self, event: object) -> None:
-        """Refuse input: the connection to a machine has no channel for it."""
-        if self._here:
-            return
-        self._logger.error('a process on a machine takes no input from launch')

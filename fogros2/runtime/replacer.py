@@ -30,10 +30,10 @@ class Moving(Nodes, Protocol):
 
     checkpoints: Optional[Checkpoints]
 
-    def halt_all(self) -> None:
+    async def halt_all(self) -> None:
         """Let the machine end all of its processes; ``drained`` follows."""
 
-    def move_halted(self) -> None:
+    async def move_halted(self) -> None:
         """Let processes start on the robot: the machine no longer runs them."""
 
     def homeless(self) -> list[str]:
@@ -91,10 +91,10 @@ class Replacer:
             self._loop.call_at(self.state.deadline, self.on, 'time')
 
     def _drain(self) -> None:
-        self._session.halt_all()
+        self._session.request(self._session.halt_all)
 
     def _move(self) -> None:
-        self._session.move_halted()
+        self._session.request(self._session.move_halted)
 
     def _end(self) -> None:
         async def end() -> None:

@@ -24,9 +24,11 @@ class AddedProcess(ExecuteProcess):
 
     It is a process action and not a :class:`launch_ros.actions.Node`: the namespaces, remappings
     and parameters that a group sets for its nodes must not change it.
+
+    :param up: the process starts when it is done, or never if its result is False.
     """
 
-    def __init__(self, spec: NodeSpec) -> None:
+    def __init__(self, spec: NodeSpec, up: Optional[asyncio.Future[bool]] = None) -> None:
         command: list[list[Substitution]] = [_substitutions(text) for text in spec.arguments]
         if spec.package:
             command.insert(0, [ExecutableInPackage(
@@ -39,18 +41,12 @@ class AddedProcess(ExecuteProcess):
             sigkill_timeout=str(spec.sigkill_timeout))
         #: The id of its node.
         self.node = spec.id
+        if up is not None:
+            private.delay_start(self, lambda: asyncio.shield(up))
 
     def get_asyncio_future(self) -> Optional[asyncio.Future[Any]]:
         """Return None: this process must not keep the launch alive when all others have ended."""
         return None
-
-
-class RobotRepublisher(AddedProcess):
-    """A republisher on the robot; it starts when the machine at the other end is up."""
-
-    def __init__(self, spec: NodeSpec, up: asyncio.Future[bool]) -> None:
-        super().__init__(spec)
-        private.delay_start(self, lambda: asyncio.shield(up))
 
 
 def _substitutions(text: Text) -> list[Substitution]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import dataclasses
 import functools
 import logging
-from typing import Any, Optional, Protocol, TYPE_CHECKING, TypeVar
+from typing import Any, Optional, TYPE_CHECKING
 
 import launch.logging
 
@@ -16,17 +16,17 @@ from fogros2.describe import values
 from fogros2.errors import AgentError, ConfigurationError, FogError
 from fogros2.events import Event
 from fogros2.model import MachineSpec, NodeSpec
-from fogros2.runtime import streaming, uncompressed
+from fogros2.runtime import streaming
 from fogros2.runtime.backlog import Backlog
 from fogros2.runtime.checkpoints import Checkpoints
+from fogros2.runtime.node_spec import full_name
+from fogros2.runtime.remote_run import RemoteRun
 from fogros2.runtime.replacer import Replacer
 from fogros2.shell import Shell
 
 if TYPE_CHECKING:
     from fogros2.deploy import RunningMachine
     from fogros2.describe.machines import CloudInstance
-
-T = TypeVar('T')
 
 #: Events of the agent about the machine, not about one process: log level and message.
 _NOTICES = {
@@ -49,44 +49,6 @@ _LAST_EVENTS = ('watchdog', 'ending')
 _HOLD = 60.0
 #: Seconds, at least, before nodes with respawn start again because their launch process ended.
 _RESPAWN_DELAY = 1.0
-
-
-class Run(Protocol):
-    """The interface of a process to its session; the event loop makes all calls."""
-
-    node: NodeSpec
-    complete: asyncio.Future[None]
-    started: bool
-    stopping: bool
-    respawning: bool
-
-    def on_event(self, event: Event) -> None:
-        """Handle an event of the agent that names this process."""
-
-    def stop(self) -> None:
-        """Stop the process, as its time-outs say."""
-
-    def end(self) -> None:
-        """Stop waiting for events of the process: none will come."""
-
-    def unreported(self) -> None:
-        """Stop waiting for the remote process: the agent will not report its exit."""
-
-    def move(self, *, stop: bool) -> None:
-        """Move to the robot; with ``stop``, after the machine has ended the process."""
-
-    def halt(self, *, stop: bool) -> None:
-        """Let the machine end the process, because another machine will continue it."""
-
-    def arrive(self) -> None:
-        """Continue on the robot, if the program is there; else wait for the machine."""
-
-    @property
-    def homeless(self) -> bool:
-        """Whether the process runs neither on its machine nor on the robot."""
-
-    async def come_back(self) -> bool:
-        """Prepare the start on the new machine; return False if the process has ended."""
 
 
 class Session:
@@ -113,7 +75,6 @@ class Session:
         #: The launch file's objects for the machine; notified when it is up.
         self.instances: list[CloudInstance] = []
         self.running: Optional[RunningMachine] = None
-        self.deployment: Optional[asyncio.Task[None]] = None
         #: True when the machine is up, False when it never will be.
         self.came_up: asyncio.Future[bool] = loop.create_future()
         #: Whether containers and monitor of the machine have been requested.
@@ -135,15 +96,15 @@ class Session:
         #: Whether all processes of a machine that is being replaced have ended there.
         self._drained = False
         self._backlog = Backlog(loop, self._on_event, busy, self._dropped)
-        self._held: list[tuple[Run, Event]] = []
-        self._runs: dict[str, Run] = {}
-        self._waiting: list[Run] = []
-        self._to_stop: list[Run] = []
+        self._held: list[tuple[RemoteRun, Event]] = []
+        self._runs: dict[str, RemoteRun] = {}
+        self._waiting: list[RemoteRun] = []
+        self._to_stop: list[RemoteRun] = []
         #: Replaces the machine, if its ``on_interrupt`` says so.
         self.replacer: Optional[Replacer] = None
         self.checkpoints: Optional[Checkpoints] = None
         #: Processes that have left a machine that is being replaced.
-        self._away: list[Run] = []
+        self._away: list[RemoteRun] = []
         #: Topic names that the first loaded components got; None if none was loaded.
         self._component_names: Optional[dict[str, str]] = None
         #: Requests to the agent that are not answered yet.
@@ -232,7 +193,7 @@ class Session:
 
     def node_names(self) -> list[str]:
         """Return the ROS names of the machine's nodes."""
-        return [uncompressed.node_name(run.node) for run in list(self._runs.values())]
+        return [full_name(run.node).rpartition('/')[2] for run in list(self._runs.values())]
 
     @property
     def shell(self) -> Optional[Shell]:
@@ -243,7 +204,7 @@ class Session:
         """Return the machine's nodes that have started."""
         return [run.node for run in self._runs.values() if run.started]
 
-    def submit(self, run: Run) -> None:
+    def submit(self, run: RemoteRun) -> None:
         """Start a process when the machine is up."""
         self._runs[run.node.id] = run
         if self.replacer is not None:
@@ -258,7 +219,7 @@ class Session:
         if self.running is not None:
             self.request(self._start_waiting)
 
-    def stop(self, run: Run) -> bool:
+    def stop(self, run: RemoteRun) -> bool:
         """Stop a process; return False if it does not run there and never will."""
         if run in [*self._waiting, *self._away] or self.running is None or self.lost:
             if run in self._waiting:
@@ -274,11 +235,11 @@ class Session:
             self.request(self._stop_collected)
         return True
 
-    def signal(self, run: Run, name: str) -> None:
+    def signal(self, run: RemoteRun, name: str) -> None:
         """Send a process a signal."""
         self.request(functools.partial(self._signal, run, name))
 
-    def forget(self, run: Run) -> None:
+    def forget(self, run: RemoteRun) -> None:
         """Remove a process that has ended."""
         self._runs.pop(run.node.id, None)
         self._check_drained()
@@ -368,7 +329,7 @@ class Session:
             for run in runs:
                 run.unreported()
 
-    async def _signal(self, run: Run, name: str) -> None:
+    async def _signal(self, run: RemoteRun, name: str) -> None:
         assert self.running is not None
         try:
             async with self._order:
@@ -459,11 +420,8 @@ class Session:
 
     # -- a new machine ---------------------------------------------------------------------------
 
-    def halt_all(self) -> None:
+    async def halt_all(self) -> None:
         """Let the machine end all of its processes, because another machine continues them."""
-        self.request(self._halt_all)
-
-    async def _halt_all(self) -> None:
         if self.checkpoints:
             await self.checkpoints.ask()
         ended = [run for run, _ in self._held]
@@ -472,7 +430,7 @@ class Session:
             run.halt(stop=not self.lost and run not in ended)
         self._check_drained()
 
-    def halted(self, run: Run) -> bool:
+    def halted(self, run: RemoteRun) -> bool:
         """Note that a process has left its machine; return whether it must not start elsewhere."""
         if self.replacer is None:
             return False
@@ -495,12 +453,9 @@ class Session:
             await self.checkpoints.save(self.running.shell, still=True)
         self.replacer.on('drained')
 
-    def move_halted(self) -> None:
+    async def move_halted(self) -> None:
         """Let processes start on the robot: the machine no longer runs them."""
         self._held.clear()
-        self.request(self._move_halted)
-
-    async def _move_halted(self) -> None:
         async with self._moves:
             if self.checkpoints:
                 await self.checkpoints.restore(self.checkpoints.robot)
@@ -520,7 +475,7 @@ class Session:
 
     async def come_back(self) -> None:
         """Move all processes to the new machine."""
-        back: dict[Run, bool] = {}
+        back: dict[RemoteRun, bool] = {}
         async with self._moves:
             was_here = len(self.homeless()) < len(self._away)
             # processes that execute meanwhile join
@@ -551,13 +506,13 @@ class Session:
         for run, event in held:
             run.on_event(event)
 
-    def _respawning(self) -> list[Run]:
+    def _respawning(self) -> list[RemoteRun]:
         """Return the processes that start again when they end."""
         return [run for run in self._runs.values() if run not in self._waiting
                 and run.started and not run.stopping and not self.interrupted
                 and run.node.respawn and run.node.respawn_max_retries != 0]
 
-    def _start_again(self, runs: list[Run]) -> None:
+    def _start_again(self, runs: list[RemoteRun]) -> None:
         """Start processes, that the end of their launch process has ended, in another one."""
         for run in runs:
             # an agent starts the same id once
@@ -570,7 +525,7 @@ class Session:
             delay = max(_RESPAWN_DELAY, *(run.node.respawn_delay for run in runs))
             self._loop.call_later(delay, self.request, self._start_waiting)
 
-    def _end_unreported(self, returncode: int, respawning: list[Run]) -> None:
+    def _end_unreported(self, returncode: int, respawning: list[RemoteRun]) -> None:
         for run in list(self._runs.values()):
             if run in self._waiting:
                 continue

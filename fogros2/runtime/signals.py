@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import contextlib
 import signal
 import threading
 from types import FrameType
-from typing import Any, Optional
+from typing import Optional
 
 from launch import LaunchContext
 from launch.events import Shutdown
@@ -44,19 +45,11 @@ def take_over(context: LaunchContext) -> Callable[[], None]:
         logger.warning(f'{name}: shutting down')
         context.emit_event_sync(Shutdown(reason=name, due_to_sigint=False))
 
-    before: dict[int, Any] = {}
-    handlers: dict[int, Any] = {}
+    undo = contextlib.ExitStack()
     for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
         if signal.getsignal(number) == signal.SIG_IGN:
             continue
-        before[number] = signal.signal(number, _noticed)
+        undo.callback(signal.signal, number, signal.signal(number, _noticed))
         if number != signal.SIGINT:
-            handlers[number] = manager.handle(number, shut_down)
-
-    def undo() -> None:
-        for number, handler in handlers.items():
-            manager.handle(number, handler)
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-    return undo
+            undo.callback(manager.handle, number, manager.handle(number, shut_down))
+    return undo.close

@@ -28,35 +28,31 @@ def check(entries: Iterable[Entry]) -> None:
 
     :raises ConfigurationError: see :func:`fogros2.image_transport.streams.stream`.
     """
-    for entry in entries:
-        parts = (entry.topic, entry.transport, entry.direction) \
-            if isinstance(entry, StreamTopic) else entry
-        if not isinstance(parts, tuple) or all(isinstance(part, str) for part in parts):
+    for entry in map(streams.topic_of, entries):
+        if all(isinstance(part, str) for part in (entry.topic, entry.transport, entry.direction)):
             # no machine has the name '', so it cannot be the source
-            streams.stream(_named(entry, '/'), '')
+            streams.stream(entry.but(topic=entry.topic and absolute(entry.topic, '/')), '')
 
 
 def resolve(
     context: LaunchContext, entries: Iterable[Entry], namespace: str,
     source: Callable[[Any], Optional[str]],
-) -> list[Entry]:
+) -> list[StreamTopic]:
     """
     Resolve the substitutions of entries, and expand their topics to full names.
 
     :param namespace: namespace of relative names.
     :param source: returns the name of the machine that a source means, None for the robot.
     """
-    found: list[Entry] = []
-    for entry in entries:
-        if isinstance(entry, tuple):
-            entry = tuple(values.resolve(context, part) for part in entry)
-        elif isinstance(entry, StreamTopic):
-            entry = StreamTopic(
-                values.resolve(context, entry.topic), values.resolve(context, entry.transport),
-                values.resolve(context, entry.direction),
-                source=source(entry.source), **{
-                    key: _parameter(context, value) for key, value in entry.parameters.items()})
-        found.append(_named(entry, namespace))
+    found: list[StreamTopic] = []
+    for entry in map(streams.topic_of, entries):
+        topic = values.resolve(context, entry.topic)
+        found.append(entry.but(
+            topic=topic and absolute(topic, namespace),
+            transport=values.resolve(context, entry.transport),
+            direction=values.resolve(context, entry.direction), source=source(entry.source),
+            parameters={key: _parameter(context, value)
+                        for key, value in entry.parameters.items()}))
     return found
 
 
@@ -206,32 +202,12 @@ def _host(machine: Optional[str]) -> str:
     return 'the robot' if machine is None else f"'{machine}'"
 
 
-def _named(entry: Any, namespace: str) -> Any:
-    """Return an entry with its topic's full name; return an invalid entry unchanged."""
-    if isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[0], str) and entry[0]:
-        return (absolute(entry[0], namespace), entry[1])
-    if isinstance(entry, StreamTopic) and isinstance(entry.topic, str) and entry.topic:
-        return _with_topic(entry, absolute(entry.topic, namespace))
-    return entry
-
-
-def _with_topic(entry: StreamTopic, topic: str) -> StreamTopic:
-    return StreamTopic(
-        topic, entry.transport, entry.direction, source=entry.source, **entry.parameters)
-
-
-def to_robot(entry: StreamTopic) -> StreamTopic:
-    """Turn a stream from another machine to this machine into a stream to the robot."""
-    return StreamTopic(entry.topic, entry.transport, 'to_robot', **entry.parameters)
-
-
-def from_robot(entry: Entry, away: Iterable[str]) -> Entry:
+def from_robot(entry: StreamTopic, away: Iterable[str]) -> StreamTopic:
     """Return a stream with the robot as its source, if its source is a preempted machine."""
-    if not isinstance(entry, StreamTopic) or entry.source not in away:
+    if entry.source not in away:
         return entry
     # the same form as a stream that ``take_over`` has moved
-    return StreamTopic(entry.topic, entry.transport, entry.direction, **{
-        'camera_info': False, **entry.parameters})
+    return entry.but(source=None, parameters={'camera_info': False, **entry.parameters})
 
 
 def _parameter(context: LaunchContext, value: Any) -> Any:

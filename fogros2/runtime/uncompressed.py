@@ -17,7 +17,7 @@ from typing import Any
 
 from fogros2 import plugin_system, process
 from fogros2.errors import FogError
-from fogros2.model import Command, NodeSpec
+from fogros2.model import Command
 
 #: Poll interval of the counters in seconds; bits per second from which the graph is inspected.
 INTERVAL, BUSY = 5.0, 20e6
@@ -95,10 +95,3 @@ def images(line: str) -> list[str]:
         return [one['topic'] for one in graph['topics'] if one['type'] == _IMAGE]
     except (ValueError, KeyError, TypeError):
         return []  # output of a library
-
-
-def node_name(node: NodeSpec) -> str:
-    """Return the ROS name of a node: its remapped name, or else its program's name."""
-    names = [argument.partition('__node:=')[2] for argument in node.arguments
-             if isinstance(argument, str) and argument.startswith('__node:=')]
-    return names[0] if names else node.executable or node.name

@@ -177,7 +177,7 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
             raise
         finally:
             channel.close()
-        result = Result(returncode, *output.text(), time.monotonic() - begin)
+        result = Result(returncode, *output.text())
         return command_line.checked(command, result, self.where) if check else result
 
     def _collect(

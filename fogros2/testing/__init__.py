@@ -3,15 +3,15 @@
 Fakes and contracts for the tests of plugin authors, and for our own tests.
 
 A provider's author subclasses :class:`ProviderContract` and writes its method ``make``; pytest
-then runs the contract against the provider. :class:`ShellContract` works the same way. The fakes
-pass the same contracts, so tests with fakes are valid for real plugins.
+then runs the contract against the provider. :class:`ShellContract` works the same way.
+``FakeProvider`` passes the same contract; ``FakeShell`` runs no command.
 """
 
-from fogros2.testing.fakes import FakeClock, FakeProvider, FakeShell, FakeStream, FakeVpn
+from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream, FakeVpn
 from fogros2.testing.provider_contract import ProviderContract, request_for
 from fogros2.testing.shell_contract import ShellContract
 
 __all__ = [
-    'FakeClock', 'FakeProvider', 'FakeShell', 'FakeStream', 'FakeVpn', 'ProviderContract',
+    'FakeProvider', 'FakeShell', 'FakeStream', 'FakeVpn', 'ProviderContract',
     'ShellContract', 'request_for',
 ]

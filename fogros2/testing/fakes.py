@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fake a clock, a provider, a VPN, a stream and a shell, without any effect."""
+"""Fake a provider, a VPN, a stream and a shell, without any effect."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import dataclasses
 from decimal import Decimal
-import fnmatch
 from pathlib import Path
 import queue
 import secrets
-import stat
 import threading
 import time
 from typing import Any, ClassVar, Optional
@@ -20,11 +18,9 @@ from fogros2.errors import (
     CommandError,
     ConfigurationError,
     ConnectError,
-    DeadlineExceeded,
     FogError,
     MachineNotFound,
     NameTaken,
-    WorkspaceError,
 )
 from fogros2.model import (
     Command,
@@ -44,21 +40,6 @@ from fogros2.vpn import Vpn
 
 #: Endpoint of every fake machine, in TEST-NET-2, which is never assigned.
 FAKE_ENDPOINT = Endpoint('fake', '198.51.100.1', user='fog')
-
-
-class FakeClock:
-    """A clock that a test advances; calling it returns the time, as ``time.monotonic`` does."""
-
-    def __init__(self, now: float = 0.0) -> None:
-        self.now = now
-
-    def __call__(self) -> float:
-        """Return the time in seconds."""
-        return self.now
-
-    def advance(self, seconds: float) -> None:
-        """Advance the clock."""
-        self.now += seconds
 
 
 class FakeProvider(Provider):
@@ -94,7 +75,8 @@ class FakeProvider(Provider):
         self._polls = polls
         self._shell = shell
         self._lock = threading.Lock()
-        self._machines: dict[str, Machine] = {}
+        #: By id; a class may have them for all of its objects.
+        self.machines: dict[str, Machine] = getattr(self, 'machines', {})
         self._tokens: dict[str, str] = {}
         self._waits: dict[str, int] = {}
 
@@ -130,10 +112,10 @@ class FakeProvider(Provider):
             self._called('create')
             if request.token in self._tokens:
                 return self._tokens[request.token]
-            if any(m.name == spec.name for m in self._machines.values()):
+            if any(m.name == spec.name for m in self.machines.values()):
                 raise NameTaken(f"there is a fake machine '{spec.name}' already")
             machine_id = f'fake-{secrets.token_hex(4)}'
-            self._machines[machine_id] = Machine(
+            self.machines[machine_id] = Machine(
                 machine_id, spec.name, self.name, MachineState.PENDING, created=time.time(),
                 tags=dict(request.tags), end_command=('true',))
             self._tokens[request.token] = machine_id
@@ -151,7 +133,7 @@ class FakeProvider(Provider):
                     machine = dataclasses.replace(
                         machine, state=MachineState.RUNNING, shell=self._shell,
                         vpn_host=self._shell.host)
-                    self._machines[machine_id] = machine
+                    self.machines[machine_id] = machine
             key = self.host_keys.get(machine_id)
             if key is not None and machine.shell is not None:
                 return dataclasses.replace(
@@ -162,27 +144,27 @@ class FakeProvider(Provider):
         """Return the machines that have all of ``tags``."""
         with self._lock:
             self._called('find')
-            return [m for m in self._machines.values() if tags.items() <= m.tags.items()]
+            return [m for m in self.machines.values() if tags.items() <= m.tags.items()]
 
     def destroy(self, machine_id: str) -> None:
         """Delete a machine."""
         with self._lock:
             self._called('destroy')
-            self._machines.pop(machine_id, None)
+            self.machines.pop(machine_id, None)
             self._tokens = {t: i for t, i in self._tokens.items() if i != machine_id}
 
     def stop(self, machine_id: str) -> None:
         """Stop a machine."""
         with self._lock:
             self._called('stop')
-            self._machines[machine_id] = dataclasses.replace(
+            self.machines[machine_id] = dataclasses.replace(
                 self._found(machine_id), state=MachineState.STOPPED, shell=None)
 
     def start(self, machine_id: str) -> None:
         """Start a stopped machine."""
         with self._lock:
             self._called('start')
-            self._machines[machine_id] = dataclasses.replace(
+            self.machines[machine_id] = dataclasses.replace(
                 self._found(machine_id), state=MachineState.PENDING)
             self._waits[machine_id] = self._polls
 
@@ -208,9 +190,9 @@ class FakeProvider(Provider):
         self.host_keys[machine_id] = host_key
 
     def _found(self, machine_id: str) -> Machine:
-        if machine_id not in self._machines:
+        if machine_id not in self.machines:
             raise MachineNotFound(f"there is no fake machine '{machine_id}'")
-        return self._machines[machine_id]
+        return self.machines[machine_id]
 
     def _called(self, method: str) -> None:
         self.calls.append(method)
@@ -308,32 +290,25 @@ class FakeShell:
     """
     A shell without a machine: it records commands, and keeps files in a dictionary.
 
-    It implements a few programs (true, false, echo, cat, sleep, printenv, id, stat, seq), so that
-    it passes the contract of real shells.
-
-    :param handlers: by program name, a function that returns the result of a command.
+    :param handlers: by program name, a function that returns the result of a command. Without
+        handlers, ``true`` and ``echo`` work, and other programs are missing.
     :param streams: streams that ``open`` returns, in this order; later ones echo their input.
     """
 
+    name = 'fake'
+
     def __init__(
-        self, *, name: str = 'fake', handlers: Optional[Mapping[str, Handler]] = None,
+        self, *, handlers: Optional[Mapping[str, Handler]] = None,
         streams: Iterable[FakeStream] = (),
     ) -> None:
-        self.name = name
         self.commands: list[Command] = []
         self.opened: list[Command] = []
         self.files: dict[str, tuple[bytes, int]] = {}
         self.closed = 0
         self._handlers = {
-            'true': lambda c: _said(''), 'false': lambda c: Result(1, '', ''),
-            'echo': lambda c: _said(' '.join(c.argv[1:]) + '\n'), 'cat': self._cat,
-            'printenv': lambda c: _said(c.environment.get(c.argv[1], '') + '\n'),
-            'id': lambda c: _said('0\n' if c.sudo else '1000\n'), 'stat': self._stat,
-            'seq': lambda c: _said(''.join(f'{n + 1}\n' for n in range(int(c.argv[1])))),
-            **(handlers or {}),
-        }
+            'true': lambda c: Result(0, '', ''),
+            'echo': lambda c: Result(0, f"{' '.join(c.argv[1:])}\n", ''), **(handlers or {})}
         self._streams = list(streams)
-        self._lock = threading.Lock()
 
     def run(
         self, command: Command, *, timeout: float, check: bool = True,
@@ -341,96 +316,38 @@ class FakeShell:
         on_output: Optional[Callable[[str], None]] = None,
     ) -> Result:
         """Answer a command by a handler; unknown programs fail as in a real shell."""
-        with self._lock:
-            self.commands.append(command)
-        what = command.what or command.argv[0]
+        self.commands.append(command)
         if cancel is not None and cancel.is_set():
-            raise Cancelled(what)
-        if command.argv[0] == 'sleep':
-            self._sleep(float(command.argv[1]), timeout, cancel, what)
-            return _said('')
+            raise Cancelled(command.what or command.argv[0])
         handler = self._handlers.get(command.argv[0])
         result = handler(command) if handler is not None else Result(
             127, '', f'{command.argv[0]}: command not found\n')
-        for line in result.stdout.splitlines() if on_output is not None else ():
-            assert on_output is not None
-            on_output(line)
         if check and result.returncode != 0:
             raise CommandError(command, result, f"'{self.name}'")
         return result
 
-    def _sleep(
-        self, seconds: float, timeout: float, cancel: Optional[threading.Event], what: str,
-    ) -> None:
-        if (cancel or threading.Event()).wait(min(seconds, timeout)):
-            raise Cancelled(what)
-        if seconds > timeout:
-            raise DeadlineExceeded(f'{what} took longer than {timeout:g} s')
-
-    def _cat(self, command: Command) -> Result:
-        if len(command.argv) == 1:
-            return _said(command.input.decode(errors='replace'))
-        path = command.argv[-1]
-        if path not in self.files:
-            return Result(1, '', f'cat: {path}: No such file or directory\n')
-        return _said(self.files[path][0].decode(errors='replace'))
-
-    def _stat(self, command: Command) -> Result:
-        path = command.argv[-1]
-        if path not in self.files:
-            return Result(1, '', f"stat: cannot statx '{path}': No such file or directory\n")
-        return _said(f'{self.files[path][1]:o}\n')
-
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
         """Store a file."""
-        with self._lock:
-            self.files[target] = (data, mode)
+        self.files[target] = (data, mode)
 
     def sync(
         self, source: Path, target: str, *, excludes: Sequence[str], timeout: float,
         includes: Sequence[str] = (), cancel: Optional[threading.Event] = None,
         on_progress: Optional[Callable[[int, int], None]] = None,
     ) -> SyncReport:
-        """Store a folder's files; patterns match names and whole paths only."""
-        if not source.is_dir():
-            raise WorkspaceError(f'{source} is no folder that could be sent')
-        kept = {}
-        for path in sorted(source.rglob('*')):
-            relative = path.relative_to(source)
-            if path.is_file() and not _left_out(relative, excludes, includes):
-                kept[f'{target}/{relative}'] = (
-                    path.read_bytes(), stat.S_IMODE(path.stat().st_mode))
-        with self._lock:
-            changed = [data for name, (data, mode) in kept.items()
-                       if self.files.get(name) != (data, mode)]
-            for name in [n for n in self.files if n.startswith(f'{target}/') and n not in kept]:
-                relative = Path(name).relative_to(target)
-                if not _left_out(relative, excludes, includes):
-                    del self.files[name]
-            self.files.update(kept)
-        size = sum(map(len, changed))
-        if on_progress is not None:
-            on_progress(size, size)
-        return SyncReport(len(changed), size, 0.0)
+        """Send nothing."""
+        return SyncReport(0, 0, 0.0)
 
     def fetch(
         self, source: str, target: Path, *, known: Optional[Path], timeout: float,
         cancel: Optional[threading.Event] = None,
     ) -> None:
-        """Write the files of a folder."""
-        with self._lock:
-            for name, (data, mode) in self.files.items():
-                if name.startswith(f'{source}/'):
-                    path = target / name[len(source) + 1:]
-                    path.parent.mkdir(parents=True, exist_ok=True)
-                    path.write_bytes(data)
-                    path.chmod(mode)
+        """Fetch nothing."""
 
     def open(self, command: Command) -> Stream:
         """Return the next stream of ``streams``, or one that echoes."""
-        with self._lock:
-            self.opened.append(command)
-            return self._streams.pop(0) if self._streams else FakeStream(echo=True)
+        self.opened.append(command)
+        return self._streams.pop(0) if self._streams else FakeStream(echo=True)
 
     def interactive(self, command: Optional[Command] = None) -> int:
         """Do nothing, and return 0."""
@@ -439,17 +356,3 @@ class FakeShell:
     def close(self) -> None:
         """Count the calls in ``closed``."""
         self.closed += 1
-
-
-def _said(text: str) -> Result:
-    return Result(0, text, '')
-
-
-def _left_out(path: Path, excludes: Sequence[str], includes: Sequence[str]) -> bool:
-    def matches(patterns: Sequence[str]) -> bool:
-        parts = [path, *path.parents][:-1]
-        return any(
-            fnmatch.fnmatch(part.name, pattern.strip('/'))
-            or fnmatch.fnmatch(str(part), pattern.strip('/'))
-            for pattern in patterns for part in parts)
-    return matches(excludes) and not matches(includes)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 import os
 from pathlib import Path
 from typing import Any, Union
@@ -11,9 +11,7 @@ from typing import Any, Union
 import pytest
 
 from fogros2 import plugin_system
-from fogros2.errors import FogError, MachineNotFound, ProviderError
-from fogros2.model import CreateRequest, Machine, MachineSpec
-from fogros2.provider import Provider
+from fogros2.errors import FogError
 
 
 def install(folder: Path, group: str, name: str, program: str, attribute: str) -> str:
@@ -61,28 +59,3 @@ def instead(
     patch.setattr(plugin_system, 'names', lambda asked: (
         list(known) if asked == group else names(asked)))
     patch.setattr(plugin_system, 'load', loaded)
-
-
-class MemoryProvider(Provider):
-    """A provider whose machines a test writes to the dictionary ``machines`` of the class."""
-
-    machines: dict[str, Machine]
-
-    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
-        """Refuse, because the test creates the machines."""
-        raise ProviderError(f"'{spec.name}' can't be made: the test makes its machines itself")
-
-    def describe(self, machine_id: str) -> Machine:
-        """Return a machine by its id."""
-        if machine_id not in self.machines:
-            raise MachineNotFound(machine_id)
-        return self.machines[machine_id]
-
-    def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
-        """Return the machines that have the tags."""
-        return [machine for machine in self.machines.values()
-                if tags.items() <= machine.tags.items()]
-
-    def destroy(self, machine_id: str) -> None:
-        """Forget a machine."""
-        self.machines.pop(machine_id, None)

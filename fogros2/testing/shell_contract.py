@@ -12,6 +12,8 @@ import threading
 import time
 from typing import ClassVar
 
+import pytest
+
 from fogros2.errors import (
     Cancelled,
     CommandError,
@@ -42,170 +44,169 @@ class ShellContract:
         finally:
             shell.close()
 
+    @pytest.fixture
+    def connection(self, tmp_path: Path) -> Iterator[tuple[Shell, str]]:
+        """Connect a shell for one test."""
+        with self.connected(tmp_path) as connection:
+            yield connection
+
+    @pytest.fixture
+    def shell(self, connection: tuple[Shell, str]) -> Shell:
+        """Return the shell."""
+        return connection[0]
+
+    @pytest.fixture
+    def there(self, connection: tuple[Shell, str]) -> str:
+        """Return the path of the empty folder there."""
+        return connection[1]
+
     def read(self, shell: Shell, path: str) -> str:
         """Return the content of a file on the shell's machine."""
         return shell.run(Command(('cat', path)), timeout=30.0).stdout
 
-    def test_a_command_s_output_and_status_come_back(self, tmp_path: Path) -> None:
-        with self.connected(tmp_path) as (shell, _):
-            result = shell.run(Command(('echo', 'hello')), timeout=30.0)
-            assert (result.returncode, result.stdout) == (0, 'hello\n')
-            assert shell.run(Command(('false',)), timeout=30.0, check=False).returncode == 1
+    def test_a_command_s_output_and_status_come_back(self, shell: Shell) -> None:
+        result = shell.run(Command(('echo', 'hello')), timeout=30.0)
+        assert (result.returncode, result.stdout) == (0, 'hello\n')
+        assert shell.run(Command(('false',)), timeout=30.0, check=False).returncode == 1
 
-    def test_words_arrive_as_they_are(self, tmp_path: Path) -> None:
+    def test_words_arrive_as_they_are(self, shell: Shell) -> None:
         words = ('a b', "it's", '"x"', '$HOME', '`id`', 'é\u4e16', '*', ';', '\\', 'two\nlines')
-        with self.connected(tmp_path) as (shell, _):
-            result = shell.run(Command(('echo', *words)), timeout=30.0)
-            assert result.stdout == ' '.join(words) + '\n'
+        result = shell.run(Command(('echo', *words)), timeout=30.0)
+        assert result.stdout == ' '.join(words) + '\n'
 
-    def test_a_failure_says_what_where_and_why(self, tmp_path: Path) -> None:
-        with self.connected(tmp_path) as (shell, there):
-            command = Command(('cat', f'{there}/nothing'), what='reading it')
-            error = raised(CommandError, lambda: shell.run(command, timeout=30.0))
-            assert isinstance(error, CommandError)
-            assert error.result.returncode == 1
-            assert 'reading it failed' in str(error)
-            assert 'No such file' in str(error)
+    def test_a_failure_says_what_where_and_why(self, shell: Shell, there: str) -> None:
+        command = Command(('cat', f'{there}/nothing'), what='reading it')
+        error = raised(CommandError, lambda: shell.run(command, timeout=30.0))
+        assert isinstance(error, CommandError)
+        assert error.result.returncode == 1
+        assert 'reading it failed' in str(error)
+        assert 'No such file' in str(error)
 
-    def test_a_missing_program_is_an_error(self, tmp_path: Path) -> None:
-        with self.connected(tmp_path) as (shell, _):
-            error = raised(FogError, lambda: shell.run(
-                Command(('fogros2-no-such-program',)), timeout=30.0))
-            assert 'fogros2-no-such-program' in str(error)
+    def test_a_missing_program_is_an_error(self, shell: Shell) -> None:
+        error = raised(FogError, lambda: shell.run(
+            Command(('fogros2-no-such-program',)), timeout=30.0))
+        assert 'fogros2-no-such-program' in str(error)
 
-    def test_input_reaches_the_command(self, tmp_path: Path) -> None:
+    def test_input_reaches_the_command(self, shell: Shell) -> None:
         text = 'line\n' * 100_000
-        with self.connected(tmp_path) as (shell, _):
-            result = shell.run(Command(('cat',), input=text.encode()), timeout=30.0)
-            assert result.stdout == text
+        result = shell.run(Command(('cat',), input=text.encode()), timeout=30.0)
+        assert result.stdout == text
 
-    def test_the_environment_is_set(self, tmp_path: Path) -> None:
-        with self.connected(tmp_path) as (shell, _):
-            command = Command(('printenv', 'FOG_TEST'), environment={'FOG_TEST': 'a b$c'})
-            assert shell.run(command, timeout=30.0).stdout == 'a b$c\n'
+    def test_the_environment_is_set(self, shell: Shell) -> None:
+        command = Command(('printenv', 'FOG_TEST'), environment={'FOG_TEST': 'a b$c'})
+        assert shell.run(command, timeout=30.0).stdout == 'a b$c\n'
 
-    def test_sudo_is_root(self, tmp_path: Path) -> None:
+    def test_sudo_is_root(self, shell: Shell) -> None:
         if not self.sudo:
             return
-        with self.connected(tmp_path) as (shell, _):
-            assert shell.run(Command(('id', '-u'), sudo=True), timeout=30.0).stdout == '0\n'
+        assert shell.run(Command(('id', '-u'), sudo=True), timeout=30.0).stdout == '0\n'
 
-    def test_output_comes_line_by_line(self, tmp_path: Path) -> None:
+    def test_output_comes_line_by_line(self, shell: Shell) -> None:
         lines: list[str] = []
-        with self.connected(tmp_path) as (shell, _):
-            shell.run(Command(('seq', '20000')), timeout=30.0, on_output=lines.append)
+        shell.run(Command(('seq', '20000')), timeout=30.0, on_output=lines.append)
         assert lines == [str(n + 1) for n in range(20000)]
 
-    def test_command_that_takes_too_long_is_given_up(self, tmp_path: Path) -> None:
-        with self.connected(tmp_path) as (shell, _):
-            begin = time.monotonic()
-            raised(DeadlineExceeded,
-                    lambda: shell.run(Command(('sleep', '30')), timeout=0.3))
-            assert time.monotonic() - begin < 10.0
-            assert shell.run(Command(('true',)), timeout=30.0).returncode == 0
+    def test_command_that_takes_too_long_is_given_up(self, shell: Shell) -> None:
+        begin = time.monotonic()
+        raised(DeadlineExceeded,
+                lambda: shell.run(Command(('sleep', '30')), timeout=0.3))
+        assert time.monotonic() - begin < 10.0
+        assert shell.run(Command(('true',)), timeout=30.0).returncode == 0
 
-    def test_a_command_can_be_cancelled(self, tmp_path: Path) -> None:
+    def test_a_command_can_be_cancelled(self, shell: Shell) -> None:
         cancel = threading.Event()
-        with self.connected(tmp_path) as (shell, _):
-            timer = threading.Timer(0.2, cancel.set)
-            timer.start()
-            begin = time.monotonic()
-            raised(Cancelled, lambda: shell.run(
-                Command(('sleep', '30')), timeout=30.0, cancel=cancel))
-            timer.join()
-            assert time.monotonic() - begin < 10.0
+        timer = threading.Timer(0.2, cancel.set)
+        timer.start()
+        begin = time.monotonic()
+        raised(Cancelled, lambda: shell.run(
+            Command(('sleep', '30')), timeout=30.0, cancel=cancel))
+        timer.join()
+        assert time.monotonic() - begin < 10.0
 
-    def test_many_threads_use_one_shell(self, tmp_path: Path) -> None:
+    def test_many_threads_use_one_shell(self, shell: Shell) -> None:
         found: dict[int, str] = {}
-        with self.connected(tmp_path) as (shell, _):
-            def ask(number: int) -> None:
-                found[number] = shell.run(Command(('echo', str(number))), timeout=30.0).stdout
+        def ask(number: int) -> None:
+            found[number] = shell.run(Command(('echo', str(number))), timeout=30.0).stdout
 
-            threads = [threading.Thread(target=ask, args=(n,)) for n in range(24)]
-            for thread in threads:
-                thread.start()
-            for thread in threads:
-                thread.join(60.0)
+        threads = [threading.Thread(target=ask, args=(n,)) for n in range(24)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60.0)
         assert found == {n: f'{n}\n' for n in range(24)}
 
-    def test_put_makes_folders_and_sets_the_mode(self, tmp_path: Path) -> None:
-        with self.connected(tmp_path) as (shell, there):
-            path = f'{there}/new folder/é'
-            for data, mode in ((b'secret', 0o600), (b'', 0o644), (b'x' * 3_000_000, 0o700)):
-                shell.put(data, path, mode=mode)
-                assert self.read(shell, path) == data.decode()
-                told = shell.run(Command(('stat', '-c', '%a', path)), timeout=30.0).stdout
-                assert told == f'{mode:o}\n'
+    def test_put_makes_folders_and_sets_the_mode(self, shell: Shell, there: str) -> None:
+        path = f'{there}/new folder/é'
+        for data, mode in ((b'secret', 0o600), (b'', 0o644), (b'x' * 3_000_000, 0o700)):
+            shell.put(data, path, mode=mode)
+            assert self.read(shell, path) == data.decode()
+            told = shell.run(Command(('stat', '-c', '%a', path)), timeout=30.0).stdout
+            assert told == f'{mode:o}\n'
 
-    def test_sync_makes_a_folder_equal(self, tmp_path: Path) -> None:
+    def test_sync_makes_a_folder_equal(self, shell: Shell, there: str, tmp_path: Path) -> None:
         source = tmp_path / 'the source'
         _write(source, {'a': 'one', 'sub/b': 'two', 'sub/é c': 'three', 'log/l': 'l'})
-        with self.connected(tmp_path) as (shell, there):
-            target = f'{there}/the target'
-            first = shell.sync(source, target, excludes=['log'], timeout=60.0)
-            assert first.files == 3
-            assert self.read(shell, f'{target}/sub/é c') == 'three'
-            raised(CommandError, lambda: self.read(shell, f'{target}/log/l'))
-            again = shell.sync(source, target, excludes=['log'], timeout=60.0)
-            assert again.files == 0
-            (source / 'a').write_text('another one')
-            (source / 'sub/b').unlink()
-            last = shell.sync(source, target, excludes=['log'], timeout=60.0)
-            assert last.files == 1
-            assert self.read(shell, f'{target}/a') == 'another one'
-            raised(CommandError, lambda: self.read(shell, f'{target}/sub/b'))
+        target = f'{there}/the target'
+        first = shell.sync(source, target, excludes=['log'], timeout=60.0)
+        assert first.files == 3
+        assert self.read(shell, f'{target}/sub/é c') == 'three'
+        raised(CommandError, lambda: self.read(shell, f'{target}/log/l'))
+        again = shell.sync(source, target, excludes=['log'], timeout=60.0)
+        assert again.files == 0
+        (source / 'a').write_text('another one')
+        (source / 'sub/b').unlink()
+        last = shell.sync(source, target, excludes=['log'], timeout=60.0)
+        assert last.files == 1
+        assert self.read(shell, f'{target}/a') == 'another one'
+        raised(CommandError, lambda: self.read(shell, f'{target}/sub/b'))
 
-    def test_sync_leaves_alone_what_is_excluded_there(self, tmp_path: Path) -> None:
+    def test_sync_leaves_alone_what_is_excluded(
+        self, shell: Shell, there: str, tmp_path: Path,
+    ) -> None:
         source = tmp_path / 'source'
         _write(source, {'a': 'one', 'build/b': 'two', 'build/keep': 'three'})
-        with self.connected(tmp_path) as (shell, there):
-            target = f'{there}/target'
-            shell.put(b'theirs', f'{target}/build/made', mode=0o644)
-            shell.sync(source, target, excludes=['build/*'], includes=['build/keep'],
-                       timeout=60.0)
-            assert self.read(shell, f'{target}/build/made') == 'theirs'
-            assert self.read(shell, f'{target}/build/keep') == 'three'
-            raised(CommandError, lambda: self.read(shell, f'{target}/build/b'))
+        target = f'{there}/target'
+        shell.put(b'theirs', f'{target}/build/made', mode=0o644)
+        shell.sync(source, target, excludes=['build/*'], includes=['build/keep'],
+                   timeout=60.0)
+        assert self.read(shell, f'{target}/build/made') == 'theirs'
+        assert self.read(shell, f'{target}/build/keep') == 'three'
+        raised(CommandError, lambda: self.read(shell, f'{target}/build/b'))
 
-    def test_sync_tells_how_far_it_is(self, tmp_path: Path) -> None:
+    def test_sync_tells_how_far_it_is(self, shell: Shell, there: str, tmp_path: Path) -> None:
         source = tmp_path / 'source'
         _write(source, {f'f{n}': 'x' * 100_000 for n in range(30)})
         seen: list[tuple[int, int]] = []
-        with self.connected(tmp_path) as (shell, there):
-            shell.sync(source, f'{there}/target', excludes=[], timeout=60.0,
-                       on_progress=lambda done, total: seen.append((done, total)))
+        shell.sync(source, f'{there}/target', excludes=[], timeout=60.0,
+                   on_progress=lambda done, total: seen.append((done, total)))
         assert seen[-1] == (3_000_000, 3_000_000)
         assert [done for done, _ in seen] == sorted(done for done, _ in seen)
 
-    def test_sync_needs_a_folder(self, tmp_path: Path) -> None:
-        with self.connected(tmp_path) as (shell, there):
-            raised(WorkspaceError, lambda: shell.sync(
-                tmp_path / 'nothing', there, excludes=[], timeout=60.0))
+    def test_sync_needs_a_folder(self, shell: Shell, there: str, tmp_path: Path) -> None:
+        raised(WorkspaceError, lambda: shell.sync(
+            tmp_path / 'nothing', there, excludes=[], timeout=60.0))
 
-    def test_a_stream_carries_lines_both_ways(self, tmp_path: Path) -> None:
-        with self.connected(tmp_path) as (shell, _):
-            stream = shell.open(Command(('cat',)))
-            for line in (b'one\n', 'zw\u00f6lf\n'.encode(), b'x' * 30_000 + b'\n'):
-                stream.write(line)
-                assert stream.readline() == line
-            stream.close()
-            assert stream.readline() == b''
+    def test_a_stream_carries_lines_both_ways(self, shell: Shell) -> None:
+        stream = shell.open(Command(('cat',)))
+        for line in (b'one\n', 'zw\u00f6lf\n'.encode(), b'x' * 30_000 + b'\n'):
+            stream.write(line)
+            assert stream.readline() == line
+        stream.close()
+        assert stream.readline() == b''
 
-    def test_closing_a_stream_wakes_its_reader(self, tmp_path: Path) -> None:
+    def test_closing_a_stream_wakes_its_reader(self, shell: Shell) -> None:
         got: list[bytes] = []
-        with self.connected(tmp_path) as (shell, _):
-            stream = shell.open(Command(('cat',)))
-            reader = threading.Thread(target=lambda: got.append(stream.readline()))
-            reader.start()
-            stream.close()
-            reader.join(10.0)
+        stream = shell.open(Command(('cat',)))
+        reader = threading.Thread(target=lambda: got.append(stream.readline()))
+        reader.start()
+        stream.close()
+        reader.join(10.0)
         assert got == [b'']
 
-    def test_it_opens_again_after_close(self, tmp_path: Path) -> None:
-        with self.connected(tmp_path) as (shell, _):
-            shell.run(Command(('true',)), timeout=30.0)
-            shell.close()
-            assert shell.run(Command(('true',)), timeout=30.0).returncode == 0
+    def test_it_opens_again_after_close(self, shell: Shell) -> None:
+        shell.run(Command(('true',)), timeout=30.0)
+        shell.close()
+        assert shell.run(Command(('true',)), timeout=30.0).returncode == 0
 
 
 def raised(kind: type[FogError], call: Callable[[], object]) -> FogError:

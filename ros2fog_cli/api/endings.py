@@ -18,7 +18,7 @@ from typing import Optional
 from fogros2 import deploy, plugin_system
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
-from fogros2.deploy.robot import clear, take_down
+from fogros2.deploy.robot import clear
 from fogros2.errors import (
     AgentError,
     ConfigurationError,
@@ -187,8 +187,7 @@ def _agent(record: Record, shell: Shell) -> Iterator[Optional[AgentClient]]:
             timeout=Timeouts().command, check=False).returncode != 0:
         yield None
         return
-    client = AgentClient(shell, record.agent, agent_path=record.agent_program,
-                         python=record.python)
+    client = AgentClient(shell, record.agent, agent_path=record.agent_program)
     try:
         yield client
     finally:
@@ -332,7 +331,7 @@ def let_go(record: Record, store: Store) -> None:
     """
     folder = store.root / 'launches' / record.launch
     with store.lock(record.name):
-        take_down(folder, record.robot_vpn, record.spec.vpn)
+        clear(folder)
         store.save(dataclasses.replace(record, launch='', pid=0, pid_start=0, robot_vpn=None))
 
 

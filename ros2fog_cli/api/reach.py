@@ -159,7 +159,7 @@ def agent(entry: Entry, to: Shell) -> AgentClient:
     if record is None or not record.agent or not record.agent_program:
         raise AgentError(f"this robot has no record of an agent on '{entry.name}'",
                          'only the robot that launched the machine has one')
-    return AgentClient(to, record.agent, agent_path=record.agent_program, python=record.python)
+    return AgentClient(to, record.agent, agent_path=record.agent_program)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,8 +9,9 @@ from decimal import Decimal
 import os
 from typing import Any, TextIO
 
+from fogros2.report import size
 from ros2fog_cli.api import replicas
-from ros2fog_cli.api.table import cost, duration, NODES, nodes, shares, size, table
+from ros2fog_cli.api.table import cost, duration, NODES, nodes, shares, table
 
 #: Enter and leave the alternate screen; meanwhile the cursor is hidden and long lines are cut,
 #: as the number of characters is no limit (a character may be two columns wide).

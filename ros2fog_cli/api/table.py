@@ -83,15 +83,6 @@ def milliseconds(time: Optional[float]) -> str:
     return NONE if time is None else f'{time:.{0 if time >= 10 else 1}f} ms'
 
 
-def size(number: float) -> str:
-    """Return bytes as text with a decimal unit."""
-    for unit in ('B', 'kB', 'MB', 'GB'):
-        if number < 1000:
-            return f'{number:.0f} {unit}' if unit == 'B' else f'{number:.1f} {unit}'
-        number /= 1000
-    return f'{number:.1f} TB'
-
-
 def cost(dollars: Optional[Decimal], places: int = 4) -> str:
     """Return US dollars with ``places`` decimal places, ``-`` for None."""
     return NONE if dollars is None else f'${dollars.quantize(Decimal(1).scaleb(-places))}'

@@ -107,8 +107,9 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
     from decimal import Decimal
 
     from fogros2.clock import ClockOffset
+    from fogros2.report import size
     from ros2fog_cli.api import replicas
-    from ros2fog_cli.api.table import cost, duration, NODES, nodes, shares, size, table
+    from ros2fog_cli.api.table import cost, duration, NODES, nodes, shares, table
     now = time.time()
     lines = [
         ('machine', f"{status['name']} ({status['provider']} {status['id'] or '-'})"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fakes keep the contracts, so that tests with them hold for the real ones."""
+"""The fake provider keeps the contract, so that tests with it hold for real ones."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ import pytest
 from fogros2.errors import ProviderError
 from fogros2.model import Command, MachineSpec, MachineState, Result
 from fogros2.testing import (
-    FakeClock,
     FakeProvider,
     FakeShell,
     FakeStream,
     ProviderContract,
     request_for,
-    ShellContract,
 )
 
 
@@ -42,12 +40,6 @@ class TestFakeCloud(ProviderContract):
         return self.provider, {'size': 'cheapest'}
 
 
-class TestFakeShell(ShellContract):
-
-    def make(self, folder):
-        return FakeShell(), '/there'
-
-
 def test_a_fake_provider_remembers_calls_and_fails_as_told():
     provider = FakeProvider(failures={'create': ProviderError('no more machines')})
     spec = MachineSpec('planner', 'fake')
@@ -68,9 +60,3 @@ def test_a_fake_shell_answers_as_told():
     assert shell.run(Command(('uname', '-s')), timeout=1).stdout == 'Fake\n'
     assert shell.open(Command(('agent',))) is stream
     assert shell.commands == [Command(('uname', '-s'))]
-
-
-def test_a_fake_clock_moves_when_told():
-    clock = FakeClock(5.0)
-    clock.advance(2.5)
-    assert clock() == 7.5

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import os
 import threading
 
-from fogros2.model import Command, Result
+from fogros2.model import Command, Endpoint, Result
+from fogros2.shell.local import LocalShell
 from fogros2.shell.movable import MovableShell
 from fogros2.testing import FakeShell, ShellContract
 from fogros2.waiting import wait_until
@@ -13,8 +15,12 @@ from fogros2.waiting import wait_until
 
 class TestMovableShell(ShellContract):
 
+    sudo = os.geteuid() == 0
+
     def make(self, folder):
-        return MovableShell(FakeShell()), '/there'
+        there = folder / 'there'
+        there.mkdir()
+        return MovableShell(LocalShell(Endpoint('local'), name='here')), str(there)
 
 
 def test_from_a_move_on_it_is_the_other_shell():

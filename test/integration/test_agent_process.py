@@ -145,7 +145,7 @@ class Rig:
     def client(self, *, follow: bool = True, **more: Any) -> AgentClient:
         client = AgentClient(
             self.shell, str(self.directory),  # type: ignore[arg-type]
-            python=sys.executable, agent_path=str(self.program), **more)
+            agent_path=str(self.program), **more)
         self.clients.append(client)
         if follow:
             client.subscribe(self.events.append, since=1)

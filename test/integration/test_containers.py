@@ -85,7 +85,7 @@ def begun(words: Sequence[str], folder: Path, **variables: str) -> subprocess.Po
 
 def started(container: Container, launch: str, folder: Path) -> subprocess.Popen[str]:
     """Start a container as a deployment does, and follow it as the agent does."""
-    assert at_machine(containers.find()).strip() == 'podman'
+    assert at_machine(containers.FIND).strip() == 'podman'
     image = at_machine(containers.fetch(container.image)).strip()
     (folder / 'variables').write_text(VARIABLES)
     at_machine(containers.run(container, 0, launch, image, str(settings(folder)),

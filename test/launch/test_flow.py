@@ -19,7 +19,7 @@ from launch.actions import (
 )
 from launch.event_handlers import OnProcessExit, OnProcessIO, OnProcessStart
 from launch.events import matches_action
-from launch.events.process import ProcessStdin, ShutdownProcess, SignalProcess
+from launch.events.process import ShutdownProcess, SignalProcess
 from launch_ros.actions import Node
 import pytest
 
@@ -185,12 +185,12 @@ def test_equal_machines_are_created_once(run, fake, planner):
     assert len(fake.noted('up')) == 1 and planner.is_created and twin.is_created
 
 
-def test_steps_are_shown_and_summed_up(run, fake, planner, capfd):
+def test_steps_are_shown_once(run, fake, planner, capfd):
     fake.on_start = ends
     assert run(LaunchDescription([talker(planner)])) == 0
     output = capfd.readouterr().out
     assert '[INFO] [fogros2]: planner: machine 0.' in output and '(made of air)' in output
-    assert 'machine  step     seconds' in output
+    assert output.count('planner: machine') == 1
     assert '\r' not in output and '\x1b' not in output
 
 
@@ -394,18 +394,6 @@ def test_shutdown_process_ends_one_node(run, fake, planner):
     ])) == 0
     (_, name), = fake.noted('stop')
     assert 'first' in name and first.return_code == -2
-
-
-def test_input_of_a_remote_process_is_refused(run, fake, planner, capfd):
-    node = talker(planner)
-    assert run(LaunchDescription([
-        node,
-        RegisterEventHandler(OnProcessStart(target_action=node, on_start=[
-            OpaqueFunction(function=lambda context: context.emit_event_sync(
-                ProcessStdin(text=b'hello', **node.process_details))),
-            TimerAction(period=0.05, actions=[Shutdown()])])),
-    ])) == 0
-    assert 'takes no input' in capfd.readouterr().out
 
 
 def test_a_refused_node_is_an_error_line(run, fake, planner, capfd):

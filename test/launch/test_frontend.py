@@ -26,7 +26,7 @@ from fogros2 import (
 )
 from fogros2.describe import keywords, values
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport.h264 import H264
+from fogros2.image_transport.nodes import H264
 from fogros2.runtime.coordinator import Coordinator
 from fogros2.testing.plugins import instead
 

@@ -35,7 +35,7 @@ from fogros2 import (
     StreamTopic,
 )
 from fogros2.errors import AgentError, ProviderError
-from fogros2.image_transport.h264 import H264
+from fogros2.image_transport.nodes import H264
 from fogros2.runtime import session
 from fogros2.testing.plugins import instead
 

@@ -38,7 +38,7 @@ from fogros2.actions.launch_description import has_machine
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport.h264 import H264
+from fogros2.image_transport.nodes import H264
 from fogros2.testing.plugins import instead
 
 KINDS = [Node, LifecycleNode, ComposableNodeContainer]

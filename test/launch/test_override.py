@@ -32,7 +32,7 @@ from fogros2 import (
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides, parse
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport.h264 import H264
+from fogros2.image_transport.nodes import H264
 from fogros2.testing.plugins import instead
 from ros2fog_cli.option.machine import complete, MachineOption
 

@@ -35,7 +35,7 @@ from fogros2 import (
 )
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
-from fogros2.image_transport.h264 import H264
+from fogros2.image_transport.nodes import H264
 from fogros2.model import NodeSpec
 from fogros2.runtime import replicas
 from fogros2.testing.plugins import instead

@@ -41,7 +41,7 @@ from fogros2 import (
 )
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
-from fogros2.image_transport.h264 import H264
+from fogros2.image_transport.nodes import H264
 from fogros2.testing.plugins import instead
 
 BACK = StreamTopic('/seen', 'h264', 'to_robot', bitrate=500_000)

@@ -42,7 +42,7 @@ def plan(run, fake, monkeypatch):
     waited = []
 
     async def stay(action, context):
-        if not isinstance(action, republishers.RobotRepublisher):
+        if not isinstance(action, republishers.AddedProcess):
             found.robot.append((*words(action.process_details['cmd']), required(action)))
         private.completed(action).set_result(None)
 

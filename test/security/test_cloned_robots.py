@@ -105,7 +105,7 @@ def test_machine_in_use_elsewhere_needs_force(
     """Its record is of an older version, so nothing tells whose it is."""
     launched(agent='/run/fogros2/slam', agent_program='/run/fogros2/slam/agent.py', robot='')
     (found,) = provider.find({})
-    provider._machines[found.id] = dataclasses.replace(
+    provider.machines[found.id] = dataclasses.replace(
         found, tags={**found.tags, TAG_ROBOT: robot_name()})
     monkeypatch.setattr(reach, 'session', lambda *_, **__: contextlib.nullcontext(
         FakeShell(handlers={'test': lambda command: Result(0, '', '')})))

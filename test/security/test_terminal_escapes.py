@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import queue
 import re
-import threading
 from typing import Any
 
 import pytest
@@ -56,7 +55,7 @@ def received(sent: list[dict[str, Any]]) -> list[Any]:
     """Return the events as the robot's programs get them."""
     found: list[Any] = []
     shell: Any = Machine(sent)
-    client = AgentClient(shell, '/run/x', agent_path='/run/x/agent.py', cancel=threading.Event())
+    client = AgentClient(shell, '/run/x', agent_path='/run/x/agent.py')
     try:
         client.subscribe(found.append, since=1)
         wait_until(lambda: len(found) == len(sent) or None, timeout=10, what='the events')
@@ -108,7 +107,7 @@ def test_no_output_of_a_command_controls_the_terminal(attack: str) -> None:
     out, err = output.text()
     assert harmless(err) and all(map(harmless, said)), ascii(err)
     assert out == f'{attack}\nend{attack}', 'programs read it'
-    for result in (Result(1, out, '', 0.0), Result(1, '', err, 0.0)):
+    for result in (Result(1, out, ''), Result(1, '', err)):
         with pytest.raises(CommandError) as failed:
             command_line.checked(Command(('x',)), result, "'planner'")
         assert harmless(str(failed.value)), ascii(str(failed.value))

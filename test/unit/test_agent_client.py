@@ -16,7 +16,6 @@ from fogros2.agent_client import AgentClient, Heartbeat
 from fogros2.errors import (
     AgentError,
     AuthenticationError,
-    Cancelled,
     ConnectError,
     DeadlineExceeded,
 )
@@ -126,7 +125,7 @@ def test_ping_before_the_subscription_does_not_replace_it(make):
     until(lambda: any(request['command'] == 'ping' for request in stream.asked))
     # answered in order, so the ping's answer has been read
     client.request('configure')
-    client.subscribe(lambda event: None)
+    client.subscribe(lambda event: None, since=1)
     assert any(request['command'] == 'log' for request in stream.asked)
 
 
@@ -144,13 +143,6 @@ def test_no_reply_in_time(make):
         client.request('status', timeout=0.05)
 
 
-def test_cancelled_launch_waits_for_no_reply(make):
-    cancel = threading.Event()
-    client = make(ScriptedStream(lambda request: [cancel.set()][1:]), cancel=cancel)
-    with pytest.raises(Cancelled):
-        client.request('status', timeout=60)
-
-
 def test_events_arrive_once_and_in_order_over_connections(make):
     first, second = agent(), agent(next_seq=6)
     client = make(first, ConnectError('not yet'), second)
@@ -165,24 +157,6 @@ def test_events_arrive_once_and_in_order_over_connections(make):
         second.say(ending(seq))
     until(lambda: len(seen) == 7)
     assert [e.get('seq', e.get('state')) for e in seen] == [1, 2, 3, 'lost', 'back', 4, 5]
-
-
-def test_subscription_without_beginning_gets_new_events(make):
-    stream = agent(next_seq=40)
-    client = make(stream)
-    seen: list[dict[str, Any]] = []
-    client.subscribe(seen.append)
-    until(lambda: len(stream.asked) == 2)
-    assert stream.asked[1]['from'] == 40
-    stream.say(ending(39))
-    stream.say(ending(40))
-    until(lambda: seen)
-    assert [e['seq'] for e in seen] == [40]
-    later: list[dict[str, Any]] = []
-    client.subscribe(later.append)
-    stream.say(ending(41))
-    until(lambda: later)
-    assert [e['seq'] for e in later] == [41] and [e['seq'] for e in seen] == [40, 41]
 
 
 def test_new_log_of_an_agent_is_read_from_its_beginning(make):

@@ -19,7 +19,7 @@ from typing import Any, Optional
 import pytest
 from ros2cli.cli import main
 
-from fogros2 import process
+from fogros2 import process, report
 from fogros2.deploy import robot
 from fogros2.errors import PrerequisiteError, ProviderError, Unsupported
 from fogros2.model import (
@@ -30,11 +30,11 @@ from fogros2.model import (
     Result,
     VpnInterface,
 )
-from fogros2.provider import TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
+from fogros2.provider import Capabilities, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.provider.container import ContainerProvider
 from fogros2.store import process_start, Record, robot_name, Store
-from fogros2.testing.fakes import FakeShell, FakeStream
-from fogros2.testing.plugins import instead, MemoryProvider
+from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream
+from fogros2.testing.plugins import instead
 from rigs import recorded_agent
 from ros2fog_cli.api import endings, joining, machines, table
 from ros2fog_cli.api.machines import Entry
@@ -42,10 +42,11 @@ from ros2fog_cli.api.machines import Entry
 NOW = 1_800_000_000.0
 
 
-class Memory(MemoryProvider):
+class Memory(FakeProvider):
     """A provider with its machines in a dictionary."""
 
     name = 'memory'
+    capabilities = Capabilities()
     machines: dict[str, Machine] = {}
     searched: list[str] = []
 
@@ -617,7 +618,7 @@ def test_durations_have_at_most_two_units(seconds: Optional[float], text: str) -
 
 
 def test_sizes_and_costs_have_units() -> None:
-    assert [table.size(n) for n in (0, 999, 1000, 1.5e9, 3e13)] == [
+    assert [report.size(n) for n in (0, 999, 1000, 1.5e9, 3e13)] == [
         '0 B', '999 B', '1.0 kB', '1.5 GB', '30.0 TB']
     assert table.cost(None) == '-' and table.cost(Decimal('1.5')) == '$1.5000'
 

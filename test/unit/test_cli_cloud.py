@@ -37,22 +37,22 @@ from fogros2.model import (
 from fogros2.provider import Capabilities, TAG_DEPENDENCIES, TAG_EXPIRES, TAG_NAME, TAG_ROBOT
 from fogros2.provider.offers import MachineType, Offer, Offers, ranked, Region, Wants
 from fogros2.store import process_start, Record, robot_name, Store
-from fogros2.testing.fakes import FakeShell
-from fogros2.testing.plugins import instead, MemoryProvider
+from fogros2.testing.fakes import FakeProvider, FakeShell
+from fogros2.testing.plugins import instead
 from ros2fog_cli.api import doctor, endings, images, pod_image, reach, table
 from ros2fog_cli.api.machines import Entry
 
 NOW = 1_800_000_000.0
 
 
-class Cloud(MemoryProvider):
+class Cloud(FakeProvider):
     """A cloud in memory."""
 
     name = 'cloud'
     capabilities = Capabilities(firewall=True, images=True, regions=True)
     machines: dict[str, Machine] = {}
     baked: list[Image] = []
-    calls: list[tuple[Any, ...]] = []
+    asked: list[tuple[Any, ...]] = []
     up = True
     lingering = False
     states: list[str] = []
@@ -62,10 +62,10 @@ class Cloud(MemoryProvider):
         return cls.up
 
     def search_in(self, regions: Sequence[str]) -> None:
-        self.calls.append(('regions', *regions))
+        self.asked.append(('regions', *regions))
 
     def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
-        self.calls.append(('find',))
+        self.asked.append(('find',))
         return super().find(tags)
 
     def destroy(self, machine_id: str) -> None:
@@ -76,10 +76,10 @@ class Cloud(MemoryProvider):
         return '198.51.100.9/32'
 
     def allow(self, machine_id: str, port: int, sources: Sequence[str]) -> None:
-        self.calls.append(('allow', machine_id, port, *sources))
+        self.asked.append(('allow', machine_id, port, *sources))
 
     def bake(self, machine_id: str, name: str, dependencies: str) -> str:
-        self.calls.append(('bake', machine_id, name, dependencies))
+        self.asked.append(('bake', machine_id, name, dependencies))
         self.baked.append(Image(f'img-{len(self.baked)}', name, 'cloud', 'here', time.time(), 30,
                                 'pending', dependencies))
         return self.baked[-1].id
@@ -109,7 +109,7 @@ class Plain(Cloud):
 
 @pytest.fixture(autouse=True)
 def cloud(monkeypatch: pytest.MonkeyPatch) -> type[Cloud]:
-    Cloud.machines, Cloud.baked, Cloud.calls, Cloud.states = {}, [], [], []
+    Cloud.machines, Cloud.baked, Cloud.asked, Cloud.states = {}, [], [], []
     Cloud.up, Cloud.lingering = True, False
     instead(monkeypatch, 'fogros2.provider', {'cloud': Cloud, 'plain': Plain})
     return Cloud
@@ -147,10 +147,10 @@ def test_unconfigured_provider_is_not_asked(capsys: pytest.CaptureFixture[str]) 
     Cloud.up = False
     machine('slam')
     assert run('list') == 0
-    assert capsys.readouterr().out == 'no machines\n' and Cloud.calls == []
+    assert capsys.readouterr().out == 'no machines\n' and Cloud.asked == []
     # a record of this robot's, or a region, names it all the same
     assert run('list', '--region', 'eu-west-1') == 0
-    assert Cloud.calls == [('regions', 'eu-west-1'), ('find',)]
+    assert Cloud.asked == [('regions', 'eu-west-1'), ('find',)]
     record('slam')
     assert run('list') == 0
     assert 'slam' in capsys.readouterr().out
@@ -267,32 +267,32 @@ def test_gc_tidies_up_providers(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def tidy(self: Cloud, dead: Collection[str] = ()) -> list[str]:
-        self.calls.append(('tidy',))
+        self.asked.append(('tidy',))
         return [f"security group of 'old' ({self.name})"] if type(self) is Cloud else []
 
     monkeypatch.setattr(Cloud, 'tidy', tidy)
     assert run('gc', '--dry-run') == 0
-    assert ('tidy',) not in Cloud.calls
+    assert ('tidy',) not in Cloud.asked
     capsys.readouterr()
     assert run('gc') == 0
     assert capsys.readouterr().out == \
         "cleared leftover security group of 'old' (cloud): its machine ended by itself\n"
     Cloud.up = False
-    Cloud.calls.clear()
+    Cloud.asked.clear()
     assert run('gc') == 0
-    assert not Cloud.calls
+    assert not Cloud.asked
 
 
 def test_gc_clears_what_a_killed_creation_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """The launch died before it saved the machine's id."""
     def tidy(self: Cloud, dead: Collection[str] = ()) -> list[str]:
-        self.calls.append(('tidy', *dead))
+        self.asked.append(('tidy', *dead))
         return []
 
     monkeypatch.setattr(Cloud, 'tidy', tidy)
     record('slam', machine_id=None, token='t1', launch='abc123')
     assert run('gc') == 0
-    assert ('tidy', 't1') in Cloud.calls
+    assert ('tidy', 't1') in Cloud.asked
     assert not Store().machine('slam').exists()
 
 
@@ -306,7 +306,7 @@ def shells(monkeypatch: pytest.MonkeyPatch) -> list[Endpoint]:
 
     def connect(to: Endpoint, **_: Any) -> FakeShell:
         opened.append(to)
-        Cloud.calls.append(('connect', to.host))
+        Cloud.asked.append(('connect', to.host))
         return FakeShell()
 
     monkeypatch.setattr(reach.shells, 'connect', connect)
@@ -317,7 +317,7 @@ def test_session_opens_and_closes_the_firewall(shells: list[Endpoint]) -> None:
     machine('slam')
     record('slam')
     assert run('connect', 'slam') == 0
-    assert Cloud.calls == [('allow', 'id-slam', 22, '198.51.100.9/32'),
+    assert Cloud.asked == [('allow', 'id-slam', 22, '198.51.100.9/32'),
                            ('connect', '198.51.100.7'), ('allow', 'id-slam', 22)]
     # the key that the record has: the machine has made it after the provider's one-time key
     assert shells[0].host_key == 'ssh-ed25519 BBBB' and shells[0].key_file == '/keys/id_ed25519'
@@ -350,7 +350,7 @@ def test_session_does_not_change_another_robots_firewall(shells: list[Endpoint])
     found = machine('slam')
     machine('slam', tags={**found.tags, TAG_ROBOT: 'another'})
     assert run('connect', 'slam') == 0
-    assert [call for call in Cloud.calls if call[0] == 'allow'] == []
+    assert [call for call in Cloud.asked if call[0] == 'allow'] == []
     assert shells[0].host == '198.51.100.7'
 
 
@@ -360,7 +360,7 @@ def test_session_leaves_the_port_open_for_a_launch(
     machine('slam')
     record('slam', alive=True)
     assert run('connect', 'slam') == 0
-    assert [call[0] for call in Cloud.calls] == ['allow', 'connect']
+    assert [call[0] for call in Cloud.asked] == ['allow', 'connect']
 
 
 def test_session_prefers_the_vpn(shells: list[Endpoint]) -> None:
@@ -370,7 +370,7 @@ def test_session_prefers_the_vpn(shells: list[Endpoint]) -> None:
         record('slam', alive=True, vpn=VpnInterface('fog', '127.0.0.1', '127.0.0.0/8', 1, ''),
                shell=Endpoint('ssh', '198.51.100.7', port, 'ubuntu', 'ssh-ed25519 BBBB'))
         assert run('connect', 'slam') == 0
-    assert [call[0] for call in Cloud.calls] == ['connect']
+    assert [call[0] for call in Cloud.asked] == ['connect']
     assert shells[0].host == '127.0.0.1' and shells[0].host_key == 'ssh-ed25519 BBBB'
     # it answers no more: the way round, through the firewall
     assert run('connect', 'slam') == 0
@@ -383,7 +383,7 @@ def test_session_without_firewall_makes_no_rule(
     monkeypatch.setattr(Cloud, 'capabilities', Capabilities(images=True, regions=True))
     machine('slam')
     assert run('connect', 'slam') == 0
-    assert [call[0] for call in Cloud.calls if call[0] != 'find'] == ['connect']
+    assert [call[0] for call in Cloud.asked if call[0] != 'find'] == ['connect']
 
 
 # -- images -------------------------------------------------------------------------------
@@ -413,7 +413,7 @@ def test_image_is_created_and_awaited(
     assert run('image', 'slam') == 0
     # what is in memory alone would not be in the image
     assert [command.argv for command in disk.commands] == [('sync',)]
-    (_, machine_id, name, dependencies), = [c for c in Cloud.calls if c[0] == 'bake']
+    (_, machine_id, name, dependencies), = [c for c in Cloud.asked if c[0] == 'bake']
     assert machine_id == 'id-slam' and dependencies == '0123456789abcdef'
     assert name.startswith('slam-image-20')
     said = capsys.readouterr()
@@ -621,8 +621,8 @@ def test_doctor_asks_configured_providers() -> None:
     assert doctor.provider('cloud') == doctor.Check(
         "provider 'cloud'", 'ok', 'answers, 1 machine')
     Cloud.up = False
-    Cloud.calls.clear()
-    assert doctor.provider('cloud').detail == 'not set up here' and not Cloud.calls
+    Cloud.asked.clear()
+    assert doctor.provider('cloud').detail == 'not set up here' and not Cloud.asked
     assert doctor.provider('cloud', needed=True).detail == 'answers, 1 machine'
 
 

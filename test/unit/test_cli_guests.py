@@ -27,10 +27,11 @@ from fogros2.model import (
     Result,
     VpnInterface,
 )
+from fogros2.provider import Capabilities
 from fogros2.provider.container import packet_filter
 from fogros2.store import process_start, Record, Store, write_private
-from fogros2.testing.fakes import FakeShell
-from fogros2.testing.plugins import instead, MemoryProvider
+from fogros2.testing.fakes import FakeProvider, FakeShell
+from fogros2.testing.plugins import instead
 from ros2fog_cli.api import endings, guests, reach
 
 OTHER = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
@@ -38,10 +39,11 @@ MACHINE = Machine('id', 'planner', 'memory', MachineState.RUNNING, time.time(),
                   Endpoint('ssh', '203.0.113.9'), vpn_host='203.0.113.9', vpn_port=30000)
 
 
-class Memory(MemoryProvider):
+class Memory(FakeProvider):
     """A provider with one machine."""
 
     name = 'memory'
+    capabilities = Capabilities()
     machines: dict[str, Machine] = {}
 
 

@@ -470,5 +470,5 @@ def test_a_computer_that_stays_keeps_no_container(monkeypatch, survives, used):
 
 
 def test_scripts_are_shell():
-    for script in ('FIND', 'INSTALL', 'IMAGE', 'RUN', 'FOLLOW', 'NODE', 'INSIDE', 'REMOVE'):
+    for script in ('FIND', 'IMAGE', 'RUN', 'FOLLOW', 'NODE', 'INSIDE', 'REMOVE'):
         subprocess.run(['sh', '-n'], input=getattr(container_scripts, script).encode(), check=True)

@@ -16,18 +16,20 @@ import pytest
 from fogros2.errors import MachineNotFound, NameTaken, ProviderError
 from fogros2.journal import Journal
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState
-from fogros2.provider import TAG_NAME, TAG_ROBOT
+from fogros2.provider import Capabilities, TAG_NAME, TAG_ROBOT
 from fogros2.report import silent, StepDone, StepStarted
 from fogros2.store import process_start, Record, robot_name, Store
-from fogros2.testing.plugins import instead, MemoryProvider
+from fogros2.testing.fakes import FakeProvider
+from fogros2.testing.plugins import instead
 from fogros2.waiting import wait_until
 from ros2fog_cli.api.live import Live
 
 
-class Memory(MemoryProvider):
+class Memory(FakeProvider):
     """A provider with its machines in a dictionary."""
 
     name = 'memory'
+    capabilities = Capabilities()
     machines: dict[str, Machine] = {}
 
     def destroy(self, machine_id: str) -> None:

@@ -45,9 +45,9 @@ def test_journal_forwards_and_stores_events(tmp_path: Path) -> None:
     times = iter([100.0, 101.0, 102.0, 103.0, 103.1, 104.0])
     folder = tmp_path / 'launch'
     keep = Journal(heard.append, folder, clock=lambda: next(times))
-    keep(StepStarted('', 'VPN'))
-    assert read(folder) == []
     folder.mkdir()
+    assert read(folder) == []
+    keep(StepStarted('', 'VPN'))
     keep(StepStarted('a', 'workspace'))
     keep(StepDone('', 'VPN', 2.0, 'up'))
     keep(Progress('a', 'workspace', 10, 100))

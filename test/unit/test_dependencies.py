@@ -17,7 +17,7 @@ import pytest
 from fogros2 import plan
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.host import bootstrap, dependencies, modules, workspace
-from fogros2.host.dependencies import PipFolder
+from fogros2.host.dependencies import fill, pip_folder, with_pip_folder
 from fogros2.host.inspection import HostFacts
 from fogros2.model import Command, MachineSpec, Result
 from rigs.rosdep import rosdep_source
@@ -73,7 +73,7 @@ def test_folder_follows_the_requirements_and_the_interpreters() -> None:
     def path(*pip: str, home: str = '/home/a', python: str = 'python 3 12 1 /usr/bin/python3',
              ) -> str:
         facts = bootstrap.host.parse_facts(f'home {home}\n{python}\n')
-        return PipFolder.of(MachineSpec('a', 'fake', pip=pip), facts).path
+        return pip_folder(MachineSpec('a', 'fake', pip=pip), facts)
 
     assert path('x', 'y') == path('y', 'x') and path('x').startswith('/home/a/.local/share/')
     assert len({path('x'), path('y'), path('x', python='python 3 11 1 /usr/bin/python3')}) == 3
@@ -93,7 +93,7 @@ def completed(command: Command) -> subprocess.CompletedProcess[str]:
 
 
 def test_variables_of_a_launch_file_are_on_no_command_line() -> None:
-    command = PipFolder('/none', ('x',)).fill({'A': 'b'}, {'API_KEY': "it's secret"}, ())
+    command = fill('/none', ('x',), {'A': 'b'}, {'API_KEY': "it's secret"}, ())
     assert 'secret' not in ' '.join(command.argv)
     shown = modules.among_nodes({'API_KEY': "it's secret"}, (), 'cat; echo "$API_KEY"', 'show')
     assert completed(shown).stdout == "it's secret\n"
@@ -111,11 +111,11 @@ def wheel(folder: Path, name: str, **modules: str) -> None:
         archive.writestr(f'{info}/RECORD', '')
 
 
-def installed(tmp_path: Path, *names: str) -> tuple[PipFolder, subprocess.CompletedProcess[str]]:
+def installed(tmp_path: Path, *names: str) -> tuple[str, subprocess.CompletedProcess[str]]:
     """Install wheels as on a machine, with this interpreter as that of the nodes."""
-    folder = PipFolder.of(MachineSpec('a', 'fake', pip=names), HostFacts(home=str(tmp_path)))
-    command = folder.fill(
-        {'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}'},
+    folder = pip_folder(MachineSpec('a', 'fake', pip=names), HostFacts(home=str(tmp_path)))
+    command = fill(
+        folder, names, {'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}'},
         {'PIP_NO_INDEX': '1', 'PIP_FIND_LINKS': str(tmp_path)}, ())
     return folder, completed(command)
 
@@ -126,7 +126,7 @@ def test_installed_packages_are_found_after_the_systems(tmp_path: Path) -> None:
           pytest='raise ImportError("pip")')
     folder, done = installed(tmp_path, 'fogt-one')
     assert done.returncode == 0, done.stderr
-    assert Path(folder.path, 'complete').exists() and not Path(folder.path, 'pip').exists()
+    assert Path(folder, 'complete').exists() and not Path(folder, 'pip').exists()
     system = tmp_path / 'system'
     system.mkdir()
     (system / 'sitecustomize.py').write_text('import builtins; builtins.before = True')
@@ -134,7 +134,7 @@ def test_installed_packages_are_found_after_the_systems(tmp_path: Path) -> None:
             'print(fogt_one.name, before, sys.path[-1].endswith("/site"))')
     found = subprocess.run(
         [sys.executable, '-c', code], capture_output=True, text=True,
-        env={**folder.found_by({}), 'PYTHONPATH': f'{folder.path}/last:{system}'})
+        env={**with_pip_folder(folder, {}), 'PYTHONPATH': f'{folder}/last:{system}'})
     assert found.stdout.split() == ['pip', 'True', 'True'], found.stderr
 
 
@@ -149,7 +149,7 @@ def test_package_that_brings_a_module_of_ours_is_not_kept(tmp_path: Path) -> Non
         archive.writestr('harmless-1.dist-info/RECORD', '')
     folder, done = installed(tmp_path, 'harmless')
     assert done.returncode == 1 and "brings 'fogros2'" in done.stderr
-    assert not Path(folder.path, 'site').exists() and not Path(folder.path, 'complete').exists()
+    assert not Path(folder, 'site').exists() and not Path(folder, 'complete').exists()
 
 
 def manifest(root: Path, name: str, *lines: str) -> None:
@@ -227,17 +227,16 @@ def test_a_users_paths_extend_the_machines(
 
 def test_missing_packages_of_keys_are_no_error() -> None:
     facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=False)
-    todo = bootstrap.Preparation(
-        'none', bootstrap.RosInstall('ros', ('ros2',), facts=facts, robot=facts))
+    install = bootstrap.RosInstall('ros', ('ros2',), facts=facts, robot=facts)
     spec = MachineSpec('lab', 'ssh')
     outputs = {'look for dependencies': 'python3-scipy\n',
                'resolve rosdep keys': '#apt\npython3-scipy\n',
                'look for apt packages': 'python3-scipy\n'}
 
     def complete(spec: MachineSpec) -> list[str]:
-        folder = PipFolder.of(spec, facts, ['python3-scipy'])
+        folder = pip_folder(spec, facts, ['python3-scipy'])
         return bootstrap._complete(
-            spec, todo, folder, ['python3-scipy'],
+            spec, install, folder, ['python3-scipy'],
             lambda command, **_: Result(0, outputs.get(command.what, ''), ''))
 
     assert complete(spec) == ['the machine lacks python3-scipy']

@@ -161,7 +161,7 @@ def kept(store, provider, **changes):
         Creation(context, mine)._claim('token')
         machine = Machine('fake-1', 'planner', 'fake', MachineState.PENDING, tags={
             'fogros2-on-exit': 'keep'})
-        provider._machines['fake-1'], provider._waits['fake-1'] = machine, 0
+        provider.machines['fake-1'], provider._waits['fake-1'] = machine, 0
         mine.save(machine_id='fake-1', launch='', pid=0, pid_start=0)
     return spec
 
@@ -560,7 +560,7 @@ def cut(request, launch, provider, monkeypatch):
     monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(
         owned=getattr(request, 'param', True)))
     reported, events = [], []
-    provider._machines['fake-1'] = Machine('fake-1', 'planner', 'fake', MachineState.RUNNING)
+    provider.machines['fake-1'] = Machine('fake-1', 'planner', 'fake', MachineState.RUNNING)
     context, mine = begun(launch, report=reported.append)
     mine.machine = mine.shell = None
     mine.interface = SimpleNamespace(address='198.18.7.2')
@@ -599,7 +599,7 @@ def test_machine_without_any_word_is_lost(cut, provider, monkeypatch):
 @pytest.mark.parametrize('on_loss_after, limit', [(0.0, 120.0), (300.0, 300.0)])
 def test_a_machine_is_replaced_after_longer_silence(launch, provider, on_loss_after, limit):
     """Never before its robot_timeout, so a cut of 30 s replaces nothing."""
-    provider._machines['fake-1'] = Machine('fake-1', 'planner', 'fake', MachineState.RUNNING)
+    provider.machines['fake-1'] = Machine('fake-1', 'planner', 'fake', MachineState.RUNNING)
     context, mine = begun(launch, dataclasses.replace(
         SPEC, on_interrupt='replace', on_loss_after=on_loss_after))
     mine.record = dataclasses.replace(mine.record, machine_id='fake-1')
@@ -638,7 +638,7 @@ def test_retired_machine_is_deleted_and_created_anew(launch, provider, monkeypat
         launch.retire('planner')
     assert launch.up(spec) is first and ended == ['heartbeat'], 'its nodes may still run'
     launch.retire('planner')
-    assert provider._machines == {} and not launch.store.exists('planner')
+    assert provider.machines == {} and not launch.store.exists('planner')
     assert launch.up(spec) is not first
     launch.retire('planner')
     launch.retire('planner')

@@ -46,6 +46,7 @@ def test_it_is_said_once_each_time(
         launch: Launch, monkeypatch: pytest.MonkeyPatch, events: list[Event]) -> None:
     robot = launch.robot_vpn()
     for granted in (True, False, False, True, False):
-        monkeypatch.setattr(process, 'refresh_ticket', lambda granted=granted: granted)
+        monkeypatch.setattr(process, 'sudo_trouble',
+                            lambda granted=granted: None if granted else process.PASSWORD)
         robot._refresh_ticket()
     assert [event.fatal for event in events if isinstance(event, StepFailed)] == [False, False]

@@ -11,8 +11,7 @@ import pytest
 
 from fogros2 import plugin_system
 from fogros2.errors import ConfigurationError, PrerequisiteError
-from fogros2.image_transport.compressed import Compressed
-from fogros2.image_transport.h264 import H264
+from fogros2.image_transport.nodes import Compressed, H264
 from fogros2.image_transport.republish import Theora
 from fogros2.image_transport.streams import nodes, remappings, stream, StreamTopic
 from fogros2.model import Stream
@@ -155,7 +154,7 @@ def test_an_unknown_parameter_gets_the_nearest_name(entry, said):
 
 def test_parameters_are_those_that_the_nodes_declare():
     pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
-    from fogros2.image_transport.h264 import H264
+    from fogros2.image_transport.nodes import H264
     from fogros2.image_transport.topics import OPTIONS
     from image_transport_h264.senders import PARAMETERS
     assert H264.options == OPTIONS | {name for name, _, _ in PARAMETERS}

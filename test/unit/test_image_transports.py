@@ -6,10 +6,7 @@ from __future__ import annotations
 import pytest
 
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport.compressed import Compressed
-from fogros2.image_transport.h264 import H264
-from fogros2.image_transport.pointcloud import PointCloud
-from fogros2.image_transport.raw import Raw
+from fogros2.image_transport.nodes import Compressed, H264, PointCloud, Raw
 from fogros2.image_transport.republish import Draco, Theora
 from fogros2.image_transport.topics import identifier, local_topic, remappings, rewrite
 from fogros2.model import Stream, to_json

@@ -54,7 +54,7 @@ def test_networks_are_normalised(text, found):
 @pytest.mark.parametrize(('given', 'said'), [
     (['198.51.100.7/28'], "write '198.51.100.0/28', or the address alone"),
     (['everybody'], "'everybody' is no network"),
-    ('198.51.100.0/28', 'is no list of networks'),
+    ('198.51.100.0/28', 'is no list'),
     ([''], "'' is no network")])
 def test_invalid_network_is_refused_in_the_launch_file(given, said):
     for make in (lambda: ContainerInstance(name='a', monitor_allow=given),
@@ -98,7 +98,7 @@ def test_next_launch_closes_the_port_of_a_killed_one(
         tmp_path, MachineSpec('planner', 'fake', on_exit='keep'), provider=provider)
     with context.store.lock('planner'):
         job.save(machine_id='fake-1', monitor=8765, monitor_open='198.51.100.9:8766')
-        provider._machines['fake-1'] = machine = Machine(
+        provider.machines['fake-1'] = machine = Machine(
             'fake-1', 'planner', 'fake', MachineState.RUNNING)
         Creation(context, job)._adopt(machine)
     assert provider.allowed == {('fake-1', 8766): []}

@@ -78,7 +78,7 @@ def words(entry: Path) -> bytes:
 
 
 def test_the_ticket_is_asked_for_without_a_question(as_user: None) -> None:
-    assert process.refresh_ticket()
+    assert process.sudo_trouble() is None
 
 
 def test_a_program_that_cannot_be_started_is_one_clear_error(monkeypatch):

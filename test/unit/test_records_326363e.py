@@ -25,14 +25,15 @@ from fogros2 import (
 from fogros2 import shell as shells
 from fogros2.errors import Unsupported
 from fogros2.model import Command, Machine, MachineState, Result, to_json
+from fogros2.provider import Capabilities
 from fogros2.provider.aws import AWSProvider
 from fogros2.provider.container import machine as container_machine
 from fogros2.provider.kubernetes.names import MachineId as JobId
 from fogros2.provider.ssh import SSHProvider
 from fogros2.report import silent
 from fogros2.store import Store
-from fogros2.testing.fakes import FakeShell
-from fogros2.testing.plugins import instead, MemoryProvider
+from fogros2.testing.fakes import FakeProvider, FakeShell
+from fogros2.testing.plugins import instead
 from ros2fog_cli.api import endings, machines, reach
 from ros2fog_cli.api.machines import Entry
 
@@ -44,9 +45,10 @@ NOW = 1795000060.0
 LAUNCH = '0a1b2d'
 
 
-class Recorded(MemoryProvider):
+class Recorded(FakeProvider):
     """A provider with the recorded machines, which all run."""
 
+    capabilities = Capabilities()
     machines: dict[str, Machine] = {}
 
     def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:

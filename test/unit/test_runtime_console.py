@@ -74,24 +74,8 @@ def test_log_level(lines):
     launch.logging.launch_config.level = logging.WARNING
     console = Console(Terminal())
     console(StepDone('planner', 'sync', 1.0))
-    console.table()
     console.close()
     assert lines == []
-
-
-def test_table(lines):
-    console = Console(io.StringIO())
-    console(StepDone('planner', 'sync', 1.5))
-    console(StepDone('', 'VPN interface', 12.25))
-    del lines[:]
-    console.table()
-    console.table()
-    (_, text), = lines
-    assert text.splitlines() == [
-        'steps',
-        '  machine  step           seconds',
-        '  planner  sync              1.50',
-        '  robot    VPN interface    12.25']
 
 
 def test_progress_on_a_terminal_only():

@@ -29,11 +29,11 @@ def test_several_have_a_sum():
     ('0', '0.00'), ('0.000042817', '0.000043'), ('0.0949', '0.095'), ('0.1', '0.10'),
     ('12.345', '12.34'), ('1234.5', '1234.50')])
 def test_amounts(amount, text):
-    assert cost.dollars(Decimal(amount)) == text
+    assert cost.short(Decimal(amount)) == text
 
 
 @pytest.mark.parametrize(('seconds', 'text'), [
     (0.0, '0.00 h'), (3.7, '0.0010 h'), (90.0, '0.025 h'), (360.0, '0.10 h'), (5400.0, '1.50 h'),
     (720000.0, '200.00 h')])
 def test_hours(seconds, text):
-    assert cost.hours(seconds) == text
+    assert cost.lines([('planner', Decimal(1), seconds)])[0].startswith(f'planner: {text} at')

@@ -14,8 +14,7 @@ from launch.substitutions import LaunchConfiguration
 
 from fogros2 import plugin_system, StreamTopic
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport.compressed import Compressed
-from fogros2.image_transport.h264 import H264
+from fogros2.image_transport.nodes import Compressed, H264
 from fogros2.model import NodeSpec
 from fogros2.runtime import streaming
 
@@ -151,7 +150,7 @@ def test_entries_are_resolved_when_executed() -> None:
                     bitrate=LaunchConfiguration('rate'), lossless=True, preset='fast')]
     streaming.check(entries)  # type: ignore[arg-type]
     assert streaming.resolve(context, entries, '/arm', lambda _: None) == [  # type: ignore[arg-type]
-        ('/arm/camera', 'h264'),
+        StreamTopic('/arm/camera', 'h264'),
         StreamTopic('/b', 'h264', bitrate=1_000_000, lossless=True, preset='fast')]
 
 

@@ -11,6 +11,7 @@ import pytest
 from fogros2.errors import Cancelled, DeadlineExceeded
 from fogros2.model import NodeSpec
 from fogros2.runtime import uncompressed
+from fogros2.runtime.node_spec import full_name
 
 INTERVAL = 5.0
 
@@ -86,7 +87,7 @@ def test_only_image_topics_of_a_line_count(line: str, topics: list[str]) -> None
     (('--ros-args', '-r', '__node:=slam'), 'slam'), ((), 'slam_node')])
 def test_node_is_known_by_its_name_in_graph(words: tuple[str, ...], name: str) -> None:
     node = NodeSpec('id', 'label', package='slam', executable='slam_node', arguments=words)
-    assert uncompressed.node_name(node) == name
+    assert full_name(node) == f'/{name}'
 
 
 def test_look_ends_with_the_launch() -> None:

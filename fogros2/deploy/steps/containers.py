@@ -10,6 +10,7 @@ from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob, Step
 from fogros2.errors import CommandError, PrerequisiteError
 from fogros2.host import container_scripts, containers
+from fogros2.host.bootstrap import apt_install
 from fogros2.model import NodeSpec
 
 
@@ -113,9 +114,11 @@ class Containers(Step):
     def _ensure_engine(self) -> None:
         job = self._job
         timeouts = self._context.timeouts
-        if not self._engine and not job.run(containers.find(), timeout=timeouts.command).strip():
+        if not self._engine and not job.run(containers.FIND, timeout=timeouts.command).strip():
             try:
-                job.run(containers.install(), timeout=timeouts.install)
+                # the configuration of podman may name crun, and its package may bring another
+                job.run(apt_install(['podman', 'crun'], 'install podman'),
+                        timeout=timeouts.install)
             except CommandError as error:
                 raise PrerequisiteError(
                     f"'{job.name}' has neither podman nor docker, and podman can't be installed: "

@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-import json
-
 from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.robot_router import MACHINES, PAUSE
 from fogros2.errors import DdsError
-from fogros2.model import NodeSpec, to_json
+from fogros2.model import NodeSpec
 
 
 def configure(context: Context, job: MachineJob) -> dict[str, str]:
@@ -37,4 +35,4 @@ def start_router(context: Context, job: MachineJob) -> None:
         executable=router.executable, files={'router.json5': router.config},
         environment={router.variable: ({'file': 'router.json5'},)},
         respawn=True, respawn_delay=PAUSE)
-    job.agent.request('start', nodes=[json.loads(to_json(node))])
+    job.agent.request('start', nodes=[node])

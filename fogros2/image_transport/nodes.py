@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Transports by this project's own nodes: ``image_transport_h264`` and ``point_cloud_stream``.
+
+doc/h264.md and doc/point_clouds.md describe their options.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+from fogros2.errors import ConfigurationError
+from fogros2.host import modules
+from fogros2.image_transport import ImageTransport
+from fogros2.image_transport.topics import (
+    carries_info,
+    check_modules,
+    DECODER_PARAMETERS,
+    node,
+    OPTIONS,
+)
+from fogros2.model import NodeSpec, Stream
+
+
+class Raw(ImageTransport):
+    """Send ``/camera`` unencoded as ``/camera/raw``: for comparison, and for fast links."""
+
+    camera_info = True
+    options = OPTIONS
+    #: The value of the nodes' parameter ``codec``, and the last part of the stream's topic.
+    codec: ClassVar[str] = 'raw'
+
+    def check(self) -> None:
+        """Check for PyAV, OpenCV and NumPy."""
+        check_modules()
+
+    def encoder(self, stream: Stream) -> NodeSpec:
+        """Return the node that sends images."""
+        return self._node(stream, 'encoder')
+
+    def decoder(self, stream: Stream) -> NodeSpec:
+        """Return the node that receives images."""
+        return self._node(stream, 'decoder')
+
+    def _node(self, stream: Stream, role: str, codec: str = '') -> NodeSpec:
+        return node(
+            stream, role=role, name=self.codec, package='image_transport_h264', topic='image',
+            options=DECODER_PARAMETERS,
+            parameters={'codec': codec or self.codec, 'camera_info': carries_info(stream)})
+
+
+class H264(Raw):
+    """Send ``/camera`` as ``/camera/h264``."""
+
+    codec = 'h264'
+    options = OPTIONS | {'adapt', 'bitrate', 'encoder', 'gop', 'lossless', 'max_rate', 'preset',
+                         'quality'}
+
+
+class Compressed(Raw):
+    """
+    Send ``/camera`` as ``/camera/compressed``, like ROS's own transport of that name.
+
+    The options are ``format`` (jpeg or png), and ``jpeg_quality`` (default 80).
+    """
+
+    codec = 'compressed'
+    options = OPTIONS | {'format', 'jpeg_quality'}
+
+    def _node(self, stream: Stream, role: str, codec: str = '') -> NodeSpec:
+        options = dict(stream.options)
+        codec = options.pop('format', 'jpeg')
+        if codec not in ('jpeg', 'png'):
+            raise ConfigurationError(f"format '{codec}' of {stream.topic} is unknown",
+                                     'there are jpeg and png')
+        return super()._node(dataclasses.replace(stream, options=options), role, codec)
+
+
+class PointCloud(Raw):
+    """Send ``/points`` as ``/points/pointcloud``."""
+
+    camera_info = False
+    options = frozenset(
+        'drop_fields lossless max_bytes max_rate priority resolution'.split())
+
+    def check(self) -> None:
+        """Check for NumPy and zstandard."""
+        check_modules(modules.CLOUDS, 'point clouds')
+
+    def _node(self, stream: Stream, role: str, codec: str = '') -> NodeSpec:
+        return node(
+            stream, role=role, name='pointcloud', package='point_cloud_stream', topic='points',
+            options=('max_bytes',), parameters={})
