@@ -106,6 +106,7 @@ setup(
             'azure = fogros2.provider.azure:AzureProvider',
             'container = fogros2.provider.container:ContainerProvider',
             'gcp = fogros2.provider.gcp:GCPProvider',
+            'hosted = fogros2.provider.container.hosted:HostedProvider',
             'joined = fogros2.provider.joined:JoinedProvider',
             'kubernetes = fogros2.provider.kubernetes:KubernetesProvider',
             'ssh = fogros2.provider.ssh:SSHProvider',

@@ -9,7 +9,7 @@ import inspect
 import os
 import re
 import shlex
-from typing import Any, cast, ClassVar, get_args, Optional, TYPE_CHECKING, Union
+from typing import Any, cast, get_args, Optional, TYPE_CHECKING, Union
 
 from fogros2.describe import names, networks, values
 from fogros2.describe.kinds import options_of
@@ -93,7 +93,7 @@ class CloudInstance:
     """
 
     #: Name of the entry point in the group ``fogros2.provider``.
-    provider: ClassVar[str] = ''
+    provider: str = ''
 
     def __init__(
         self, ros_workspace: Optional[SomeSubstitutionsType] = None,
@@ -332,8 +332,11 @@ class CloudInstance:
 
 class ContainerInstance(CloudInstance):
     """
-    A container on this computer that behaves like a separate cloud machine.
+    A container on this computer, or on another one, that behaves like a separate cloud machine.
 
+    :param on: the computer that hosts the container, an ``SSHInstance``, of which only ``host``,
+        ``user``, ``port``, ``key`` and ``host_key`` count; None for this computer. What follows is
+        about the host then: "this computer", and where its ports and folders are.
     :param image: its container image; None for this computer's own root file system, restricted
         by an allow-list (podman only).
     :param isolated: use the root file system of a new installation of this computer's release
@@ -357,7 +360,8 @@ class ContainerInstance(CloudInstance):
     provider = 'container'
 
     def __init__(
-        self, *, image: Optional[SomeSubstitutionsType] = None,
+        self, *, on: Union[SSHInstance, Mapping[str, str], None] = None,
+        image: Optional[SomeSubstitutionsType] = None,
         isolated: Optional[Bool] = None,
         engine: Optional[SomeSubstitutionsType] = None,
         network: Optional[SomeSubstitutionsType] = None,
@@ -372,7 +376,16 @@ class ContainerInstance(CloudInstance):
         containers: Optional[Bool] = None,
         **common: Any,
     ) -> None:
-        super().__init__(options=options_of(ContainerInstance.__init__, locals()), **common)
+        options = options_of(ContainerInstance.__init__, locals())
+        if on is not None:
+            self.provider = 'hosted'
+            if isinstance(on, SSHInstance):
+                options['on'] = on._options
+            elif not isinstance(on, Mapping):
+                raise ConfigurationError(
+                    f'on={type(on).__name__} is no host of container machines',
+                    'use SSHInstance; a machine of a cloud admits no robot to further ports')
+        super().__init__(options=options, **common)
 
     def takes_containers(self) -> None:
         """Create the machine with the rights that a container engine needs, by default."""

@@ -213,6 +213,30 @@ def test_keywords_are_attributes_and_take_substitutions(provider):
             assert found == expected, keyword.name
 
 
+def test_container_on_another_computer():
+    expected = ContainerInstance(
+        name='planner', ros_workspace='', memory='2g', on={'host': 'gpu-box', 'port': '2222'},
+    ).spec(LaunchContext())
+    assert expected.provider == 'hosted'
+    assert machine(xml("""
+      <fog_machine name="planner" provider="container" ros_workspace="" memory="2g">
+        <on name="host" value="$(var box)"/>
+        <on name="port" value="2222"/>
+      </fog_machine>"""), box='gpu-box') == expected
+    # YAML reads the word as a truth value if it is not quoted
+    assert machine(load("""
+launch:
+- fog_machine:
+    name: planner
+    provider: container
+    ros_workspace: ''
+    memory: 2g
+    'on':
+    - {name: host, value: gpu-box}
+    - {name: port, value: '2222'}
+""")) == expected
+
+
 def test_the_provider_may_be_a_substitution(run, fake):
     there = {}
     description = load("""

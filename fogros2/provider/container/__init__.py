@@ -5,7 +5,8 @@ Run machines on this computer: containers of podman or docker, each with an SSH 
 ``engine`` calls podman and docker. ``root`` and ``debian_root`` make the root file system of a
 machine without an image, ``entry`` makes its first process. ``packet_filter`` keeps machines from
 this computer's ports. ``machine`` reads the reports of the engine, ``options`` parses the options
-in launch files.
+in launch files. ``served`` is a program for a computer that hosts machines of others, and
+``hosted`` the robot's end of it.
 """
 
 from __future__ import annotations

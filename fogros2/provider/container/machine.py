@@ -21,7 +21,8 @@ LOGIN = 'fogros2-login'
 MACHINE = 'fogros2-machine'
 DIRECTORY = 'fogros2-directory'
 ENDS_STOPPED = 'fogros2-ends-stopped'
-_OURS = (ATTEMPT, LOGIN, MACHINE, DIRECTORY, ENDS_STOPPED)
+VPN_PORT = 'fogros2-vpn-port'
+_OURS = (ATTEMPT, LOGIN, MACHINE, DIRECTORY, ENDS_STOPPED, VPN_PORT)
 
 #: Roots of machines without an image; the engine removes each with its container.
 ROOTS = Path('/var/lib/fogros2')
@@ -83,6 +84,14 @@ def address_of(entry: Mapping[str, Any]) -> str:
     """Return the container's first address, or ''."""
     networks = (entry.get('NetworkSettings') or {}).get('Networks') or {}
     return next((str(n['IPAddress']) for n in networks.values() if n.get('IPAddress')), '')
+
+
+def published(entry: Mapping[str, Any]) -> tuple[int, int]:
+    """Return the published ports of a container's SSH and VPN port, 0 for none."""
+    ports = (entry.get('NetworkSettings') or {}).get('Ports') or {}
+    inside = '22/tcp', f'{labels_of(entry).get(VPN_PORT)}/udp'
+    ssh, vpn = (int((ports.get(port) or [{'HostPort': 0}])[0]['HostPort']) for port in inside)
+    return ssh, vpn
 
 
 def timestamp(text: str) -> float:

@@ -23,6 +23,7 @@ from fogros2.provider.container.machine import (
     ENDS_STOPPED,
     LOGIN,
     MACHINE,
+    VPN_PORT,
 )
 from fogros2.provider.options import parsed
 
@@ -182,7 +183,7 @@ def common_flags(
     yield from ('--name', container_name(spec.name), '--hostname', spec.name)
     labels = {
         **request.tags, ATTEMPT: request.token, LOGIN: options.user, MACHINE: spec.name,
-        DIRECTORY: '' if options.image else 'root',
+        DIRECTORY: '' if options.image else 'root', VPN_PORT: str(request.vpn_port),
     }
     if spec.on_exit == 'stop':
         labels[ENDS_STOPPED] = 'yes'
