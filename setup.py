@@ -36,7 +36,8 @@ def data_files():
             str(p) for p in Path(package, 'launch').glob('*.launch.*'))
         yield f'lib/{package}', [f'{package}/scripts/{name}' for name in names]
     yield 'lib/fogros2', [
-        'fogros2_monitor/scripts/bridge', 'fogros2_replicas/scripts/first_answer']
+        'fogros2_monitor/scripts/bridge', 'fogros2_replicas/scripts/first_answer',
+        'fogros2_share/scripts/share']
 
 
 #: What builds the documentation.

@@ -17,6 +17,7 @@ from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.host import containers, dependencies
 from fogros2.host.checkpoint import check_folder
 from fogros2.host.workspace import find_workspaces, underlays
+from fogros2.image_transport import topics
 from fogros2.model import (
     Bootstrap,
     DEFAULT_CHECKPOINT_INTERVAL,
@@ -88,6 +89,8 @@ class CloudInstance:
         they share it by need and priority.
     :param monitor_allow: networks (CIDR) from which external clients may connect to the Foxglove
         bridge, by TLS and with a token.
+    :param share: topics, such as '/map', that pass between this launch and those of other robots
+        whose machines are on the same host and list them too; serialized, with their QoS.
     :param options: the provider's own options; subclasses set it.
     :raises ConfigurationError: an unknown keyword (the hint names the nearest), or a wrong value.
     """
@@ -115,6 +118,7 @@ class CloudInstance:
         monitor_allow: Optional[Sequence[SomeSubstitutionsType]] = None,
         apt: Optional[Sequence[SomeSubstitutionsType]] = None,
         pip: Optional[Sequence[SomeSubstitutionsType]] = None,
+        share: Optional[Sequence[SomeSubstitutionsType]] = None,
         options: Optional[Mapping[str, Any]] = None,
         **unknown: object,
     ) -> None:
@@ -143,7 +147,8 @@ class CloudInstance:
         self._foxglove = launch_foxglove
         self._monitor_allow = networks.items(monitor_allow)
         self._containers: list[SomeSubstitutionsType] = []
-        self._packages = {'apt': _packages('apt', apt), 'pip': _packages('pip', pip)}
+        self._lists = {name: _listed(name, given) for name, given in (
+            ('apt', apt), ('pip', pip), ('share', share))}
         self._spec: Optional[MachineSpec] = None
         self._running: Optional[RunningMachine] = None
         # values that are known already are checked where they are written
@@ -225,7 +230,7 @@ class CloudInstance:
         :param args: package names, separated by spaces.
         :raises ConfigurationError: an invalid package name.
         """
-        self._packages['apt'] += _packages('apt', shlex.split(args))
+        self._lists['apt'] += _listed('apt', shlex.split(args))
 
     def pip_install(self, args: str) -> None:
         """
@@ -234,7 +239,7 @@ class CloudInstance:
         :param args: requirements, separated by spaces.
         :raises ConfigurationError: an invalid requirement, or a package that FogROS2 contains.
         """
-        self._packages['pip'] += _packages('pip', shlex.split(args))
+        self._lists['pip'] += _listed('pip', shlex.split(args))
 
     def add_docker_container(
         self, cmd: Optional[SomeSubstitutionsType] = None, *, image: str = '', **parts: Any,
@@ -310,13 +315,13 @@ class CloudInstance:
                     context, 'launch_foxglove', values.Bool(self._foxglove)),
                 monitor_allow=networks.resolve(context, self._monitor_allow),
                 apt=self._wanted(context, 'apt'), pip=self._wanted(context, 'pip'),
-                **settings)
+                share=self._wanted(context, 'share'), **settings)
         return self._spec
 
     def _wanted(self, context: LaunchContext, program: str) -> tuple[str, ...]:
-        wanted = [value for some in self._packages[program]
+        wanted = [value for some in self._lists[program]
                   for value in values.resolve(context, some)]
-        return tuple(dict.fromkeys(_PACKAGE_CHECKS[program](value) for value in wanted))
+        return tuple(dict.fromkeys(_LIST_CHECKS[program](value) for value in wanted))
 
     def _resolved(self, context: LaunchContext, keyword: str, value: Any) -> Any:
         with _named(keyword):
@@ -522,21 +527,22 @@ def _choice(kind: Any) -> Any:
     return check
 
 
-_PACKAGE_CHECKS = {'apt': dependencies.check_apt, 'pip': dependencies.check_pip}
+_LIST_CHECKS = {'apt': dependencies.check_apt, 'pip': dependencies.check_pip,
+                'share': topics.check_name}
 
 
-def _packages(program: str, given: Any) -> list[Union[values.Items, values.List]]:
+def _listed(program: str, given: Any) -> list[Union[values.Items, values.List]]:
     """
-    Read a value of ``apt=`` or ``pip=``; check the items that are known already.
+    Read a value of ``apt=``, ``pip=`` or ``share=``; check the items that are known already.
 
-    :raises ConfigurationError: not a list of packages.
+    :raises ConfigurationError: not a list, or a wrong item.
     """
     if isinstance(given, str):
         raise ConfigurationError(f'{program}={given!r} is no list', f'{program}=[{given!r}]')
     found = values.items(given)
     for value in found if isinstance(found, values.Items) else ():
         if isinstance(value, str):
-            _PACKAGE_CHECKS[program](value)
+            _LIST_CHECKS[program](value)
     return [] if found is None else [found]
 
 

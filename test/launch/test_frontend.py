@@ -185,6 +185,7 @@ CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'on_l
            'checkpoint': '$HOME/map', 'bandwidth': '10Mbit/s',
            'name': 'planner'}
 LISTS = {'monitor_allow': ('198.51.100.0/28,::1', ['198.51.100.0/28', '::1']),
+         'share': ('/map, /tf_static', ['/map', '/tf_static']),
          'apt': ('libzbar0, g++', ['libzbar0', 'g++']),
          'pip': ('pyzbar==0.1.9, qrcode', ['pyzbar==0.1.9', 'qrcode'])}
 

@@ -75,6 +75,19 @@ def test_container_on_another_computer(context):
     assert ContainerInstance(name='planner').spec(context).provider == 'container'
 
 
+def test_shared_topics(context):
+    from launch.substitutions import LaunchConfiguration
+    context.launch_configurations.update(topic='/map')
+    machine = ContainerInstance(
+        name='planner', share=[LaunchConfiguration('topic'), '/tf_static', '/map'])
+    assert machine.spec(context).share == ('/map', '/tf_static')
+    for wrong in ('map', '/map/', '', '/a b', '/map*'):
+        with pytest.raises(ConfigurationError, match='full name of a topic'):
+            ContainerInstance(share=[wrong])
+    with pytest.raises(ConfigurationError, match='no list'):
+        ContainerInstance(share='/map')
+
+
 @pytest.mark.parametrize('on', [AWSCloudInstance(), 'gpu-box', ContainerInstance()])
 def test_only_ssh_hosts_have_container_machines(on):
     with pytest.raises(ConfigurationError, match='no host of container machines') as error:

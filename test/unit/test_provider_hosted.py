@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import io
 import json
 from pathlib import Path
+import re
 import socket
 import tarfile
 from typing import Any
@@ -24,20 +25,28 @@ from fogros2.errors import (
     ProviderError,
     Unsupported,
 )
-from fogros2.model import Command, Endpoint, Machine, MachineSpec, MachineState, Result
+from fogros2.model import (
+    Command,
+    Endpoint,
+    Machine,
+    MachineSpec,
+    MachineState,
+    Result,
+    to_json,
+)
+from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import hosted, served
 from fogros2.provider.container import machine as container_machine
 from fogros2.provider.container.hosted import HostedProvider, program, result_of
-from fogros2.provider.container.served import Report
 from fogros2.shell.local import LocalShell
 from fogros2.store import Record, Store
 from fogros2.testing import FakeShell, request_for
 
 ID = 'podman:0123456789ab:0123-token'
 REPORT = {
-    'id': ID, 'state': 'running', 'created': 1700000000, 'user': 'fog',
-    'host_key': 'ssh-ed25519 AAAA', 'address': '198.51.100.2', 'image': '', 'ssh_port': 40001,
-    'vpn_port': 40002, 'tags': {'fogros2-name': 'planner', 'fogros2-hosted': 'yes'}}
+    'id': ID, 'state': 'running', 'created': 1700000000.5, 'vpn_host': '198.51.100.2', 'image': '',
+    'shell': {'host': '198.51.100.2', 'port': 40001, 'user': 'fog', 'host_key': 'ssh-ed25519 AA'},
+    'vpn_port': 40002, 'tags': {'fogros2-name': 'planner', 'fogros2-hosted': '-1234abcd'}}
 
 
 @pytest.fixture
@@ -72,10 +81,10 @@ def test_create_asks_the_host_for_a_container(on: dict[str, Any], shell: FakeShe
     call = asked(shell)
     assert call['call'] == 'create'
     sent, request = call['given']['spec'], call['given']['request']
-    assert sent['name'].startswith('planner-') and len(sent['name']) == len('planner-') + 8
+    assert sent['name'] == 'planner'
     assert sent['options'] == {'memory': '2g', 'ports': ['80', '22', '51820/udp']}
     assert request['token'] == '0123-token'
-    assert request['tags'] == {'fogros2-name': 'planner', 'fogros2-hosted': 'yes'}
+    assert {*request['tags']} == {'fogros2-name', 'fogros2-hosted'}
 
 
 def test_robots_have_containers_of_different_names(
@@ -86,8 +95,9 @@ def test_robots_have_containers_of_different_names(
     for robot in ('one', 'two'):
         monkeypatch.setattr(hosted, 'robot_id', lambda: robot)  # noqa: B023
         HostedProvider().create(spec_on(on), request_for(spec_on(on)))
-        names.add(asked(shell)['given']['spec']['name'])
-    assert len(names) == 2
+        names.add(container_machine.container_name(
+            'planner', asked(shell)['given']['request']['tags']))
+    assert len(names) == 2 and all(re.fullmatch('fogros2-planner-[0-9a-f]{8}', n) for n in names)
 
 
 def test_machine_has_the_ports_of_its_host(on: dict[str, Any], shell: FakeShell) -> None:
@@ -96,7 +106,7 @@ def test_machine_has_the_ports_of_its_host(on: dict[str, Any], shell: FakeShell)
     machine_id = provider.create(spec_on(on), request_for(spec_on(on)))
     shell.said = json.dumps({'result': REPORT})  # type: ignore[attr-defined]
     machine = provider.describe(machine_id)
-    assert machine.shell == Endpoint('ssh', '127.0.0.1', 40001, 'fog', 'ssh-ed25519 AAAA')
+    assert machine.shell == Endpoint('ssh', '127.0.0.1', 40001, 'fog', 'ssh-ed25519 AA')
     assert (machine.vpn_host, machine.vpn_port) == ('127.0.0.1', 40002)
     assert (machine.id, machine.name, machine.region) == (machine_id, 'planner', '127.0.0.1')
     assert machine.state is MachineState.RUNNING and machine.end_command
@@ -105,13 +115,14 @@ def test_machine_has_the_ports_of_its_host(on: dict[str, Any], shell: FakeShell)
     assert asked(shell)['given'] == {'id': ID}
     # before the first boot has made a host key
     shell.said = json.dumps(  # type: ignore[attr-defined]
-        {'result': {**REPORT, 'host_key': '', 'ssh_port': 0}})
+        {'result': {**REPORT, 'shell': None}})
     assert provider.describe(machine_id).shell is None
 
 
 @pytest.mark.parametrize('wrong', [
-    {'state': 'asleep'}, {'ssh_port': '22; true'}, {'ssh_port': -1}, {'tags': {'a': 1}},
-    {'tags': 'a'}, {'user': None, 'state': ['running']}, {'colour': 'blue'}])
+    {'state': 'asleep'}, {'shell': {**REPORT['shell'], 'port': '22; true'}}, {'vpn_port': None},
+    {'tags': ['a']}, {'shell': {'port': 22}}, {'created': 'today'}, {'state': ['running']},
+    {'shell': 'ssh'}])
 def test_report_of_a_host_is_checked(
     on: dict[str, Any], shell: FakeShell, wrong: dict[str, Any],
 ) -> None:
@@ -140,20 +151,6 @@ def test_error_of_the_host_is_raised_here(kind: str, raised: type[FogError]) -> 
 def test_no_answer_of_the_host_is_one_error(text: str) -> None:
     with pytest.raises(ProviderError, match="the host 'box' sent no answer"):
         result_of(text, 'box')
-
-
-def test_names_in_errors_are_those_of_the_launch(on: dict[str, Any], shell: FakeShell) -> None:
-    provider = HostedProvider()
-
-    def refuse(command: Command) -> Result:
-        name = json.loads(command.input)['given']['spec']['name']
-        return Result(0, json.dumps({'error': 'NameTaken', 'message': f"there is '{name}'",
-                                     'hint': f'ros2 fog delete {name}'}), '')
-
-    shell._handlers['sh'] = refuse
-    with pytest.raises(NameTaken, match="there is 'planner'") as error:
-        provider.create(spec_on(on), request_for(spec_on(on)))
-    assert error.value.hint == 'ros2 fog delete planner'
 
 
 def test_program_is_sent_once(on: dict[str, Any], shell: FakeShell) -> None:
@@ -189,7 +186,7 @@ def test_host_that_is_off_is_no_lost_machine(on: dict[str, Any], shell: FakeShel
 @pytest.mark.parametrize(('options', 'words'), [
     ({'on': {'host': 'box'}, 'memry': '2g'}, "has no option 'memry'"),
     ({'on': {'host': 'box'}, 'cpus': 'many'}, "'cpus' can't be"),
-    ({'on': {'hots': 'box'}}, 'names no host'), ({}, 'names no host'), ({'on': 3}, 'no host'),
+    ({'on': {'hots': 'box'}}, "has no option 'hots'"), ({}, "can't be the host"),
     ({'on': {'host': 'box', 'prt': 22}}, "has no option 'prt'"),
     ({'on': {'host': '-oProxyCommand=x'}}, "can't be the host"),
 ])
@@ -223,13 +220,33 @@ def test_find_asks_the_hosts_of_the_records(
     Store().save(Record('planner', 'hosted', spec_on(on)))
     shell.said = json.dumps({'result': [REPORT]})  # type: ignore[attr-defined]
     found, = HostedProvider().find({'fogros2-launch': 'abc'})
-    assert asked(shell)['given'] == {
-        'tags': {'fogros2-launch': 'abc', 'fogros2-hosted': 'yes'}}
+    assert asked(shell)['given'] == {'tags': {'fogros2-launch': 'abc'}}
+    # the host's own machines are left out
+    shell.said = json.dumps(  # type: ignore[attr-defined]
+        {'result': [REPORT, {**REPORT, 'tags': {'fogros2-name': 'own'}}]})
     Store().save(Record('planner', 'hosted', spec_on(on), machine_id=found.id))
     assert [machine.id for machine in HostedProvider().find({})] == [found.id]
 
 
 # -- the program on the host ---------------------------------------------------------------------
+
+def test_machine_of_a_robot_is_reached_at_published_ports() -> None:
+    ports = {'22/tcp': [{'HostPort': '41001'}], '51820/udp': [{'HostPort': '41002'}]}
+    labels = {'fogros2-token': '0123-token', 'fogros2-login': 'fog', 'fogros2-vpn-port': '51820'}
+    entry: dict[str, Any] = {
+        'Id': '0123456789abcdef', 'Created': '2026-11-25T09:00:00Z',
+        'State': {'Status': 'running'},
+        'NetworkSettings': {'Ports': ports, 'Networks': {'n': {'IPAddress': '198.51.100.2'}}},
+        'Config': {'Labels': {**labels, 'fogros2-hosted': '-1234abcd'}}}
+    machine = container_machine.machine_of(container_engine.docker(), entry, 'ssh-ed25519 AA')
+    assert machine.shell is not None
+    assert (machine.shell.port, machine.vpn_port) == (41001, 41002)
+    assert json.loads(to_json(machine))['state'] == 'running'
+    # what a user publishes of another machine leads nowhere else
+    entry['Config']['Labels'] = labels
+    machine = container_machine.machine_of(container_engine.docker(), entry, 'ssh-ed25519 AA')
+    assert machine.shell is not None and (machine.shell.port, machine.vpn_port) == (22, 0)
+
 
 def test_published_ports_are_found_in_both_engines() -> None:
     ports = {'22/tcp': [{'HostIp': '', 'HostPort': '41001'}], '80/tcp': None,
@@ -289,21 +306,19 @@ class Containers:
         self.calls: list[tuple[str, Any]] = []
 
     def __getattr__(self, name: str) -> Any:
-        return lambda *given: self.calls.append((name, given)) or ID
+        return lambda *given: self.calls.append((name, given)) or (
+            ID if name == 'create' else None)
 
     def find(self, tags: Any) -> list[Machine]:
         return [Machine(ID, 'planner', 'container', MachineState.STOPPED, tags=tags)]
 
 
-def test_calls_reach_the_provider_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(container_machine.Engine, 'inspect', lambda self, names: [])
+def test_calls_reach_the_provider_on_the_host() -> None:
     provider: Any = Containers()
     given = {'spec': {'name': 'a', 'provider': 'container', 'options': {'cpus': 1.0}},
              'request': {'token': 't', 'authorized_key': 'k', 'tags': {}, 'vpn_port': 1}}
     assert served.answer(provider, 'create', given) == ID
-    served.answer(provider, 'destroy', {'id': ID})
+    assert served.answer(provider, 'destroy', {'id': ID}) is None
     assert [call for call, _ in provider.calls] == ['check', 'create', 'destroy']
     assert served.answer(provider, 'find', {'tags': {'a': 'b'}}) == [
-        Report(ID, 'stopped', tags={'a': 'b'})]
-    with pytest.raises(KeyError):
-        served.answer(provider, '__init__', {'id': ID})
+        Machine(ID, 'planner', 'container', MachineState.STOPPED, tags={'a': 'b'})]

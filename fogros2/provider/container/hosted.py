@@ -17,17 +17,12 @@ import gzip
 import hashlib
 import json
 from pathlib import Path
-import threading
 from typing import Any, ClassVar
 
-from fogros2 import model, plugin_system
+from fogros2 import errors, model, plugin_system
 from fogros2.errors import (
-    ConfigurationError,
-    ConnectError,
     FogError,
     MachineNotFound,
-    NameTaken,
-    PrerequisiteError,
     ProviderError,
     Unsupported,
 )
@@ -35,24 +30,20 @@ from fogros2.events import clean
 from fogros2.model import Command, CreateRequest, Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider, TAG_NAME
 from fogros2.provider.container import ContainerProvider
-from fogros2.provider.container import entry as container_entry
+from fogros2.provider.container.entry import END_COMMAND
+from fogros2.provider.container.machine import HOSTED
 from fogros2.provider.container.options import Options
 from fogros2.provider.container.root import Archive
-from fogros2.provider.container.served import Report
 from fogros2.provider.options import parsed
 from fogros2.shell import connect, Shell
 from fogros2.shell.command_line import checked
 from fogros2.store import robot_id, Store
 
 _SCHEME = 'hosted:'
-#: Marks the containers that robots have on a host, besides the host's own machines.
-_HOSTED = {'fogros2-hosted': 'yes'}
 #: Seconds for one call on the host; a creation may download an image.
 _TIMEOUT, _CREATE_TIMEOUT = 90.0, 1900.0
-
 #: Errors of the host that stay what they are; all others are a ProviderError.
-_KINDS: Mapping[str, type[FogError]] = {kind.__name__: kind for kind in (
-    ConfigurationError, PrerequisiteError, MachineNotFound, NameTaken, Unsupported)}
+_KINDS = ('ConfigurationError', 'PrerequisiteError', 'MachineNotFound', 'NameTaken', 'Unsupported')
 #: The modules that the host runs.
 _SENT = ('*.py', 'agent/*.py', 'agent_client/*.py', 'shell/*.py', 'provider/*.py',
          'provider/container/*.py')
@@ -78,9 +69,8 @@ mv -T "$aside" "$folder" 2>/dev/null || [ -d "$folder" ]
 def program() -> tuple[bytes, str]:
     """Return the archive of the modules that a host runs, and its hash."""
     archive, top = Archive(), Path(model.__file__).parent
-    for pattern in _SENT:
-        for path in sorted(top.glob(pattern)):
-            archive.file(f'fogros2/{path.relative_to(top)}', path.read_bytes())
+    for path in sorted(path for pattern in _SENT for path in top.glob(pattern)):
+        archive.file(f'fogros2/{path.relative_to(top)}', path.read_bytes())
     data = gzip.compress(archive.data(), mtime=0)
     return data, hashlib.sha256(data).hexdigest()[:16]
 
@@ -96,12 +86,11 @@ def result_of(text: str, name: str) -> Any:
         found = json.loads(text.splitlines()[-1])
         if 'error' not in found:
             return found['result']
-        error = _KINDS.get(found['error'], ProviderError)(
-            clean(str(found['message'])), clean(str(found['hint'])))
-    except (ValueError, LookupError, TypeError, AttributeError) as invalid:
-        raise ProviderError(
-            f"the host '{name}' sent no answer, but {text[-200:]!r}",
-            'its login must print nothing after a command') from invalid
+        kind = getattr(errors, found['error']) if found['error'] in _KINDS else ProviderError
+        error: FogError = kind(clean(str(found['message'])), clean(str(found['hint'])))
+    except (ValueError, LookupError, TypeError) as invalid:
+        raise ProviderError(f"the host '{name}' sent no answer, but {text[-200:]!r}",
+                            'its login must print nothing after a command') from invalid
     raise error
 
 
@@ -114,29 +103,26 @@ class HostedProvider(Provider):
 
     def __init__(self) -> None:
         self._ssh: Provider = plugin_system.load('fogros2.provider', 'ssh')()
-        #: Ids of the hosts at the provider of SSH machines, with their machines there.
+        #: By their ids at the provider of SSH machines: hosts, with their machines there.
         self._hosts: dict[str, tuple[Machine, Shell]] = {}
-        self._asked: dict[str, Mapping[str, Any]] = {}
-        self._lock = threading.Lock()
+        self._asked: list[Mapping[str, Any]] = []
 
     # -- the host -------------------------------------------------------------------------------
 
     def _find_host(self, on: Mapping[str, Any]) -> str:
         """Return the id of the host that an option ``on`` describes."""
-        return self._ssh.create(MachineSpec(str(on['host']), 'ssh', on),
-                                CreateRequest('', '', {}, 0))
+        return self._ssh.create(MachineSpec(on['host'], 'ssh', on), CreateRequest('', '', {}, 0))
 
     def _host(self, host: str) -> tuple[Machine, Shell]:
-        with self._lock:
-            if host not in self._hosts:
-                machine = self._ssh.describe(host)
-                if machine.shell is None:
-                    raise ConnectError(f"the host '{machine.name}' does not answer",
-                                       'is it on, and reachable from this robot?')
-                self._hosts[host] = machine, connect(machine.shell, name=machine.name)
-            return self._hosts[host]
+        if host not in self._hosts:
+            machine = self._ssh.describe(host)
+            if machine.shell is None:
+                raise errors.ConnectError(f"the host '{machine.name}' does not answer",
+                                          'is it on, and reachable from this robot?')
+            self._hosts[host] = machine, connect(machine.shell, name=machine.name)
+        return self._hosts[host]
 
-    def _call(self, host: str, call: str, **given: Any) -> Any:
+    def _call(self, host: str, call: str, timeout: float = _TIMEOUT, **given: Any) -> Any:
         """
         Call a method of the container provider on a host.
 
@@ -144,17 +130,20 @@ class HostedProvider(Provider):
         """
         machine, shell = self._host(host)
         data, key = program()
-        run = functools.partial(
-            shell.run, check=False, cancel=self.cancel if call == 'create' else None,
-            timeout=_CREATE_TIMEOUT if call == 'create' else _TIMEOUT)
         ask = Command(('sh', '-c', _SERVE, 'sh', key), what=f'{call} a container machine',
                       input=model.to_json({'call': call, 'given': given}).encode())
-        done = run(ask)
+        run = functools.partial(shell.run, ask, check=False, timeout=timeout,
+                                cancel=self.cancel if call == 'create' else None)
+        done = run()
         if done.returncode == _LACKING:
             shell.run(Command(('sh', '-ec', _KEEP, 'sh', key), input=data,
                               what='send the program for container machines'), timeout=_TIMEOUT)
-            done = run(ask)
+            done = run()
         return result_of(checked(ask, done, f"'{machine.name}'").stdout, machine.name)
+
+    def _call_of(self, machine_id: str, call: str) -> Any:
+        host, identity = _parse(machine_id)
+        return self._call(host, call, id=identity)
 
     # -- before a machine exists ----------------------------------------------------------------
 
@@ -172,13 +161,9 @@ class HostedProvider(Provider):
         :raises ConfigurationError: one is unknown, or has another type.
         """
         options = dict(spec.options)
-        on = options.pop('on', None)
-        if not isinstance(on, Mapping) or not on.get('host'):
-            raise ConfigurationError(f"on= of '{spec.name}' names no host",
-                                     "write on=SSHInstance('gpu-box')")
+        self._asked.append(options.pop('on', {}))
         parsed(Options, options, 'a container machine')
-        self._asked[spec.name] = on
-        return on, options
+        return self._asked[-1], options
 
     def check_containers(self, spec: MachineSpec) -> None:
         """Check that the machine is created with the rights to run containers."""
@@ -195,79 +180,67 @@ class HostedProvider(Provider):
         """Create and start the container on the host."""
         on, options = self._options(spec)
         host = self._find_host(on)
-        # two robots may have machines of the same name
-        name = f'{spec.name}-{hashlib.sha256(robot_id().encode()).hexdigest()[:8]}'
         options['ports'] = [*(options.get('ports') or ()), '22', f'{request.vpn_port}/udp']
-        try:
-            identity = self._call(
-                host, 'create',
-                spec={'name': name, 'provider': ContainerProvider.name, 'options': options,
-                      'on_exit': spec.on_exit, 'containers': spec.containers},
-                request=dataclasses.replace(request, tags={**request.tags, **_HOSTED}))
-        except FogError as error:
-            error.args = (str(error.args[0]).replace(name, spec.name),)
-            error.hint = error.hint.replace(name, spec.name)
-            raise
+        robot = f'-{hashlib.sha256(robot_id().encode()).hexdigest()[:8]}'
+        identity = self._call(
+            host, 'create', _CREATE_TIMEOUT,
+            spec={'name': spec.name, 'provider': ContainerProvider.name, 'options': options,
+                  'on_exit': spec.on_exit, 'containers': spec.containers, 'share': spec.share},
+            request=dataclasses.replace(request, tags={**request.tags, HOSTED: robot}))
         return f'{_SCHEME}{identity}@{host}'
 
     def describe(self, machine_id: str) -> Machine:
         """Return the state of a container, from the host."""
-        host, identity = _parse(machine_id)
-        return self._machine(host, self._call(host, 'describe', id=identity))
+        return self._machine(_parse(machine_id)[0], self._call_of(machine_id, 'describe'))
 
     def _machine(self, host: str, found: Any) -> Machine:
-        machine, _ = self._host(host)
+        """Return a machine as the robot sees it, from the JSON of one on its host."""
+        outside, _ = self._host(host)
+        assert outside.shell is not None
         try:
-            report = parsed(Report, found, 'the report')
-            state = MachineState(report.state)
-        except (ConfigurationError, ValueError, TypeError) as error:
+            tags = {str(name): str(value) for name, value in found['tags'].items()}
+            shell = found['shell'] and Endpoint(
+                'ssh', outside.shell.host, int(found['shell']['port']),
+                str(found['shell']['user']), str(found['shell']['host_key']))
+            return Machine(
+                f"{_SCHEME}{found['id']}@{host}", tags.get(TAG_NAME, ''), self.name,
+                MachineState(found['state']), float(found['created']), shell, outside.vpn_host,
+                # the host's packet filter admits no machine to the host's ports
+                int(found['vpn_port']), private_network=host, private_ip=str(found['vpn_host']),
+                region=outside.name, image=str(found['image']), tags=tags, end_command=END_COMMAND)
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise ProviderError(
-                f"the host '{machine.name}' reports a machine wrongly: {error}") from error
-        outside = machine.shell
-        assert outside is not None
-        shell = None
-        if report.host_key and report.ssh_port:
-            shell = Endpoint('ssh', outside.host, report.ssh_port, report.user, report.host_key)
-        return Machine(
-            f'{_SCHEME}{report.id}@{host}', report.tags.get(TAG_NAME, ''), self.name,
-            state, report.created, shell, machine.vpn_host, report.vpn_port,
-            # the host's packet filter admits no machine to the host's ports
-            private_network=host, private_ip=report.address, region=machine.name,
-            image=report.image, tags=report.tags, end_command=container_entry.END_COMMAND)
+                f"the host '{outside.name}' reports a machine wrongly: {error!r}") from error
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
         """
-        Yield the containers on the hosts that this robot's records name.
+        Yield the robots' containers on the hosts that this robot's records name.
 
         :raises Unsupported: it knows no host.
         """
-        known = {_parse(record.machine_id)[0]: None for record in Store().machines()
-                 if record.provider == self.name and record.machine_id is not None}
-        asked = [*self._asked.values(), *(
+        hosts = dict.fromkeys(self._find_host(on) for on in [*self._asked, *(
             record.spec.options['on'] for record in Store().machines()
-            if record.provider == self.name and record.machine_id is None)]
-        known.update({self._find_host(on): None for on in asked})
-        if not known:
+            if record.provider == self.name)])
+        if not hosts:
             raise Unsupported('only its host knows a container machine on another computer')
-        for host in known:
-            for found in self._call(host, 'find', tags={**tags, **_HOSTED}):
-                yield self._machine(host, found)
+        for host in hosts:
+            for found in self._call(host, 'find', tags=tags):
+                machine = self._machine(host, found)
+                if HOSTED in machine.tags:
+                    yield machine
 
     def destroy(self, machine_id: str) -> None:
         """Remove a container from its host; return when it is removed."""
         with contextlib.suppress(MachineNotFound):
-            host, identity = _parse(machine_id)
-            self._call(host, 'destroy', id=identity)
+            self._call_of(machine_id, 'destroy')
 
     def stop(self, machine_id: str) -> None:
         """Stop a container that was created with ``on_exit='stop'``; its disk stays."""
-        host, identity = _parse(machine_id)
-        self._call(host, 'stop', id=identity)
+        self._call_of(machine_id, 'stop')
 
     def start(self, machine_id: str) -> None:
         """Start a stopped container again."""
-        host, identity = _parse(machine_id)
-        self._call(host, 'start', id=identity)
+        self._call_of(machine_id, 'start')
 
 
 def _parse(machine_id: str) -> tuple[str, str]:
