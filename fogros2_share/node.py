@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Mapping
 import contextlib
 import json
 import os
@@ -24,24 +23,20 @@ from ament_index_python.packages import get_package_prefix
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.subscription import Subscription
 from rosidl_runtime_py.utilities import get_message
 
 from fogros2_share.wire import decode, DEEPEST, Echoes, encode, Form, LARGEST, LINE
 
 #: The socket in the folder of a machine.
 NAME = 'relay'
-#: Seconds between two looks at the graph and at the other machines; and between two changes of
-#: the type or QoS of another machine's topic.
-LOOK, CHANGE = 0.25, 1.0
-#: Messages that a publisher or subscription queues.
-DEPTH = 10
+#: Seconds between two looks at the graph and at the other machines, and between two changes of
+#: the type or QoS of another machine's topic. Messages that a publisher or subscription queues.
+LOOK, CHANGE, DEPTH = 0.25, 1.0, 10
 #: Maximum number of other machines, and of bytes that wait for one of them.
 MOST, WAITING = 64, 1 << 27
 #: By topic, what publishes for another machine: its form, since when, and the publisher.
-Publishers = dict[str, tuple[Form, float, Publisher]]
+Publishers = dict[str, tuple[Form, float, Any]]
 
 
 class Shared:
@@ -51,7 +46,7 @@ class Shared:
         #: The type that nodes of this launch use; '' if none uses the topic.
         self.kind = ''
         self.form: Optional[Form] = None
-        self.subscription: Optional[Subscription] = None
+        self.subscription: Any = None
         #: What later machines get.
         self.kept: deque[bytes] = deque(maxlen=0)
         self.echoes = Echoes()
@@ -63,13 +58,13 @@ class Relay(Node):
     """
     The node.
 
-    :param settings: ``topics``; ``own``, the machine's folder; ``others``, the folder of all.
+    :param settings: ``topics``; ``folders``, the machine's own, and the folder of all.
     """
 
-    def __init__(self, settings: Mapping[str, Any]) -> None:
+    def __init__(self, settings: dict[str, Any]) -> None:
         super().__init__(f'share_{os.urandom(4).hex()}', start_parameter_services=False)
         self._shared = {name: Shared() for name in settings['topics']}
-        self._own, self._others = Path(settings['own']), Path(settings['others'])
+        self._own, self._others = map(Path, settings['folders'])
         self._robots: dict[Path, asyncio.Task[None]] = {}
         self._readers: set[asyncio.StreamWriter] = set()
         self._complained: set[str] = set()
@@ -206,7 +201,7 @@ def main() -> None:
     """Run until a signal; the first argument is the settings as JSON."""
     rclpy.init()
     settings = json.loads(sys.argv[1])
-    if not os.path.isdir(settings['own']):
+    if not os.path.isdir(settings['folders'][0]):
         sys.exit('no topic is shared: this machine was made without share=')
     node = Relay(settings)
 

@@ -10,8 +10,7 @@ from typing import NamedTuple
 #: Maximum size of a message in bytes, and of the line before it; maximum number of messages that
 #: publishers keep for subscribers that come later.
 LARGEST, LINE, DEEPEST = 99_999_999, 1024, 99
-_LINE = re.compile(r'(/[A-Za-z0-9_/]+) ([a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*) ([01]) '
-                   r'([0-9]{1,2}) ([0-9]{1,8})\n')
+_LINE = re.compile(r'(/[\w/]+) ([a-z]\w*/msg/[A-Z]\w*) ([01]) (\d\d?) (\d{1,8})\n', re.ASCII)
 
 
 class Form(NamedTuple):

@@ -383,13 +383,12 @@ class ContainerInstance(CloudInstance):
     ) -> None:
         options = options_of(ContainerInstance.__init__, locals())
         if on is not None:
-            self.provider = 'hosted'
-            if isinstance(on, SSHInstance):
-                options['on'] = on._options
-            elif not isinstance(on, Mapping):
+            if not isinstance(on, (SSHInstance, Mapping)):
                 raise ConfigurationError(
                     f'on={type(on).__name__} is no host of container machines',
                     'use SSHInstance; a machine of a cloud admits no robot to further ports')
+            self.provider = 'hosted'
+            options['on'] = on._options if isinstance(on, SSHInstance) else on
         super().__init__(options=options, **common)
 
     def takes_containers(self) -> None:

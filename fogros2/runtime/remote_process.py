@@ -136,12 +136,12 @@ class RemoteProcess(private.RemoteStart):
             found.append(process_on(containers.follow(
                 containers.parse(line), number, coordinator.launch.id), name))
         if session.spec.share:
-            own, others = coordinator.launch.provider(
+            folders = coordinator.launch.provider(
                 session.spec.provider).capabilities.share_folders
             found.append(process_on(NodeSpec(
                 id=f'share-{name}', name='share', package='fogros2', executable='share',
                 respawn=True, respawn_delay=1.0, arguments=(json.dumps({
-                    'topics': session.spec.share, 'own': own, 'others': others}),)), name))
+                    'topics': session.spec.share, 'folders': folders}),)), name))
         if session.spec.monitored:
             bridge, started = foxglove.on_machine(
                 coordinator, session, allow=session.spec.monitor_allow)

@@ -61,7 +61,7 @@ class Robot:
         """Start its relay."""
         self.relay = subprocess.Popen(
             [sys.executable, str(ROOT / 'fogros2_share/scripts/share'), json.dumps({
-                'topics': topics, 'own': str(self.folder), 'others': str(self.fleet)})],
+                'topics': topics, 'folders': [str(self.folder), str(self.fleet)]})],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             env={**os.environ, 'ROS_DOMAIN_ID': self.domain, 'PYTHONPATH': os.pathsep.join(

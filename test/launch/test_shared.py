@@ -53,7 +53,7 @@ def test_machine_runs_one_relay_of_its_topics(run, sharing):
     relay, = (node for _, node in nodes if node.executable == 'share')
     assert (relay.package, relay.executable, relay.respawn) == ('fogros2', 'share', True)
     assert json.loads(relay.arguments[0]) == {
-        'topics': ['/map', '/tf_static'], 'own': '/own', 'others': '/all'}
+        'topics': ['/map', '/tf_static'], 'folders': ['/own', '/all']}
     assert [name for name, node in nodes if node is relay] == ['planner']
 
 

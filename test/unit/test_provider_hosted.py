@@ -208,7 +208,6 @@ def test_viewers_of_other_computers_are_refused() -> None:
 def test_foreign_id_is_no_machine(machine_id: str) -> None:
     with pytest.raises(MachineNotFound):
         HostedProvider().describe(machine_id)
-    HostedProvider().destroy(machine_id)
 
 
 def test_find_asks_the_hosts_of_the_records(

@@ -387,8 +387,7 @@ def _sharing(spec: MachineSpec, token: str) -> Iterator[None]:
     folder = str(container_machine.share_folder(token))
     with contextlib.ExitStack() as failed:
         if spec.share:
-            failed.callback(process.run, Command(('rm', '-rf', '--', folder), sudo=True),
-                            timeout=10.0)
+            failed.callback(process.run, Command(('rm', '-rf', folder), sudo=True), timeout=10.0)
             process.run(Command(('sh', '-ec', _SHARE, 'sh', folder), sudo=True), timeout=10.0)
         yield
         failed.pop_all()
@@ -463,10 +462,9 @@ def filter_name(top: Path) -> str:
 
 def clean(top: Path) -> str:
     """Return shell text that removes a machine's packet filter, root and folder of its relay."""
-    shared = container_machine.SHARED
     return (f'{packet_filter.unset(filter_name(top))}; '
-            f'rm -rf -- {top} {shared}/*/{top.name}; '
-            f'rmdir -- {top.parent} {shared}/* {shared} 2>/dev/null; true')
+            f'rm -rf -- {top} {container_machine.SHARED}/*/{top.name}; rmdir -- {top.parent} '
+            f'{container_machine.SHARED}/* {container_machine.SHARED} 2>/dev/null; true')
 
 
 def hooks(top: Path, *, kept: bool) -> Iterator[str]:

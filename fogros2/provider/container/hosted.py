@@ -10,7 +10,6 @@ robot reaches the container at ports that the engine publishes on the host.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-import contextlib
 import dataclasses
 import functools
 import gzip
@@ -20,12 +19,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from fogros2 import errors, model, plugin_system
-from fogros2.errors import (
-    FogError,
-    MachineNotFound,
-    ProviderError,
-    Unsupported,
-)
+from fogros2.errors import FogError, MachineNotFound, ProviderError, Unsupported
 from fogros2.events import clean
 from fogros2.model import Command, CreateRequest, Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider, TAG_NAME
@@ -44,15 +38,12 @@ _SCHEME = 'hosted:'
 _TIMEOUT, _CREATE_TIMEOUT = 90.0, 1900.0
 #: Errors of the host that stay what they are; all others are a ProviderError.
 _KINDS = ('ConfigurationError', 'PrerequisiteError', 'MachineNotFound', 'NameTaken', 'Unsupported')
-#: The modules that the host runs.
-_SENT = ('*.py', 'agent/*.py', 'agent_client/*.py', 'shell/*.py', 'provider/*.py',
-         'provider/container/*.py')
-#: Exit status of ``_SERVE`` on a host that lacks the modules.
-_LACKING = 75
+#: The folders of modules that the host runs.
+_SENT = ('', 'agent/', 'agent_client/', 'shell/', 'provider/', 'provider/container/')
 _FOLDER = 'folder=${XDG_CACHE_HOME:-$HOME/.cache}/fogros2/host-$1\n'
-# The machines show the host's ROS 2, if it has one.
-_SERVE = _FOLDER + f"""\
-cd "$folder" 2>/dev/null || exit {_LACKING}
+# The machines show the host's ROS 2, if it has one. Exit status 75: the host lacks the modules.
+_SERVE = _FOLDER + """\
+cd "$folder" 2>/dev/null || exit 75
 for setup in /opt/ros/*/setup.sh; do [ ! -e "$setup" ] || . "$setup"; done
 exec python3 -m fogros2.provider.container.served
 """
@@ -69,7 +60,7 @@ mv -T "$aside" "$folder" 2>/dev/null || [ -d "$folder" ]
 def program() -> tuple[bytes, str]:
     """Return the archive of the modules that a host runs, and its hash."""
     archive, top = Archive(), Path(model.__file__).parent
-    for path in sorted(path for pattern in _SENT for path in top.glob(pattern)):
+    for path in sorted(path for folder in _SENT for path in top.glob(f'{folder}*.py')):
         archive.file(f'fogros2/{path.relative_to(top)}', path.read_bytes())
     data = gzip.compress(archive.data(), mtime=0)
     return data, hashlib.sha256(data).hexdigest()[:16]
@@ -99,7 +90,6 @@ class HostedProvider(Provider):
 
     name: ClassVar[str] = 'hosted'
     capabilities: ClassVar[Capabilities] = ContainerProvider.capabilities
-    poll_interval: ClassVar[float] = 0.3
 
     def __init__(self) -> None:
         self._ssh: Provider = plugin_system.load('fogros2.provider', 'ssh')()
@@ -135,7 +125,7 @@ class HostedProvider(Provider):
         run = functools.partial(shell.run, ask, check=False, timeout=timeout,
                                 cancel=self.cancel if call == 'create' else None)
         done = run()
-        if done.returncode == _LACKING:
+        if done.returncode == 75:
             shell.run(Command(('sh', '-ec', _KEEP, 'sh', key), input=data,
                               what='send the program for container machines'), timeout=_TIMEOUT)
             done = run()
@@ -231,8 +221,7 @@ class HostedProvider(Provider):
 
     def destroy(self, machine_id: str) -> None:
         """Remove a container from its host; return when it is removed."""
-        with contextlib.suppress(MachineNotFound):
-            self._call_of(machine_id, 'destroy')
+        self._call_of(machine_id, 'destroy')
 
     def stop(self, machine_id: str) -> None:
         """Stop a container that was created with ``on_exit='stop'``; its disk stays."""

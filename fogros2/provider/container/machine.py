@@ -134,7 +134,6 @@ def machine_of(engine: Engine, entry: Mapping[str, Any], host_key: Optional[str]
     return Machine(
         id=machine_id(engine, str(entry['Id']), labels[ATTEMPT]), name=labels.get(MACHINE, ''),
         provider='container', state=state_of(entry), created=timestamp(str(entry['Created'])),
-        shell=shell, vpn_host=address, vpn_port=vpn_port,
-        image=str((entry.get('Config') or {}).get('Image') or ''),
+        shell=shell, vpn_host=address, vpn_port=vpn_port, image=entry['Config'].get('Image') or '',
         tags={key: value for key, value in labels.items() if key not in _OURS},
         end_command=container_entry.END_COMMAND)
