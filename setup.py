@@ -36,7 +36,8 @@ def data_files():
             str(p) for p in Path(package, 'launch').glob('*.launch.*'))
         yield f'lib/{package}', [f'{package}/scripts/{name}' for name in names]
     yield 'lib/fogros2', [
-        'fogros2_monitor/scripts/bridge', 'fogros2_replicas/scripts/first_answer']
+        'fogros2_monitor/scripts/bridge', 'fogros2_replicas/scripts/first_answer',
+        'fogros2_share/scripts/share']
 
 
 #: What builds the documentation.
@@ -106,6 +107,7 @@ setup(
             'azure = fogros2.provider.azure:AzureProvider',
             'container = fogros2.provider.container:ContainerProvider',
             'gcp = fogros2.provider.gcp:GCPProvider',
+            'hosted = fogros2.provider.container.hosted:HostedProvider',
             'joined = fogros2.provider.joined:JoinedProvider',
             'kubernetes = fogros2.provider.kubernetes:KubernetesProvider',
             'ssh = fogros2.provider.ssh:SSHProvider',

@@ -65,6 +65,7 @@ class MachineSpec:
     :param bandwidth: bits per second of its link that streams may use in each direction, 0 for
         no limit.
     :param apt: Debian packages to install; ``pip`` Python packages, in pip's syntax.
+    :param share: topics that it has in common with machines of other robots on its host.
     :param wanted: for a machine of any cloud, the requirements for which the launch has chosen
         ``provider`` and ``options``.
     """
@@ -92,6 +93,7 @@ class MachineSpec:
     bandwidth: float = 0.0
     apt: tuple[str, ...] = ()
     pip: tuple[str, ...] = ()
+    share: tuple[str, ...] = ()
     wanted: Optional[Mapping[str, Any]] = None
 
     @property

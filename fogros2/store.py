@@ -377,7 +377,7 @@ def record_from_json(data: Mapping[str, Any]) -> Record:
     values = {key: value for key, value in data.items() if key in known}
     fields = {f.name for f in dataclasses.fields(MachineSpec)}
     spec: dict[str, Any] = {k: v for k, v in values['spec'].items() if k in fields}
-    for key in ('underlays', 'containers', 'monitor_allow', 'apt', 'pip'):
+    for key in ('underlays', 'containers', 'monitor_allow', 'apt', 'pip', 'share'):
         spec[key] = tuple(spec.get(key, ()))
     values['spec'] = MachineSpec(**spec)
     for key, kind in (('shell', Endpoint), ('vpn', VpnInterface), ('robot_vpn', VpnInterface)):

@@ -8,7 +8,7 @@ import inspect
 import os
 import re
 import shlex
-from typing import Any, cast, ClassVar, get_args, Optional, TYPE_CHECKING, Union
+from typing import Any, cast, get_args, Optional, TYPE_CHECKING, Union
 
 from fogros2.describe import names, networks, values
 from fogros2.describe.kinds import options_of
@@ -16,6 +16,7 @@ from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.host import containers, dependencies
 from fogros2.host.checkpoint import check_folder
 from fogros2.host.workspace import find_workspaces, underlays
+from fogros2.image_transport import topics
 from fogros2.model import (
     Bootstrap,
     DEFAULT_CHECKPOINT_INTERVAL,
@@ -87,12 +88,14 @@ class CloudInstance:
         they share it by need and priority.
     :param monitor_allow: networks (CIDR) from which external clients may connect to the Foxglove
         bridge, by TLS and with a token.
+    :param share: topics, such as '/map', that pass between this launch and those of other robots
+        whose machines are on the same host and list them too; serialized, with their QoS.
     :param options: the provider's own options; subclasses set it.
     :raises ConfigurationError: an unknown keyword (the hint names the nearest), or a wrong value.
     """
 
     #: Name of the entry point in the group ``fogros2.provider``.
-    provider: ClassVar[str] = ''
+    provider: str = ''
 
     def __init__(
         self, ros_workspace: Optional[SomeSubstitutionsType] = None,
@@ -114,6 +117,7 @@ class CloudInstance:
         monitor_allow: Optional[Sequence[SomeSubstitutionsType]] = None,
         apt: Optional[Sequence[SomeSubstitutionsType]] = None,
         pip: Optional[Sequence[SomeSubstitutionsType]] = None,
+        share: Optional[Sequence[SomeSubstitutionsType]] = None,
         options: Optional[Mapping[str, Any]] = None,
         **unknown: object,
     ) -> None:
@@ -134,7 +138,8 @@ class CloudInstance:
         self._foxglove = launch_foxglove
         self._monitor_allow = networks.items(monitor_allow)
         self._containers: list[SomeSubstitutionsType] = []
-        self._packages = {'apt': _packages('apt', apt), 'pip': _packages('pip', pip)}
+        self._lists = {name: _listed(name, given) for name, given in (
+            ('apt', apt), ('pip', pip), ('share', share))}
         self._spec: Optional[MachineSpec] = None
         self._running: Optional[RunningMachine] = None
         # values that are known already are checked where they are written
@@ -216,7 +221,7 @@ class CloudInstance:
         :param args: package names, separated by spaces.
         :raises ConfigurationError: an invalid package name.
         """
-        self._packages['apt'] += _packages('apt', shlex.split(args))
+        self._lists['apt'] += _listed('apt', shlex.split(args))
 
     def pip_install(self, args: str) -> None:
         """
@@ -225,7 +230,7 @@ class CloudInstance:
         :param args: requirements, separated by spaces.
         :raises ConfigurationError: an invalid requirement, or a package that FogROS2 contains.
         """
-        self._packages['pip'] += _packages('pip', shlex.split(args))
+        self._lists['pip'] += _listed('pip', shlex.split(args))
 
     def add_docker_container(
         self, cmd: Optional[SomeSubstitutionsType] = None, *, image: str = '', **parts: Any,
@@ -298,16 +303,16 @@ class CloudInstance:
                     context, 'launch_foxglove', values.Bool(self._foxglove)),
                 monitor_allow=networks.resolve(context, self._monitor_allow),
                 apt=self._wanted(context, 'apt'), pip=self._wanted(context, 'pip'),
-                **settings)
+                share=self._wanted(context, 'share'), **settings)
             self._check_findable(spec.on_exit)
             _check_loss(spec)
             self._spec = spec
         return self._spec
 
     def _wanted(self, context: LaunchContext, program: str) -> tuple[str, ...]:
-        wanted = [value for some in self._packages[program]
+        wanted = [value for some in self._lists[program]
                   for value in values.resolve(context, some)]
-        return tuple(dict.fromkeys(_PACKAGE_CHECKS[program](value) for value in wanted))
+        return tuple(dict.fromkeys(_LIST_CHECKS[program](value) for value in wanted))
 
     def _resolved(self, context: LaunchContext, keyword: str, value: Any) -> Any:
         with values.named(keyword):
@@ -323,8 +328,11 @@ class CloudInstance:
 
 class ContainerInstance(CloudInstance):
     """
-    A container on this computer that behaves like a separate cloud machine.
+    A container on this computer, or on another one, that behaves like a separate cloud machine.
 
+    :param on: the computer that hosts the container, an ``SSHInstance``, of which only ``host``,
+        ``user``, ``port``, ``key`` and ``host_key`` count; None for this computer. What follows is
+        about the host then: "this computer", and where its ports and folders are.
     :param image: its container image; None for this computer's own root file system, restricted
         by an allow-list (podman only).
     :param isolated: use the root file system of a new installation of this computer's release
@@ -348,7 +356,8 @@ class ContainerInstance(CloudInstance):
     provider = 'container'
 
     def __init__(
-        self, *, image: Optional[SomeSubstitutionsType] = None,
+        self, *, on: Union[SSHInstance, Mapping[str, str], None] = None,
+        image: Optional[SomeSubstitutionsType] = None,
         isolated: Optional[Bool] = None,
         engine: Optional[SomeSubstitutionsType] = None,
         network: Optional[SomeSubstitutionsType] = None,
@@ -363,7 +372,16 @@ class ContainerInstance(CloudInstance):
         containers: Optional[Bool] = None,
         **common: Any,
     ) -> None:
-        super().__init__(options=options_of(ContainerInstance.__init__, locals()), **common)
+        options = options_of(ContainerInstance.__init__, locals())
+        if on is not None:
+            self.provider = 'hosted'
+            if isinstance(on, SSHInstance):
+                options['on'] = on._options
+            elif not isinstance(on, Mapping):
+                raise ConfigurationError(
+                    f'on={type(on).__name__} is no host of container machines',
+                    'use SSHInstance; a machine of a cloud admits no robot to further ports')
+        super().__init__(options=options, **common)
 
     def takes_containers(self) -> None:
         """Create the machine with the rights that a container engine needs, by default."""
@@ -490,16 +508,17 @@ def _choice(kind: Any) -> Any:
     return check
 
 
-_PACKAGE_CHECKS = {'apt': dependencies.check_apt, 'pip': dependencies.check_pip}
+_LIST_CHECKS = {'apt': dependencies.check_apt, 'pip': dependencies.check_pip,
+                'share': topics.check_name}
 
 
-def _packages(program: str, given: Any) -> list[Union[values.Items, values.List]]:
+def _listed(program: str, given: Any) -> list[Union[values.Items, values.List]]:
     """
-    Read a value of ``apt=`` or ``pip=``; check the items that are known already.
+    Read a value of ``apt=``, ``pip=`` or ``share=``; check the items that are known already.
 
-    :raises ConfigurationError: not a list of packages.
+    :raises ConfigurationError: not a list, or a wrong item.
     """
-    found = values.checked_items(program, given, _PACKAGE_CHECKS[program])
+    found = values.checked_items(program, given, _LIST_CHECKS[program])
     return [] if found is None else [found]
 
 

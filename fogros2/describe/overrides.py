@@ -48,12 +48,12 @@ class Override:
         Keywords of every machine are kept; options of a provider only with the same provider.
         """
         described = self.machine(spec.name).spec(context)
-        before = spec.options if spec.provider == self.provider else {}
+        before = spec.options if spec.provider == described.provider else {}
         common = {_FIELDS.get(name, name) for name in self.given if name not in described.options}
         if 'workspace' in common:
             common.add('underlays')
         return dataclasses.replace(
-            spec, provider=self.provider, options={**before, **described.options},
+            spec, provider=described.provider, options={**before, **described.options},
             **{field: getattr(described, field) for field in common if field is not None})
 
     def machine(self, name: str) -> CloudInstance:

@@ -31,6 +31,18 @@ _CLOUD = '/cloud'
 OPTIONS = frozenset({'camera_info', 'priority', *DECODER_PARAMETERS})
 
 
+def check_name(topic: str) -> str:
+    """
+    Check that ``topic`` is the full name of a topic; return it.
+
+    :raises ConfigurationError: it is not.
+    """
+    if not TOPIC.fullmatch(topic) or '__' in topic:
+        raise ConfigurationError(f"'{topic}' is not the full name of a topic",
+                                 "write it as ros2 topic list does, such as '/camera/image_raw'")
+    return topic
+
+
 def check(stream: Stream) -> None:
     """
     Check that a stream is possible.
@@ -42,9 +54,7 @@ def check(stream: Stream) -> None:
     if not isinstance(priority, (int, float)) or not 0.01 <= priority <= 100:
         raise ConfigurationError(f'{stream.topic}: priority={priority!r} is invalid',
                                  'give a number from 0.01 to 100; the default is 1')
-    if not TOPIC.fullmatch(stream.topic) or '__' in stream.topic:
-        raise ConfigurationError(f"'{stream.topic}' is not the full name of a topic",
-                                 "write it as ros2 topic list does, such as '/camera/image_raw'")
+    check_name(stream.topic)
     if stream.source == stream.target:
         where = stream.source or 'the robot'
         raise ConfigurationError(f'{stream.topic} would be streamed from {where} to itself',

@@ -55,6 +55,8 @@ class Capabilities:
     :param agent_directory: folder on the machine of the agent that ``create`` starts at boot; ''
         if the launch starts the agent over the first connection.
     :param agent_program: path on the machine of that agent's program.
+    :param share_folders: folders on the machine by which its relay of shared topics meets those of
+        other robots: its own, and the folder of all; empty if the provider has none.
     :param application_port: TCP port on the machine's loopback where ``create`` serves the
         request's application, 0 if it serves none.
     :param preemption_notice: command that the agent runs as root every few seconds. Exit status 0
@@ -74,6 +76,7 @@ class Capabilities:
     prices: bool = False
     agent_directory: str = ''
     agent_program: str = ''
+    share_folders: tuple[str, ...] = ()
     application_port: int = 0
     preemption_notice: tuple[str, ...] = ()
 

@@ -289,6 +289,11 @@ class Coordinator:
                 raise ConfigurationError(
                     f"'{spec.name}' has a checkpoint, and nothing would restore it",
                     "add on_interrupt='replace', or leave checkpoint= out")
+            if spec.share and any(one.spec.share for one in self._sessions.values()):
+                # two relays would send each other's messages round and round
+                raise ConfigurationError(
+                    f"'{spec.name}' is the second machine of this launch with share=",
+                    'one machine shares topics for all nodes of a launch')
             self._streams.bandwidths[spec.name] = spec.bandwidth
             session.rename(self._streams.remappings(spec.name))
             self._sessions[spec.name] = session

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import contextlib
+import json
 from typing import Any, cast, Optional, TYPE_CHECKING
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
@@ -120,7 +121,7 @@ class RemoteProcess(private.RemoteStart):
             self._fogros2_streams, Coordinator.of(context), self._fogros2_session)
 
     def _helpers(self, context: LaunchContext) -> list[LaunchDescriptionEntity]:
-        """Return the machine's containers and Foxglove bridge, once, with its first process."""
+        """Return the machine's containers, relay and Foxglove bridge, with its first process."""
         session = self._fogros2_session
         if session.has_helpers or session.interrupted:
             return []
@@ -132,6 +133,13 @@ class RemoteProcess(private.RemoteStart):
             from fogros2.host import containers
             found.append(process_on(containers.follow(
                 containers.parse(line), number, coordinator.launch.id), name))
+        if session.spec.share:
+            folders = coordinator.launch.provider(
+                session.spec.provider).capabilities.share_folders
+            found.append(process_on(NodeSpec(
+                id=f'share-{name}', name='share', package='fogros2', executable='share',
+                respawn=True, respawn_delay=1.0, arguments=(json.dumps({
+                    'topics': session.spec.share, 'folders': folders}),)), name))
         if session.spec.monitored:
             bridge, started = foxglove.on_machine(
                 coordinator, session, allow=session.spec.monitor_allow)

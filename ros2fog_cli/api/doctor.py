@@ -49,8 +49,8 @@ class Check:
     remedy: str = ''
 
 
-#: Providers that have checks of their own.
-_LOOKED_AT = ('container', 'joined', 'ssh')
+#: Providers that have checks of their own, or nothing to ask.
+_LOOKED_AT = ('container', 'hosted', 'joined', 'ssh')
 #: Time-out of a provider's answer, in seconds.
 TIMEOUT = 8.0
 

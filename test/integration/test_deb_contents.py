@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SITE = 'opt/ros/jazzy/lib/python3.12/site-packages'
 VPN = 'usr/libexec/fogros2/vpn'
 #: ROS packages, and the folders whose scripts are their executables.
-SCRIPTS = {'fogros2': ('fogros2_monitor', 'fogros2_replicas'),
+SCRIPTS = {'fogros2': ('fogros2_monitor', 'fogros2_replicas', 'fogros2_share'),
            'fogros2_examples': ('fogros2_examples',),
            'image_transport_h264': ('image_transport_h264',),
            'point_cloud_stream': ('point_cloud_stream',)}

@@ -185,6 +185,7 @@ CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'on_l
            'checkpoint': '$HOME/map', 'bandwidth': '10Mbit/s',
            'name': 'planner'}
 LISTS = {'monitor_allow': ('198.51.100.0/28,::1', ['198.51.100.0/28', '::1']),
+         'share': ('/map, /tf_static', ['/map', '/tf_static']),
          'apt': ('libzbar0, g++', ['libzbar0', 'g++']),
          'pip': ('pyzbar==0.1.9, qrcode', ['pyzbar==0.1.9', 'qrcode'])}
 
@@ -211,6 +212,30 @@ def test_keywords_are_attributes_and_take_substitutions(provider):
                     name: option if isinstance(option, list) else str(option).lower()
                     for name, option in spec.options.items()})
             assert found == expected, keyword.name
+
+
+def test_container_on_another_computer():
+    expected = ContainerInstance(
+        name='planner', ros_workspace='', memory='2g', on={'host': 'gpu-box', 'port': '2222'},
+    ).spec(LaunchContext())
+    assert expected.provider == 'hosted'
+    assert machine(xml("""
+      <fog_machine name="planner" provider="container" ros_workspace="" memory="2g">
+        <on name="host" value="$(var box)"/>
+        <on name="port" value="2222"/>
+      </fog_machine>"""), box='gpu-box') == expected
+    # YAML reads the word as a truth value if it is not quoted
+    assert machine(load("""
+launch:
+- fog_machine:
+    name: planner
+    provider: container
+    ros_workspace: ''
+    memory: 2g
+    'on':
+    - {name: host, value: gpu-box}
+    - {name: port, value: '2222'}
+""")) == expected
 
 
 def test_the_provider_may_be_a_substitution(run, fake):

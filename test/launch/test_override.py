@@ -27,6 +27,7 @@ from fogros2 import (
     CloudNode,
     ContainerInstance,
     FogROSLaunchDescription,
+    SSHInstance,
     StreamTopic,
 )
 from fogros2.actions.override import OverrideMachines
@@ -77,6 +78,17 @@ def test_same_provider_keeps_settings_that_are_not_named():
     found = spec('planner=aws,region=eu-west-1,tags={team: slam}', AWSCloudInstance(**AWS))
     assert found.options == {'region': 'eu-west-1', 'ec2_instance_type': 't3.large', 'spot': True,
                              'tags': {'team': 'slam'}}
+
+
+def test_container_moves_to_another_computer_and_back():
+    found = spec('planner=container,on={host: box, user: lab},memory=2g',
+                 AWSCloudInstance(**AWS))
+    assert (found.provider, found.options) == (
+        'hosted', {'on': {'host': 'box', 'user': 'lab'}, 'memory': '2g'})
+    there = ContainerInstance(name='planner', on=SSHInstance('box'), memory='2g')
+    assert spec('planner=container,cpus=2', there).options == {'cpus': 2}
+    assert spec('planner=container,on={host: other}', there).options == {
+        'on': {'host': 'other'}, 'memory': '2g'}
 
 
 def test_what_holds_for_any_machine_can_be_said_too():

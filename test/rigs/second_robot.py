@@ -48,7 +48,7 @@ class SecondRobot:
 
     def __init__(self, state: Path, number: int) -> None:
         self.host, self.nat_address = (f'203.0.113.{192 + 4 * number + end}' for end in (1, 2))
-        mark = f'fogs{os.getpid() % 100000}'
+        mark = f'fogs{os.getpid() % 10000}{number:02}'
         self.spaces = [f'{mark}n', f'{mark}r']
         self.environment = {
             **os.environ, 'FOGROS2_STATE_HOME': str(state), 'XDG_CONFIG_HOME': f'{state}/config',

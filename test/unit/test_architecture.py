@@ -16,8 +16,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE = ROOT / 'fogros2'
-PACKAGES = ('fogros2_replicas', 'image_transport_h264', 'point_cloud_stream', 'fogros2',
-            'fogros2_monitor', 'ros2fog_cli')
+PACKAGES = ('fogros2_replicas', 'fogros2_share', 'image_transport_h264', 'point_cloud_stream',
+            'fogros2', 'fogros2_monitor', 'ros2fog_cli')
 
 #: The parts of the core, lowest first; a module imports only its own part and those before it.
 #: Inside a package the order is the one in which the docstring of its ``__init__`` names the
@@ -69,7 +69,7 @@ SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_c
         'google': 'provider', 'paramiko': 'shell', 'av': 'image_transport',
         'foxglove': 'fogros2_monitor'}
 #: Found by their entry points, or started by the user: the core imports none of them.
-ABOVE = ('fogros2_monitor', 'fogros2_replicas', 'ros2fog_cli', 'rigs')
+ABOVE = ('fogros2_monitor', 'fogros2_replicas', 'fogros2_share', 'ros2fog_cli', 'rigs')
 
 
 def python_files(folder: Path) -> list[Path]:
@@ -181,6 +181,7 @@ def test_exceptions_name_what_exists() -> None:
 @pytest.mark.parametrize(('folder', 'above'), [
     ('fogros2', ABOVE), ('fogros2_monitor', ABOVE[1:]),
     ('fogros2_replicas', ('fogros2', 'fogros2_monitor', 'ros2fog_cli', 'rigs')),
+    ('fogros2_share', ('fogros2', 'fogros2_monitor', 'ros2fog_cli', 'rigs')),
     ('point_cloud_stream', (*ABOVE, 'fogros2')),
     ('image_transport_h264', (*ABOVE, 'fogros2', 'point_cloud_stream'))])
 def test_package_imports_nothing_above_it(folder: str, above: tuple[str, ...]) -> None:

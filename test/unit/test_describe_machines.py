@@ -16,6 +16,7 @@ from fogros2.describe.machines import (
     parse_duration,
     SSHInstance,
 )
+from fogros2.describe.machines_cloud import AWSCloudInstance
 from fogros2.errors import ConfigurationError
 from fogros2.host.workspace import find_workspaces
 
@@ -59,6 +60,39 @@ def test_ssh(context):
     assert spec.options == {
         'host': 'host.example', 'user': 'me', 'port': 2222, 'key': '~/.ssh/k',
         'host_key': 'ssh-ed25519 AAAA'}
+
+
+def test_container_on_another_computer(context):
+    from launch.substitutions import LaunchConfiguration
+    context.launch_configurations.update(box='gpu-box')
+    box = SSHInstance(LaunchConfiguration('box'), 'lab', 2222, host_key='ssh-ed25519 AAAA')
+    spec = ContainerInstance(name='planner', on=box, memory='2g', gpus='all').spec(context)
+    assert spec.provider == 'hosted'
+    assert spec.options == {'memory': '2g', 'gpus': 'all', 'on': {
+        'host': 'gpu-box', 'user': 'lab', 'port': 2222, 'host_key': 'ssh-ed25519 AAAA'}}
+    text = ContainerInstance(name='planner', on={'host': 'gpu-box', 'port': '2222'}).spec(context)
+    assert text.options == {'on': {'host': 'gpu-box', 'port': '2222'}}
+    assert ContainerInstance(name='planner').spec(context).provider == 'container'
+
+
+def test_shared_topics(context):
+    from launch.substitutions import LaunchConfiguration
+    context.launch_configurations.update(topic='/map')
+    machine = ContainerInstance(
+        name='planner', share=[LaunchConfiguration('topic'), '/tf_static', '/map'])
+    assert machine.spec(context).share == ('/map', '/tf_static')
+    for wrong in ('map', '/map/', '', '/a b', '/map*'):
+        with pytest.raises(ConfigurationError, match='full name of a topic'):
+            ContainerInstance(share=[wrong])
+    with pytest.raises(ConfigurationError, match='no list'):
+        ContainerInstance(share='/map')
+
+
+@pytest.mark.parametrize('on', [AWSCloudInstance(), 'gpu-box', ContainerInstance()])
+def test_only_ssh_hosts_have_container_machines(on):
+    with pytest.raises(ConfigurationError, match='no host of container machines') as error:
+        ContainerInstance(name='planner', on=on)
+    assert 'SSHInstance' in error.value.hint
 
 
 def test_substitutions_are_resolved_when_executed(context):

@@ -275,6 +275,29 @@ def test_nested_containers_get_their_right_on_request(
     assert '--privileged' not in words and not any('unmask' in word for word in words)
 
 
+def test_relays_of_one_user_meet_in_folders_of_their_own(monkeypatch, tmp_path):
+    monkeypatch.setattr(container_machine, 'SHARED', tmp_path / 'shared')
+    spec = MachineSpec('m', 'container', share=('/map',))
+    words = list(container_options.common_flags(Engine('podman'), spec, REQUEST, Options()))
+    folder = container_machine.share_folder('0123-token')
+    # a machine writes into its own folder alone
+    assert f'{folder}:/opt/fogros2/share' in words
+    assert f'{folder.parent}:/opt/fogros2/shared:ro' in words
+    assert not any('fogros2/share' in word for word in container_options.common_flags(
+        Engine('podman'), MachineSpec('m', 'container'), REQUEST, Options()))
+    with container._sharing(spec, '0123-token'):
+        assert [stat.S_IMODE(path.stat().st_mode) for path in (
+            folder, folder.parent, folder.parent.parent)] == [0o1777, 0o755, 0o700]
+    with container._sharing(spec, 'other-token'), pytest.raises(ProviderError):
+        with container._sharing(spec, 'third-token'):
+            raise ProviderError('no more memory')
+    assert {path.name for path in folder.parent.iterdir()} == {'0123-token', 'other-token'}
+    monkeypatch.setattr(container.packet_filter, 'unset', lambda name: 'true')
+    for token in ('0123-token', 'other-token'):
+        subprocess.run(['sh', '-c', container.clean(tmp_path / 'roots' / token)], check=True)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_control_groups_decide_podman_s_flags():
     flags = container_engine.flags_for
     assert flags(unified=True, systemd=True, runc=True) == ()

@@ -5,7 +5,8 @@ Run machines on this computer: containers of podman or docker, each with an SSH 
 ``engine`` calls podman and docker. ``root`` and ``debian_root`` make the root file system of a
 machine without an image, ``entry`` makes its first process. ``packet_filter`` keeps machines from
 this computer's ports. ``machine`` reads the reports of the engine, ``options`` parses the options
-in launch files.
+in launch files. ``served`` is a program for a computer that hosts machines of others, and
+``hosted`` the robot's end of it.
 """
 
 from __future__ import annotations
@@ -87,6 +88,13 @@ shift 3
 "$@"
 """
 
+# The machine's users have any number. Only machines of one user of this computer meet: no other
+# user enters the outermost folder. The end of the last machine removes the outer folders.
+_SHARE = """\
+umask 077
+until mkdir -p "$1" && chmod 1777 "$1" && chmod 755 "${1%/*}"; do sleep 0.1; done
+"""
+
 #: Maximum size of a host key's file in bytes, and the form of a key.
 _KEY_BYTES = 4096
 _HOST_KEY = re.compile('ssh-[a-z0-9-]+ [A-Za-z0-9+/=]+')
@@ -114,7 +122,8 @@ class ContainerProvider(Provider):
     #: Containers only on request: they need SYS_ADMIN, which weakens the machine's isolation.
     capabilities: ClassVar[Capabilities] = Capabilities(
         containers=False, stop=True, agent_directory=f'/{container_entry.AGENT_DIRECTORY}',
-        agent_program=f'/{container_entry.FOLDER}/agent.py')
+        agent_program=f'/{container_entry.FOLDER}/agent.py',
+        share_folders=container_options.SHARE_FOLDERS)
     poll_interval: ClassVar[float] = 0.1
 
     def __init__(self) -> None:
@@ -174,27 +183,28 @@ class ContainerProvider(Provider):
             container_engine.select(options.engine, options.image or None))
         engine = next(ways)
         create = self._create_from_image if options.image else self._create_from_root
-        while True:
-            try:
-                identity = create(engine, spec, request, options)
-                container_engine.remember(engine)
-                break
-            except ProviderError as error:
-                another = next(ways, None)
-                if another is None or not container_engine.is_runtime_trouble(error):
-                    identity = self._existing(engine, spec.name, request.token, error)
+        with _sharing(spec, request.token):
+            while True:
+                try:
+                    identity = create(engine, spec, request, options)
+                    container_engine.remember(engine)
                     break
-                engine = another
+                except ProviderError as error:
+                    another = next(ways, None)
+                    if another is None or not container_engine.is_runtime_trouble(error):
+                        identity = self._existing(engine, spec.name, request, error)
+                        break
+                    engine = another
         return container_machine.machine_id(engine, identity, request.token)
 
     def _existing(
-        self, engine: Engine, name: str, token: str, error: ProviderError,
+        self, engine: Engine, name: str, request: CreateRequest, error: ProviderError,
     ) -> str:
         """Return the container that an earlier attempt with this token created, or raise."""
-        found = engine.inspect([container_machine.container_name(name)])
+        found = engine.inspect([container_machine.container_name(name, request.tags)])
         if not found:
             raise error
-        if container_machine.labels_of(found[0]).get(container_machine.ATTEMPT) != token:
+        if container_machine.labels_of(found[0]).get(container_machine.ATTEMPT) != request.token:
             raise NameTaken(f"there is a container machine '{name}' already",
                             f'ros2 fog delete {name}') from error
         return str(found[0]['Id'])
@@ -371,6 +381,18 @@ class ContainerProvider(Provider):
                             'it needs sshd, sudo, rsync and python3, or apt-get and a network')
 
 
+@contextlib.contextmanager
+def _sharing(spec: MachineSpec, token: str) -> Iterator[None]:
+    """Make the folder of a machine's relay, if it shares topics; remove it if the block fails."""
+    folder = str(container_machine.share_folder(token))
+    with contextlib.ExitStack() as failed:
+        if spec.share:
+            failed.callback(process.run, Command(('rm', '-rf', folder), sudo=True), timeout=10.0)
+            process.run(Command(('sh', '-ec', _SHARE, 'sh', folder), sudo=True), timeout=10.0)
+        yield
+        failed.pop_all()
+
+
 def _inspected(machine_id: str) -> tuple[Engine, str, dict[str, Any]]:
     """
     Return a machine's engine, its container's id, and what the engine reports of it.
@@ -439,9 +461,10 @@ def filter_name(top: Path) -> str:
 
 
 def clean(top: Path) -> str:
-    """Return shell text that removes a machine's packet filter and root."""
+    """Return shell text that removes a machine's packet filter, root and folder of its relay."""
     return (f'{packet_filter.unset(filter_name(top))}; '
-            f'rm -rf -- {top}; rmdir -- {top.parent} 2>/dev/null; true')
+            f'rm -rf -- {top} {container_machine.SHARED}/*/{top.name}; rmdir -- {top.parent} '
+            f'{container_machine.SHARED}/* {container_machine.SHARED} 2>/dev/null; true')
 
 
 def hooks(top: Path, *, kept: bool) -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import datetime
+import os
 from pathlib import Path
 import re
 from typing import Any, Optional
@@ -21,10 +22,15 @@ LOGIN = 'fogros2-login'
 MACHINE = 'fogros2-machine'
 DIRECTORY = 'fogros2-directory'
 ENDS_STOPPED = 'fogros2-ends-stopped'
-_OURS = (ATTEMPT, LOGIN, MACHINE, DIRECTORY, ENDS_STOPPED)
+VPN_PORT = 'fogros2-vpn-port'
+#: Tag of a machine that another computer has on this one; its value ends the container's name.
+HOSTED = 'fogros2-hosted'
+_OURS = (ATTEMPT, LOGIN, MACHINE, DIRECTORY, ENDS_STOPPED, VPN_PORT)
 
 #: Roots of machines without an image; the engine removes each with its container.
 ROOTS = Path('/var/lib/fogros2')
+#: Folders by which relays of shared topics meet: of each user of this computer, of each machine.
+SHARED = Path('/var/lib/fogros2-share')
 
 _STATES = {
     'created': MachineState.PENDING, 'configured': MachineState.PENDING,
@@ -36,9 +42,9 @@ _STATES = {
 }
 
 
-def container_name(machine: str) -> str:
-    """Return the name of a machine's container."""
-    return f'fogros2-{machine}'
+def container_name(machine: str, tags: Mapping[str, str] = {}) -> str:
+    """Return the name of a machine's container; robots that share a host have different ones."""
+    return f"fogros2-{machine}{tags.get(HOSTED, '')}"
 
 
 def directory(token: str) -> Path:
@@ -50,6 +56,11 @@ def directory(token: str) -> Path:
     if not re.fullmatch(r'[A-Za-z0-9][A-Za-z0-9_-]{3,63}', token):
         raise MachineNotFound(f"'{token}' is no token of a container machine")
     return ROOTS / token
+
+
+def share_folder(token: str) -> Path:
+    """Return the folder of the relay of a machine; the one above is of all machines that meet."""
+    return SHARED / str(os.getuid()) / directory(token).name
 
 
 def host_key_file(token: str) -> Path:
@@ -85,6 +96,14 @@ def address_of(entry: Mapping[str, Any]) -> str:
     return next((str(n['IPAddress']) for n in networks.values() if n.get('IPAddress')), '')
 
 
+def published(entry: Mapping[str, Any]) -> tuple[int, int]:
+    """Return the published ports of a container's SSH and VPN port, 0 for none."""
+    ports = (entry.get('NetworkSettings') or {}).get('Ports') or {}
+    inside = '22/tcp', f'{labels_of(entry).get(VPN_PORT)}/udp'
+    ssh, vpn = (int((ports.get(port) or [{'HostPort': 0}])[0]['HostPort']) for port in inside)
+    return ssh, vpn
+
+
 def timestamp(text: str) -> float:
     """Return an engine's time of creation in seconds since the epoch."""
     match = re.match(r'(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)(\.\d{1,6})?\d*(Z|[+-]\d\d:\d\d)', text)
@@ -108,12 +127,13 @@ def machine_of(engine: Engine, entry: Mapping[str, Any], host_key: Optional[str]
     """
     labels = labels_of(entry)
     address = address_of(entry)
+    port, vpn_port = published(entry) if HOSTED in labels else (22, 0)
     shell = None
     if host_key and address:
-        shell = Endpoint('ssh', address, 22, labels[LOGIN], host_key)
+        shell = Endpoint('ssh', address, port, labels[LOGIN], host_key)
     return Machine(
         id=machine_id(engine, str(entry['Id']), labels[ATTEMPT]), name=labels.get(MACHINE, ''),
         provider='container', state=state_of(entry), created=timestamp(str(entry['Created'])),
-        shell=shell, vpn_host=address, image=str((entry.get('Config') or {}).get('Image') or ''),
+        shell=shell, vpn_host=address, vpn_port=vpn_port, image=entry['Config'].get('Image') or '',
         tags={key: value for key, value in labels.items() if key not in _OURS},
         end_command=container_entry.END_COMMAND)

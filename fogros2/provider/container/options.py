@@ -16,6 +16,7 @@ from fogros2.errors import ConfigurationError
 from fogros2.model import CreateRequest, MachineSpec
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container.engine import Engine
+from fogros2.provider.container.entry import FOLDER
 from fogros2.provider.container.machine import (
     ATTEMPT,
     container_name,
@@ -23,9 +24,13 @@ from fogros2.provider.container.machine import (
     ENDS_STOPPED,
     LOGIN,
     MACHINE,
+    share_folder,
+    VPN_PORT,
 )
 from fogros2.provider.options import parsed
 
+#: Folders on the machine by which relays of shared topics meet: its own, and that of all.
+SHARE_FOLDERS = (f'/{FOLDER}/share', f'/{FOLDER}/shared')
 APPARMOR = Path('/sys/kernel/security/apparmor')
 
 
@@ -179,10 +184,10 @@ def common_flags(
     engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
 ) -> Iterator[str]:
     """Yield the engine's flags for a spec, with or without an image."""
-    yield from ('--name', container_name(spec.name), '--hostname', spec.name)
+    yield from ('--name', container_name(spec.name, request.tags), '--hostname', spec.name)
     labels = {
         **request.tags, ATTEMPT: request.token, LOGIN: options.user, MACHINE: spec.name,
-        DIRECTORY: '' if options.image else 'root',
+        DIRECTORY: '' if options.image else 'root', VPN_PORT: str(request.vpn_port),
     }
     if spec.on_exit == 'stop':
         labels[ENDS_STOPPED] = 'yes'
@@ -211,6 +216,9 @@ def common_flags(
         yield from ('--device', device)
     for port in options.ports:
         yield from ('-p', port)
+    if spec.share:
+        folder, (own, others) = share_folder(request.token), SHARE_FOLDERS
+        yield from ('-v', f'{folder}:{own}', '-v', f'{folder.parent}:{others}:ro')
     for mount in options.mounts:
         source, _, target = mount.partition(':')
         yield from ('-v', f'{source}:{target or source}:ro')

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Container machines on another computer, the host of a fleet: one for each robot.
+
+The host has an SSH server and a container engine, and keeps nothing running for FogROS2. The
+program ``served`` creates the container there, whose agent then ends it without the robot. The
+robot reaches the container at ports that the engine publishes on the host.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+import dataclasses
+import functools
+import gzip
+import hashlib
+import json
+from pathlib import Path
+from typing import Any, ClassVar
+
+from fogros2 import errors, model, plugin_system
+from fogros2.errors import FogError, MachineNotFound, ProviderError, Unsupported
+from fogros2.events import clean
+from fogros2.model import Command, CreateRequest, Endpoint, Machine, MachineSpec, MachineState
+from fogros2.provider import Capabilities, Provider, TAG_NAME
+from fogros2.provider.container import ContainerProvider
+from fogros2.provider.container.entry import END_COMMAND
+from fogros2.provider.container.machine import HOSTED
+from fogros2.provider.container.options import Options
+from fogros2.provider.container.root import Archive
+from fogros2.provider.options import parsed
+from fogros2.shell import connect, Shell
+from fogros2.shell.command_line import checked
+from fogros2.store import robot_id, Store
+
+_SCHEME = 'hosted:'
+#: Seconds for one call on the host; a creation may download an image.
+_TIMEOUT, _CREATE_TIMEOUT = 90.0, 1900.0
+#: Errors of the host that stay what they are; all others are a ProviderError.
+_KINDS = ('ConfigurationError', 'PrerequisiteError', 'MachineNotFound', 'NameTaken', 'Unsupported')
+#: The folders of modules that the host runs.
+_SENT = ('', 'agent/', 'agent_client/', 'shell/', 'provider/', 'provider/container/')
+_FOLDER = 'folder=${XDG_CACHE_HOME:-$HOME/.cache}/fogros2/host-$1\n'
+# The machines show the host's ROS 2, if it has one. Exit status 75: the host lacks the modules.
+_SERVE = _FOLDER + """\
+cd "$folder" 2>/dev/null || exit 75
+for setup in /opt/ros/*/setup.sh; do [ ! -e "$setup" ] || . "$setup"; done
+exec python3 -m fogros2.provider.container.served
+"""
+_KEEP = _FOLDER + """\
+mkdir -p "${folder%/*}"
+aside=$(mktemp -d "$folder.XXXXXX")
+trap 'rm -rf -- "$aside"' EXIT
+tar -xzf - --no-same-owner -C "$aside"
+mv -T "$aside" "$folder" 2>/dev/null || [ -d "$folder" ]
+"""
+
+
+@functools.lru_cache(maxsize=1)
+def program() -> tuple[bytes, str]:
+    """Return the archive of the modules that a host runs, and its hash."""
+    archive, top = Archive(), Path(model.__file__).parent
+    for path in sorted(path for folder in _SENT for path in top.glob(f'{folder}*.py')):
+        archive.file(f'fogros2/{path.relative_to(top)}', path.read_bytes())
+    data = gzip.compress(archive.data(), mtime=0)
+    return data, hashlib.sha256(data).hexdigest()[:16]
+
+
+def result_of(text: str, name: str) -> Any:
+    """
+    Return the result in the output of ``served``.
+
+    :param name: the host's name, for messages.
+    :raises FogError: the error of the call on the host.
+    """
+    try:
+        found = json.loads(text.splitlines()[-1])
+        if 'error' not in found:
+            return found['result']
+        kind = getattr(errors, found['error']) if found['error'] in _KINDS else ProviderError
+        error: FogError = kind(clean(str(found['message'])), clean(str(found['hint'])))
+    except (ValueError, LookupError, TypeError) as invalid:
+        raise ProviderError(f"the host '{name}' sent no answer, but {text[-200:]!r}",
+                            'its login must print nothing after a command') from invalid
+    raise error
+
+
+class HostedProvider(Provider):
+    """Containers of podman or docker on a computer with an SSH server."""
+
+    name: ClassVar[str] = 'hosted'
+    capabilities: ClassVar[Capabilities] = ContainerProvider.capabilities
+
+    def __init__(self) -> None:
+        self._ssh: Provider = plugin_system.load('fogros2.provider', 'ssh')()
+        #: By their ids at the provider of SSH machines: hosts, with their machines there.
+        self._hosts: dict[str, tuple[Machine, Shell]] = {}
+        self._asked: list[Mapping[str, Any]] = []
+
+    # -- the host -------------------------------------------------------------------------------
+
+    def _find_host(self, on: Mapping[str, Any]) -> str:
+        """Return the id of the host that an option ``on`` describes."""
+        return self._ssh.create(MachineSpec(on['host'], 'ssh', on), CreateRequest('', '', {}, 0))
+
+    def _host(self, host: str) -> tuple[Machine, Shell]:
+        if host not in self._hosts:
+            machine = self._ssh.describe(host)
+            if machine.shell is None:
+                raise errors.ConnectError(f"the host '{machine.name}' does not answer",
+                                          'is it on, and reachable from this robot?')
+            self._hosts[host] = machine, connect(machine.shell, name=machine.name)
+        return self._hosts[host]
+
+    def _call(self, host: str, call: str, timeout: float = _TIMEOUT, **given: Any) -> Any:
+        """
+        Call a method of the container provider on a host.
+
+        :raises FogError: the method's error, or the host cannot be reached.
+        """
+        machine, shell = self._host(host)
+        data, key = program()
+        ask = Command(('sh', '-c', _SERVE, 'sh', key), what=f'{call} a container machine',
+                      input=model.to_json({'call': call, 'given': given}).encode())
+        run = functools.partial(shell.run, ask, check=False, timeout=timeout,
+                                cancel=self.cancel if call == 'create' else None)
+        done = run()
+        if done.returncode == 75:
+            shell.run(Command(('sh', '-ec', _KEEP, 'sh', key), input=data,
+                              what='send the program for container machines'), timeout=_TIMEOUT)
+            done = run()
+        return result_of(checked(ask, done, f"'{machine.name}'").stdout, machine.name)
+
+    def _call_of(self, machine_id: str, call: str) -> Any:
+        host, identity = _parse(machine_id)
+        return self._call(host, call, id=identity)
+
+    # -- before a machine exists ----------------------------------------------------------------
+
+    def check(self, spec: MachineSpec) -> None:
+        """Check the options without a connection; the host checks their values."""
+        self._ssh.check(MachineSpec(spec.name, 'ssh', self._options(spec)[0]))
+        if spec.monitor_allow:
+            raise Unsupported(f"'{spec.name}' can't open a port of its host for monitor_allow",
+                              "leave it out, and use 'ros2 fog monitor'")
+
+    def _options(self, spec: MachineSpec) -> tuple[Mapping[str, Any], dict[str, Any]]:
+        """
+        Return the options of the host, and of the container.
+
+        :raises ConfigurationError: one is unknown, or has another type.
+        """
+        options = dict(spec.options)
+        self._asked.append(options.pop('on', {}))
+        parsed(Options, options, 'a container machine')
+        return self._asked[-1], options
+
+    def check_containers(self, spec: MachineSpec) -> None:
+        """Check that the machine is created with the rights to run containers."""
+        ContainerProvider().check_containers(
+            dataclasses.replace(spec, options=self._options(spec)[1]))
+
+    def has_own_packages(self, spec: MachineSpec) -> bool:
+        """Return whether the machine starts from a container image."""
+        return bool(spec.options.get('image'))
+
+    # -- a machine's life -----------------------------------------------------------------------
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        """Create and start the container on the host."""
+        on, options = self._options(spec)
+        host = self._find_host(on)
+        options['ports'] = [*(options.get('ports') or ()), '22', f'{request.vpn_port}/udp']
+        robot = f'-{hashlib.sha256(robot_id().encode()).hexdigest()[:8]}'
+        identity = self._call(
+            host, 'create', _CREATE_TIMEOUT,
+            spec={'name': spec.name, 'provider': ContainerProvider.name, 'options': options,
+                  'on_exit': spec.on_exit, 'containers': spec.containers, 'share': spec.share},
+            request=dataclasses.replace(request, tags={**request.tags, HOSTED: robot}))
+        return f'{_SCHEME}{identity}@{host}'
+
+    def describe(self, machine_id: str) -> Machine:
+        """Return the state of a container, from the host."""
+        return self._machine(_parse(machine_id)[0], self._call_of(machine_id, 'describe'))
+
+    def _machine(self, host: str, found: Any) -> Machine:
+        """Return a machine as the robot sees it, from the JSON of one on its host."""
+        outside, _ = self._host(host)
+        assert outside.shell is not None
+        try:
+            tags = {str(name): str(value) for name, value in found['tags'].items()}
+            shell = found['shell'] and Endpoint(
+                'ssh', outside.shell.host, int(found['shell']['port']),
+                str(found['shell']['user']), str(found['shell']['host_key']))
+            return Machine(
+                f"{_SCHEME}{found['id']}@{host}", tags.get(TAG_NAME, ''), self.name,
+                MachineState(found['state']), float(found['created']), shell, outside.vpn_host,
+                # the host's packet filter admits no machine to the host's ports
+                int(found['vpn_port']), private_network=host, private_ip=str(found['vpn_host']),
+                region=outside.name, image=str(found['image']), tags=tags, end_command=END_COMMAND)
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            raise ProviderError(
+                f"the host '{outside.name}' reports a machine wrongly: {error!r}") from error
+
+    def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
+        """
+        Yield the robots' containers on the hosts that this robot's records name.
+
+        :raises Unsupported: it knows no host.
+        """
+        hosts = dict.fromkeys(self._find_host(on) for on in [*self._asked, *(
+            record.spec.options['on'] for record in Store().machines()
+            if record.provider == self.name)])
+        if not hosts:
+            raise Unsupported('only its host knows a container machine on another computer')
+        for host in hosts:
+            for found in self._call(host, 'find', tags=tags):
+                machine = self._machine(host, found)
+                if HOSTED in machine.tags:
+                    yield machine
+
+    def destroy(self, machine_id: str) -> None:
+        """Remove a container from its host; return when it is removed."""
+        self._call_of(machine_id, 'destroy')
+
+    def stop(self, machine_id: str) -> None:
+        """Stop a container that was created with ``on_exit='stop'``; its disk stays."""
+        self._call_of(machine_id, 'stop')
+
+    def start(self, machine_id: str) -> None:
+        """Start a stopped container again."""
+        self._call_of(machine_id, 'start')
+
+
+def _parse(machine_id: str) -> tuple[str, str]:
+    """
+    Return the id of a machine's host, and the container's id there.
+
+    :raises MachineNotFound: it is no id of this provider.
+    """
+    identity, at, host = machine_id.removeprefix(_SCHEME).partition('@')
+    if not machine_id.startswith(_SCHEME) or not at:
+        raise MachineNotFound(f"'{machine_id}' is no container machine on another computer")
+    return host, identity

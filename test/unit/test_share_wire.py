@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What relays of shared topics send each other, and which messages are their own; by value."""
+
+from __future__ import annotations
+
+from hypothesis import given, strategies
+import pytest
+
+from fogros2_share.wire import decode, DEEPEST, Echoes, encode, Form, LARGEST, LINE
+
+MAP = Form('nav_msgs/msg/OccupancyGrid', True, 1)
+
+
+def test_message_arrives_as_it_was_sent() -> None:
+    line, end, data = encode('/map', MAP, b'\n{}').partition(b'\n')
+    assert decode(line + end) == ('/map', MAP, 3) and data == b'\n{}'
+    other = Form('sensor_msgs/msg/LaserScan', False, 0)
+    assert decode(encode('/scan', other, b'')) == ('/scan', other, 0)
+    assert len(encode('/' + 'a' * 255, MAP, b'')) < LINE
+
+
+@pytest.mark.parametrize('line', [
+    '/map a_msgs/msg/Grid 1 1', '', '{}', '/map a_msgs/msg/Grid 1 1 3 4',
+    'map a_msgs/msg/Grid 1 1 3', '/map a_msgs/msg/Grid 2 1 3', '/map a_msgs/msg/Grid 1 -1 3',
+    '/map a_msgs/msg/Grid 1 1 -3',
+    '/map a_msgs/msg/Grid 1 1 3.0', f'/map a_msgs/msg/Grid 1 1 {LARGEST + 1}',
+    f'/map a_msgs/msg/Grid 1 {DEEPEST + 1} 3', '/map os/path 1 1 3', '/map os.path/msg/A 1 1 3',
+    '/map ../msg/A 1 1 3', '/map a/srv/A 1 1 3', '/map a_msgs/msg/Grid 1 1 ٣'])
+def test_wrong_header_ends_the_connection(line: str) -> None:
+    with pytest.raises(ValueError):
+        decode(f'{line}\n'.encode())
+    # the same, without the mistake
+    assert decode(b'/map a_msgs/msg/Grid 1 1 3\n') == ('/map', Form('a_msgs/msg/Grid', True, 1), 3)
+
+
+@given(strategies.one_of(
+    strategies.binary(max_size=2 * LINE), strategies.lists(strategies.one_of(
+        strategies.text(), strategies.integers().map(str), strategies.just(MAP.kind)),
+        max_size=6).map(lambda words: f'/map {" ".join(words)}\n'.encode(errors='replace'))))
+def test_anything_is_a_message_or_a_value_error(line: bytes) -> None:
+    try:
+        _, form, size = decode(line)
+    except ValueError:
+        return
+    assert 0 <= size <= LARGEST and 0 <= form.kept <= DEEPEST
+
+
+def test_own_message_is_heard_once() -> None:
+    echoes = Echoes()
+    assert not echoes.heard(0.0, b'a')
+    echoes.add(0.0, b'a')
+    echoes.add(0.1, b'a')
+    assert not echoes.heard(0.2, b'b')
+    assert [echoes.heard(0.2, b'a') for _ in range(3)] == [True, True, False]
+
+
+def test_message_of_long_ago_is_no_echo() -> None:
+    echoes = Echoes()
+    echoes.add(0.0, b'a')
+    echoes.add(4.0, b'a')
+    # the first one was never heard; a node has the second content by itself later
+    assert echoes.heard(5.5, b'a')
+    assert not echoes.heard(5.6, b'a')
+    echoes.add(6.0, b'b')
+    assert not echoes.heard(6.0 + Echoes.DELAY + 0.1, b'b')
+
+
+def test_echoes_that_nobody_hears_are_forgotten() -> None:
+    echoes = Echoes()
+    for number in range(3 * Echoes.MOST):
+        echoes.add(number / 100, str(number).encode())
+    assert len(echoes._published) <= Echoes.MOST
+    last = 3 * Echoes.MOST - 1
+    assert echoes.heard(last / 100, str(last).encode())
