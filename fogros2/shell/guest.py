@@ -13,6 +13,8 @@ import contextlib
 import hmac
 from pathlib import Path
 import socket
+import threading
+from typing import Optional
 
 from fogros2.errors import AuthenticationError, ConnectError
 from fogros2.events import clean
@@ -33,7 +35,7 @@ class GuestShell(MultiplexedShell):
     :param timeout: seconds for which to try to connect.
     """
 
-    def _connect(self, timeout: float) -> Link:
+    def _connect(self, timeout: float, cancel: Optional[threading.Event]) -> Link:
         return Link(admitted(self.endpoint, self.name, timeout), self.name, self.user)
 
 

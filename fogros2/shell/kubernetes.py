@@ -33,7 +33,7 @@ class KubernetesShell(MultiplexedShell):
         """Start to import the client; see :func:`fogros2.shell.warm`."""
         threading.Thread(target=_load, name='fog-load', daemon=True).start()
 
-    def _connect(self, timeout: float) -> Link:
+    def _connect(self, timeout: float, cancel: Optional[threading.Event]) -> Link:
         """Open a connection; wait for an API server that restarts."""
         last: list[FogError] = []
 
@@ -45,7 +45,7 @@ class KubernetesShell(MultiplexedShell):
                 return None
 
         try:
-            return wait_until(attempt, timeout=timeout, interval=0.1,
+            return wait_until(attempt, timeout=timeout, interval=0.1, cancel=cancel,
                               what=f"a connection to '{self.name}'")
         except DeadlineExceeded as error:
             raise last[0] if last else error from error

@@ -49,10 +49,11 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
         self._closings = 0
 
     @abc.abstractmethod
-    def _connect(self, timeout: float) -> Link:
+    def _connect(self, timeout: float, cancel: Optional[threading.Event]) -> Link:
         """
         Open a connection, in a thread that a cancel abandons.
 
+        :param cancel: ends the thread between two attempts.
         :raises ConnectError: the machine cannot be reached.
         """
 
@@ -99,7 +100,7 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
             if connection is not None:
                 return connection
             connection = cancellable(
-                lambda: self._connect(max(0.5, until - time.monotonic())), cancel,
+                lambda: self._connect(max(0.5, until - time.monotonic()), cancel), cancel,
                 what=f"connecting to '{self.name}'", late=lambda late: late.close())
             with self._lock:
                 if closings == self._closings:

@@ -37,7 +37,9 @@ class SSHShell(RemoteShell['paramiko.Transport']):
     #: Start to import paramiko; see :func:`fogros2.shell.warm`.
     warm = staticmethod(ssh_connection.warm)
 
-    def _connect(self, timeout: float) -> paramiko.Transport:
+    def _connect(
+        self, timeout: float, cancel: Optional[threading.Event],
+    ) -> paramiko.Transport:
         return ssh_connection.connect(
             self.endpoint, name=self.name, timeout=min(timeout, _ATTEMPT))
 

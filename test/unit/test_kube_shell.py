@@ -192,7 +192,7 @@ def test_restart_of_the_api_server_is_waited_for(api, shell):
 
 def test_ctrl_c_ends_the_wait_for_a_silent_cluster(api, shell):
     api.refusals += [Unreachable('refused')] * 1000
-    cancel, ended = threading.Event(), []
+    cancel, ended, before = threading.Event(), [], threading.active_count()
 
     def ask() -> None:
         with pytest.raises(Cancelled):
@@ -212,6 +212,8 @@ def test_ctrl_c_ends_the_wait_for_a_silent_cluster(api, shell):
     cancel.set()
     thread.join(3.0)
     assert ended == ['cancelled']
+    wait_until(lambda: threading.active_count() <= before, timeout=5.0,
+               what='the thread that connects to end')
 
 
 def test_ctrl_c_ends_an_exec_that_never_begins(api, shell, monkeypatch):
