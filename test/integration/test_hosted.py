@@ -195,8 +195,8 @@ def test_robots_hear_shared_topics_of_each_other_alone(
         assert {row['name'] for row in rows} == {'planner'}
 
     # limits hold: a runaway node of one robot is slowed down, and the other robot goes on
-    fog(host, 'one', 'shell', 'planner', '--', 'sh', '-c',
-        'for each in 1 2; do (while :; do :; done) >/dev/null 2>&1 & done')
+    fog(host, 'one', 'connect', 'planner', '--', 'sh', '-c',
+        'for each in 1 2; do timeout 120 sh -c "while :; do :; done" >/dev/null 2>&1 & done')
     throttled = next(iter(
         one['Id'] for one in host.containers().values()
         if one['Config']['Labels']['fogros2-robot'] == robot_of(host, 'one')))
