@@ -3,17 +3,19 @@
 The relay of one machine: publishes here what other robots publish, and sends them what is here.
 
 Messages pass as bytes. Types and QoS come from the ROS graphs, so a launch file names only topics.
-The main thread has rclpy's executor; everything else happens in asyncio's thread.
+The main thread has rclpy's executor, and sends to other machines from its callbacks. A thread for
+each other machine publishes here, so a message changes threads once in each process.
 """
 
 from __future__ import annotations
 
-import asyncio
 from collections import deque
+from collections.abc import Iterable
 import contextlib
 import json
 import os
 from pathlib import Path
+import socket
 import sys
 import threading
 import time
@@ -35,6 +37,8 @@ NAME = 'relay'
 LOOK, CHANGE, DEPTH = 0.25, 1.0, 10
 #: Maximum number of other machines, and of bytes that wait for one of them.
 MOST, WAITING = 64, 1 << 27
+#: Bytes that are read at once.
+BUFFER = 1 << 16
 #: By topic, what publishes for another machine: its form, since when, and the publisher.
 Publishers = dict[str, tuple[Form, float, Any]]
 
@@ -48,10 +52,70 @@ class Shared:
         self.form: Optional[Form] = None
         self.subscription: Any = None
         #: What later machines get.
-        self.kept: deque[bytes] = deque(maxlen=0)
+        self.kept: deque[tuple[bytes, bytes]] = deque(maxlen=0)
         self.echoes = Echoes()
         #: Contents that the publishers for other machines still give to later subscribers.
         self.theirs: dict[Path, deque[int]] = {}
+
+
+class Reader:
+    """
+    Another relay that reads from here. Its messages wait in memory while it is slow.
+
+    :param waiting: what to send first.
+    """
+
+    def __init__(self, link: socket.socket, waiting: Iterable[bytes]) -> None:
+        self._link = link
+        self._waiting = deque[memoryview](memoryview(part) for part in waiting)
+        self._news, self._left = threading.Condition(), False
+        threading.Thread(target=self._send, name='fog-share-send', daemon=True).start()
+
+    def put(self, *parts: bytes) -> None:
+        """Send a message without waiting; drop it if too much waits already."""
+        with self._news:
+            sent, rest = 0, deque[memoryview](memoryview(part) for part in parts)
+            if not self._waiting:
+                with contextlib.suppress(OSError):  # the other thread notices the end
+                    sent = self._link.sendmsg(parts, [], socket.MSG_DONTWAIT)
+            elif sum(map(len, self._waiting)) >= WAITING:
+                return
+            while rest and sent >= len(rest[0]):
+                sent -= len(rest.popleft())
+            if rest:
+                rest[0] = rest[0][sent:]
+                self._waiting += rest
+                self._news.notify()
+
+    def _send(self) -> None:
+        """Send what waits, in a thread."""
+        with self._link, contextlib.suppress(OSError):
+            while True:
+                with self._news:
+                    self._news.wait_for(lambda: self._waiting or self._left)
+                    if self._left:
+                        return
+                    part = self._waiting[0]
+                self._link.sendall(part)
+                with self._news:
+                    # a message that comes meanwhile has to queue behind this one
+                    self._waiting.popleft()
+
+    def has_left(self) -> bool:
+        """Return whether the other relay has closed its end; it has nothing to say."""
+        try:
+            return self._link.recv(1, socket.MSG_DONTWAIT) is not None
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+
+    def close(self) -> None:
+        """Close the connection."""
+        with self._news, contextlib.suppress(OSError):
+            self._left = True
+            self._news.notify()
+            self._link.shutdown(socket.SHUT_RDWR)
 
 
 class Relay(Node):
@@ -65,23 +129,47 @@ class Relay(Node):
         super().__init__(f'share_{os.urandom(4).hex()}', start_parameter_services=False)
         self._shared = {name: Shared() for name in settings['topics']}
         self._own, self._others = map(Path, settings['folders'])
-        self._robots: dict[Path, asyncio.Task[None]] = {}
-        self._readers: set[asyncio.StreamWriter] = set()
+        #: Guards everything below, and the topics.
+        self._lock = threading.Lock()
+        self._robots: dict[Path, threading.Thread] = {}
+        self._links: set[socket.socket] = set()
+        self._readers: list[Reader] = []
         self._complained: set[str] = set()
+        (self._own / NAME).unlink(missing_ok=True)
+        self._server = socket.socket(socket.AF_UNIX)
+        self._server.bind(str(self._own / NAME))
+        # the users of machines have any number
+        (self._own / NAME).chmod(0o666)
+        self._server.listen()
+        threading.Thread(target=self._serve, name='fog-share-serve', daemon=True).start()
+        self.create_timer(LOOK, self._tick)
 
-    async def run(self) -> None:
-        """Relay until rclpy ends."""
-        self._loop = asyncio.get_running_loop()
-        async with await asyncio.start_unix_server(self._serve, self._own / NAME):
-            # the users of machines have any number
-            (self._own / NAME).chmod(0o666)
-            while rclpy.ok(context=self.context):
-                for name, shared in self._shared.items():
-                    self._look(name, shared)
-                for folder in sorted(self._others.iterdir())[:MOST]:
-                    if folder not in self._robots and not os.path.samefile(folder, self._own):
-                        self._robots[folder] = asyncio.create_task(self._follow(folder))
-                await asyncio.sleep(LOOK)
+    def _tick(self) -> None:
+        """Look for changes of the topics and of the other machines."""
+        with self._lock:
+            for reader in [one for one in self._readers if one.has_left()]:
+                self._readers.remove(reader)
+                reader.close()
+        for name, shared in self._shared.items():
+            self._look(name, shared)
+        with contextlib.suppress(OSError):  # a machine ends
+            for folder in sorted(self._others.iterdir())[:MOST]:
+                if folder not in self._robots and not os.path.samefile(folder, self._own):
+                    self._robots[folder] = threading.Thread(
+                        target=self._follow, args=(folder,), name='fog-share', daemon=True)
+                    self._robots[folder].start()
+
+    def close(self) -> None:
+        """End the threads; rclpy has ended."""
+        with self._lock:
+            for link in (self._server, *self._links):
+                with contextlib.suppress(OSError):  # it may not be connected
+                    link.shutdown(socket.SHUT_RDWR)
+            for reader in self._readers:
+                reader.close()
+            threads = list(self._robots.values())
+        for thread in threads:
+            thread.join(2 * CHANGE)
 
     def _complain(self, text: str) -> None:
         """Log a warning once."""
@@ -114,54 +202,69 @@ class Relay(Node):
             return
         if shared.subscription is not None:
             self.destroy_subscription(shared.subscription)
-        shared.form, shared.kept = form, deque(shared.kept, form.kept if form else 0)
+        with self._lock:
+            shared.form, shared.kept = form, deque(shared.kept, form.kept if form else 0)
         shared.subscription = form and self.create_subscription(
-            self._imported(form.kind), name, lambda data: self._loop.call_soon_threadsafe(
-                self._heard, name, shared, form, data), profile(form, DEPTH), raw=True)
+            self._imported(form.kind), name, lambda data: self._heard(name, shared, form, data),
+            profile(form, DEPTH), raw=True)
 
     def _heard(self, name: str, shared: Shared, form: Form, data: bytes) -> None:
-        if shared.echoes.heard(time.monotonic(), data) or any(
-                hash(data) in kept for kept in shared.theirs.values() if kept):
-            return
-        if len(data) > LARGEST:
-            return self._complain(f'{name}: {len(data)} bytes are too large to be shared')
-        frame = encode(name, form, data)
-        shared.kept.append(frame)
-        for reader in self._readers:
-            if reader.transport.get_write_buffer_size() < WAITING:
-                reader.write(frame)
+        with self._lock:
+            if shared.echoes.heard(time.monotonic(), data) or any(
+                    hash(data) in kept for kept in shared.theirs.values() if kept):
+                return
+            if len(data) > LARGEST:
+                return self._complain(f'{name}: {len(data)} bytes are too large to be shared')
+            head = encode(name, form, len(data))
+            for reader in self._readers:
+                reader.put(head, data)
+            shared.kept.append((head, data))
 
-    async def _serve(self, stream: asyncio.StreamReader, reader: asyncio.StreamWriter) -> None:
-        """Send to another relay until it leaves; it has nothing to say."""
-        with contextlib.closing(reader), contextlib.suppress(OSError):
-            if len(self._readers) < MOST:
-                for shared in self._shared.values():
-                    reader.writelines(shared.kept)
-                self._readers.add(reader)
-                await stream.read(1)
-        self._readers.discard(reader)
+    def _serve(self) -> None:
+        """Accept other relays."""
+        with contextlib.suppress(OSError):
+            while True:
+                link, _ = self._server.accept()
+                with self._lock:
+                    if len(self._readers) < MOST:
+                        self._readers.append(Reader(link, [
+                            part for shared in self._shared.values()
+                            for frame in shared.kept for part in frame]))
+                    else:
+                        link.close()
 
     # -- from another robot to this launch ------------------------------------------------------
 
-    async def _follow(self, folder: Path) -> None:
+    def _follow(self, folder: Path) -> None:
         """Publish what another relay sends until it ends, as its publishers do then."""
         publishers: Publishers = {}
+        link = socket.socket(socket.AF_UNIX)
+        with self._lock:
+            self._links.add(link)
         try:
-            stream, writer = await asyncio.open_unix_connection(folder / NAME, limit=LINE)
-            with contextlib.closing(writer):
-                while line := await stream.readline():
+            link.connect(str(folder / NAME))
+            with link.makefile('rb', BUFFER) as stream:
+                while line := stream.readline(LINE):
                     name, form, size = decode(line)
-                    self._take(folder, publishers, name, form, await stream.readexactly(size))
-        except (OSError, EOFError):
+                    data = stream.read(size)
+                    if len(data) < size:
+                        break
+                    with self._lock:
+                        self._take(folder, publishers, name, form, data)
+        except OSError:
             pass  # its machine is starting or ending
         except (ValueError, RuntimeError) as error:
-            self._complain(f'the machine {folder.name} shares no messages: {error}')
-            await asyncio.sleep(CHANGE)
+            if rclpy.ok():  # else rclpy has ended during a call
+                self._complain(f'the machine {folder.name} shares no messages: {error}')
+                time.sleep(CHANGE)
         finally:
-            for name, (_, _, publisher) in publishers.items():
-                self._shared[name].theirs.pop(folder, None)
-                self.destroy_publisher(publisher)
-            del self._robots[folder]
+            with self._lock:
+                for name, (_, _, publisher) in publishers.items():
+                    self._shared[name].theirs.pop(folder, None)
+                    self.destroy_publisher(publisher)
+                self._links.discard(link)
+                link.close()
+                del self._robots[folder]
 
     def _take(
         self, folder: Path, publishers: Publishers, name: str, form: Form, data: bytes,
@@ -183,10 +286,11 @@ class Relay(Node):
             publisher = self.create_publisher(message, name, profile(form))
             publishers[name] = form, now, publisher
             shared.theirs[folder] = deque(maxlen=form.kept)
+        # the relay hears the message only when the lock is free
+        publisher.publish(data)
         shared.theirs[folder].append(hash(data))
         if shared.subscription is not None:
             shared.echoes.add(now, data)
-        publisher.publish(data)
 
 
 def profile(form: Form, least: int = 1) -> QoSProfile:
@@ -204,19 +308,7 @@ def main() -> None:
     if not os.path.isdir(settings['folders'][0]):
         sys.exit('no topic is shared: this machine was made without share=')
     node = Relay(settings)
-
-    def relay() -> None:
-        try:
-            asyncio.run(node.run())
-        except RuntimeError:
-            if rclpy.ok():  # else rclpy has ended during a call
-                raise
-        finally:
-            rclpy.try_shutdown()
-
-    thread = threading.Thread(target=relay)
-    thread.start()
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
     rclpy.try_shutdown()
-    thread.join()
+    node.close()

@@ -28,9 +28,9 @@ class Form(NamedTuple):
     kept: int
 
 
-def encode(topic: str, form: Form, data: bytes) -> bytes:
-    """Return a message as it is sent."""
-    return f'{topic} {form.kind} {form.reliable:d} {form.kept} {len(data)}\n'.encode() + data
+def encode(topic: str, form: Form, size: int) -> bytes:
+    """Return the line before a message of ``size`` bytes."""
+    return f'{topic} {form.kind} {form.reliable:d} {form.kept} {size}\n'.encode()
 
 
 def decode(line: bytes) -> tuple[str, Form, int]:
