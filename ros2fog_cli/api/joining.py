@@ -72,5 +72,6 @@ def run(name: str, words: Sequence[str] = ()) -> NoReturn:
         os.execvpe(words[0], words, {
             **os.environ, **variables, 'PATH': os.pathsep.join(filter(None, path))})
     except OSError as error:
+        signal.signal(signal.SIGPIPE, signal.SIG_IGN)
         raise ConfigurationError(f"'{words[0]}' can not be run: {error.strerror}",
                                  'name a program of this computer after --') from error

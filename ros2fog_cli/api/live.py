@@ -91,6 +91,8 @@ class Live:
         for follower in followers:
             follower.join(2.0)
         self._threads[0].join(5.0)
+        for launch in self._launches.values():
+            launch.close()
         if self._graphs is not None:
             self._graphs.close()
 
@@ -255,6 +257,9 @@ class Live:
             launch.read(path)
         for name, launch in list(self._launches.items()):
             if name not in there:
+                if launch.file is not None:
+                    launch.read(folder / name)
+                    launch.close()
                 launch.alive = False
                 launch.ended = launch.ended or now
                 if now - launch.ended > KEPT:

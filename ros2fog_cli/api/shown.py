@@ -7,9 +7,10 @@ from collections.abc import Mapping
 import contextlib
 import dataclasses
 import json
+import os
 from pathlib import Path
 import time
-from typing import Any, Optional
+from typing import Any, Optional, TextIO
 
 from fogros2 import journal
 from fogros2.clock import ClockOffset
@@ -52,7 +53,8 @@ class ShownLaunch:
 
     pid: int = 0
     alive: bool = True
-    #: Bytes of the journal that were read.
+    #: The open journal: the launch deletes its folder, and the last lines must still be readable.
+    file: Optional[TextIO] = None
     size: int = 0
     steps: tuple[journal.Step, ...] = ()
     clocks: Mapping[str, ClockOffset] = dataclasses.field(default_factory=dict)
@@ -60,13 +62,21 @@ class ShownLaunch:
 
     def read(self, folder: Path) -> None:
         """Read the journal again if it has grown."""
-        path = folder / journal.FILE
-        with contextlib.suppress(OSError):  # there is no journal yet, or no more
-            size = path.stat().st_size
+        with contextlib.suppress(OSError):  # there is no journal yet
+            if self.file is None:
+                self.file = open(folder / journal.FILE, errors='replace')
+            size = os.fstat(self.file.fileno()).st_size
             if size != self.size:
-                lines = path.read_text(errors='replace').splitlines()
                 self.size = size
+                self.file.seek(0)
+                lines = self.file.read().splitlines()
                 self.steps, self.clocks = tuple(journal.steps(lines)), journal.clocks(lines)
+
+    def close(self) -> None:
+        """Close the journal."""
+        if self.file is not None:
+            self.file.close()
+            self.file = None
 
 
 def machine_json(key: str, shown: Shown) -> dict[str, Any]:

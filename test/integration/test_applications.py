@@ -294,7 +294,8 @@ def test_node_checks_its_parameters_first(node, asked, said):
 
 
 @pytest.mark.parametrize(('package', 'executable'), [
-    ('fogros2' if path.parts[-3] == 'fogros2_replicas' else path.parts[-3], path.name)
+    ('fogros2' if path.parts[-3] in ('fogros2_replicas', 'fogros2_share') else path.parts[-3],
+     path.name)
     for path in sorted(ROOT.glob('*/scripts/*'))
     if path.is_file() and path.parts[-3] != 'fogros2_monitor'])
 def test_starting_node_can_be_interrupted(package, executable, tmp_path):

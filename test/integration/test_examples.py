@@ -59,8 +59,7 @@ def test_demo_talks_between_two_hosts(launch, engine):
     assert run.ended() == 0, run.text
     assert run.text.count(f'I heard: [Hello World from {name} ') >= 2
     assert clean(run), run.text
-    (total,) = re.findall(r'steps\n(?:.*\n)*?  .*agent +([0-9.]+)', run.text)
-    assert float(total) < 30
+    assert len(re.findall(rf'{name}: agent +[0-9.]+ s', run.text)) == 1
 
 
 def test_machine_on_a_node_in_a_group_and_an_include(launch, engine, tmp_path):

@@ -11,6 +11,7 @@ import importlib.util
 import json
 import os
 from pathlib import Path
+import signal
 import subprocess
 import sys
 import time
@@ -528,9 +529,11 @@ def become(*words: str, stdin: Path = Path(os.devnull)) -> int:
     """Run the verb 'shell' in another process, and return the status of what it becomes."""
     child = os.fork()
     if child == 0:
-        os.dup2(os.open(stdin, os.O_RDONLY), 0)
-        run('shell', 'a', *words)
-        os._exit(99)
+        try:
+            os.dup2(os.open(stdin, os.O_RDONLY), 0)
+            run('shell', 'a', *words)
+        finally:
+            os._exit(99)
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
@@ -547,6 +550,7 @@ def test_shell_becomes_a_command_in_the_launch(
     # that of all terminals of the launch
     assert (where == str(joined / 'bin' / 'ros2')) is daemon
     assert "'no-such-program' can not be run" in str(run('shell', 'a', '--', 'no-such-program'))
+    assert signal.getsignal(signal.SIGPIPE) is signal.SIG_IGN  # as Python has it
     assert become('--', 'sh', '-c', 'kill -KILL $$') == -9
     # a program ends by a pipe without a reader, as it does without us
     assert become('--', 'sh', '-c', 'kill -PIPE $$') == -13

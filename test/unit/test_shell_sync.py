@@ -122,9 +122,10 @@ class Here(multiplexed.MultiplexedShell):
 @pytest.fixture
 def shell():
     found = Here()
-    with contextlib.closing(found), found.child:
-        yield found
-        found.close()
+    yield found
+    found.close()
+    found.child.kill()
+    found.child.wait()
 
 
 def test_large_folders_go_both_ways(shell, tmp_path):
