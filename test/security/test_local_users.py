@@ -91,15 +91,6 @@ for link in links:
 print(closed, flush=True)
 sys.stdin.read()
 """
-#: Connects to the abstract sockets of relays before rsync does, and holds the connections.
-FIRST = """\
-import socket
-links = []
-for line in sys.stdin:
-    links.append(socket.socket(socket.AF_UNIX))
-    links[-1].connect('\\0' + line.strip())
-    print('connected', flush=True)
-"""
 
 
 class Said:
@@ -154,16 +145,13 @@ def test_a_stopped_terminal_does_not_stop_the_vpn_helper(root: None) -> None:
     assert done.stdout == 'goes on\n', done.stderr
 
 
-def test_an_account_that_connects_first_stops_no_sync(root: None) -> None:
-    with stranger(FIRST) as child, relay.remote_shell(lambda line: Said()) as (rsh, failures):
-        assert child.stdin and child.stdout
-        for _ in range(3):
-            child.stdin.write(rsh.split()[-1].encode() + b'\n')
-            child.stdin.flush()
-            assert child.stdout.readline() == b'connected\n'
+def test_no_account_can_connect_to_a_sync() -> None:
+    """Its socket has no name; rsync's remote shell inherits it."""
+    with relay.remote_shell(lambda line: Said()) as (rsh, inherited, failures):
+        assert '@fogros2' not in Path('/proc/net/unix').read_text()
         # as rsync starts it
         done = subprocess.run([*shlex.split(rsh), 'machine', 'rsync', '--server'], timeout=10,
-                              stdin=subprocess.DEVNULL, capture_output=True)
+                              stdin=subprocess.DEVNULL, capture_output=True, pass_fds=inherited)
     assert (done.stdout, done.returncode, failures) == (b'from the machine\n', 7, [])
 
 

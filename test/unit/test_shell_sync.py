@@ -8,6 +8,7 @@ from pathlib import Path
 import socket
 import subprocess
 import sys
+import threading
 
 import paramiko
 import pytest
@@ -114,7 +115,9 @@ class Here(multiplexed.MultiplexedShell):
                                           stdin=theirs, stdout=theirs)
         self.link = multiplexed.Link(ours, self.name, self.user)
 
-    def _connect(self, timeout: float) -> multiplexed.Link:
+    def _connect(
+        self, timeout: float, cancel: threading.Event | None,
+    ) -> multiplexed.Link:
         return self.link
 
 
