@@ -249,6 +249,9 @@ class Relay(Node):
                     data = stream.read(size)
                     if len(data) < size:
                         break
+                    known, since, _ = publishers.get(name, (form, 0.0, None))
+                    if known != form:  # not dropped: a map is sent only once
+                        time.sleep(max(0.0, since + CHANGE - time.monotonic()))
                     with self._lock:
                         self._take(folder, publishers, name, form, data)
         except OSError:
@@ -276,9 +279,9 @@ class Relay(Node):
         if shared.kind not in ('', form.kind):
             return self._complain(
                 f'{name} is {form.kind} on another robot, so it is not shared here')
-        known, since, publisher = publishers.get(name, (None, -CHANGE, None))
+        known, _, publisher = publishers.get(name, (None, now, None))
         if publisher is None or known != form:
-            message = self._imported(form.kind) if now - since >= CHANGE else None
+            message = self._imported(form.kind)
             if message is None:
                 return
             if publisher is not None:

@@ -266,6 +266,23 @@ def test_hijacked_relay_is_left_and_others_go_on(
     assert any('shares no messages' in line for line in one.lines)
 
 
+def test_message_after_a_quick_change_of_qos_arrives(robot: Callable[[str], Robot]) -> None:
+    one = robot('one')
+    heard = one.heard(String, '/chat')
+    data = b'\0\1\0\0\2\0\0\0b\0'
+    with stranger(one.fleet / 'other', *(
+            encode('/chat', Form('std_msgs/msg/String', True, kept), len(data)) + data
+            for kept in (0, 1))):
+        one.start('/chat')
+        wait_until(lambda: one.node.get_publishers_info_by_topic('/chat') and any(
+            info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            for info in one.node.get_publishers_info_by_topic('/chat')), timeout=40,
+            what='the new QoS')
+        late = one.heard(String, '/chat', LATCHED)
+        wait_until(lambda: bool(late), timeout=20, what='the message')
+    assert {message.data for message in (*heard, *late)} == {'b'}
+
+
 def test_foreign_types_and_links_reach_nothing(robot: Callable[[str], Robot]) -> None:
     one, two = robot('one'), robot('two')
     (one.fleet / 'link').mkdir()
