@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import os
 from pathlib import Path
+import re
 import shlex
 import socket
 import subprocess
@@ -32,6 +33,7 @@ ROOT = Path(__file__).resolve().parents[2]
 HELPER = """\
 import importlib.util, os, shutil, signal, sys, tempfile
 from pathlib import Path
+import re
 spec = importlib.util.spec_from_file_location('vpn_helper', sys.argv[1])
 vpn = sys.modules['vpn_helper'] = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(vpn)
@@ -148,7 +150,9 @@ def test_a_stopped_terminal_does_not_stop_the_vpn_helper(root: None) -> None:
 def test_no_account_can_connect_to_a_sync() -> None:
     """Its socket has no name; rsync's remote shell inherits it."""
     with relay.remote_shell(lambda line: Said()) as (rsh, inherited, failures):
-        assert '@fogros2' not in Path('/proc/net/unix').read_text()
+        # a test that runs beside this one holds its DDS domain by a name of its own
+        named = re.findall('@fogros2(?!-test-domain).*', Path('/proc/net/unix').read_text())
+        assert named == []
         # as rsync starts it
         done = subprocess.run([*shlex.split(rsh), 'machine', 'rsync', '--server'], timeout=10,
                               stdin=subprocess.DEVNULL, capture_output=True, pass_fds=inherited)

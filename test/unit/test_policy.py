@@ -204,7 +204,7 @@ def openpi_server():
         def there():
             with contextlib.suppress(BadPolicy):
                 found.append(Openpi(port))
-            return found
+            return found or None
 
         wait_until(there, timeout=60, what='the server of openpi')
         yield found[0], lambda: Openpi(port)
