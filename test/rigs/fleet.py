@@ -37,7 +37,9 @@ count, own = node.create_publisher(String, '/count', 10), node.create_publisher(
     String, f'/of_{robot}', 10)
 def tell(message):
     print('heard', message.data, flush=True)
-node.create_subscription(String, topic, tell, latched)
+# one message for each robot: with a depth of 1, the last of several that come at once is heard
+node.create_subscription(String, topic, tell, QoSProfile(
+    depth=32, durability=DurabilityPolicy.TRANSIENT_LOCAL))
 node.create_subscription(String, '/count', tell, 10)
 def tick():
     count.publish(String(data=f'count of {robot}'))
