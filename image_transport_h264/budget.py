@@ -48,6 +48,7 @@ class Budget:
         self._priority = min(100.0, max(0.01, priority))
         #: Bits per second that the stream may use, infinite without a budget.
         self.share = math.inf
+        self._warned = False
         self._need = self._free_at = 0.0
         #: floor, ceiling, latency and short, as of :meth:`sent`
         self._facts = FLOOR, UNLIMITED, 0.0, False
@@ -98,6 +99,12 @@ class Budget:
         links = [each for each in self._links.values() if each[0].used]
         self.share = min((link.share(self._stream, claim, now) for link, _ in links),
                          default=math.inf)
+        if self.share < floor and not self._warned:
+            self._warned = True
+            self._node.get_logger().warning(
+                f'{self._stream} gets {self.share / 1e3:.0f} kbit/s of the bandwidth of its '
+                f'machine, and needs at least {floor / 1e3:.0f} kbit/s: give the machine more '
+                'bandwidth=, or fewer streams')
         claim = dataclasses.replace(claim, share=min(self.share, UNLIMITED))
         for publisher in (self._reports, *(publisher for _, publisher in links)):
             self._node.put_out(publisher, _message([self._stream], dataclasses.astuple(claim)))

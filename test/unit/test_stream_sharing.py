@@ -7,9 +7,11 @@ import dataclasses
 import math
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import pytest
 
+from image_transport_h264.budget import Budget
 from image_transport_h264.sharing import (
     Claim,
     claim_of,
@@ -135,3 +137,22 @@ def test_report_and_announcement_are_read() -> None:
     assert claim_of(message(['/a'], [1, 2, 3, 4, 5, 6])) == ('/a', Claim(1, 2, 3, 4, 5, 6))
     assert links_of(message(['/a/in', 'no topic', '/b', '/c', '/d'], [
         1e6, 1e6, 0.0, math.nan, 2e6])) == {'/a/in': 1e6, '/d': 2e6}
+
+
+def test_share_below_the_minimum_is_reported_once() -> None:
+    node = mock.Mock()
+    node.declare_parameter.return_value.value = 1.0
+    budget = Budget(node, '/camera/h264', lambda: 1)
+    (_, announced, join, *_), = (call.args for call in node.create_subscription.call_args_list)
+    report_now = node.create_timer.call_args.args[1]
+    warning = node.get_logger.return_value.warning
+    budget.sent(1000, floor=1e5, latency=0.0)
+    join(message(['/link'], [1e6]))
+    report_now()
+    assert (announced, warning.call_count) == ('/camera/h264/link', 0)
+    budget.sent(1000, floor=1e6, latency=0.0)
+    report_now()
+    report_now()
+    assert [call.args[0] for call in warning.call_args_list] == [
+        '/camera/h264 gets 800 kbit/s of the bandwidth of its machine, and needs at least 1000 '
+        'kbit/s: give the machine more bandwidth=, or fewer streams']
