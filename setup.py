@@ -103,10 +103,10 @@ setup(
     zip_safe=False,
     entry_points={
         'fogros2.provider': [
-            'aws = fogros2.provider.aws:AWSProvider',
-            'azure = fogros2.provider.azure:AzureProvider',
+            'aws = fogros2.provider.aws.provider:AWSProvider',
+            'azure = fogros2.provider.azure.provider:AzureProvider',
             'container = fogros2.provider.container:ContainerProvider',
-            'gcp = fogros2.provider.gcp:GCPProvider',
+            'gcp = fogros2.provider.gcp.provider:GCPProvider',
             'hosted = fogros2.provider.container.hosted:HostedProvider',
             'joined = fogros2.provider.joined:JoinedProvider',
             'kubernetes = fogros2.provider.kubernetes:KubernetesProvider',
@@ -123,9 +123,9 @@ setup(
             'ssh = fogros2.describe.machines:SSHInstance',
         ],
         'fogros2.configured': [
-            'aws = fogros2.provider.aws.clients:configured',
-            'azure = fogros2.provider.azure.account:configured',
-            'gcp = fogros2.provider.gcp.account:configured',
+            'aws = fogros2.provider.aws.login:configured',
+            'azure = fogros2.provider.azure.login:configured',
+            'gcp = fogros2.provider.gcp.login:configured',
             'kubernetes = fogros2.kubernetes_client:configured',
         ],
         'fogros2.monitor': [

@@ -75,16 +75,26 @@ def run_measure(environment: dict[str, str]) -> float:
 def main() -> None:
     """Measure through the VPN, over the bridge between robot and container, and here."""
     from fogros2.deploy import Launch
-    from fogros2.model import DdsInterface, MachineSpec, NodeSpec
+    from fogros2.model import Command, DdsInterface, MachineSpec, NodeSpec
+    from fogros2.process import run as run_here
+    from fogros2.provider.container import packet_filter
 
     launch = Launch()
     through, beside, here = [], [], []
     try:
         script = Path(__file__).read_text()
-        machine = launch.up(MachineSpec('bench-rtt', 'container'))
-        machine.shell.put(script.encode(), '/tmp/bench/round_trip.py', mode=0o755)
-        machine.shell.put(b'class Row: ...\ndef write(): ...\n', '/tmp/bench/figures.py',
+        machine, bare = (launch.up(MachineSpec(f'bench-rtt-{number}', 'container'))
+                         for number in range(2))
+        for one in (machine, bare):
+            one.shell.put(script.encode(), '/tmp/bench/round_trip.py', mode=0o755)
+            one.shell.put(b'class Row: ...\ndef write(): ...\n', '/tmp/bench/figures.py',
                           mode=0o644)
+        # both ends admit DDS only through the VPN
+        token = launch.store.load(bare.spec.name).token
+        run_here(Command.script(
+            packet_filter.unset(f'fogros2-{token}'), sudo=True), timeout=10.0)
+        bare.shell.run(Command(('nft', 'delete', 'table', 'inet', bare.interface.name), sudo=True),
+                       timeout=10.0)
         robot = launch.robot_environment()
 
         def node(name: str, environment: dict[str, str]) -> NodeSpec:
@@ -92,7 +102,7 @@ def main() -> None:
                 sys.executable, '/tmp/bench/round_trip.py', '--echo'))
 
         vendor = launch.dds()
-        address = machine.machine.vpn_host
+        address = bare.machine.vpn_host
         # the same nodes, with the bridge's addresses instead of the VPN's
         bridge = subprocess.run(
             ['ip', '-o', 'route', 'get', address], check=True, capture_output=True,
@@ -101,7 +111,7 @@ def main() -> None:
         folder = launch.store.launch(launch.id)
         (folder / 'bridge.xml').write_text(vendor.render(
             [DdsInterface(device, 10), DdsInterface('lo')], [address]))
-        machine.shell.put(vendor.render(
+        bare.shell.put(vendor.render(
             [DdsInterface('eth0', 10), DdsInterface('lo')], [own]).encode(),
             '/tmp/bench/bridge.xml', mode=0o644)
         (folder / 'here.xml').write_text(vendor.render([DdsInterface('lo')], []))
@@ -111,10 +121,10 @@ def main() -> None:
             machine.start([node(f'vpn-{run}', {})])
             through.append(run_measure(robot))
             machine.stop([f'vpn-{run}'])
-            machine.start([node(f'bridge-{run}', dict(
+            bare.start([node(f'bridge-{run}', dict(
                 vendor.environment('/tmp/bench/bridge.xml', {})))])
             beside.append(run_measure(plain))
-            machine.stop([f'bridge-{run}'])
+            bare.stop([f'bridge-{run}'])
             echoing = subprocess.Popen(
                 [sys.executable, __file__, '--echo'], env={**os.environ, **local})
             try:

@@ -2,11 +2,9 @@
 """
 Invitations of other computers to a machine: sealed text that only the invited computer can open.
 
-The text is ``fog1.`` and base64 of an ephemeral X25519 public key and a ChaCha20-Poly1305
-ciphertext. Its key is HKDF-SHA256 of the shared secret with the invited computer's key, salted
-with both public keys (as RFC 9180 does). Each text has an ephemeral key of its own, so the nonce
-is constant. All of the content is sealed and authenticated, the expiry included. The sealing does
-not show who wrote the text: the user pastes it, as a launch file.
+The text is ``fog1.`` and base64 of what ``sealing`` returns. All of the content is sealed and
+authenticated, the expiry included. The sealing does not show who wrote the text: the user pastes
+it, as a launch file.
 """
 
 from __future__ import annotations
@@ -22,24 +20,11 @@ import re
 import time
 from typing import Optional
 
-from cryptography.exceptions import InvalidTag
-from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
-from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
-from cryptography.hazmat.primitives.hashes import SHA256
-from cryptography.hazmat.primitives.kdf.hkdf import HKDF
-from cryptography.hazmat.primitives.serialization import (
-    Encoding,
-    NoEncryption,
-    PrivateFormat,
-    PublicFormat,
-)
-
 from fogros2.errors import ConfigurationError
 from fogros2.model import to_json
 from fogros2.store import check_name, robot_name, Store, write_private
 
 _PREFIX = 'fog1.'
-_NONCE = bytes(12)
 #: File with the invitation in the folder of a joined machine, which is like a launch's folder;
 #: and the file there with the secret for ``GuestShell``.
 JOINED, SECRET = 'joined.json', 'door.key'
@@ -107,19 +92,19 @@ def read(folder: Path) -> Optional[Invitation]:
     return None
 
 
-def own_key(store: Store) -> X25519PrivateKey:
+def own_key(store: Store) -> bytes:
     """Return this computer's private key; make it if there is none."""
+    from fogros2 import sealing
     path = store.root / 'key'
     if not path.exists():
-        new = X25519PrivateKey.generate().private_bytes(
-            Encoding.Raw, PrivateFormat.Raw, NoEncryption())
-        write_private(path, base64.b64encode(new) + b'\n')
-    return X25519PrivateKey.from_private_bytes(base64.b64decode(path.read_bytes()))
+        write_private(path, base64.b64encode(sealing.private_key()) + b'\n')
+    return base64.b64decode(path.read_bytes())
 
 
-def public_text(key: X25519PrivateKey) -> str:
-    """Return the public key as ``wg`` writes it."""
-    return base64.b64encode(_public(key)).decode()
+def public_text(key: bytes) -> str:
+    """Return the public key of a private one as ``wg`` writes it."""
+    from fogros2 import sealing
+    return base64.b64encode(sealing.public_key(key)).decode()
 
 
 def own_name(store: Store) -> str:
@@ -147,30 +132,26 @@ def seal(invitation: Invitation, key: str) -> str:
 
     :param key: the invited computer's public key, in base64.
     """
-    once = X25519PrivateKey.generate()
-    to = X25519PublicKey.from_public_bytes(base64.b64decode(key))
-    own = _public(once)
-    sealed = _cipher(once.exchange(to), own, base64.b64decode(key)).encrypt(
-        _NONCE, to_json(invitation).encode(), _PREFIX.encode())
-    return _PREFIX + base64.urlsafe_b64encode(own + sealed).decode()
+    from fogros2 import sealing
+    sealed = sealing.seal(to_json(invitation).encode(), base64.b64decode(key), _PREFIX.encode())
+    return _PREFIX + base64.urlsafe_b64encode(sealed).decode()
 
 
-def unseal(text: str, key: X25519PrivateKey) -> Invitation:
+def unseal(text: str, key: bytes) -> Invitation:
     """
     Open an invitation to this computer.
 
     :raises ConfigurationError: the text is for another computer, changed, or expired.
     """
+    from fogros2 import sealing
     text = ''.join(text.split())
     try:
         data = base64.b64decode(text.removeprefix(_PREFIX), b'-_', validate=True)
         if _PREFIX + base64.urlsafe_b64encode(data).decode() != text:
             raise ValueError('a character is changed')  # base64 ignores some bits of the last
-        shared = key.exchange(X25519PublicKey.from_public_bytes(data[:32]))
-        content = _cipher(shared, data[:32], _public(key)).decrypt(
-            _NONCE, data[32:], text[:len(_PREFIX)].encode())
+        content = sealing.unseal(data, key, text[:len(_PREFIX)].encode())
         invitation = Invitation(**json.loads(content))
-    except InvalidTag:
+    except sealing.WrongKey:
         raise ConfigurationError(
             'this invitation is for another computer, or not complete',
             'ros2 fog key prints the key that the invitation needs') from None
@@ -181,12 +162,3 @@ def unseal(text: str, key: X25519PrivateKey) -> Invitation:
         raise ConfigurationError(f"the invitation to '{invitation.machine}' has expired",
                                  'ask for a new one: ros2 fog invite')
     return invitation
-
-
-def _public(key: X25519PrivateKey) -> bytes:
-    return key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)
-
-
-def _cipher(shared: bytes, sender: bytes, recipient: bytes) -> ChaCha20Poly1305:
-    return ChaCha20Poly1305(HKDF(
-        SHA256(), 32, salt=sender + recipient, info=b'fogros2 invitation').derive(shared))

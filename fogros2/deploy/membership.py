@@ -9,8 +9,6 @@ import os
 from pathlib import Path
 from typing import Optional
 
-from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
-
 from fogros2 import plugin_system, process
 from fogros2.dds import addresses_of, DdsVendor
 from fogros2.deploy.robot import check_robot, clear, run
@@ -57,8 +55,7 @@ def join(
     vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
         domain=invitation.domain, ports=vendor.ports,
         asked=addresses_of(vendor.asked(environment)))
-    private = base64.b64encode(key.private_bytes(
-        Encoding.Raw, PrivateFormat.Raw, NoEncryption())).decode()
+    private = base64.b64encode(key).decode()
     store.launch(invitation.number)
     try:
         _write(folder, invitation, interface, vendor, environment, owner or {

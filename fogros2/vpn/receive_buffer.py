@@ -14,8 +14,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 import ctypes
 import os
-from pathlib import Path
-import socket
 import sys
 import time
 
@@ -23,51 +21,68 @@ import time
 SIZE = 7 << 20
 #: Seconds that wireguard-go may need to open its sockets.
 TIMEOUT = 2.0
-#: <asm-generic/unistd.h> and <asm-generic/socket.h>; Python has neither.
-_PIDFD_GETFD, _SO_RCVBUFFORCE = 438, 33
+#: <asm-generic/unistd.h>, and names and values of <asm-generic/socket.h> and <bits/socket.h>.
+# Python's socket module has some, and takes longer to load than all of this program.
+_PIDFD_GETFD, _SOL_SOCKET, _SO_TYPE, _SO_DOMAIN, _SO_RCVBUFFORCE = 438, 1, 3, 39, 33
+_SOCK_DGRAM, _AF_INET, _AF_INET6 = 2, 2, 10
+_libc = ctypes.CDLL(None, use_errno=True)
 
 
 def processes(interface: str) -> Iterator[int]:
     """Yield the wireguard-go processes of an interface in this network namespace."""
     here = os.stat('/proc/self/ns/net').st_ino
-    for path in Path('/proc').glob('[0-9]*'):
+    for name in filter(str.isdigit, os.listdir('/proc')):
         try:
-            words = (path / 'cmdline').read_bytes().split(b'\0')
+            with open(f'/proc/{name}/cmdline', 'rb') as file:
+                words = file.read().split(b'\0')
             if (words[:2] == [b'wireguard-go', interface.encode()]
-                    and os.stat(path / 'ns/net').st_ino == here):
-                yield int(path.name)
+                    and os.stat(f'/proc/{name}/ns/net').st_ino == here):
+                yield int(name)
         except OSError:
             continue  # the process has ended
 
 
-def sockets(process: int) -> Iterator[socket.socket]:
+def sockets(process: int) -> Iterator[int]:
     """
     Yield copies of a process's UDP sockets.
 
     :raises OSError: this user, or this kernel, does not allow it.
     """
-    libc = ctypes.CDLL(None, use_errno=True)
     there = os.pidfd_open(process)
     try:
-        for path in Path(f'/proc/{process}/fd').iterdir():
-            if not os.readlink(path).startswith('socket:'):
+        for name in os.listdir(f'/proc/{process}/fd'):
+            if not os.readlink(f'/proc/{process}/fd/{name}').startswith('socket:'):
                 continue
-            copy = libc.syscall(_PIDFD_GETFD, there, int(path.name), 0)
-            if copy < 0:
-                raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
-            with socket.socket(fileno=copy) as one:
-                if one.type == socket.SOCK_DGRAM and one.family in (
-                        socket.AF_INET, socket.AF_INET6):
-                    yield one
+            copy = _checked(_libc.syscall(_PIDFD_GETFD, there, int(name), 0))
+            try:
+                if (_option(copy, _SO_TYPE) == _SOCK_DGRAM
+                        and _option(copy, _SO_DOMAIN) in (_AF_INET, _AF_INET6)):
+                    yield copy
+            finally:
+                os.close(copy)
     finally:
         os.close(there)
 
 
+def _option(number: int, option: int) -> int:
+    value, size = ctypes.c_int(), ctypes.c_uint(4)
+    _checked(_libc.getsockopt(
+        number, _SOL_SOCKET, option, ctypes.byref(value), ctypes.byref(size)))
+    return value.value
+
+
+def _checked(result: int) -> int:
+    if result < 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    return result
+
+
 def enlarge(process: int) -> int:
     """Set the receive buffers of a process's UDP sockets; return the number of sockets."""
-    count = 0
-    for one in sockets(process):
-        one.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, SIZE)
+    count, size = 0, ctypes.c_int(SIZE)
+    for number in sockets(process):
+        _checked(_libc.setsockopt(
+            number, _SOL_SOCKET, _SO_RCVBUFFORCE, ctypes.byref(size), ctypes.c_uint(4)))
         count += 1
     return count
 

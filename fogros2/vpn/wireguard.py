@@ -549,7 +549,7 @@ def _buffer(interface: VpnInterface) -> str:
     name = _name(interface)
     source = Path(__file__).with_name('receive_buffer.py').read_text()
     return (f'[ ! -S /var/run/wireguard/{name}.sock ] || '
-            f'python3 -I -c {shlex.quote(source)} {name} || :')
+            f'python3 -IS -c {shlex.quote(source)} {name} || :')
 
 
 def _routes(interface: VpnInterface, peers: Sequence[Peer]) -> list[str]:

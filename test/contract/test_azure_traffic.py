@@ -17,7 +17,7 @@ import subprocess
 import pytest
 
 from fogros2.model import MachineSpec
-from fogros2.provider.azure import AzureProvider
+from fogros2.provider.azure.provider import AzureProvider
 from fogros2.testing import request_for
 from rigs.azure import service, traffic
 

@@ -10,8 +10,8 @@ import boto3
 import pytest
 
 from fogros2.model import MachineSpec, MachineState
-from fogros2.provider.aws import AWSProvider
 from fogros2.provider.aws.instances import tag_list
+from fogros2.provider.aws.provider import AWSProvider
 from fogros2.provider.container import engine, machine
 from fogros2.provider.kubernetes import names
 

@@ -7,7 +7,6 @@ what a test leaves behind.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from importlib import metadata
 import ipaddress
 import os
 from pathlib import Path
@@ -29,6 +28,7 @@ from fogros2.provider.container import root as container_root
 from rigs.cluster import images as cluster_images
 from rigs.container_machines import cloud_network, engine
 from rigs.domains import taken
+from rigs.launched import embedded
 from rigs.traces import nothing_left as nothing_left_of
 from rigs.traces import RUN, Traces
 
@@ -114,9 +114,7 @@ def nothing_left(
 @pytest.fixture(scope='session')
 def isolated_root() -> None:
     """Skip where isolated machines get no root, or one that can't have the robot's ROS."""
-    try:
-        metadata.distribution('ros2-embedded')
-    except metadata.PackageNotFoundError:
+    if not embedded():
         pytest.skip('an isolated root gets the embedded default alone without a package index')
     try:
         debian_root.check()
@@ -205,9 +203,7 @@ def images(engine: str, busybox: Path, tmp_path_factory: pytest.TempPathFactory,
 def with_python() -> list[str]:
     """Return options of ``docker run`` that bring this Python environment into ``system.tar``."""
     mounts = container_root.environment_mounts(None)
-    try:
-        metadata.distribution('ros2-embedded')
-    except metadata.PackageNotFoundError:
+    if not embedded():
         mounts.append('/usr/lib')  # what ROS 2 is linked with
     return [word for mount in mounts for word in ('-v', f'{mount}:{mount}:ro')]
 

@@ -24,10 +24,11 @@ from fogros2.errors import (
 )
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_DEPENDENCIES, TAG_NAME
-from fogros2.provider.aws import AWSProvider, images, instances
+from fogros2.provider.aws import images, instances
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.aws.failures import AwsError
+from fogros2.provider.aws.provider import AWSProvider
 from fogros2.provider.vm import user_data
 from fogros2.testing.provider_contract import PUBLIC_KEY
 from rigs.ec2 import iam

@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 
 from fogros2.model import MachineSpec
-from fogros2.provider.azure import AzureProvider
+from fogros2.provider.azure.provider import AzureProvider
 from fogros2.testing import request_for
 from rigs.azure import cli, service
 

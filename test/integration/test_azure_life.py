@@ -26,8 +26,9 @@ from fogros2.errors import (
 )
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_DEPENDENCIES
-from fogros2.provider.azure import AzureProvider, ending
+from fogros2.provider.azure import ending
 from fogros2.provider.azure.account import Account
+from fogros2.provider.azure.provider import AzureProvider
 from fogros2.provider.offers import wants
 from fogros2.provider.vm.user_data import LIMIT
 from fogros2.testing.provider_contract import PUBLIC_KEY

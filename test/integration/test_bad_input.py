@@ -9,7 +9,6 @@ than zero, and nothing is left.
 from __future__ import annotations
 
 import contextlib
-from importlib import metadata
 import os
 import shutil
 import subprocess
@@ -23,7 +22,7 @@ from fogros2 import process
 from fogros2.provider.container import root as container_root
 from fogros2.store import Store
 from rigs.bare_computer import bare_computer
-from rigs.launched import launching
+from rigs.launched import embedded, launching
 from rigs.sshd import private_sshd
 
 pytestmark = [
@@ -45,14 +44,6 @@ def generate_launch_description():
         CloudNode(machine=machine, package={package!r}, executable={executable!r}),
     ])
 """
-
-
-def embedded():
-    try:
-        metadata.distribution('ros2-embedded')
-    except metadata.PackageNotFoundError:
-        return False
-    return True
 
 
 @pytest.fixture(autouse=True)

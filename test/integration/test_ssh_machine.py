@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from importlib import metadata
 import json
 import os
 import shutil
@@ -18,7 +17,7 @@ from fogros2.provider.container import root as container_root
 from fogros2.waiting import wait_until
 from rigs.bare_computer import bare_computer
 from rigs.colcon_workspace import colcon_workspace
-from rigs.launched import launching, ros2
+from rigs.launched import embedded, launching, ros2
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
@@ -38,14 +37,6 @@ done
 """
 COLCON = shutil.which('colcon', path=os.pathsep.join(
     [os.path.dirname(sys.executable), os.environ.get('PATH', '')]))
-
-
-def embedded():
-    try:
-        metadata.distribution('ros2-embedded')
-    except metadata.PackageNotFoundError:
-        return False
-    return True
 
 
 @pytest.fixture(scope='module')

@@ -449,7 +449,7 @@ def test_a_launch_says_what_it_cost(run, fake, talker, capfd):
 
 def test_choices_are_made_in_threads(run, fake, talker, monkeypatch):
     from fogros2 import AWSCloudInstance, find_nearest_aws_region
-    from fogros2.provider.aws import AWSProvider
+    from fogros2.provider.aws.provider import AWSProvider
     where = []
 
     def nearest(self, regions=()):
@@ -468,7 +468,7 @@ def test_choices_are_made_in_threads(run, fake, talker, monkeypatch):
 
 def test_a_choice_that_cannot_be_made(run, fake, talker, monkeypatch, capfd):
     from fogros2 import AWSCloudInstance, find_nearest_aws_region
-    from fogros2.provider.aws import AWSProvider
+    from fogros2.provider.aws.provider import AWSProvider
 
     def nearest(self, regions=()):
         raise ProviderError('no region answers', 'is there a network?')

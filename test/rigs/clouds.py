@@ -232,7 +232,7 @@ class Aws(Cloud):
 
     def provider(self) -> VmProvider:
         """Return the provider."""
-        from fogros2.provider.aws import AWSProvider
+        from fogros2.provider.aws.provider import AWSProvider
         return AWSProvider()
 
     def variables(self, box: Any, folder: Path, *, here: bool = False) -> dict[str, str]:
@@ -370,7 +370,7 @@ class Gcp(Cloud):
 
     def provider(self) -> VmProvider:
         """Return the provider."""
-        from fogros2.provider.gcp import GCPProvider
+        from fogros2.provider.gcp.provider import GCPProvider
         return GCPProvider()
 
     def variables(self, box: Any, folder: Path, *, here: bool = False) -> dict[str, str]:
@@ -465,9 +465,9 @@ class Azure(Cloud):
 
     def provider(self) -> VmProvider:
         """Return a provider that remembers nothing of earlier tests."""
-        from fogros2.provider.azure import AzureProvider
         from fogros2.provider.azure.account import Account
         from fogros2.provider.azure.cloud import Azure
+        from fogros2.provider.azure.provider import AzureProvider
         return AzureProvider(Azure(Account()))
 
     def variables(self, box: Any, folder: Path, *, here: bool = False) -> dict[str, str]:

@@ -165,7 +165,7 @@ class Azure(Memory):
 
     def provider(self) -> VmProvider:
         """Return the provider."""
-        from fogros2.provider.azure import AzureProvider
+        from fogros2.provider.azure.provider import AzureProvider
         return AzureProvider()
 
     def left(self) -> bool:
@@ -223,7 +223,7 @@ class Gcp(Memory):
 
     def provider(self) -> VmProvider:
         """Return the provider."""
-        from fogros2.provider.gcp import GCPProvider
+        from fogros2.provider.gcp.provider import GCPProvider
         return GCPProvider()
 
     def left(self) -> bool:

@@ -15,8 +15,9 @@ from fogros2.model import Command, MachineSpec
 from fogros2.process import run
 from fogros2.provider.container import machine as container_machine
 from fogros2.provider.container.hosted import HostedProvider
-from rigs.launched import Launched
+from rigs.launched import embedded, Launched
 from rigs.sshd import private_sshd, PrivateSshd
+from rigs.vpn_lab import PASSED
 
 #: Of TEST-NET-3; several, as two runs of the tests may meet on one computer.
 SUBNETS = [f'203.0.113.{host}/27' for host in (64, 96, 128, 160)]
@@ -167,7 +168,10 @@ def fleet(folder: Path, address: str = '127.0.0.1') -> Iterator[Fleet]:
     :param address: address of this computer at which robots reach it.
     """
     cache = folder / 'cache'
-    more = f'ListenAddress {address}\nSetEnv SHLVL=2 XDG_CACHE_HOME={cache}\n'
+    # a login of the host knows ROS 2 as this process does, wherever it is
+    ros = '' if embedded() else ''.join(
+        f' {name}={os.environ[name]}' for name in PASSED if name in os.environ)
+    more = f'ListenAddress {address}\nSetEnv SHLVL=2 XDG_CACHE_HOME={cache}{ros}\n'
     with network() as name, private_sshd(folder / 'sshd', more) as server:
         try:
             yield Fleet(server, folder, name, address)

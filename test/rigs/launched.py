@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
+from importlib import metadata
 import os
 import signal
 import subprocess
@@ -16,6 +17,15 @@ from typing import Optional
 from fogros2.waiting import wait_until
 
 ROS2 = 'ros2'
+
+
+def embedded() -> bool:
+    """Return whether the tests run on the embedded default."""
+    try:
+        metadata.distribution('ros2-embedded')
+    except metadata.PackageNotFoundError:
+        return False
+    return True
 
 
 class Launched:

@@ -29,8 +29,8 @@ def test_neighbour_s_group_stays_during_its_creation(
 ) -> None:
     """The neighbour's clock is a quarter of an hour behind this robot's."""
     boto3 = pytest.importorskip('boto3')
-    from fogros2.provider.aws import AWSProvider
     from fogros2.provider.aws.instances import tag_list
+    from fogros2.provider.aws.provider import AWSProvider
     attempt = '0123456789abcdef'
     boto3.client('ec2', REGION).create_security_group(
         GroupName=f'fogros2-{attempt}', Description='FogROS2', TagSpecifications=[{

@@ -27,7 +27,7 @@ ORDER = """
     model errors events clock
     waiting report process
     agent cloud_launch
-    plugin_system store journal ros2_daemon monitor_addresses invitation
+    plugin_system store journal ros2_daemon monitor_addresses sealing invitation
     kubernetes_client
     shell vpn dds
     agent_client

@@ -20,9 +20,10 @@ import pytest
 
 from fogros2.describe import choices
 from fogros2.errors import ConfigurationError, FogError, PrerequisiteError, ProviderError
-from fogros2.provider.aws import AWSProvider, prices
+from fogros2.provider.aws import prices
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.cloud import Ec2
+from fogros2.provider.aws.provider import AWSProvider
 from fogros2.provider.offers import MachineType, Wants, wants
 from fogros2.provider.vm import market as markets
 from fogros2.provider.vm.market import Market

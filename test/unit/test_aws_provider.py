@@ -26,9 +26,10 @@ import yaml
 from fogros2.agent_client import joined
 from fogros2.errors import ConfigurationError, MachineNotFound, PrerequisiteError, ProviderError
 from fogros2.model import CreateRequest, MachineSpec, MachineState
-from fogros2.provider.aws import AWSProvider, clients, failures, instances, network
+from fogros2.provider.aws import clients, failures, instances, login, network
 from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.aws.options import Options
+from fogros2.provider.aws.provider import AWSProvider
 from fogros2.provider.vm import address, cloud
 from fogros2.provider.vm import user_data as boot
 from fogros2.provider.vm.cloud import Order, Place
@@ -574,16 +575,16 @@ def test_missing_action_of_a_policy_is_named():
 
 @pytest.mark.parametrize('name', ['AWS_ACCESS_KEY_ID', 'AWS_PROFILE'])
 def test_whether_somebody_set_aws_up_is_seen_without_boto3(monkeypatch, tmp_path, name):
-    for variable in clients._VARIABLES:
+    for variable in login._VARIABLES:
         monkeypatch.delenv(variable, raising=False)
-    for variable in clients._FILES:
+    for variable in login._FILES:
         monkeypatch.setenv(variable, str(tmp_path / 'none'))
-    assert not clients.configured()
+    assert not login.configured()
     monkeypatch.setenv(name, 'x')
-    assert clients.configured()
+    assert login.configured()
     monkeypatch.delenv(name)
     (tmp_path / 'none').write_text('[default]\n')
-    assert clients.configured()
+    assert login.configured()
 
 
 # -- rights -------------------------------------------------------------------------------------

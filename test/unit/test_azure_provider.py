@@ -14,7 +14,7 @@ import pytest
 from fogros2 import AzureCloudInstance
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.model import CreateRequest, MachineSpec, MachineState
-from fogros2.provider.azure import account, ending, failures, machines, prices
+from fogros2.provider.azure import account, ending, failures, login, machines, prices
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
 from fogros2.provider.vm.cloud import Order, Place
@@ -197,12 +197,12 @@ def test_role_of_machines_is_the_narrowest(monkeypatch):
 def test_subscription_is_that_of_the_environment_or_of_the_login(monkeypatch, tmp_path):
     monkeypatch.setenv('AZURE_CONFIG_DIR', str(tmp_path))
     monkeypatch.delenv('AZURE_SUBSCRIPTION_ID', raising=False)
-    assert not account.configured()
+    assert not login.configured()
     with pytest.raises(PrerequisiteError, match='no subscription'):
         account.subscription()
     # az writes a byte order mark
     (tmp_path / 'azureProfile.json').write_text(json.dumps({'subscriptions': [
         {'id': 'one', 'isDefault': False}, {'id': 'two', 'isDefault': True}]}), 'utf-8-sig')
-    assert account.configured() and account.subscription() == 'two'
+    assert login.configured() and account.subscription() == 'two'
     monkeypatch.setenv('AZURE_SUBSCRIPTION_ID', 'three')
     assert account.subscription() == 'three'

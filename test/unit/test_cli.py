@@ -652,3 +652,16 @@ def test_help_imports_no_core(words: list[str], tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                           cwd=tmp_path, check=True)
     assert done.stderr.splitlines()[-1] == '[]'
+
+
+def test_list_loads_no_cloud_that_is_not_set_up(tmp_path: Path) -> None:
+    code = ('import sys\nimport ros2fog_cli.verb.list\n'
+            'from ros2fog_cli.api.machines import configured\n'
+            'configured(None)\nprint([name for name in sys.modules if name.startswith(("boto3", '
+            '"cryptography", "google", "urllib.request", "fogros2.provider.vm"))])')
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          cwd=tmp_path, check=True,
+                          env={'PATH': os.environ['PATH'], 'HOME': str(tmp_path), **{
+                              name: os.environ[name] for name in ('PYTHONPATH', 'LD_LIBRARY_PATH')
+                              if name in os.environ}})
+    assert done.stdout == '[]\n'

@@ -21,9 +21,10 @@ from fogros2.deploy import launch as launches
 from fogros2.errors import ConfigurationError, FogError, ProviderError
 from fogros2.model import MachineSpec
 from fogros2.provider import clouds
-from fogros2.provider.azure import AzureProvider
+from fogros2.provider.azure.provider import AzureProvider
 from fogros2.provider.cheapest import Cheapest
-from fogros2.provider.gcp import GCPProvider, prices
+from fogros2.provider.gcp import prices
+from fogros2.provider.gcp.provider import GCPProvider
 from fogros2.provider.offers import MachineType, Offer, Offers, ranked, Region, Wants, wants
 from fogros2.provider.vm import regions
 from fogros2.report import Warned

@@ -16,7 +16,7 @@ from fogros2.describe import choices as later
 from fogros2.describe import keywords, overrides, values
 from fogros2.errors import ConfigurationError
 from fogros2.provider import clouds
-from fogros2.provider.aws import AWSProvider
+from fogros2.provider.aws.provider import AWSProvider
 from fogros2.provider.offers import MachineType, Offer, Offers, wants
 
 

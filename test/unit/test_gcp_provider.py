@@ -20,8 +20,9 @@ from fogros2.errors import (
 )
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_ON_EXIT
-from fogros2.provider.gcp import account, failures, firewall, GCPProvider, instances, prices
+from fogros2.provider.gcp import account, failures, firewall, instances, prices
 from fogros2.provider.gcp.options import Options
+from fogros2.provider.gcp.provider import GCPProvider
 from fogros2.provider.offers import wants
 from fogros2.provider.vm import cloud
 from fogros2.provider.vm.cloud import Order, Place

@@ -26,7 +26,7 @@ from fogros2 import shell as shells
 from fogros2.errors import Unsupported
 from fogros2.model import Command, Machine, MachineState, Result, to_json
 from fogros2.provider import Capabilities
-from fogros2.provider.aws import AWSProvider
+from fogros2.provider.aws.provider import AWSProvider
 from fogros2.provider.container import machine as container_machine
 from fogros2.provider.kubernetes.names import MachineId as JobId
 from fogros2.provider.ssh import SSHProvider

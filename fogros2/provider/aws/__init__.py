@@ -2,23 +2,6 @@
 """
 EC2 instances, by boto3.
 
-In reading order: ``options``, ``failures`` (AWS's refusals), ``clients`` (calls),
-``instances``, ``network``, ``prices``, ``images``, ``cloud`` (the adapter).
+In reading order: ``login``, ``options``, ``failures`` (AWS's refusals), ``clients`` (calls),
+``instances``, ``network``, ``prices``, ``images``, ``cloud`` (the adapter), ``provider``.
 """
-
-from __future__ import annotations
-
-import dataclasses
-
-from fogros2.provider.aws import instances
-from fogros2.provider.aws.cloud import Ec2
-from fogros2.provider.vm.provider import VmProvider
-
-
-class AWSProvider(VmProvider):
-    """EC2 instances."""
-
-    name = Ec2.name
-    adapter = Ec2
-    capabilities = dataclasses.replace(
-        VmProvider.capabilities, stop=True, images=True, preemption_notice=instances.NOTICE)

@@ -10,7 +10,7 @@ from typing import Any, Optional
 
 from fogros2.errors import MachineNotFound
 from fogros2.model import MachineSpec
-from fogros2.provider.aws import clients, images, instances
+from fogros2.provider.aws import clients, images, instances, login
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.network import Ec2Network
 from fogros2.provider.aws.options import Options
@@ -40,7 +40,7 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network):
     regions = Regions('AWS', read_table(__file__), api_host)
     id_form = 'i-[0-9a-f]+'
     base_region = 'us-east-1'
-    configured = staticmethod(clients.configured)
+    configured = staticmethod(login.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
         self._account: Account = account or clients.usual()

@@ -6,11 +6,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 import json
 import os
-from pathlib import Path
 import threading
 from typing import Any, Optional
 
 from fogros2.errors import FogError, PrerequisiteError, ProviderError
+from fogros2.provider.azure import login
 from fogros2.provider.azure.failures import refusal
 from fogros2.provider.vm.failures import one_line, unless_gone
 from fogros2.provider.vm.rest import Answer, RestAccount
@@ -35,15 +35,6 @@ def endpoint() -> str:
     return os.environ.get(ENDPOINT_VARIABLE, ENDPOINT).rstrip('/')
 
 
-def configured() -> bool:
-    """Return whether Azure is set up here; read only files and variables."""
-    return bool(os.environ.get('AZURE_SUBSCRIPTION_ID')) or _file('azureProfile.json').is_file()
-
-
-def _file(name: str) -> Path:
-    return Path(os.environ.get('AZURE_CONFIG_DIR') or Path.home() / '.azure', name)
-
-
 def subscription() -> str:
     """
     Return the id of the user's subscription: of the environment, else of ``az login``.
@@ -53,7 +44,7 @@ def subscription() -> str:
     named = os.environ.get('AZURE_SUBSCRIPTION_ID', '')
     if not named:
         try:
-            known = json.loads(_file('azureProfile.json').read_text(encoding='utf-8-sig'))
+            known = json.loads(login.file('azureProfile.json').read_text(encoding='utf-8-sig'))
             named = next((str(entry['id']) for entry in known['subscriptions']
                           if entry.get('isDefault')), '')
         except (OSError, ValueError, KeyError, TypeError):

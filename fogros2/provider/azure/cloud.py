@@ -20,8 +20,8 @@ from typing import Any, Optional
 from fogros2.errors import ConfigurationError, FogError, MachineNotFound, ProviderError
 from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_EXPIRES
-from fogros2.provider.azure import ending, images, machines, prices
-from fogros2.provider.azure.account import Account, configured, endpoint, subscription
+from fogros2.provider.azure import ending, images, login, machines, prices
+from fogros2.provider.azure.account import Account, endpoint, subscription
 from fogros2.provider.azure.failures import refusal
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
@@ -65,7 +65,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
                       lambda region: f'{region}.handler.control.monitor.azure.com')
     id_form = 'fogros2-[0-9a-f]{16}-[0-9a-f]{8}'
     base_region = 'westeurope'
-    configured = staticmethod(configured)
+    configured = staticmethod(login.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
         self._account = account or _USUAL

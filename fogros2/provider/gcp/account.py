@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping
 import copy
 import functools
 import os
-from pathlib import Path
 import threading
 import time
 from typing import Any, cast
@@ -15,7 +14,7 @@ import uuid
 import warnings
 
 from fogros2.errors import DeadlineExceeded, FogError, PrerequisiteError
-from fogros2.provider.gcp import failures
+from fogros2.provider.gcp import failures, login
 from fogros2.provider.vm.failures import tolerated, unless_gone
 from fogros2.provider.vm.rest import RestAccount
 
@@ -28,17 +27,6 @@ _VARIABLES = (
     'GOOGLE_APPLICATION_CREDENTIALS', 'GOOGLE_CLOUD_PROJECT', 'CLOUDSDK_CONFIG', 'HOME')
 #: Time-out in seconds of an operation, and of a request that waits for one: two minutes there.
 OPERATION_TIMEOUT, WAIT_TIMEOUT = 300.0, 140.0
-
-
-def _credentials() -> Path:
-    named = os.environ.get('GOOGLE_APPLICATION_CREDENTIALS', '')
-    folder = Path(os.environ.get('CLOUDSDK_CONFIG') or '~/.config/gcloud').expanduser()
-    return Path(named) if named else folder / 'application_default_credentials.json'
-
-
-def configured() -> bool:
-    """Return whether Google Cloud is set up here; read only files and variables."""
-    return _credentials().is_file()
 
 
 @functools.lru_cache(maxsize=4)
@@ -94,7 +82,7 @@ class Account(RestAccount):
         return other
 
     def _opened(self) -> tuple[Any, str]:
-        if not configured():
+        if not login.configured():
             raise PrerequisiteError(
                 'there are no Google credentials on this computer',
                 'gcloud auth application-default login, or set GOOGLE_APPLICATION_CREDENTIALS')

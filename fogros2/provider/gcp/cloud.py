@@ -12,8 +12,8 @@ from typing import Any, Optional
 from fogros2.errors import ConfigurationError, MachineNotFound
 from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_ON_EXIT
-from fogros2.provider.gcp import guest, images, instances, prices
-from fogros2.provider.gcp.account import Account, configured, ENDPOINT_VARIABLE
+from fogros2.provider.gcp import guest, images, instances, login, prices
+from fogros2.provider.gcp.account import Account, ENDPOINT_VARIABLE
 from fogros2.provider.gcp.failures import GoogleError
 from fogros2.provider.gcp.firewall import GoogleFirewall
 from fogros2.provider.gcp.options import Options
@@ -50,7 +50,7 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
     #: Project, zone and name.
     id_form = r'[a-z0-9.:-]+/[a-z0-9-]+/fogros2-[0-9a-f]{16}'
     base_region = DEFAULT_REGION
-    configured = staticmethod(configured)
+    configured = staticmethod(login.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
         self._account: Account = account or Account()

@@ -10,7 +10,6 @@ import os
 import socket
 import threading
 import time
-import urllib.request
 
 from fogros2.errors import ProviderError
 from fogros2.provider.vm.options import cidr
@@ -57,6 +56,7 @@ class RobotAddress:
         return [*named, *([own] if own else [])]
 
     def _ask(self, url: str) -> str:
+        import urllib.request  # ssl and email too: 10 ms that a listing does not need
         hint = f'{ADDRESS_VARIABLE}=... names it'
         try:
             with urllib.request.urlopen(url, timeout=5.0) as answer:

@@ -13,9 +13,10 @@ import boto3
 from botocore.awsrequest import AWSResponse
 import botocore.session
 
-from fogros2.provider.aws import AWSProvider, instances
+from fogros2.provider.aws import instances
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.cloud import Ec2
+from fogros2.provider.aws.provider import AWSProvider
 
 #: Knows the services' models, which take longest to read, for all tests.
 LOADER = botocore.session.get_session().get_component('data_loader')
