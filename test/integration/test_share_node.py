@@ -173,16 +173,16 @@ def test_robot_that_comes_later_gets_the_map(robot: Callable[[str], Robot]) -> N
 def test_both_robots_publish_the_same_topic(robot: Callable[[str], Robot]) -> None:
     """Each hears the other's map beside its own, once, and no relay sends one back."""
     robots = [robot('one'), robot('two'), robot('three')]
+    publishers = [each.publisher(OccupancyGrid, '/map', LATCHED) for each in robots]
     heard = []
     for number, each in enumerate(robots):
-        each.publisher(OccupancyGrid, '/map', LATCHED).publish(OccupancyGrid(data=[number]))
+        publishers[number].publish(OccupancyGrid(data=[number]))
         heard.append(each.heard(OccupancyGrid, '/map', QoSProfile(
             depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)))
         each.start('/map')
     wait_until(lambda: all(len(maps) >= 3 for maps in heard), timeout=40, what='all maps')
     # a message that is sent back would be under way by then
-    late = robots[0].publisher(OccupancyGrid, '/map', LATCHED)
-    late.publish(OccupancyGrid(data=[9]))
+    publishers[0].publish(OccupancyGrid(data=[9]))
     wait_until(lambda: all(9 in [one.data[0] for one in maps] for maps in heard), timeout=20,
                what='a new map')
     for maps in heard:
