@@ -37,7 +37,8 @@ RESULTS = ROOT / 'benchmarks' / 'results'
 #: Keeps systems, packages and running roots. It must lie on a disk: an overlay carries no other.
 FOLDER = Path(os.environ.get('FOGROS2_FRESH_FOLDER') or Path(
     os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache', 'fogros2/fresh'))
-#: A folder with Kubernetes as tools/kubernetes.sh builds it, which saves these ten minutes.
+#: Where tools/kubernetes.sh has built Kubernetes before, such as ~/.cache/fogros2/kubernetes: saves
+#: ten minutes.
 KUBERNETES = os.environ.get('FOGROS2_FRESH_KUBERNETES', '')
 BOOKWORM, TRIXIE = Suite('bookworm', 'Debian 12'), Suite('trixie', 'Debian 13')
 NOBLE = Suite('noble', 'Ubuntu 24.04', 'ubuntu', os.environ.get('FOGROS2_UBUNTU_MIRROR', ''))
@@ -262,6 +263,8 @@ def main(words: Sequence[str]) -> int:
     unknown = set(options.variants) - set(VARIANTS)
     if unknown:
         parser.error(f'no variant {", ".join(sorted(unknown))}; there are {", ".join(VARIANTS)}')
+    if KUBERNETES and not any(Path(KUBERNETES).glob('*/built')):
+        parser.error(f'FOGROS2_FRESH_KUBERNETES: {KUBERNETES} has no build of Kubernetes')
     for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(each, interrupt)
     try:
