@@ -37,7 +37,7 @@ RESULTS = ROOT / 'benchmarks' / 'results'
 #: Keeps systems, packages and running roots. It must lie on a disk: an overlay carries no other.
 FOLDER = Path(os.environ.get('FOGROS2_FRESH_FOLDER') or Path(
     os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache', 'fogros2/fresh'))
-#: Where tools/kubernetes.sh has built Kubernetes before, such as ~/.cache/fogros2/kubernetes: saves
+#: Where tools/kubernetes.sh has built Kubernetes, such as ~/.cache/fogros2/kubernetes: saves
 #: ten minutes.
 KUBERNETES = os.environ.get('FOGROS2_FRESH_KUBERNETES', '')
 BOOKWORM, TRIXIE = Suite('bookworm', 'Debian 12'), Suite('trixie', 'Debian 13')
