@@ -117,7 +117,7 @@ def test_missing_folder_has_no_snapshot(shell, tmp_path):
 
 
 def test_too_large_folder_is_refused(kept, shell, monkeypatch):
-    monkeypatch.setattr(checkpoint, 'LIMIT', 1000)
+    monkeypatch.setattr(checkpoint, 'LIMIT', 1)
     with pytest.raises(ShellError, match=r'has 0.0 GB, and a checkpoint at most 0.0 GB'):
         kept.save(shell, still=False)
 
