@@ -31,7 +31,7 @@ class MeadowOptions(VmOptions):
     Options of a machine at Meadow.
 
     It inherits region, regions, by_region, disk_size, spot, arch, min_cpu, min_memory_gb,
-    cpu_type, gpu, gpu_memory_gb, max_price, tags, user and ssh_from.
+    cpu_type, gpu, gpu_memory_gb, max_price, tags, user, ssh_from and fleet.
 
     :param machine_type: name of a type, or 'cheapest'.
     :param machine_types: types to try after ``machine_type``.

@@ -380,7 +380,7 @@ class ContainerInstance(CloudInstance):
             elif not isinstance(on, Mapping):
                 raise ConfigurationError(
                     f'on={type(on).__name__} is no host of container machines',
-                    'use SSHInstance; a machine of a cloud admits no robot to further ports')
+                    'use SSHInstance; fleet= makes a machine of a cloud one')
         super().__init__(options=options, **common)
 
     def takes_containers(self) -> None:

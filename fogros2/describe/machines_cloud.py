@@ -51,6 +51,8 @@ class VmInstance(CloudInstance):
     :param user: the image's login user.
     :param ssh_from: networks (CIDR) that may reach the SSH port; None for this robot's public
         address only.
+    :param fleet: public SSH keys of other robots, which from the networks of ``ssh_from`` may have
+        container machines on this one (``ContainerInstance(on=SSHInstance(...))``).
     """
 
     def __init__(
@@ -65,6 +67,7 @@ class VmInstance(CloudInstance):
         regions: Optional[Sequence[SomeSubstitutionsType]] = None,
         user: Optional[SomeSubstitutionsType] = None,
         ssh_from: Optional[Sequence[SomeSubstitutionsType]] = None,
+        fleet: Optional[Sequence[SomeSubstitutionsType]] = None,
         options: Optional[Mapping[str, Any]] = None, **common: Any,
     ) -> None:
         shared = options_of(VmInstance.__init__, locals())

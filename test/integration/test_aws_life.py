@@ -162,6 +162,17 @@ def test_networks_that_were_named_stay_allowed_with_the_robot(aws):
     assert ports(machine_id)['tcp 22'] == ['198.51.100.64/26', '198.51.100.7/32']
 
 
+def test_robots_of_a_fleet_may_log_in_and_reach_published_ports(aws):
+    spec, request = ask(on_exit='keep', fleet=[KEY], ssh_from=['198.51.100.64/26'])
+    machine_id = aws.provider.create(spec, request)
+    assert ports(machine_id) == {
+        'udp 51820': ['0.0.0.0/0', '::/0'], **dict.fromkeys(
+            ('tcp 22', 'tcp 32768', 'udp 32768'), ['198.51.100.64/26'])}
+    asked, = aws.asked('RunInstances')
+    told = gzip.decompress(asked['UserData']).decode()
+    assert json.loads(told.partition('\n')[2])['ssh_authorized_keys'] == [PUBLIC_KEY, KEY]
+
+
 def test_resources_of_a_machine_are_deleted_with_it(aws):
     spec, request = ask()
     machine_id = aws.provider.create(spec, request)

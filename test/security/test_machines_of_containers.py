@@ -16,6 +16,7 @@ import pytest
 from fogros2.model import Command
 from fogros2.process import run
 from fogros2.shell.ssh import SSHShell
+from fogros2.waiting import wait_until
 from rigs.container_machines import Cloud, cloud, cloud_network, engine, key
 
 __all__ = ['cloud', 'cloud_network', 'engine', 'key']
@@ -63,6 +64,39 @@ one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 one.settimeout(5)
 one.sendto(bytes.fromhex('0001010000010000000000000000020001'), (sys.argv[1], 53))
 print(len(one.recv(4096)))
+"""
+METADATA = '169.254.169.254'
+#: Answers at the ports of a metadata service and of DNS.
+SERVICE = """
+import selectors, socket
+chosen = selectors.DefaultSelector()
+for port, kind in ((80, socket.SOCK_STREAM), (53, socket.SOCK_DGRAM)):
+    one = socket.socket(socket.AF_INET, kind)
+    one.bind(('169.254.169.254', port))
+    if port == 80:
+        one.listen()
+    chosen.register(one, selectors.EVENT_READ, port)
+while True:
+    for key, _ in chosen.select():
+        if key.data == 80:
+            with key.fileobj.accept()[0] as link:
+                link.send(b'token')
+        else:
+            key.fileobj.sendto(b'name', key.fileobj.recvfrom(99)[1])
+"""
+#: Prints the ports of that service which answer.
+ASK_SERVICE = """
+import socket, sys
+for port, kind in ((80, socket.SOCK_STREAM), (53, socket.SOCK_DGRAM)):
+    with socket.socket(socket.AF_INET, kind) as one:
+        one.settimeout(2)
+        try:
+            one.connect((sys.argv[1], port))
+            one.send(b'query')
+            if one.recv(9):
+                print(port)
+        except OSError:
+            pass
 """
 
 
@@ -182,3 +216,23 @@ def test_started_machine_reaches_no_port_either(
     with cloud.shell(cloud.reached(machine.id)) as shell:
         attack(robot, shell, cloud_network)
         assert robot.heard == []
+
+
+def test_machine_gets_dns_and_no_token_from_a_cloud(cloud: Cloud) -> None:
+    """Another machine has the address of clouds' metadata services, and this computer a route."""
+    with cloud.machine(options={'network': ''}) as (service, far), \
+            cloud.machine(options={'network': ''}) as (_, shell):
+        assert service.shell is not None
+        far.run(Command(('ip', 'address', 'add', f'{METADATA}/32', 'dev', 'lo'), sudo=True),
+                timeout=10)
+        far.run(Command(('sh', '-c', 'python3 -c "$1" >/dev/null 2>&1 &', 'sh', SERVICE),
+                        sudo=True), timeout=10)
+        route = METADATA, 'via', service.shell.host
+        run(Command(('ip', 'route', 'add', *route), sudo=True), timeout=10)
+        try:
+            ask = Command(('python3', '-c', ASK_SERVICE, METADATA))
+            wait_until(lambda: run(ask, timeout=20).stdout.split() == ['80', '53'], timeout=20,
+                       what='the service')
+            assert shell.run(ask, timeout=20).stdout.split() == ['53']
+        finally:
+            run(Command(('ip', 'route', 'del', *route), sudo=True), timeout=10)

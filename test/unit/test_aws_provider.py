@@ -38,6 +38,7 @@ from fogros2.waiting import wait_until
 from rigs.ec2 import iam
 
 ROOT = Path(__file__).resolve().parents[2]
+KEY = 'ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJ3Tq0CrBqXbWb0bqzPkGrjsvC7OxUD3yAyRIqLHTNN9'
 TOKEN = '5f0c7ab8-3a60-4b66-a3ff-f6f0ff4b9a37'
 SPEC = MachineSpec('planner', 'aws', {'region': 'eu-central-1'})
 REQUEST = CreateRequest(
@@ -90,6 +91,10 @@ def test_a_type_is_chosen_where_none_is_named(options, chooses):
     ({'security_groups': ['default']}, 'takes sg-'),
     ({'security_groups': 'sg-1'}, 'a list of strings'),
     ({'ssh_from': '300.0.0.1'}, 'no address or network'),
+    ({'fleet': ['/home/me/.ssh/id_ed25519.pub'], 'ssh_from': '198.51.100.0/24'},
+     'no public SSH key'),
+    ({'fleet': [f'{KEY}\n{KEY}'], 'ssh_from': '198.51.100.0/24'}, 'no public SSH key'),
+    ({'fleet': [KEY]}, 'the networks of its robots'),
     ({'tags': {'fogros2-name': 'x'}}, "can't be a tag"),
     ({'ami_image': 'ami-1', 'regions': ['us-east-1']}, 'belongs to one region'),
     ({'subnet': 'subnet-1', 'region': 'nearest'}, 'belongs to one region'),
@@ -105,6 +110,15 @@ def test_a_type_is_chosen_where_none_is_named(options, chooses):
 def test_a_wrong_option_is_named_with_what_to_do(options, words):
     with pytest.raises(ConfigurationError, match=re.escape(words)):
         Options.parse(options)
+
+
+@pytest.mark.parametrize('words', [
+    {}, {'on_exit': 'stop'}, {'on_exit': 'keep', 'idle_timeout': 9.0}])
+def test_machine_of_a_fleet_outlives_its_launch(words):
+    options = {'fleet': [f'{KEY} robot@lab'], 'ssh_from': ['198.51.100.0/24']}
+    assert Options.of(MachineSpec('gpu-box', 'aws', options, on_exit='keep')).fleet
+    with pytest.raises(ConfigurationError, match='use the machine after the launch'):
+        Options.of(MachineSpec('gpu-box', 'aws', options, **words))
 
 
 def test_options_by_region_are_those_of_the_region():
@@ -366,7 +380,7 @@ def test_the_robots_address_can_be_named(monkeypatch):
 
 def config(**agent):
     return boot.cloud_config(
-        name='planner', user='ubuntu', authorized_key='ssh-ed25519 AAAA robot',
+        name='planner', user='ubuntu', authorized_keys=['ssh-ed25519 AAAA robot'],
         host_key=one_time(TOKEN), agent_config=agent)
 
 
@@ -441,7 +455,7 @@ def test_booting_instance_starts_its_agent(booted):
     user = os.environ.get('USER') or subprocess.run(
         ['id', '-un'], capture_output=True, text=True).stdout.strip()
     told = boot.cloud_config(
-        name='planner', user=user, authorized_key='ssh-ed25519 AAAA', host_key=one_time(TOKEN),
+        name='planner', user=user, authorized_keys=['ssh-ed25519 AAAA'], host_key=one_time(TOKEN),
         agent_config={'machine': 'planner', 'launch': 'l1', 'directory': '/run/fogros2',
                       'lifetime': 600.0})
     top = booted(told)
@@ -488,7 +502,7 @@ def test_a_machine_that_boots_again_is_not_its_first_launchs(booted):
 def test_a_machine_that_can_not_be_guarded_ends(booted, monkeypatch):
     monkeypatch.setattr(boot, 'UNGUARDED', 1)
     told = boot.cloud_config(
-        name='planner', user='no-such-user', authorized_key='ssh-ed25519 AAAA',
+        name='planner', user='no-such-user', authorized_keys=['ssh-ed25519 AAAA'],
         host_key=one_time(TOKEN), agent_config={'machine': 'planner'})
     top = booted(told)
     wait_until((top / 'ended').exists, timeout=20.0, what='the end')

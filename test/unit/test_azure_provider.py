@@ -88,6 +88,18 @@ def test_firewall_admits_the_robot_and_nobody_else():
         rules['nothing-else']['priority'] < 65000
 
 
+def test_firewall_admits_robots_of_a_fleet_to_published_ports():
+    options = Options.parse({'fleet': ['ssh-ed25519 AAAA'], 'ssh_from': ['198.51.100.0/24']})
+    body = {'properties': machines.firewall(dataclasses.replace(order(), options=options))}
+    assert schema.unknown('networkSecurityGroups', body) == ''
+    found = {rule['properties']['protocol']: rule['properties'] for rule in
+             body['properties']['securityRules'] if rule['name'].startswith('fleet-')}
+    assert sorted(found) == ['Tcp', 'Udp']
+    for rule in found.values():
+        assert rule['destinationPortRange'] == '32768-60999'
+        assert rule['sourceAddressPrefixes'] == ['198.51.100.7/32']
+
+
 def test_names_come_from_the_token_and_the_place():
     here = machines.name_of(order(), PLACE)
     assert here == machines.name_of(order(), PLACE)

@@ -173,13 +173,15 @@ def test_list_shows_what_providers_and_the_store_know(
 
 
 def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
-    machine('a', cost_per_hour=Decimal('0.5'), image='ami-1', key='fogros2-a', disk_gb=40)
+    machine('a', cost_per_hour=Decimal('0.5'), image='ami-1', key='fogros2-a', disk_gb=40,
+            shell=Endpoint('ssh', '198.51.100.7', 22, 'fog', 'ssh-ed25519 AAAA'))
     record('a', **alive())
     record('b')
     assert run('list', '--json') == 0
     entry, unknown = json.loads(capsys.readouterr().out)
     assert (entry['image'], entry['key'], entry['disk_gb']) == ('ami-1', 'fogros2-a', 40)
     assert (unknown['image'], unknown['key'], unknown['disk_gb']) == (None, None, None)
+    assert (entry['host_key'], unknown['host_key']) == ('ssh-ed25519 AAAA', None)
     assert entry['name'] == 'a' and entry['provider'] == 'memory' and entry['id'] == 'id-a'
     assert entry['launch_alive'] is True and entry['cost_per_hour'] == '0.5'
     assert float(entry['cost']) == pytest.approx(0.5 / 6, rel=0.01)

@@ -44,7 +44,7 @@ def test_everything_that_an_instance_takes(context):
         'cpu_type': 'aws', 'gpu': 1, 'gpu_memory_gb': 16, 'max_price': 0.5,
         'iam_instance_profile': 'robot', 'subnet': 'subnet-1', 'security_groups': ['sg-1'],
         'tags': {'team': 'red'}, 'regions': ['eu-west-1'], 'instance_types': ['t3.large'],
-        'user': 'ubuntu', 'ssh_from': ['198.51.100.0/24']}
+        'user': 'ubuntu', 'ssh_from': ['198.51.100.0/24'], 'fleet': ['ssh-ed25519 AAAA robot']}
     spec = AWSCloudInstance(
         name='cloud', on_interrupt='robot', on_exit='keep', lifetime='2h', **said).spec(context)
     assert spec.options == said

@@ -304,6 +304,18 @@ def test_denial_is_between_our_rules_and_googles(gce):
     assert gce.own_firewalls == []
 
 
+def test_robots_of_a_fleet_reach_the_ports_that_engines_publish(gce):
+    provider = GCPProvider()
+    spec = MachineSpec('planner', 'gcp', {
+        'fleet': ['ssh-ed25519 AAAA'], 'ssh_from': ['198.51.100.0/28']}, on_exit='keep')
+    machine = provider.create(spec, request_for(spec))
+    assert {rule['allowed'][0]['IPProtocol']: (rule['allowed'][0]['ports'], rule['sourceRanges'])
+            for rule in gce.own_firewalls if '-fleet-' in rule['name']} == dict.fromkeys(
+                ('tcp', 'udp'), (['32768-60999'], ['198.51.100.0/28']))
+    provider.destroy(machine)
+    assert gce.own_firewalls == []
+
+
 def test_robot_without_ipv4_is_told_before_creation(gce):
     spec = MachineSpec('planner', 'gcp', {'ssh_from': ['2001:db8::/64']})
     with pytest.raises(ConfigurationError, match='the robot has none'):

@@ -95,7 +95,9 @@ class Connection(Step):
             job.undoing('firewall', self._leave_vpn)
             self._shell.move(inside)
             self._close_port()
-            detail.append(f'SSH through the VPN alone, port {outside.port} closed')
+            detail.append(
+                'SSH through the VPN, and open to the fleet' if self._is_for_fleet
+                else f'SSH through the VPN alone, port {outside.port} closed')
 
     def _leave_vpn(self) -> None:
         """Reach a kept machine from outside again, before the VPN is taken down."""
@@ -113,7 +115,14 @@ class Connection(Step):
         self._allow([address])
         self._allowed = address
 
+    @property
+    def _is_for_fleet(self) -> bool:
+        """Whether other robots log in too, so that the port stays as it was created."""
+        return bool(self._job.spec.options.get('fleet'))
+
     def _allow(self, sources: Sequence[str]) -> None:
+        if self._is_for_fleet:
+            return
         outside = self._job.record.shell
         assert outside is not None
         self._context.provider.allow(self._job.machine_id, outside.port, sources)

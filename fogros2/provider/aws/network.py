@@ -19,7 +19,7 @@ from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.failures import AwsError
 from fogros2.provider.vm.cloud import Order, own_name, TAG_ATTEMPT, TAG_SSH_FROM, VmCloud, VmId
 from fogros2.provider.vm.failures import tolerated
-from fogros2.provider.vm.options import cidr, SSH
+from fogros2.provider.vm.options import cidr, FREE_PORTS, SSH
 from fogros2.waiting import wait_until
 
 #: Time-out in seconds for the end of an instance; usually it takes half a minute.
@@ -28,10 +28,10 @@ TIMEOUT = 300.0
 ANYONE = {'IpRanges': [{'CidrIp': '0.0.0.0/0'}], 'Ipv6Ranges': [{'CidrIpv6': '::/0'}]}
 
 
-def rule(protocol: str, port: int, sources: Iterable[str]) -> dict[str, Any]:
-    """Return a rule of a security group in EC2's form."""
+def rule(protocol: str, port: int, sources: Iterable[str], last: int = 0) -> dict[str, Any]:
+    """Return a rule of a security group in EC2's form, for a port or those up to ``last``."""
     networks = sorted({cidr(source) for source in sources})
-    found: dict[str, Any] = {'IpProtocol': protocol, 'FromPort': port, 'ToPort': port}
+    found: dict[str, Any] = {'IpProtocol': protocol, 'FromPort': port, 'ToPort': last or port}
     four = [{'CidrIp': network} for network in networks if ':' not in network]
     six = [{'CidrIpv6': network} for network in networks if ':' in network]
     return {**found, **({'IpRanges': four} if four else {}),
@@ -86,12 +86,15 @@ class Ec2Network(VmCloud):
     def _open_group(self, region: str, group: str, order: Order) -> None:
         """Open the ports of a new group: the VPN's, and SSH for the order's sources."""
         port, ssh = order.request.vpn_port, rule('tcp', SSH, order.sources)
+        first, last = FREE_PORTS
         with tolerated('InvalidPermission.Duplicate'):
             self._account.call(
                 'ec2', region, 'authorize_security_group_ingress',
                 f"opening the ports of '{order.spec.name}'", GroupId=group, IpPermissions=[
                     {'IpProtocol': 'udp', 'FromPort': port, 'ToPort': port, **ANYONE},
-                    *([ssh] if order.sources else [])])
+                    *([ssh] if order.sources else []),
+                    *(rule(protocol, first, order.sources, last)
+                      for protocol in (('tcp', 'udp') if order.options.fleet else ()))])
             if order.sources:
                 self._account.doors[order.attempt] = (group, ssh)
                 self._account.admitted[order.attempt] = sorted(map(cidr, order.sources))

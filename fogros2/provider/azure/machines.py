@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from fogros2.model import MachineState
 from fogros2.provider.azure.options import OLD_UBUNTU, Options
 from fogros2.provider.vm.cloud import Order, own_name, Place, TAG_DISK, Vm, when
-from fogros2.provider.vm.options import ipv4, SSH
+from fogros2.provider.vm.options import FREE_PORTS, ipv4, SSH
 
 #: The static public address, and on a network of the user's the private one: VMs do not have it.
 TAG_ADDRESS, TAG_PRIVATE = 'fogros2-address', 'fogros2-private-ip'
@@ -71,8 +71,11 @@ def open_port(port: int, sources: Sequence[str]) -> dict[str, Any]:
 def firewall(order: Order) -> dict[str, Any]:
     """Return the rules of a new machine; without the last, a network's machines reach it."""
     ssh = [open_port(SSH, order.sources)] if ipv4(order.sources) else []
+    fleet = [
+        rule(f'fleet-{protocol}', priority, protocol, '{}-{}'.format(*FREE_PORTS), order.sources)
+        for priority, protocol in ((3201, 'Tcp'), (3202, 'Udp'))] if order.options.fleet else []
     return {'securityRules': [
-        *ssh, rule('vpn', 3200, 'Udp', str(order.request.vpn_port), ()),
+        *ssh, *fleet, rule('vpn', 3200, 'Udp', str(order.request.vpn_port), ()),
         rule('nothing-else', 4096, '*', '*', (), access='Deny')]}
 
 

@@ -7,7 +7,9 @@ the bridge. The kernel never uses the index of a port again: a filter that outli
 matches no other container. A mark carries the result to the hook that knows addresses and
 connections. This hook clears the mark, and precedes the redirection of published ports.
 
-The machine may answer this computer, ping it, use its DNS server, and reach other computers.
+The machine may answer this computer, ping it, use its DNS server, and reach other computers. If
+this computer is a virtual machine, the cloud's services for it (metadata, its account's tokens)
+are not for container machines; DNS is.
 """
 
 from __future__ import annotations
@@ -38,6 +40,8 @@ table inet $1 {
         type filter hook prerouting priority mangle;
         meta mark != 0x666f6732 accept
         meta mark set 0
+        ip daddr { 169.254.0.0/16, 168.63.129.16 } meta l4proto { tcp, udp } th dport != 53 drop
+        ip6 daddr fd00:ec2::/32 meta l4proto { tcp, udp } th dport != 53 drop
         fib daddr type unicast accept
         ct state established,related accept
         icmp type echo-request accept

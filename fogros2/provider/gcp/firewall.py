@@ -18,7 +18,7 @@ from fogros2.provider.gcp.account import Account
 from fogros2.provider.vm.address import ADDRESS_VARIABLE
 from fogros2.provider.vm.cloud import Order, own_name, TAG_SSH_FROM, VmCloud, VmId
 from fogros2.provider.vm.failures import unless_gone
-from fogros2.provider.vm.options import ipv4, SSH
+from fogros2.provider.vm.options import FREE_PORTS, ipv4, SSH
 
 ALLOW, DENY = 1000, 2000
 #: Sources of WireGuard's port, which answers only known keys, and of the denial.
@@ -27,12 +27,12 @@ ANYONE = ('0.0.0.0/0',)
 
 def rule(
     attempt: str, suffix: str, network: str, tags: Mapping[str, str], sources: Sequence[str],
-    protocol: str = '', port: int = 0,
+    protocol: str = '', ports: str = '',
 ) -> dict[str, Any]:
-    """Return the body of firewalls.insert: admit a port, or without a protocol deny all."""
+    """Return the body of firewalls.insert: admit ports, or without a protocol deny all."""
     if protocol:
         action: dict[str, Any] = {'priority': ALLOW, 'allowed': [
-            {'IPProtocol': protocol, 'ports': [str(port)]}]}
+            {'IPProtocol': protocol, 'ports': [ports]}]}
     else:
         action = {'priority': DENY, 'denied': [{'IPProtocol': 'all'}]}
     return {
@@ -67,8 +67,11 @@ class GoogleFirewall(VmCloud):
                 f'{ADDRESS_VARIABLE}= or ssh_from= names an address or a network of IPv4')
         rules = [
             rule(order.attempt, 'deny', network, tags, ANYONE),
-            rule(order.attempt, 'vpn', network, tags, ANYONE, 'udp', order.request.vpn_port),
-            rule(order.attempt, f'tcp-{SSH}', network, tags, sources, 'tcp', SSH)]
+            rule(order.attempt, 'vpn', network, tags, ANYONE, 'udp', str(order.request.vpn_port)),
+            *(rule(order.attempt, f'fleet-{protocol}', network, tags, sources, protocol,
+                   '{}-{}'.format(*FREE_PORTS))
+              for protocol in (('tcp', 'udp') if order.options.fleet else ())),
+            rule(order.attempt, f'tcp-{SSH}', network, tags, sources, 'tcp', str(SSH))]
         base = f'{self._account.project}/global/firewalls'
         with ThreadPoolExecutor(len(rules), 'fog-firewall') as pool:
             *_, existed = pool.map(lambda body: self._account.create(
@@ -113,7 +116,7 @@ class GoogleFirewall(VmCloud):
         tags = tags_of(found)
         more = tags.get(TAG_SSH_FROM, '').split() if port == SSH else []
         body = rule(machine.attempt, f'tcp-{port}', found['network'], tags,
-                    ipv4([*sources, *more]), 'tcp', port)
+                    ipv4([*sources, *more]), 'tcp', str(port))
         if found['name'] != name:
             self._account.create(base, what, body)
         elif sorted(found['sourceRanges']) != body['sourceRanges']:

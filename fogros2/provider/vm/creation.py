@@ -127,7 +127,7 @@ class Creation:
             agent = {**agent, 'end_command': list(self.cloud.end_command(tags))}
         return user_data(cloud_config(
             name=self.spec.name, user=options.user,
-            authorized_key=self.request.authorized_key,
+            authorized_keys=[self.request.authorized_key, *options.fleet],
             host_key=one_time(self.request.token), agent_config=agent))
 
     def _make(self, region: str, order: Order, prepared: Mapping[str, Any]) -> VmId:

@@ -19,7 +19,10 @@ from fogros2.provider.options import convert, parsed
 NEAREST, CHEAPEST = 'nearest', 'cheapest'
 #: Port of the SSH server of every machine.
 SSH = 22
+#: Ports from which Linux, and so a container engine, chooses free ones.
+FREE_PORTS = (32768, 60999)
 _ARCHES = {'': '', 'x86_64': 'x86_64', 'amd64': 'x86_64', 'arm64': 'arm64', 'aarch64': 'arm64'}
+_PUBLIC_KEY = r'(ssh-|ecdsa-|sk-)[a-z0-9@.-]+ [A-Za-z0-9+/]+={0,2}( [\w@.-]+)?'
 Own = TypeVar('Own', bound='VmOptions')
 
 
@@ -50,6 +53,7 @@ class VmOptions:
     tags: Mapping[str, str] = dataclasses.field(default_factory=dict)
     user: str = 'ubuntu'
     ssh_from: tuple[str, ...] = ()
+    fleet: tuple[str, ...] = ()
     by_region: Mapping[str, Mapping[str, str]] = dataclasses.field(default_factory=dict)
 
     #: For messages, such as 'a machine at AWS'.
@@ -101,6 +105,9 @@ class VmOptions:
         if options.spot and spec.on_exit == 'stop':
             raise ConfigurationError("a spot instance can't be stopped and started again",
                                      "on_exit='delete' or 'keep', or spot=False")
+        if options.fleet and (spec.on_exit != 'keep' or spec.idle_timeout is not None):
+            raise ConfigurationError('robots of fleet= use the machine after the launch',
+                                     "on_exit='keep', without idle_timeout=")
         return options
 
     def in_region(self: Own, region: str) -> Own:
@@ -180,6 +187,13 @@ class VmOptions:
                                      f'disk_size= takes {least} to {most}')
         for network in self.ssh_from:
             cidr(network)
+        for key in self.fleet:
+            if not re.fullmatch(_PUBLIC_KEY, key):
+                raise ConfigurationError(f"'{key:.40}' is no public SSH key",
+                                         "fleet= takes 'ssh-ed25519 AAAA...'")
+        if self.fleet and not self.ssh_from:
+            raise ConfigurationError('fleet= needs the networks of its robots',
+                                     "ssh_from=['198.51.100.0/24'] names one")
         for key, value in self.tags.items():
             if not 0 < len(key) <= 128 or len(value) > 256 or key.startswith(self.RESERVED):
                 first = ', '.join(f"'{word}'" for word in self.RESERVED)

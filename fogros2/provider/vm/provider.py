@@ -52,7 +52,7 @@ _ROBOT_ADDRESS = RobotAddress()
 END_TIMEOUT = 300.0
 ALL = 'all'
 #: Options with the same meaning in every cloud that do not choose the machine.
-EVERYWHERE = ('disk_size', 'spot', 'tags', 'user', 'ssh_from')
+EVERYWHERE = ('disk_size', 'spot', 'tags', 'user', 'ssh_from', 'fleet')
 #: Number of regions that are asked at the same time.
 PARALLEL = 20
 #: After the type of a spot machine, for people.

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import base64
 import bz2
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import gzip
 import json
 import shlex
@@ -110,7 +110,7 @@ def user_data(config: Mapping[str, Any]) -> bytes:
 
 
 def cloud_config(
-    *, name: str, user: str, authorized_key: str, host_key: HostKey,
+    *, name: str, user: str, authorized_keys: Sequence[str], host_key: HostKey,
     agent_config: Mapping[str, Any],
 ) -> dict[str, Any]:
     """
@@ -124,7 +124,7 @@ def cloud_config(
         'ssh_deletekeys': True,
         'ssh_keys': {'ed25519_private': host_key.private,
                      'ed25519_public': f'{host_key.public}\n'},
-        'ssh_authorized_keys': [authorized_key.strip()],
+        'ssh_authorized_keys': [key.strip() for key in authorized_keys],
         'ssh_pwauth': False,
         'package_update': False,
         'package_upgrade': False,

@@ -9,11 +9,13 @@ import json
 import os
 from pathlib import Path
 import re
+import subprocess
 import sys
 
 import pytest
 
 from fogros2.waiting import wait_until
+from rigs.computers.network import ROBOT
 
 pytestmark = pytest.mark.timeout(240)
 
@@ -35,6 +37,39 @@ def generate_launch_description():
         Node(executable='listener', name='here', **words),
     ])
 '''
+#: Answers on an instance as an engine's published ports do, and where nobody may come.
+PORTS = """
+import selectors, socket
+with selectors.DefaultSelector() as chosen:
+    for port in 40000, 8000:
+        for kind in socket.SOCK_STREAM, socket.SOCK_DGRAM:
+            one = socket.socket(socket.AF_INET, kind)
+            one.bind(('', port))
+            if kind is socket.SOCK_STREAM:
+                one.listen()
+            chosen.register(one, selectors.EVENT_READ)
+    while True:
+        for key, _ in chosen.select():
+            if key.fileobj.type is socket.SOCK_STREAM:
+                key.fileobj.accept()[0].close()
+            else:
+                key.fileobj.sendto(b'answer', key.fileobj.recvfrom(9)[1])
+"""
+#: Prints which of those ports answer at an address.
+ASK = """
+import socket, sys
+for port in 40000, 8000:
+    for kind in socket.SOCK_STREAM, socket.SOCK_DGRAM:
+        with socket.socket(socket.AF_INET, kind) as one:
+            one.settimeout(1)
+            try:
+                one.connect((sys.argv[1], port))
+                one.send(b'ask')
+                if kind is socket.SOCK_STREAM or one.recv(9):
+                    print(port, kind.name[5:])
+            except OSError:
+                pass
+"""
 
 
 def complaint(run):
@@ -146,6 +181,40 @@ def test_kept_machine_is_baked_listed_and_deleted_elsewhere(cloud, robot, box, n
     (image,) = json.loads(robot.fog('image', 'list', '--json'))
     robot.fog('image', 'delete', image['id'], '--yes')
     assert not robot.things()
+
+
+@pytest.mark.parametrize('cloud', [
+    'aws', *(pytest.param(name, marks=pytest.mark.soak) for name in ('azure', 'gcp'))],
+    indirect=True, scope='session')
+def test_kept_machine_is_a_host_for_the_robots_of_its_fleet(cloud, robot, box, name, tmp_path):
+    key = tmp_path / 'robot two'
+    subprocess.run(['ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f', key], check=True)
+    run = robot.own(name, {'fleet': [key.with_suffix('.pub').read_text().strip()],
+                           'ssh_from': [f'{ROBOT}/32'], 'on_exit': 'keep'})
+    run.wait_for(f'I heard: [Hello World from {name} ')
+    run.wait_for('open to the fleet')
+    (instance,) = box.alive()
+    box.run(instance.id, f'cat >/root/ports.py <<END\n{PORTS}\nEND\n'
+                         'setsid python3 /root/ports.py >/dev/null 2>&1 &')
+
+    def reached():
+        done = robot.run([
+            'ssh', '-i', str(key), '-F', '/dev/null', '-o', 'BatchMode=yes',
+            '-o', 'ConnectTimeout=3', '-o', 'StrictHostKeyChecking=no',
+            '-o', 'UserKnownHostsFile=/dev/null', f'ubuntu@{instance.public}', 'sudo whoami'])
+        asked = robot.run([sys.executable, '-c', ASK, instance.public])
+        return [*done.stdout.split(), *asked.stdout.splitlines()]
+
+    wait_until(lambda: len(reached()) == 3, timeout=20, what='the ports to answer')
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert reached() == ['root', '40000 STREAM', '40000 DGRAM']
+    box.move_robot()  # to an address that is not admitted
+    try:
+        assert reached() == []
+    finally:
+        box.move_robot(back=True)
+    robot.fog('delete', '--yes', name)
 
 
 @pytest.mark.soak
