@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import datetime
 from decimal import Decimal
@@ -394,6 +395,17 @@ def test_the_one_time_host_key_is_a_key_pair_and_always_the_same(tmp_path):
     shown = subprocess.run(['ssh-keygen', '-y', '-f', str(file)], capture_output=True, text=True)
     assert shown.returncode == 0, shown.stderr
     assert shown.stdout.split()[:2] == key.public.split()
+
+
+def test_user_data_takes_a_dozen_keys_and_refuses_too_many():
+    def data(keys):
+        return boot.user_data({**config(**REQUEST.agent_config), 'ssh_authorized_keys': [
+            f'ssh-ed25519 {base64.b64encode(os.urandom(51)).decode()} robot{n}'
+            for n in range(keys)]})
+    assert data(13)
+    with pytest.raises(ProviderError) as refused:
+        data(50)
+    assert 'fleet=' in refused.value.hint
 
 
 def test_user_data_fits_and_is_the_same_for_the_same_request():

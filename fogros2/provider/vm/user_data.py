@@ -105,7 +105,7 @@ def user_data(config: Mapping[str, Any]) -> bytes:
     data = gzip.compress(text.encode(), 9, mtime=0)
     if len(data) > LIMIT:
         raise ProviderError(f"the user data of '{config['hostname']}' has {len(data)} bytes, and "
-                            f'a cloud takes {LIMIT}')
+                            f'a cloud takes {LIMIT}', 'name fewer keys in fleet=')
     return data
 
 
