@@ -245,7 +245,8 @@ prepare() {
                 "$("$interpreter" -V 2>&1))"
             "$interpreter" -m venv --clear $options "$folder"
         fi
-        pip_in "$folder" install 'setuptools>=70.1' wheel
+        # version 80 has no `develop --editable`, which `colcon build --symlink-install` calls
+        pip_in "$folder" install 'setuptools>=70.1,<80' wheel
         [ "$now" = none ] && with= || with="[$now]"
         # Debian 12's pip tries versions back to those without wheels, and gives up there
         [ "$now" = none ] || pip_in "$folder" install 'pip>=24'
