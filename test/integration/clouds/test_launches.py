@@ -189,8 +189,9 @@ def test_kept_machine_is_baked_listed_and_deleted_elsewhere(cloud, robot, box, n
 def test_kept_machine_is_a_host_for_the_robots_of_its_fleet(cloud, robot, box, name, tmp_path):
     key = tmp_path / 'robot two'
     subprocess.run(['ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f', key], check=True)
-    run = robot.own(name, {'fleet': [key.with_suffix('.pub').read_text().strip()],
-                           'ssh_from': [f'{ROBOT}/32'], 'on_exit': 'keep'})
+    options = {'fleet': [key.with_suffix('.pub').read_text().strip()],
+               'ssh_from': [f'{ROBOT}/32'], 'on_exit': 'keep'}
+    run = robot.own(name, options)
     run.wait_for(f'I heard: [Hello World from {name} ')
     run.wait_for('open to the fleet')
     (instance,) = box.alive()
@@ -208,6 +209,12 @@ def test_kept_machine_is_a_host_for_the_robots_of_its_fleet(cloud, robot, box, n
     wait_until(lambda: len(reached()) == 3, timeout=20, what='the ports to answer')
     run.interrupt()
     assert run.ended() == 0, run.text
+    assert reached() == ['root', '40000 STREAM', '40000 DGRAM']
+    again = robot.own(name, options)
+    again.wait_for(f'I heard: [Hello World from {name} ')
+    again.interrupt()
+    assert again.ended() == 0, again.text
+    assert [one.id for one in box.alive()] == [instance.id]
     assert reached() == ['root', '40000 STREAM', '40000 DGRAM']
     box.move_robot()  # to an address that is not admitted
     try:
