@@ -313,5 +313,5 @@ def main() -> None:
     node = Relay(settings)
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
-    rclpy.try_shutdown()
+    # rclpy shuts down already, in its own thread: not twice
     node.close()

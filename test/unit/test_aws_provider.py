@@ -95,7 +95,8 @@ def test_a_type_is_chosen_where_none_is_named(options, chooses):
     ({'fleet': ['/home/me/.ssh/id_ed25519.pub'], 'ssh_from': '198.51.100.0/24'},
      'no public SSH key'),
     ({'fleet': [f'{KEY}\n{KEY}'], 'ssh_from': '198.51.100.0/24'}, 'no public SSH key'),
-    ({'fleet': [KEY]}, 'the networks of its robots'),
+    ({'fleet': [KEY]}, 'the networks (IPv4) of its robots'),
+    ({'fleet': [KEY], 'ssh_from': '2001:db8::/64'}, 'the networks (IPv4) of its robots'),
     ({'tags': {'fogros2-name': 'x'}}, "can't be a tag"),
     ({'ami_image': 'ami-1', 'regions': ['us-east-1']}, 'belongs to one region'),
     ({'subnet': 'subnet-1', 'region': 'nearest'}, 'belongs to one region'),
@@ -116,7 +117,7 @@ def test_a_wrong_option_is_named_with_what_to_do(options, words):
 @pytest.mark.parametrize('words', [
     {}, {'on_exit': 'stop'}, {'on_exit': 'keep', 'idle_timeout': 9.0}])
 def test_machine_of_a_fleet_outlives_its_launch(words):
-    options = {'fleet': [f'{KEY} robot@lab'], 'ssh_from': ['198.51.100.0/24']}
+    options = {'fleet': [f'{KEY} robot two@lab:/x\n'], 'ssh_from': ['198.51.100.0/24']}
     assert Options.of(MachineSpec('gpu-box', 'aws', options, on_exit='keep')).fleet
     with pytest.raises(ConfigurationError, match='use the machine after the launch'):
         Options.of(MachineSpec('gpu-box', 'aws', options, **words))
@@ -397,12 +398,12 @@ def test_the_one_time_host_key_is_a_key_pair_and_always_the_same(tmp_path):
     assert shown.stdout.split()[:2] == key.public.split()
 
 
-def test_user_data_takes_a_dozen_keys_and_refuses_too_many():
+def test_user_data_takes_ten_keys_and_refuses_too_many():
     def data(keys):
         return boot.user_data({**config(**REQUEST.agent_config), 'ssh_authorized_keys': [
             f'ssh-ed25519 {base64.b64encode(os.urandom(51)).decode()} robot{n}'
             for n in range(keys)]})
-    assert data(13)
+    assert data(11)
     with pytest.raises(ProviderError) as refused:
         data(50)
     assert 'fleet=' in refused.value.hint

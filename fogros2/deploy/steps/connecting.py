@@ -96,7 +96,7 @@ class Connection(Step):
             self._shell.move(inside)
             self._close_port()
             detail.append(
-                'SSH through the VPN, and open to the fleet' if self._is_for_fleet
+                'SSH through the VPN, and open to the fleet' if self._job.spec.fleet_networks
                 else f'SSH through the VPN alone, port {outside.port} closed')
 
     def _leave_vpn(self) -> None:
@@ -115,17 +115,11 @@ class Connection(Step):
         self._allow([address])
         self._allowed = address
 
-    @property
-    def _is_for_fleet(self) -> bool:
-        """Whether other robots log in too, so that the port stays as it was created."""
-        return bool(self._job.spec.options.get('fleet'))
-
     def _allow(self, sources: Sequence[str]) -> None:
-        if self._is_for_fleet:
-            return
         outside = self._job.record.shell
         assert outside is not None
-        self._context.provider.allow(self._job.machine_id, outside.port, sources)
+        self._context.provider.allow(
+            self._job.machine_id, outside.port, [*sources, *self._job.spec.fleet_networks])
 
     def _shell_to(self, endpoint: Endpoint) -> Shell:
         return shells.connect(

@@ -8,8 +8,8 @@ matches no other container. A mark carries the result to the hook that knows add
 connections. This hook clears the mark, and precedes the redirection of published ports.
 
 The machine may answer this computer, ping it, use its DNS server, and reach other computers. If
-this computer is a virtual machine, the cloud's services for it (metadata, its account's tokens)
-are not for container machines; DNS is.
+this computer is a virtual machine at AWS, Azure or Google, the cloud's services for it (metadata,
+its account's tokens) are not for container machines; DNS is.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ table inet $1 {
         type filter hook prerouting priority mangle;
         meta mark != 0x666f6732 accept
         meta mark set 0
-        ip daddr { 169.254.0.0/16, 168.63.129.16 } meta l4proto { tcp, udp } th dport != 53 drop
-        ip6 daddr fd00:ec2::/32 meta l4proto { tcp, udp } th dport != 53 drop
+        ip daddr { 169.254.169.0/24, 169.254.170.0/24, 168.63.129.16 } \\
+            meta l4proto { tcp, udp } th dport != 53 drop
+        ip6 daddr { fd00:ec2::/32, fd20:ce::254 } meta l4proto { tcp, udp } th dport != 53 drop
         fib daddr type unicast accept
         ct state established,related accept
         icmp type echo-request accept

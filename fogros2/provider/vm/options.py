@@ -22,7 +22,7 @@ SSH = 22
 #: Ports from which Linux, and so a container engine, chooses free ones.
 FREE_PORTS = (32768, 60999)
 _ARCHES = {'': '', 'x86_64': 'x86_64', 'amd64': 'x86_64', 'arm64': 'arm64', 'aarch64': 'arm64'}
-_PUBLIC_KEY = r'(ssh-|ecdsa-|sk-)[a-z0-9@.-]+ [A-Za-z0-9+/]+={0,2}( [\w@.-]+)?'
+_PUBLIC_KEY = r'(ssh-|ecdsa-|sk-)[a-z0-9@.-]+ [A-Za-z0-9+/]+={0,2}( [^\r\n]*)?'
 Own = TypeVar('Own', bound='VmOptions')
 
 
@@ -188,11 +188,11 @@ class VmOptions:
         for network in self.ssh_from:
             cidr(network)
         for key in self.fleet:
-            if not re.fullmatch(_PUBLIC_KEY, key):
+            if not re.fullmatch(_PUBLIC_KEY, key.strip()):
                 raise ConfigurationError(f"'{key:.40}' is no public SSH key",
                                          "fleet= takes 'ssh-ed25519 AAAA...'")
-        if self.fleet and not self.ssh_from:
-            raise ConfigurationError('fleet= needs the networks of its robots',
+        if self.fleet and not ipv4(self.ssh_from):
+            raise ConfigurationError('fleet= needs the networks (IPv4) of its robots',
                                      "ssh_from=['198.51.100.0/24'] names one")
         for key, value in self.tags.items():
             if not 0 < len(key) <= 128 or len(value) > 256 or key.startswith(self.RESERVED):

@@ -215,6 +215,7 @@ def test_kept_machine_is_a_host_for_the_robots_of_its_fleet(cloud, robot, box, n
     again.interrupt()
     assert again.ended() == 0, again.text
     assert [one.id for one in box.alive()] == [instance.id]
+    robot.fog('connect', name, '--', 'true')  # opens the port, and closes it
     assert reached() == ['root', '40000 STREAM', '40000 DGRAM']
     box.move_robot()  # to an address that is not admitted
     try:

@@ -161,6 +161,8 @@ def test_losses_cost_neither_pictures_nor_pixels(vpn: Any) -> None:
     vpn.relay.tell({'rate': 10e6, 'delay': 0.02})
     viewer = stream(vpn)
 
+    pictures: list[float] = []
+
     def stretch(loss: float) -> list[dict[str, Any]]:
         vpn.relay.tell({'loss': loss})
         return during(viewer, time.monotonic() + 1.0, 4.0)
@@ -170,12 +172,12 @@ def test_losses_cost_neither_pictures_nor_pixels(vpn: Any) -> None:
 
     def compared() -> Any:
         whole, lossy = stretch(0.0), stretch(0.02)
-        return lossy if len(whole) > 20 and len(lossy) > 0.9 * len(whole) \
-            and median(lossy) < median(whole) + 0.05 else None
+        pictures.extend(line['psnr'] for line in lossy if 'psnr' in line)
+        return len(whole) > 20 and len(lossy) > 0.9 * len(whole) \
+            and median(lossy) < median(whole) + 0.05
 
     # 120 images on an idle computer; a busy one encodes fewer, and not always as many
-    lines = wait_until(compared, timeout=90.0, what='two stretches with as many images')
+    wait_until(compared, timeout=30.0, what='two stretches with as many images')
     # smears would show at once: they cost tens of decibels
-    pictures = [line['psnr'] for line in lines if 'psnr' in line]
-    assert len(pictures) > len(lines) // 15
+    assert len(pictures) > 2
     assert min(pictures) > 30
