@@ -99,8 +99,9 @@ def test_late_subscriber_of_a_budget_spoils_no_stream(vpn: Any) -> None:
     # the starts of the second pair are in this stretch, and the first seconds of its stream
     both = during(left, begin, time.monotonic() - begin + 4.0)
     seconds, size = time.monotonic() - begin, sent() - before
-    # without a budget it is 5 Mbit/s, and the queue of the link fills up
-    assert 8 * size / seconds < 4e6
+    # the right stream begins before it knows the left one; without a budget it is 5 Mbit/s all
+    # the time, and the queue of the link fills up
+    assert 8 * size / seconds < 4.5e6
     arrivals = [line['arrival'] for line in both]
     # 30 images a second on an idle computer; a busy one encodes fewer
     assert len(arrivals) > 4 * seconds
