@@ -198,11 +198,15 @@ def test_kept_machine_is_a_host_for_the_robots_of_its_fleet(cloud, robot, box, n
     box.run(instance.id, f'cat >/root/ports.py <<END\n{PORTS}\nEND\n'
                          'setsid python3 /root/ports.py >/dev/null 2>&1 &')
 
+    (told,) = json.loads(robot.fog('list', '--json'))
+    known = tmp_path / 'known'
+    known.write_text(f"{told['address']} {told['host_key']}\n")
+
     def reached():
         done = robot.run([
             'ssh', '-i', str(key), '-F', '/dev/null', '-o', 'BatchMode=yes',
-            '-o', 'ConnectTimeout=3', '-o', 'StrictHostKeyChecking=no',
-            '-o', 'UserKnownHostsFile=/dev/null', f'ubuntu@{instance.public}', 'sudo whoami'])
+            '-o', 'ConnectTimeout=3', '-o', 'StrictHostKeyChecking=yes',
+            '-o', f'UserKnownHostsFile={known}', f'ubuntu@{instance.public}', 'sudo whoami'])
         asked = robot.run([sys.executable, '-c', ASK, instance.public])
         return [*done.stdout.split(), *asked.stdout.splitlines()]
 
