@@ -93,12 +93,21 @@ def read(folder: Path) -> Optional[Invitation]:
 
 
 def own_key(store: Store) -> bytes:
-    """Return this computer's private key; make it if there is none."""
+    """
+    Return this computer's private key; make it if there is none.
+
+    :raises ConfigurationError: its file is damaged.
+    """
     from fogros2 import sealing
     path = store.root / 'key'
     if not path.exists():
         write_private(path, base64.b64encode(sealing.private_key()) + b'\n')
-    return base64.b64decode(path.read_bytes())
+    with contextlib.suppress(ValueError):
+        key = base64.b64decode(path.read_bytes().strip(), validate=True)
+        if len(key) == 32:
+            return key
+    raise ConfigurationError(
+        f'{path} holds no key', 'delete it: ros2 fog key makes a new one, for new invitations')
 
 
 def public_text(key: bytes) -> str:

@@ -39,7 +39,7 @@ _TOOLS = (rf'file /home/{USER}/(\.ros|\.sudo_as_admin_successful)(/.*)?', r'file
           rf'file /tmp/pytest-of-({USER}|root)(/.*)?')
 #: The folders of FogROS2's own state, as long as they are empty.
 _STATE = (rf'file /home/{USER}/\.local(/state(/fogros2(/(machines|launches))?)?)?',)
-_OTHERS = re.compile('|'.join((*_PODMAN, *_PACKAGES, *_TOOLS, *_STATE)))
+_OTHERS = re.compile('|'.join((*_PODMAN, *_PACKAGES, *_TOOLS, *_STATE)), re.DOTALL)
 #: For the page with the results.
 NOT_COUNTED = (
     "Not counted as left behind: the project's folder, the user's cache, podman's own (storage, "

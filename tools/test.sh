@@ -6,6 +6,12 @@ set -u
 cd "$(dirname "$0")/.."
 . tools/common.sh
 mkdir -p .cache
+# What programs leave that a test kills, and ROS 2's launch at each start, goes with this folder.
+# pytest keeps its own where it always does.
+export PYTEST_DEBUG_TEMPROOT="${TMPDIR:-/tmp}"
+TMPDIR=$(mktemp -d -t fogt-XXXXXX) || fail 'No folder for temporary files: is there room in /tmp?'
+export TMPDIR
+trap 'rm -rf "$TMPDIR"' EXIT
 # building Kubernetes can take longer than sudo remembers the password
 keep_ticket
 rm -f .cache/test-*.xml

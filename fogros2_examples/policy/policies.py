@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
+import os
 from typing import Any
 
 import cv2
@@ -78,6 +79,8 @@ class Onnx(Policy):
     """
 
     def __init__(self, model: str | bytes, names: Sequence[str], providers: Sequence[str]) -> None:
+        # its releases send records of use to Microsoft unless this is set before the import
+        os.environ.setdefault('ORT_DISABLE_TELEMETRY', '1')
         import onnxruntime
         there = [name for name in providers if name in onnxruntime.get_available_providers()]
         options = onnxruntime.SessionOptions()

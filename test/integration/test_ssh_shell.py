@@ -419,7 +419,7 @@ def test_a_login_shell_is_given(server, terminals):
     try:
         child = subprocess.Popen(interactive(server, ''), stdin=theirs, stdout=theirs,
                                  stderr=theirs, start_new_session=True)
-        os.write(ours, b'echo $((6 * 7)); exit 3\r')
+        os.write(ours, b'unset HISTFILE; echo $((6 * 7)); exit 3\r')
         read_until(ours, b'42\r\n')
         assert child.wait(20.0) == 3
     finally:

@@ -40,6 +40,7 @@ def install(source: Path, cache: Path) -> str:
             try:
                 made = subprocess.run(
                     [npm, 'install', '--no-package-lock', '--no-audit', '--no-fund',
+                     f'--cache={cache / "npm"}',
                      '--fetch-retries=1', f'--fetch-timeout={TIMEOUT * 500:.0f}'],
                     cwd=cache, env=_environment(), capture_output=True, text=True,
                     stdin=subprocess.DEVNULL, timeout=TIMEOUT)

@@ -53,6 +53,15 @@ def test_invitation_for_another_computer_is_refused(
         invitation.unseal(sealed(store, valid), other)
 
 
+@pytest.mark.parametrize('content', [b'', b'\xff', b'AAAA\n', b'no key', b'A' * 43 + b'*='])
+def test_damaged_key_of_this_computer_is_reported(store: Store, content: bytes) -> None:
+    invitation.own_key(store)
+    (store.root / 'key').write_bytes(content)
+    with pytest.raises(ConfigurationError, match='/key holds no key') as raised:
+        invitation.own_key(store)
+    assert 'delete it' in raised.value.hint
+
+
 def test_each_changed_character_is_noticed(store: Store, valid: Invitation) -> None:
     text, key = sealed(store, valid), invitation.own_key(store)
     for at in range(len(text)):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 from pathlib import Path
 import subprocess
 import sys
@@ -143,6 +144,22 @@ def test_unusable_model_is_refused(model, names, reason):
     made = perceptron(IMAGES, layers(numpy.random.default_rng(0)), 3) if model is None else model
     with pytest.raises(BadPolicy, match=reason):
         Onnx(made, names, CPU)
+
+
+def test_a_policy_reports_to_nobody(tmp_path):
+    """Tests that ONNX Runtime makes none of the files with which it prepares its telemetry."""
+    model = tmp_path / 'policy.onnx'
+    model.write_bytes(perceptron(IMAGES, layers(numpy.random.default_rng(0)), 3))
+    (tmp_path / 'home').mkdir()
+    environment = {name: value for name, value in os.environ.items()
+                   if name not in ('CI', 'GITHUB_ACTIONS', 'TF_BUILD', 'ORT_DISABLE_TELEMETRY')}
+    for name in ('HOME', 'TMPDIR', 'XDG_CACHE_HOME', 'XDG_STATE_HOME', 'XDG_DATA_HOME'):
+        environment[name] = str(tmp_path / 'home')
+    subprocess.run(
+        [sys.executable, '-c', 'import sys\nfrom fogros2_examples.policy.policies import Onnx\n'
+         'Onnx(sys.argv[1], sys.argv[2:], ["CPUExecutionProvider"])', model, *NAMES],
+        env=environment, check=True, timeout=60)
+    assert not list((tmp_path / 'home').rglob('*'))
 
 
 def test_truncated_model_is_refused_at_any_length():
