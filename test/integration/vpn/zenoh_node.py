@@ -18,7 +18,8 @@ import zenoh
 
 #: As rmw_zenoh's sessions have it without a configuration: the router of the computer.
 OWN = {'mode': 'peer', 'connect': {'endpoints': ['tcp/127.0.0.1:7447']},
-       'listen': {'endpoints': ['tcp/127.0.0.1:0']}, 'scouting': {'multicast': {'enabled': False}}}
+       'listen': {'endpoints': ['tcp/127.0.0.1:0']}, 'scouting': {'multicast': {'enabled': False}},
+       'transport': {'shared_memory': {'enabled': False}}}  # its files would stay
 
 
 def configuration(variable: str) -> zenoh.Config:
