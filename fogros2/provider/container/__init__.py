@@ -18,6 +18,7 @@ import os
 from pathlib import Path
 import re
 import stat
+import tempfile
 from typing import Any, ClassVar, Optional
 
 from fogros2 import process
@@ -254,8 +255,10 @@ class ContainerProvider(Provider):
             f'/{container_entry.FOLDER}/entry.sh', what=what, timeout=1800.0,
             cancel=self.cancel).stdout.split()[-1]
         try:
-            engine.call('cp', '-', f'{identity}:/', what=what,
-                        data=_entry(spec, request, options).data())
+            # podman keeps what it has copied in its folder for temporary files
+            with tempfile.TemporaryDirectory() as aside:
+                engine.call('cp', '-', f'{identity}:/', what=what, variables=(f'TMPDIR={aside}',),
+                            data=_entry(spec, request, options).data())
             _start(engine, identity, request.token, kept=spec.on_exit == 'stop', what=what)
         except BaseException:
             with contextlib.suppress(ProviderError, DeadlineExceeded):

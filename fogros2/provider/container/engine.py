@@ -56,13 +56,18 @@ class Engine:
         return (self.name, *self.flags, *words)
 
     def call(self, *words: str, what: str, timeout: float = 60.0, check: bool = True,
-             data: bytes = b'', cancel: Optional[threading.Event] = None) -> Result:
+             data: bytes = b'', variables: Sequence[str] = (),
+             cancel: Optional[threading.Event] = None) -> Result:
         """
         Run a sub-command.
 
+        :param variables: of its environment, as NAME=VALUE.
         :raises ProviderError: the sub-command failed, and ``check`` is set.
         """
-        command = Command(self.argv(*words), sudo=self.sudo, input=data, what=what)
+        argv = self.argv(*words)
+        if variables:
+            argv = ('env', *variables, *argv)  # sudo passes none on
+        command = Command(argv, sudo=self.sudo, input=data, what=what)
         try:
             return process.run(command, timeout=timeout, check=check, cancel=cancel)
         except CommandError as error:
