@@ -116,6 +116,7 @@ class CommandError(ShellError):
         super().__init__(f"{message}: {' / '.join(tail)}" if tail else message, hint)
         self.command = command
         self.result = result
+        self.where = where
 
 
 class VpnError(FogError):

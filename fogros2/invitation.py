@@ -10,6 +10,7 @@ it, as a launch file.
 from __future__ import annotations
 
 import base64
+import binascii
 import contextlib
 import dataclasses
 import hashlib
@@ -165,7 +166,8 @@ def unseal(text: str, key: bytes) -> Invitation:
             'this invitation is for another computer, or not complete',
             'ros2 fog key prints the key that the invitation needs') from None
     except (ValueError, TypeError, ConfigurationError, RecursionError) as error:
-        raise ConfigurationError(f'this is no invitation: {error}',
+        why = 'it is not complete' if isinstance(error, binascii.Error) else error
+        raise ConfigurationError(f'this is no invitation: {why}',
                                  'ros2 fog invite prints one, in one line') from error
     if time.time() > invitation.expires:
         raise ConfigurationError(f"the invitation to '{invitation.machine}' has expired",

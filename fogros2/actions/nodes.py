@@ -132,5 +132,7 @@ class ComposableNodeContainer(Node, launch_ros.actions.ComposableNodeContainer):
 class CloudNode(Node):
     """A Node that always has a machine."""
 
-    def __init__(self, machine: SomeMachine, **kwargs: Any) -> None:
-        super().__init__(machine=checked(machine), **kwargs)
+    def __init__(
+        self, machine: SomeMachine, stream_topics: Sequence[Entry] = (), **kwargs: Any,
+    ) -> None:
+        super().__init__(machine=checked(machine), stream_topics=stream_topics, **kwargs)

@@ -8,8 +8,9 @@ carries the plan out: its ``tools``, then its wheels, then its ``commands``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -23,7 +24,7 @@ import threading
 from typing import Literal, Optional
 
 from fogros2 import process
-from fogros2.errors import ConfigurationError, PrerequisiteError, WorkspaceError
+from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError, WorkspaceError
 from fogros2.host import dependencies as needs
 from fogros2.host import inspection as host
 from fogros2.host import locked
@@ -149,6 +150,7 @@ def ensure(
     cancel: Optional[threading.Event] = None,
     on_plan: Callable[[RosInstall], object] = lambda install: None, elsewhere: bool = False,
     packages: Sequence[str] = (), guest: bool = False,
+    warn: Callable[[str, str], object] = lambda text, hint: None,
 ) -> tuple[RosInstall, str]:
     """
     Prepare a machine for ROS 2 nodes, by its facts and by ``spec.bootstrap``.
@@ -160,6 +162,7 @@ def ensure(
     :param elsewhere: refuse a machine with this computer's network, see ``check_elsewhere``.
     :param packages: packages of the nodes that will run there.
     :param guest: send workspaces to the login user's home; other users may have the same paths.
+    :param warn: takes a warning and its remedy.
     :returns: how ROS programs run there, and what was done in a few words.
     :raises ConfigurationError: the machine has this computer's network.
     :raises PrerequisiteError: the machine cannot be prepared, or its answer is not valid.
@@ -218,13 +221,13 @@ def ensure(
     notes = [todo.note]
     if (spec.apt or spec.pip or keys) and os.path.basename(folder) not in facts.installed:
         notes += _complete(spec, install, folder, keys, functools.partial(
-            shell.run, timeout=timeout, cancel=cancel))
+            shell.run, timeout=timeout, cancel=cancel), warn)
     return install, ', '.join(notes)
 
 
 def _complete(
     spec: MachineSpec, install: RosInstall, folder: str, keys: Sequence[str],
-    run: Callable[..., Result],
+    run: Callable[..., Result], warn: Callable[[str, str], object],
 ) -> list[str]:
     """
     Install what nodes need besides ROS 2, and return what was done in a few words.
@@ -232,11 +235,15 @@ def _complete(
     :param keys: rosdep keys. If a key cannot be resolved, or its package cannot be installed, the
         result names it; the nodes may not need it.
     :param run: function that runs a command on the machine.
+    :param warn: takes a warning and its remedy where rosdep cannot be asked; the next launch asks
+        again.
     :raises PrerequisiteError: a package in the launch file cannot be installed.
     """
     facts = install.facts
     environment = extended(install.environment, spec.environment)
-    apt, pip, notes = spec.apt, spec.pip, []
+    apt, pip, notes, complete = spec.apt, spec.pip, [], True
+    named = {name.partition('=')[0] for name in apt}
+    keys = [key for key in keys if key not in named]
     able = spec.bootstrap != 'none' and facts.root and 'apt-get' in facts.programs
     left = run(needs.unknown(keys, environment, install.setup)).stdout.split() if keys else []
     if left:
@@ -249,26 +256,43 @@ def _complete(
             more_apt, more_pip = needs.resolved(asked.stdout)
             apt, pip = (*apt, *more_apt), (*pip, *more_pip)
             left = re.findall(r"no rosdep rule for '([^']+)'", asked.stderr)
-        if left:
+        elif able:
+            complete = False
+            why = ' / '.join(asked.stderr.strip().splitlines()[-3:]) or 'it is not installed'
+            warn(f"machine '{spec.name}' may lack {', '.join(left)}, as rosdep gave no answer: "
+                 f'{why}', "apt=['...'] or pip=['...'] of the machine installs what it lacks")
+        if left and complete:
             notes.append(f"the machine may lack {', '.join(left)}")
     if apt:
         lacking = run(needs.missing(apt)).stdout.split()
-        named = [name for name in lacking if name in spec.apt]
-        if named and not able:
+        asked_for = [name for name in lacking if name in spec.apt]
+        if asked_for and not able:
             raise PrerequisiteError(
-                f"machine '{spec.name}' lacks the packages {', '.join(named)}",
-                f"on the machine: apt-get install {' '.join(named)}")
+                f"machine '{spec.name}' lacks the packages {', '.join(asked_for)}",
+                f"on the machine: apt-get install {' '.join(asked_for)}")
         if lacking and not able:
             notes.append(f"the machine lacks {', '.join(lacking)}")
         elif lacking:
-            run(apt_install(lacking, f"install {', '.join(lacking)}"))
+            with _remedy('apt= of the machine and package.xml of the workspace name packages'):
+                run(apt_install(lacking, f"install {', '.join(lacking)}"))
             notes.append(f"installed {', '.join(lacking)}")
     if not (apt or pip) and install.kind == 'ros':
         return notes
-    run(needs.fill(folder, pip, install.environment, spec.environment, install.setup))
+    with _remedy('pip= of the machine and package.xml of the workspace name packages'):
+        run(needs.fill(folder, pip, install.environment, spec.environment, install.setup,
+                       complete=complete))
     if pip:
         notes.append(f"installed {', '.join(pip)} by pip")
     return notes
+
+
+@contextlib.contextmanager
+def _remedy(hint: str) -> Iterator[None]:
+    """Give a command that fails in this block a remedy."""
+    try:
+        yield
+    except CommandError as error:
+        raise CommandError(error.command, error.result, error.where, hint) from error
 
 
 def check_elsewhere(spec: MachineSpec, facts: HostFacts, robot: HostFacts) -> None:

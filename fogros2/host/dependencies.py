@@ -197,12 +197,13 @@ def with_pip_folder(folder: str, environment: Mapping[str, str]) -> dict[str, st
 
 def fill(
     folder: str, requirements: Sequence[str], environment: Mapping[str, str],
-    given: Mapping[str, str], setup: Sequence[str],
+    given: Mapping[str, str], setup: Sequence[str], *, complete: bool = True,
 ) -> Command:
     """
     Return the command that installs packages into a folder by one call of pip.
 
     :param environment: variables of nodes there; ``given`` has those of the launch file.
+    :param complete: whether a later launch has nothing to add.
     """
     names = ' '.join(name.replace('-', '_') for name in OURS)
     script = modules.PIP.format(folder=shlex.quote(folder)) if requirements else (
@@ -215,6 +216,6 @@ def fill(
         '    rm -rf site; exit 1; }\n'
         'done\n'
         f'mkdir -p last\nprintf %s {shlex.quote(_LAST_IN_PATH)} >last/sitecustomize.py\n'
-        ': >complete\n')
+        f"{': >complete' if complete else ':'}\n")
     return modules.among_nodes(
         plan.extended(environment, given), setup, script, 'install Python packages')

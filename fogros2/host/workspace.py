@@ -110,7 +110,7 @@ def inspect(path: str | os.PathLike[str]) -> Workspace:
     """
     root = _absolute(path)
     if not root.is_dir():
-        raise WorkspaceError(f'{root} is no folder', 'workspace= names a colcon workspace')
+        raise WorkspaceError(f'{root} is no folder', 'ros_workspace= names a colcon workspace')
     install = root / 'install'
     installed = dict(_installed(install))
     sources = dict(_sources(_source_folder(root)))

@@ -360,7 +360,8 @@ class Provider(abc.ABC):
         :param dependencies: see :class:`~fogros2.model.Image`.
         :raises Unsupported: the provider keeps no images.
         """
-        raise Unsupported(f"provider '{self.name}' keeps no images of machines")
+        raise Unsupported(f"provider '{self.name}' keeps no images of machines",
+                          'AWS, Azure and Google Cloud do; for pods: ros2 fog image create')
 
     def images(self) -> Iterable[Image]:
         """
@@ -368,7 +369,8 @@ class Provider(abc.ABC):
 
         :raises Unsupported: the provider keeps none.
         """
-        raise Unsupported(f"provider '{self.name}' keeps no images of machines")
+        raise Unsupported(f"provider '{self.name}' keeps no images of machines",
+                          'AWS, Azure and Google Cloud do; for pods: ros2 fog image create')
 
     def delete_image(self, image_id: str) -> None:
         """
@@ -376,7 +378,8 @@ class Provider(abc.ABC):
 
         :raises Unsupported: the provider keeps none.
         """
-        raise Unsupported(f"provider '{self.name}' keeps no images of machines")
+        raise Unsupported(f"provider '{self.name}' keeps no images of machines",
+                          'AWS, Azure and Google Cloud do; for pods: ros2 fog image create')
 
     # -- regions and prices ---------------------------------------------------------------------
 

@@ -26,8 +26,9 @@ def take_over(context: LaunchContext) -> Callable[[], None]:
     Make SIGTERM and SIGHUP shut the launch down in order; return the undo function.
 
     By default both kill ``ros2 launch`` at once and leave its machines behind. A signal that was
-    ignored from the start (``nohup``) stays ignored. launch still handles SIGINT, but SIGINT no
-    longer raises KeyboardInterrupt in the main thread, which could interrupt a rollback.
+    ignored from the start stays ignored: SIGHUP under ``nohup``, SIGINT in the background of a
+    script. launch still handles SIGINT, but SIGINT no longer raises KeyboardInterrupt in the main
+    thread, which could interrupt a rollback.
     """
     manager = private.signal_manager()
     if manager is None or threading.current_thread() is not threading.main_thread():

@@ -163,6 +163,7 @@ def test_launch_file_runs_with_arguments(package):
 
 @pytest.mark.parametrize('arguments, error', [
     (['nope', 'x'], "Package 'nope' not found: "),
+    (['./nope.launch.py'], "there is no launch file './nope.launch.py' ("),
     (['pkg', 'x'], "file 'x' was not found in the share directory of package 'pkg' which is at "),
     (['pkg', 'twice.launch.py'], "file 'twice.launch.py' was found more than once in the share"),
     (['pkg', 'a.launch.py', 'a=b'], "malformed launch argument 'a=b', expected format "

@@ -107,6 +107,21 @@ def test_topic_pub_publishes_and_ends(worker):
                             values, status=1)
 
 
+@pytest.mark.skipif(not importlib.util.find_spec('rosidl_embedded'), reason='is ROS 2 itself')
+def test_first_message_reaches_the_awaited_subscription():
+    for number in range(4):
+        topic = f'/first{number}'
+        reader = subprocess.Popen(
+            ['ros2', 'topic', 'echo', '--once', topic, 'std_msgs/msg/String'],
+            stdout=subprocess.PIPE, text=True)
+        ros2('topic', 'pub', '--once', topic, 'std_msgs/msg/String', '{data: go}')
+        try:
+            assert reader.communicate(timeout=10)[0] == 'data: go\n---\n'
+        finally:
+            reader.kill()
+            reader.wait()
+
+
 @pytest.mark.parametrize('options', [(), ('-r', '5'), ('-w', '0')])
 def test_topic_pub_repeats_until_interrupted(worker, options):
     ros2('topic', 'pub', *options, '/cell/orders', 'std_msgs/msg/String', '{data: again}',

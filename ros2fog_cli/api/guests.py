@@ -14,7 +14,7 @@ from typing import Optional, TypedDict
 
 from fogros2 import invitation, plugin_system
 from fogros2.deploy import membership
-from fogros2.errors import ConfigurationError, VpnError
+from fogros2.errors import CommandError, ConfigurationError, VpnError
 from fogros2.model import host_port
 from fogros2.shell import multiplexer, Shell
 from fogros2.store import GUESTS, Record, Store
@@ -149,12 +149,18 @@ def revoke(name: str, who: Optional[str], warn: Callable[[str], None]) -> list[s
     entry = reach.find(name, warn)
     record = held(entry, kept=True)
     with reach.session(entry) as shell:
-        guests = ask(shell, record, 'look')
+        try:
+            guests = ask(shell, record, 'look')
+        except CommandError as error:
+            if 'Unable to access interface' not in error.result.stderr:
+                raise
+            guests = []  # the VPN ended with its launch
         key = invitation.parse_key(who)[1] if who and who.endswith('=') else who
         gone = [guest for guest in guests
                 if who is None or key in (guest['label'], guest['address'], guest['key'])]
         if who is not None and not gone:
             raise ConfigurationError(f"'{name}' has no guest {who}",
                                      f'ros2 fog status {name} shows its guests')
-        ask(shell, record, 'remove', {'keys': [guest['key'] for guest in gone]})
+        if gone:
+            ask(shell, record, 'remove', {'keys': [guest['key'] for guest in gone]})
     return [guest['label'] or guest['key'] for guest in gone]

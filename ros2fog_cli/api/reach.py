@@ -22,7 +22,7 @@ from fogros2.agent_client import AgentClient
 from fogros2.clock import ClockOffset
 from fogros2.errors import AgentError, ConnectError, DdsError, FogError, MachineNotFound
 from fogros2.events import Event
-from fogros2.model import Command, Endpoint, VpnInterface
+from fogros2.model import Command, Endpoint, MachineState, VpnInterface
 from fogros2.shell import Shell
 from fogros2.store import Record, Store
 from fogros2.vpn import helped, Vpn
@@ -64,8 +64,10 @@ def endpoint(entry: Entry, user: Optional[str] = None) -> Endpoint:
         found = dataclasses.replace(
             found, key_file=known.key_file, user=known.user,
             host_key=known.host_key or found.host_key) if found is not None else known
-    if found is None:
-        raise ConnectError(f"the machine '{entry.name}' can't be reached: {entry.state}")
+    stopped = entry.machine is not None and entry.machine.state is MachineState.STOPPED
+    if found is None or stopped:
+        raise ConnectError(f"the machine '{entry.name}' can't be reached: {entry.state}",
+                           'a launch that names it starts it again' if stopped else '')
     return dataclasses.replace(found, user=user) if user else found
 
 

@@ -22,9 +22,12 @@ class GcVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Clean up; return 1 if something still exists that should be deleted."""
-        from fogros2.errors import FogError
+        from fogros2.errors import ConfigurationError, FogError
         from fogros2.store import Store
         from ros2fog_cli.api import endings, machines, progress
+        if not args.keep_stopped >= 0:
+            raise ConfigurationError(f'--keep-stopped {args.keep_stopped:g} is no number of days',
+                                     'it takes 0 or more')
         store, done = Store(), []
 
         def note(what: str, name: str, reason: str, error: str = '') -> None:

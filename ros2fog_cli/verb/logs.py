@@ -25,13 +25,19 @@ class LogsVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the log."""
+        from fogros2.errors import ConfigurationError, did_you_mean
         from ros2fog_cli.api import reach
         entry = reach.find(args.name, warn, regions=args.region)
+        names: set[str] = set()
+
+        def take(event: Event) -> None:
+            names.add(str(event.get('name', '')))
+            show(event, args.node)
+
         with reach.session(entry) as shell:
             client = reach.agent(entry, shell)
             try:
-                there = reach.follow(
-                    client, lambda event: show(event, args.node), forever=args.follow)
+                there = reach.follow(client, take, forever=args.follow)
             except KeyboardInterrupt:
                 return 0
             except BrokenPipeError:
@@ -41,6 +47,9 @@ class LogsVerb(VerbExtension):
                 client.close()
         if not there:
             warn(f"the agent of '{args.name}' is gone")
+        elif args.node and args.node not in names:
+            raise ConfigurationError(f"'{args.name}' has no node '{args.node}'",
+                                     did_you_mean(args.node, sorted(names - {''})))
         return 0 if there else 1
 
 

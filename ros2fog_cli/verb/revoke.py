@@ -20,6 +20,9 @@ class RevokeVerb(VerbExtension):
     def main(self, *, args: argparse.Namespace) -> int:
         """Print who was removed."""
         from ros2fog_cli.api import guests
-        for each in guests.revoke(args.name, args.who, warn):
+        gone = guests.revoke(args.name, args.who, warn)
+        for each in gone:
             print(f'revoked {each}')
+        if not gone:
+            print(f"'{args.name}' has no guests")
         return 0

@@ -87,8 +87,12 @@ def test_verbs_work_beside_a_running_launch(
     logs = fog('logs', name)
     assert 'process started' in logs.stdout
     assert 'Publishing' in logs.stdout + logs.stderr
-    nobody = fog('logs', name, '--node', 'nobody')
-    assert 'Publishing' not in nobody.stdout + nobody.stderr
+    nobody = fog('logs', name, '--node', 'talkr-1', check=False)
+    assert nobody.returncode == 1 and 'Publishing' not in nobody.stdout + nobody.stderr
+    assert f"'{name}' has no node 'talkr-1' (did you mean 'talker-1'?)" in nobody.stderr
+    unwatched = fog('monitor', name, '--no-browser', check=False)
+    assert unwatched.returncode == 1
+    assert f"'{name}' has no Foxglove bridge (launch_foxglove=True" in unwatched.stderr
 
     assert fog('connect', name, '--', 'hostname').stdout.strip() == name
     assert fog('connect', name, '--', 'sh', '-c', 'exit 7', check=False).returncode == 7

@@ -16,6 +16,7 @@ import subprocess
 
 import pytest
 
+import fogros2
 from rigs.launched import launching, ros2
 
 pytestmark = pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH')
@@ -68,6 +69,11 @@ def test_launch_file_of_fogros2_is_read(tmp_path, kind):
     path.write_text(f'{HEAD}    machine = {machine}\n{TAIL}')
     shown = ros2('launch', str(path), '-s')
     check(shown, error)
+
+
+def test_streams_of_fogros2_may_be_positional():
+    node = fogros2.CloudNode('planner', [('/image', 'h264')], package='p', executable='e')
+    assert node.stream_topics == [('/image', 'h264')]
 
 
 @pytest.mark.parametrize('option', ['-it', '-d'])

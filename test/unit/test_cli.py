@@ -240,6 +240,21 @@ def test_gc_deletes_machine_whose_id_was_not_saved(capsys: pytest.CaptureFixture
     assert [*Memory.machines] == ['id-of-a-neighbour']
 
 
+@pytest.mark.parametrize('days', ['-1', 'nan'])
+def test_gc_refuses_a_negative_time(days: str) -> None:
+    machine('a', state=MachineState.STOPPED, created=NOW)
+    assert 'is no number of days' in run('gc', f'--keep-stopped={days}')
+    assert [*Memory.machines] == ['id-a']
+
+
+def test_stopped_machine_is_not_connected_to() -> None:
+    machine('a', state=MachineState.STOPPED)
+    record('a', launch='')
+    for verb in ('connect', 'logs'):
+        said = run(verb, 'a')
+        assert "'a' can't be reached: stopped" in said and 'starts it again' in said
+
+
 def test_delete_asks_for_confirmation(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -17,7 +17,7 @@ from ros2cli.cli import main
 
 from fogros2 import invitation
 from fogros2.deploy import membership
-from fogros2.errors import VpnError
+from fogros2.errors import CommandError, VpnError
 from fogros2.model import (
     Command,
     Endpoint,
@@ -141,6 +141,21 @@ def test_guests_are_revoked_by_name_address_or_key(
     assert fog('revoke', 'planner', *who) == 0
     assert capsys.readouterr().out == 'revoked robot2\n'
     assert asked == [('look', None), ('remove', {'keys': [OTHER]})]
+
+
+def test_nobody_is_revoked_where_the_vpn_has_ended(
+    monkeypatch: pytest.MonkeyPatch, asked: list[tuple[str, Any]],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def ended(shell: object, record: Record, verb: str, request: object = None) -> None:
+        assert verb == 'look'
+        raise CommandError(Command(('python3',)), Result(
+            1, '', 'Unable to access interface: No such device\nTraceback ...'), "'planner'")
+
+    monkeypatch.setattr(guests, 'ask', ended)
+    assert fog('revoke', 'planner') == 0
+    assert capsys.readouterr().out == "'planner' has no guests\n"
+    assert "'planner' has no guest robot2" in fog('revoke', 'planner', 'robot2')
 
 
 @pytest.mark.parametrize('change', [

@@ -15,7 +15,7 @@ import zipfile
 import pytest
 
 from fogros2 import plan
-from fogros2.errors import ConfigurationError, PrerequisiteError
+from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError
 from fogros2.host import bootstrap, dependencies, modules, workspace
 from fogros2.host.dependencies import fill, pip_folder, with_pip_folder
 from fogros2.host.inspection import HostFacts
@@ -237,8 +237,57 @@ def test_missing_packages_of_keys_are_no_error() -> None:
         folder = pip_folder(spec, facts, ['python3-scipy'])
         return bootstrap._complete(
             spec, install, folder, ['python3-scipy'],
-            lambda command, **_: Result(0, outputs.get(command.what, ''), ''))
+            lambda command, **_: Result(0, outputs.get(command.what, ''), ''),
+            lambda *warning: pytest.fail(f'{warning}'))
 
     assert complete(spec) == ['the machine lacks python3-scipy']
     with pytest.raises(PrerequisiteError, match="'lab' lacks the packages python3-scipy"):
         complete(dataclasses.replace(spec, apt=('python3-scipy',)))
+
+
+@pytest.mark.parametrize('pip', [(), ('x',)])
+def test_silent_rosdep_is_a_warning_and_asked_again(pip: tuple[str, ...]) -> None:
+    facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=True)
+    install = bootstrap.RosInstall('embedded', ('ros2',), facts=facts, robot=facts)
+    ran: list[Command] = []
+
+    def run(command: Command, **_: object) -> Result:
+        ran.append(command)
+        return {'look for dependencies': Result(0, 'python3-humanize\n', ''),
+                'resolve rosdep keys': Result(3, '', 'ERROR: cannot download\nWebsite is down\n'),
+                }.get(command.what, Result(0, '', ''))
+
+    warned: list[tuple[str, str]] = []
+    spec = MachineSpec('lab', 'ssh', apt=('python3-scipy=1.2',), pip=pip)
+    notes = bootstrap._complete(
+        spec, install, '/home/fog/pip', ['python3-humanize', 'python3-scipy'], run,
+        lambda text, hint: warned.append((text, hint)))
+    assert notes == ['installed x by pip'] * len(pip)
+    assert warned == [(
+        "machine 'lab' may lack python3-humanize, as rosdep gave no answer: "
+        'ERROR: cannot download / Website is down',
+        "apt=['...'] or pip=['...'] of the machine installs what it lacks")]
+    # what apt= installs needs no rosdep
+    assert b'set -- python3-humanize\n' in ran[0].input
+    assert b'sitecustomize' in ran[-1].input and b': >complete' not in ran[-1].input
+    # with an answer, the next launch has nothing to do
+    assert b': >complete' in fill('/none', (), {}, {}, ()).input
+
+
+@pytest.mark.parametrize(('option', 'remedy'), [
+    ({'apt': ('none',)}, 'apt= of the machine'), ({'pip': ('none',)}, 'pip= of the machine')])
+def test_package_that_cannot_be_installed_has_a_remedy(
+    option: dict[str, tuple[str, ...]], remedy: str,
+) -> None:
+    facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=True)
+    install = bootstrap.RosInstall('ros', ('ros2',), facts=facts, robot=facts)
+    spec: MachineSpec = dataclasses.replace(MachineSpec('lab', 'ssh'), **option)
+
+    def run(command: Command, **_: object) -> Result:
+        if command.what.startswith('install'):
+            raise CommandError(command, Result(100, '', 'E: Unable to locate it'), "'lab'")
+        return Result(0, 'none', '')
+
+    with pytest.raises(CommandError, match="on 'lab'.*Unable to locate it") as raised:
+        bootstrap._complete(spec, install, '/home/fog/pip', [], run, lambda *warning: None)
+    assert raised.value.hint.startswith(remedy)

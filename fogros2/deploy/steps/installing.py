@@ -17,7 +17,7 @@ from fogros2.deploy.machine_job import MachineJob, Step
 from fogros2.errors import CommandError, PrerequisiteError
 from fogros2.host import bootstrap, modules, workspace
 from fogros2.model import Command, NodeSpec
-from fogros2.report import Progress
+from fogros2.report import Progress, Warned
 
 #: Debian packages of the shared libraries that the wheels of OpenCV and PyAV need.
 _PACKAGES = {'libGL.so.1': 'libgl1', 'libglib-2.0.so.0': 'libglib2.0-0',
@@ -32,7 +32,8 @@ def install_ros(
         ros, note = bootstrap.ensure(
             job.shell, context.underlay(job.spec.workspaces), job.spec,
             timeout=context.timeouts.install, cancel=job.cancel, on_plan=on_plan,
-            elsewhere=True, packages=context.packages, guest=context.invitation is not None)
+            elsewhere=True, packages=context.packages, guest=context.invitation is not None,
+            warn=lambda text, hint: context.report(Warned(job.name, text, hint)))
         detail.append(note)
         return ros
 

@@ -27,6 +27,8 @@ _HINTS = {
         "this root file system can't be overlaid: name an image with image='...'",
     'network of its own': 'network= takes a bridge network: podman network ls',
     'packet filter': 'use a kernel with nftables for bridges (nf_tables, bridge family)',
+    'short-name.*did not resolve|manifest unknown|pull access denied|name unknown':
+        "image= takes the name of an image, such as 'docker.io/library/ros:jazzy-ros-base'",
     'no space left': 'the disk is full',
     'exec format error': f'the image has to be for {os.uname().machine} processors',
     'rlimit|cgroup': 'see `ros2 fog doctor`',

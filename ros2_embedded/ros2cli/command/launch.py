@@ -11,8 +11,11 @@ from ros2cli.command import CommandExtension
 from ros2cli.plugin_system import instantiate_extensions
 
 
-def _find(package: str, name: str) -> str:
+def _find(package: str, name: str | None) -> str:
     """Return the path of a launch file, anywhere below its package's share directory."""
+    if name is None:
+        raise RuntimeError(f"there is no launch file '{package}' (a launch file of a package has "
+                           'the name of the package before it)')
     try:
         share = get_package_share_directory(package)
     except PackageNotFoundError as exc:

@@ -56,6 +56,8 @@ def _publish(node: Any, args: Any) -> str | None:
             print(f'Waiting for at least {wanted} matching subscription(s)...')
         waited += 1
         rclpy.spin_once(node, timeout_sec=_WAIT)  # raises when a signal has come
+    if wanted:
+        time.sleep(_WAIT)  # until the subscriptions know this publisher, too
     message = kind()
     try:
         set_message_fields(message, values)
