@@ -65,7 +65,7 @@ command -v rosdep >/dev/null || exit {NO_ROSDEP}
 """ + """\
 if [ ! -e "${ROS_HOME:-$HOME/.ros}/rosdep/sources.cache/index" ]; then
     [ -n "$ROSDEP_SOURCE_PATH" ] || [ -e /etc/ros/rosdep/sources.list.d/20-default.list ] \\
-        || sudo -n rosdep init >&2 || exit 3
+        || sudo -n "$(command -v rosdep)" init >&2 || exit 3
     rosdep update --rosdistro "$distro" >&2 || exit 3
 fi
 rosdep resolve --rosdistro "$distro" "$@" || [ $? = 1 ]

@@ -360,8 +360,7 @@ class Provider(abc.ABC):
         :param dependencies: see :class:`~fogros2.model.Image`.
         :raises Unsupported: the provider keeps no images.
         """
-        raise Unsupported(f"provider '{self.name}' keeps no images of machines",
-                          'AWS, Azure and Google Cloud do; for pods: ros2 fog image create')
+        raise self._no_images()
 
     def images(self) -> Iterable[Image]:
         """
@@ -369,8 +368,7 @@ class Provider(abc.ABC):
 
         :raises Unsupported: the provider keeps none.
         """
-        raise Unsupported(f"provider '{self.name}' keeps no images of machines",
-                          'AWS, Azure and Google Cloud do; for pods: ros2 fog image create')
+        raise self._no_images()
 
     def delete_image(self, image_id: str) -> None:
         """
@@ -378,8 +376,11 @@ class Provider(abc.ABC):
 
         :raises Unsupported: the provider keeps none.
         """
-        raise Unsupported(f"provider '{self.name}' keeps no images of machines",
-                          'AWS, Azure and Google Cloud do; for pods: ros2 fog image create')
+        raise self._no_images()
+
+    def _no_images(self) -> Unsupported:
+        return Unsupported(f"provider '{self.name}' keeps no images of machines",
+                           'AWS, Azure and Google Cloud do; for pods: ros2 fog image create')
 
     # -- regions and prices ---------------------------------------------------------------------
 

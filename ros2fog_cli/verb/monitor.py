@@ -45,8 +45,7 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
     from fogros2_monitor.tunnel import Tunnel
     from ros2fog_cli.api import monitor, reach
     from ros2fog_cli.api.browser import browser_at
-    record = entry.record
-    if record is not None and record.launch_alive and not record.monitor:
+    if entry.record is not None and not entry.record.monitor:
         raise ConfigurationError(
             f"'{entry.name}' has no Foxglove bridge",
             'launch_foxglove=True of the machine, or a Foxglove action, starts one')
