@@ -15,6 +15,10 @@ from ros2cli.plugin_system import PluginException, satisfies_version
 ROS2 = shutil.which('ros2', path=os.pathsep.join([os.path.dirname(sys.executable), os.environ[
     'PATH']]))
 
+embedded_alone = pytest.mark.skipif(
+    importlib.util.find_spec('rosidl_embedded') is None,
+    reason='ROS 2 itself differs')
+
 LAUNCH_FILE = '''
 import sys
 from launch import LaunchDescription
@@ -112,8 +116,7 @@ def test_help_lists_the_commands(package):
     assert status == 2 and "invalid choice: 'no-such-command'" in err
 
 
-@pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None,
-                    reason='ROS 2 has them')
+@embedded_alone
 @pytest.mark.parametrize('words', [
     ('bag', 'record', '-a'), ('action', 'list', '-t'), ('topic', 'delay', '/x'),
     ('service', 'type', '/x')])
@@ -163,7 +166,6 @@ def test_launch_file_runs_with_arguments(package):
 
 @pytest.mark.parametrize('arguments, error', [
     (['nope', 'x'], "Package 'nope' not found: "),
-    (['./nope.launch.py'], "there is no launch file './nope.launch.py' ("),
     (['pkg', 'x'], "file 'x' was not found in the share directory of package 'pkg' which is at "),
     (['pkg', 'twice.launch.py'], "file 'twice.launch.py' was found more than once in the share"),
     (['pkg', 'a.launch.py', 'a=b'], "malformed launch argument 'a=b', expected format "
@@ -172,6 +174,13 @@ def test_launch_file_runs_with_arguments(package):
 def test_launch_error_is_one_line_and_status_1(package, arguments, error):
     status, out, err = ros2('launch', *arguments)
     assert (status, len(err.splitlines())) == (1, 1) and err.startswith(error)
+
+
+@embedded_alone
+def test_absent_launch_file_is_one_error():
+    status, out, err = ros2('launch', './nope.launch.py')
+    assert (status, len(err.splitlines())) == (1, 1)
+    assert err.startswith("there is no launch file './nope.launch.py' (")
 
 
 def start(*arguments):
