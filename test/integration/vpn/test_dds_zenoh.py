@@ -59,12 +59,10 @@ def hosts(vpn: Lab, tmp_path: Path) -> Hosts:
 
 def test_robot_and_machine_hear_each_other_and_the_lan_goes_on(hosts: Hosts) -> None:
     hosts.lab.lan()
-    (hosts.folder / 'own.json5').write_text(
-        '{mode: "router", listen: {endpoints: ["tcp/[::]:7447"]},'
-        ' connect: {endpoints: ["tcp/192.168.77.2:7447"]}}')
-    hosts._start('lan', 'router', ZENOH_ROUTER_CONFIG_URI=_own(hosts, '[]'))
+    hosts._start('lan', 'router', ZENOH_ROUTER_CONFIG_URI=_own(hosts, 'lan'))
     # the robot's own, which the user linked with the other computer's
-    hosts._start('robot', 'router', ZENOH_ROUTER_CONFIG_URI=str(hosts.folder / 'own.json5'))
+    hosts._start('robot', 'router', ZENOH_ROUTER_CONFIG_URI=_own(
+        hosts, 'own', '"tcp/192.168.77.2:7447"'))
     lan = hosts.stock('lan', 'from:/to_lan', 'to:/from_lan')
     terminal = hosts.stock('robot', 'from:/to_lan')
     # the robot's first: it goes on asking for machines that aren't there yet
@@ -80,10 +78,12 @@ def test_robot_and_machine_hear_each_other_and_the_lan_goes_on(hosts: Hosts) -> 
     assert len(lan.lines('topic', '/up')) == 0
 
 
-def _own(hosts: Hosts, endpoints: str) -> str:
-    path = hosts.folder / 'lan.json5'
+def _own(hosts: Hosts, name: str, endpoint: str = '') -> str:
+    path = hosts.folder / f'{name}.json5'
+    # the files of shared memory would stay
     path.write_text('{mode: "router", listen: {endpoints: ["tcp/[::]:7447"]},'
-                    f' connect: {{endpoints: {endpoints}}}}}')
+                    f' connect: {{endpoints: [{endpoint}]}},'
+                    ' transport: {shared_memory: {enabled: false}}}')
     return str(path)
 
 
