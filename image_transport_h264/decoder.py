@@ -39,7 +39,7 @@ class DecoderNode(LazyNode):
         self.get_logger().info(f'{stream} ({codec}) comes in as {topic}')
 
     def _listeners_changed(self) -> None:
-        self._receiver.want(self._announcement.want(self._images.get_subscription_count() > 0))
+        self._receiver.want(self._announcement.want(self.subscribers(self._images) > 0))
 
 
 def main() -> None:

@@ -87,6 +87,7 @@ class LazyNode(Node):
         self._complained: set[str] = set()
         self._complaining = threading.Lock()
         self._turns = Turns()
+        self._counts: dict[Publisher, int] = {}
         self._workers: list[Worker[Any]] = []
         self.failed = False
 
@@ -139,13 +140,13 @@ class LazyNode(Node):
             return False  # the node is shutting down
 
     def subscribers(self, publisher: Publisher) -> int:
-        """Return the number of a topic's subscribers; 0 while the node is shutting down."""
-        try:
-            return publisher.get_subscription_count()
-        except RuntimeError:
-            if rclpy.ok(context=self.context):
-                raise
-            return 0
+        """
+        Return the number of subscribers of a publisher that ``offer`` created, in any thread.
+
+        To ask Cyclone DDS for the number ends the event of its last change: if that has not been
+        handled yet, ``changed`` would never be called.
+        """
+        return self._counts[publisher]
 
     def complain(self, cause: str, message: str) -> None:
         """Log a warning for the first message of each cause."""
@@ -159,9 +160,14 @@ class LazyNode(Node):
         self, kind: Any, topic: str, qos: QoSProfile, changed: Callable[[], None],
     ) -> Publisher:
         """Create a publisher; ``changed`` is called when subscribers come or go."""
-        return self.create_publisher(
-            kind, topic, qos,
-            event_callbacks=PublisherEventCallbacks(matched=lambda _: changed()))
+        def matched(event: Any) -> None:
+            self._counts[publisher] = event.current_count
+            changed()
+
+        publisher = self.create_publisher(
+            kind, topic, qos, event_callbacks=PublisherEventCallbacks(matched=matched))
+        self._counts[publisher] = 0
+        return publisher
 
     def fitting(self, topic: str, qos: QoSProfile) -> QoSProfile:
         """Return the profile, with best effort unless all publishers of the topic are reliable."""
@@ -224,8 +230,9 @@ class Relay:
     def __init__(
         self, node: LazyNode, kind: Any, source: str, target: str, qos: QoSProfile,
     ) -> None:
+        self._node = node
         self._publisher = node.offer(kind, target, qos, self._changed)
         self._tap = Tap(node, kind, source, qos, self._publisher.publish)
 
     def _changed(self) -> None:
-        self._tap.want(self._publisher.get_subscription_count() > 0)
+        self._tap.want(self._node.subscribers(self._publisher) > 0)

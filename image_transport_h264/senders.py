@@ -42,10 +42,11 @@ class Sender(abc.ABC):
     """Encode and publish images; ``send`` runs in the worker's thread."""
 
     publishers: Sequence[Publisher]
+    _node: LazyNode
 
     def listeners(self) -> int:
         """Return the number of subscriptions of the stream."""
-        return sum(publisher.get_subscription_count() for publisher in self.publishers)
+        return sum(map(self._node.subscribers, self.publishers))
 
     @abc.abstractmethod
     def send(self, image: Image) -> None:

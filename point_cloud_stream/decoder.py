@@ -43,7 +43,7 @@ class DecoderNode(LazyNode):
         self.get_logger().info(f'{stream} comes in as {topic}')
 
     def _matched(self) -> None:
-        self._parts.want(self._announcement.want(self._points.get_subscription_count() > 0))
+        self._parts.want(self._announcement.want(self.subscribers(self._points) > 0))
 
     def _part(self, part: CompressedImage) -> None:
         acknowledge, whole = self._assembler.add(bytes(part.data))

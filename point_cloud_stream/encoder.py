@@ -50,7 +50,7 @@ class EncoderNode(LazyNode):
         self._worker = self.start_worker('encode', self._send)
         self._clouds = Tap(self, PointCloud2, topic, IMAGE_QOS, self._take)
         self._publisher = self.offer(CompressedImage, stream, STREAM_QOS, self._matched)
-        self._budget = Budget(self, stream, self._publisher.get_subscription_count)
+        self._budget = Budget(self, stream, lambda: self.subscribers(self._publisher))
         self.create_subscription(
             UInt64MultiArray, f'{stream}/{FEEDBACK}', self._heard, STREAM_QOS)
         self._matched()
@@ -59,7 +59,7 @@ class EncoderNode(LazyNode):
     # --- in the executor's thread
 
     def _matched(self) -> None:
-        known = self._publisher.get_subscription_count()
+        known = self.subscribers(self._publisher)
         if known < self._known:
             # the receiver that has gone would acknowledge no more
             with self._news:
