@@ -20,6 +20,9 @@ import urllib.request
 
 import pytest
 
+# ONNX Runtime tells Microsoft of its use, from its import on
+os.environ['ORT_DISABLE_TELEMETRY'] = '1'
+
 #: What ``colcon test`` runs by default: what makes no machine.
 QUICK = ['test/unit', 'test/contract', 'test/launch']
 #: Regions that the AWS of the tests has.
