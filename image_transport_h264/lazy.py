@@ -143,8 +143,8 @@ class LazyNode(Node):
         """
         Return the number of subscribers of a publisher that ``offer`` created, in any thread.
 
-        To ask Cyclone DDS for the number ends the event of its last change: if that has not been
-        handled yet, ``changed`` would never be called.
+        ROS 2's own count is not asked: with Cyclone DDS, that discards an event which is not
+        handled yet, and ``changed`` would not be called.
         """
         return self._counts[publisher]
 

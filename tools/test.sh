@@ -12,6 +12,8 @@ export PYTEST_DEBUG_TEMPROOT="${TMPDIR:-/tmp}"
 TMPDIR=$(mktemp -d -t fogt-XXXXXX) || fail 'No folder for temporary files: is there room in /tmp?'
 export TMPDIR
 trap 'rm -rf "$TMPDIR"' EXIT
+trap 'exit 130' INT
+trap 'exit 143' TERM
 # building Kubernetes can take longer than sudo remembers the password
 keep_ticket
 rm -f .cache/test-*.xml

@@ -292,7 +292,8 @@ def _remedy(hint: str) -> Iterator[None]:
     try:
         yield
     except CommandError as error:
-        raise CommandError(error.command, error.result, error.where, hint) from error
+        raise CommandError(
+            error.command, error.result, error.where, error.hint or hint) from error
 
 
 def check_elsewhere(spec: MachineSpec, facts: HostFacts, robot: HostFacts) -> None:

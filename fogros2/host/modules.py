@@ -97,6 +97,8 @@ def version(module, names):
         except metadata.PackageNotFoundError:
             pass
     return ''
+# ONNX Runtime would tell Microsoft that it was imported
+os.environ.setdefault('ORT_DISABLE_TELEMETRY', '1')
 missing = {}
 for name, names, oldest, package in json.loads(sys.argv[1]):
     if package and any(

@@ -24,6 +24,7 @@ from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from fogros2.host import modules
 from fogros2_examples.policy import arm, messages, training
 from fogros2_examples.policy.chunks import SECOND
 from fogros2_examples.policy.onnx_file import perceptron
@@ -146,7 +147,12 @@ def test_unusable_model_is_refused(model, names, reason):
         Onnx(made, names, CPU)
 
 
-def test_a_policy_reports_to_nobody(tmp_path):
+LOADS = ('import sys\nfrom fogros2_examples.policy.policies import Onnx\n'
+         'Onnx(sys.argv[1], sys.argv[2:], ["CPUExecutionProvider"])')
+
+
+@pytest.mark.parametrize('program', [LOADS, modules._ASK], ids=['node', 'launch'])
+def test_nothing_is_reported_to_microsoft(tmp_path, program):
     """Tests that ONNX Runtime makes none of the files with which it prepares its telemetry."""
     model = tmp_path / 'policy.onnx'
     model.write_bytes(perceptron(IMAGES, layers(numpy.random.default_rng(0)), 3))
@@ -155,10 +161,10 @@ def test_a_policy_reports_to_nobody(tmp_path):
                    if name not in ('CI', 'GITHUB_ACTIONS', 'TF_BUILD', 'ORT_DISABLE_TELEMETRY')}
     for name in ('HOME', 'TMPDIR', 'XDG_CACHE_HOME', 'XDG_STATE_HOME', 'XDG_DATA_HOME'):
         environment[name] = str(tmp_path / 'home')
-    subprocess.run(
-        [sys.executable, '-c', 'import sys\nfrom fogros2_examples.policy.policies import Onnx\n'
-         'Onnx(sys.argv[1], sys.argv[2:], ["CPUExecutionProvider"])', model, *NAMES],
-        env=environment, check=True, timeout=60)
+    words = [model, *NAMES] if program is LOADS else [
+        json.dumps([['onnxruntime', ['onnxruntime'], [], '']])]
+    subprocess.run([sys.executable, '-c', program, *words], env=environment, check=True,
+                   timeout=60)
     assert not list((tmp_path / 'home').rglob('*'))
 
 
