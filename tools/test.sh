@@ -10,6 +10,8 @@ mkdir -p .cache
 # pytest keeps its own where it always does.
 export PYTEST_DEBUG_TEMPROOT="${TMPDIR:-/tmp}"
 TMPDIR=$(mktemp -d -t fogt-XXXXXX) || fail 'No folder for temporary files: is there room in /tmp?'
+# as open as /tmp: some tests act as another account
+chmod 1777 "$TMPDIR"
 export TMPDIR
 trap 'rm -rf "$TMPDIR"' EXIT
 trap 'exit 130' INT
