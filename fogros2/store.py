@@ -8,6 +8,7 @@ mode 0600; files are replaced atomically.
 
 from __future__ import annotations
 
+import atexit
 from collections.abc import Iterator, Mapping
 import contextlib
 import dataclasses
@@ -26,7 +27,7 @@ from fogros2 import model
 from fogros2.errors import ConfigurationError, NameTaken, StoreError
 from fogros2.model import Endpoint, MachineSpec, VpnInterface
 
-#: Name of a file that is being written, with the process that writes it.
+#: Name of a file or folder that only one process uses, with that process.
 _UNFINISHED = re.compile(r'\..+\.([0-9]+)\.[a-z0-9_]{8}')
 #: File in a machine's folder: guests were invited, and may have stayed when their launch ended.
 GUESTS = 'guests'
@@ -254,10 +255,14 @@ class Store:
         return records
 
     def sweep(self) -> None:
-        """Remove the locks, unfinished files and empty folders that killed launches left."""
-        for path in self.root.rglob('.*'):
+        """Remove the locks, unfinished files and folders that killed launches left."""
+        for path in list(self.root.rglob('.*')):
             unfinished = _UNFINISHED.fullmatch(path.name)
-            if unfinished and process_start(int(unfinished[1])) is None:
+            if not unfinished or process_start(int(unfinished[1])) is not None:
+                continue
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
                 path.unlink(missing_ok=True)
         for path in (self.root / 'machines').glob('*'):
             with contextlib.suppress(NameTaken, ConfigurationError, OSError):
@@ -353,6 +358,21 @@ def write_private(path: Path, data: bytes) -> None:
             raise
     except OSError as error:
         raise _not_written(path, error) from error
+
+
+def process_folder() -> Path:
+    """
+    Return a new folder (0700) that is removed when this process ends.
+
+    :raises StoreError: the disk is full, or the state folder is not writable.
+    """
+    home = _make_folder(state_home())
+    try:
+        folder = tempfile.mkdtemp(dir=home, prefix=f'.process.{os.getpid()}.')
+    except OSError as error:
+        raise _not_written(home, error) from error
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
 
 
 def _make_folder(path: Path) -> Path:

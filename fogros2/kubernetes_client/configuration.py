@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from fogros2 import store
 from fogros2.errors import PrerequisiteError
 
 #: Token, certificate and namespace of a pod that may use the API.
@@ -63,7 +64,9 @@ def load(context: str) -> tuple[str, str, Any]:
                 f"the kubeconfig has no context '{name}'", f"there are: {', '.join(names)}")
         entry = next(each for each in contexts if each['name'] == name)
         settings = type.__call__(kubernetes.client.Configuration)
-        config.load_kube_config(files, context=name, client_configuration=settings)
+        # The client writes the kubeconfig's certificates and keys to files: not in /tmp.
+        config.load_kube_config(files, context=name, client_configuration=settings,
+                                temp_file_path=str(store.process_folder()))
         # One connection for each of many machines that start at once.
         settings.connection_pool_maxsize = 64
         client = kubernetes.client.ApiClient(settings)

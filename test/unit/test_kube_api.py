@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable
 import http.server
 import inspect
@@ -22,6 +23,7 @@ import yaml
 from fogros2 import kubernetes_client
 from fogros2.errors import Cancelled, DeadlineExceeded, PrerequisiteError
 from fogros2.kubernetes_client import ApiError, Unreachable
+from fogros2.store import Store
 from fogros2.testing.shell_contract import raised
 
 pytest.importorskip('kubernetes', reason='needs the client: pip install kubernetes')
@@ -159,6 +161,29 @@ def test_invalid_kubeconfig_is_reported(tmp_path, monkeypatch):
     for text in ('', 'no: [yaml', '[]', 'contexts: 3'):
         path.write_text(text)
         assert 'kubeconfig' in str(raised(PrerequisiteError, kubernetes_client.connect))
+
+
+@pytest.mark.parametrize('end', ['', 'os.kill(os.getpid(), 9)'])
+def test_keys_of_a_kubeconfig_stay_in_the_state_folder(tmp_path, end):
+    state, elsewhere = tmp_path / 'state', tmp_path / 'tmp'
+    elsewhere.mkdir()
+    path = kubeconfig(tmp_path / 'config', 'https://127.0.0.1:9', **{
+        f'client-{each}-data': base64.b64encode(each.encode()).decode()
+        for each in ('certificate', 'key')})
+    code = ('import os\nfrom fogros2.kubernetes_client import configuration\n'
+            f'print(configuration.load("")[2].configuration.key_file, flush=True)\n{end}')
+    done = subprocess.run(
+        [sys.executable, '-c', code], text=True, stdout=subprocess.PIPE, env={
+            **os.environ, 'FOGROS2_STATE_HOME': str(state), 'TMPDIR': str(elsewhere),
+            'KUBECONFIG': str(path)})
+    key = Path(done.stdout.strip())
+    assert key.parent.parent == state and list(elsewhere.iterdir()) == []
+    if end:
+        # killed: until `ros2 fog gc`, only the user can read it
+        assert key.read_text() == 'key'
+        assert [each.stat().st_mode & 0o77 for each in (key, key.parent)] == [0, 0]
+        Store(state).sweep()
+    assert list(state.iterdir()) == []
 
 
 def test_failing_credential_plugin_is_reported(tmp_path, monkeypatch):
