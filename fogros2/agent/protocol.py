@@ -75,6 +75,8 @@ CONFIG: dict[str, tuple[tuple[type, ...], Any]] = {
     'setup': ((list,), []),
     'ros_command': ((list,), []),
     'log_bytes': ((int,), LOG_BYTES),
+    # file that says, after a reboot, until when a launch has kept this machine; '' for none
+    'kept_until': ((str,), ''),
 }
 
 

@@ -178,6 +178,7 @@ class Agent:
                     f'another agent (process {other}) serves {self.directory}',
                     'connect to it', 'running') from None
             self._resume()
+            self._recall_kept()
             self.journal = Journal(self.directory, self.config['log_bytes'])
             self.listener = self._listen()
             # before the start is reported: another robot's launch reads whose agent this is
@@ -227,13 +228,39 @@ class Agent:
             self.config.update({key: saved[key] for key in RESUMED if key in saved})
             self._restart_watchdog()
             if not self.config['launch'] and self.config['on_exit'] == 'keep':
-                self.watchdog.disarm()  # a kept machine expects no launch
-                self.released = True
+                self._expect_no_launch()
             with contextlib.suppress(OSError, OverflowError, TypeError, ValueError), \
                     open(self.path('watchdog.json')) as stream:
                 self.nodes.mark, *state = json.load(stream)
                 if self.config['launch']:
                     self.watchdog.resume(state, self.loop.clock())
+
+    def _expect_no_launch(self) -> None:
+        """Only the lifetime ends this machine, which a launch has kept."""
+        self.watchdog.disarm()
+        self.released = True
+
+    def _recall_kept(self) -> None:
+        """Go on with a kept machine that was rebooted, which empties the directory."""
+        if self.config['launch']:
+            return
+        with self.identity.root(), contextlib.suppress(OSError, ValueError), \
+                open(self.config['kept_until']) as stream:
+            self.config.update(on_exit='keep', lifetime=float(stream.read()) - time.time())
+            self._expect_no_launch()
+
+    def _note_kept(self) -> None:
+        """Write until when a launch keeps the machine, for ``_recall_kept``."""
+        path = self.config['kept_until']
+        if not path:
+            return
+        with self.identity.root(), contextlib.suppress(OSError):
+            if self.config['on_exit'] == 'keep':
+                left = self.watchdog.lifetime_from + self.config['lifetime'] - self.loop.clock()
+                with open(path, 'w') as stream:
+                    stream.write(f'{time.time() + left:.0f}')
+            else:
+                os.unlink(path)
 
     def save(self) -> None:
         """Write the pid for people, and the configuration for a restarted agent."""
@@ -350,7 +377,7 @@ class Agent:
     def do_configure(self, client: Client, request: Json) -> Optional[Configured]:
         """Change settings; a new launch takes the machine over."""
         new = checked(request)
-        for fixed in ('directory', 'user', 'log_bytes'):
+        for fixed in ('directory', 'user', 'log_bytes', 'kept_until'):
             new.pop(fixed, None)
         if self.ending:
             raise Refused('this machine is ending', 'launch again', 'ending')
@@ -404,6 +431,7 @@ class Agent:
             self.watchdog.boot_from = self.loop.clock()
         self._restart_watchdog()
         self.save()
+        self._note_kept()
         self.heartbeats.open()
         return {'machine': self.config['machine'], 'next': self.journal.next, 'signed': True}
 
@@ -497,6 +525,7 @@ class Agent:
         self.config.update(heartbeat=None, launch='')
         self.heartbeats.open()
         self.save()
+        self._note_kept()
         reply = client.reply_later(request.get('id'))
 
         def stopped() -> None:

@@ -139,9 +139,11 @@ def parse(line: str) -> Container:
             break
         name, equals, value = word.partition('=')
         if not word.startswith('--'):
-            if set(word[1:]) <= set(_SHORT_FLAGS):
-                options += ['-P'] if 'P' in word else []
+            rest = word[1:].lstrip(_SHORT_FLAGS)
+            options += ['-P'] if 'P' in word[:len(word) - len(rest)] else []
+            if not rest:
                 continue
+            word = f'-{rest}'
             name, equals, value = word[:2], word[2:], word[2:].lstrip('=')
         if name in _OURS:
             continue

@@ -117,6 +117,8 @@ def keys(workspaces: Iterable[Workspace], packages: Iterable[str]) -> tuple[str,
     """
     Return the rosdep keys of what a machine needs besides the workspaces, sorted.
 
+    What FogROS2's own packages need is sent with them (``modules``).
+
     :param packages: packages of the launch's nodes.
     """
     own: set[str] = set()
@@ -124,7 +126,8 @@ def keys(workspaces: Iterable[Workspace], packages: Iterable[str]) -> tuple[str,
     for workspace in workspaces:
         own |= set(workspace.packages)
         for name, prefix in workspace.installed.items():
-            found |= run_dependencies(prefix / 'share' / name / 'package.xml')
+            if name not in OWN_PACKAGES:
+                found |= run_dependencies(prefix / 'share' / name / 'package.xml')
     return tuple(sorted(found - own - {''}))
 
 

@@ -23,6 +23,7 @@ from fogros2 import process
 from fogros2.errors import WorkspaceError
 from fogros2.host.inspection import DISTRO, HostFacts
 from fogros2.model import Command
+from fogros2.plugin_system import OWN_PACKAGES
 from fogros2.report import size
 from fogros2.shell import Shell
 from fogros2.waiting import Timeouts
@@ -162,6 +163,8 @@ def dependencies(*paths: str | os.PathLike[str]) -> list[str]:
     """
     Return the rosdep keys of the workspaces' dependencies outside themselves, sorted.
 
+    What FogROS2's own packages need is sent with them (``modules``).
+
     :raises WorkspaceError: a manifest cannot be read.
     """
     manifests: dict[str, Path] = {}
@@ -172,8 +175,8 @@ def dependencies(*paths: str | os.PathLike[str]) -> list[str]:
         for name, prefix in _installed(root / 'install'):
             manifests.setdefault(name, prefix / 'share' / name / 'package.xml')
     needed: set[str] = set()
-    for manifest in manifests.values():
-        if manifest.is_file():
+    for name, manifest in manifests.items():
+        if name not in OWN_PACKAGES and manifest.is_file():
             needed |= {(element.text or '').strip() for element in _parsed(manifest)
                        if element.tag == 'depend' or element.tag.endswith('_depend')}
     return sorted(needed - {''} - set(manifests))

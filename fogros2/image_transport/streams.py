@@ -121,6 +121,7 @@ def nodes(streams: Iterable[Stream]) -> dict[Optional[str], list[NodeSpec]]:
     :raises PrerequisiteError: a dependency of a transport is not installed.
     """
     found: dict[Optional[str], dict[str, NodeSpec]] = {}
+    topics_of: dict[tuple[Optional[str], str], str] = {}
     informed: dict[tuple[Optional[str], Optional[str], str], str] = {}
     for one in streams:
         transport = _transport(one)
@@ -133,6 +134,11 @@ def nodes(streams: Iterable[Stream]) -> dict[Optional[str], list[NodeSpec]]:
         for machine, spec in ((one.source, transport.encoder(one)),
                               (one.target, transport.decoder(decoded))):
             there = found.setdefault(machine, {})
+            other = topics_of.setdefault((machine, spec.id), one.topic)
+            if other != one.topic:
+                raise ConfigurationError(
+                    f"the streams {other} and {one.topic} can't have nodes of different names",
+                    'remap one of the topics to another name')
             if there.setdefault(spec.id, spec) != spec:
                 raise ConfigurationError(
                     f'{one.topic} is streamed twice with different parameters',

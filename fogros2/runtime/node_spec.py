@@ -109,7 +109,7 @@ def robot_command(action: ExecuteLocal, context: LaunchContext) -> list[str]:
 def from_action(
     action: ExecuteLocal, context: LaunchContext, base: Mapping[str, str], spec: MachineSpec,
     launch_id: str, image: str = '', image_options: Sequence[str] = (),
-    own_packages: bool = False,
+    own_packages: bool = False, moved: bool = False,
 ) -> NodeSpec:
     """
     Convert a prepared action to a NodeSpec.
@@ -119,10 +119,11 @@ def from_action(
 
     :param base: the environment before the launch changed it; changes are sent.
     :param own_packages: whether the machine may have packages that the robot does not have.
+    :param moved: whether the workspace has another path on the machine.
     :raises ConfigurationError: a package, an executable or a parameter file is missing.
     """
     description = action.process_description
-    texts = Texts(() if image else plan.ament_prefixes(base), spec.workspace)
+    texts = Texts(() if image else plan.ament_prefixes(base), None if moved else spec.workspace)
     final = list(description.final_cmd or ())
     # launch puts the prefix before the command
     count = len(final) - len(description.cmd)

@@ -66,10 +66,11 @@ class RemoteProcess(private.RemoteStart):
         node_spec.use_names_of_programs(self)
         super().prepare(context)
         private.prefix_output(self, session.spec.name)
+        provider = coordinator.launch.provider(session.spec.provider)
         self._fogros2_node = node_spec.from_action(
             self, context, coordinator.base_environment, session.spec, coordinator.launch.id,
             self._fogros2_image, self._fogros2_image_options,
-            coordinator.launch.provider(session.spec.provider).has_own_packages(session.spec))
+            provider.has_own_packages(session.spec), bool(provider.invitation(session.spec)))
         if session.spec.idle_timeout is not None and (
                 self._fogros2_image or session.spec.containers):
             raise ConfigurationError(

@@ -93,6 +93,8 @@ class Session:
         #: Whether the machine is gone.
         self.lost = False
         self._ending = False
+        #: Whether nobody used the machine, so that the launch has ended it.
+        self._ended = False
         #: Whether all processes of a machine that is being replaced have ended there.
         self._drained = False
         self._backlog = Backlog(loop, self._on_event, busy, self._dropped)
@@ -206,6 +208,12 @@ class Session:
 
     def submit(self, run: RemoteRun) -> None:
         """Start a process when the machine is up."""
+        if self._ended:
+            self._logger.error(
+                f'{self.spec.name}: {run.node.name} does not start: the machine has ended, because '
+                'nobody used it (launch again)')
+            run.end()
+            return
         self._runs[run.node.id] = run
         if self.replacer is not None:
             self.replacer.allow(run.node)
@@ -409,6 +417,7 @@ class Session:
         """End the machine and its processes, while the launch goes on: nobody uses it."""
         if self.interrupted or self.running is None:
             return
+        self._ended = True
         reason = f'nobody has used it for {self.spec.idle_timeout:g} s'
         self._logger.info(f"{self.spec.name}: {reason}; on_exit='{self.spec.on_exit}'")
         runs = list(self._runs.values())

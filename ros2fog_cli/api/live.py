@@ -15,7 +15,6 @@ import time
 from typing import Any, Optional
 
 from fogros2.errors import FogError, MachineNotFound
-from fogros2.model import Machine
 from fogros2.store import robot_name, Store
 from ros2fog_cli.api import endings, machines, replicas
 from ros2fog_cli.api.follower import Follower
@@ -59,7 +58,7 @@ class Live:
         #: Names and ids of records, at the last look and when the providers were asked.
         self._known: set[tuple[str, Optional[str]]] = set()
         self._answered = self._known
-        self._answers: dict[str, Optional[list[Machine]]] = {}
+        self._answers: dict[str, Optional[machines.Answer]] = {}
         self._lock = threading.RLock()
         self._news = threading.Condition(self._lock)
         self._wake, self._stopped = threading.Event(), threading.Event()

@@ -10,7 +10,7 @@ import dataclasses
 from decimal import Decimal
 import threading
 import time
-from typing import Any, Optional, TypeVar
+from typing import Any, NamedTuple, Optional, TypeVar
 
 from fogros2 import monitor_addresses, plugin_system
 from fogros2.errors import (
@@ -183,6 +183,18 @@ class Entry:
         }
 
 
+class Answer(NamedTuple):
+    """
+    What a provider answered.
+
+    :param silent: records whose machines it could not be asked about, such as those on a host
+        that is off.
+    """
+
+    machines: list[Machine]
+    silent: Sequence[str] = ()
+
+
 def survey(
     warn: Warn, *, name: Optional[str] = None, regions: Optional[Sequence[str]] = None,
     store: Optional[Store] = None,
@@ -205,7 +217,7 @@ def recorded(store: Store, name: Optional[str] = None) -> dict[str, Record]:
 def answers(
     warn: Warn, records: Mapping[str, Record], name: Optional[str],
     regions: Optional[Sequence[str]], cancel: threading.Event,
-) -> dict[str, Optional[list[Machine]]]:
+) -> dict[str, Optional[Answer]]:
     """
     Return each provider's machines, or those named ``name``; ask all in parallel.
 
@@ -216,17 +228,17 @@ def answers(
     tags = {} if name is None else {TAG_NAME: name}
     providers = plugin_system.names('fogros2.provider')
     return dict(zip(providers, ask_all(warn, providers, lambda provider: _ask(
-        provider, tags, regions, records.values(), cancel))))
+        warn, provider, tags, regions, records.values(), cancel))))
 
 
 def combined(
-    records: Mapping[str, Record], answers: Mapping[str, Optional[list[Machine]]],
+    records: Mapping[str, Record], answers: Mapping[str, Optional[Answer]],
 ) -> list[Entry]:
     """Return the machines that the store or a provider knows."""
     entries: list[Entry] = []
     matched: set[str] = set()
-    for machines in answers.values():
-        for machine in machines or []:
+    for answer in answers.values():
+        for machine in answer.machines if answer else []:
             record = _record_of(machine, records)
             if record is not None:
                 matched.add(record.name)
@@ -234,7 +246,8 @@ def combined(
                                  machine.provider, machine, record))
     for record in records.values():
         if record.name not in matched:
-            known = answers.get(record.provider) is not None or bool(record.damage)
+            asked = answers.get(record.provider)
+            known = asked is not None and record.name not in asked.silent or bool(record.damage)
             entries.append(Entry(record.name, record.provider or '?', None, record, known))
     return sorted(entries, key=lambda entry: (entry.name, entry.provider))
 
@@ -288,25 +301,43 @@ def _record_of(machine: Machine, records: Mapping[str, Record]) -> Optional[Reco
 
 
 def _ask(
-    name: str, tags: Mapping[str, str], regions: Optional[Sequence[str]],
+    warn: Warn, name: str, tags: Mapping[str, str], regions: Optional[Sequence[str]],
     records: Iterable[Record], cancel: threading.Event,
-) -> list[Machine]:
-    """Return a provider's machines."""
+) -> Answer:
+    """
+    Return a provider's machines.
+
+    :raises FogError: the provider can't be asked, about none of its machines.
+    """
     if not any(record.provider == name for record in records) and not wanted(name, regions):
-        return []
+        return Answer([])
     provider = load(name, regions)
     provider.cancel = cancel
+    found: list[Machine] = []
+    silent = []
     try:
-        found = list(provider.find(tags))
+        for machine in provider.find(tags):
+            found.append(machine)
     except Unsupported:
-        found = []
+        pass
+    except FogError:
+        if not found:
+            raise
+        # such as one of several hosts: those who ask for its machines below hear of it
     # it may have no tags, or not be able to search where the machine is
     ids = {machine.id for machine in found}
     for record in records:
         if record.provider == name and record.machine_id and record.machine_id not in ids:
-            with contextlib.suppress(MachineNotFound):
+            try:
                 found.append(provider.describe(record.machine_id))
-    return found
+            except MachineNotFound:
+                pass
+            except FogError as error:
+                if not found:
+                    raise
+                warn(f'{name}: {error}')
+                silent.append(record.name)
+    return Answer(found, silent)
 
 
 def load(name: str, regions: Optional[Sequence[str]] = None) -> Provider:

@@ -110,4 +110,8 @@ def agreed(one: str, several: str, number: int) -> bool:
         warn('not deleted: there is no terminal to ask at (--yes answers)')
         return False
     what = one if number == 1 else f'these {number} {several}'
-    return input(f'Delete {what}? [y/N] ').strip().lower() in ('y', 'yes')
+    try:
+        return input(f'Delete {what}? [y/N] ').strip().lower() in ('y', 'yes')
+    except EOFError:  # Ctrl-D
+        print()
+        return False

@@ -822,6 +822,36 @@ def test_kept_machine_without_launch_outlives_its_agent(rig):
     assert rig.wait('watchdog')['reason'] == 'lifetime'
 
 
+def test_kept_machine_outlives_a_reboot(rig):
+    """Which empties the agent's directory; the boot's configuration knows nothing of a launch."""
+    mark, boot = rig.folder / 'kept_until', {'boot_timeout': 0.3, 'end_command': ends(rig)}
+    agent = rig.serve(launch='', kept_until=str(mark), **{**boot, 'boot_timeout': 60.0})
+    client = rig.client()
+    client.request('configure', launch='second', on_exit='keep', lifetime=1000.0,
+                   boot_timeout=60.0, kept_until='/etc/passwd')
+    client.request('release', launch='second')
+    assert 900 < float(mark.read_text()) - time.time() <= 1000
+    for left in (500, 1):
+        agent.kill()
+        agent.wait(10)
+        shutil.rmtree(rig.directory)
+        mark.write_text(f'{time.time() + left}')
+        agent = rig.serve(launch='', kept_until=str(mark), **boot)
+        status = rig.client().request('status')
+        assert left - 10 < status['lifetime_left'] < left and status['on_exit'] == 'keep'
+    assert rig.wait('watchdog')['reason'] == 'lifetime'
+
+
+def test_machine_of_a_later_launch_is_not_kept_after_a_reboot(rig):
+    mark = rig.folder / 'kept_until'
+    rig.serve(on_exit='keep', kept_until=str(mark), boot_timeout=60.0)
+    client = rig.client()
+    client.request('configure', launch='abc123')
+    assert mark.exists()
+    client.request('release', on_exit='stop')
+    assert not mark.exists()
+
+
 def test_machine_that_a_launch_sets_up_is_not_taken_over(rig):
     rig.serve(boot_timeout=60.0)
     client = rig.client()

@@ -54,6 +54,9 @@ class FakeMachine:
                 if node.id in ids:
                     self.say('exited', node, returncode=-2, respawns=False)
 
+    def end(self, reason):
+        self.launch.note('end', self.spec.name, reason)
+
     def signal(self, node, name):
         self.signals.append((node, name))
 
@@ -116,7 +119,8 @@ class FakeLaunch:
             return [note[1:] for note in self.notes if note[0] == what]
 
     def provider(self, name):
-        return SimpleNamespace(has_own_packages=lambda spec: 'image' in spec.options)
+        return SimpleNamespace(has_own_packages=lambda spec: 'image' in spec.options,
+                               invitation=lambda spec: spec.options.get('invitation', ''))
 
     def expect(self, names):
         self.note('expect', *names)

@@ -434,6 +434,24 @@ def test_streams_that_come_later_know_of_it(run, fake, harmless, planner, talker
     assert len(fake.machines['planner'].all) == 1
 
 
+# -- nobody uses it -------------------------------------------------------------------------------
+
+def test_node_for_a_machine_that_has_ended_does_not_start(
+    run, fake, talker, watch, capfd,
+):
+    idle = ContainerInstance(name='planner', ros_workspace='', idle_timeout='1m')
+    late = talker(machine=idle, exec_name='late')
+    watch.at_start = {1: says(fake, 'idle', reason='')}
+    assert run(FogROSLaunchDescription([
+        *watch(), talker(machine=idle, exec_name='talks'),
+        RegisterEventHandler(OnProcessExit(on_exit=[
+            late, TimerAction(period=0.3, actions=end())])),
+    ])) == 0
+    assert [name for name, _ in watch.starts] == ['talks']
+    text = capfd.readouterr().out
+    assert 'does not start: the machine has ended, because nobody used it' in text
+
+
 # -- money ----------------------------------------------------------------------------------------
 
 def test_a_launch_says_what_it_cost(run, fake, talker, capfd):

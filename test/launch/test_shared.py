@@ -24,7 +24,7 @@ pytestmark = pytest.mark.timeout(60)
 def sharing(fake):
     """Return the fake with folders in which relays meet."""
     fake.provider = lambda name: SimpleNamespace(
-        has_own_packages=lambda spec: True,
+        has_own_packages=lambda spec: True, invitation=lambda spec: '',
         capabilities=Capabilities(share_folders=('/own', '/all')))
     return fake
 

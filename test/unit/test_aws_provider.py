@@ -92,6 +92,7 @@ def test_a_type_is_chosen_where_none_is_named(options, chooses):
     ({'security_groups': ['default']}, 'takes sg-'),
     ({'security_groups': 'sg-1'}, 'a list of strings'),
     ({'ssh_from': '300.0.0.1'}, 'no address or network'),
+    ({'ssh_from': [f'198.51.{n}.0/24' for n in range(20)]}, 'too many networks'),
     ({'fleet': ['/home/me/.ssh/id_ed25519.pub'], 'ssh_from': '198.51.100.0/24'},
      'no public SSH key'),
     ({'fleet': [f'{KEY}\n{KEY}'], 'ssh_from': '198.51.100.0/24'}, 'no public SSH key'),
@@ -505,11 +506,14 @@ def test_a_machine_that_boots_again_is_not_its_first_launchs(booted):
     told = config(machine='planner', launch='l1', directory='/run/fogros2')
     file = booted(told) / 'opt/fogros2/agent.json'
     assert json.loads(file.read_text())['launch'] == 'l1'
+    kept = file.with_name('kept_until')
+    assert json.loads(file.read_text())['kept_until'] == str(kept)
+    kept.touch()
     booted(told)
-    assert json.loads(file.read_text())['launch'] == ''
+    assert json.loads(file.read_text())['launch'] == '' and kept.exists()
     assert oct(file.stat().st_mode)[-3:] == '600'
     booted(told, INSTANCE_ID='i-2')
-    assert json.loads(file.read_text())['launch'] == 'l1'
+    assert json.loads(file.read_text())['launch'] == 'l1' and not kept.exists()
 
 
 def test_a_machine_that_can_not_be_guarded_ends(booted, monkeypatch):

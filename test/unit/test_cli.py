@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 import dataclasses
 from decimal import Decimal
 import importlib.util
@@ -16,13 +16,20 @@ import subprocess
 import sys
 import time
 from typing import Any, Optional
+from unittest.mock import Mock
 
 import pytest
 from ros2cli.cli import main
 
 from fogros2 import process, report
 from fogros2.deploy import robot
-from fogros2.errors import PrerequisiteError, ProviderError, Unsupported
+from fogros2.errors import (
+    ConnectError,
+    MachineNotFound,
+    PrerequisiteError,
+    ProviderError,
+    Unsupported,
+)
 from fogros2.model import (
     Endpoint,
     Machine,
@@ -255,6 +262,30 @@ def test_stopped_machine_is_not_connected_to() -> None:
         assert "'a' can't be reached: stopped" in said and 'starts it again' in said
 
 
+def test_machines_are_listed_where_one_host_does_not_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def find(self: Memory, tags: Any) -> Iterator[Machine]:
+        yield Memory.machines['id-there']
+        raise ConnectError('the second host is off')
+
+    def describe(self: Memory, machine_id: str) -> Machine:
+        if machine_id == 'id-gone':
+            raise MachineNotFound('none')
+        raise ConnectError('the second host is off')
+
+    for name in ('there', 'silent', 'gone'):
+        record(name)
+    machine('there')
+    monkeypatch.setattr(Memory, 'find', find)
+    monkeypatch.setattr(Memory, 'describe', describe)
+    warnings: list[str] = []
+    found = {entry.name: entry for entry in machines.survey(warnings.append)}
+    assert found['there'].machine is not None
+    assert (found['silent'].asked, found['gone'].asked) == (False, True)
+    assert 'memory: the second host is off' in warnings
+
+
 def test_delete_asks_for_confirmation(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -266,6 +297,10 @@ def test_delete_asks_for_confirmation(
         monkeypatch.setattr('builtins.input', lambda text, answer=answer: answer)
         assert run('delete', 'a') == status
     assert not Memory.machines
+    machine('a')
+    monkeypatch.setattr('builtins.input', Mock(side_effect=EOFError))  # Ctrl-D
+    assert run('delete', 'a') == 1
+    assert Memory.machines
 
 
 def test_delete_refuses_under_a_running_launch(capsys: pytest.CaptureFixture[str]) -> None:

@@ -27,6 +27,18 @@ def test_all_files_have_the_same_version() -> None:
     assert newest == version
 
 
+def test_manifest_has_the_dependencies_of_the_packages_below() -> None:
+    """Rosdep and colcon do not look below a package."""
+    def of(path: Path) -> set[tuple[str | None, str | None]]:
+        return {(found.text, found.get('condition'))
+                for found in ElementTree.parse(path).iter('exec_depend')}
+
+    below = [*ROOT.glob('*/package.xml')]
+    own = {(path.parent.name, None) for path in below} | {('fogros2', None)}
+    assert len(below) == 3
+    assert set().union(*map(of, below)) - own <= of(ROOT / 'package.xml')
+
+
 @pytest.mark.parametrize(('prefix', 'source', 'quick'), [
     ('fogros2', Source.TESTPATHS, True), ('fogros2', Source.ARGS, False),
     (None, Source.TESTPATHS, False)])

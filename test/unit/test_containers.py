@@ -43,6 +43,8 @@ from rigs import deploying
      Container('image', ('--privileged', '--ipc', 'host'), (), 'all', 'eyes')),
     ('docker run -p8080:80 -e=X=1 -dP -- image',
      Container('image', ('-p', '8080:80', '-e', 'X=1', '-P'))),
+    ('docker run -dp 3000:3000 -itv/a:/b -de A=b -Pdw /x image',
+     Container('image', ('-p', '3000:3000', '-v', '/a:/b', '-e', 'A=b', '-P', '-w', '/x'))),
     ("docker run -e 'A=b c' --restart always image sh -c 'echo hi'",
      Container('image', ('-e', 'A=b c'), ('sh', '-c', 'echo hi'), restart='always')),
 ])

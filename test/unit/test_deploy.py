@@ -179,6 +179,20 @@ def test_a_kept_machine_is_not_taken_for_another(launch, provider, changes, erro
     assert launch.store.load('planner').machine_id == 'fake-1'
 
 
+@pytest.mark.parametrize('id_known', [True, False])
+def test_what_a_machine_that_is_gone_left_is_deleted(launch, provider, monkeypatch, id_known):
+    spec, told = kept(launch.store, provider), []
+    provider.machines.clear()
+    if not id_known:
+        launch.store.save(dataclasses.replace(launch.store.load('planner'), machine_id=None))
+    monkeypatch.setattr(provider, 'destroy', told.append)
+    monkeypatch.setattr(provider, 'tidy', lambda dead: told.extend(dead) or [])
+    provider.failures.update(create=ProviderError('no more'))
+    with pytest.raises(ProviderError, match='no more'):
+        launch.up(spec)
+    assert told == (['fake-1'] if id_known else ['token'])
+
+
 def skip_early_steps(monkeypatch):
     """Replace the steps before ROS 2 is installed."""
     for step, name in [(Creation, 'run'), (Connection, 'open'), (Joining, 'choose_interface'),

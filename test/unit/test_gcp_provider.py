@@ -225,12 +225,14 @@ def test_changed_labels_of_another_program_are_kept(gce):
 # -- reports ----------------------------------------------------------------------------------
 
 
-def test_stopped_machine_of_another_launch_is_no_leftover(gce):
+@pytest.mark.parametrize('stopped', [True, False])
+def test_stopped_machine_is_no_leftover_and_gets_a_new_lifetime(gce, stopped):
     spec, provider = dataclasses.replace(SPEC, on_exit='stop'), GCPProvider()
     machine = provider.create(spec, request_for(spec, **{TAG_ON_EXIT: 'stop'}))
     provider.stop(machine)
-    wait_until(lambda: provider.describe(machine).state is MachineState.STOPPED, timeout=5,
-               what='it to be stopped')
+    if stopped:
+        wait_until(lambda: provider.describe(machine).state is MachineState.STOPPED, timeout=5,
+                   what='it to be stopped')
     again = dataclasses.replace(SPEC, lifetime=60.0)
     provider.adopt(machine, again, {TAG_ON_EXIT: 'delete'})
     assert gce.instances[0]['scheduling']['maxRunDuration'] == {'seconds': '60'}

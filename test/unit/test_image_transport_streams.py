@@ -64,6 +64,13 @@ def test_one_topic_is_encoded_in_one_way() -> None:
         nodes(streams)
 
 
+def test_topics_that_look_alike_are_told_apart() -> None:
+    streams = [stream(('/left/image', 'h264'), 'a'), stream(('/left_image', 'h264'), 'a')]
+    with pytest.raises(ConfigurationError, match='/left/image and /left_image') as caught:
+        nodes(streams)
+    assert 'remap' in caught.value.hint
+
+
 def test_one_topic_from_several_machines() -> None:
     """Each has a stream of its own, and nodes with names of their own."""
     back = StreamTopic('/seen', 'h264', 'to_robot')

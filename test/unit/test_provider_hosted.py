@@ -227,6 +227,20 @@ def test_find_asks_the_hosts_of_the_records(
     assert [machine.id for machine in HostedProvider().find({})] == [found.id]
 
 
+def test_host_that_is_off_hides_no_machine_of_another(
+    on: dict[str, Any], shell: FakeShell, state_home: Path,
+) -> None:
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        off = {**on, 'port': server.getsockname()[1]}
+    for name, host in (('first', off), ('planner', on)):
+        Store().save(Record(name, 'hosted', spec_on(host)))
+    shell.said = json.dumps({'result': [REPORT]})  # type: ignore[attr-defined]
+    search = HostedProvider().find({})
+    assert next(search).name == 'planner'
+    with pytest.raises(ProviderError, match='refuses connections'):
+        next(search)
+
+
 # -- the program on the host ---------------------------------------------------------------------
 
 def test_machine_of_a_robot_is_reached_at_published_ports() -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import pathlib
 import tempfile
@@ -177,6 +178,17 @@ def test_paths_of_the_workspace_stay(tmp_path):
     assert Texts([str(install)], str(tmp_path / 'ws')).text(text) == text
     assert Texts([str(install)], None).text(text) == ({'share': 'demo'}, '/x')
     assert Texts([], None).text(text) == text
+
+
+@pytest.mark.parametrize('moved', [False, True])
+def test_paths_of_a_workspace_that_a_guest_sends_are_looked_up(context, tmp_path, moved):
+    install = tmp_path / 'ws/install/mine'
+    make_package(install, 'mine')
+    map_file = f'{install}/share/mine/map.yaml'
+    found = convert_with(
+        ExecuteProcess(cmd=['look', map_file]), context, {'AMENT_PREFIX_PATH': str(install)},
+        dataclasses.replace(SPEC, workspace=str(tmp_path / 'ws')), moved=moved)
+    assert found.arguments[-1] == (({'share': 'mine'}, '/map.yaml') if moved else map_file)
 
 
 def test_paths_are_read_as_they_are(context, tmp_path):

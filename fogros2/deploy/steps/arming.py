@@ -9,7 +9,7 @@ import secrets
 from typing import Any, Optional
 
 from fogros2 import model, plan
-from fogros2.agent_client import AgentClient, Heartbeat, joined
+from fogros2.agent_client import AgentClient, Heartbeat, HEARTBEAT_INTERVAL, joined
 from fogros2.deploy.machine_job import AGENT_FOLDER, SILENCE_TIMEOUT, Step
 from fogros2.errors import (
     AgentAbsent,
@@ -198,7 +198,8 @@ class Arming(Step):
                 ) from error
             raise
         job.heartbeat = Heartbeat(
-            address, port, context.launch, key if configured.get('signed') else '')
+            address, port, context.launch, key if configured.get('signed') else '',
+            interval=max(0.25, min(HEARTBEAT_INTERVAL, job.spec.robot_timeout / 4)))
         job.undo.callback(job.heartbeat.close)
         try:
             wait_until(

@@ -96,19 +96,21 @@ class Creation(Step):
             with contextlib.suppress(Unsupported):
                 for machine in self._find(before.last or before.launch):
                     context.provider.destroy(machine.id)
+            if before.token:
+                context.provider.tidy(dead=[before.token])
             return None
-        try:
-            machine = context.provider.describe(before.machine_id)
-        except MachineNotFound:
+        found: Optional[Machine] = None
+        with contextlib.suppress(MachineNotFound):
+            found = context.provider.describe(before.machine_id)
+        if found is None or found.state is MachineState.DELETED:
+            context.provider.destroy(before.machine_id)  # what was made for it may still be there
             return None
-        if machine.state is MachineState.DELETED:
-            return None
-        self._check_alike(before.asked_options, machine)
+        self._check_alike(before.asked_options, found)
         # the earlier choices still hold; everything else comes from this launch
         job.spec = dataclasses.replace(job.spec, options=before.spec.options)
         job.record = dataclasses.replace(before, spec=job.spec)
         job.former = before.last or before.launch
-        return machine
+        return found
 
     def _find(self, launch: str) -> Iterable[Machine]:
         return self._context.provider.find({TAG_NAME: self._job.name, TAG_LAUNCH: launch})

@@ -45,6 +45,3 @@ class Options(VmOptions):
             if re.search(r'[<>%&\\?/]', key) or len(self.tags) > 30:
                 raise ConfigurationError(f"'{key}' can't be a tag at Azure",
                                          r'a key has none of <>%&\?/, and there are at most 30')
-        if len(' '.join(self.ssh_from)) > 256:
-            raise ConfigurationError('ssh_from= names too many networks for a tag of Azure',
-                                     'name fewer, or larger ones')

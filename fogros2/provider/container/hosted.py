@@ -16,7 +16,7 @@ import gzip
 import hashlib
 import json
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Optional
 
 from fogros2 import errors, model, plugin_system
 from fogros2.errors import FogError, MachineNotFound, ProviderError, Unsupported
@@ -207,17 +207,29 @@ class HostedProvider(Provider):
         Yield the robots' containers on the hosts that this robot's records name.
 
         :raises Unsupported: it knows no host.
+        :raises FogError: a host does not answer, after the machines of all others.
         """
-        hosts = dict.fromkeys(self._find_host(on) for on in [*self._asked, *(
+        known = [*self._asked, *(
             record.spec.options['on'] for record in Store().machines()
-            if record.provider == self.name)])
-        if not hosts:
+            if record.provider == self.name)]
+        if not known:
             raise Unsupported('only its host knows a container machine on another computer')
-        for host in hosts:
-            for found in self._call(host, 'find', tags=tags):
+        asked: set[str] = set()
+        failure: Optional[FogError] = None
+        for on in known:
+            try:
+                host = self._find_host(on)
+                answer = [] if host in asked else self._call(host, 'find', tags=tags)
+            except FogError as error:
+                failure = error
+                continue
+            asked.add(host)
+            for found in answer:
                 machine = self._machine(host, found)
                 if HOSTED in machine.tags:
                     yield machine
+        if failure is not None:
+            raise failure
 
     def destroy(self, machine_id: str) -> None:
         """Remove a container from its host; return when it is removed."""

@@ -20,6 +20,7 @@ from fogros2.provider.gcp.options import Options
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import (
     CloudError,
+    END_TIMEOUT,
     Order,
     own_name,
     Place,
@@ -29,7 +30,7 @@ from fogros2.provider.vm.cloud import (
 )
 from fogros2.provider.vm.failures import unless_gone
 from fogros2.provider.vm.regions import read_table, Regions
-from fogros2.waiting import cancellable
+from fogros2.waiting import cancellable, wait_until
 
 #: The region of FogROS2's default zone.
 DEFAULT_REGION = 'us-central1'
@@ -255,7 +256,10 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
     def set_ending(self, machine: VmId, spec: MachineSpec) -> None:
         """Change when Google ends an instance, which it takes for stopped instances only."""
         path, what = _path(machine.vm), f'writing how {machine.vm} ends'
-        found = self._account.call('GET', path, what)
+        found = wait_until(
+            lambda: state if (state := self._account.call('GET', path, what))['status']
+            not in ('PENDING_STOP', 'STOPPING') else None,
+            timeout=END_TIMEOUT, interval=1.0, longest=5.0, what=f'{machine.vm} to be stopped')
         words = {key: value for key, value in found['scheduling'].items()
                  if key not in ('maxRunDuration', 'instanceTerminationAction')}
         if found['status'] == 'TERMINATED':

@@ -26,6 +26,8 @@ from fogros2.provider.vm.regions import Regions
 from fogros2.provider.vm.user_data import END_COMMAND
 from fogros2.store import is_another_robot
 
+#: Seconds in which a machine has to end or to stop; usually it is half a minute.
+END_TIMEOUT = 300.0
 #: The tag of every resource of one machine: it identifies the attempt that created them.
 TAG_ATTEMPT = 'fogros2-attempt'
 TAG_HOST_KEY = 'fogros2-host-key'

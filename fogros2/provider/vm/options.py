@@ -187,6 +187,9 @@ class VmOptions:
                                      f'disk_size= takes {least} to {most}')
         for network in self.ssh_from:
             cidr(network)
+        if len(' '.join(self.ssh_from)) > 256:
+            raise ConfigurationError('ssh_from= names too many networks for a tag',
+                                     'name fewer, or larger ones')
         for key in self.fleet:
             if not re.fullmatch(_PUBLIC_KEY, key.strip()):
                 raise ConfigurationError(f"'{key:.40}' is no public SSH key",

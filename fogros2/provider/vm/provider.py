@@ -29,6 +29,7 @@ from fogros2.provider.vm.address import RobotAddress
 from fogros2.provider.vm.cloud import (
     attempt_of,
     CloudError,
+    END_TIMEOUT,
     TAG_ATTEMPT,
     TAG_DISK,
     TAG_HOST_KEY,
@@ -48,8 +49,6 @@ T = TypeVar('T')
 
 #: One for all providers of this process: each machine of a launch would ask again.
 _ROBOT_ADDRESS = RobotAddress()
-#: Seconds in which a machine has to end or to stop; usually it is half a minute.
-END_TIMEOUT = 300.0
 ALL = 'all'
 #: Options with the same meaning in every cloud that do not choose the machine.
 EVERYWHERE = ('disk_size', 'spot', 'tags', 'user', 'ssh_from', 'fleet')

@@ -62,6 +62,7 @@ if [ "$(cat {folder}/instance 2>/dev/null)" != "$INSTANCE_ID" ]; then
     home=$(getent passwd {user} | cut -d: -f6)
     [ -z "$home" ] || rm -f "$home/.ssh/authorized_keys"
     rm -f /root/.ssh/authorized_keys
+    rm -f {folder}/kept_until
     echo "$INSTANCE_ID" >{folder}/instance
 else
     owned=  # at a later boot, the first launch that connects uses the machine
@@ -131,7 +132,7 @@ def cloud_config(
         'runcmd': [['sh', '-c', _TOOLS]],
     }
     if agent_config:
-        armed = {'user': user, **agent_config}
+        armed = {'user': user, 'kept_until': f'{FOLDER}/kept_until', **agent_config}
         armed['end_command'] = armed.get('end_command') or list(END_COMMAND)
         names = {'user': user, 'folder': FOLDER, 'program': AGENT_PROGRAM, 'log': LOG,
                  'unguarded': UNGUARDED, 'end': shlex.join(armed['end_command'])}
