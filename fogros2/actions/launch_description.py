@@ -26,6 +26,7 @@ from launch.actions import (
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.fog_machine import FogMachine
 from fogros2.describe import keywords
+from fogros2.describe.machines import CloudInstance
 from fogros2.errors import ConfigurationError
 from fogros2.launch_internals import private
 from fogros2.launch_internals.wrapping import below, wrap
@@ -67,7 +68,13 @@ class FogROSLaunchDescription(LaunchDescription):
         for name in unknown:
             known = set(inspect.signature(FogROSLaunchDescription).parameters) - {'unknown'}
             raise keywords.unknown('a FogROSLaunchDescription', name, known)
-        super().__init__(initial_entities, deprecated_reason=deprecated_reason)
+        entities = list(initial_entities or ())
+        for machine in entities:
+            if isinstance(machine, CloudInstance):
+                raise ConfigurationError(
+                    'a machine alone does nothing in a FogROSLaunchDescription',
+                    'give it to a node: Node(machine=...)')
+        super().__init__(entities, deprecated_reason=deprecated_reason)
         if robot_nodes not in get_args(RobotNodes):
             raise ConfigurationError(
                 f'robot_nodes={robot_nodes!r} is unknown', f'use one of {get_args(RobotNodes)}')

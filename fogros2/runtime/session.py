@@ -210,8 +210,8 @@ class Session:
         """Start a process when the machine is up."""
         if self._ended:
             self._logger.error(
-                f'{self.spec.name}: {run.node.name} does not start: the machine has ended, because '
-                'nobody used it (launch again)')
+                f'{self.spec.name}: {run.node.name} does not start: the machine has ended, '
+                'because nobody used it (launch again)')
             run.end()
             return
         self._runs[run.node.id] = run

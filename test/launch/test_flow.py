@@ -97,6 +97,11 @@ def test_unknown_value_of_robot_nodes_is_refused():
         FogROSLaunchDescription(robot_nodes='soon')
 
 
+def test_machine_without_a_node_is_an_error(planner):
+    with pytest.raises(ConfigurationError, match='a machine alone does nothing'):
+        FogROSLaunchDescription([planner])
+
+
 def test_waiting_process_keeps_its_configuration(run, fake, planner, capfd):
     """A held process has the configuration of its place, not of the moment it starts."""
     from launch.actions import SetLaunchConfiguration
