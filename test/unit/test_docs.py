@@ -105,7 +105,7 @@ def test_command_of_a_page_is_accepted(line, monkeypatch):
     else:
         # other people's programs, which take an account, a network or a workspace
         assert words[0] in ('.', 'aws', 'colcon', 'echo', 'git', 'kubectl', 'npm', 'rosdep',
-                            'source', 'ssh', 'sudo', 'FOGROS2_ROSDEP=yes', 'python'), line
+                            'source', 'ssh', 'sudo', 'PIP_BREAK_SYSTEM_PACKAGES=1', 'python'), line
 
 
 def _refuse(self: argparse.ArgumentParser, message: str) -> None:

@@ -70,6 +70,11 @@ for port in 40000, 8000:
             except OSError:
                 pass
 """
+#: Has a rebooted instance's agent start something.
+ASK_AGENT = """
+[ -e /run/before ] || echo '{"id": 1, "command": "launch"}' |
+    python3 -IS /opt/fogros2/agent.py connect --directory /run/fogros2
+"""
 
 
 def complaint(run):
@@ -226,6 +231,10 @@ def test_kept_machine_is_a_host_for_the_robots_of_its_fleet(cloud, robot, box, n
         assert reached() == []
     finally:
         box.move_robot(back=True)
+    # after a reboot, it waits for no launch, which would end it
+    box.run(instance.id, 'touch /run/before; reboot', check=False)
+    wait_until(lambda: 'no launch has this machine' in box.run(
+        instance.id, ASK_AGENT, check=False), timeout=30, what='the agent after the reboot')
     robot.fog('delete', '--yes', name)
 
 

@@ -10,6 +10,7 @@ import subprocess
 
 import pytest
 
+from fogros2 import store
 from rigs.cluster import Client, Cluster, cluster, running_cluster
 from rigs.cluster.namespaces import making_namespaces, Namespace
 
@@ -35,6 +36,15 @@ def binaries(root: None) -> Path:
     if not found.stdout:
         pytest.skip("needs Kubernetes: 'make test-kubernetes' builds it (six minutes, once)")
     return Path(found.stdout.strip())
+
+
+@pytest.fixture(scope='session', autouse=True)
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep the files with this process's keys, which the client writes once, for all tests."""
+    folder = tmp_path_factory.mktemp('keys')
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store, 'process_folder', lambda: folder)
+        yield
 
 
 @pytest.fixture(scope='session')
