@@ -258,7 +258,7 @@ class Agent:
             if self.config['on_exit'] == 'keep':
                 left = self.watchdog.lifetime_from + self.config['lifetime'] - self.loop.clock()
                 with open(path, 'w') as stream:
-                    stream.write(f'{time.time() + left:.0f}')
+                    stream.write(f'{time.time() + left}')
             else:
                 os.unlink(path)
 
