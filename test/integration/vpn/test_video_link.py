@@ -105,7 +105,9 @@ def test_late_subscriber_of_a_budget_spoils_no_stream(vpn: Any) -> None:
     arrivals = [line['arrival'] for line in both]
     # 30 images a second on an idle computer; a busy one encodes fewer
     assert len(arrivals) > 4 * seconds
-    assert max(after - one for one, after in zip(arrivals, arrivals[1:])) < 2.0
+    gaps = sorted(after - one for one, after in zip(arrivals, arrivals[1:]))
+    # usually 0.1 to 0.3 s; the start of the right stream may cost the left one a key picture
+    assert gaps[-2] < 1.0 and gaps[-1] < 5.0
     assert len(during(right, time.monotonic() - 5.0, 5.0)) > 20
 
 
