@@ -286,17 +286,20 @@ class Agent:
 
     # -- running ------------------------------------------------------------------------------
 
-    def run(self) -> None:
-        """Serve until the agent ends."""
-        alarm, wake = socket.socketpair()
+    def heed_signals(self) -> None:
+        """End in order at a signal; called before the start is reported."""
+        alarm, self.wake = socket.socketpair()
         alarm.setblocking(False)
-        wake.setblocking(False)
-        signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
+        self.wake.setblocking(False)
+        signal.set_wakeup_fd(self.wake.fileno(), warn_on_full_buffer=False)
         # a handler, because children would inherit an ignored SIGHUP
         for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, lambda number, frame: None)
         self.loop.select(
             alarm, selectors.EVENT_READ, lambda mask: self._on_signals(alarm.recv(4096)))
+
+    def run(self) -> None:
+        """Serve until the agent ends."""
         self.loop.select(self.listener, selectors.EVENT_READ, self._accept)
         try:
             self.heartbeats.open()
@@ -675,6 +678,7 @@ def serve(config_path: str, *, daemon: bool) -> int:
             supervise(config['directory'], answer)
         agent = Agent(config)
         agent.open()
+        agent.heed_signals()
     except Refused as error:
         if daemon:
             os.write(answer, dump(error.answer))
