@@ -8,7 +8,7 @@ The robot's end of the agent's protocol.
 """
 
 from fogros2.agent_client.connection import AgentClient, EventCallback
-from fogros2.agent_client.heartbeat import Heartbeat, HEARTBEAT_INTERVAL
+from fogros2.agent_client.heartbeat import Heartbeat, interval_for
 from fogros2.agent_client.program import joined
 
-__all__ = ['AgentClient', 'EventCallback', 'Heartbeat', 'HEARTBEAT_INTERVAL', 'joined']
+__all__ = ['AgentClient', 'EventCallback', 'Heartbeat', 'interval_for', 'joined']

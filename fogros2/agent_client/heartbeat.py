@@ -17,8 +17,15 @@ from fogros2.model import to_json
 
 #: Interval of heartbeats in seconds.
 HEARTBEAT_INTERVAL = 2.0
+#: Shortest one, for a short ``robot_timeout``.
+_SHORTEST = 0.25
 #: Longest round trip in seconds that measures the machine's clock.
 LONGEST = 20.0
+
+
+def interval_for(robot_timeout: float) -> float:
+    """Return the interval at which some heartbeats may be lost within ``robot_timeout``."""
+    return max(_SHORTEST, min(HEARTBEAT_INTERVAL, robot_timeout / 4))
 
 
 class Heartbeat:

@@ -315,26 +315,28 @@ def _ask(
     provider.cancel = cancel
     found: list[Machine] = []
     silent = []
+    failure: Optional[FogError] = None
     try:
         for machine in provider.find(tags):
             found.append(machine)
     except Unsupported:
         pass
-    except FogError:
+    except FogError as error:
         if not found:
             raise
-        # such as one of several hosts: those who ask for its machines below hear of it
+        failure = error  # such as one of several hosts
     # it may have no tags, or not be able to search where the machine is
     ids = {machine.id for machine in found}
     for record in records:
-        if record.provider == name and record.machine_id and record.machine_id not in ids:
+        if record.provider == name and record.machine_id not in ids:
             try:
-                found.append(provider.describe(record.machine_id))
+                if record.machine_id:
+                    found.append(provider.describe(record.machine_id))
+                elif failure is not None:
+                    raise failure  # the machine may be where nobody answered
             except MachineNotFound:
                 pass
             except FogError as error:
-                if not found:
-                    raise
                 warn(f'{name}: {error}')
                 silent.append(record.name)
     return Answer(found, silent)

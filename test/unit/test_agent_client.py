@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from fogros2.agent_client import AgentClient, Heartbeat
+from fogros2.agent_client import AgentClient, Heartbeat, interval_for
 from fogros2.errors import (
     AgentError,
     AuthenticationError,
@@ -436,3 +436,9 @@ def test_heartbeats_continue_while_the_network_is_down(address):
     heartbeat._thread.join(0.2)
     assert heartbeat._thread.is_alive() and heartbeat.round_trip is None
     heartbeat.close()
+
+
+@pytest.mark.parametrize(('robot_timeout', 'interval'), [
+    (120.0, 2.0), (8.0, 2.0), (2.0, 0.5), (0.1, 0.25)])
+def test_heartbeats_are_frequent_enough(robot_timeout, interval):
+    assert interval_for(robot_timeout) == interval

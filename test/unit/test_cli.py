@@ -276,13 +276,15 @@ def test_machines_are_listed_where_one_host_does_not_answer(
 
     for name in ('there', 'silent', 'gone'):
         record(name)
+    record('unsaved', machine_id=None)  # its launch was killed before it had the id
     machine('there')
     monkeypatch.setattr(Memory, 'find', find)
     monkeypatch.setattr(Memory, 'describe', describe)
     warnings: list[str] = []
     found = {entry.name: entry for entry in machines.survey(warnings.append)}
     assert found['there'].machine is not None
-    assert (found['silent'].asked, found['gone'].asked) == (False, True)
+    assert {name: entry.asked for name, entry in found.items()} == {
+        'there': True, 'silent': False, 'gone': True, 'unsaved': False}
     assert 'memory: the second host is off' in warnings
 
 

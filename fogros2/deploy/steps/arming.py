@@ -9,7 +9,7 @@ import secrets
 from typing import Any, Optional
 
 from fogros2 import model, plan
-from fogros2.agent_client import AgentClient, Heartbeat, HEARTBEAT_INTERVAL, joined
+from fogros2.agent_client import AgentClient, Heartbeat, interval_for, joined
 from fogros2.deploy.machine_job import AGENT_FOLDER, SILENCE_TIMEOUT, Step
 from fogros2.errors import (
     AgentAbsent,
@@ -199,7 +199,7 @@ class Arming(Step):
             raise
         job.heartbeat = Heartbeat(
             address, port, context.launch, key if configured.get('signed') else '',
-            interval=max(0.25, min(HEARTBEAT_INTERVAL, job.spec.robot_timeout / 4)))
+            interval=interval_for(job.spec.robot_timeout))
         job.undo.callback(job.heartbeat.close)
         try:
             wait_until(
