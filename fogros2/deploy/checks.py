@@ -82,7 +82,7 @@ def check_architecture(spec: MachineSpec, provider: Provider) -> None:
 
     :raises WorkspaceError: the workspace is compiled for another processor.
     """
-    if spec.workspace is None and spec.bootstrap not in ('embedded', 'apt'):
+    if spec.workspace is None and spec.bootstrap not in ('pip', 'apt'):
         return  # only the machine's system decides
     architecture: Optional[str] = provider.architecture(spec)
     if architecture:

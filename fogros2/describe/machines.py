@@ -67,7 +67,7 @@ class CloudInstance:
         its boot (a pod: 10 minutes, or this time if it is longer).
     :param idle_timeout: time without use after which the machine ends as ``on_exit`` says, while
         the launch goes on; seconds or as above. See doc/howto/idle_machines.md.
-    :param bootstrap: how to install ROS 2 there: 'auto', 'apt', 'embedded', 'none'.
+    :param bootstrap: how to install ROS 2 there: 'auto', 'apt', 'pip', 'none'.
     :param environment: variables for every node on the machine; PYTHONPATH, PATH and other lists
         of folders are prepended to the machine's own.
     :param apt: Debian packages that the machine needs, such as 'libzbar0'.

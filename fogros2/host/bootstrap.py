@@ -32,7 +32,15 @@ from fogros2.host import wheels as wheel_cache
 from fogros2.host import workspace as workspaces
 from fogros2.host.inspection import DISTRO, HostFacts, MIN_PYTHON, Python
 from fogros2.model import Bootstrap, Command, MachineSpec, Result
-from fogros2.plan import DEFAULT_RMW, extended, PATH_LISTS, PLAIN_VARIABLES, SYSTEM_PATH, Underlay
+from fogros2.plan import (
+    DEFAULT_RMW,
+    extended,
+    has_wheels,
+    PATH_LISTS,
+    PLAIN_VARIABLES,
+    SYSTEM_PATH,
+    Underlay,
+)
 from fogros2.shell import Shell
 
 #: The system for which ROS 2 Jazzy has packages.
@@ -40,8 +48,8 @@ APT_SYSTEM, APT_RELEASE, APT_CODENAME = 'ubuntu', '24.04', 'noble'
 APT_ARCHITECTURES = ('x86_64', 'aarch64')
 #: Folder in the login user's home, with a folder for each version of the sent wheels.
 INSTALL_FOLDER = '.local/share/fogros2'
-#: Free bytes that the embedded default needs, and that ROS 2's packages need.
-EMBEDDED_BYTES, APT_BYTES = 300 << 20, 3 << 30
+#: Free bytes that the wheels of ROS 2 need, and that its packages need.
+PIP_BYTES, APT_BYTES = 400 << 20, 3 << 30
 
 #: Programs that every machine needs, with their Debian packages.
 TOOLS: Mapping[str, str] = {
@@ -66,7 +74,7 @@ class RosInstall:
     """
     How ROS programs run on a machine.
 
-    :param kind: ROS 2 itself, or the embedded default.
+    :param kind: an installation of ROS 2, or its wheels.
     :param command: command that starts our launch file there.
     :param setup: scripts for sh to source in this order, after ``environment`` is set; with a
         workspace's script if it is needed.
@@ -74,7 +82,7 @@ class RosInstall:
     :param workspaces: how workspaces get there, in the order in which they are sourced.
     """
 
-    kind: Literal['ros', 'embedded']
+    kind: Literal['ros', 'pip']
     command: tuple[str, ...]
     setup: tuple[str, ...] = ()
     environment: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -93,7 +101,7 @@ class Preparation:
     :param wheels_target: folder on the machine to send the wheels to; '' sends none.
     """
 
-    mode: Literal['none', 'apt', 'embedded']
+    mode: Literal['none', 'apt', 'pip']
     install: RosInstall
     tools: tuple[Command, ...] = ()
     wheels_target: str = ''
@@ -104,7 +112,7 @@ class Preparation:
         """What the preparation does, in a few words."""
         if self.mode == 'none':
             return 'there already' if not (self.tools or self.commands) else 'completed'
-        return 'installed from packages' if self.mode == 'apt' else 'embedded default installed'
+        return 'installed from packages' if self.mode == 'apt' else 'ROS 2 installed by pip'
 
 
 def apt_packages(rmw: str) -> tuple[str, ...]:
@@ -125,22 +133,20 @@ def dependencies(spec: MachineSpec, under: Underlay, packages: Sequence[str] = (
     :param packages: packages of the nodes that will run there.
     :raises WorkspaceError: a manifest of a workspace cannot be read.
     """
-    embedded = any(
-        next(Path(prefix).glob('lib/python3*/site-packages/ros2_embedded-*'), None)
-        for prefix in under.prefixes)
+    wheels = any(map(has_wheels, under.prefixes))
     wanted = {
         'distro': under.environment.get('ROS_DISTRO') or DISTRO,
         'bootstrap': spec.bootstrap,
-        'kind': 'embedded' if embedded else 'ros',
+        'kind': 'pip' if wheels else 'ros',
         'packages': sorted({*apt_packages(under.rmw), *TOOLS.values()}),
         'workspace': workspaces.dependencies(*spec.workspaces),
         'apt': sorted(spec.apt), 'pip': sorted(spec.pip),
     }
-    # Our packages come with the wheels, and those of the embedded default with it.
+    # Our packages and those of ROS 2 come with the wheels.
     ours = {name.replace('-', '_') for name in needs.OURS}
     named = needs.keys(map(workspaces.inspect, spec.workspaces), {*packages} - ours)
     named = tuple({*named} & {*packages})
-    if named := needs.outside(named, [sys.prefix] if embedded else []):
+    if named := needs.outside(named, [sys.prefix] if wheels else []):
         wanted['launch'] = sorted(named)
     return hashlib.sha256(json.dumps(wanted, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -196,7 +202,7 @@ def ensure(
                 f"the packages for '{spec.name}' can't be packed on this computer: {error}",
                 'XDG_CACHE_HOME names another folder for it') from error
         todo = plan(spec, facts, robot, under, wheels, chain)
-        if todo.install.kind == 'embedded':
+        if todo.install.kind == 'pip':
             # The machine gets a copy of this environment.
             keys = needs.outside(keys, [sys.prefix])
     install = todo.install
@@ -340,7 +346,7 @@ def plan_alike(
     if not same or not ours or spec.bootstrap == 'apt':
         return None
     install = RosInstall(
-        'ros' if robot.has_rmw(under.rmw) else 'embedded', (under.ros2, 'launch', *ours),
+        'ros' if robot.has_rmw(under.rmw) else 'pip', (under.ros2, 'launch', *ours),
         environment=under.environment, facts=facts, robot=robot)
     return Preparation(
         'none', _with_workspaces(install, chain, spec.name, _builds(facts)),
@@ -364,32 +370,32 @@ def plan(
         raise PrerequisiteError(f'{machine} has no Python 3.10 or newer',
                                 'install python3 there')
     tools = _tools(facts, mode, spec.name)
-    python_only = mode == 'embedded' or all(space.python_only for space in chain)
-    no_embedded = _why_not_embedded(facts, wheels, python_only)
+    python_only = mode == 'pip' or all(space.python_only for space in chain)
+    no_pip = _why_not_pip(facts, wheels, python_only)
     if under.rmw != DEFAULT_RMW:
-        no_embedded = f'the embedded default has {DEFAULT_RMW} alone, and not {under.rmw}'
+        no_pip = f'the wheels of ROS 2 have {DEFAULT_RMW} alone, and not {under.rmw}'
     no_apt = _why_not_apt(facts)
     if facts.has_rmw(under.rmw) and (
             mode in ('auto', 'none')
             or mode == 'apt' and _builds(facts)):
         todo = _ros(facts, wheels, chain)
-    elif (mode != 'apt' and wheels.embedded and wheels.key in facts.installed
+    elif (mode != 'apt' and wheels.ros and wheels.key in facts.installed
             and under.rmw == DEFAULT_RMW):
-        todo = Preparation('none', _embedded_install(facts, wheels))
+        todo = Preparation('none', _pip_install(facts, wheels))
     elif mode == 'none':
         raise PrerequisiteError(f'{machine} has no ROS 2 {DISTRO} with {under.rmw}',
                                 "bootstrap='auto' would install what is missing")
-    elif mode != 'apt' and not no_embedded:
-        todo = _embedded(facts, wheels)
-    elif mode == 'embedded':
+    elif mode != 'apt' and not no_pip:
+        todo = _pip(facts, wheels)
+    elif mode == 'pip':
         raise PrerequisiteError(
-            f"{machine} can't take the embedded default: {no_embedded}",
-            'make room there' if 'are free' in no_embedded else
+            f"{machine} can't get ROS 2 by pip: {no_pip}",
+            'make room there' if 'are free' in no_pip else
             "bootstrap='auto' takes another way where there is one")
     elif not no_apt:
         todo = _apt(facts, wheels, chain, (*apt_packages(under.rmw), *spec.apt))
     else:
-        reason = no_apt if mode == 'apt' else f'{no_embedded}; {no_apt}'
+        reason = no_apt if mode == 'apt' else f'{no_pip}; {no_apt}'
         raise PrerequisiteError(
             f"{machine} can't be made ready for ROS 2: {reason}",
             'choose an image or computer with Ubuntu 24.04, or one that has ROS 2 already')
@@ -417,15 +423,15 @@ def check_architecture(
         built there.
     """
     machine = f"machine '{spec.name}' ({architecture})"
-    if spec.bootstrap == 'embedded':
+    if spec.bootstrap == 'pip':
         sent = wheels()
         names = [] if sent.architecture == architecture else [
             _distribution(file) for file in sent.hashes if not file.endswith('-none-any.whl')]
         lacking = locked.lacking(names, architecture)
         if lacking:
             raise PrerequisiteError(
-                f"{machine} can't take the embedded default: its {', '.join(lacking)} has no "
-                f'package for {architecture} processors',
+                f"{machine} can't get ROS 2 by pip: there are no wheels of it for {architecture} "
+                'processors',
                 f"use bootstrap='apt' (Ubuntu {APT_RELEASE}), an image that has ROS 2, or a "
                 'machine with an x86_64 processor')
     elif spec.bootstrap == 'apt' and architecture not in APT_ARCHITECTURES:
@@ -438,10 +444,10 @@ def check_architecture(
         return
     if not workspace.sources:
         raise workspaces.no_sources(workspace, spec.name, reason)
-    if spec.bootstrap == 'embedded':
+    if spec.bootstrap == 'pip':
         raise WorkspaceError(
-            f'{workspace.root} would have to be built on {machine}: {reason}; the embedded '
-            'default builds nothing', "use bootstrap='auto' or 'apt'")
+            f'{workspace.root} would have to be built on {machine}: {reason}; '
+            "bootstrap='pip' builds nothing", "use bootstrap='auto' or 'apt'")
 
 
 def _builds(facts: HostFacts) -> bool:
@@ -506,21 +512,21 @@ def _tools(facts: HostFacts, mode: Bootstrap, machine: str) -> tuple[Command, ..
     return (apt_install(packages, f"install {', '.join(packages)}"),)
 
 
-def _why_not_embedded(
+def _why_not_pip(
     facts: HostFacts, wheels: wheel_cache.Wheels, python_only: bool,
 ) -> str:
-    if not wheels.embedded:
-        return 'this robot runs ROS 2 itself and has no embedded default to send'
+    if not wheels.ros:
+        return 'this robot has no wheels of ROS 2 to send'
     if not python_only:
         return 'the workspace has compiled packages, which need ROS 2 itself'
     lacking = locked.lacking(_asked(facts, wheels), facts.architecture)
     if lacking:
-        return f"its {', '.join(lacking)} has no package for {facts.architecture} processors"
+        return f'ROS 2 has no wheels for {facts.architecture} processors'
     if not any(p.venv and p.version >= MIN_PYTHON for p in facts.pythons):
         return "its Python lacks the module 'venv' (package python3-venv)"
-    if facts.free_bytes is not None and facts.free_bytes < EMBEDDED_BYTES:
+    if facts.free_bytes is not None and facts.free_bytes < PIP_BYTES:
         return (f'{facts.free_bytes >> 20} MB are free in {facts.home}, '
-                f'{EMBEDDED_BYTES >> 20} are needed')
+                f'{PIP_BYTES >> 20} are needed')
     return ''
 
 
@@ -564,21 +570,21 @@ def _folder(facts: HostFacts, wheels: wheel_cache.Wheels) -> str:
     return f'{facts.home}/{INSTALL_FOLDER}/{wheels.key}'
 
 
-def _embedded_python(facts: HostFacts, wheels: wheel_cache.Wheels) -> Python:
+def _pip_python(facts: HostFacts, wheels: wheel_cache.Wheels) -> Python:
     return _fits(facts, wheels) or next(
         p for p in facts.pythons if p.venv and p.version >= MIN_PYTHON)
 
 
-def _embedded_install(facts: HostFacts, wheels: wheel_cache.Wheels) -> RosInstall:
+def _pip_install(facts: HostFacts, wheels: wheel_cache.Wheels) -> RosInstall:
     prefix = f'{_folder(facts, wheels)}/venv'
-    version = '{}.{}'.format(*_embedded_python(facts, wheels).version)
+    version = '{}.{}'.format(*_pip_python(facts, wheels).version)
     program = f'{prefix}/lib/python{version}/site-packages/fogros2/cloud_launch.py'
-    return RosInstall('embedded', (f'{prefix}/bin/ros2', 'launch', program), environment={
+    return RosInstall('pip', (f'{prefix}/bin/ros2', 'launch', program), environment={
         'PATH': f'{prefix}/bin:{SYSTEM_PATH}', 'AMENT_PREFIX_PATH': prefix,
         'VIRTUAL_ENV': prefix})
 
 
-def _embedded(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
+def _pip(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
     """Return the plan that installs the sent wheels into a virtual environment."""
     folder = _folder(facts, wheels)
     target = f'{folder}/wheels'
@@ -595,13 +601,13 @@ def _embedded(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
         f'cd {shlex.quote(folder)}\n'
         f'{_checked(wheels, wheels.pip)}'
         'rm -rf venv\n'
-        f'{shlex.quote(_embedded_python(facts, wheels).path)} -m venv --without-pip venv\n'
+        f'{shlex.quote(_pip_python(facts, wheels).path)} -m venv --without-pip venv\n'
         f"printf '%s\\n' {shlex.join([*lines, *locked.requirements(asked)])} >requirements.txt\n"
         f'venv/bin/python {shlex.join(words)} --requirement requirements.txt\n'
         ': >complete\n')
     return Preparation(
-        'embedded', _embedded_install(facts, wheels), wheels_target=target,
-        commands=(Command.script(script, what='install the embedded default'),))
+        'pip', _pip_install(facts, wheels), wheels_target=target,
+        commands=(Command.script(script, what='install ROS 2 by pip'),))
 
 
 def _checked(wheels: wheel_cache.Wheels, file: str) -> str:

@@ -18,6 +18,8 @@ from fogros2.errors import PrerequisiteError
 FILE = Path(__file__).with_name('locked.txt')
 #: Start of the line in the file with the distributions that have wheels only for x86_64.
 X86_64_ALONE = '# Wheels for x86_64 alone:'
+#: Start of the names of ROS 2's distributions.
+ROS = 'ros-'
 #: Options of pip besides the requirements. Sources would be built by programs without hashes.
 OPTIONS = ('--no-deps', '--require-hashes', '--only-binary', ':all:')
 
@@ -55,6 +57,11 @@ def requirements(names: Iterable[str]) -> list[str]:
                 'choose a machine with the same Python, processor and C library as the robot')
         lines += entries[name_of(name)]
     return lines
+
+
+def ros() -> list[str]:
+    """Return the names of the distributions of ROS 2 that nodes need."""
+    return [name for name in parse(FILE.read_text()) if name.startswith(ROS)]
 
 
 def lacking(names: Iterable[str], architecture: str) -> list[str]:

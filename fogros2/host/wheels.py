@@ -52,7 +52,7 @@ class Wheels:
     :param python: version of the interpreter they are for, with ``architecture`` and ``libc``.
     :param fogros2: file name of our own wheel, for any Python.
     :param pip: file name of pip's wheel.
-    :param embedded: whether they contain the embedded default, which a robot with ROS 2 lacks.
+    :param ros: whether they contain ROS 2; a robot with an installation of ROS 2 has no wheels.
     :param hashes: SHA-256 of each wheel in hexadecimal digits, by file name.
     """
 
@@ -63,7 +63,7 @@ class Wheels:
     libc: str
     fogros2: str
     pip: str = ''
-    embedded: bool = True
+    ros: bool = True
     hashes: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
@@ -162,11 +162,11 @@ def libc_for(files: Iterable[str]) -> str:
 
 def _closure() -> Iterator[metadata.Distribution]:
     """
-    Yield the distributions to send: ours, the embedded default, pip, and their dependencies.
+    Yield the distributions to send: ours, ROS 2, pip, and their dependencies.
 
-    A robot with ROS 2 sends only this package, to machines that have ROS 2 too.
+    A robot with an installation of ROS 2 sends only this package, to machines that have one too.
     """
-    todo, seen = [OWN, EMBEDDED, PIP], set(_ROBOT_ONLY)
+    todo, seen = [OWN, EMBEDDED, PIP, *locked.ros()], set(_ROBOT_ONLY)
     try:
         metadata.distribution(EMBEDDED)
     except metadata.PackageNotFoundError:

@@ -2,7 +2,7 @@
 """Conditions of actions."""
 from __future__ import annotations
 
-from rosidl_embedded.lacking import lacking
+from embedded_default.lacking import lacking
 
 from .._base import Condition, SomeSubstitutionsType, Substitution
 from ..launch_context import LaunchContext

@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections.abc
 from typing import Any, Callable, TYPE_CHECKING
 
-from rosidl_embedded.lacking import lacking
+from embedded_default.lacking import lacking
 
 from .. import _base
 from ..events import IncludeLaunchDescription, Shutdown

@@ -24,7 +24,7 @@ def _parse(kind: str, methods: dict[str, Any], name: str, unknown: str, *args: A
     if name in methods:
         return methods[name](*args)
     if name in _LACKING[kind].split():
-        from rosidl_embedded.lacking import NotEmbeddedError
+        from embedded_default.lacking import NotEmbeddedError
         raise NotEmbeddedError(f"the {kind} '{name}' in launch files")
     raise RuntimeError(f'{unknown}: {name}')
 

@@ -9,7 +9,7 @@ import os
 from typing import Any, Iterable, Sequence
 
 import launch.logging
-from rosidl_embedded.lacking import lacking
+from embedded_default.lacking import lacking
 
 from .._base import SomeSubstitutionsType, Substitution
 from ..frontend.expose import expose_substitution

@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections.abc
 from typing import Any, List, TYPE_CHECKING
 
-from rosidl_embedded.lacking import lacking
+from embedded_default.lacking import lacking
 
 from .._base import Substitution
 from . import ensure_argument_type, normalize_to_list_of_substitutions, perform_substitutions

@@ -11,7 +11,7 @@ from launch.frontend.expose import expose_substitution
 from launch.launch_context import LaunchContext
 from launch.substitutions import described, ParsedSubstitution, SubstitutionFailure
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
-from rosidl_embedded.lacking import lacking
+from embedded_default.lacking import lacking
 
 __all__ = ['ExecutableInPackage', 'FindPackage', 'FindPackagePrefix', 'FindPackageShare']
 __getattr__ = lacking(__name__, 'Parameter')

@@ -5,12 +5,10 @@ from collections.abc import Callable
 import sys
 from typing import Any
 
-_MODULES = {f'rclpy.{name}' for name in (
-    'action', 'guard_condition', 'impl.implementation_singleton', 'parameter_event_handler',
-    'qos_overriding_options', 'type_description_service', 'wait_for_message', 'waitable')} | {
-        'example_interfaces.action', 'launch.utilities.typing_file_path', 'launch_testing',
-        'launch_ros.parameters_type', 'launch_ros.remap_rule_type', 'tf2_msgs.action',
-        'rosidl_runtime_py.get_interfaces', 'rosidl_runtime_py.import_message', 'launch_pytest'}
+_MODULES = {
+    'launch.utilities.typing_file_path', 'launch_testing', 'launch_ros.parameters_type',
+    'launch_ros.remap_rule_type', 'rosidl_runtime_py.get_interfaces',
+    'rosidl_runtime_py.import_message', 'launch_pytest'}
 
 #: The names that modules refuse, by module.
 LACKING: dict[str, list[str]] = {}
