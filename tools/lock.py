@@ -6,7 +6,6 @@ Write fogros2/host/locked.txt: what a machine may take from its package index, p
 
 It takes ``uv`` (``pip install uv``), which asks the index that it is set up with. A version is
 chosen for each Python that we support, and all its wheels are taken, whatever their processor.
-Distributions without one for 64-bit ARM are named: no machine of that kind can have them.
 """
 
 from __future__ import annotations
@@ -51,15 +50,6 @@ def resolved(requirements: list[str]) -> str:
              file.name], check=True, capture_output=True, text=True).stdout
 
 
-def lacks_aarch64(name: str, entries: list[str]) -> bool:
-    """Return whether a distribution has no wheel for 64-bit ARM and the Python of ROS 2 Jazzy."""
-    version = entries[-1].split()[0].removeprefix(f'{name}==')
-    return subprocess.run(
-        ['uv', 'pip', 'compile', '--quiet', '--no-deps', '--only-binary', ':all:',
-         '--python-version', '3.12', '--python-platform', 'aarch64-manylinux_2_39', '-'],
-        input=f'{name}=={version}\n', capture_output=True, text=True).returncode != 0
-
-
 def main() -> None:
     """Resolve all together, as they are used together, and keep those that are asked for."""
     requirements = list(dict.fromkeys(
@@ -72,10 +62,7 @@ def main() -> None:
     missing = [name for name in names if name not in entries]
     if missing:
         sys.exit(f'uv has no answer for {", ".join(missing)}')
-    # the builder of ROS 2's wheels makes none for ARM
-    alone = [name for name in names
-             if name.startswith(locked.ROS) or lacks_aarch64(name, entries[name])]
-    TARGET.write_text(HEADER + f'{locked.X86_64_ALONE} {" ".join(alone)}\n' + ''.join(
+    TARGET.write_text(HEADER + ''.join(
         entry.replace(' --hash', ' \\\n    --hash') + '\n'
         for name in names for entry in entries[name]))
     print(f'{TARGET}: {", ".join(names)}')

