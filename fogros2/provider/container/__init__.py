@@ -48,11 +48,11 @@ from fogros2.waiting import wait_until
 _NO_UPPER = ('overlay', 'nfs', 'nfs4', 'cifs', 'vfat', 'exfat', 'ntfs', '9p', 'virtiofs', 'fuse')
 
 # One process does all steps, in its own session: a launch that is killed meanwhile leaves either
-# nothing or a machine with its watchdog. From the sixth argument on, the words are the engine's.
+# nothing or a machine with its watchdog. After the fourth argument come the paths of layers, an
+# empty word, and the engine's words.
 _CREATE = """\
-top=$1 begin=$2 end=$3 clean=$4 layers=$5
-shift 5
-engine=$1
+top=$1 begin=$2 end=$3 clean=$4
+shift 4
 umask 022
 failed() {
     code=$?
@@ -74,7 +74,9 @@ mkdir "$top/root" "$top/hooks"
 chmod 711 "$top"
 printf %s "$begin" >"$top/hooks/begin.json"
 printf %s "$end" >"$top/hooks/end.json"
-for layer in $layers; do mkdir -p "$top/layers$layer/upper" "$top/layers$layer/work"; done
+while [ -n "$1" ]; do mkdir -p "$top/layers$1/upper" "$top/layers$1/work"; shift; done
+shift
+engine=$1
 tar -xpf - --numeric-owner -C "$top/root"
 "$@"
 """
@@ -231,9 +233,9 @@ class ContainerProvider(Provider):
             archive.file('etc/apt/apt.conf.d/90fogros2', debian_root.connection().encode())
         command = Command(
             ('sh', '-ec', _CREATE, 'sh', str(top), *hooks(top, kept=kept), clean(top),
-             ' '.join(system) if kept else '',
-             engine.name, *engine.flags, *hook_flags(top), 'run', '-d', '--cidfile', f'{top}/cid',
-             *words, '--rootfs', f'{top}/root', '/bin/sh', f'/{container_entry.FOLDER}/entry.sh'),
+             *(system if kept else ()), '', engine.name, *engine.flags, *hook_flags(top),
+             'run', '-d', '--cidfile', f'{top}/cid', *words,
+             '--rootfs', f'{top}/root', '/bin/sh', f'/{container_entry.FOLDER}/entry.sh'),
             sudo=engine.sudo, what=f"creating container machine '{spec.name}'",
             input=container_root.skeleton(options.user, base) + archive.data())
         try:
