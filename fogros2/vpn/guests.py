@@ -55,7 +55,7 @@ PROOF_TIMEOUT, CONNECTIONS = 10.0, 8
 #: Bytes of a challenge, and of its answer by HMAC-SHA256.
 CHALLENGE = 32
 #: Folder of the guests' homes; where else their files may be.
-HOMES = Path('/var/lib/fogros2')
+HOMES = Path('/var/lib/fogros2-guests')
 ELSEWHERE = ('/tmp', '/var/tmp', '/dev/shm', '/var/spool/cron')  # noqa: S108 - only deleted there
 #: Ends all other processes of an account; fails until there are none.
 KILL = """\

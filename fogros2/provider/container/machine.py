@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import datetime
+import hashlib
 import os
 from pathlib import Path
 import re
@@ -49,13 +50,18 @@ def container_name(machine: str, tags: Mapping[str, str] = {}) -> str:
 
 def directory(token: str) -> Path:
     """
-    Return the folder of the root of the machine with this token.
+    Return the folder of the root of the machine with this token, which its name does not tell.
 
     :raises MachineNotFound: the token is not ours, so that no other folder is ever removed.
     """
     if not re.fullmatch(r'[A-Za-z0-9][A-Za-z0-9_-]{3,63}', token):
         raise MachineNotFound(f"'{token}' is no token of a container machine")
-    return ROOTS / token
+    return ROOTS / hashlib.sha256(token.encode()).hexdigest()[:16]
+
+
+def token_label(token: str) -> str:
+    """Return the line of a file with the label of a machine's token."""
+    return f'{ATTEMPT}={token}\n'
 
 
 def share_folder(token: str) -> Path:

@@ -18,7 +18,6 @@ from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container.engine import Engine
 from fogros2.provider.container.entry import FOLDER
 from fogros2.provider.container.machine import (
-    ATTEMPT,
     container_name,
     DIRECTORY,
     ENDS_STOPPED,
@@ -183,10 +182,10 @@ def network_subnets(output: str) -> list[ipaddress.IPv4Network]:
 def common_flags(
     engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
 ) -> Iterator[str]:
-    """Yield the engine's flags for a spec, with or without an image."""
+    """Yield the engine's flags for a spec, with or without an image; the token is not in them."""
     yield from ('--name', container_name(spec.name, request.tags), '--hostname', spec.name)
     labels = {
-        **request.tags, ATTEMPT: request.token, LOGIN: options.user, MACHINE: spec.name,
+        **request.tags, LOGIN: options.user, MACHINE: spec.name,
         DIRECTORY: '' if options.image else 'root', VPN_PORT: str(request.vpn_port),
     }
     if spec.on_exit == 'stop':
@@ -218,7 +217,9 @@ def common_flags(
         yield from ('-p', port)
     if spec.share:
         folder, (own, others) = share_folder(request.token), SHARE_FOLDERS
-        yield from ('-v', f'{folder}:{own}', '-v', f'{folder.parent}:{others}:ro')
+        # a program of another machine gives no rights here
+        safe = ',nosuid,nodev,noexec' if engine.name == 'podman' else ''
+        yield from ('-v', f'{folder}:{own}:rw{safe}', '-v', f'{folder.parent}:{others}:ro{safe}')
     for mount in options.mounts:
         source, _, target = mount.partition(':')
         yield from ('-v', f'{source}:{target or source}:ro')
