@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import array
 from collections.abc import Callable
-import os
 from typing import Any
 
 import pytest
@@ -18,7 +17,7 @@ from sensor_msgs.msg import CompressedImage, PointCloud2
 from fogros2_examples.city import City
 from fogros2_examples.lidar import message
 from point_cloud_stream.parts import split
-from rigs.bench import Bench, BEST_EFFORT, RELIABLE
+from rigs.bench import Bench, BEST_EFFORT, lossy, RELIABLE
 
 SCAN = City(16, 256).scan(3)
 
@@ -120,12 +119,10 @@ def test_a_decoder_that_dies_stops_nobody(bench: Bench) -> None:
 
 def test_large_clouds_cross_a_link_that_loses_messages(bench: Bench) -> None:
     """Every fifth message is lost; the middleware repeats parts, and none is shown damaged."""
-    bench.environment['CYCLONEDDS_URI'] = os.environ['CYCLONEDDS_URI'] + (
-        ',<CycloneDDS><Domain Id="any"><Internal><Test><XmitLossiness>200</XmitLossiness></Test>'
-        '</Internal></Domain></CycloneDDS>')
     pair(bench, '-p', 'lossless:=true')
     seen = bench.heard(PointCloud2, '/seen/points')
-    bench.until(lambda: len(seen) >= 3, 'clouds', timeout=60, meanwhile=source(bench))
+    with lossy(bench.domain):
+        bench.until(lambda: len(seen) >= 3, 'clouds', timeout=60, meanwhile=source(bench))
     assert all(bytes(got.data) == SCAN.tobytes() for got in seen)
 
 

@@ -27,7 +27,7 @@ from std_msgs.msg import Empty, UInt64MultiArray
 from image_transport_h264 import annexb, message
 from image_transport_h264.acknowledgement import wait_for_all_acked
 from image_transport_h264.codec import Encoder, peek, Picture, Settings
-from rigs.bench import Bench, BEST_EFFORT, RELIABLE
+from rigs.bench import Bench, BEST_EFFORT, lossy, RELIABLE
 
 ROOT = Path(__file__).parents[2]
 WIDTH, HEIGHT = 96, 64
@@ -82,13 +82,11 @@ def test_how_packets_are_taken(
     bench: Bench, encoding: str, options: dict[str, int], reliability: ReliabilityPolicy,
 ) -> None:
     """A deep picture of hundreds of fragments comes over a link that loses every fifth message."""
-    bench.environment['CYCLONEDDS_URI'] += (
-        ',<CycloneDDS><Domain Id="any"><Internal><Test><XmitLossiness>200</XmitLossiness></Test>'
-        '</Internal></Domain></CycloneDDS>')
     bench.pair()
     seen = bench.heard(Image, '/seen/camera')
     camera = source(bench, encoding=encoding, **options)
-    bench.until(lambda: len(seen) >= 3, 'an image', timeout=40, meanwhile=camera)
+    with lossy(bench.domain):
+        bench.until(lambda: len(seen) >= 3, 'an image', timeout=40, meanwhile=camera)
     bench.until(lambda: [info.qos_profile.reliability for info in
                          bench.node.get_subscriptions_info_by_topic('/camera/h264')
                          ] == [reliability], 'the subscription', meanwhile=camera)

@@ -14,13 +14,14 @@ import threading
 import time
 from typing import Any
 
+import pytest
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from fogros2.dds.cyclonedds import CycloneDds
+from fogros2.dds.fastdds import FastDds
 from fogros2.model import DdsInterface
 from rigs.domains import taken
 
@@ -32,12 +33,12 @@ BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 class Bench:
     """A node in this process, and the processes under test."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, domain: int) -> None:
+        self.folder, self.domain = folder, domain
         self.environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(
             filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))}
         self.context = Context()
-        rclpy.init(context=self.context, domain_id=int(os.environ['ROS_DOMAIN_ID']))
+        rclpy.init(context=self.context, domain_id=domain)
         self.node = Node('bench', context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
@@ -113,15 +114,40 @@ def made(folder: Path, setenv: Callable[[str, str], None]) -> Iterator[Bench]:
 
     :param setenv: sets a variable of this process until the test ends.
     """
-    vendor = CycloneDds()
-    path = folder / 'dds.xml'
-    path.write_text(vendor.render([DdsInterface('lo')], []))
-    for key, value in vendor.environment(str(path), {}).items():
-        setenv(key, value)
-    with taken() as domain:
-        setenv('ROS_DOMAIN_ID', domain)
-        bench = Bench(folder)
+    with on_loopback(folder, setenv) as domain:
+        bench = Bench(folder, domain)
         try:
             yield bench
         finally:
             bench.close()
+
+
+@contextlib.contextmanager
+def on_loopback(folder: Path, setenv: Callable[[str, str], None]) -> Iterator[int]:
+    """Keep the DDS of a test on the loopback, in a domain of its own, which is returned."""
+    with taken() as domain:
+        vendor = FastDds(int(domain))
+        path = folder / 'dds.xml'
+        path.write_text(vendor.render([DdsInterface('127.0.0.1')], []))
+        for key, value in vendor.environment(str(path), {}).items():
+            setenv(key, value)
+        setenv('ROS_DOMAIN_ID', domain)
+        yield int(domain)
+
+
+@contextlib.contextmanager
+def lossy(domain: int) -> Iterator[None]:
+    """Lose every fifth datagram of user data in a domain on the loopback."""
+    if os.geteuid() != 0:
+        pytest.skip('only root can add a packet filter')
+    # RTPS 2.5, 9.6.2.3: participants listen for user data at odd ports from 7411 on
+    first = 7411 + 250 * domain
+    ports = ', '.join(str(first + 2 * index) for index in range(20))
+    name = f'fogt{domain}'
+    rules = (f'table inet {name} {{ chain input {{ type filter hook input priority 0; '
+             f'iif lo udp dport {{ {ports} }} numgen random mod 5 == 0 drop }} }}')
+    subprocess.run(['nft', '-f', '-'], input=rules, text=True, check=True)
+    try:
+        yield
+    finally:
+        subprocess.run(['nft', 'delete', 'table', 'inet', name], check=True)
