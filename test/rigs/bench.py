@@ -144,8 +144,8 @@ def lossy(domain: int) -> Iterator[None]:
     first = 7411 + 250 * domain
     ports = ', '.join(str(first + 2 * index) for index in range(20))
     name = f'fogt{domain}'
-    rules = (f'table inet {name} {{ chain input {{ type filter hook input priority 0; '
-             f'iif lo udp dport {{ {ports} }} numgen random mod 5 == 0 drop }} }}')
+    rules = (f'table inet {name} {{\nchain input {{\ntype filter hook input priority 0\n'
+             f'iif lo udp dport {{ {ports} }} numgen random mod 5 == 0 drop\n}}\n}}\n')
     subprocess.run(['nft', '-f', '-'], input=rules, text=True, check=True)
     try:
         yield
