@@ -17,6 +17,8 @@ import subprocess
 import sys
 import threading
 
+import pytest
+
 from fogros2 import process
 from fogros2.model import Command
 from fogros2.shell import relay
@@ -77,6 +79,37 @@ finally:
     os.kill(child, signal.SIGKILL)
     shutil.rmtree(top)
 """
+#: Root makes a name a user's own; the launch ends, and another process gets its id. Prints what
+#: the helper says to the requests that concern this process, and what it does for them.
+REUSED = """\
+import importlib.util, os, shutil, subprocess, sys, tempfile
+from pathlib import Path
+spec = importlib.util.spec_from_file_location('vpn_helper', sys.argv[1])
+vpn = sys.modules['vpn_helper'] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(vpn)
+top = Path(tempfile.mkdtemp(dir='/run'))
+vpn.RECORDS = top / 'records'
+vpn.prepare()
+vpn.run = lambda commands: print('root acts on', launch.pid)
+launch = subprocess.Popen(['sleep', '60'])
+try:
+    vpn.claim('fog0a1b2c', 0, launch.pid)
+    request = {'name': 'fog0a1b2c', 'network': '198.18.7.0/24', 'address': '198.18.7.1',
+               'port': 51820, 'domain': 0, 'ports': [], 'asked': [], 'peers': []}
+    vpn.up(request, 0)
+    launch.kill(), launch.wait()
+    Path('/proc/sys/kernel/ns_last_pid').write_text(str(launch.pid - 1))
+    other = subprocess.Popen(['sleep', '60'])
+    assert other.pid == launch.pid
+    for verb in 'up', 'peers', 'repair':
+        try:
+            vpn.VERBS[verb](request, 0)
+        except vpn.Refused as error:
+            print(error)
+    other.kill(), other.wait()
+finally:
+    shutil.rmtree(top)
+"""
 #: Opens many connections to a port of the loopback, and counts those that the server closes.
 MANY = """\
 import socket
@@ -130,6 +163,17 @@ def test_no_account_locks_the_vpn_helper_s_folder(root: None) -> None:
 
 def test_the_vpn_helper_waits_for_a_lock_until_a_deadline(root: None) -> None:
     assert 'another process has held' in helper('new', 'stays')
+
+
+def test_vpn_helper_knows_a_process_id_that_was_used_again(root: None) -> None:
+    if not Path('/proc/sys/kernel/ns_last_pid').exists():
+        pytest.skip('needs a kernel that lets root choose the next process id')
+    said = process.run(Command((
+        'unshare', '--pid', '--fork', '--mount-proc', sys.executable, '-I', '-c', REUSED,
+        str(ROOT / 'packaging/vpn_helper/vpn.py')), sudo=True), timeout=30.0).stdout
+    first, *others = said.splitlines()
+    assert first.startswith('root acts on') and len(others) == 3
+    assert all(line.endswith('has ended') for line in others), said
 
 
 def test_a_stopped_terminal_does_not_stop_the_vpn_helper(root: None) -> None:

@@ -125,7 +125,7 @@ def test_each_machine_has_a_login_id_of_its_own(cloud: Cloud) -> None:
             numbers.add(int(shell.run(Command(('id', '-u')), timeout=20.0).stdout))
     assert len(numbers) == 2
     for number in numbers:
-        assert login_ids.FIRST <= number <= login_ids.LAST
+        assert number in login_ids.IDS
         with contextlib.suppress(KeyError):
             pytest.fail(f'{pwd.getpwuid(number)} has it')
 
@@ -135,7 +135,7 @@ def test_login_id_is_in_no_subordinate_range(tmp_path: Path) -> None:
     first = login_ids.login_id('token', [])
     path.write_text(f'# a line\nalice:{first - 5}:10\n')
     second = login_ids.login_id('token', [path, tmp_path / 'missing'])
-    assert second != first and login_ids.FIRST <= second <= login_ids.LAST
+    assert second != first and second in login_ids.IDS
     path.write_text(f'alice:100000:{2 ** 31}\n')
     with pytest.raises(PrerequisiteError, match='no user id'):
         login_ids.login_id('token', [path])

@@ -16,8 +16,9 @@ import pwd
 
 from fogros2.errors import PrerequisiteError
 
-#: Ids that systemd's list of ranges (UIDS-GIDS) leaves free, without those of sssd's id mapping.
-FIRST, LAST = 0x78000000, 0x7ffdffff
+#: Ids that systemd's list of ranges (UIDS-GIDS) leaves free, without those of sssd's id mapping,
+#: and of guests (``vpn.guests``); and ids for a computer in a namespace of users that lacks them.
+IDS, FEW_IDS = range(0x78000000, 0x7c000000), range(20000, 60000)
 #: Ranges of ids that accounts may use in containers of their own.
 SUBORDINATE = (Path('/etc/subuid'), Path('/etc/subgid'))
 
@@ -32,13 +33,16 @@ def login_id(token: str, subordinate: Sequence[Path] = SUBORDINATE) -> int:
     ranges = [(int(words[1]), int(words[1]) + int(words[2]))
               for path in subordinate if path.exists() for line in path.read_text().splitlines()
               if len(words := line.split(':')) == 3 and words[1].isdigit() and words[2].isdigit()]
+    mapped = [[int(word) for word in line.split()]
+              for line in Path('/proc/self/uid_map').read_text().splitlines()]
+    some = IDS if any(first + count > IDS[-1] for first, _, count in mapped) else FEW_IDS
     for attempt in range(100):
         digest = hashlib.sha256(f'{token} {attempt}'.encode()).digest()
-        number = FIRST + int.from_bytes(digest[:8], 'big') % (LAST - FIRST + 1)
+        number = some[int.from_bytes(digest[:8], 'big') % len(some)]
         if not _known(number) and not any(first <= number < end for first, end in ranges):
             return number
     raise PrerequisiteError(
-        f'no user id from {FIRST} to {LAST} is free for a container machine',
+        f'no user id from {some[0]} to {some[-1]} is free for a container machine',
         f"leave some out of {' and '.join(map(str, subordinate))}")
 
 
