@@ -15,12 +15,12 @@ import contextlib
 import dataclasses
 import hashlib
 import ipaddress
-import json
 from pathlib import Path
 import re
 import time
 from typing import Optional
 
+from fogros2 import untrusted
 from fogros2.errors import ConfigurationError
 from fogros2.model import to_json
 from fogros2.store import check_name, robot_name, Store, write_private
@@ -89,7 +89,7 @@ def joined(store: Store) -> dict[str, Path]:
 def read(folder: Path) -> Optional[Invitation]:
     """Return the invitation by which this computer has joined a machine, None if there is none."""
     with contextlib.suppress(OSError, ValueError, TypeError, ConfigurationError):
-        return Invitation(**json.loads((folder / JOINED).read_text()))
+        return Invitation(**untrusted.parsed((folder / JOINED).read_text()))
     return None
 
 
@@ -160,12 +160,12 @@ def unseal(text: str, key: bytes) -> Invitation:
         if _PREFIX + base64.urlsafe_b64encode(data).decode() != text:
             raise ValueError('a character is changed')  # base64 ignores some bits of the last
         content = sealing.unseal(data, key, text[:len(_PREFIX)].encode())
-        invitation = Invitation(**json.loads(content))
+        invitation = Invitation(**untrusted.parsed(content))
     except sealing.WrongKey:
         raise ConfigurationError(
             'this invitation is for another computer, or not complete',
             'ros2 fog key prints the key that the invitation needs') from None
-    except (ValueError, TypeError, ConfigurationError, RecursionError) as error:
+    except (ValueError, TypeError, ConfigurationError) as error:
         why = 'it is not complete' if isinstance(error, binascii.Error) else error
         raise ConfigurationError(f'this is no invitation: {why}',
                                  'ros2 fog invite prints one, in one line') from error

@@ -22,6 +22,7 @@ import shlex
 import sys
 from typing import Optional
 
+from fogros2 import untrusted
 from fogros2.errors import PrerequisiteError
 from fogros2.host import locked
 from fogros2.host.wheels import libc_for, runs_on
@@ -211,7 +212,7 @@ def answer(output: str) -> Answer:
     :raises PrerequisiteError: the machine's nodes have no Python.
     """
     try:
-        python, architecture, libc, missing = json.loads(output.strip().splitlines()[-1])
+        python, architecture, libc, missing = untrusted.parsed(output.strip().splitlines()[-1])
         return Answer((int(python[0]), int(python[1])), str(architecture), str(libc),
                       tuple(map(str, missing)), tuple(filter(None, map(str, missing.values()))))
     except (ValueError, LookupError, TypeError, AttributeError) as error:

@@ -7,8 +7,8 @@ import dataclasses
 import shlex
 
 from fogros2.errors import CommandError
-from fogros2.events import clean
 from fogros2.model import Command, Result
+from fogros2.untrusted import clean
 
 _ANNOUNCE = 'echo $$; exec "$@"'
 

@@ -17,9 +17,9 @@ import threading
 from typing import Optional
 
 from fogros2.errors import AuthenticationError, ConnectError
-from fogros2.events import clean
 from fogros2.model import Endpoint
 from fogros2.shell.multiplexed import Link, MultiplexedShell
+from fogros2.untrusted import clean
 
 #: Bytes of the challenge, and of the longest answer to its proof.
 _CHALLENGE, _LINE = 32, 300

@@ -9,7 +9,7 @@ import threading
 from typing import Optional, Protocol
 
 from fogros2.errors import ConnectError, FogError
-from fogros2.events import clean
+from fogros2.untrusted import clean
 
 #: Maximum bytes of a line, so that a machine cannot fill the robot's memory: JSON of empty lists
 #: takes 40 times as much when it is parsed. An agent's longest messages are output of 64 K

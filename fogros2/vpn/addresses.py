@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 import ipaddress
-import json
 import socket
 
+from fogros2 import untrusted
 from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import Command
 
@@ -107,7 +107,7 @@ def parse_used(output: str) -> list[str]:
     found: set[str] = set()
     try:
         for line in output.splitlines():
-            for entry in json.loads(line):
+            for entry in untrusted.parsed(line):
                 # an interface that is down has addresses but no routes
                 for address in entry.get('addr_info', ()):
                     found.add(f"{address['local']}/{address['prefixlen']}")
