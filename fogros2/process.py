@@ -34,24 +34,28 @@ def argv(command: Command) -> list[str]:
 
 
 def start(
-    command: Command, *, environment: Mapping[str, str], stdin: int, stderr: int,
-    inherited: Sequence[int] = (),
+    command: Command, *, stdin: int, stderr: int, stdout: int = subprocess.PIPE,
+    environment: Optional[Mapping[str, str]] = None, inherited: Sequence[int] = (),
 ) -> subprocess.Popen[bytes]:
     """
-    Start a command on this computer, with a pipe as standard output; do not wait for it.
+    Start a command on this computer; do not wait for it.
 
     It gets its own session, so that Ctrl-C in the terminal reaches only the launch and does not
     kill an undo step. With sudo it gets a process group instead, which Ctrl-C does not reach
     either: sudo binds its ticket to the terminal, and would ask for the password in a session
     without one.
 
+    :param environment: None for this process's variables and the command's.
     :raises FileNotFoundError: there is no such program.
     """
     apart: dict[str, Any] = {'start_new_session': True, 'pass_fds': inherited}
     if _through_sudo(command):
         apart = {'process_group': 0} if sys.version_info >= (3, 11) else {
             'preexec_fn': os.setpgrp}
-    return subprocess.Popen(argv(command), env=environment, stdin=stdin, stdout=subprocess.PIPE,
+    if environment is None:
+        path = _ENVIRONMENT.get('PATH', os.defpath)
+        environment = {**_ENVIRONMENT, 'PATH': f'{path}:/usr/sbin:/sbin', **command.environment}
+    return subprocess.Popen(argv(command), env=environment, stdin=stdin, stdout=stdout,
                             stderr=stderr, **apart)
 
 
@@ -142,13 +146,10 @@ def run(
     :raises PrerequisiteError: the program is missing, or cannot be started.
     """
     words = argv(command)
-    path = _ENVIRONMENT.get('PATH', os.defpath)
-    environment = {**_ENVIRONMENT, 'PATH': f'{path}:/usr/sbin:/sbin', **command.environment}
     try:
         with _file_of(command.input) if command.input else open(os.devnull, 'rb') as stdin:
-            child = start(
-                command, environment=environment, stdin=stdin.fileno(), stderr=subprocess.PIPE,
-                inherited=inherited)
+            child = start(command, stdin=stdin.fileno(), stderr=subprocess.PIPE,
+                          inherited=inherited)
     except FileNotFoundError as error:
         raise PrerequisiteError(
             f'{words[0]} not found on this computer',

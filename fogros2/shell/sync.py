@@ -10,7 +10,7 @@ goes over OpenSSH, whose ciphers take a third of the processor time of Python's.
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import os
 from pathlib import Path
@@ -31,7 +31,7 @@ from fogros2.errors import (
     WorkspaceError,
 )
 from fogros2.model import Command, Endpoint, Result, SyncReport
-from fogros2.shell import command_line, Shell, ssh_connection
+from fogros2.shell import command_line, relay, Shell, ssh_connection
 
 #: Bytes from which a separate connection of OpenSSH is faster.
 BULK = 64 << 20
@@ -43,10 +43,6 @@ _LOST = (10, 12, 255)
 _NOT_WRITTEN = 11
 
 
-#: The value of rsync's ``-e``, '' for this computer; the files that rsync inherits; errors.
-RemoteShell = tuple[str, Sequence[int], list[FogError]]
-
-
 class RsyncShell(Shell):
     """The methods of a Shell that copy files and folders; a subclass runs commands."""
 
@@ -55,7 +51,7 @@ class RsyncShell(Shell):
     where: str
 
     @abc.abstractmethod
-    def _remote_shell(self) -> contextlib.AbstractContextManager[RemoteShell]:
+    def _remote_shell(self) -> contextlib.AbstractContextManager[relay.RemoteShell]:
         """Return how rsync reaches the machine."""
 
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
@@ -83,7 +79,7 @@ class RsyncShell(Shell):
             and process.which('ssh') is not None and is_large(source, BULK)
         with open_ssh(self.endpoint) if bulk else self._remote_shell() as (rsh, files, failures):
             result = process.run(
-                rsync(source, place(target, rsh), excludes=excludes, includes=includes, rsh=rsh,
+                rsync(source, target, excludes=excludes, includes=includes, rsh=rsh,
                       compress=bulk, progress=on_progress is not None),
                 timeout=max(0.1, timeout - (time.monotonic() - begin)), cancel=cancel,
                 check=False, inherited=files,
@@ -107,10 +103,10 @@ class RsyncShell(Shell):
         words = ['rsync', '-rltp', '-s', '--delete', '--safe-links', '--chmod=u-s,g-s']
         words += [f'--link-dest={known.resolve()}'] if known is not None else []
         with self._remote_shell() as (rsh, files, failures):
-            words += ['-e', rsh] if rsh else []
+            words += ['-e', relay.RSH] if rsh else []
             result = process.run(
-                Command((*words, '--', place(source, rsh), f'{target}/'),
-                        environment={'LC_ALL': 'C'}, what='rsync'),
+                Command((*words, '--', place(source, remote=bool(rsh)), f'{target}/'),
+                        environment={'LC_ALL': 'C', **rsh}, what='rsync'),
                 timeout=timeout, cancel=cancel, check=False, inherited=files)
         if failures:
             raise failures[0]
@@ -143,9 +139,9 @@ def is_large(source: Path, limit: int) -> bool:
     return False
 
 
-def place(folder: str, rsh: str) -> str:
-    """Return a folder as rsync takes it: one of this computer, or of the host behind ``rsh``."""
-    if not rsh:
+def place(folder: str, *, remote: bool) -> str:
+    """Return a folder as rsync takes it: one of this computer, or of the machine."""
+    if not remote:
         return f'{os.path.expanduser(folder)}/'
     inside = folder.removeprefix('~/') or '.'  # rsync begins in the login user's home
     return f'machine:{inside}/'
@@ -153,13 +149,12 @@ def place(folder: str, rsh: str) -> str:
 
 def rsync(
     source: Path, target: str, *, excludes: Sequence[str], includes: Sequence[str],
-    rsh: str = '', compress: bool = False, progress: bool = False,
+    rsh: Mapping[str, str] = {}, compress: bool = False, progress: bool = False,
 ) -> Command:
     """
     Return the command that makes ``target`` equal to ``source``.
 
-    :param target: a local folder, or ``machine:folder``.
-    :param rsh: remote shell of rsync (``-e``) that connects to ``machine``.
+    :param rsh: variables of ``relay.RSH`` if the target is on a machine.
     :param compress: use the best common compression, mostly zstd, which is faster than most links.
     :param progress: print the progress as lines.
     """
@@ -172,13 +167,13 @@ def rsync(
     if progress:
         words += ['--info=progress2', '--no-inc-recursive']
     if rsh:
-        words += ['-e', rsh]
-    words += ['--', f'{source}/', target]
+        words += ['-e', relay.RSH]
+    words += ['--', f'{source}/', place(target, remote=bool(rsh))]
     if progress:
         # rsync rewrites one line with carriage returns; convert them to lines.
         script = 'set -o pipefail; "$@" | stdbuf -oL tr "\\r" "\\n"'
         words = ['bash', '-c', script, 'rsync', *words]
-    return Command(tuple(words), environment={'LC_ALL': 'C'}, what='rsync')
+    return Command(tuple(words), environment={'LC_ALL': 'C', **rsh}, what='rsync')
 
 
 class Progress:
@@ -253,9 +248,9 @@ def explained(result: Result, source: Path, where: str) -> FogError:
 
 
 @contextlib.contextmanager
-def open_ssh(endpoint: Endpoint) -> Iterator[RemoteShell]:
+def open_ssh(endpoint: Endpoint) -> Iterator[relay.RemoteShell]:
     """
-    Yield a remote shell by a connection of OpenSSH with the same pinned host key.
+    Yield how rsync reaches a machine by a connection of OpenSSH with the same pinned host key.
 
     :raises HostKeyError: known_hosts cannot be read.
     :raises PrerequisiteError: the temporary file with the host key cannot be created.
@@ -263,7 +258,7 @@ def open_ssh(endpoint: Endpoint) -> Iterator[RemoteShell]:
     words = [
         'ssh', '-F', 'none', '-T', '-p', str(endpoint.port),
         '-l', ssh_connection.user_of(endpoint),
-        '-o', f'HostName={endpoint.host}', '-o', 'BatchMode=yes', '-o', 'ControlPath=none',
+        '-o', 'BatchMode=yes', '-o', 'ControlPath=none',
         '-o', 'StrictHostKeyChecking=yes', '-o', 'UpdateHostKeys=no', '-o', 'LogLevel=ERROR',
         '-o', 'PreferredAuthentications=publickey', '-o', 'GSSAPIAuthentication=no',
         '-o', 'Compression=no', '-o', 'ForwardX11=no', '-o', 'ForwardAgent=no',
@@ -284,9 +279,18 @@ def open_ssh(endpoint: Endpoint) -> Iterator[RemoteShell]:
         known.flush()
         words += ['-o', 'HostKeyAlias=machine', '-o', f'UserKnownHostsFile={known.name}',
                   '-o', 'GlobalKnownHostsFile=/dev/null']
-        yield ' '.join(_word(word) for word in words), (), []
+        children = []
 
+        def run(line: str, stdin: int, stdout: int, stderr: int) -> int:
+            child = process.start(Command((*words, '--', endpoint.host, line)),
+                                  stdin=stdin, stdout=stdout, stderr=stderr)
+            children.append(child)
+            return child.wait()
 
-def _word(word: str) -> str:
-    """Quote a word for rsync's ``-e`` if it contains a space."""
-    return f"'{word}'" if ' ' in word else word
+        with relay.remote_shell(run) as remote:
+            try:
+                yield remote
+            finally:
+                for child in children:
+                    if child.poll() is None:
+                        process.end(child, sudo=False)
