@@ -15,8 +15,9 @@ import math
 import re
 from typing import Any, get_args, get_origin, get_type_hints, is_typeddict, Literal, Union
 
-#: Names of accounts, and public host keys (``ssh-ed25519 AAAA...``).
+#: Names of accounts, absolute paths, and public host keys (``ssh-ed25519 AAAA...``).
 NAME = re.compile('[a-z_][a-z0-9_-]{0,31}')
+PATH = re.compile('/[^\x00-\x1f\x7f]{0,1000}')
 HOST_KEY = re.compile('(?:ssh|ecdsa)-[a-z0-9-]+ [A-Za-z0-9+/]+={0,2}')
 #: Largest magnitude of a number: float and every interpreter of JSON represent it exactly.
 LARGEST = 2 ** 53

@@ -35,6 +35,8 @@ from fogros2.shell import command_line, relay, Shell, ssh_connection
 
 #: Bytes from which a separate connection of OpenSSH is faster.
 BULK = 64 << 20
+#: Bytes that a file takes at least.
+BLOCK = 4096
 #: Exit status of rsync for vanished source files, which is normal with editors and compilers.
 VANISHED = 24
 #: Exit statuses of rsync for errors in socket or protocol, and of the remote shell.
@@ -91,14 +93,17 @@ class RsyncShell(Shell):
         return report(result.stdout, time.monotonic() - begin)
 
     def fetch(
-        self, source: str, target: Path, *, known: Optional[Path], timeout: float,
+        self, source: str, target: Path, *, known: Optional[Path], limit: int, timeout: float,
         cancel: Optional[threading.Event] = None,
     ) -> None:
         """
         Make the local folder ``target`` equal to the machine's ``source``; see the protocol.
 
-        The machine is not trusted: no special files, no links out of the folder, no set-uid bits.
+        The machine is not trusted: no special files, no links out of the folder, no set-uid bits,
+        and the target is measured while it grows.
         """
+        room = Room(target, limit, cancel, f'{self.where} has sent more than '
+                    f'{limit / 1e9:.1f} GB in place of {source}')
         process.require(['rsync'])
         words = ['rsync', '-rltp', '-s', '--delete', '--safe-links', '--chmod=u-s,g-s']
         words += [f'--link-dest={known.resolve()}'] if known is not None else []
@@ -107,12 +112,53 @@ class RsyncShell(Shell):
             result = process.run(
                 Command((*words, '--', place(source, remote=bool(rsh)), f'{target}/'),
                         environment={'LC_ALL': 'C', **rsh}, what='rsync'),
-                timeout=timeout, cancel=cancel, check=False, inherited=files)
+                timeout=timeout, cancel=room, check=False, inherited=files)
         if failures:
             raise failures[0]
+        room.measure()
         if result.returncode != 0:
             lost = result.returncode in _LOST and 'No space left' not in result.stderr
             raise explained(result, Path(source), self.where if lost else process.HERE)
+
+
+class Room(threading.Event):
+    """
+    Is set with another event; raises an error while it is asked, if a folder becomes too large.
+
+    :param limit: bytes on the disk. Each file and folder counts as a block at least, because a
+        disk has room for a number of them.
+    :param message: of the error.
+    """
+
+    def __init__(
+        self, folder: Path, limit: int, cancel: Optional[threading.Event], message: str,
+    ) -> None:
+        super().__init__()
+        self._folder, self._limit, self._cancel = folder, limit, cancel
+        self._message = message
+        self._next = 0.0
+
+    def is_set(self) -> bool:
+        """Return whether the other event is set; measure the folder now and then."""
+        if time.monotonic() >= self._next:
+            self.measure()
+        return self._cancel is not None and self._cancel.is_set()
+
+    def measure(self) -> None:
+        """
+        Measure the folder.
+
+        :raises ShellError: it is too large.
+        """
+        begin, size = time.monotonic(), 0
+        for folder, folders, files in os.walk(self._folder):
+            for name in (*folders, *files):
+                with contextlib.suppress(OSError):  # deleted meanwhile
+                    size += max(BLOCK, 512 * os.lstat(os.path.join(folder, name)).st_blocks)
+            if size > self._limit:
+                raise ShellError(self._message, 'the machine may be hijacked: delete it')
+        # a tenth of the time at most
+        self._next = time.monotonic() + max(0.1, 10 * (time.monotonic() - begin))
 
 
 def check_source(source: Path) -> None:
@@ -183,7 +229,7 @@ class Progress:
     rsync prints whole percents; each line narrows the possible total down.
     """
 
-    _LINE = re.compile(r'^\s*(\d+)\s+(\d+)%')
+    _LINE = re.compile(r'^\s*([0-9]{1,18})\s+([0-9]{1,3})%')
 
     def __init__(self, report: Callable[[int, int], None], interval: float = 0.1) -> None:
         self._report = report
@@ -214,7 +260,7 @@ def report(output: str, seconds: float) -> SyncReport:
 
 
 def _number(output: str, label: str) -> int:
-    match = re.search(rf'^{label}: ([\d,.]+)', output, re.MULTILINE)
+    match = re.search(rf'^{label}: ([0-9,.]{{1,24}})$', output, re.MULTILINE)
     return int(re.sub(r'\D', '', match[1])) if match else 0
 
 

@@ -156,11 +156,12 @@ def test_large_folders_go_both_ways(shell, tmp_path):
         (tmp_path / f'source/{number}').write_bytes(os.urandom(300_000))
     there = str(tmp_path / 'there')
     assert shell.sync(tmp_path / 'source', there, excludes=[], timeout=60.0).files == 20
-    shell.fetch(there, tmp_path / 'back', known=None, timeout=60.0)
+    shell.fetch(there, tmp_path / 'back', known=None, limit=1 << 30, timeout=60.0)
     assert (tmp_path / 'back/19').read_bytes() == (tmp_path / 'source/19').read_bytes()
     before = set(os.listdir('/proc/self/fd'))
     with pytest.raises(CommandError, match='No such file'):
-        shell.fetch(f'{there}/nowhere', tmp_path / 'back', known=None, timeout=60.0)
+        shell.fetch(f'{there}/nowhere', tmp_path / 'back', known=None, limit=1 << 30,
+                    timeout=60.0)
     assert set(os.listdir('/proc/self/fd')) == before
 
 
@@ -170,4 +171,5 @@ def test_large_folders_go_both_ways(shell, tmp_path):
 def test_folders_begin_in_the_home(folder, there, monkeypatch):
     monkeypatch.setenv('HOME', '/home/robot')
     assert sync.place(folder, remote=True) == f'machine:{there}'
-    assert sync.place(folder, remote=False).rstrip('/') == folder.replace('~', '/home/robot').rstrip('/')
+    here = sync.place(folder, remote=False)
+    assert here.rstrip('/') == folder.replace('~', '/home/robot').rstrip('/')
