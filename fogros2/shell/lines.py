@@ -9,6 +9,7 @@ import threading
 from typing import Optional, Protocol
 
 from fogros2.errors import ConnectError, FogError
+from fogros2.process import Tail
 from fogros2.untrusted import clean
 
 #: Maximum bytes of a line, so that a machine cannot fill the robot's memory: JSON of empty lists
@@ -149,7 +150,7 @@ class Output:
         self.pid = 0
         self._head: Optional[bytes] = b'' if announced else None
         self._on_output = on_output
-        self._out, self._err = _Tail(), _Tail()
+        self._out, self._err = Tail(KEPT), Tail(KEPT)
         self._rest = b''
 
     def add(self, out: bytes = b'', err: bytes = b'') -> None:
@@ -175,21 +176,3 @@ class Output:
             self._on_output(clean(self._rest.decode(errors='replace')))
             self._rest = b''
         return self._out.text(), clean(self._err.text())
-
-
-class _Tail:
-    """The last bytes of a stream."""
-
-    def __init__(self) -> None:
-        self._data = bytearray()
-        self._dropped = 0
-
-    def add(self, data: bytes) -> None:
-        self._data += data
-        if len(self._data) > KEPT + MAX_LINE:
-            self._dropped += len(self._data) - KEPT
-            del self._data[:-KEPT]
-
-    def text(self) -> str:
-        text = self._data.decode(errors='replace')
-        return f'[{self._dropped} earlier bytes were dropped]\n{text}' if self._dropped else text

@@ -32,6 +32,7 @@ from fogros2.errors import (
 )
 from fogros2.model import Command, Endpoint, Result, SyncReport
 from fogros2.shell import command_line, relay, Shell, ssh_connection
+from fogros2.shell.lines import KEPT
 
 #: Bytes from which a separate connection of OpenSSH is faster.
 BULK = 64 << 20
@@ -84,7 +85,7 @@ class RsyncShell(Shell):
                 rsync(source, target, excludes=excludes, includes=includes, rsh=rsh,
                       compress=bulk, progress=on_progress is not None),
                 timeout=max(0.1, timeout - (time.monotonic() - begin)), cancel=cancel,
-                check=False, inherited=files,
+                check=False, inherited=files, kept=KEPT,
                 on_output=None if on_progress is None else Progress(on_progress))
         if failures:
             raise failures[0]
@@ -112,7 +113,8 @@ class RsyncShell(Shell):
             result = process.run(
                 Command((*words, '--', place(source, remote=bool(rsh)), f'{target}/'),
                         environment={'LC_ALL': 'C', **rsh}, what='rsync'),
-                timeout=timeout, cancel=room, check=False, inherited=files)
+                timeout=timeout, cancel=room, check=False, inherited=files,
+                kept=KEPT)
         if failures:
             raise failures[0]
         room.measure()

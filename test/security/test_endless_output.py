@@ -144,6 +144,38 @@ shell.open"""), tmp_path)
     assert said == ['ConnectError'] and taken < LIMIT
 
 
+#: Copies a folder to a machine whose rsync writes errors without end.
+COPIES = f"""\
+import os
+from pathlib import Path
+from fogros2.errors import FogError
+from fogros2.shell import relay, sync
+from fogros2.model import Endpoint
+Path('source').mkdir()
+class Shell(sync.RsyncShell):
+    endpoint, where = Endpoint('guest'), "'planner'"
+    def run(self, command, **options):
+        return type('Done', (), {{'stdout': ''}})
+    open = interactive = close = None
+    def _remote_shell(self):
+        def flood(line, stdin, stdout, stderr):
+            for _ in range({AMOUNT} // {PIECE}):
+                os.write(stderr, {'bytes(%d)' % PIECE})
+            return 1
+        return relay.remote_shell(flood)
+# attack
+try:
+    Shell().sync(Path('source'), '/target', excludes=(), timeout=60.0)
+except FogError as error:
+    print(type(error).__name__)
+"""
+
+
+def test_rsync_that_only_complains_fills_no_memory(tmp_path: Path) -> None:
+    taken, said = measure(COPIES, tmp_path)
+    assert said == ['ConnectError'] and taken < LIMIT
+
+
 @pytest.fixture
 def linked() -> Iterator[tuple[multiplexed.Link, socket.socket]]:
     ours, theirs = socket.socketpair()
