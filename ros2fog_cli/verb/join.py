@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from ros2fog_cli.verb import VerbExtension
+from ros2fog_cli.verb import confirmed, VerbExtension
 
 
 class JoinVerb(VerbExtension):
@@ -20,6 +20,6 @@ class JoinVerb(VerbExtension):
         from fogros2.deploy import membership
         from fogros2.store import Store
         from ros2fog_cli.api import joining, reach
-        folder = membership.join(args.invitation, Store())
+        folder = membership.join(args.invitation, Store(), agreed=confirmed)
         print(*joining.shell_lines(folder, reach.variables_of(folder)), sep='\n')
         return 0
