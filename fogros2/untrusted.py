@@ -4,7 +4,7 @@ Check text that a machine, a host, a guest or a tag supplied, where it enters th
 
 A hijacked machine may send anything. So such text becomes a value only here: names by
 :func:`matched`, numbers by :func:`number`, JSON by :func:`parsed`, its fields by :func:`checked`.
-:func:`clean` makes text fit for a terminal.
+:func:`clean` and :func:`one_line` make text fit for a terminal.
 """
 
 from __future__ import annotations
@@ -186,3 +186,9 @@ def clean(text: str) -> str:
     if text.isprintable():
         return text
     return _NO_COLOUR.sub(_REPLACEMENT, text.replace('\r\n', '\n')).translate(_VISIBLE)
+
+
+def one_line(text: str) -> str:
+    """Return a text in one line and without colours, as for a cell of a table."""
+    return ''.join(character if character.isprintable() else ' ' if character in '\t\n\r'
+                   else _REPLACEMENT for character in text)

@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 
 from fogros2.errors import CommandError
 from fogros2.model import Command, Result
-from fogros2.untrusted import clean
 
 _ANNOUNCE = 'echo $$; exec "$@"'
 
@@ -72,7 +70,6 @@ def checked(command: Command, result: Result, where: str) -> Result:
     :raises CommandError: the exit status is not zero.
     """
     if result.returncode != 0:
-        result = dataclasses.replace(result, stdout=clean(result.stdout))
         raise CommandError(
             command, result, where, hint_for(result.returncode, result.stderr, where))
     return result

@@ -10,7 +10,6 @@ from typing import Optional, Protocol
 
 from fogros2.errors import ConnectError, FogError
 from fogros2.process import Tail
-from fogros2.untrusted import clean
 
 #: Maximum bytes of a line, so that a machine cannot fill the robot's memory: JSON of empty lists
 #: takes 40 times as much when it is parsed. An agent's longest messages are output of 64 K
@@ -168,11 +167,11 @@ class Output:
                 lines.append(self._rest)
                 self._rest = b''
             for line in lines:
-                self._on_output(clean(line.decode(errors='replace')))
+                self._on_output(line.decode(errors='replace'))
 
     def text(self) -> tuple[str, str]:
-        """Return standard output, and standard error cleaned; pass an incomplete last line on."""
+        """Return standard output and standard error; pass an incomplete last line on."""
         if self._on_output is not None and self._rest:
-            self._on_output(clean(self._rest.decode(errors='replace')))
+            self._on_output(self._rest.decode(errors='replace'))
             self._rest = b''
-        return self._out.text(), clean(self._err.text())
+        return self._out.text(), self._err.text()

@@ -219,7 +219,7 @@ class HostedProvider(Provider):
             yield
         except ValueError as error:
             raise ProviderError(f"the host '{self._host(host)[0].name}' reports a machine "
-                                f'wrongly: {error}', 'it may be hijacked') from error
+                                f'wrongly: {error}', 'the host may be hijacked') from error
 
     def _machine(self, host: str, report: Any) -> Machine:
         """Return a machine as the robot sees it, from the report of its host."""
