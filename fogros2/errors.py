@@ -30,6 +30,8 @@ from collections.abc import Collection
 import difflib
 from typing import Optional, TYPE_CHECKING
 
+from fogros2.untrusted import clean
+
 if TYPE_CHECKING:
     from fogros2.model import Command, Result
 
@@ -38,7 +40,7 @@ class FogError(RuntimeError):
     """
     A failure with a known cause.
 
-    :param message: what failed, where and why, in one line.
+    :param message: what failed, where and why, in one line; may contain text of a machine.
     :param hint: the remedy, in one line; may be empty.
     """
 
@@ -50,8 +52,8 @@ class FogError(RuntimeError):
     undo_failures: tuple[FogError, ...] = ()
 
     def __init__(self, message: str, hint: str = '') -> None:
-        super().__init__(message)
-        self.hint = hint
+        super().__init__(clean(message))
+        self.hint = clean(hint)
 
     def __str__(self) -> str:
         message = str(self.args[0])

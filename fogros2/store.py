@@ -208,7 +208,7 @@ class Store:
 
     def delete(self, name: str) -> None:
         """Remove a machine's folder with its content."""
-        shutil.rmtree(self.machine(name), ignore_errors=True)
+        delete_folder(self.machine(name))
 
     @contextlib.contextmanager
     def lock(self, name: str) -> Iterator[None]:
@@ -261,7 +261,7 @@ class Store:
             if not unfinished or process_start(int(unfinished[1])) is not None:
                 continue
             if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
+                delete_folder(path)
             else:
                 path.unlink(missing_ok=True)
         for path in (self.root / 'machines').glob('*'):
@@ -358,6 +358,23 @@ def write_private(path: Path, data: bytes) -> None:
             raise
     except OSError as error:
         raise _not_written(path, error) from error
+
+
+def delete_folder(path: Path) -> None:
+    """
+    Delete a folder with its content, also with folders inside that nobody may write.
+
+    Nodes may have made such folders, of which a checkpoint is a copy.
+    """
+    shutil.rmtree(path, ignore_errors=True)
+    if path.is_dir():
+        path.chmod(0o700)
+        for parent, names, _ in os.walk(path):
+            for name in names:
+                with contextlib.suppress(OSError):
+                    if not os.path.islink(folder := os.path.join(parent, name)):
+                        os.chmod(folder, 0o700)
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def process_folder() -> Path:

@@ -23,7 +23,7 @@ import sys
 import threading
 from typing import Literal, Optional
 
-from fogros2 import process
+from fogros2 import process, untrusted
 from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError, WorkspaceError
 from fogros2.host import dependencies as needs
 from fogros2.host import inspection as host
@@ -187,9 +187,9 @@ def ensure(
         robot = here.result()
     try:
         facts = host.parse_facts(there.stdout)
-    except ValueError as error:
+    except untrusted.InvalidMessage as error:
         raise PrerequisiteError(
-            f"'{spec.name}' describes itself with a value that is no number: {error}",
+            f"'{spec.name}' describes itself wrongly: {error}",
             'its login shell or its programs are not what they seem: use another machine'
         ) from error
     if elsewhere:

@@ -229,8 +229,9 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
         raise ConnectError(f"the connection to '{self.name}' was lost while "
                            f'{_what(command)} ran there', "check the robot's network")
 
-    def _remote_shell(self) -> contextlib.AbstractContextManager[sync.RemoteShell]:
-        return relay.remote_shell(self.start)
+    def _remote_shell(self) -> contextlib.AbstractContextManager[relay.RemoteShell]:
+        return relay.remote_shell(
+            lambda line, *streams: relay.relay(self.start(line), *streams))
 
     def open(self, command: Command) -> Stream:
         """Start a program on the machine; closing the returned stream ends the program."""

@@ -193,13 +193,16 @@ def test_a_stopped_terminal_does_not_stop_the_vpn_helper(root: None) -> None:
 
 def test_no_account_can_connect_to_a_sync() -> None:
     """Its socket has no name; rsync's remote shell inherits it."""
-    with relay.remote_shell(lambda line: Said()) as (rsh, inherited, failures):
+    with relay.remote_shell(lambda line, *streams: relay.relay(Said(), *streams)) \
+            as (variables, inherited, failures):
         # a test that runs beside this one holds its DDS domain by a name of its own
         named = re.findall('@fogros2(?!-test-domain).*', Path('/proc/net/unix').read_text())
         assert named == []
         # as rsync starts it
-        done = subprocess.run([*shlex.split(rsh), 'machine', 'rsync', '--server'], timeout=10,
-                              stdin=subprocess.DEVNULL, capture_output=True, pass_fds=inherited)
+        done = subprocess.run(
+            [*shlex.split(relay.RSH), 'machine', 'rsync', '--server'], timeout=10,
+            stdin=subprocess.DEVNULL, capture_output=True, pass_fds=inherited,
+            env={**os.environ, **variables})
     assert (done.stdout, done.returncode, failures) == (b'from the machine\n', 7, [])
 
 

@@ -24,7 +24,7 @@ PACKAGES = ('fogros2_replicas', 'fogros2_share', 'image_transport_h264', 'point_
 #: modules (``name``), lowest first. All imports count, also late ones and those for types.
 #: ``image_transport`` is above ``host``, which knows the modules that its nodes import.
 ORDER = """
-    model errors events clock
+    model untrusted errors events clock
     waiting report process
     agent cloud_launch
     plugin_system store journal ros2_daemon monitor_addresses sealing invitation

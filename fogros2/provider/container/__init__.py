@@ -16,12 +16,11 @@ import contextlib
 import json
 import os
 from pathlib import Path
-import re
 import stat
 import tempfile
 from typing import Any, ClassVar, Optional
 
-from fogros2 import process
+from fogros2 import process, untrusted
 from fogros2.errors import (
     CommandError,
     DeadlineExceeded,
@@ -102,9 +101,8 @@ umask 077
 until mkdir -p "$1" && chmod 1777 "$1" && chmod 755 "${1%/*}"; do sleep 0.1; done
 """
 
-#: Maximum size of a host key's file in bytes, and the form of a key.
+#: Maximum size of a host key's file in bytes.
 _KEY_BYTES = 4096
-_HOST_KEY = re.compile('ssh-[a-z0-9-]+ [A-Za-z0-9+/=]+')
 _READ_PLAIN = f'[ -f "$1" ] && [ ! -L "$1" ] && head -c {_KEY_BYTES} -- "$1"'
 
 #: Exit statuses of a regular end, SIGKILL and SIGTERM.
@@ -380,7 +378,7 @@ class ContainerProvider(Provider):
                 Command(('sh', '-c', _READ_PLAIN, 'sh', str(path)), sudo=True), timeout=10.0,
                 check=False).stdout
         key = ' '.join(text.split()[:2])
-        if not _HOST_KEY.fullmatch(key):
+        if not untrusted.HOST_KEY.fullmatch(key):
             return None
         self._host_keys[identity] = key
         return key

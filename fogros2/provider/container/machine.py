@@ -32,6 +32,8 @@ _OURS = (ATTEMPT, LOGIN, MACHINE, DIRECTORY, ENDS_STOPPED, VPN_PORT)
 ROOTS = Path('/var/lib/fogros2')
 #: Folders by which relays of shared topics meet: of each user of this computer, of each machine.
 SHARED = Path('/var/lib/fogros2-share')
+#: A machine's id: its engine, its container's id, its token.
+ID = re.compile(r'(podman|docker):([0-9a-f]{12}):([A-Za-z0-9_-]+)')
 
 _STATES = {
     'created': MachineState.PENDING, 'configured': MachineState.PENDING,
@@ -80,7 +82,7 @@ def parse_id(machine_id: str) -> tuple[Engine, str, str]:
 
     :raises MachineNotFound: it is no id of this provider.
     """
-    match = re.fullmatch(r'(podman|docker):([0-9a-f]{12}):([A-Za-z0-9_-]+)', machine_id)
+    match = ID.fullmatch(machine_id)
     if not match:
         raise MachineNotFound(f"'{machine_id}' is no container machine")
     return container_engine.named(match[1]), match[2], match[3]

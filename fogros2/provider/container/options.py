@@ -12,6 +12,7 @@ from pathlib import Path
 import re
 from typing import Any
 
+from fogros2 import untrusted
 from fogros2.errors import ConfigurationError
 from fogros2.model import CreateRequest, MachineSpec
 from fogros2.provider.container import engine as container_engine
@@ -89,7 +90,7 @@ def _check_values(options: Options) -> None:
     if options.engine == 'docker' and not options.image:
         raise ConfigurationError("docker can't use this computer's own root",
                                  "name an image with image='...', or take engine='podman'")
-    if not re.fullmatch(r'[a-z_][a-z0-9_-]{0,31}', options.user):
+    if not untrusted.NAME.fullmatch(options.user):
         raise ConfigurationError(
             f"'{options.user}' can't be a user name",
             'user= takes small letters, digits, - and _, beginning with a letter')

@@ -17,7 +17,7 @@ import threading
 import time
 from typing import Any, ClassVar, Optional
 
-from fogros2 import kubernetes_client
+from fogros2 import kubernetes_client, untrusted
 from fogros2.errors import (
     ConfigurationError,
     MachineNotFound,
@@ -309,11 +309,12 @@ class KubernetesProvider(Provider):
         tags = names.tags_of(job)
         status = (pod or {}).get('status') or {}
         shell = None
-        if pod is not None and state is MachineState.RUNNING:
+        user = names.annotation(job, names.LOGIN)
+        if pod is not None and state is MachineState.RUNNING and untrusted.NAME.fullmatch(user):
             shell = Endpoint(
                 'kubernetes', names.endpoint_host(
                     where.namespace, str(pod['metadata']['name']), where.context),
-                0, names.annotation(job, names.LOGIN))
+                0, user)
         address = str(status.get('podIP') or '')
         return Machine(
             id=str(where), name=tags.get('fogros2-name', where.job), provider=self.name,
