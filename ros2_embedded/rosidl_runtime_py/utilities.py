@@ -4,6 +4,7 @@
 import importlib
 from typing import Any
 
+from ament_index_python import has_resource
 from rosidl_embedded.lacking import NotEmbeddedError
 
 
@@ -15,6 +16,11 @@ def _import(identifier: str, kind: str | None) -> Any:
         raise ValueError(f"'{identifier}' is not of the form package/kind/Name")
     if parts[1] == 'action':
         raise NotEmbeddedError(f'the action {identifier}')
+    # others choose the types of their topics: no other module is imported for them
+    if parts[1] not in ('msg', 'srv'):
+        raise ValueError(f"'{identifier}' is neither a message nor a service")
+    if not has_resource('rosidl_interfaces', parts[0]):
+        raise ModuleNotFoundError(f"No package '{parts[0]}' with interfaces is installed")
     return getattr(importlib.import_module('.'.join(parts[:2])), parts[2])
 
 
