@@ -16,11 +16,17 @@ import socket
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
+
+import pytest
 
 from fogros2 import process
 from fogros2.model import Command
 from fogros2.shell import relay
 from fogros2.testing.fakes import FakeShell
+from fogros2.vpn.guests import Door
+from fogros2.waiting import wait_until
+from fogros2_monitor import accounts
 from fogros2_monitor.dashboard.server import Dashboard
 from fogros2_monitor.gate import Gate
 from fogros2_monitor.tunnel import Tunnel
@@ -77,10 +83,12 @@ finally:
     os.kill(child, signal.SIGKILL)
     shutil.rmtree(top)
 """
+#: The loopback interface for sockets of both address families.
+FAMILIES = pytest.mark.parametrize('address', ['127.0.0.1', '::ffff:127.0.0.1'])
 #: Opens many connections to a port of the loopback, and counts those that the server closes.
 MANY = """\
 import socket
-links = [socket.create_connection(('127.0.0.1', int(sys.argv[1]))) for _ in range(150)]
+links = [socket.create_connection((sys.argv[2], int(sys.argv[1]))) for _ in range(150)]
 closed = 0
 for link in links:
     link.settimeout(10)
@@ -92,6 +100,14 @@ for link in links:
         break
 print(closed, flush=True)
 sys.stdin.read()
+"""
+#: Opens a connection, and closes its socket at once.
+LEAVE = """\
+import socket
+link = socket.create_connection((sys.argv[2], int(sys.argv[1])), 10)
+link.sendall(b'GET / HTTP/1.0\\r\\n\\r\\n')
+link.close()
+print('left', flush=True)
 """
 
 
@@ -159,11 +175,12 @@ def test_no_account_can_connect_to_a_sync() -> None:
     assert (done.stdout, done.returncode, failures) == (b'from the machine\n', 7, [])
 
 
-def test_no_account_takes_up_the_dashboard_s_threads(root: None) -> None:
+@FAMILIES
+def test_no_account_takes_up_the_dashboard_s_threads(root: None, address: str) -> None:
     dashboard = Dashboard(None)  # type: ignore[arg-type]
     threading.Thread(target=dashboard.serve, daemon=True).start()
     before = threading.active_count()
-    with stranger(MANY, str(dashboard.port)) as child:
+    with stranger(MANY, str(dashboard.port), address) as child:
         assert child.stdout and child.stdout.readline() == b'150\n'
         assert threading.active_count() == before
         with socket.create_connection(('127.0.0.1', dashboard.port)) as own:
@@ -172,23 +189,25 @@ def test_no_account_takes_up_the_dashboard_s_threads(root: None) -> None:
     dashboard.close()
 
 
-def test_no_account_starts_programs_through_the_tunnel(root: None) -> None:
+@FAMILIES
+def test_no_account_starts_programs_through_the_tunnel(root: None, address: str) -> None:
     shell = FakeShell(streams=[])
     made = Tunnel(shell, ('127.0.0.1', 9))
     threading.Thread(target=made.serve, daemon=True).start()
-    with stranger(MANY, str(made.port)) as child:
+    with stranger(MANY, str(made.port), address) as child:
         assert child.stdout and child.stdout.readline() == b'150\n'
     assert shell.opened == []
     made.close()
 
 
-def test_no_account_takes_up_the_gate_s_connections(root: None) -> None:
+@FAMILIES
+def test_no_account_takes_up_the_gate_s_connections(root: None, address: str) -> None:
     async def knock() -> bytes:
         listener = socket.create_server(('127.0.0.1', 0))
         listener.setblocking(False)
         port = listener.getsockname()[1]
         serving = asyncio.ensure_future(Gate(('127.0.0.1', 9), 'token').serve(listener))
-        with stranger(MANY, str(port)) as child:
+        with stranger(MANY, str(port), address) as child:
             assert child.stdout
             closed = await asyncio.to_thread(child.stdout.readline)
             assert closed == b'150\n'
@@ -200,3 +219,57 @@ def test_no_account_takes_up_the_gate_s_connections(root: None) -> None:
         return answer
 
     assert loops.run(knock()).startswith(b'HTTP/1.1 401 ')
+
+
+@FAMILIES
+def test_no_account_takes_up_the_door_for_guests(
+    root: None, address: str, tmp_path: Path,
+) -> None:
+    (tmp_path / 'guests').write_text('[]')
+    door = Door(SimpleNamespace(state=tmp_path / 'guests'),  # type: ignore[arg-type]
+                {'address': '127.0.0.1', 'port': 0, 'agent': __file__})
+    threading.Thread(target=door.serve_forever, daemon=True).start()
+    with stranger(MANY, str(door.server_address[1]), address) as child:
+        assert child.stdout and child.stdout.readline() == b'150\n'
+    door.shutdown()
+    door.server_close()
+
+
+def unowned(link: socket.socket) -> bool:
+    """Return whether the kernel lists a client's socket without its account."""
+    ports = [f':{name[1]:04X}' for name in (link.getpeername(), link.getsockname())]
+    lines = [line.split() for table in ('tcp', 'tcp6')
+             for line in Path('/proc/net', table).read_text().splitlines()[1:]]
+    return ['0'] == [fields[7] for fields in lines
+                     if all(map(str.endswith, fields[1:3], ports))]
+
+
+@FAMILIES
+def test_closed_socket_of_an_account_is_foreign(root: None, address: str) -> None:
+    """The kernel lists a closed socket as root's."""
+    with socket.create_server(('127.0.0.1', 0)) as listener:
+        with stranger(LEAVE, str(listener.getsockname()[1]), address) as child:
+            assert child.stdout and child.stdout.readline() == b'left\n'
+        with listener.accept()[0] as link:
+            wait_until(lambda: unowned(link), timeout=10.0, what='the last ACK')
+            assert accounts.is_foreign(link)
+
+
+@pytest.mark.parametrize(('peer', 'foreign'), [
+    (('127.0.0.1', 1), True), (('127.3.2.1', 1), True), (('::1', 1, 0, 0), True),
+    (('::ffff:127.0.0.1', 1, 0, 0), True), (('198.51.100.7', 1), False),
+    (('::ffff:198.51.100.7', 1, 0, 0), False), (('2001:db8::7', 1, 0, 0), False)])
+def test_unlisted_client_is_foreign_on_this_computer(
+    peer: tuple[str, int], foreign: bool,
+) -> None:
+    """The gate serves computers of the VPN too, whose accounts are unknown here."""
+    link = SimpleNamespace(getpeername=lambda: peer, getsockname=lambda: peer)
+    assert accounts.is_foreign(link) == foreign  # type: ignore[arg-type]
+
+
+@FAMILIES
+def test_own_client_is_not_foreign(address: str) -> None:
+    with socket.create_server(('127.0.0.1', 0)) as listener, \
+            socket.create_connection((address, listener.getsockname()[1])), \
+            listener.accept()[0] as link:
+        assert not accounts.is_foreign(link)
