@@ -8,6 +8,8 @@ The account is ``nobody``: it owns nothing and belongs to no group.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import http.client
 import os
 from pathlib import Path
 import re
@@ -17,6 +19,7 @@ import subprocess
 import sys
 import threading
 from types import SimpleNamespace
+import urllib.parse
 
 import pytest
 
@@ -32,6 +35,7 @@ from fogros2_monitor.gate import Gate
 from fogros2_monitor.tunnel import Tunnel
 from rigs import loops
 from rigs.stranger import stranger
+from ros2fog_cli.api.browser import Ticket
 
 ROOT = Path(__file__).resolve().parents[2]
 #: The helper's folder, as an older version left it or not there yet, is opened by another account
@@ -100,6 +104,16 @@ for link in links:
         break
 print(closed, flush=True)
 sys.stdin.read()
+"""
+#: Asks a port of the loopback for a page, and says what it answered.
+ASK = """\
+import socket
+link = socket.create_connection((sys.argv[2], int(sys.argv[1])), 10)
+try:
+    link.sendall(f'GET {sys.argv[3]} HTTP/1.0\\r\\n\\r\\n'.encode())
+    print(link.recv(1000), flush=True)
+except ConnectionError:
+    print(b'', flush=True)
 """
 #: Opens a connection, and closes its socket at once.
 LEAVE = """\
@@ -233,6 +247,19 @@ def test_no_account_takes_up_the_door_for_guests(
         assert child.stdout and child.stdout.readline() == b'150\n'
     door.shutdown()
     door.server_close()
+
+
+@FAMILIES
+def test_no_account_gets_the_page_of_a_browser(root: None, address: str) -> None:
+    """Every account can read the ticket on the command line of the browser."""
+    with contextlib.closing(Ticket('http://127.0.0.1:9/#token')) as ticket:
+        place = urllib.parse.urlsplit(ticket.url)
+        with stranger(ASK, str(place.port), address, place.path) as child:
+            assert child.stdout and child.stdout.readline() == b"b''\n"
+        # the ticket is not used up either
+        with contextlib.closing(http.client.HTTPConnection(place.netloc, timeout=10)) as own:
+            own.request('GET', place.path)
+            assert own.getresponse().getheader('Location') == 'http://127.0.0.1:9/#token'
 
 
 def unowned(link: socket.socket) -> bool:
