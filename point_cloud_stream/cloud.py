@@ -79,9 +79,9 @@ class Layout:
             raise CloudError('more than 255 fields, or a name of more bytes')
         for field in self.fields:
             if not 0 < field.datatype < len(SIZES):
-                raise CloudError(f"field '{field.name}' has an unknown datatype")
+                raise CloudError('a field has an unknown datatype')
             if field.offset + field.size > self.point_step:
-                raise CloudError(f"field '{field.name}' ends after the point")
+                raise CloudError('a field ends after the point')
         self.places()
 
     def places(self) -> list[int]:
