@@ -24,7 +24,7 @@ REMEMBERED, MISSES = 512, 10
 STREAK = 3
 #: An input that is so many nanoseconds older than the newest one means that time was set back.
 SET_BACK = 1_000_000_000
-#: Bytes of a frame id that are compared, and different ones of one stamp that are told apart.
+#: Bytes of a frame id that are compared; maximum number of different ids of one stamp.
 FRAME, FRAMES = 256, 1000
 
 
