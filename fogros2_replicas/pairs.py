@@ -24,6 +24,8 @@ REMEMBERED, MISSES = 512, 10
 STREAK = 3
 #: An input that is so many nanoseconds older than the newest one means that time was set back.
 SET_BACK = 1_000_000_000
+#: Bytes of a frame id that are compared; maximum number of different ids of one stamp.
+FRAME, FRAMES = 256, 1000
 
 
 def header_of(data: bytes) -> Optional[Header]:
@@ -39,7 +41,7 @@ def header_of(data: bytes) -> Optional[Header]:
     seconds, nanoseconds, length = struct.unpack_from('<iII' if little else '>iII', data, 4)
     if len(data) < 16 + length:
         return None
-    frame = data[16:16 + max(0, length - 1)].decode(errors='replace')
+    frame = data[16:16 + min(max(0, length - 1), FRAME)].decode(errors='replace')
     return seconds * 1_000_000_000 + nanoseconds, frame
 
 
@@ -112,6 +114,8 @@ class Pair:
             self._newest = stamp
             self._came.clear()
             self._forwarded.clear()
+        if len(self._came) == FRAMES and (name, frame) not in self._came:
+            return False
         self._came[name, frame] += 1
         if self._came[name, frame] <= self._forwarded[frame]:
             return False

@@ -20,8 +20,8 @@ import threading
 import pytest
 
 from fogros2 import monitor_addresses
-from fogros2_monitor import credentials, page
-from fogros2_monitor.gate import endpoint, network, plain_address
+from fogros2_monitor import accounts, credentials, page
+from fogros2_monitor.gate import endpoint, network
 from fogros2_monitor.request import check, check_site, cookie, parse, Refused
 
 TOKEN = 'sesame-0123456789'
@@ -135,8 +135,8 @@ def test_endpoint_is_an_address_and_a_port():
 
 
 def test_ipv4_address_is_the_same_on_an_ipv6_socket():
-    assert plain_address('::ffff:198.51.100.1') == '198.51.100.1'
-    assert plain_address('fe80::1%eth0') == 'fe80::1'
+    assert accounts.plain_address('::ffff:198.51.100.1') == '198.51.100.1'
+    assert accounts.plain_address('fe80::1%eth0') == 'fe80::1'
     with pytest.raises(Exception, match='host bits'):
         network('198.51.100.1/28')
 
