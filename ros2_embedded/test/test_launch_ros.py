@@ -9,7 +9,12 @@ import subprocess
 import sys
 
 from launch import LaunchContext, LaunchDescription, LaunchService
-from launch.actions import GroupAction, IncludeLaunchDescription, OpaqueFunction
+from launch.actions import (
+    GroupAction,
+    IncludeLaunchDescription,
+    OpaqueFunction,
+    TimerAction,
+)
 import launch.logging
 from launch.substitutions import (
     LaunchConfiguration,
@@ -156,6 +161,17 @@ def test_pushed_namespace_ends_with_its_group():
     assert context.launch_configurations['ros_namespace'] == '/d'
     with pytest.raises(SubstitutionFailure, match='The resulting namespace is invalid'):
         PushROSNamespace('1').execute(context)
+
+
+def test_timed_node_has_namespace_and_remappings_of_its_group():
+    node = Node(package='pkg', executable='exe', name='n')
+    service = LaunchService(noninteractive=True)
+    service.include_launch_description(LaunchDescription([GroupAction([
+        PushROSNamespace('front'), SetRemap('a', 'b'), SetParameter('p', 1),
+        TimerAction(period=0.05, actions=[node])])]))
+    assert service.run() == 0
+    assert node.node_name == '/front/n' and node.expanded_remapping_rules == [('a', 'b')]
+    assert 'p:=1' in node.process_details['cmd']
 
 
 def test_global_parameters_and_remappings_come_first(tmp_path):

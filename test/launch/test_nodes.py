@@ -11,8 +11,10 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import (
     DeclareLaunchArgument,
     EmitEvent,
+    GroupAction,
     IncludeLaunchDescription,
     RegisterEventHandler,
+    TimerAction,
 )
 from launch.conditions import IfCondition
 from launch.event_handlers import OnProcessStart
@@ -127,6 +129,15 @@ def test_node_runs_on_its_machine(run, fake, planner, cls):
         away])) == 0
     assert started(fake) == [('planner', 'talker')] and seen == [4001]
     assert run.context.environment['RMW_IMPLEMENTATION'] == 'rmw_cyclonedds_cpp'
+
+
+def test_timed_node_has_namespace_and_remappings_of_its_group(run, fake, planner):
+    fake.on_start = ends
+    assert run(LaunchDescription([GroupAction([
+        launch_ros.actions.PushROSNamespace('front'), launch_ros.actions.SetRemap('a', 'b'),
+        TimerAction(period=0.05, actions=[node(machine=planner)])])])) == 0
+    [sent] = fake.machines['planner'].all
+    assert {'__ns:=/front', 'a:=b'} <= {*sent.arguments}
 
 
 @pytest.mark.parametrize('name', [
