@@ -271,10 +271,24 @@ def test_namespaces_are_joined(base, name, expected):
     assert make_namespace_absolute('a') == '/a' and make_namespace_absolute(None) is None
 
 
+def test_path_is_a_text_for_nodes(tmp_path, prefix):
+    file = tmp_path / 'p.yaml'
+    file.write_text('{}')
+    got, _ = command(
+        executable=Path('exe'), name='n', arguments=[Path('/a b')],
+        parameters=[file, FindPackageShare('pkg') / 'none.yaml',
+                    {'one': Path('/x'), 'some': [Path('/y'), 'z']}], remappings=[])
+    assert got[:2] == ['/a b', '--ros-args'] and got[5] == str(file)
+    assert plain(load(got[7])) == {'/**': {'ros__parameters': {
+        'one': '/x', 'some': ['/y', 'z']}}}
+
+
 def test_substitutions_find_packages_and_executables(prefix):
     context = LaunchContext()
     assert FindPackagePrefix('pkg').perform(context) == str(prefix)
     assert FindPackageShare(['p', 'kg']).perform(context) == str(prefix / 'share' / 'pkg')
+    path = FindPackageShare('pkg') / 'launch' / Path('x.py')
+    assert path.perform(context) == str(prefix / 'share' / 'pkg' / 'launch' / 'x.py')
     executable = ExecutableInPackage(package='pkg', executable='exe')
     assert executable.perform(context) == str(prefix / 'lib' / 'pkg' / 'exe')
     assert executable.describe() == "ExecInPkg(pkg='pkg', exec='exe')"

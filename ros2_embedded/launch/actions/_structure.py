@@ -101,7 +101,9 @@ class IncludeLaunchDescription(_base.Action):
     @classmethod
     def parse(cls, entity: Entity, parser: Parser) -> _base.ParsedAction:
         _, kwargs = super().parse(entity, parser)
-        kwargs['launch_arguments'] = (simple.parse_pairs(entity, parser, 'arg') or {}).items()
+        kwargs['launch_arguments'] = [
+            pair for element in ('arg', 'let')
+            for pair in (simple.parse_pairs(entity, parser, element) or {}).items()]
         return cls, kwargs
 
     def get_sub_entities(self) -> _base.Entities:

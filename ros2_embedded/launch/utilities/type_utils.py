@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections.abc
+import os
 from typing import Any, List, TYPE_CHECKING
 
 from rosidl_embedded.lacking import lacking
@@ -137,6 +138,8 @@ def normalize_typed_substitution(value: Any, data_type: Any) -> Any:
 
     :raises TypeError: if it can't be, or become, of the type.
     """
+    if isinstance(value, os.PathLike):
+        value = os.fspath(value)
     error = TypeError(f"value='{value}' of {type(value)} is not an instance of {data_type}")
     if isinstance(value, ScalarTypesTuple):
         if not is_instance_of(value, data_type):

@@ -8,6 +8,7 @@ looks like, so it is quoted as YAML does: what substitutions become is read as Y
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import os
 import pathlib
 from typing import Any, Iterator
 
@@ -33,6 +34,7 @@ def as_yaml(value: Any) -> str:
 
 def _normalize_array(value: Sequence[Any]) -> tuple[Any, ...]:
     kinds = set()
+    value = [os.fspath(item) if isinstance(item, os.PathLike) else item for item in value]
     for item in value:
         ensure_argument_type(
             item, (float, int, str, bool, *SomeSubstitutionsType_types_tuple), 'subvalue')
@@ -68,8 +70,8 @@ def normalize_parameter_dict(
         name = tuple(parts)
         if isinstance(value, Mapping):
             normalized.update(normalize_parameter_dict(value, _prefix=name))
-        elif isinstance(value, str):
-            normalized[name] = tuple(normalize(as_yaml(value)))
+        elif isinstance(value, (str, os.PathLike)):
+            normalized[name] = tuple(normalize(as_yaml(os.fspath(value))))
         elif isinstance(value, Substitution):
             normalized[name] = (value,)
         elif isinstance(value, (ParameterValue, float, bool, int, bytes)):
