@@ -241,30 +241,6 @@ def test_timer_action_runs_and_is_cancelled():
         TimerAction(period=1.0, actions=None)
 
 
-def test_timer_keeps_the_configurations_of_its_group():
-    notes = []
-    several = ['one']
-
-    def change(context):
-        several.append('two')
-        context.launch_configurations['a'] = 'changed by the timer'
-
-    assert run(
-        SetLaunchConfiguration('a', 'outer'),
-        GroupAction([
-            SetLaunchConfiguration('a', 'inner'), SetLaunchConfiguration('p', '0.05'),
-            OpaqueFunction(function=lambda context: context.launch_configurations.update(
-                several=several)),
-            TimerAction(period=LaunchConfiguration('p'), actions=[
-                note(notes, configuration('a')), note(notes, configuration('several')),
-                OpaqueFunction(function=change)])]),
-        OpaqueFunction(function=change),
-        SetLaunchConfiguration('a', 'outer'),
-        TimerAction(period=0.3, actions=[
-            note(notes, configuration('a')), note(notes, configuration('p'))])) == 0
-    assert notes == ['inner', ['one'], 'outer', None]
-
-
 def test_launch_waits_for_completion_futures():
     notes = []
 

@@ -9,12 +9,7 @@ import subprocess
 import sys
 
 from launch import LaunchContext, LaunchDescription, LaunchService
-from launch.actions import (
-    GroupAction,
-    IncludeLaunchDescription,
-    OpaqueFunction,
-    TimerAction,
-)
+from launch.actions import GroupAction, IncludeLaunchDescription, OpaqueFunction
 import launch.logging
 from launch.substitutions import (
     LaunchConfiguration,
@@ -163,17 +158,6 @@ def test_pushed_namespace_ends_with_its_group():
         PushROSNamespace('1').execute(context)
 
 
-def test_timed_node_has_namespace_and_remappings_of_its_group():
-    node = Node(package='pkg', executable='exe', name='n')
-    service = LaunchService(noninteractive=True)
-    service.include_launch_description(LaunchDescription([GroupAction([
-        PushROSNamespace('front'), SetRemap('a', 'b'), SetParameter('p', 1),
-        TimerAction(period=0.05, actions=[node])])]))
-    assert service.run() == 0
-    assert node.node_name == '/front/n' and node.expanded_remapping_rules == [('a', 'b')]
-    assert 'p:=1' in node.process_details['cmd']
-
-
 def test_global_parameters_and_remappings_come_first(tmp_path):
     file = tmp_path / 'global.yaml'
     file.write_text('{}')
@@ -271,24 +255,10 @@ def test_namespaces_are_joined(base, name, expected):
     assert make_namespace_absolute('a') == '/a' and make_namespace_absolute(None) is None
 
 
-def test_path_is_a_text_for_nodes(tmp_path, prefix):
-    file = tmp_path / 'p.yaml'
-    file.write_text('{}')
-    got, _ = command(
-        executable=Path('exe'), name='n', arguments=[Path('/a b')],
-        parameters=[file, FindPackageShare('pkg') / 'none.yaml',
-                    {'one': Path('/x'), 'some': [Path('/y'), 'z']}], remappings=[])
-    assert got[:2] == ['/a b', '--ros-args'] and got[5] == str(file)
-    assert plain(load(got[7])) == {'/**': {'ros__parameters': {
-        'one': '/x', 'some': ['/y', 'z']}}}
-
-
 def test_substitutions_find_packages_and_executables(prefix):
     context = LaunchContext()
     assert FindPackagePrefix('pkg').perform(context) == str(prefix)
     assert FindPackageShare(['p', 'kg']).perform(context) == str(prefix / 'share' / 'pkg')
-    path = FindPackageShare('pkg') / 'launch' / Path('x.py')
-    assert path.perform(context) == str(prefix / 'share' / 'pkg' / 'launch' / 'x.py')
     executable = ExecutableInPackage(package='pkg', executable='exe')
     assert executable.perform(context) == str(prefix / 'lib' / 'pkg' / 'exe')
     assert executable.describe() == "ExecInPkg(pkg='pkg', exec='exe')"

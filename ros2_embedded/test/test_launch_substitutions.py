@@ -2,19 +2,11 @@
 """launch's substitutions, typed values and launch files in XML and YAML, by value."""
 
 import os
-from pathlib import Path
 import re
 from typing import List
 
 from launch import LaunchContext, LaunchDescription, LaunchService
-from launch.actions import (
-    DeclareLaunchArgument,
-    ExecuteProcess,
-    GroupAction,
-    IncludeLaunchDescription,
-    LogInfo,
-    SetEnvironmentVariable,
-)
+from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription, LogInfo
 from launch.frontend import expose_action, Parser
 from launch.frontend.parse_substitution import parse_substitution
 import launch.logging
@@ -31,11 +23,9 @@ from launch.substitutions import (
     NotSubstitution,
     OrSubstitution,
     PathJoinSubstitution,
-    PathSubstitution,
     PythonExpression,
     SubstitutionFailure,
     TextSubstitution,
-    ThisLaunchFileDir,
 )
 from launch.utilities import perform_substitutions
 from launch.utilities.type_utils import (
@@ -56,7 +46,7 @@ def context(tmp_path, monkeypatch):
     launch.logging.reset()
     made = LaunchContext()
     made.launch_configurations.update(a='1', word='hello', quote="it's")
-    made.extend_locals({'pair': {'x': 'y'}, 'current_launch_file_directory': '/launch'})
+    made.extend_locals({'pair': {'x': 'y'}})
     yield made
     launch.logging.reset()
 
@@ -72,11 +62,7 @@ A = LaunchConfiguration('a')
     (EnvironmentVariable('FOG_ENV'), 'from env'),
     (EnvironmentVariable('FOG_NO', default_value=A), '1'),
     (LocalSubstitution("pair['x']"), 'y'),
-    (PathJoinSubstitution(['/a', A, Path('b/c')]), '/a/1/b/c'),
-    (PathJoinSubstitution(['/a']) / A / Path('c') / 'd.x', '/a/1/c/d.x'),
-    (PathSubstitution(A) / 'b', '1/b'), (PathSubstitution(['/', A]) / '/c', '/c'),
-    (PathSubstitution(Path('/a')) / PathJoinSubstitution(['b', 'c']), '/a/b/c'),
-    (ThisLaunchFileDir() / 'x.py', '/launch/x.py'),
+    (PathJoinSubstitution(['/a', A, 'b']), '/a/1/b'),
     (PythonExpression(['1 + ', A]), '2'),
     (PythonExpression('pi > math.e'), 'True'),
     (PythonExpression('os.sep', ['os']), '/'),
@@ -94,32 +80,6 @@ A = LaunchConfiguration('a')
 def test_substitution_returns_its_value(context, substitution, text):
     assert substitution.perform(context) == text
     assert context.perform_substitution(substitution) == text
-
-
-def test_path_is_a_text(context, tmp_path, capsys):
-    """A pathlib.Path stands for its text wherever a launch file may give a text."""
-    included = tmp_path / 'included.py'
-    included.write_text('from launch import LaunchDescription\n'
-                        'from launch.actions import DeclareLaunchArgument, LogInfo\n'
-                        'from launch.substitutions import LaunchConfiguration\n'
-                        'def generate_launch_description():\n'
-                        "    return LaunchDescription([DeclareLaunchArgument('at'), LogInfo(\n"
-                        "        msg=['AT ', LaunchConfiguration('at')])])\n")
-    launch.logging.reset()
-    service = LaunchService(noninteractive=True)
-    service.include_launch_description(LaunchDescription([
-        LogInfo(msg=tmp_path), SetEnvironmentVariable('FOG_ENV', tmp_path / 'env'),
-        IncludeLaunchDescription(included, launch_arguments={'at': Path('a/b')}.items()),
-        DeclareLaunchArgument('with_default', default_value=Path('/d')),
-        ExecuteProcess(cmd=[Path('/bin/sh'), '-c', ['cd ', tmp_path, '; pwd; echo $FOG_ENV']],
-                       cwd=Path('/'), output='screen')]))
-    assert service.run() == 0
-    shown = capsys.readouterr().out
-    assert all(text in shown for text in (f'{tmp_path}\n', f'{tmp_path}/env', 'AT a/b'))
-    assert service.context.launch_configurations['with_default'] == '/d'
-    assert normalize_typed_substitution(Path('/x'), str) == '/x'
-    with pytest.raises(TypeError, match="'str', 'pathlib.Path' or 'launch.Substitution' were"):
-        LogInfo(msg=3)
 
 
 @pytest.mark.parametrize('substitution, error', [
@@ -297,20 +257,6 @@ def test_xml_and_yaml_launch_files_run(context, tmp_path, monkeypatch, capsys, n
         assert f'[INFO] [launch.user]: {text}' in out.splitlines()
     assert f'] two  words hello! {tmp_path}' in out
     assert 'never' not in out
-
-
-@pytest.mark.parametrize('content', [
-    '<launch><include file="$(dirname)/inner.launch.xml">'
-    '<let name="who" value="front"/><arg name="how" value="well"/></include></launch>',
-    'launch: [{include: {file: $(dirname)/inner.launch.xml, arg: [{name: how, value: well}],'
-    ' let: [{name: who, value: front}]}}]'], ids=['xml', 'yaml'])
-def test_include_passes_arguments_by_let_or_arg(context, tmp_path, capsys, content):
-    (tmp_path / 'inner.launch.xml').write_text(
-        '<launch><arg name="who"/><arg name="how"/>'
-        '<log message="GOT $(var who) $(var how)"/></launch>')
-    path = tmp_path / f'main.launch.{"xml" if content[0] == "<" else "yaml"}'
-    path.write_text(content)
-    assert launch_file(path) == 0 and 'GOT front well' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize('content, error', [

@@ -245,6 +245,8 @@ def fogros_launch(text):
     '<node_container machine="planner" pkg="demo" exec="talker" exec_name="one" name="box" '
     'namespace=""><composable_node pkg="demo" plugin="demo::View" name="view" if="false"/>'
     '</node_container>',
+    '<lifecycle_node machine="planner" pkg="demo" exec="talker" exec_name="one" name="box" '
+    'namespace="" autostart="false"/>',
 ])
 def test_machine_on_an_element_anywhere_below(run, fake, text):
     fake.on_start = ends

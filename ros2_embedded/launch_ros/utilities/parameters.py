@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import os
 import pathlib
+import re
 from typing import Any, Iterator
 
 from launch import SomeSubstitutionsType_types_tuple, Substitution
@@ -173,13 +174,20 @@ def _nodes_of(content: dict[str, Any], names: tuple[str, ...] = ()) -> Iterator[
             yield from _nodes_of(value, (*names, key.strip('/')))
 
 
-def _read(path: pathlib.Path, node: str) -> dict[str, Any]:
+def _matches(pattern: str, node: str) -> bool:
+    """Say whether a key of a parameter file means a node: * is one part of its name, ** any."""
+    parts = [{'*': '/[^/]+', '**': '(/[^/]+)*'}.get(part, '/' + re.escape(part))
+             for part in pattern.split('/') if part]
+    return re.fullmatch(''.join(parts), f'/{node}') is not None
+
+
+def _read(path: pathlib.Path, node: str) -> list[dict[str, Any]]:
+    """Return the parts of a parameter file that are for a node; a later part wins, as in rcl."""
     import yaml
     content = yaml.safe_load(path.read_text()) or {}
-    nodes = dict(_nodes_of(content))
-    if not nodes:
-        return dict(content)
-    return {**nodes.get('**', {}), **nodes.get(node, {})}
+    nodes = list(_nodes_of(content))
+    return [values or {} for pattern, values in nodes if _matches(pattern, node)] if nodes else [
+        content]
 
 
 def to_parameters_list(
@@ -195,8 +203,10 @@ def to_parameters_list(
     node = '/'.join(part.strip('/') for part in (namespace or '', node_name) if part.strip('/'))
     parameters = []
     for given in evaluated_parameters:
-        values = given if isinstance(given, dict) else evaluate_parameter_dict(
-            context, normalize_parameter_dict(_read(given, node)))
+        values: dict[str, Any] = {}
+        for part in [given] if isinstance(given, dict) else _read(given, node):
+            values |= part if part is given else evaluate_parameter_dict(
+                context, normalize_parameter_dict(part))
         for name, value in values.items():
             kind = next((kind for kind in Parameter.Type if kind.check(value)), None)
             if kind is None:
