@@ -107,7 +107,7 @@ def note(notes, name):
         function=lambda context: notes.append(context.launch_configurations.get(name)))
 
 
-# -- paths: launch 3.4.5, 3.4.9, 3.4.10, launch_ros 0.26.10 ----------------------------------------
+# -- paths: launch 3.4.5, 3.4.9, 3.4.10, launch_ros 0.26.10 ---------------------------------------
 
 @pytest.mark.parametrize('path, text', [
     (PathJoinSubstitution(['/a', A, Path('b/c')]), '/a/1/b/c'),
@@ -172,7 +172,7 @@ def test_path_is_a_text_as_parameter(package):
     assert normalize_typed_substitution(Path('/x'), str) == '/x'
 
 
-# -- <let> below <include>: launch 3.4.7 -----------------------------------------------------------
+# -- <let> below <include>: launch 3.4.7 ----------------------------------------------------------
 
 @pytest.mark.parametrize('name, content', [
     ('main.launch.xml',
@@ -190,7 +190,7 @@ def test_include_passes_arguments_by_let_or_arg(tmp_path, capsys, name, content)
     assert 'GOT front well' in capsys.readouterr().out
 
 
-# -- timers: launch 3.4.5, 3.4.6 -------------------------------------------------------------------
+# -- timers: launch 3.4.5, 3.4.6 ------------------------------------------------------------------
 
 def test_timer_keeps_the_configurations_of_its_group():
     notes = []
@@ -227,7 +227,7 @@ def test_timed_node_has_namespace_and_remappings_of_its_group(package):
     assert 'p:=1' not in nodes[1].process_details['cmd']
 
 
-# -- <lifecycle_node>: launch_ros 0.26.12; autostart=: 0.26.7, see test_launch_ros_lifecycle.py ----
+# -- <lifecycle_node>: launch_ros 0.26.12; autostart=: 0.26.7, see test_launch_ros_lifecycle.py ---
 
 @pytest.mark.parametrize('name, content', [
     ('a.launch.xml', '<launch><lifecycle_node pkg="pkg" exec="exe" name="n" namespace="a" '
@@ -243,7 +243,7 @@ def test_xml_and_yaml_describe_a_lifecycle_node(tmp_path, name, content):
     assert perform_substitutions(context, node.node_autostart) == 'true'
 
 
-# -- wildcards of parameter files: launch_ros 0.26.8 -----------------------------------------------
+# -- wildcards of parameter files: launch_ros 0.26.8 ----------------------------------------------
 
 WILDCARDS = '''
 /**: {ros__parameters: {all: 1, last: 1, nested: {all: 1}}}

@@ -21,7 +21,8 @@ __all__ = [
     'AndSubstitution', 'Command', 'EqualsSubstitution', 'EnvironmentVariable', 'FileContent',
     'FindExecutable', 'LaunchConfiguration', 'LocalSubstitution', 'NotSubstitution',
     'NotEqualsSubstitution', 'OrSubstitution', 'PathJoinSubstitution', 'PathSubstitution',
-    'PythonExpression', 'SubstitutionFailure', 'TextSubstitution', 'ThisLaunchFile', 'ThisLaunchFileDir']
+    'PythonExpression', 'SubstitutionFailure', 'TextSubstitution', 'ThisLaunchFile',
+    'ThisLaunchFileDir']
 __getattr__ = lacking(__name__, 'AllSubstitution AnonName AnySubstitution BooleanSubstitution '
                                 'IfElseSubstitution LaunchLogDir')
 
@@ -151,7 +152,8 @@ class PathJoinSubstitution(Substitution):
     """Parts of a path, joined; ``/`` adds one more."""
 
     def __init__(self, substitutions: Iterable[SomeSubstitutionsType]) -> None:
-        self.substitutions = normalize_to_list_of_substitutions(substitutions)
+        self.substitutions = [
+            sub for part in substitutions for sub in normalize_to_list_of_substitutions(part)]
 
     def __truediv__(self, part: SomeSubstitutionsType) -> PathJoinSubstitution:
         return PathJoinSubstitution([self, part])
