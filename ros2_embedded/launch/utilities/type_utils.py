@@ -10,6 +10,7 @@ from rosidl_embedded.lacking import lacking
 
 from .._base import Substitution
 from . import ensure_argument_type, normalize_to_list_of_substitutions, perform_substitutions
+from .ros_yaml import load
 
 if TYPE_CHECKING:
     from ..launch_context import LaunchContext
@@ -68,7 +69,7 @@ is_instance_of_valid_type = is_instance_of
 
 def coerce_to_type(value: str, data_type: Any = None, *, can_be_str: bool = False) -> Any:
     """
-    Read a text as the type; without one, as YAML.
+    Read a text as the type; without one, as rcl reads YAML.
 
     :param can_be_str: whether the text itself will do where it isn't of the type.
     :raises ValueError: if it can't be read so.
@@ -88,7 +89,7 @@ def coerce_to_type(value: str, data_type: Any = None, *, can_be_str: bool = Fals
     import yaml
     given = {'1': 'true', '0': 'false'}.get(value, value) if data_type is bool else value
     try:
-        output = yaml.safe_load(given)
+        output = load(given)
     except yaml.YAMLError as exc:
         if can_be_str:
             return value

@@ -3,11 +3,12 @@
 Parameters of nodes: normalized, evaluated, and as rclpy's.
 
 Normalized ones have flat names, and texts as substitutions. A plain text stays a text whatever it
-looks like, so it is quoted as YAML does: what substitutions become is read as YAML.
+looks like, so it is quoted as in YAML: what substitutions become is read as rcl reads YAML.
 """
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import contextlib
 import os
 import pathlib
 import re
@@ -18,6 +19,7 @@ from launch.launch_context import LaunchContext
 from launch.substitutions import TextSubstitution
 from launch.utilities import ensure_argument_type, perform_substitutions
 from launch.utilities import normalize_to_list_of_substitutions as normalize
+from launch.utilities.ros_yaml import dump, load
 
 from ..parameter_descriptions import ParameterFile, ParameterValue
 
@@ -28,9 +30,18 @@ _WRAP = ('If the parameter is meant to be a string, try wrapping it in '
          'launch_ros.parameter_descriptions.ParameterValue(value, value_type=str)')
 
 
-def as_yaml(value: Any) -> str:
+def as_argument(value: Any) -> str:
+    """
+    Return a parameter's value for ``-p``, where rcl finds its type.
+
+    A text that launch too takes for another type is written as in ROS 2.
+    """
     import yaml
-    return str(yaml.dump(value))
+    if isinstance(value, str):
+        with contextlib.suppress(yaml.YAMLError):
+            if load(value) == value or isinstance(yaml.safe_load(value), (int, float, list)):
+                return value
+    return dump(value)
 
 
 def _normalize_array(value: Sequence[Any]) -> tuple[Any, ...]:
@@ -51,7 +62,7 @@ def _normalize_array(value: Sequence[Any]) -> tuple[Any, ...]:
         return tuple(normalize(value))
     return tuple(
         normalize(
-            as_yaml(item) if isinstance(item, (float, int, bool, str)) else item)
+            dump(item) if isinstance(item, (float, int, bool, str)) else item)
         for item in value)
 
 
@@ -72,7 +83,7 @@ def normalize_parameter_dict(
         if isinstance(value, Mapping):
             normalized.update(normalize_parameter_dict(value, _prefix=name))
         elif isinstance(value, (str, os.PathLike)):
-            normalized[name] = tuple(normalize(as_yaml(os.fspath(value))))
+            normalized[name] = tuple(normalize(dump(os.fspath(value))))
         elif isinstance(value, Substitution):
             normalized[name] = (value,)
         elif isinstance(value, (ParameterValue, float, bool, int, bytes)):
@@ -115,7 +126,7 @@ def _uniform(name: str, items: Sequence[Any]) -> Any:
 def _from_text(name: str, text: str) -> Any:
     import yaml
     try:
-        value = yaml.safe_load(text or "''")
+        value = load(text or "''")
     except yaml.YAMLError as exc:
         raise TypeError(
             f'Unable to parse the value of parameter {name} as yaml. {_WRAP}') from exc
@@ -138,9 +149,7 @@ def _evaluate(context: LaunchContext, name: str, value: Any) -> Any:
     if isinstance(value[0], Substitution):
         return _from_text(name, perform_substitutions(context, value))
     if isinstance(value[0], Sequence):
-        import yaml
-        return _uniform(
-            name, [yaml.safe_load(perform_substitutions(context, item)) for item in value])
+        return _uniform(name, [load(perform_substitutions(context, item)) for item in value])
     return value
 
 
@@ -183,8 +192,7 @@ def _matches(pattern: str, node: str) -> bool:
 
 def _read(path: pathlib.Path, node: str) -> list[dict[str, Any]]:
     """Return the parts of a parameter file that are for a node; a later part wins, as in rcl."""
-    import yaml
-    content = yaml.safe_load(path.read_text()) or {}
+    content = load(path.read_text()) or {}
     nodes = list(_nodes_of(content))
     return [values or {} for pattern, values in nodes if _matches(pattern, node)] if nodes else [
         content]
