@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import collections.abc
+import os
 from typing import Any, Callable, Iterable, Optional, TYPE_CHECKING, Union
 
 if TYPE_CHECKING:
@@ -36,8 +37,9 @@ class Substitution:
         raise NotImplementedError('perform() not implemented for Substitution base class.')
 
 
-SomeSubstitutionsType = Union[str, Substitution, Iterable[Union[str, Substitution]]]
-SomeSubstitutionsType_types_tuple = (str, Substitution, collections.abc.Iterable)
+SomeSubstitutionsType = Union[str, 'os.PathLike[str]', Substitution, Iterable[
+    Union[str, 'os.PathLike[str]', Substitution]]]
+SomeSubstitutionsType_types_tuple = (str, os.PathLike, Substitution, collections.abc.Iterable)
 
 
 class Condition:

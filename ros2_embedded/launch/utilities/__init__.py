@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import collections.abc
 import inspect
+import os
 from typing import Any, Iterable, TYPE_CHECKING
 
 from .._base import Entities, LaunchDescriptionEntity, SomeSubstitutionsType, Substitution
@@ -55,21 +57,20 @@ def normalize_to_list_of_entities(entities: Iterable[Any]) -> Entities:
 
 def normalize_to_list_of_substitutions(subs: SomeSubstitutionsType) -> list[Substitution]:
     """
-    Return substitutions, texts as TextSubstitution.
+    Return substitutions in one flat list, texts and paths as TextSubstitution.
 
-    :raises TypeError: for an item that is neither.
+    :raises TypeError: for an item that is none of these.
     """
     from ..substitutions import TextSubstitution
-    normalized: list[Substitution] = []
-    for item in [subs] if isinstance(subs, (str, Substitution)) else subs:
-        if isinstance(item, str):
-            item = TextSubstitution(text=item)
-        elif not isinstance(item, Substitution):
-            raise TypeError(
-                f"Failed to normalize given item of type '{type(item)}', when only 'str' or "
-                "'launch.Substitution' were expected.")
-        normalized.append(item)
-    return normalized
+    if isinstance(subs, Substitution):
+        return [subs]
+    if isinstance(subs, (str, os.PathLike)):
+        return [TextSubstitution(text=os.fspath(subs))]
+    if not isinstance(subs, collections.abc.Iterable):
+        raise TypeError(
+            f"Failed to normalize given item of type '{type(subs)}', when only 'str', "
+            "'pathlib.Path' or 'launch.Substitution' were expected.")
+    return [sub for item in subs for sub in normalize_to_list_of_substitutions(item)]
 
 
 def perform_substitutions(context: LaunchContext, subs: Iterable[Substitution]) -> str:

@@ -19,11 +19,12 @@ import launch.logging
 from launch.substitutions import LocalSubstitution
 from launch.utilities import ensure_argument_type, perform_substitutions
 from launch.utilities import normalize_to_list_of_substitutions as normalize
+from launch.utilities.ros_yaml import dump
 
 from ..parameter_descriptions import ParameterFile, ParameterValue
 from ..substitutions import ExecutableInPackage
 from ..utilities import names
-from ..utilities.parameters import evaluate_parameters, normalize_parameters
+from ..utilities.parameters import as_argument, evaluate_parameters, normalize_parameters
 
 
 @expose_action('node')
@@ -168,13 +169,9 @@ class Node(ExecuteProcess):
                 and self.UNSPECIFIED_NODE_NAMESPACE not in self.node_name)
 
     def _create_params_file_from_dict(self, params: dict[str, Any]) -> str:
-        import yaml
         node = self.node_name if self.is_node_name_fully_specified() else '/**'
         with NamedTemporaryFile(mode='w', prefix='launch_params_', delete=False) as file:
-            values = {
-                name: list(value) if isinstance(value, tuple) else value
-                for name, value in params.items()}
-            yaml.dump({node: {'ros__parameters': values}}, file, default_flow_style=False)
+            file.write(dump({node: {'ros__parameters': params}}))
         # not sooner: a node that is started again reads it again
         atexit.register(pathlib.Path(file.name).unlink, missing_ok=True)
         return file.name
@@ -201,7 +198,7 @@ class Node(ExecuteProcess):
     def __expand_parameters(self, context: LaunchContext) -> None:
         for given in context.launch_configurations.get('global_params', ()):
             if isinstance(given, tuple):
-                self.__extend_cmd('-p', f'{given[0]}:={given[1]}')
+                self.__extend_cmd('-p', f'{given[0]}:={as_argument(given[1])}')
                 continue
             path = os.path.abspath(given)
             if not os.path.isfile(path):

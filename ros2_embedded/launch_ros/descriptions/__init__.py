@@ -8,11 +8,13 @@ from launch import Action, Condition, SomeSubstitutionsType
 from launch.frontend import Entity, Parser
 from launch.substitutions import normalized_default
 from launch.utilities import normalize_to_list_of_substitutions
+from rosidl_embedded.lacking import lacking
 
-from ..parameter_descriptions import __getattr__ as __getattr__
 from ..parameter_descriptions import ParameterFile as ParameterFile
 from ..parameter_descriptions import ParameterValue as ParameterValue
 from ..utilities import normalize_parameters, normalize_remap_rules
+
+__getattr__ = lacking(__name__, 'ComposableLifecycleNode Parameter')
 
 
 class ComposableNode:
