@@ -8,7 +8,7 @@ from launch import Action, Condition, SomeSubstitutionsType
 from launch.frontend import Entity, Parser
 from launch.substitutions import normalized_default
 from launch.utilities import normalize_to_list_of_substitutions
-from rosidl_embedded.lacking import lacking
+from embedded_default.lacking import lacking
 
 from ..parameter_descriptions import ParameterFile as ParameterFile
 from ..parameter_descriptions import ParameterValue as ParameterValue
