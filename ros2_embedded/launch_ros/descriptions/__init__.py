@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any, List, Sequence
 
+from embedded_default.lacking import lacking
 from launch import Action, Condition, SomeSubstitutionsType
 from launch.frontend import Entity, Parser
 from launch.substitutions import normalized_default
 from launch.utilities import normalize_to_list_of_substitutions
-from embedded_default.lacking import lacking
 
 from ..parameter_descriptions import ParameterFile as ParameterFile
 from ..parameter_descriptions import ParameterValue as ParameterValue
