@@ -228,16 +228,18 @@ def ensure(
                   timeout=timeout, cancel=cancel)
         shell.sync(Path(wheels.folder), todo.wheels_target, excludes=(), timeout=timeout,
                    cancel=cancel)
-    try:
-        for command in todo.commands:
+    for command in todo.commands:
+        try:
             shell.run(command, timeout=timeout, cancel=cancel)
-    except CommandError:
-        if not todo.fetched:
-            raise
-        fetched = wheel_cache.fetch(todo.fetched, todo.python, timeout=timeout)
-        shell.sync(Path(fetched.folder), f'{todo.wheels_target}-fetched', excludes=(),
-                   timeout=timeout, cancel=cancel)
-        shell.run(_install_wheels(facts, wheels, fetched.hashes), timeout=timeout, cancel=cancel)
+        except CommandError:
+            if not todo.fetched:
+                raise
+            # its package index cannot be reached
+            fetched = wheel_cache.fetch(todo.fetched, todo.python, timeout=timeout)
+            shell.sync(Path(fetched.folder), f'{todo.wheels_target}-fetched', excludes=(),
+                       timeout=timeout, cancel=cancel)
+            shell.run(_install_wheels(facts, wheels, fetched.hashes), timeout=timeout,
+                      cancel=cancel)
     notes = [todo.note]
     if (spec.apt or spec.pip or keys) and os.path.basename(folder) not in facts.installed:
         notes += _complete(spec, install, folder, keys, functools.partial(
