@@ -137,7 +137,9 @@ def test_damaged_parts_leave_the_decoder_running(bench: Bench) -> None:
 
     for data in (b'', b'PCP1', bytes(100), *split(b'PCS1' + bytes(500), 1, 1, 1)):
         put(data)
-    bench.until(lambda: any('cloud not shown' in line for line in lines), 'a warning')
+    publisher.publish(b'\0\1\0\0\1')
+    bench.until(lambda: any('cloud not shown' in line for line in lines)
+                and any('ends too soon' in line for line in lines), 'two warnings')
     start(bench, 'encoder', '-r', 'points:=/points', '-p', 'stream:=/s')
     bench.until(lambda: seen, 'a cloud', meanwhile=source(bench))
 
@@ -149,7 +151,8 @@ def test_a_cloud_without_coordinates_is_one_warning(bench: Bench) -> None:
     good, bad = source(bench), PointCloud2(height=1, width=1, point_step=4, row_step=4,
                                            data=array.array('B', bytes(4)))
     parts = bench.heard(CompressedImage, '/points/pointcloud')
-    bench.until(lambda: any('not float32' in line for line in lines), 'a warning',
-                meanwhile=lambda: publisher.publish(bad))
+    for message, text in ((bad, 'not float32'), (b'\0\1\0\0\1', 'ends too soon')):
+        bench.until(lambda: any(text in line for line in lines), 'a warning',
+                    meanwhile=lambda: publisher.publish(message))
     bench.until(lambda: parts, 'a cloud', meanwhile=good)
     assert parts[0].format == 'pointcloud' and parts[0].header.frame_id.startswith('frame ')
