@@ -34,6 +34,8 @@ from std_msgs.msg import Empty
 
 from fogros2 import ros_types
 from fogros2_monitor.definitions import definition
+from image_transport_h264.cdr import CdrError
+from image_transport_h264.message import coded
 
 #: Poll interval of the topics in the graph, in seconds.
 LOOK = 0.5
@@ -106,23 +108,24 @@ class _Topic:
     def _subscribe(self) -> None:
         qos = fitting(self._node, self._name)
         self._fits = qos.durability, qos.reliability
-        if self.video:
-            self._subscription = self._node.create_subscription(
-                self._class, self._name, self._show_video, qos)
-        else:
-            self._subscription = self._node.create_subscription(
-                self._class, self._name, self._channel.log, qos, raw=True)
+        self._subscription = self._node.create_subscription(
+            self._class, self._name, self._show_video if self.video else self._channel.log, qos,
+            raw=True)
 
     def _unsubscribe(self) -> None:
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
 
-    def _show_video(self, message: Any) -> None:
-        stamp = message.header.stamp
+    def _show_video(self, message: bytes) -> None:
+        try:
+            header, form, data = coded(message)
+        except CdrError as error:
+            self._node.get_logger().warning(f'{self._name}: {error}', once=True)
+            return
         self._channel.log(CompressedVideo(
-            timestamp=Timestamp(stamp.sec, stamp.nanosec), frame_id=message.header.frame_id,
-            data=bytes(message.data), format=message.format).encode())
+            timestamp=Timestamp(header.sec, header.nanosec), frame_id=header.frame_id,
+            data=bytes(data), format=form).encode())
 
 
 class BridgeNode(Node, ServerListener):

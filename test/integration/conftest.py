@@ -220,8 +220,8 @@ def children() -> Iterator[list[subprocess.Popen[bytes]]]:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Return a bench for nodes; see rigs.bench."""
     from rigs.bench import made
-    with made(tmp_path, monkeypatch.setenv) as bench:
+    with made(monkeypatch.setenv) as bench:
         yield bench

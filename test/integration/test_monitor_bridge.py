@@ -35,7 +35,7 @@ from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 from fogros2.errors import DeadlineExceeded
 from fogros2.waiting import wait_until
 from rigs import viewer as viewers
-from rigs.bench import on_loopback
+from rigs.domains import taken
 
 ROOT = Path(__file__).parents[2]
 CACHE = ROOT / '.cache/node'
@@ -118,8 +118,10 @@ def client() -> None:
 
 
 @pytest.fixture
-def bench(client: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    with on_loopback(tmp_path, monkeypatch.setenv):
+def bench(client: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    with taken() as domain:
+        monkeypatch.setenv('ROS_DOMAIN_ID', domain)
         made = Bench()
         try:
             yield made

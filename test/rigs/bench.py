@@ -14,18 +14,16 @@ import threading
 import time
 from typing import Any
 
-import pytest
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from fogros2.dds.fastdds import FastDds
-from fogros2.model import DdsInterface
 from rigs.domains import taken
 
 ROOT = Path(__file__).parents[2]
+SUDO = [] if os.geteuid() == 0 else ['sudo', '-n']
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -33,12 +31,11 @@ BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 class Bench:
     """A node in this process, and the processes under test."""
 
-    def __init__(self, folder: Path, domain: int) -> None:
-        self.folder, self.domain = folder, domain
+    def __init__(self) -> None:
         self.environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(
             filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))}
         self.context = Context()
-        rclpy.init(context=self.context, domain_id=domain)
+        rclpy.init(context=self.context, domain_id=int(os.environ['ROS_DOMAIN_ID']))
         self.node = Node('bench', context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
@@ -89,6 +86,20 @@ class Bench:
         self.node.create_subscription(kind, topic, messages.append, qos)
         return messages
 
+    @contextlib.contextmanager
+    def lossy(self) -> Iterator[None]:
+        """Lose every fifth datagram of the domain; it takes root, and nodes started inside."""
+        table = f'fogt{os.getpid()}'
+        first = 7400 + 250 * int(os.environ['ROS_DOMAIN_ID'])
+        self.environment['FASTDDS_BUILTIN_TRANSPORTS'] = 'UDPv4'
+        rules = (f'table inet {table} {{ chain lose {{ type filter hook input priority 0; '
+                 f'udp dport {first}-{first + 249} numgen random mod 5 == 0 drop; }}; }}')
+        subprocess.run([*SUDO, 'nft', '-f', '-'], input=rules, text=True, check=True)
+        try:
+            yield
+        finally:
+            subprocess.run([*SUDO, 'nft', 'delete', 'table', 'inet', table], check=True)
+
     def close(self) -> None:
         for process, _, _ in self.processes:
             if process.poll() is None:
@@ -108,46 +119,17 @@ class Bench:
 
 
 @contextlib.contextmanager
-def made(folder: Path, setenv: Callable[[str, str], None]) -> Iterator[Bench]:
+def made(setenv: Callable[[str, str], None]) -> Iterator[Bench]:
     """
-    Make a bench whose DDS stays on the loopback, in a domain of its own.
+    Make a bench whose DDS stays on this computer, in a domain of its own.
 
     :param setenv: sets a variable of this process until the test ends.
     """
-    with on_loopback(folder, setenv) as domain:
-        bench = Bench(folder, domain)
+    setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    with taken() as domain:
+        setenv('ROS_DOMAIN_ID', domain)
+        bench = Bench()
         try:
             yield bench
         finally:
             bench.close()
-
-
-@contextlib.contextmanager
-def on_loopback(folder: Path, setenv: Callable[[str, str], None]) -> Iterator[int]:
-    """Keep the DDS of a test on the loopback, in a domain of its own, which is returned."""
-    with taken() as domain:
-        vendor = FastDds(int(domain))
-        path = folder / 'dds.xml'
-        path.write_text(vendor.render([DdsInterface('127.0.0.1')], []))
-        for key, value in vendor.environment(str(path), {}).items():
-            setenv(key, value)
-        setenv('ROS_DOMAIN_ID', domain)
-        yield int(domain)
-
-
-@contextlib.contextmanager
-def lossy(domain: int) -> Iterator[None]:
-    """Lose every fifth datagram of user data in a domain on the loopback."""
-    if os.geteuid() != 0:
-        pytest.skip('only root can add a packet filter')
-    # RTPS 2.5, 9.6.2.3: participants listen for user data at odd ports from 7411 on
-    first = 7411 + 250 * domain
-    ports = ', '.join(str(first + 2 * index) for index in range(20))
-    name = f'fogt{domain}'
-    rules = (f'table inet {name} {{\nchain input {{\ntype filter hook input priority 0\n'
-             f'iif lo udp dport {{ {ports} }} numgen random mod 5 == 0 drop\n}}\n}}\n')
-    subprocess.run(['nft', '-f', '-'], input=rules, text=True, check=True)
-    try:
-        yield
-    finally:
-        subprocess.run(['nft', 'delete', 'table', 'inet', name], check=True)
