@@ -80,8 +80,10 @@ def result_of(text: str, name: str) -> Any:
         kind = getattr(errors, found['error']) if found['error'] in _KINDS else ProviderError
         error: FogError = kind(clean(str(found['message'])), clean(str(found['hint'])))
     except (ValueError, LookupError, TypeError) as invalid:
-        raise ProviderError(f"the host '{name}' sent no answer, but {text[-200:]!r}",
-                            'its login must print nothing after a command') from invalid
+        error = ProviderError(f"the host '{name}' sent no answer, but {text[-200:]!r}",
+                              'its login must print nothing after a command')
+        error.refused = False
+        raise error from invalid
     raise error
 
 
@@ -172,11 +174,16 @@ class HostedProvider(Provider):
         host = self._find_host(on)
         options['ports'] = [*(options.get('ports') or ()), '22', f'{request.vpn_port}/udp']
         robot = f'-{hashlib.sha256(robot_id().encode()).hexdigest()[:8]}'
-        identity = self._call(
-            host, 'create', _CREATE_TIMEOUT,
-            spec={'name': spec.name, 'provider': ContainerProvider.name, 'options': options,
-                  'on_exit': spec.on_exit, 'containers': spec.containers, 'share': spec.share},
-            request=dataclasses.replace(request, tags={**request.tags, HOSTED: robot}))
+        try:
+            identity = self._call(
+                host, 'create', _CREATE_TIMEOUT,
+                spec={'name': spec.name, 'provider': ContainerProvider.name, 'options': options,
+                      'on_exit': spec.on_exit, 'containers': spec.containers,
+                      'share': spec.share},
+                request=dataclasses.replace(request, tags={**request.tags, HOSTED: robot}))
+        except errors.ShellError as error:
+            error.refused = False  # the host may go on without the connection
+            raise
         return f'{_SCHEME}{identity}@{host}'
 
     def describe(self, machine_id: str) -> Machine:
@@ -210,7 +217,8 @@ class HostedProvider(Provider):
         :raises FogError: a host does not answer, after the machines of all others.
         """
         known = [*self._asked, *(
-            record.spec.options['on'] for record in Store().machines()
+            record.spec.options['on'] for record in (
+                *Store().machines(), *(record for record, _ in Store().requests()))
             if record.provider == self.name)]
         if not known:
             raise Unsupported('only its host knows a container machine on another computer')
