@@ -44,8 +44,9 @@ class FogError(RuntimeError):
     :param hint: the remedy, in one line; may be empty.
     """
 
-    #: Set by a provider's ``create``: nothing was created, so nothing has to be looked for.
-    refused: bool = False
+    #: Set by a provider's ``create``. True: nothing was created. False: no answer came, so a
+    #: machine may exist or may still appear. None: unknown, so the launch searches once.
+    refused: Optional[bool] = None
     #: Set by a provider's ``create``: another region or cloud may have capacity.
     no_capacity: bool = False
     #: Resources that the failed step could not clean up; reported with the error.
@@ -144,9 +145,13 @@ class StoreError(FogError):
 class DeadlineExceeded(FogError):
     """A wait has timed out."""
 
+    refused = False
+
 
 class Cancelled(FogError):
     """The launch was asked to end during this."""
+
+    refused = False
 
     def __init__(self, what: str = 'the deployment') -> None:
         super().__init__(f'{what} was cancelled')

@@ -21,6 +21,7 @@ import re
 import secrets
 import shutil
 import tempfile
+import time
 from typing import Any, Optional
 
 from fogros2 import model
@@ -209,6 +210,29 @@ class Store:
     def delete(self, name: str) -> None:
         """Remove a machine's folder with its content."""
         delete_folder(self.machine(name))
+
+    def _request(self, record: Record) -> Path:
+        return self.root / 'requests' / f'{record.name}.{record.last or record.launch}.json'
+
+    def set_aside(self, record: Record) -> None:
+        """Remove a machine's folder, but keep the request for it, which got no answer."""
+        write_private(self._request(record), model.to_json(record).encode())
+        self.delete(record.name)
+
+    def requests(self) -> list[tuple[Record, float]]:
+        """Return the records of requests without an answer, and the seconds since each."""
+        found = []
+        for path in sorted((self.root / 'requests').glob('[!.]*.json')):
+            try:
+                age = time.time() - path.stat().st_mtime
+                found.append((record_from_json(json.loads(path.read_text())), age))
+            except (OSError, ValueError, TypeError, KeyError, AttributeError):
+                continue  # another program has just removed it, or it is damaged
+        return found
+
+    def answered(self, record: Record) -> None:
+        """Forget a request: no machine of it can appear any more."""
+        self._request(record).unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def lock(self, name: str) -> Iterator[None]:

@@ -29,6 +29,8 @@ TAG_LAUNCH = 'fogros2-launch'
 TAG_EXPIRES = 'fogros2-expires'
 TAG_ON_EXIT = 'fogros2-on-exit'
 TAG_DEPENDENCIES = 'fogros2-dependencies'
+#: Seconds after which a request without an answer creates no machine any more.
+SETTLED = 900.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -288,6 +290,15 @@ class Provider(abc.ABC):
         :param dead: tokens of requests (``CreateRequest``) whose launches have died.
         """
         return []
+
+    def may_create(self, token: str, age: float) -> bool:
+        """
+        Return whether a request for a machine that got no answer may still create one.
+
+        :param token: of the request (``CreateRequest``).
+        :param age: seconds since the launch stopped waiting for the answer.
+        """
+        return self.capabilities.owned and age < SETTLED
 
     # -- its network ----------------------------------------------------------------------------
 

@@ -101,7 +101,8 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
                 return connection
             connection = cancellable(
                 lambda: self._connect(max(0.5, until - time.monotonic()), cancel), cancel,
-                what=f"connecting to '{self.name}'", late=lambda late: late.close())
+                what=f"connecting to '{self.name}'", grace=lambda: 1.0,
+                late=lambda late: late.close())
             with self._lock:
                 if closings == self._closings:
                     self._connection = connection

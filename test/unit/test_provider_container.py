@@ -8,6 +8,7 @@ import io
 import json
 import os
 from pathlib import Path
+import secrets
 import stat
 import subprocess
 import tarfile
@@ -552,3 +553,15 @@ def test_computer_without_own_sources_gets_a_hint(system, targets):
 def test_packages_of_a_container_image_are_its_own(options, own):
     spec = MachineSpec('m', 'container', options)
     assert container.ContainerProvider().has_own_packages(spec) is own
+
+
+def test_request_may_create_while_a_program_works_at_it():
+    provider, token = container.ContainerProvider(), secrets.token_hex(8)
+    assert not provider.may_create(token, 0.0)
+    engine = subprocess.Popen(['sh', '-c', 'read line', 'podman', 'run', f'--label={token}'],
+                              stdin=subprocess.PIPE)
+    try:
+        assert provider.may_create(token, 1e9)
+    finally:
+        engine.communicate(b'')
+    assert not provider.may_create(token, 0.0)

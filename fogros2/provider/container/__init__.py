@@ -318,6 +318,14 @@ class ContainerProvider(Provider):
                     yield container_machine.machine_of(
                         engine, entry, self._host_key(engine, entry) if running else None)
 
+    def may_create(self, token: str, age: float) -> bool:
+        """Return whether an engine still works at a request: it may outlive its launch."""
+        for path in Path('/proc').glob('[0-9]*/cmdline'):
+            with contextlib.suppress(OSError):
+                if token.encode() in path.read_bytes():
+                    return True
+        return False
+
     def destroy(self, machine_id: str) -> None:
         """Remove a container and its root; return when both are removed."""
         engine, identity, token = container_machine.parse_id(machine_id)

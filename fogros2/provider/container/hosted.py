@@ -108,8 +108,10 @@ def result_of(text: str, name: str) -> Any:
         kind = getattr(errors, answer['error']) if answer['error'] in _KINDS else ProviderError
         error: FogError = kind(answer['message'], answer['hint'])
     except (untrusted.InvalidMessage, LookupError) as invalid:
-        raise ProviderError(f"the host '{name}' sent no answer, but {text[-200:]!r}",
-                            'its login must print nothing after a command') from invalid
+        error = ProviderError(f"the host '{name}' sent no answer, but {text[-200:]!r}",
+                              'its login must print nothing after a command')
+        error.refused = False
+        raise error from invalid
     raise error
 
 
@@ -200,11 +202,16 @@ class HostedProvider(Provider):
         host = self._find_host(on)
         options['ports'] = [*(options.get('ports') or ()), '22', f'{request.vpn_port}/udp']
         robot = f'-{hashlib.sha256(robot_id().encode()).hexdigest()[:8]}'
-        identity = self._call(
-            host, 'create', _CREATE_TIMEOUT,
-            spec={'name': spec.name, 'provider': ContainerProvider.name, 'options': options,
-                  'on_exit': spec.on_exit, 'containers': spec.containers, 'share': spec.share},
-            request=dataclasses.replace(request, tags={**request.tags, HOSTED: robot}))
+        try:
+            identity = self._call(
+                host, 'create', _CREATE_TIMEOUT,
+                spec={'name': spec.name, 'provider': ContainerProvider.name, 'options': options,
+                      'on_exit': spec.on_exit, 'containers': spec.containers,
+                      'share': spec.share},
+                request=dataclasses.replace(request, tags={**request.tags, HOSTED: robot}))
+        except errors.ShellError as error:
+            error.refused = False  # the host may go on without the connection
+            raise
         with self._reading(host):
             return f'{_SCHEME}{untrusted.matched(ID, identity)}@{host}'
 
@@ -249,7 +256,8 @@ class HostedProvider(Provider):
         :raises FogError: a host does not answer, after the machines of all others.
         """
         known = [*self._asked, *(
-            record.spec.options['on'] for record in Store().machines()
+            record.spec.options['on'] for record in (
+                *Store().machines(), *(record for record, _ in Store().requests()))
             if record.provider == self.name)]
         if not known:
             raise Unsupported('only its host knows a container machine on another computer')
