@@ -17,7 +17,7 @@ from decimal import Decimal
 import threading
 from typing import ClassVar, Optional
 
-from fogros2.errors import ProviderError, Unsupported
+from fogros2.errors import MachineNotFound, ProviderError, Unsupported
 from fogros2.model import CreateRequest, Image, Machine, MachineSpec, MachineState
 from fogros2.provider.offers import Offer, Offers, Region, Wants
 from fogros2.waiting import wait_until
@@ -211,6 +211,20 @@ class Provider(abc.ABC):
 
         :raises MachineNotFound: the machine does not exist (any more).
         """
+
+    def reclaims(self, machine_id: str) -> bool:
+        """
+        Return whether the provider itself reports that it reclaims a machine, or has done so.
+
+        The launch asks after a machine's notice, which a node there may have forged.
+
+        :raises FogError: the provider does not answer.
+        """
+        try:
+            state = self.describe(machine_id).state
+        except MachineNotFound:
+            return True
+        return state not in (MachineState.PENDING, MachineState.RUNNING)
 
     @abc.abstractmethod
     def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:

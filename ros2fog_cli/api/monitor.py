@@ -5,13 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import contextlib
-import http.client
 from pathlib import Path
 import re
 import socket
 import threading
 from typing import Optional
-import urllib.parse
 
 from fogros2 import monitor_addresses, untrusted
 from fogros2.deploy.machine_job import AGENT_FOLDER
@@ -46,19 +44,6 @@ def carrying(tunnel: Tunnel) -> Iterator[threading.Event]:
     finally:
         tunnel.close()
         thread.join(5.0)
-
-
-def has_application(port: int, token: str) -> bool:
-    """Return whether the gate at a loopback port serves the web application."""
-    connection = http.client.HTTPConnection('localhost', port, timeout=_TIMEOUT)
-    with contextlib.closing(connection):
-        try:
-            connection.request('GET', f'/?{urllib.parse.urlencode({"token": token})}')
-            answer = connection.getresponse()
-        except (OSError, http.client.HTTPException):
-            return False  # the tunnel reports the error
-        # The gate redirects to the application, to remove the token from the URL.
-        return answer.status == 303
 
 
 def on_robot(name: str) -> Optional[tuple[int, str]]:

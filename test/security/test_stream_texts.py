@@ -10,12 +10,14 @@ import threading
 import time
 import tracemalloc
 from types import SimpleNamespace
+from unittest import mock
 
 import pytest
 
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
 pytest.importorskip('zstandard', reason='the extra "point_clouds" is not installed')
 from fogros2_replicas.pairs import header_of, Pair
+from image_transport_h264.budget import Budget
 from image_transport_h264.codec import Settings
 from image_transport_h264.control import Control
 from image_transport_h264.lazy import LazyNode
@@ -72,6 +74,23 @@ def test_frame_ids_of_one_stamp_take_little() -> None:
     assert taken(flood) < LIMIT
     pair.input(1.0, (2, ''))
     assert pair.output(1.1, 'a', (2, ''))
+
+
+@pytest.mark.parametrize(('name', 'link'), [
+    ('/fogros2/planner_1/link_in', True), ('/fogros2/m/link_out', True),
+    ('/forward_velocity_controller/commands', False), ('/fogros2/m/cmd', False),
+    ('/fogros2/m/link_in/x', False), ('/fogros2/a/b/link_in', False), ('link_in', False),
+    ('/x/fogros2/m/link_in', False), ('/fogros2//link_in', False)])
+def test_encoder_publishes_claims_on_links_alone(name: str, link: bool) -> None:
+    """Controllers take the type of a claim, and a decoder announces the topics."""
+    node = mock.Mock()
+    node.declare_parameter.return_value.value = 1.0
+    Budget(node, '/camera/h264', lambda: 1)
+    join = node.create_subscription.call_args_list[0].args[2]
+    node.create_publisher.reset_mock()
+    layout = SimpleNamespace(dim=[SimpleNamespace(label=name)])
+    join(SimpleNamespace(layout=layout, data=[1e6]))
+    assert [call.args[1] for call in node.create_publisher.call_args_list] == [name] * link
 
 
 def test_names_of_fields_are_in_no_error() -> None:

@@ -155,13 +155,6 @@ def test_page_links_applications_that_can_open_the_bridge(host, links, shown):
     assert '<script>' not in text
 
 
-def test_page_links_contain_the_token():
-    asked = parse(b'GET /?token=x HTTP/1.1\r\nHost: 198.51.100.2:8766\r\n\r\n')
-    text = page.links(asked, 'planner', TOKEN, encrypted=True).decode()
-    assert ('https://lichtblick-suite.github.io/lichtblick/?ds=foxglove-websocket&amp;'
-            f'ds.url=wss%3A%2F%2F198.51.100.2%3A8766%2F%3Ftoken%3D{TOKEN}"') in text
-
-
 class Bridge(http.server.BaseHTTPRequestHandler):
     """Stands for the bridge: answers each GET with its target."""
 

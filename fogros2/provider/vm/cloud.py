@@ -295,6 +295,10 @@ class VmCloud(abc.ABC):
         :raises MachineNotFound: it does not exist (any more).
         """
 
+    def is_marked(self, machine: VmId) -> bool:
+        """Return whether the API announces the end of a spot machine that still runs."""
+        return False
+
     def prepare(self, region: str, order: Order, types: Sequence[str]) -> Mapping[str, Any]:
         """
         Look up what ``insert`` needs for each type, such as the image; create nothing.

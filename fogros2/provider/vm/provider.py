@@ -249,6 +249,9 @@ class VmProvider(Provider):
             look, timeout=timeout, cancel=self.cancel, first=0.5, interval=1.5, longest=5.0,
             what=f"'{name}' ({machine.vm}) to run")
 
+    def reclaims(self, machine_id: str) -> bool:
+        return super().reclaims(machine_id) or self._until().is_marked(self._id(machine_id))
+
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
         cloud = self._until()
         for found in self._everywhere(cloud, lambda region: list(cloud.find(region, tags))):
