@@ -15,6 +15,7 @@ from ..events import TimerEvent
 from ..frontend.expose import expose_action
 from ..launch_context import LaunchContext
 from ..launch_description import LaunchDescriptionSource
+from ..launch_description_sources import AnyLaunchDescriptionSource
 from ..utilities import ensure_argument_type, perform_substitutions
 from ..utilities import normalize_to_list_of_substitutions as normalize
 from ..utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
@@ -83,6 +84,7 @@ class GroupAction(_base.Action):
 class IncludeLaunchDescription(_base.Action):
     """Sets launch configurations, then visits a launch description from elsewhere."""
 
+    _role = 'include'
     _texts = {'launch_description_source': 'file'}
 
     def __init__(
@@ -92,7 +94,6 @@ class IncludeLaunchDescription(_base.Action):
     ) -> None:
         super().__init__(**kwargs)
         if not isinstance(launch_description_source, LaunchDescriptionSource):
-            from ..launch_description_sources import AnyLaunchDescriptionSource
             launch_description_source = AnyLaunchDescriptionSource(launch_description_source)
         self.launch_description_source = launch_description_source
         self.launch_arguments = tuple(launch_arguments or ())

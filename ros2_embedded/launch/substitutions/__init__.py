@@ -11,7 +11,7 @@ from typing import Any, Iterable, Sequence
 from embedded_default.lacking import lacking
 import launch.logging
 
-from .._base import SomeSubstitutionsType, Substitution
+from .._base import SomeSubstitutionsType, Substitution, TextSubstitution
 from ..frontend.expose import expose_substitution
 from ..launch_context import LaunchContext
 from ..utilities import normalize_to_list_of_substitutions, perform_substitutions
@@ -73,20 +73,6 @@ class ParsedSubstitution(Substitution):
     def describe(self) -> str:
         shown = [described(getattr(self, name)) for name in self._parameters if name[-1] != '?']
         return f"{self._label or type(self).__name__}({', '.join(shown)})"
-
-
-class TextSubstitution(Substitution):
-
-    def __init__(self, *, text: str) -> None:
-        if not isinstance(text, str):
-            raise TypeError(f"TextSubstitution expected Text object got '{type(text)}' instead.")
-        self.text = text
-
-    def describe(self) -> str:
-        return f"'{self.text}'"
-
-    def perform(self, context: LaunchContext) -> str:
-        return self.text
 
 
 @expose_substitution('var')

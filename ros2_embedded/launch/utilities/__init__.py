@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-import collections.abc
 import inspect
-import os
-from typing import Any, Iterable, TYPE_CHECKING
+from typing import Any, Iterable
 
-from .._base import Entities, LaunchDescriptionEntity, SomeSubstitutionsType, Substitution
+from .._base import (
+    Entities,
+    LaunchDescriptionEntity,
+    normalize_to_list_of_substitutions,
+    perform_substitutions,
+)
+from ..launch_context import LaunchContext
 from .signal_management import AsyncSafeSignalManager
-
-if TYPE_CHECKING:
-    from ..launch_context import LaunchContext
 
 __all__ = [
     'AsyncSafeSignalManager', 'ensure_argument_type', 'is_a', 'is_a_subclass',
@@ -53,28 +54,6 @@ def normalize_to_list_of_entities(entities: Iterable[Any]) -> Entities:
     for entity in entities:
         flat.extend([entity] if isinstance(entity, LaunchDescriptionEntity) else entity)
     return flat
-
-
-def normalize_to_list_of_substitutions(subs: SomeSubstitutionsType) -> list[Substitution]:
-    """
-    Return substitutions in one flat list, texts and paths as TextSubstitution.
-
-    :raises TypeError: for an item that is none of these.
-    """
-    from ..substitutions import TextSubstitution
-    if isinstance(subs, Substitution):
-        return [subs]
-    if isinstance(subs, (str, os.PathLike)):
-        return [TextSubstitution(text=os.fspath(subs))]
-    if not isinstance(subs, collections.abc.Iterable):
-        raise TypeError(
-            f"Failed to normalize given item of type '{type(subs)}', when only 'str', "
-            "'pathlib.Path' or 'launch.Substitution' were expected.")
-    return [sub for item in subs for sub in normalize_to_list_of_substitutions(item)]
-
-
-def perform_substitutions(context: LaunchContext, subs: Iterable[Substitution]) -> str:
-    return ''.join([context.perform_substitution(sub) for sub in subs])
 
 
 def visit_all_entities_and_collect_futures(

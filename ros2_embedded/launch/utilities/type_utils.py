@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import collections.abc
 import os
-from typing import Any, List, TYPE_CHECKING
+from typing import Any, List
 
 from embedded_default.lacking import lacking
 
-from .._base import Substitution
-from . import ensure_argument_type, normalize_to_list_of_substitutions, perform_substitutions
+from .._base import normalize_to_list_of_substitutions, perform_substitutions, Substitution
+from ..launch_context import LaunchContext
+from . import ensure_argument_type
 from .ros_yaml import load
-
-if TYPE_CHECKING:
-    from ..launch_context import LaunchContext
 
 __getattr__ = lacking(
     __name__, 'AllowedTypesTuple AllowedTypesType AllowedValueType ListTypesTuple ListTypesType '
