@@ -126,7 +126,7 @@ rm -rf site
 if python3 -m pip --version >/dev/null 2>&1; then
     set -- python3 -m pip
 elif wheel=$(ls "$VIRTUAL_ENV"/../wheels/pip-*.whl 2>/dev/null); then
-    # the wheel of the embedded default: Debian's venv has no pip
+    # the sent wheel: Debian's venv has no pip
     set -- python3 "$wheel/pip"
 else
     python3 -m venv --clear pip

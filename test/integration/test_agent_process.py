@@ -28,7 +28,7 @@ from fogros2.errors import AgentError, ConnectError
 from fogros2.model import Command, NodeSpec
 from fogros2.waiting import wait_until
 
-pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded default')
+pytest.importorskip('launch.actions', reason='launch is not installed')
 
 ME = pwd.getpwuid(os.getuid()).pw_name
 #: What a sourced ROS 2 needs; an agent that runs as root gives nodes a login's environment.

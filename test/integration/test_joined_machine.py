@@ -226,7 +226,7 @@ from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
 def generate_launch_description():
     machine = SSHInstance(
         '{host.address}', '{host.user}', key='{host.key}', host_key='{host.host_key}',
-        name='{host.name}', ros_workspace='', bootstrap='embedded', on_exit='keep')
+        name='{host.name}', ros_workspace='', bootstrap='pip', on_exit='keep')
     return FogROSLaunchDescription([
         CloudNode(machine=machine, package='fogros2_examples', executable='listener',
                   output='screen', remappings=[('chatter', '/near')])])
@@ -239,7 +239,7 @@ def test_guest_of_an_ssh_host_gets_what_its_nodes_need(
     engine: str, nothing_left: None,
 ) -> None:
     if not wheels.collect(tmp_path / 'wheels').embedded:
-        pytest.skip('this robot has ROS 2 and no embedded default to send')
+        pytest.skip('this robot has an installation of ROS 2 and no wheels to send')
     name = f'ssh-{uuid.uuid4().hex[:6]}'
     path = tmp_path / 'ssh.launch.py'
     with bare_computer(name, tmp_path / 'computer', cloud_network) as computer, \

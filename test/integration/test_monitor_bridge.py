@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 
 pytest.importorskip('foxglove', reason='the extra "monitor" is not installed')
-pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
+pytest.importorskip('rclpy', reason='rclpy is not installed')
 from geometry_msgs.msg import Twist
 import numpy
 import rclpy

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 pytest.importorskip('zstandard', reason='the extra "point_clouds" is not installed')
-pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
+pytest.importorskip('rclpy', reason='rclpy is not installed')
 import numpy
 from sensor_msgs.msg import CompressedImage, PointCloud2
 

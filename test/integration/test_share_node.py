@@ -19,7 +19,7 @@ from typing import Any, Optional
 
 import pytest
 
-pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
+pytest.importorskip('rclpy', reason='rclpy is not installed')
 from nav_msgs.msg import OccupancyGrid
 import rclpy
 from rclpy.context import Context

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
-pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
+pytest.importorskip('rclpy', reason='rclpy is not installed')
 import numpy
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterType, ParameterValue

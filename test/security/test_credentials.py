@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded default')
+pytest.importorskip('launch.actions', reason='launch is not installed')
 from launch import LaunchContext
 from launch.actions import ExecuteProcess
 import launch.logging

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded default')
+pytest.importorskip('launch.actions', reason='launch is not installed')
 from fogros2.agent_client import joined
 from fogros2.errors import MachineNotFound
 from fogros2.model import Machine, MachineSpec, MachineState

@@ -9,7 +9,7 @@ import pytest
 
 from rigs.memory import measure
 
-pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded default')
+pytest.importorskip('launch.actions', reason='launch is not installed')
 
 LIMIT = 100e6
 

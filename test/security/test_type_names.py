@@ -11,7 +11,7 @@ import sys
 
 import pytest
 
-pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
+pytest.importorskip('rclpy', reason='rclpy is not installed')
 from fogros2 import ros_types
 from fogros2_monitor import GRAPH
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip('launch', reason='neither ROS 2 nor the embedded default is installed')
+pytest.importorskip('launch', reason='rclpy is not installed')
 from launch import LaunchContext
 from launch.substitutions import LaunchConfiguration
 
