@@ -31,9 +31,9 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.serialization import serialize_message
 
 from fogros2 import invitation
-from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.invitation import Invitation
-from fogros2.model import Command, DdsInterface
+from fogros2.model import Command
+from fogros2.plan import DEFAULT_RMW
 from fogros2.process import run
 from fogros2.store import Store
 
@@ -80,7 +80,7 @@ def invited(guest: Guest, store: Store) -> str:
     guest.admit(3600.0)
     return invitation.seal(Invitation(
         'planner', guest.machine_key, MACHINE, f'{OUTSIDE}:{PORT}', GUEST, NETWORK,
-        'rmw_cyclonedds_cpp', 0, time.time() + 3600), guest.key)
+        DEFAULT_RMW, 0, time.time() + 3600), guest.key)
 
 
 def join() -> list[Row]:
@@ -226,9 +226,7 @@ def relay() -> list[Row]:
     rows = []
     with contextlib.ExitStack() as undo:
         folder = Path(undo.enter_context(tempfile.TemporaryDirectory(prefix='fogb')))
-        vendor = CycloneDds()
-        (folder / 'dds.xml').write_text(vendor.render([DdsInterface('lo')], []))
-        os.environ.update(vendor.environment(str(folder / 'dds.xml'), {}))
+        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
         for size, label in ((1000, '1 kB'), (1_000_000, '1 MB')):
             times: dict[bool, list[float]] = {True: [], False: []}
             for turn in range(TURNS):

@@ -10,7 +10,6 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 
 from figures import Row, write
@@ -30,33 +29,26 @@ def memory(process: subprocess.Popen[bytes]) -> float:
 
 def main() -> None:
     """Send images through both nodes; compare their memory early with that at the end."""
-    from fogros2.dds.cyclonedds import CycloneDds
-    from fogros2.model import DdsInterface
-
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--count', type=int, default=100_000)
     count = parser.parse_args().count
-    with tempfile.TemporaryDirectory() as folder:
-        dds = CycloneDds()
-        path = Path(folder, 'dds.xml')
-        path.write_text(dds.render([DdsInterface('lo')], []))
-        os.environ.update(dds.environment(str(path), {}), ROS_DOMAIN_ID='84',
-                          PYTHONPATH=os.pathsep.join(
-                              [str(ROOT), os.environ.get('PYTHONPATH', '')]))
-        scripts = ROOT / 'image_transport_h264/scripts'
-        nodes = {
-            'encoder': subprocess.Popen(
-                [sys.executable, str(scripts / 'encoder'), '--ros-args', '-r', 'image:=/camera',
-                 '-p', 'adapt:=false']),
-            'decoder': subprocess.Popen(
-                [sys.executable, str(scripts / 'decoder'), '--ros-args', '-r', 'image:=/seen',
-                 '-p', 'stream:=/camera/h264'])}
-        try:
-            early, late, seen = through(nodes, count)
-        finally:
-            for node in nodes.values():
-                node.send_signal(signal.SIGINT)
-                node.wait(15)
+    os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_DOMAIN_ID='84',
+                      PYTHONPATH=os.pathsep.join(
+                          [str(ROOT), os.environ.get('PYTHONPATH', '')]))
+    scripts = ROOT / 'image_transport_h264/scripts'
+    nodes = {
+        'encoder': subprocess.Popen(
+            [sys.executable, str(scripts / 'encoder'), '--ros-args', '-r', 'image:=/camera',
+             '-p', 'adapt:=false']),
+        'decoder': subprocess.Popen(
+            [sys.executable, str(scripts / 'decoder'), '--ros-args', '-r', 'image:=/seen',
+             '-p', 'stream:=/camera/h264'])}
+    try:
+        early, late, seen = through(nodes, count)
+    finally:
+        for node in nodes.values():
+            node.send_signal(signal.SIGINT)
+            node.wait(15)
     rows = [Row('images through both nodes', float(seen), '')]
     for name in nodes:
         rows.append(Row(f'{name}: memory after a tenth', early[name], 'MiB'))

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import dataclasses
 import datetime
+from importlib import metadata
 import json
 import os
 from pathlib import Path
@@ -70,7 +71,18 @@ def machine() -> str:
             break
     memory = os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30
     return (f'{model}, {os.cpu_count()} cores, {memory:.0f} GiB, Linux {platform.release()}, '
-            f'Python {platform.python_version()}')
+            f'Python {platform.python_version()}, {ros()}')
+
+
+def ros() -> str:
+    """Return the versions of rclpy and of the middleware that nodes use here."""
+    rmw = os.environ.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp'
+    try:
+        return (f"rclpy {metadata.version('ros-rclpy')} from wheels with {rmw} "
+                f"{metadata.version('ros-rmw-fastrtps-cpp')} (Fast DDS "
+                f"{metadata.version('ros-fastrtps')})")
+    except metadata.PackageNotFoundError:
+        return f"ROS 2 {os.environ.get('ROS_DISTRO', 'of this computer')} with {rmw}"
 
 
 def write(

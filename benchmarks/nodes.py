@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-``rclpy`` on the embedded default, and beside it on ROS 2 where that is installed.
+Nodes of ``rclpy`` from the wheels, and beside them from ROS 2 where that is installed.
 
-Both run as they come, with Cyclone DDS and the receive buffers that each asks for, on this
-computer's loopback. ``ROS2_SETUP`` names the set-up script of a ROS 2 that isn't in
-``/opt/ros/jazzy``.
+Both run as they come, with Fast DDS, on this computer. ``ROS2_SETUP`` names the set-up script of a
+ROS 2 that isn't in ``/opt/ros/jazzy``.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 import contextlib
-import importlib
 import json
 import os
 from pathlib import Path
@@ -22,12 +20,6 @@ import subprocess
 import sys
 import time
 from typing import Any
-
-if __name__ == 'rclpy':
-    # a script beside this one asked for ROS 2's package, which this file hides by its name
-    sys.path.append(sys.path.pop(sys.path.index(str(Path(__file__).parent))))
-    del sys.modules['rclpy']
-    importlib.import_module('rclpy')
 
 from figures import Row, write
 
@@ -234,7 +226,7 @@ class Ros:
         keep = ('HOME', 'LANG', 'PATH', 'FOGROS2_VENV')
         self.environment = {key: os.environ[key] for key in keep if key in os.environ}
         self.environment.update(
-            RMW_IMPLEMENTATION='rmw_cyclonedds_cpp', ROS_DOMAIN_ID='87',
+            ROS_DOMAIN_ID='87',
             ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', PYTHONUNBUFFERED='1')
 
     @contextlib.contextmanager
@@ -312,12 +304,12 @@ class Ros:
                          'MiB', 1, 1)]
 
     def row(self, what: str, value: float, unit: str, target: float | None, runs: int) -> Row:
-        """Make a row; targets are for the embedded default."""
+        """Make a row; targets are for the wheels."""
         return Row(f'{what}: {self.name}', value, unit,
-                   target if self.name == EMBEDDED else None, runs=runs)
+                   target if self.name == WHEELS else None, runs=runs)
 
 
-EMBEDDED = 'embedded'
+WHEELS = 'wheels'
 
 
 def hear(process: subprocess.Popen[str]) -> dict[str, float]:
@@ -334,13 +326,13 @@ def main() -> None:
     """Measure on both, one figure after the other."""
     both = []
     if Path(os.environ.get('FOGROS2_VENV', ROOT / '.venv')).is_dir():
-        both.append(Ros(EMBEDDED, [str(ROOT / 'tools/run.sh'), 'embedded', '--', 'python']))
+        both.append(Ros(WHEELS, [str(ROOT / 'tools/run.sh'), 'embedded', '--', 'python']))
     if SETUP.is_file():
         both.append(Ros('ROS 2', ['sh', '-c', f'. "{SETUP}" && exec python3 "$@"', 'sh']))
     rows = [row for measure in (Ros.imports, Ros.round_trips, Ros.images, Ros.discovery,
                                 Ros.memory)
             for ros in both for row in measure(ros)]
-    write('rclpy', 'rclpy on the embedded default and on ROS 2', rows)
+    write('nodes', 'Nodes of rclpy, from the wheels and from ROS 2', rows)
 
 
 ROLES = {role.__name__: role for role in (echo, trips, many, camera, viewer)}
