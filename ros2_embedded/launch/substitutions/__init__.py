@@ -8,8 +8,8 @@ import math
 import os
 from typing import Any, Iterable, Sequence
 
-import launch.logging
 from embedded_default.lacking import lacking
+import launch.logging
 
 from .._base import SomeSubstitutionsType, Substitution
 from ..frontend.expose import expose_substitution

@@ -6,12 +6,12 @@ import os
 import shutil
 
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
+from embedded_default.lacking import lacking
 from launch import SomeSubstitutionsType
 from launch.frontend.expose import expose_substitution
 from launch.launch_context import LaunchContext
 from launch.substitutions import described, ParsedSubstitution, SubstitutionFailure
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
-from embedded_default.lacking import lacking
 
 __all__ = ['ExecutableInPackage', 'FindPackage', 'FindPackagePrefix', 'FindPackageShare']
 __getattr__ = lacking(__name__, 'Parameter')
