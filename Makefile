@@ -34,12 +34,12 @@ cloud-check:
 	@tools/setup.sh cloud
 	@tools/run.sh best -- python tools/cloud_check.py $(PROVIDER) $(if $(OPTIONS),--options '$(OPTIONS)')
 
-## test   all tests, on the embedded default and, where it is installed, on ROS 2
+## test   the tests, on ROS 2's wheels and, where it is installed, on ROS 2
 test:
 	@tools/setup.sh test
 	@tools/test.sh $(ARGS)
 
-## test-fast   the tests that make no machine, on the embedded default, in less than 90 s
+## test-fast   the tests that make no machine, on ROS 2's wheels, in less than 90 s
 test-fast:
 	@tools/setup.sh test
 	@rm -f .cache/test-*.xml

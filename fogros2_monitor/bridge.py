@@ -32,7 +32,10 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from std_msgs.msg import Empty
 
-from fogros2_monitor.definitions import definition, message_class
+from fogros2 import ros_types
+from fogros2_monitor.definitions import definition
+from image_transport_h264.cdr import CdrError
+from image_transport_h264.message import coded
 
 #: Poll interval of the topics in the graph, in seconds.
 LOOK = 0.5
@@ -52,7 +55,7 @@ class _Topic:
         self.viewers: set[int] = set()
         self._node = node
         self._name = name
-        self._class = message_class(kind)
+        self._class = ros_types.message(kind)
         schema = CompressedVideo.get_schema() if video else foxglove.Schema(
             name=kind, encoding='ros2msg', data=definition(kind).encode())
         self._channel = foxglove.Channel(
@@ -105,23 +108,24 @@ class _Topic:
     def _subscribe(self) -> None:
         qos = fitting(self._node, self._name)
         self._fits = qos.durability, qos.reliability
-        if self.video:
-            self._subscription = self._node.create_subscription(
-                self._class, self._name, self._show_video, qos)
-        else:
-            self._subscription = self._node.create_subscription(
-                self._class, self._name, self._channel.log, qos, raw=True)
+        self._subscription = self._node.create_subscription(
+            self._class, self._name, self._show_video if self.video else self._channel.log, qos,
+            raw=True)
 
     def _unsubscribe(self) -> None:
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
 
-    def _show_video(self, message: Any) -> None:
-        stamp = message.header.stamp
+    def _show_video(self, message: bytes) -> None:
+        try:
+            header, form, data = coded(message)
+        except CdrError as error:
+            self._node.get_logger().warning(f'{self._name}: {error}', once=True)
+            return
         self._channel.log(CompressedVideo(
-            timestamp=Timestamp(stamp.sec, stamp.nanosec), frame_id=message.header.frame_id,
-            data=bytes(message.data), format=message.format).encode())
+            timestamp=Timestamp(header.sec, header.nanosec), frame_id=header.frame_id,
+            data=bytes(data), format=form).encode())
 
 
 class BridgeNode(Node, ServerListener):
@@ -207,7 +211,7 @@ class BridgeNode(Node, ServerListener):
             self._refuse(f"{topic}: publishes '{encoding}', this bridge takes cdr")
             return
         try:
-            self._published[key] = self.create_publisher(message_class(kind), topic, 10)
+            self._published[key] = self.create_publisher(ros_types.message(kind), topic, 10)
         except (LookupError, NameValidationException) as error:
             self._refuse(f'{topic}: {error}')
 

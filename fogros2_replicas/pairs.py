@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-import struct
 from typing import Optional
 
 from fogros2_replicas.figures import Figures
+from image_transport_h264.cdr import CdrError, Reader
 
 #: Stamp in nanoseconds, and frame id.
 Header = tuple[int, str]
@@ -24,23 +24,21 @@ REMEMBERED, MISSES = 512, 10
 STREAK = 3
 #: An input that is so many nanoseconds older than the newest one means that time was set back.
 SET_BACK = 1_000_000_000
+#: Bytes of a frame id that are compared; maximum number of different ids of one stamp.
+FRAME, FRAMES = 256, 1000
 
 
 def header_of(data: bytes) -> Optional[Header]:
     """
     Read stamp and frame id of a serialized message that begins with ``std_msgs/Header``.
 
-    :param data: CDR with its encapsulation header of four bytes.
-    :returns: None if the data are too short.
+    :returns: None if the message is malformed.
     """
-    little = data[1:2] in (b'\x01', b'\x07')
-    if len(data) < 16:
+    try:
+        seconds, nanoseconds, frame = Reader(data).header()
+    except CdrError:
         return None
-    seconds, nanoseconds, length = struct.unpack_from('<iII' if little else '>iII', data, 4)
-    if len(data) < 16 + length:
-        return None
-    frame = data[16:16 + max(0, length - 1)].decode(errors='replace')
-    return seconds * 1_000_000_000 + nanoseconds, frame
+    return seconds * 1_000_000_000 + nanoseconds, frame[:FRAME]
 
 
 class Pair:
@@ -112,6 +110,8 @@ class Pair:
             self._newest = stamp
             self._came.clear()
             self._forwarded.clear()
+        if len(self._came) == FRAMES and (name, frame) not in self._came:
+            return False
         self._came[name, frame] += 1
         if self._came[name, frame] <= self._forwarded[frame]:
             return False

@@ -8,7 +8,6 @@ SEI unit with a Tag. Deep pictures (16 bit, float) are coded by FFV1 instead, al
 
 from __future__ import annotations
 
-import array
 import dataclasses
 from fractions import Fraction
 import functools
@@ -330,8 +329,8 @@ class Decoder:
                               f'{width}x{height} in rows of {step} bytes', 'damage')
         data = _pixels(frame, layout, width, height, step)
         if tag is not None and layout.alpha:
-            _put_alpha(numpy.frombuffer(data, numpy.uint8).reshape(height, step), tag)
-        return Picture(width, height, encoding, step, data, big)
+            _put_alpha(data, tag)
+        return Picture(width, height, encoding, step, data.reshape(-1).data, big)
 
 
 def peek(data: bytes) -> Optional[Tag]:
@@ -551,39 +550,40 @@ def _frame(picture: Picture, layout: Layout, coding: Coding) -> VideoFrame:
 
 def _pixels(
     frame: VideoFrame, layout: Layout, width: int, height: int, step: int,
-) -> array.array[int]:
-    """Convert a frame to ``step * height`` bytes in the layout."""
-    # rclpy takes an array over as it is, so this is the only copy after the codec.
-    memory = array.array('B', [0]) * (height * step)
-    out = numpy.frombuffer(memory, numpy.uint8).reshape(height, step)
-    _convert(frame, layout, width, height, out)
-    return memory
+) -> Pixels:
+    """
+    Convert a frame to an array (height, step) in the layout.
+
+    The array shares the frame's memory where its rows have ``step`` bytes. Then the only copy of
+    the pixels is the one into the message.
+    """
+    rows, row = _converted(frame, layout, width, height), width * layout.pixel_bytes
+    if rows.shape[1] == row == step:
+        return rows[:height]
+    out = numpy.zeros((height, step), numpy.uint8)
+    out[:, :row] = rows[:height, :row]
+    return out
 
 
-def _convert(
-    frame: VideoFrame, layout: Layout, width: int, height: int, out: Pixels,
-) -> None:
-    row = width * layout.pixel_bytes
+def _converted(frame: VideoFrame, layout: Layout, width: int, height: int) -> Pixels:
+    """Return a frame's rows in the layout, of the picture's width and height or more."""
     if layout.kind == 'grey' and frame.format.name.startswith(('gray', 'yuv', 'nv')):
-        out[:, :row] = lines(frame)[:height, :width]
-        return
+        return lines(frame)
     if layout.kind == 'yuv422':
-        converted = _reformat(
+        return lines(_reformat(
             frame, format=layout.av_format, src_color_range=ColorRange.MPEG,
-            dst_color_range=ColorRange.MPEG)
-    else:
-        # swscale (9.5, x86) leaves the last 2 or 4 of 16n + 2 or 4 four-byte pixels unwritten.
-        narrow = layout.alpha and frame.width % 16 != 0
-        av_format = layout.av_format.replace('a', '24') if narrow else layout.av_format
-        converted = _reformat(
-            frame, format=av_format, src_colorspace=_colorspace(frame),
-            dst_colorspace=Colorspace.ITU601)
-        if narrow:
-            colours = lines(converted)[:height, :3 * width].reshape(height, width, 3)
-            for channel in range(3):
-                out[:, channel:row:4] = colours[:, :, channel]
-            return
-    out[:, :row] = lines(converted)[:height, :row]
+            dst_color_range=ColorRange.MPEG))
+    # swscale (9.5, x86) leaves the last 2 or 4 of 16n + 2 or 4 four-byte pixels unwritten.
+    narrow = layout.alpha and frame.width % 16 != 0
+    av_format = layout.av_format.replace('a', '24') if narrow else layout.av_format
+    rows = lines(_reformat(
+        frame, format=av_format, src_colorspace=_colorspace(frame),
+        dst_colorspace=Colorspace.ITU601))
+    if not narrow:
+        return rows
+    pixels = numpy.full((height, width, 4), 255, numpy.uint8)
+    pixels[:, :, :3] = rows[:height, :3 * width].reshape(height, width, 3)
+    return pixels.reshape(height, 4 * width)
 
 
 def _colorspace(frame: VideoFrame) -> int:

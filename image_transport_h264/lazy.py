@@ -40,6 +40,8 @@ REQUEST_QOS = _qos(1)
 #: A message that later subscribers receive too.
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
+#: Maximum number of causes that a node logs; some have a text of the message.
+MOST_CAUSES = 64
 #: Time-out of a message's acknowledgement in seconds; a reader that hangs delays the others.
 LONGEST = 2.0
 
@@ -149,11 +151,16 @@ class LazyNode(Node):
         return self._counts[publisher]
 
     def complain(self, cause: str, message: str) -> None:
-        """Log a warning for the first message of each cause."""
+        """
+        Log a warning for the first message of each cause.
+
+        :param message: may have texts of other computers, which must control no terminal.
+        """
         with self._complaining:
-            if cause in self._complained:
+            if cause in self._complained or len(self._complained) >= MOST_CAUSES:
                 return
             self._complained.add(cause)
+        message = ''.join(c if c.isprintable() else '?' for c in message)
         self.get_logger().warning(f'{message} (further ones of this kind go unmentioned)')
 
     def offer(
@@ -179,14 +186,14 @@ class LazyNode(Node):
 
 class Tap:
     """
-    A subscription that exists only on request.
+    A subscription to serialized messages that exists only on request.
 
     The tap subscribes again if a new publisher needs another reliability.
     """
 
     def __init__(
         self, node: LazyNode, kind: Any, topic: str, qos: QoSProfile,
-        heard: Callable[[Any], object], *, adapt: bool = True,
+        heard: Callable[[bytes], object], *, adapt: bool = True,
     ) -> None:
         self._node, self._kind, self._topic = node, kind, topic
         self._qos, self._heard, self._adapt = qos, heard, adapt
@@ -215,7 +222,7 @@ class Tap:
         self._reliability = qos.reliability
         events = SubscriptionEventCallbacks(matched=self._matched if self._adapt else None)
         self._subscription = self._node.create_subscription(
-            self._kind, self._topic, self._heard, qos, event_callbacks=events)
+            self._kind, self._topic, self._heard, qos, event_callbacks=events, raw=True)
 
     def _matched(self, _: Any) -> None:
         fitting = self._node.fitting(self._topic, self._qos).reliability

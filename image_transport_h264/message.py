@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Convert between ROS messages, pictures and packets."""
+"""Convert between serialized ROS messages, pictures and packets."""
 
 from __future__ import annotations
 
 import array
 import importlib
 import struct
-from typing import Any, Optional
+from typing import Any, Optional, TYPE_CHECKING
 
-from sensor_msgs.msg import CompressedImage, Image
-from std_msgs.msg import Header
+from image_transport_h264.cdr import CdrError, Header, Reader, Writer
+from image_transport_h264.picture import Buffer, Picture
 
-from image_transport_h264.codec import Packet, Picture
+if TYPE_CHECKING:
+    from image_transport_h264.codec import Packet
 
 #: Last part of the names of a stream's auxiliary topics.
 KEY_REQUEST, FEEDBACK, PIECES, CAMERA_INFO = 'keyframe', 'feedback', 'pieces', 'camera_info'
@@ -20,49 +21,86 @@ KEY_REQUEST, FEEDBACK, PIECES, CAMERA_INFO = 'keyframe', 'feedback', 'pieces', '
 _HEADER = struct.Struct('>iIH')
 
 
-def picture(message: Image) -> Picture:
-    """Return the picture of a message; it shares the message's data."""
-    return Picture(message.width, message.height, message.encoding, message.step,
-                   memoryview(message.data), bool(message.is_bigendian))
+def picture(data: bytes) -> tuple[Header, Picture]:
+    """
+    Read a serialized ``sensor_msgs/Image``; the picture shares the message's memory.
+
+    :raises CdrError: the message is malformed.
+    """
+    reader = Reader(data)
+    header = reader.header()
+    height, width = reader.numbers('II')
+    encoding = reader.string()
+    big, step = reader.numbers('BI')
+    return header, Picture(width, height, encoding, step, reader.octets(), bool(big))
 
 
-def image(header: Header, shown: Picture) -> Image:
-    """Return a picture as a message, with one copy of the data."""
-    return Image(
-        header=header, height=shown.height, width=shown.width, encoding=shown.encoding,
-        is_bigendian=int(shown.is_bigendian), step=shown.step, data=octets(shown.data))
+def image(header: Header, shown: Picture) -> bytes:
+    """Return a picture as a serialized ``sensor_msgs/Image``, with one copy of the data."""
+    return Writer().header(header).numbers('II', shown.height, shown.width).string(
+        shown.encoding).numbers('BI', shown.is_bigendian, shown.step).octets(shown.data).data()
 
 
-def octets(data: Any) -> 'array.array[int]':
+def coded(data: bytes) -> tuple[Header, str, memoryview]:
+    """
+    Return header, format and data of a serialized ``sensor_msgs/CompressedImage``.
+
+    :raises CdrError: the message is malformed.
+    """
+    reader = Reader(data)
+    return reader.header(), reader.string(), reader.octets()
+
+
+def compressed(header: Header, form: str, data: Buffer) -> bytes:
+    """
+    Return a packet as a serialized ``sensor_msgs/CompressedImage``.
+
+    :param form: of H.264 only 'h264', which viewers know; the packet has the original encoding.
+    """
+    return Writer().header(header).string(form).octets(data).data()
+
+
+def piece(data: bytes) -> bytes:
+    """
+    Return the data of a serialized ``std_msgs/UInt8MultiArray`` without dimensions.
+
+    :raises CdrError: the message is malformed.
+    """
+    reader = Reader(data)
+    dimensions, _ = reader.numbers('II')
+    if dimensions:
+        raise CdrError('a piece of a packet with dimensions')
+    return bytes(reader.octets())
+
+
+def in_pieces(data: bytes) -> bytes:
+    """Return a piece of a packet as a serialized ``std_msgs/UInt8MultiArray``."""
+    return Writer().numbers('II', 0, 0).octets(data).data()
+
+
+def octets(data: Buffer) -> 'array.array[int]':
     """Convert bytes to an array, which rclpy takes over without a check of each byte."""
-    if isinstance(data, array.array):
-        return data
-    values = array.array('B')
-    values.frombytes(data)
-    return values
-
-
-def compressed(header: Header, packet: Packet) -> CompressedImage:
-    """
-    Return a packet as a message.
-
-    ``format`` is only 'h264', which viewers know; the packet contains the original encoding.
-    """
-    return CompressedImage(header=header, format=packet.format, data=octets(packet.data))
+    return array.array('B', bytes(data))
 
 
 def with_header(header: Header, data: bytes) -> bytes:
     """Return a packet with its message's header in front, to be sent in pieces."""
-    name: bytes = header.frame_id.encode()
-    return _HEADER.pack(header.stamp.sec, header.stamp.nanosec, len(name)) + name + data
+    name = header.frame_id.encode()
+    return _HEADER.pack(header.sec, header.nanosec, len(name)) + name + data
 
 
 def header_and_data(whole: bytes) -> tuple[Header, bytes]:
-    """Split the bytes of :func:`with_header` into header and packet."""
+    """
+    Split the bytes of :func:`with_header` into header and packet.
+
+    :raises CdrError: the bytes are too few.
+    """
+    if len(whole) < _HEADER.size:
+        raise CdrError('a packet in pieces without a header')
     seconds, nanoseconds, length = _HEADER.unpack_from(whole)
-    header = Header(frame_id=whole[_HEADER.size:_HEADER.size + length].decode(errors='replace'))
-    header.stamp.sec, header.stamp.nanosec = seconds, nanoseconds
-    return header, whole[_HEADER.size + length:]
+    begin = _HEADER.size + length
+    name = whole[_HEADER.size:begin].decode(errors='replace')
+    return Header(seconds, nanoseconds, name), whole[begin:]
 
 
 def camera_info_topic(topic: str) -> str:
@@ -81,13 +119,16 @@ def installed(package: str, name: str) -> Optional[Any]:
 def ffmpeg_packet(kind: Any, header: Header, packet: Packet) -> Any:
     """Return a packet as ``ffmpeg_image_transport_msgs/FFMPEGPacket``."""
     tag = packet.tag
-    return kind(
-        header=header, width=tag.width, height=tag.height,
-        encoding=f'h264;yuv420p;bgr8;{tag.encoding}', pts=tag.sequence, flags=int(tag.key),
-        is_bigendian=tag.is_bigendian, data=octets(packet.data))
+    made = kind(
+        width=tag.width, height=tag.height, encoding=f'h264;yuv420p;bgr8;{tag.encoding}',
+        pts=tag.sequence, flags=int(tag.key), is_bigendian=tag.is_bigendian,
+        data=octets(packet.data))
+    made.header.stamp.sec, made.header.stamp.nanosec, made.header.frame_id = header
+    return made
 
 
 def compressed_video(kind: Any, header: Header, packet: Packet) -> Any:
     """Return a packet as ``foxglove_msgs/CompressedVideo``."""
-    return kind(timestamp=header.stamp, frame_id=header.frame_id, format='h264',
-                data=octets(packet.data))
+    made = kind(frame_id=header.frame_id, format='h264', data=octets(packet.data))
+    made.timestamp.sec, made.timestamp.nanosec, _ = header
+    return made

@@ -11,10 +11,11 @@ from typing import Any, Optional
 
 from rcl_interfaces.msg import ParameterDescriptor
 from sensor_msgs.msg import CompressedImage, Image
-from std_msgs.msg import Empty, Header, UInt8MultiArray, UInt64MultiArray
+from std_msgs.msg import Empty, UInt8MultiArray, UInt64MultiArray
 
 from image_transport_h264 import message, stills
 from image_transport_h264.annexb import Tag
+from image_transport_h264.cdr import CdrError, Header
 from image_transport_h264.codec import CodecError, Decoder, Missing, peek
 from image_transport_h264.lazy import (
     best_effort,
@@ -30,7 +31,7 @@ from image_transport_h264.message import FEEDBACK, KEY_REQUEST, PIECES
 from image_transport_h264.picture import MAX_PIXELS
 from image_transport_h264.repair import Assembler
 
-Publish = Callable[[Image], None]
+Publish = Callable[[bytes], None]
 #: A packet, with its tag if it is to be acknowledged when it is decoded.
 Coded = tuple[Header, bytes, Optional[Tag]]
 #: Maximum number of packets that wait for the decoder; with more, the decoder is too slow.
@@ -59,14 +60,14 @@ class Receiver:
 
 def make_receiver(node: LazyNode, codec: str, stream: str, publish: Publish) -> Receiver:
     """
-    Create the receiver of a codec, which passes images to ``publish``.
+    Create the receiver of a codec, which passes serialized images to ``publish``.
 
     :raises ValueError: the codec is unknown.
     """
     if codec == 'h264':
         return VideoReceiver(node, stream, publish)
     kind: Any = Image
-    work: Callable[[Any], None] = publish
+    work: Callable[[bytes], None] = publish
     if codec in ('jpeg', 'png'):
         kind = CompressedImage
         work = functools.partial(_decode_still, node, publish, _max_pixels(node))
@@ -81,15 +82,16 @@ def _max_pixels(node: LazyNode) -> int:
 
 
 def _decode_still(
-    node: LazyNode, publish: Publish, max_pixels: int, coded: CompressedImage,
+    node: LazyNode, publish: Publish, max_pixels: int, coded: bytes,
 ) -> None:
     """Decode a JPEG or PNG image."""
     try:
-        picture = stills.decode(coded.format, memoryview(coded.data), max_pixels)
-    except CodecError as error:
+        header, form, data = message.coded(coded)
+        picture = stills.decode(form, data, max_pixels)
+    except (CdrError, CodecError) as error:
         node.complain(error.cause, f'packet not shown: {error}')
         return
-    publish(message.image(coded.header, picture))
+    publish(message.image(header, picture))
 
 
 class VideoReceiver(Receiver):
@@ -118,26 +120,36 @@ class VideoReceiver(Receiver):
                      adapt=False)
         super().__init__(self._tap, pieces)
 
-    def _whole(self, coded: CompressedImage) -> None:
-        data = bytes(coded.data)
+    def _whole(self, coded: bytes) -> None:
+        try:
+            header, form, view = message.coded(coded)
+        except CdrError as error:
+            self._node.complain(error.cause, f'packet not shown: {error}')
+            return
+        data = bytes(view)
         tag = peek(data)
         if tag is not None:
             self._count(tag)
-        if coded.format == 'ffv1':
+        if form == 'ffv1':
             self._tap.ask_for(STREAM_QOS)
             # The sender waits for the acknowledgement of the middleware.
-            self._worker.put((coded.header, data, None))
+            self._worker.put((header, data, None))
             return
         # Pieces or a new keyframe repair losses; repetition by the middleware would delay packets
         # that have already arrived.
         self._tap.ask_for(best_effort(STREAM_QOS))
-        self._take(coded.header, data, tag)
+        self._take(header, data, tag)
 
-    def _piece(self, piece: UInt8MultiArray) -> None:
-        whole = self._assembler.add(bytes(piece.data))
-        if whole is not None:
+    def _piece(self, piece: bytes) -> None:
+        try:
+            whole = self._assembler.add(message.piece(piece))
+            if whole is None:
+                return
             header, data = message.header_and_data(whole)
-            self._take(header, data, peek(data))
+        except CdrError as error:
+            self._node.complain(error.cause, f'packet not shown: {error}')
+            return
+        self._take(header, data, peek(data))
 
     def _take(self, header: Header, data: bytes, tag: Optional[Tag]) -> None:
         # An early acknowledgement measures the link. If decoding is the bottleneck, acknowledge

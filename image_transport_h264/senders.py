@@ -15,10 +15,11 @@ from rcl_interfaces.msg import IntegerRange, ParameterDescriptor, SetParametersR
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CompressedImage, Image
-from std_msgs.msg import Empty, Header, UInt8MultiArray, UInt64MultiArray
+from std_msgs.msg import Empty, UInt8MultiArray, UInt64MultiArray
 
 from image_transport_h264 import message, stills
 from image_transport_h264.budget import Budget
+from image_transport_h264.cdr import CdrError, Header
 from image_transport_h264.codec import CodecError, Encoder, Packet, Settings
 from image_transport_h264.control import Control
 from image_transport_h264.lazy import (
@@ -49,8 +50,8 @@ class Sender(abc.ABC):
         return sum(map(self._node.subscribers, self.publishers))
 
     @abc.abstractmethod
-    def send(self, image: Image) -> None:
-        """Encode and publish an image."""
+    def send(self, image: bytes) -> None:
+        """Encode and publish a serialized ``sensor_msgs/Image``."""
 
 
 def make_sender(
@@ -90,10 +91,10 @@ class PictureSender(Sender):
         self._waiters = ThreadPoolExecutor(MOST, 'acknowledgement')
         self._under_way: list[Future[tuple[Sent, float, bool]]] = []
 
-    def send(self, image: Any) -> None:
-        """Publish an image, raw or compressed, and wait until the next one may be sent."""
+    def send(self, image: bytes) -> None:
+        """Publish a serialized image, and wait until the next one may be sent."""
         self._budget.pace()
-        begin, size = time.monotonic(), len(image.data)
+        begin, size = time.monotonic(), len(image)
         self._budget.sent(size, 8.0 * size, self._latency)
         if size >= LARGE:
             self._node.put_through(self._publisher, image)
@@ -134,16 +135,16 @@ class StillSender(PictureSender):
         node.declare_parameter('jpeg_quality', 80, ParameterDescriptor(
             integer_range=[IntegerRange(from_value=1, to_value=100, step=1)]))
 
-    def send(self, image: Image) -> None:
+    def send(self, image: bytes) -> None:
         """Encode and publish the image."""
         try:
-            form, data = stills.encode(message.picture(image), self._kind,
-                                       self._node.get_parameter('jpeg_quality').value)
-        except CodecError as error:
+            header, picture = message.picture(image)
+            form, data = stills.encode(
+                picture, self._kind, self._node.get_parameter('jpeg_quality').value)
+        except (CdrError, CodecError) as error:
             self._node.complain(error.cause, f'image not sent: {error}')
             return
-        super().send(CompressedImage(
-            header=image.header, format=form, data=message.octets(data)))
+        super().send(message.compressed(header, form, data))
 
 
 #: name, default, description
@@ -237,11 +238,15 @@ class VideoSender(Sender):
 
     # --- in the worker's thread
 
-    def send(self, image: Image) -> None:
+    def send(self, image: bytes) -> None:
         """Encode and publish the image, unless the rate control skips it."""
+        try:
+            header, picture = message.picture(image)
+        except CdrError as error:
+            self._node.complain(error.cause, f'image not sent: {error}')
+            return
         self._budget.pace()
         now = time.monotonic()
-        picture = message.picture(image)
         with self._lock:
             self._control.share = self._budget.share
             if not self._control.due(now, picture.width * picture.height):
@@ -259,14 +264,15 @@ class VideoSender(Sender):
             # An incomplete deep picture is useless, so the middleware repeats lost parts; the
             # wait for the acknowledgement limits the rate to the link's.
             self._budget.sent(len(packet.data), 8.0 * len(packet.data), 0.0)
-            self._node.put_through(self._video, message.compressed(image.header, packet))
+            self._node.put_through(
+                self._video, message.compressed(header, packet.format, packet.data))
             return
         with self._lock:
             protects = self._control.protects(now)
         again: list[bytes] = []
         if protects:
             again = pieces(packet.tag.stream, packet.tag.sequence,
-                           message.with_header(image.header, packet.data))
+                           message.with_header(header, packet.data))
         left = time.monotonic()
         size = len(packet.data) + sum(map(len, again))
         with self._lock:
@@ -277,11 +283,12 @@ class VideoSender(Sender):
             self._budget.sent(size, floor, self._control.latency, self._control.asked.bitrate)
         # Pieces first: after a loss, the packet is then complete one datagram later.
         for piece in again:
-            self._node.put_out(self._pieces, UInt8MultiArray(data=message.octets(piece)))
-        self._publish(image.header, packet)
+            self._node.put_out(self._pieces, message.in_pieces(piece))
+        self._publish(header, packet)
 
     def _publish(self, header: Header, packet: Packet) -> None:
-        self._node.put_out(self._video, message.compressed(header, packet))
+        self._node.put_out(
+            self._video, message.compressed(header, packet.format, packet.data))
         for publisher, kind, make in self._others:
             if self._node.subscribers(publisher):
                 self._node.put_out(publisher, make(kind, header, packet))

@@ -15,6 +15,8 @@ Octets = NDArray[numpy.uint8]
 MAX_BYTES = 32 << 20
 #: Bytes of the largest point.
 MAX_POINT = 4096
+#: Maximum number of fields, and of bytes of a field's name.
+MOST_FIELDS = 255
 #: Bytes of the datatypes of ``sensor_msgs/PointField``, INT8 = 1 to FLOAT64 = 8.
 SIZES = (0, 1, 1, 2, 2, 4, 4, 4, 8)
 FLOAT32 = 7
@@ -68,19 +70,21 @@ class Layout:
         :raises CloudError: the cloud has no x, y, z as float32, or the sizes contradict each
             other, or the data have more than ``max_bytes``.
         """
-        sizes = (self.row_step * self.height, 12 * self.points, self.height, self.width,
-                 self.row_step)
+        # rows and columns take memory, even without points
+        height, width = max(self.height, 1), max(self.width, 1)
+        sizes = (self.row_step * height, 12 * height * width)
         if max(sizes) > max_bytes or self.point_step > MAX_POINT:
             raise CloudError('more points or bytes than allowed')
         if self.row_step < self.width * self.point_step:
             raise CloudError('row_step is less than a row')
-        if max([len(self.fields), *(len(field.name.encode()) for field in self.fields)]) > 255:
-            raise CloudError('more than 255 fields, or a name of more bytes')
+        if max([len(self.fields), *(len(field.name.encode()) for field in self.fields)]) > (
+                MOST_FIELDS):
+            raise CloudError(f'more than {MOST_FIELDS} fields, or a name of more bytes')
         for field in self.fields:
             if not 0 < field.datatype < len(SIZES):
-                raise CloudError(f"field '{field.name}' has an unknown datatype")
+                raise CloudError('a field has an unknown datatype')
             if field.offset + field.size > self.point_step:
-                raise CloudError(f"field '{field.name}' ends after the point")
+                raise CloudError('a field ends after the point')
         self.places()
 
     def places(self) -> list[int]:

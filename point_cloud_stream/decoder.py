@@ -8,15 +8,17 @@ parameter ``stream``. See doc/point_clouds.md for all topics and parameters.
 
 from __future__ import annotations
 
-import array
 import secrets
 
 from rcl_interfaces.msg import ParameterDescriptor
-from sensor_msgs.msg import CompressedImage, PointCloud2, PointField
-from std_msgs.msg import Header, UInt64MultiArray
+from sensor_msgs.msg import CompressedImage, PointCloud2
+from std_msgs.msg import UInt64MultiArray
 
 from image_transport_h264.budget import Announcement
+from image_transport_h264.cdr import CdrError, Header
 from image_transport_h264.lazy import IMAGE_QOS, LazyNode, run, STREAM_QOS, Tap
+from image_transport_h264.message import coded
+from point_cloud_stream import message
 from point_cloud_stream.cloud import CloudError, MAX_BYTES
 from point_cloud_stream.codec import decode, FORMAT
 from point_cloud_stream.parts import Assembler, FEEDBACK
@@ -45,28 +47,27 @@ class DecoderNode(LazyNode):
     def _matched(self) -> None:
         self._parts.want(self._announcement.want(self.subscribers(self._points) > 0))
 
-    def _part(self, part: CompressedImage) -> None:
-        acknowledge, whole = self._assembler.add(bytes(part.data))
+    def _part(self, part: bytes) -> None:
+        try:
+            header, _, data = coded(part)
+        except CdrError as error:
+            self.complain(str(error), f'part of a cloud not used: {error}')
+            return
+        acknowledge, whole = self._assembler.add(bytes(data))
         if acknowledge is not None:
             self.put_out(self._feedback, UInt64MultiArray(
                 data=[acknowledge[0], self._identity, acknowledge[1]]))
         if whole is not None:
-            self._worker.put((part.header, whole))
+            self._worker.put((header, whole))
 
-    def _decode(self, coded: tuple[Header, bytes]) -> None:
-        header, data = coded
+    def _decode(self, item: tuple[Header, bytes]) -> None:
+        header, data = item
         try:
             layout, octets = decode(data, self._max_bytes)
         except CloudError as error:
             self.complain(str(error), f'cloud not shown: {error}')
             return
-        self.put_out(self._points, PointCloud2(
-            header=header, height=layout.height, width=layout.width, fields=[
-                PointField(name=each.name, offset=each.offset, datatype=each.datatype,
-                           count=each.count) for each in layout.fields],
-            is_bigendian=layout.is_bigendian, point_step=layout.point_step,
-            row_step=layout.row_step, is_dense=layout.is_dense,
-            data=array.array('B', octets.tobytes())))
+        self.put_out(self._points, message.points(header, layout, octets))
 
 
 def main() -> None:

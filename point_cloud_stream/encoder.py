@@ -8,7 +8,6 @@ in the parameter ``stream``. See doc/point_clouds.md for all topics and paramete
 
 from __future__ import annotations
 
-import array
 import secrets
 import threading
 import time
@@ -19,8 +18,11 @@ from sensor_msgs.msg import CompressedImage, PointCloud2
 from std_msgs.msg import UInt64MultiArray
 
 from image_transport_h264.budget import Budget
+from image_transport_h264.cdr import CdrError
 from image_transport_h264.lazy import IMAGE_QOS, LazyNode, run, STREAM_QOS, Tap
-from point_cloud_stream.cloud import CloudError, Field, Layout
+from image_transport_h264.message import compressed
+from point_cloud_stream import message
+from point_cloud_stream.cloud import CloudError
 from point_cloud_stream.codec import encode, FORMAT
 from point_cloud_stream.control import Control, GIVE_UP
 from point_cloud_stream.parts import FEEDBACK, split
@@ -68,7 +70,7 @@ class EncoderNode(LazyNode):
         self._known = known
         self._clouds.want(known > 0)
 
-    def _take(self, cloud: PointCloud2) -> None:
+    def _take(self, cloud: bytes) -> None:
         with self._news:
             due = self._control.arrived(time.monotonic())
         if due:
@@ -84,11 +86,12 @@ class EncoderNode(LazyNode):
 
     # --- in the worker's thread
 
-    def _send(self, cloud: PointCloud2) -> None:
+    def _send(self, cloud: bytes) -> None:
         """Encode and publish a cloud, part by part as share and link take them."""
         try:
-            coded = encode(_layout(cloud), cloud.data, self._control.resolution, self._drop)
-        except CloudError as error:
+            header, layout, points = message.cloud(cloud)
+            coded = encode(layout, points, self._control.resolution, self._drop)
+        except (CdrError, CloudError) as error:
             self.complain(str(error), f'cloud of {self._named} not sent: {error}')
             return
         parts = split(coded.data, self._stream, self._cloud, self._part + 1)
@@ -105,15 +108,7 @@ class EncoderNode(LazyNode):
                 self._control.sent(self._part, time.monotonic())
             self._budget.sent(len(part), 8.0 * len(coded.data), self._control.latency,
                               short=self._control.resolution > self._control.asked)
-            self.put_out(self._publisher, CompressedImage(
-                header=cloud.header, format=FORMAT, data=array.array('B', part)))
-
-
-def _layout(cloud: PointCloud2) -> Layout:
-    return Layout(
-        cloud.height, cloud.width,
-        tuple(Field(each.name, each.offset, each.datatype, each.count) for each in cloud.fields),
-        cloud.point_step, cloud.row_step, bool(cloud.is_bigendian), bool(cloud.is_dense))
+            self.put_out(self._publisher, compressed(header, FORMAT, part))
 
 
 def main() -> None:

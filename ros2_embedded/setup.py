@@ -55,6 +55,8 @@ def index_entries() -> list[tuple[str, list[str]]]:
         (HERE / marker).write_text('')
         entries.append((f'share/{name}', [str(manifest)]))
         entries.append(('share/ament_index/resource_index/packages', [str(marker)]))
+        if name not in ROS_PACKAGES:
+            entries.append(('share/ament_index/resource_index/rosidl_interfaces', [str(marker)]))
     return entries
 
 

@@ -49,7 +49,7 @@ NOT_HERE = {
     'tests as root': 'the user is not root: tests that become other users are skipped by name',
     'systemd': 'the first process is a shell: no service is masked or started, no timer runs',
     'kernel modules': "the kernel is this computer's: WireGuard is wireguard-go where it has none",
-    'ROS 2 Jazzy': 'no release of Debian has it as packages: the embedded default is tested',
+    'ROS 2 Jazzy': 'no release of Debian has it as packages: its wheels are tested',
 }
 
 

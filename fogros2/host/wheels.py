@@ -203,7 +203,7 @@ def runs_on(needed: str, libc: str) -> bool:
     """Return whether a C library (such as ``glibc 2.36``) is at least the needed one."""
     def parts(text: str) -> tuple[str, tuple[int, ...]]:
         kind, _, version = text.partition(' ')
-        return kind, tuple(int(n) for n in version.split('.') if n.isdigit())
+        return kind, tuple(map(int, re.findall('[0-9]{1,9}', version)))
 
     return parts(needed)[0] == parts(libc)[0] and parts(needed) <= parts(libc)
 

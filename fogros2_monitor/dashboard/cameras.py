@@ -11,15 +11,15 @@ from typing import Any, Optional
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Empty
 
 from fogros2_monitor.dashboard import shots
 from image_transport_h264 import stills
+from image_transport_h264.cdr import CdrError
 from image_transport_h264.codec import CodecError, Decoder, Missing
-from image_transport_h264.message import KEY_REQUEST, picture
+from image_transport_h264.message import coded, KEY_REQUEST, picture
 from image_transport_h264.picture import Picture
 
 #: Seconds between two pictures of an image topic (IMAGE) and of a stream between machines
@@ -86,12 +86,12 @@ class Camera:
                 shown = self._picture(data)
                 if shown is not None:
                     self._show(shots.jpeg(shown))
-            except CodecError as error:
+            except (CdrError, CodecError) as error:
                 self._done()
                 self._tell({'picture': self._name, 'note': str(error)})
 
     def _picture(self, data: bytes) -> Optional[Picture]:
-        return picture(deserialize_message(data, Image))
+        return picture(data)[1]
 
     def _show(self, shot: bytes) -> None:
         self._done()
@@ -131,11 +131,11 @@ class StreamCamera(Camera):
             CompressedImage, self.topic, self._take, _QOS, raw=True)
 
     def _picture(self, data: bytes) -> Optional[Picture]:
-        message = deserialize_message(data, CompressedImage)
-        if message.format not in ('h264', 'ffv1'):
-            return stills.decode(message.format, memoryview(message.data))
+        _, form, packet = coded(data)
+        if form not in ('h264', 'ffv1'):
+            return stills.decode(form, packet)
         try:
-            return self._decoder.decode(message.data)
+            return self._decoder.decode(packet)
         except Missing:
             now = time.monotonic()
             if now - self._requested > REQUEST:

@@ -15,11 +15,15 @@ def set_up_environment() -> None:
     """
     Do what sourcing ``setup.bash`` does for ROS 2, for this process and those it starts.
 
-    Nodes then find this Python. (The ament index is set at each start of this Python.)
+    Nodes then find this Python, and the ament index its packages, behind those of overlays.
     """
-    paths = os.environ.get('PATH', '').split(os.pathsep)
-    if (programs := os.path.join(sys.prefix, 'bin')) not in paths:
-        os.environ['PATH'] = os.pathsep.join([programs, *filter(None, paths)])
+    def extended(name: str, *paths: str) -> None:
+        os.environ[name] = os.pathsep.join(dict.fromkeys(filter(None, paths)))
+
+    extended('PATH', os.path.join(sys.prefix, 'bin'),
+             *os.environ.get('PATH', '').split(os.pathsep))
+    extended('AMENT_PREFIX_PATH', *os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep),
+             sys.prefix)
     os.environ.setdefault('ROS_DISTRO', 'jazzy')
     os.environ.setdefault('ROS_VERSION', '2')
     os.environ.setdefault('ROS_PYTHON_VERSION', '3')

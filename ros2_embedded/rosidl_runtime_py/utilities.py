@@ -14,8 +14,8 @@ def _import(identifier: str, kind: str | None) -> Any:
     if len(parts) != 3 or parts[1] not in ('msg', 'srv', 'action'):
         raise ValueError(f"'{identifier}' is not of the form package/kind/Name")
     # The name may come from any node of the network: import no other module than a package's.
-    if not has_resource('packages', parts[0]):
-        raise ModuleNotFoundError(f"No package '{parts[0]}' in the ament index")
+    if not has_resource('rosidl_interfaces', parts[0]):
+        raise ModuleNotFoundError(f"No package '{parts[0]}' with interfaces is installed")
     return getattr(importlib.import_module('.'.join(parts[:2])), parts[2])
 
 

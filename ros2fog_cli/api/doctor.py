@@ -206,12 +206,12 @@ def firewall_program() -> Check:
 
 
 def ros() -> Check:
-    """Check for ROS 2 Jazzy or the embedded default."""
+    """Check for ROS 2 Jazzy, installed or from wheels."""
     name = 'ROS 2'
     if process.which('ros2') is None:
         return Check(name, 'failed', 'ros2 is not on PATH', "source ROS 2's setup.bash")
     try:
-        return Check(name, 'ok', f"embedded default {metadata.version('ros2-embedded')}")
+        return Check(name, 'ok', f"rclpy {metadata.version('ros-rclpy')} from wheels")
     except metadata.PackageNotFoundError:
         pass
     distro = os.environ.get('ROS_DISTRO', '')

@@ -115,7 +115,7 @@ def nothing_left(
 def isolated_root() -> None:
     """Skip where isolated machines get no root, or one that can't have the robot's ROS."""
     if not embedded():
-        pytest.skip('an isolated root gets the embedded default alone without a package index')
+        pytest.skip('an isolated root gets ROS 2 by pip alone')
     try:
         debian_root.check()
     except PrerequisiteError as error:
@@ -185,7 +185,7 @@ def images(engine: str, busybox: Path, tmp_path_factory: pytest.TempPathFactory,
     for name, text in ROS.items():
         archive.file(name, text.encode(), 0o755)
     ros.write_bytes(archive.data())
-    # as an entry point would set up what is mounted: the robot's ROS 2, or the embedded default
+    # as an entry point would set up what is mounted: the robot's ROS 2 or its wheels
     here = [f'PATH={sys.prefix}/bin:/usr/bin:/bin', 'AMENT_PREFIX_PATH=' + ':'.join(
         [*filter(None, [os.environ.get('AMENT_PREFIX_PATH')]), sys.prefix])]
     here += [f'{name}={os.environ[name]}' for name in ('LD_LIBRARY_PATH', 'PYTHONPATH')
@@ -220,8 +220,8 @@ def children() -> Iterator[list[subprocess.Popen[bytes]]]:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Return a bench for nodes; see rigs.bench."""
     from rigs.bench import made
-    with made(tmp_path, monkeypatch.setenv) as bench:
+    with made(monkeypatch.setenv) as bench:
         yield bench

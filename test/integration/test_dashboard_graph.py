@@ -15,7 +15,7 @@ import time
 import pytest
 
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
-pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
+pytest.importorskip('rclpy', reason='rclpy is not installed')
 import cv2
 import numpy
 import rclpy

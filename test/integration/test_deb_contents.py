@@ -90,7 +90,7 @@ def test_depends_on_what_the_manifests_say(built: Path) -> None:
         'python3-numpy (>= 1:1.26)', 'python3-opencv (>= 4.6)',
         'python3-paramiko (>= 2.12)', 'python3-yaml (>= 6.0)',
         'iproute2', 'openssh-client', 'rsync', 'wireguard-tools',
-        'ros-jazzy-launch-ros', 'ros-jazzy-rclpy', 'ros-jazzy-rmw-cyclonedds-cpp',
+        'ros-jazzy-launch-ros', 'ros-jazzy-rclpy', 'ros-jazzy-rmw-fastrtps-cpp',
         'ros-jazzy-ros2launch', 'ros-jazzy-ros-workspace', 'ros-jazzy-sensor-msgs'} <= found
     own = ('fogros2', 'image-transport-h264')
     assert not [name for name in found if name.startswith(tuple(f'ros-jazzy-{o}' for o in own))]

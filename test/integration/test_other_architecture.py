@@ -259,8 +259,8 @@ def test_modules_are_those_for_its_processor(
 def test_package_that_cannot_be_installed_is_named_first(
     computer: BareComputer, tmp_path: Path,
 ) -> None:
-    if not wheels.collect(tmp_path / 'wheels').embedded:
-        pytest.skip('this robot has ROS 2 and no embedded default to send')
+    if not wheels.collect(tmp_path / 'wheels').ros:
+        pytest.skip('this robot has an installation of ROS 2 and no wheels to send')
     path = tmp_path / 'arm.launch.py'
     path.write_text(f"""
 from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
@@ -276,7 +276,7 @@ def generate_launch_description():
         ended = start(str(path))
         assert ended.ended() == 1, ended.text
     assert f"(debian 12 {ARCHITECTURE}) can't be made ready for ROS 2" in ended.text
-    assert f'its cyclonedds has no package for {ARCHITECTURE} processors' in ended.text
+    assert f'ROS 2 has no wheels for {ARCHITECTURE} processors' in ended.text
     assert 'Ubuntu 24.04' in ended.text
     # nothing was sent but the agent, which has gone
     assert computer.run('ls /home/fog/.local/share/fogros2 /run/fogros2 2>&1 || :').stdout \

@@ -74,7 +74,7 @@ def launch():
 
 def example(computer, **arguments):
     given = {'host': computer.address, 'user': computer.user, 'key': computer.key,
-             'name': f'ssh-{RUN}', 'bootstrap': 'embedded', 'count': 2, **arguments}
+             'name': f'ssh-{RUN}', 'bootstrap': 'pip', 'count': 2, **arguments}
     return ['fogros2_examples', 'talker.ssh.launch.py',
             *(f'{name}:={value}' for name, value in given.items())]
 
@@ -101,7 +101,7 @@ def test_bare_computer_gets_missing_packages_once(computer, launch, home):
     first = launch(*example(computer, host_key=computer.host_key))
     assert first.ended() == 0, first.text
     assert f'I heard: [Hello World from {computer.name}' in first.text
-    assert ('embedded default installed' in first.text) == embedded()
+    assert ('ROS 2 installed by pip' in first.text) == embedded()
     assert 'WARNING' not in first.text and first.errors == []
     assert nothing_runs(computer) == []
 
@@ -226,7 +226,7 @@ def test_streams_bring_what_they_import_once(computer, launch, tmp_path):
         def generate_launch_description():
             machine = SSHInstance(
                 '{computer.address}', '{computer.user}', key='{computer.key}',
-                host_key='{computer.host_key}', name='video-{RUN}', bootstrap='embedded')
+                host_key='{computer.host_key}', name='video-{RUN}', bootstrap='pip')
             return FogROSLaunchDescription([
                 CloudNode(machine=machine, package='fogros2_examples', output='screen',
                           executable='image_processor', on_exit=Shutdown(), stream_topics=[

@@ -20,11 +20,10 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from fogros2.dds.cyclonedds import CycloneDds
-from fogros2.model import DdsInterface
 from rigs.domains import taken
 
 ROOT = Path(__file__).parents[2]
+SUDO = [] if os.geteuid() == 0 else ['sudo', '-n']
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -32,8 +31,7 @@ BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 class Bench:
     """A node in this process, and the processes under test."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self) -> None:
         self.environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(
             filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))}
         self.context = Context()
@@ -88,6 +86,20 @@ class Bench:
         self.node.create_subscription(kind, topic, messages.append, qos)
         return messages
 
+    @contextlib.contextmanager
+    def lossy(self) -> Iterator[None]:
+        """Lose every fifth datagram of the domain; it takes root, and nodes started inside."""
+        table = f'fogt{os.getpid()}'
+        first = 7400 + 250 * int(os.environ['ROS_DOMAIN_ID'])
+        self.environment['FASTDDS_BUILTIN_TRANSPORTS'] = 'UDPv4'
+        rules = (f'table inet {table} {{ chain lose {{ type filter hook input priority 0; '
+                 f'udp dport {first}-{first + 249} numgen random mod 5 == 0 drop; }}; }}')
+        subprocess.run([*SUDO, 'nft', '-f', '-'], input=rules, text=True, check=True)
+        try:
+            yield
+        finally:
+            subprocess.run([*SUDO, 'nft', 'delete', 'table', 'inet', table], check=True)
+
     def close(self) -> None:
         for process, _, _ in self.processes:
             if process.poll() is None:
@@ -107,20 +119,16 @@ class Bench:
 
 
 @contextlib.contextmanager
-def made(folder: Path, setenv: Callable[[str, str], None]) -> Iterator[Bench]:
+def made(setenv: Callable[[str, str], None]) -> Iterator[Bench]:
     """
-    Make a bench whose DDS stays on the loopback, in a domain of its own.
+    Make a bench whose DDS stays on this computer, in a domain of its own.
 
     :param setenv: sets a variable of this process until the test ends.
     """
-    vendor = CycloneDds()
-    path = folder / 'dds.xml'
-    path.write_text(vendor.render([DdsInterface('lo')], []))
-    for key, value in vendor.environment(str(path), {}).items():
-        setenv(key, value)
+    setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     with taken() as domain:
         setenv('ROS_DOMAIN_ID', domain)
-        bench = Bench(folder)
+        bench = Bench()
         try:
             yield bench
         finally:

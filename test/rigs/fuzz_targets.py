@@ -22,7 +22,7 @@ from typing import Any, cast, Optional
 
 import numpy
 
-from fogros2 import agent_client, events
+from fogros2 import agent_client, events, untrusted
 from fogros2.agent import protocol
 from fogros2.agent_client import connection
 from fogros2.dds.cyclonedds import CycloneDds
@@ -33,10 +33,14 @@ from fogros2_examples.city import City
 from fogros2_examples.lidar import message
 from fogros2_monitor import request as gate
 from fogros2_monitor.dashboard import server as dashboard
-from image_transport_h264 import stills
+from fogros2_replicas.pairs import header_of
+from image_transport_h264 import message as images
+from image_transport_h264 import repair, stills
+from image_transport_h264.cdr import CdrError, Header
 from image_transport_h264.codec import Decoder, Encoder, Picture
 from image_transport_h264.picture import CodecError
 from point_cloud_stream import codec
+from point_cloud_stream import message as point_clouds
 from point_cloud_stream.cloud import CloudError, Field, Layout
 from point_cloud_stream.parts import Assembler, split
 from rigs import recorded_agent
@@ -119,6 +123,34 @@ def _parts() -> Iterator[Target]:
 
 
 @contextlib.contextmanager
+def _messages() -> Iterator[Target]:
+    """Serialized messages; the first byte says which kind one is read as."""
+    header, assembler = Header(1, 2, 'camera'), repair.Assembler()
+    layout = Layout(1, 2, (Field('x', 0, 7), Field('y', 4, 7), Field('z', 8, 7)), 12, 24)
+
+    def pieced(data: bytes) -> object:
+        whole = assembler.add(images.piece(data))
+        return whole and images.header_and_data(whole)
+
+    def checked(data: bytes) -> object:
+        found, points = point_clouds.cloud(data)[1:]
+        return codec.encode(found, points, 0.01)
+
+    read = [images.picture, images.coded, pieced, checked, header_of]
+    packets = [images.with_header(header, bytes(3000)), b'short']
+    valid = [
+        [images.image(header, Picture(2, 2, 'mono8', 2, b'abcd'))],
+        [images.compressed(header, 'h264', b'abcd')],
+        [images.in_pieces(piece) for number, packet in enumerate(packets)
+         for piece in repair.pieces(1, number, packet)],
+        [point_clouds.points(header, layout, bytes(24))],
+        [images.compressed(header, 'h264', b'')]]
+    yield Target([bytes([kind]) + data for kind, each in enumerate(valid) for data in each],
+                 lambda data: data and read[data[0] % len(read)](data[1:]),
+                 (CdrError, CloudError))
+
+
+@contextlib.contextmanager
 def _agent_messages() -> Iterator[Target]:
     """What a machine's agent sends, as the robot reads it."""
     valid = [json.dumps(each).encode() for each in [
@@ -127,11 +159,13 @@ def _agent_messages() -> Iterator[Target]:
     commands = sorted({command for command, _ in recorded_agent.answers()})
 
     def read(data: bytes) -> None:
-        message = dict(connection._parsed(data) or {})
+        message: dict[str, Any] = {}
+        with contextlib.suppress(untrusted.InvalidMessage):
+            message = connection._parsed(data)
         for command in commands:
-            with contextlib.suppress(events.InvalidMessage):
+            with contextlib.suppress(untrusted.InvalidMessage):
                 events.answer(command, dict(message))
-        with contextlib.suppress(events.InvalidMessage):
+        with contextlib.suppress(untrusted.InvalidMessage):
             events.event(message)
     yield Target(valid, read, ())
 
@@ -346,8 +380,8 @@ def _dds() -> Iterator[Target]:
 
 TARGETS: dict[str, Callable[[], contextlib.AbstractContextManager[Target]]] = {
     'decoder': _decoder, 'stills': _stills, 'clouds': _clouds, 'parts': _parts,
-    'agent messages': _agent_messages, 'heartbeats': _heartbeats, 'agent': _agent, 'door': _door,
-    'gate': _gate, 'dashboard': _dashboard, 'VPN helper': _vpn_helper, 'DDS configuration': _dds}
+    'messages': _messages, 'agent messages': _agent_messages, 'heartbeats': _heartbeats,
+    'agent': _agent, 'door': _door, 'gate': _gate, 'dashboard': _dashboard, 'VPN helper': _vpn_helper, 'DDS configuration': _dds}
 #: Targets whose readers are Python code in the process that feeds them.
-PYTHON = {'parts', 'agent messages', 'heartbeats', 'door', 'gate', 'dashboard', 'VPN helper',
-          'DDS configuration'}
+PYTHON = {'parts', 'messages', 'agent messages', 'heartbeats', 'door', 'gate', 'dashboard',
+          'VPN helper', 'DDS configuration'}

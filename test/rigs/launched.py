@@ -20,7 +20,7 @@ ROS2 = 'ros2'
 
 
 def embedded() -> bool:
-    """Return whether the tests run on the embedded default."""
+    """Return whether the tests run on the wheels of ROS 2, with our own launch."""
     try:
         metadata.distribution('ros2-embedded')
     except metadata.PackageNotFoundError:

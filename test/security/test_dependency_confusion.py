@@ -128,7 +128,7 @@ def install(packed: Wheels, machine: Machine) -> tuple[subprocess.CompletedProce
         libc='glibc 2.1', pythons=(Python(sys.executable, sys.version_info[:2], True),),
         programs=frozenset({'ip', 'nft', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'}))
     todo = bootstrap.plan(
-        MachineSpec('m', 'ssh', bootstrap='embedded'), facts, facts, UNDER, packed)
+        MachineSpec('m', 'ssh', bootstrap='pip'), facts, facts, UNDER, packed)
     target = Path(todo.wheels_target)
     target.mkdir(parents=True)
     for path in Path(packed.folder).iterdir():

@@ -181,10 +181,10 @@ def test_facts_of_nothing_are_defaults() -> None:
 
 
 @pytest.mark.parametrize('answer', ['user x robot', 'python three 11 1 /usr/bin/python3',
-                                    f"user {'9' * 5000} robot"])
-def test_machine_that_lies_about_a_number_is_refused(answer: str) -> None:
+                                    f"user {'9' * 5000} robot", 'home :module'])
+def test_machine_that_lies_about_itself_is_refused(answer: str) -> None:
     shell = FakeShell(handlers={'sh': lambda command: Result(0, f'{answer}\n', '')})
-    with pytest.raises(PrerequisiteError, match="'m' describes itself with a value"):
+    with pytest.raises(PrerequisiteError, match="'m' describes itself wrongly"):
         bootstrap.ensure(shell, UNDER, MachineSpec('m', 'ssh'), timeout=30.0)
 
 

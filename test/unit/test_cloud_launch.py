@@ -13,8 +13,8 @@ import sys
 
 import pytest
 
-pytest.importorskip('ament_index_python.packages', reason='needs ROS 2, or its embedded default')
-pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded default')
+pytest.importorskip('ament_index_python.packages', reason='launch is not installed')
+pytest.importorskip('launch.actions', reason='launch is not installed')
 
 from launch import LaunchContext
 

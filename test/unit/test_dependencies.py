@@ -252,7 +252,7 @@ def test_missing_packages_of_keys_are_no_error() -> None:
 @pytest.mark.parametrize('pip', [(), ('x',)])
 def test_silent_rosdep_is_a_warning_and_asked_again(pip: tuple[str, ...]) -> None:
     facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=True)
-    install = bootstrap.RosInstall('embedded', ('ros2',), facts=facts, robot=facts)
+    install = bootstrap.RosInstall('pip', ('ros2',), facts=facts, robot=facts)
     ran: list[Command] = []
 
     def run(command: Command, **_: object) -> Result:

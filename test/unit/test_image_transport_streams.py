@@ -160,7 +160,7 @@ def test_an_unknown_parameter_gets_the_nearest_name(entry, said):
 
 
 def test_parameters_are_those_that_the_nodes_declare():
-    pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
+    pytest.importorskip('rclpy', reason='rclpy is not installed')
     from fogros2.image_transport.nodes import H264
     from fogros2.image_transport.topics import OPTIONS
     from image_transport_h264.senders import PARAMETERS

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded default')
+pytest.importorskip('launch.actions', reason='launch is not installed')
 
 from fogros2.deploy import RunningMachine
 from fogros2.errors import AgentError, ConnectError

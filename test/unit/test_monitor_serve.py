@@ -13,7 +13,7 @@ import sys
 import pytest
 
 serve = pytest.importorskip(
-    'fogros2_monitor.serve', reason='neither ROS 2 nor the embedded default is installed')
+    'fogros2_monitor.serve', reason='rclpy is not installed')
 
 
 def test_patterns_become_regular_expressions():

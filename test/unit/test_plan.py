@@ -192,7 +192,8 @@ def test_a_middleware_has_to_be_there_and_to_be_one_for_all(tmp_path: Path) -> N
     index.mkdir(parents=True)
     (index / 'rmw_fastrtps_cpp').touch()
     here, wheels = [str(tmp_path), '/nowhere'], str(tmp_path / 'wheels')
-    (tmp_path / 'wheels/lib/python3.12/site-packages/ros_rclpy-7.1.6.dist-info').mkdir(parents=True)
+    info = 'lib/python3.12/site-packages/ros_rclpy-7.1.6.dist-info'
+    (tmp_path / 'wheels' / info).mkdir(parents=True)
     like = MachineSpec('m', 'ssh', environment={'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp'})
     plan.check_rmw('rmw_fastrtps_cpp', here, [like, MachineSpec('n', 'ssh')])
     plan.check_rmw(plan.DEFAULT_RMW, ['/nowhere'], [MachineSpec('n', 'ssh')])

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip('launch', reason='neither ROS 2 nor the embedded default is installed')
+pytest.importorskip('launch', reason='rclpy is not installed')
 from launch import LaunchContext
 from launch.substitutions import LaunchConfiguration
 
@@ -152,6 +152,17 @@ def test_entries_are_resolved_when_executed() -> None:
     assert streaming.resolve(context, entries, '/arm', lambda _: None) == [  # type: ignore[arg-type]
         StreamTopic('/arm/camera', 'h264'),
         StreamTopic('/b', 'h264', bitrate=1_000_000, lossless=True, preset='fast')]
+
+
+@pytest.mark.parametrize('text, value', [
+    ('1e-3', 0.001), ('5e-06', 5e-06), ('3', 3), ('true', True), ('False', False),
+    ('1_000', '1_000'), ('12:30', '12:30'), ('fast', 'fast')])
+def test_substituted_parameter_has_the_type_that_rcl_gives(text: str, value: Any) -> None:
+    context = LaunchContext()
+    context.launch_configurations['p'] = text
+    [entry] = streaming.resolve(
+        context, [StreamTopic('/b', 'h264', p=LaunchConfiguration('p'))], '/', lambda _: None)
+    assert (entry.parameters['p'], type(entry.parameters['p'])) == (value, type(value))
 
 
 @pytest.mark.parametrize('entry', ['/camera', ('/camera',), ('/camera', 'vhs'), ('/a b', 'h264'),

@@ -3,7 +3,7 @@
 Machine images for a test's cluster, made on this computer: nothing is downloaded but packages.
 
 ``BARE`` is Debian with the few programs that every machine needs, by debootstrap; ``READY`` has
-the robot's ROS besides (the embedded default, or this computer's ROS 2), put there by the same
+the robot's ROS besides (its wheels, or this computer's ROS 2), put there by the same
 bootstrap that a launch uses; ``SANDBOX`` holds a pod's namespaces. They are kept, unpacked as
 containerd does it, in the user's cache folder.
 """
@@ -141,12 +141,12 @@ def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
     """
     Return containerd's folder with all images in it, made unless it is there.
 
-    It is named after what is in the images, so the embedded default is always today's.
+    It is named after what is in the images, so the wheels are always today's.
 
     :param binaries: the cluster's programs.
     """
     packed = wheels.collect()
-    its = None if packed.embedded else ros.prefix()
+    its = None if packed.ros else ros.prefix()
     with alone(cache):
         root = base(cache, say)
         system = cache / f'system-{system_key(root, static_busybox())}'
@@ -179,7 +179,7 @@ def alone(cache: Path) -> Iterator[None]:
 def _make(
     aside: Path, root: Path, system: Path, target: Path, its: Optional[Path], binaries: Path,
 ) -> None:
-    layers = [aside / name for name in ('system.tar', 'embedded.tar', 'sandbox.tar')]
+    layers = [aside / name for name in ('system.tar', 'wheels.tar', 'sandbox.tar')]
     upper, archive = aside / 'upper', aside / 'images.tar'
     with contextlib.ExitStack() as undo:
         undo.callback(debian_root.remove, upper)
@@ -232,7 +232,7 @@ def _add_ros(shell: RootShell, its: Optional[Path], root: Path, files: Path) -> 
     """
     Install what a launch of this robot would, and return why that can't be done.
 
-    :param its: the folder of the robot's ROS 2, None where it has the embedded default.
+    :param its: the folder of the robot's ROS 2, None where it has wheels.
     """
     # tests may be run by an interpreter whose folder isn't on PATH
     beside = str(Path(sys.executable).with_name('ros2'))
@@ -249,7 +249,7 @@ def _add_ros(shell: RootShell, its: Optional[Path], root: Path, files: Path) -> 
     under = plan.underlay(dict(os.environ), (), ros2)
     bootstrap.ensure(
         shell, under,  # type: ignore[arg-type]  # nothing there asks for put, open, interactive
-        MachineSpec(name='image', provider='', bootstrap='none' if its else 'embedded'),
+        MachineSpec(name='image', provider='', bootstrap='none' if its else 'pip'),
         timeout=300.0)
     # or each pod would compile what it imports, once for each of its processes that begin together
     shell.run(Command(('python3', '-m', 'compileall', '-q', bootstrap.INSTALL_FOLDER),
