@@ -6,9 +6,9 @@ import sys
 from typing import Any
 
 _MODULES = {
-    'launch.utilities.typing_file_path', 'launch_testing', 'launch_ros.parameters_type',
-    'launch_ros.remap_rule_type', 'rosidl_runtime_py.get_interfaces',
-    'rosidl_runtime_py.import_message', 'launch_pytest'}
+    'composition_interfaces', 'launch.utilities.typing_file_path', 'launch_pytest',
+    'launch_ros.parameters_type', 'launch_ros.remap_rule_type', 'launch_testing',
+    'rosidl_runtime_py.get_interfaces', 'rosidl_runtime_py.import_message'}
 
 #: The names that modules refuse, by module.
 LACKING: dict[str, list[str]] = {}
@@ -41,12 +41,12 @@ def lacking(where: str, names: str,
 
 
 class _Finder:
-    """Refuses modules that only ROS 2 has, also where an older version has left a folder."""
+    """Refuse modules of ROS 2 that neither we nor the user's workspaces provide."""
 
     @staticmethod
     def find_spec(name: str, path: object = None, target: object = None) -> None:
         if name in _MODULES:
-            raise ImportError(str(NotEmbeddedError(name)), name=name)
+            raise ModuleNotFoundError(str(NotEmbeddedError(name)), name=name)
 
 
-sys.meta_path.insert(0, _Finder)
+sys.meta_path.append(_Finder)

@@ -3,6 +3,7 @@
 
 import contextlib
 import os
+from pathlib import Path
 
 from rigs.domains import taken
 
@@ -10,8 +11,10 @@ from rigs.domains import taken
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 _held = contextlib.ExitStack()
 os.environ['ROS_DOMAIN_ID'] = _held.enter_context(taken())  # until this process ends
-# this computer and nothing else
-os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-for name in ('RMW_IMPLEMENTATION', 'ROS_STATIC_PEERS', 'ROS_LOCALHOST_ONLY'):
+# This computer and nothing else. No shared memory either: Fast DDS writes errors to stdout where a
+# process of another network namespace has the same port in /dev/shm.
+os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(Path(__file__).with_name('loopback.xml'))
+for name in ('RMW_IMPLEMENTATION', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_STATIC_PEERS',
+             'ROS_LOCALHOST_ONLY'):
     os.environ.pop(name, None)
 os.environ['RCUTILS_COLORIZED_OUTPUT'] = '0'

@@ -396,7 +396,7 @@ def test_lifecycle_events_match_their_node():
         OnStateTransition(target_lifecycle_node=Node(executable='x'), entities=[])
 
 
-@pytest.mark.skipif(importlib.util.find_spec('rosidl_embedded') is None,
+@pytest.mark.skipif(importlib.util.find_spec('embedded_default') is None,
                     reason='ROS 2 leaves its parameter files')
 def test_parameter_files_are_deleted_at_exit(tmp_path):
     code = '''

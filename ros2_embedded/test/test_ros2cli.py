@@ -16,7 +16,7 @@ ROS2 = shutil.which('ros2', path=os.pathsep.join([os.path.dirname(sys.executable
     'PATH']]))
 
 embedded_alone = pytest.mark.skipif(
-    importlib.util.find_spec('rosidl_embedded') is None,
+    importlib.util.find_spec('embedded_default') is None,
     reason='ROS 2 itself differs')
 
 LAUNCH_FILE = '''

@@ -11,10 +11,10 @@ import pytest
 
 NODE = '''
 import rclpy
-from example_interfaces.srv import AddTwoInts
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import String
+from std_srvs.srv import SetBool
 rclpy.init()
 node = rclpy.create_node('worker', namespace='/cell')
 node.declare_parameter('speed', 1.5, ParameterDescriptor(description='how fast'))
@@ -22,10 +22,10 @@ node.declare_parameter('arm.joints', 6)
 publisher = node.create_publisher(String, 'chatter', 10)
 node.create_timer(0.05, lambda: publisher.publish(String(data='hello')))
 node.create_subscription(String, 'orders', lambda message: print(message.data, flush=True), 10)
-def add(request, response):
-    response.sum = request.a + request.b
+def switch(request, response):
+    response.success = request.data
     return response
-node.create_service(AddTwoInts, 'add', add)
+node.create_service(SetBool, 'switch', switch)
 actions = [node.create_publisher(String, 'count/_action/feedback', 10),
            node.create_subscription(String, 'walk/_action/feedback', print, 10)]
 print('ready', flush=True)
@@ -107,7 +107,7 @@ def test_topic_pub_publishes_and_ends(worker):
                             values, status=1)
 
 
-@pytest.mark.skipif(not importlib.util.find_spec('rosidl_embedded'), reason='is ROS 2 itself')
+@pytest.mark.skipif(not importlib.util.find_spec('embedded_default'), reason='is ROS 2 itself')
 def test_first_message_reaches_the_awaited_subscription():
     for number in range(4):
         topic = f'/first{number}'
@@ -131,11 +131,11 @@ def test_topic_pub_repeats_until_interrupted(worker, options):
 
 @pytest.mark.parametrize('command', [
     ('topic', 'pub', '--once', '/nobody', 'std_msgs/msg/String'),
-    ('service', 'call', '/nobody', 'example_interfaces/srv/AddTwoInts')])
+    ('service', 'call', '/nobody', 'std_srvs/srv/SetBool')])
 def test_sigterm_ends_a_waiting_command(command):
     said = ros2(*command, until='aiting for ', by=signal.SIGTERM, status=None, timeout=10)
     assert 'publishing' not in said and 'response' not in said
-    if importlib.util.find_spec('rosidl_embedded'):
+    if importlib.util.find_spec('embedded_default'):
         assert len(said.splitlines()) == 1
 
 
@@ -151,7 +151,7 @@ def test_node_list_and_info_show_nodes(worker):
     info = ros2('node', 'info', '/cell/worker').splitlines()
     assert info[0] == '/cell/worker'
     assert '    /cell/orders: std_msgs/msg/String' in info
-    assert info.index('    /cell/add: example_interfaces/srv/AddTwoInts') > \
+    assert info.index('    /cell/switch: std_srvs/srv/SetBool') > \
         info.index('  Service Servers:')
     servers, clients = info.index('  Action Servers:'), info.index('  Action Clients:')
     assert info[servers + 1:clients] == ['    /cell/count: std_msgs/msg/String']
@@ -160,13 +160,13 @@ def test_node_list_and_info_show_nodes(worker):
 
 
 def test_service_list_and_call_work(worker):
-    assert '/cell/add [example_interfaces/srv/AddTwoInts]' in \
+    assert '/cell/switch [std_srvs/srv/SetBool]' in \
         ros2('service', 'list', '-t').splitlines()
-    called = ros2('service', 'call', '/cell/add', 'example_interfaces/srv/AddTwoInts',
-                  '{a: 3, b: 4}')
-    assert 'requester: making request: example_interfaces.srv.AddTwoInts_Request(a=3, b=4)' in \
+    called = ros2('service', 'call', '/cell/switch', 'std_srvs/srv/SetBool',
+                  '{data: true}')
+    assert 'requester: making request: std_srvs.srv.SetBool_Request(data=True)' in \
         called
-    assert 'response:\nexample_interfaces.srv.AddTwoInts_Response(sum=7)' in called
+    assert "response:\nstd_srvs.srv.SetBool_Response(success=True, message='')" in called
     assert 'service type is invalid' in ros2('service', 'call', '/x', 'no/such', status=1)
 
 

@@ -34,15 +34,17 @@ class DirectNode:
     def _discover(self, seconds: float | None) -> None:
         """Spin for some seconds; with None, until the graph has others and is still."""
         import rclpy
-        alone = self._graph()
-        seen, begin = alone, time.monotonic()
-        changed = begin
-        while (now := time.monotonic()) - begin < (LONGEST if seconds is None else seconds):
-            if seconds is None and seen != alone and now - changed > STILL:
-                return
+        limit = LONGEST if seconds is None else seconds
+        seen = alone = self._graph()
+        begin = changed = time.monotonic()
+        while True:
             rclpy.spin_once(self.node, timeout_sec=0.05)
+            now = time.monotonic()
             if (graph := self._graph()) != seen:
-                seen, changed = graph, time.monotonic()
+                seen, changed = graph, now
+            still = seconds is None and seen != alone and now - changed > STILL
+            if still or now - begin >= limit:
+                return
 
     def _graph(self) -> tuple[Any, ...]:
         return (sorted(self.node.get_node_names_and_namespaces()),
@@ -54,10 +56,15 @@ class DirectNode:
     def __getattr__(self, name: str) -> Any:
         return getattr(self.node, name)
 
-    def __exit__(self, *exception: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         import rclpy
+        from rclpy.executors import ExternalShutdownException
+        signalled = not rclpy.ok()
         self.node.destroy_node()
         rclpy.try_shutdown()
+        if signalled and isinstance(error, Exception):
+            # whatever failed because a signal had ended rclpy
+            raise ExternalShutdownException from None
 
 
 def add_arguments(parser: Any) -> None:

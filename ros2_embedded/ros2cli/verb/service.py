@@ -2,9 +2,11 @@
 """Verbs of ``ros2 service``."""
 from __future__ import annotations
 
+from argparse import Namespace
 from typing import Any
 
 from ros2cli.node import NODE_NAME_PREFIX
+from ros2cli.node.direct import DirectNode
 from ros2cli.verb import topic, VerbExtension
 
 
@@ -25,7 +27,6 @@ class CallVerb(VerbExtension):
             help="Values to fill the service request with in YAML format (e.g. '{a: 1, b: 2}')")
 
     def main(self, *, args: Any) -> Any:
-        import rclpy
         from rosidl_runtime_py.utilities import get_service
         try:
             kind = get_service(args.service_type)
@@ -33,18 +34,13 @@ class CallVerb(VerbExtension):
             raise RuntimeError('The passed service type is invalid') from None
         except ValueError:
             raise RuntimeError('The passed type is not a service') from None
-        rclpy.init(args=[])
-        package, _, name = kind._service.split('/')
-        node = rclpy.create_node(f'{NODE_NAME_PREFIX}_requester_{package}_{name}')
-        try:
-            return self._call(node, kind, args)
-        finally:
-            node.destroy_node()
-            rclpy.try_shutdown()
+        package, *_, name = args.service_type.split('/')
+        with DirectNode(Namespace(spin_time=0), node_name=(
+                f'{NODE_NAME_PREFIX}_requester_{package}_{name}')) as direct:
+            return self._call(direct.node, kind, args)
 
     def _call(self, node: Any, kind: Any, args: Any) -> str | None:
         import rclpy
-        from rclpy.executors import ExternalShutdownException
         from rosidl_runtime_py import set_message_fields
         import yaml
         client = node.create_client(kind, args.service_name)
@@ -55,8 +51,8 @@ class CallVerb(VerbExtension):
             return f'Failed to populate field: {error}'
         if not client.service_is_ready():
             print('waiting for service to become available...')
-            if not client.wait_for_service():
-                raise ExternalShutdownException()  # a signal has ended the wait
+            while not client.service_is_ready():
+                rclpy.spin_once(node, timeout_sec=0.1)
         print(f'requester: making request: {request!r}\n')
         future = client.call_async(request)
         rclpy.spin_until_future_complete(node, future)
