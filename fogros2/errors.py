@@ -30,6 +30,8 @@ from collections.abc import Collection
 import difflib
 from typing import Optional, TYPE_CHECKING
 
+from fogros2.untrusted import clean
+
 if TYPE_CHECKING:
     from fogros2.model import Command, Result
 
@@ -38,20 +40,21 @@ class FogError(RuntimeError):
     """
     A failure with a known cause.
 
-    :param message: what failed, where and why, in one line.
+    :param message: what failed, where and why, in one line; may contain text of a machine.
     :param hint: the remedy, in one line; may be empty.
     """
 
-    #: Set by a provider's ``create``: nothing was created, so nothing has to be looked for.
-    refused: bool = False
+    #: Set by a provider's ``create``. True: nothing was created. False: no answer came, so a
+    #: machine may exist or may still appear. None: unknown, so the launch searches once.
+    refused: Optional[bool] = None
     #: Set by a provider's ``create``: another region or cloud may have capacity.
     no_capacity: bool = False
     #: Resources that the failed step could not clean up; reported with the error.
     undo_failures: tuple[FogError, ...] = ()
 
     def __init__(self, message: str, hint: str = '') -> None:
-        super().__init__(message)
-        self.hint = hint
+        super().__init__(clean(message))
+        self.hint = clean(hint)
 
     def __str__(self) -> str:
         message = str(self.args[0])
@@ -142,9 +145,13 @@ class StoreError(FogError):
 class DeadlineExceeded(FogError):
     """A wait has timed out."""
 
+    refused = False
+
 
 class Cancelled(FogError):
     """The launch was asked to end during this."""
+
+    refused = False
 
     def __init__(self, what: str = 'the deployment') -> None:
         super().__init__(f'{what} was cancelled')

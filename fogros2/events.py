@@ -11,28 +11,9 @@ defined here, and events of other names, come from a newer agent: the robot igno
 from __future__ import annotations
 
 from collections.abc import Mapping
-import functools
-import math
-import re
-from typing import (
-    Any,
-    get_args,
-    get_origin,
-    get_type_hints,
-    is_typeddict,
-    Literal,
-    Optional,
-    TypedDict,
-    Union,
-)
+from typing import Any, get_args, get_type_hints, Literal, Optional, TypedDict, Union
 
-#: Largest magnitude of a number: float and every interpreter of JSON represent it exactly.
-LARGEST = 2 ** 53
-
-
-class InvalidMessage(ValueError):
-    """A message does not have its type; the text names the field."""
-
+from fogros2.untrusted import checked, InvalidMessage
 
 # -- events -----------------------------------------------------------------------------------
 
@@ -290,45 +271,6 @@ _ANSWERS: Mapping[str, Any] = {
     'status': Status}
 
 
-# -- text -------------------------------------------------------------------------------------
-
-_REPLACEMENT = '\N{REPLACEMENT CHARACTER}'
-_NO_COLOUR = re.compile('\x1b(?!\\[[0-9;:]*m)')
-
-
-class _Visible(dict[int, str]):
-    """Characters as a terminal may get them; escape characters are those of colours."""
-
-    def __missing__(self, code: int) -> str:
-        return chr(code) if chr(code).isprintable() else _REPLACEMENT
-
-
-_VISIBLE = _Visible({0x1b: '\x1b', ord('\t'): '\t', ord('\n'): '\n', ord('\r'): '\n'})
-
-
-def clean(text: str) -> str:
-    """
-    Replace control characters in a machine's text, so that a terminal can show it.
-
-    Colours, tabs and line breaks stay. A carriage return becomes a line break: it would let the
-    text overwrite the name of the machine in front of it.
-    """
-    if text.isprintable():
-        return text
-    return _NO_COLOUR.sub(_REPLACEMENT, text.replace('\r\n', '\n')).translate(_VISIBLE)
-
-
-def cleaned(value: Any) -> Any:
-    """Return a received value with all of its texts cleaned."""
-    if isinstance(value, str):
-        return clean(value)
-    if isinstance(value, list):
-        return [cleaned(item) for item in value]
-    if isinstance(value, dict):
-        return {name: cleaned(item) for name, item in value.items()}
-    return value
-
-
 # -- the check --------------------------------------------------------------------------------
 
 
@@ -340,11 +282,11 @@ def event(message: dict[str, Any]) -> Optional[AgentEvent]:
     """
     name = message.get('event')
     if not isinstance(name, str):
-        raise InvalidMessage(f"field 'event': expected str, got {_kind(name)}")
+        raise InvalidMessage(f"field 'event': expected str, got {type(name).__name__}")
     if name not in _EVENTS:
-        _check(message, _Numbered)
+        checked(message, _Numbered)
         return None
-    _check(message, _EVENTS[name])
+    checked(message, _EVENTS[name])
     return message  # type: ignore[return-value]
 
 
@@ -355,7 +297,7 @@ def answer(command: str, message: dict[str, Any]) -> dict[str, Any]:
     :raises InvalidMessage: a field is missing or has another type.
     """
     refused = message.get('ok') is not True and command != 'log'
-    _check(message, Refusal if refused else _ANSWERS.get(command, Empty))
+    checked(message, Refusal if refused else _ANSWERS.get(command, Empty))
     return message
 
 
@@ -365,49 +307,5 @@ def heartbeat(message: Any) -> HeartbeatAnswer:
 
     :raises InvalidMessage: a field is missing or has another type.
     """
-    _check(message, HeartbeatAnswer, 'heartbeat')
+    checked(message, HeartbeatAnswer, 'heartbeat')
     return message  # type: ignore[no-any-return]
-
-
-_hints = functools.lru_cache(maxsize=None)(get_type_hints)
-
-
-def _check(value: Any, kind: Any, field: str = '') -> None:
-    """
-    Check that a value has a type of this module.
-
-    :raises InvalidMessage: it has another type, or a number is not finite or too large.
-    """
-    options = get_args(kind)
-    if is_typeddict(kind) and isinstance(value, dict):
-        for name, expected in _hints(kind).items():
-            where = f'{field}.{name}' if field else name
-            if name in value:
-                _check(value[name], expected, where)
-            elif name in kind.__required_keys__:
-                raise InvalidMessage(f"field '{where}' is missing")
-        return
-    if get_origin(kind) is Union:
-        if value is None:
-            return
-        kind = options[0]
-    elif get_origin(kind) is list and isinstance(value, list):
-        for item in value:
-            _check(item, options[0], field)
-        return
-    elif get_origin(kind) is Literal and value in options:
-        return
-    if kind in (int, float) and type(value) in (int, kind) and abs(value) <= LARGEST:
-        return  # NaN and infinity are not less than anything
-    if kind in (str, bool) and isinstance(value, kind):
-        return
-    raise InvalidMessage(
-        f"field '{field}': expected {getattr(kind, '__name__', 'object')}, got {_kind(value)}")
-
-
-def _kind(value: Any) -> str:
-    """Name the type of a value, or the value of a number, which may be out of range."""
-    if type(value) is int and abs(value) > LARGEST or type(value) is float and not math.isfinite(
-            value):
-        return 'a number out of range'
-    return type(value).__name__

@@ -15,12 +15,12 @@ import contextlib
 import dataclasses
 import hashlib
 import ipaddress
-import json
 from pathlib import Path
 import re
 import time
-from typing import Optional
+from typing import get_type_hints, Optional
 
+from fogros2 import untrusted
 from fogros2.errors import ConfigurationError
 from fogros2.model import to_json
 from fogros2.store import check_name, robot_name, Store, write_private
@@ -29,6 +29,11 @@ _PREFIX = 'fog1.'
 #: File with the invitation in the folder of a joined machine, which is like a launch's folder;
 #: and the file there with the secret for ``GuestShell``.
 JOINED, SECRET = 'joined.json', 'door.key'
+#: Prefix length of the largest network of a launch (see ``vpn.addresses``).
+PREFIX = 24
+#: Private address space (RFC 1918), shared address space (RFC 6598), and the default pool.
+_PRIVATE = tuple(map(ipaddress.IPv4Network, (
+    '10.0.0.0/8', '172.16.0.0/12', '192.168.0.0/16', '100.64.0.0/10', '198.18.0.0/15')))
 #: A computer's public key, with its name for people before it.
 _KEY = re.compile(r'(?:([A-Za-z0-9_.-]{1,80}):)?([A-Za-z0-9+/]{43}=)')
 
@@ -60,18 +65,27 @@ class Invitation:
     secret: str = dataclasses.field(default='', repr=False)
 
     def __post_init__(self) -> None:
+        for name, kind in get_type_hints(type(self)).items():
+            untrusted.checked(getattr(self, name), kind, name)
         check_name(self.machine)
         subnet = ipaddress.IPv4Network(self.network)
+        if subnet.prefixlen < PREFIX:
+            raise ValueError(f'{subnet} is larger than the network of a launch')
+        if subnet.is_loopback or subnet.is_link_local or subnet.is_multicast or subnet.is_reserved:
+            raise ValueError(f'{subnet} is the network of no computer')
         inside = {ipaddress.IPv4Address(self.address), ipaddress.IPv4Address(self.joiner)}
         if len(inside) != 2 or not all(address in subnet for address in inside):
             raise ValueError('its addresses are not those of one network')
-        if type(self.domain) is not int or not 0 <= self.domain <= 232:
+        if not 0 <= self.domain <= 232:
             raise ValueError('its ROS domain is none')
-        if not isinstance(self.expires, float):
-            raise ValueError('its end is no time')
         if self.interface and not re.fullmatch('fog[0-9a-f]{6}m[0-9]{1,3}', self.interface) \
                 or len(bytes.fromhex(self.secret)) not in (0, 32):
             raise ValueError('its door is none')
+
+    @property
+    def private(self) -> bool:
+        """Whether its network is one that no computer of the internet has."""
+        return any(ipaddress.IPv4Network(self.network).subnet_of(each) for each in _PRIVATE)
 
     @property
     def number(self) -> str:
@@ -89,7 +103,7 @@ def joined(store: Store) -> dict[str, Path]:
 def read(folder: Path) -> Optional[Invitation]:
     """Return the invitation by which this computer has joined a machine, None if there is none."""
     with contextlib.suppress(OSError, ValueError, TypeError, ConfigurationError):
-        return Invitation(**json.loads((folder / JOINED).read_text()))
+        return Invitation(**untrusted.parsed((folder / JOINED).read_text()))
     return None
 
 
@@ -160,12 +174,12 @@ def unseal(text: str, key: bytes) -> Invitation:
         if _PREFIX + base64.urlsafe_b64encode(data).decode() != text:
             raise ValueError('a character is changed')  # base64 ignores some bits of the last
         content = sealing.unseal(data, key, text[:len(_PREFIX)].encode())
-        invitation = Invitation(**json.loads(content))
+        invitation = Invitation(**untrusted.parsed(content))
     except sealing.WrongKey:
         raise ConfigurationError(
             'this invitation is for another computer, or not complete',
             'ros2 fog key prints the key that the invitation needs') from None
-    except (ValueError, TypeError, ConfigurationError, RecursionError) as error:
+    except (ValueError, TypeError, ConfigurationError) as error:
         why = 'it is not complete' if isinstance(error, binascii.Error) else error
         raise ConfigurationError(f'this is no invitation: {why}',
                                  'ros2 fog invite prints one, in one line') from error

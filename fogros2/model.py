@@ -11,7 +11,7 @@ import json
 from typing import Any, Literal, Optional, Union
 
 OnExit = Literal['delete', 'stop', 'keep']
-Bootstrap = Literal['auto', 'apt', 'embedded', 'none']
+Bootstrap = Literal['auto', 'apt', 'pip', 'none']
 RobotNodes = Literal['after_cloud', 'immediately']
 OnInterrupt = Literal['shutdown', 'robot', 'replace']
 

@@ -20,7 +20,8 @@ from fogros2.vpn.addresses import FIRST_GUEST
 FIRST_MACHINE = 2
 #: UDP port of the agent's heartbeat, on the VPN address only.
 HEARTBEAT_PORT = 7399
-DEFAULT_RMW = 'rmw_cyclonedds_cpp'
+#: ROS 2's own default, and the middleware of the wheels in the package index.
+DEFAULT_RMW = 'rmw_fastrtps_cpp'
 #: The PATH of a login shell without the user's own additions.
 SYSTEM_PATH = '/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin'
 
@@ -48,7 +49,7 @@ def extended(base: Mapping[str, str], given: Mapping[str, str]) -> dict[str, str
 
 def choose_rmw(environment: Mapping[str, str], known: Sequence[str]) -> str:
     """
-    Choose the RMW of all nodes of the launch: the user's, or Cyclone's.
+    Choose the RMW of all nodes of the launch: the user's, or ROS 2's default.
 
     :raises DdsError: no plugin supports the user's RMW.
     """
@@ -84,12 +85,12 @@ def check_rmw(rmw: str, prefixes: Sequence[str], specs: Iterable[MachineSpec]) -
     indices = [index for prefix in prefixes if (
         index := Path(prefix, 'share/ament_index/resource_index/rmw_typesupport')).is_dir()]
     if not any((index / rmw).exists() for index in indices):
+        if any(has_wheels(prefix) for prefix in prefixes):
+            raise DdsError(f'{rmw} is not in the wheels of ROS 2, which have {DEFAULT_RMW} alone',
+                           'unset RMW_IMPLEMENTATION, or source an installation of ROS 2')
         if indices:
             raise DdsError(f'{rmw} is not installed on this computer',
                            f'sudo apt-get install {apt}, or set RMW_IMPLEMENTATION to another')
-        if rmw != DEFAULT_RMW:
-            raise DdsError(f'{rmw} needs ROS 2: the embedded default has {DEFAULT_RMW} alone',
-                           'unset RMW_IMPLEMENTATION, or source ROS 2')
     for spec in specs:
         own = spec.environment.get('RMW_IMPLEMENTATION') or rmw
         if own != rmw:
@@ -97,11 +98,17 @@ def check_rmw(rmw: str, prefixes: Sequence[str], specs: Iterable[MachineSpec]) -
                 f"the nodes of machine '{spec.name}' would have RMW_IMPLEMENTATION={own}, those"
                 f' here {rmw}: they would not hear each other',
                 'set RMW_IMPLEMENTATION for the whole launch, before it')
-        if spec.bootstrap == 'embedded' and rmw != DEFAULT_RMW:
+        if spec.bootstrap == 'pip' and rmw != DEFAULT_RMW:
             raise DdsError(
-                f"machine '{spec.name}' would get the embedded default, which has only "
-                f'{DEFAULT_RMW}, but nodes on the robot use {rmw}',
-                "leave bootstrap='embedded' out, or unset RMW_IMPLEMENTATION")
+                f"machine '{spec.name}' would get ROS 2 by pip, which has only {DEFAULT_RMW}, but "
+                f'nodes on the robot use {rmw}',
+                "use bootstrap='apt' (Ubuntu 24.04), or unset RMW_IMPLEMENTATION")
+
+
+def has_wheels(prefix: str) -> bool:
+    """Return whether a prefix has ROS 2 from the wheels of the package index."""
+    return next(Path(prefix).glob('lib/python3*/site-packages/ros_rclpy-*.dist-info'),
+                None) is not None
 
 
 def robot_interface(

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import errno
+import math
 import os
 import shutil
 import signal
@@ -22,6 +23,8 @@ from fogros2.model import Command, Result
 HERE = 'this computer'
 #: sudo's reason for refusing without a password, and the remedy.
 PASSWORD = 'sudo wants a password', 'run `sudo -v` first'
+#: Maximum bytes of a line of output; a longer one is several.
+_LINE = 1 << 16
 #: A copy: launch empties ``os.environ`` briefly when a scoped group ends, while threads run.
 _ENVIRONMENT = dict(os.environ)
 
@@ -34,24 +37,28 @@ def argv(command: Command) -> list[str]:
 
 
 def start(
-    command: Command, *, environment: Mapping[str, str], stdin: int, stderr: int,
-    inherited: Sequence[int] = (),
+    command: Command, *, stdin: int, stderr: int, stdout: int = subprocess.PIPE,
+    environment: Optional[Mapping[str, str]] = None, inherited: Sequence[int] = (),
 ) -> subprocess.Popen[bytes]:
     """
-    Start a command on this computer, with a pipe as standard output; do not wait for it.
+    Start a command on this computer; do not wait for it.
 
     It gets its own session, so that Ctrl-C in the terminal reaches only the launch and does not
     kill an undo step. With sudo it gets a process group instead, which Ctrl-C does not reach
     either: sudo binds its ticket to the terminal, and would ask for the password in a session
     without one.
 
+    :param environment: None for this process's variables and the command's.
     :raises FileNotFoundError: there is no such program.
     """
     apart: dict[str, Any] = {'start_new_session': True, 'pass_fds': inherited}
     if _through_sudo(command):
         apart = {'process_group': 0} if sys.version_info >= (3, 11) else {
             'preexec_fn': os.setpgrp}
-    return subprocess.Popen(argv(command), env=environment, stdin=stdin, stdout=subprocess.PIPE,
+    if environment is None:
+        path = _ENVIRONMENT.get('PATH', os.defpath)
+        environment = {**_ENVIRONMENT, 'PATH': f'{path}:/usr/sbin:/sbin', **command.environment}
+    return subprocess.Popen(argv(command), env=environment, stdin=stdin, stdout=stdout,
                             stderr=stderr, **apart)
 
 
@@ -128,6 +135,7 @@ def run(
     cancel: Optional[threading.Event] = None,
     on_output: Optional[Callable[[str], None]] = None,
     inherited: Sequence[int] = (),
+    kept: float = math.inf,
 ) -> Result:
     """
     Run a command on this computer and wait for it; Ctrl-C does not reach it (see ``start``).
@@ -136,19 +144,18 @@ def run(
     :param check: raise CommandError for an exit status other than zero.
     :param on_output: receives each line of standard output when it is printed.
     :param inherited: file descriptors that the command inherits; not with ``sudo``.
+    :param kept: bytes of each output that are kept, the last ones; for commands that pass on what
+        a machine sends.
     :raises CommandError: it failed and ``check`` is set.
     :raises DeadlineExceeded: it timed out.
     :raises Cancelled: ``cancel`` was set while it ran.
     :raises PrerequisiteError: the program is missing, or cannot be started.
     """
     words = argv(command)
-    path = _ENVIRONMENT.get('PATH', os.defpath)
-    environment = {**_ENVIRONMENT, 'PATH': f'{path}:/usr/sbin:/sbin', **command.environment}
     try:
         with _file_of(command.input) if command.input else open(os.devnull, 'rb') as stdin:
-            child = start(
-                command, environment=environment, stdin=stdin.fileno(), stderr=subprocess.PIPE,
-                inherited=inherited)
+            child = start(command, stdin=stdin.fileno(), stderr=subprocess.PIPE,
+                          inherited=inherited)
     except FileNotFoundError as error:
         raise PrerequisiteError(
             f'{words[0]} not found on this computer',
@@ -159,17 +166,14 @@ def run(
             f"{words[0]} can't be started on this computer: {error.strerror}",
             'are there processes and memory left?' if isinstance(error, BlockingIOError)
             or error.errno == errno.ENOMEM else '') from error
-    output: dict[str, bytes] = {'stdout': b'', 'stderr': b''}
+    output = {'stdout': Tail(kept), 'stderr': Tail(kept)}
 
     def read(name: str) -> None:
-        stream = getattr(child, name)
-        lines = []
-        for line in iter(stream.readline, b''):
-            lines.append(line)
-            if on_output is not None and name == 'stdout':
-                on_output(line.decode(errors='replace').rstrip('\n'))
-        output[name] = b''.join(lines)
-        stream.close()
+        with getattr(child, name) as stream:
+            for line in iter(lambda: stream.readline(_LINE), b''):
+                output[name].add(line)
+                if on_output is not None and name == 'stdout':
+                    on_output(line.decode(errors='replace').rstrip('\n'))
 
     threads = [threading.Thread(target=read, args=(name,), daemon=True) for name in output]
     for thread in threads:
@@ -193,14 +197,38 @@ def run(
     for thread in threads:
         # a daemon that the command left may keep the pipe open
         thread.join(2.0)
-    result = Result(child.returncode, output['stdout'].decode(errors='replace'),
-                    output['stderr'].decode(errors='replace'))
+    result = Result(child.returncode, output['stdout'].text(), output['stderr'].text())
     if check and result.returncode != 0:
         hint = ''
         if command.sudo and 'password is required' in result.stderr:
             hint = 'run `sudo -v` first, or allow it without a password'
         raise CommandError(command, result, HERE, hint)
     return result
+
+
+class Tail:
+    """
+    The last bytes of a stream.
+
+    :param kept: their number; infinite for all.
+    """
+
+    def __init__(self, kept: float) -> None:
+        self._kept = kept
+        self._data = bytearray()
+        self._dropped = 0
+
+    def add(self, data: bytes) -> None:
+        """Add new bytes."""
+        self._data += data
+        if len(self._data) > 1.25 * self._kept:
+            self._dropped += len(self._data) - int(self._kept)
+            del self._data[:-int(self._kept)]
+
+    def text(self) -> str:
+        """Return them as text, with a note of what was dropped."""
+        text = self._data.decode(errors='replace')
+        return f'[{self._dropped} earlier bytes were dropped]\n{text}' if self._dropped else text
 
 
 def _file_of(data: bytes) -> BinaryIO:

@@ -21,6 +21,7 @@ import re
 import secrets
 import shutil
 import tempfile
+import time
 from typing import Any, Optional
 
 from fogros2 import model
@@ -208,7 +209,30 @@ class Store:
 
     def delete(self, name: str) -> None:
         """Remove a machine's folder with its content."""
-        shutil.rmtree(self.machine(name), ignore_errors=True)
+        delete_folder(self.machine(name))
+
+    def _request(self, record: Record) -> Path:
+        return self.root / 'requests' / f'{record.name}.{record.last or record.launch}.json'
+
+    def set_aside(self, record: Record) -> None:
+        """Remove a machine's folder, but keep the request for it, which got no answer."""
+        write_private(self._request(record), model.to_json(record).encode())
+        self.delete(record.name)
+
+    def requests(self) -> list[tuple[Record, float]]:
+        """Return the records of requests without an answer, and the seconds since each."""
+        found = []
+        for path in sorted((self.root / 'requests').glob('[!.]*.json')):
+            try:
+                age = time.time() - path.stat().st_mtime
+                found.append((record_from_json(json.loads(path.read_text())), age))
+            except (OSError, ValueError, TypeError, KeyError, AttributeError):
+                continue  # another program has just removed it, or it is damaged
+        return found
+
+    def answered(self, record: Record) -> None:
+        """Forget a request: no machine of it can appear any more."""
+        self._request(record).unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def lock(self, name: str) -> Iterator[None]:
@@ -261,7 +285,7 @@ class Store:
             if not unfinished or process_start(int(unfinished[1])) is not None:
                 continue
             if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
+                delete_folder(path)
             else:
                 path.unlink(missing_ok=True)
         for path in (self.root / 'machines').glob('*'):
@@ -358,6 +382,23 @@ def write_private(path: Path, data: bytes) -> None:
             raise
     except OSError as error:
         raise _not_written(path, error) from error
+
+
+def delete_folder(path: Path) -> None:
+    """
+    Delete a folder with its content, also with folders inside that nobody may write.
+
+    Nodes may have made such folders, of which a checkpoint is a copy.
+    """
+    shutil.rmtree(path, ignore_errors=True)
+    if path.is_dir():
+        path.chmod(0o700)
+        for parent, names, _ in os.walk(path):
+            for name in names:
+                with contextlib.suppress(OSError):
+                    if not os.path.islink(folder := os.path.join(parent, name)):
+                        os.chmod(folder, 0o700)
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def process_folder() -> Path:

@@ -13,6 +13,8 @@ from typing import Optional, TypeVar
 from fogros2.errors import Cancelled, DeadlineExceeded
 
 T = TypeVar('T')
+#: Seconds to wait for the answer to a sent request, which may create something, after a cancel.
+ON_ITS_WAY = 15.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +99,7 @@ class Periodic:
 
 def cancellable(
     call: Callable[[], T], cancel: Optional[threading.Event], *, what: str,
-    grace: Callable[[], float] = lambda: 1.0, late: Optional[Callable[[T], None]] = None,
+    grace: Callable[[], float] = lambda: ON_ITS_WAY, late: Optional[Callable[[T], None]] = None,
 ) -> T:
     """
     Run a blocking call that a cancel abandons; return its result or raise its error.

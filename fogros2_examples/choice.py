@@ -42,7 +42,7 @@ def arguments(machine: str, name: str, second: str = '') -> list[DeclareLaunchAr
         argument('key', '', 'machine:=ssh: private key to log in with'),
         argument('host_key', '', 'machine:=ssh: its public host key; else known_hosts decides'),
         argument('bootstrap', 'auto',
-                 'machine:=ssh: how ROS 2 gets there: auto, apt, embedded or none'),
+                 'machine:=ssh: how ROS 2 gets there: auto, apt, pip or none'),
     ]
     if second:
         found += [

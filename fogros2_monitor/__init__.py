@@ -20,4 +20,6 @@ import sys
 #: Package and executable that serve a machine's topics to Foxglove.
 FOXGLOVE = ('fogros2', 'bridge')
 #: Command that prints the topics of a launch, see :mod:`~fogros2_monitor.dashboard.graph`.
-GRAPH = (sys.executable, '-m', 'fogros2_monitor.dashboard.graph')
+#: Without the current folder: it may have modules of other accounts.
+GRAPH = (sys.executable, '-c', 'import sys; sys.path[:] = filter(None, sys.path); '
+         'from fogros2_monitor.dashboard import graph; graph.main()')

@@ -32,7 +32,8 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from std_msgs.msg import Empty
 
-from fogros2_monitor.definitions import definition, message_class
+from fogros2 import ros_types
+from fogros2_monitor.definitions import definition
 from image_transport_h264.cdr import CdrError
 from image_transport_h264.message import coded
 
@@ -54,7 +55,7 @@ class _Topic:
         self.viewers: set[int] = set()
         self._node = node
         self._name = name
-        self._class = message_class(kind)
+        self._class = ros_types.message(kind)
         schema = CompressedVideo.get_schema() if video else foxglove.Schema(
             name=kind, encoding='ros2msg', data=definition(kind).encode())
         self._channel = foxglove.Channel(
@@ -210,7 +211,7 @@ class BridgeNode(Node, ServerListener):
             self._refuse(f"{topic}: publishes '{encoding}', this bridge takes cdr")
             return
         try:
-            self._published[key] = self.create_publisher(message_class(kind), topic, 10)
+            self._published[key] = self.create_publisher(ros_types.message(kind), topic, 10)
         except (LookupError, NameValidationException) as error:
             self._refuse(f'{topic}: {error}')
 

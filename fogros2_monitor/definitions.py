@@ -8,9 +8,9 @@ interfaces and need no ``.msg`` file.
 
 from __future__ import annotations
 
-import importlib
 import re
-from typing import Any
+
+from fogros2 import ros_types
 
 _RULE = '=' * 80
 #: Types of IDL in message classes, and the same types in message files.
@@ -23,23 +23,6 @@ _BASIC = {
 _SEQUENCE = re.compile(r'sequence<(?P<item>.+?)(?:, (?P<bound>\d+))?>$')
 _ARRAY = re.compile(r'(?P<item>.+)\[(?P<size>\d+)\]$')
 _BOUNDED = re.compile(r'(?P<kind>w?string)<(?P<bound>\d+)>$')
-
-
-def message_class(name: str) -> Any:
-    """
-    Import a message class.
-
-    :param name: type name, such as ``std_msgs/msg/String`` or ``std_msgs/String``.
-    :raises LookupError: the type is not installed here, or is no message.
-    """
-    parts = name.split('/')
-    package, kind = parts[0], parts[-1]
-    if len(parts) not in (2, 3) or len(parts) == 3 and parts[1] != 'msg':
-        raise LookupError(f"'{name}' is no name of a message")
-    try:
-        return getattr(importlib.import_module(f'{package}.msg'), kind)
-    except (ImportError, AttributeError) as error:
-        raise LookupError(f"'{name}' isn't installed here: {error}") from error
 
 
 def definition(name: str) -> str:
@@ -60,7 +43,7 @@ def definition(name: str) -> str:
         if short in seen:
             continue
         lines = []
-        for field, kind in message_class(this).get_fields_and_field_types().items():
+        for field, kind in ros_types.message(this).get_fields_and_field_types().items():
             written, inner = _written(kind)
             if '/' in inner:
                 waiting.append(inner)

@@ -100,7 +100,7 @@ class Gate:
         try:
             while True:
                 connection, peer = await loop.sock_accept(listener)
-                who = plain_address(peer[0])
+                who = accounts.plain_address(peer[0])
                 why = '' if len(connections) < CONNECTIONS else \
                     f'{CONNECTIONS} connections are open'
                 if public is None and accounts.is_foreign(connection):
@@ -179,13 +179,6 @@ class Gate:
         if (who, why) not in self._logged and len(self._logged) < LOGGED:
             self._logged.add((who, why))
             print(f'turned away {who}: {why}', file=sys.stderr, flush=True)
-
-
-def plain_address(address: str) -> str:
-    """Return a peer's address; map an IPv4 address of a dual-stack socket back to IPv4."""
-    found = ipaddress.ip_address(address.partition('%')[0])
-    mapped = getattr(found, 'ipv4_mapped', None)
-    return str(mapped or found)
 
 
 async def _pass(

@@ -80,10 +80,10 @@ def links(request: Request, name: str, token: str, *, encrypted: bool) -> bytes:
         parts.append('<p>The certificate is accepted: your browser will open this address in the '
                      'applications below, too.</p>')
     if encrypted or is_loopback(where):
-        parts.append('<ul>' + ''.join(
-            f'<li><a href="{html.escape(urls.app(address, at))}">{title}</a></li>'
-            for title, at in (('Lichtblick', urls.LICHTBLICK), ('Foxglove', urls.FOXGLOVE)))
-            + '</ul>')
+        parts.append(
+            f'<p>In <a href="{urls.LICHTBLICK}">Lichtblick</a> or <a href="{urls.FOXGLOVE}">'
+            f'Foxglove</a>, choose {html.escape(urls.HOW)}. The application then has the token.'
+            '</p>')
     else:
         parts.append(
             '<p>Pages of other hosts may not open it from here, as the connection to this one is '

@@ -5,11 +5,14 @@ from __future__ import annotations
 
 import urllib.parse
 
-#: URLs of the hosted applications Foxglove and Lichtblick, and the values of ``Origin`` that a
-#: browser sends for their pages.
-FOXGLOVE = 'https://app.foxglove.dev/~/view'
+#: URLs of the hosted applications, and the values of ``Origin`` that a browser sends for their
+#: pages. A link to them has no bridge's URL: their servers would get its token.
+FOXGLOVE = 'https://app.foxglove.dev/'
 LICHTBLICK = 'https://lichtblick-suite.github.io/lichtblick/'
 APPLICATIONS = ('https://app.foxglove.dev', 'https://lichtblick-suite.github.io')
+#: How to open a bridge there.
+HOW = "'Open connection', 'Foxglove WebSocket', and this address"
+
 
 def with_token(where: str, token: str, scheme: str = 'ws') -> str:
     """
@@ -21,19 +24,6 @@ def with_token(where: str, token: str, scheme: str = 'ws') -> str:
     return f'{scheme}://{where}/?{urllib.parse.urlencode({"token": token})}'
 
 
-def app(address: str, at: str = FOXGLOVE) -> str:
-    """
-    Return the URL that opens a bridge in a hosted web application.
-
-    From a page of HTTPS, a browser opens ``ws://`` only to its own computer's loopback interface.
-
-    :param address: URL of the bridge.
-    :param at: URL of the application.
-    """
-    query = urllib.parse.urlencode({'ds': 'foxglove-websocket', 'ds.url': address})
-    return f'{at}?{query}'
-
-
 def served(where: str, token: str) -> str:
     """
     Return the URL at which the gate itself serves the web application.
@@ -42,5 +32,6 @@ def served(where: str, token: str) -> str:
 
     :param where: ``host:port``.
     """
-    page = app(with_token(where, token), f'http://{where}/')
-    return f'{page}&{urllib.parse.urlencode({"token": token})}'
+    query = urllib.parse.urlencode({
+        'ds': 'foxglove-websocket', 'ds.url': with_token(where, token), 'token': token})
+    return f'http://{where}/?{query}'

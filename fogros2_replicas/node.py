@@ -30,8 +30,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
-from rosidl_runtime_py.utilities import get_message, get_service
 
+from fogros2 import ros_types
 from fogros2_replicas import figures
 from fogros2_replicas.calls import Action, Answer, Calls
 from fogros2_replicas.pairs import Header, header_of, Pair
@@ -69,7 +69,7 @@ class _Served:
         self._kind, fit = self.node.agreed(self.name, self._kind, {
             name: min(kinds[prefix + self.name], key=self._kind.__eq__)
             for name, prefix in self.node.replicas.items() if kinds.get(prefix + self.name)})
-        service = self.node.imported(self.name, self._kind, get_service)
+        service = self.node.imported(self.name, self._kind, ros_types.service)
         if service is None:
             return
         if not self.opened:
@@ -138,7 +138,7 @@ class _Forwarded:
                  for name, prefix in self.node.replicas.items()}
         self._kind, fit = self.node.agreed(
             self.name, self._kind, {name: kind for name, (kind, _) in found.items() if kind})
-        message = self.node.imported(self.name, self._kind, get_message)
+        message = self.node.imported(self.name, self._kind, ros_types.message)
         for name, replica in self.figures.replicas.items():
             replica.there = name in fit
             if message is None or not replica.there or name in self._heard:
@@ -150,7 +150,7 @@ class _Forwarded:
                 message, self.node.replicas[name] + self.name, functools.partial(
                     self._came_out, name, _reader(message)), qos, raw=True)
         kind, qos = self.node.published(self._source)
-        message = self.node.imported(self._source, kind, get_message)
+        message = self.node.imported(self._source, kind, ros_types.message)
         if self._inputs is None and message is not None:
             self._inputs = [] if self._streamed else [
                 self.node.create_publisher(message, prefix + self._source, qos)
@@ -229,9 +229,9 @@ class FirstAnswer(Node):
         """Return the class of a type, None for none; complain if it is not installed."""
         try:
             return get(kind) if kind else None
-        except (ImportError, AttributeError, ValueError) as error:
+        except LookupError as error:
             return self.complain(
-                f"{name}: its type '{kind}' can't be imported on the robot ({error}); "
+                f"{name}: its type {kind!r} can't be imported on the robot ({error}); "
                 'install its package here too, or source the workspace that has it')
 
     def complain(self, text: str) -> None:

@@ -24,6 +24,8 @@ REMEMBERED, MISSES = 512, 10
 STREAK = 3
 #: An input that is so many nanoseconds older than the newest one means that time was set back.
 SET_BACK = 1_000_000_000
+#: Bytes of a frame id that are compared; maximum number of different ids of one stamp.
+FRAME, FRAMES = 256, 1000
 
 
 def header_of(data: bytes) -> Optional[Header]:
@@ -36,7 +38,7 @@ def header_of(data: bytes) -> Optional[Header]:
         seconds, nanoseconds, frame = Reader(data).header()
     except CdrError:
         return None
-    return seconds * 1_000_000_000 + nanoseconds, frame
+    return seconds * 1_000_000_000 + nanoseconds, frame[:FRAME]
 
 
 class Pair:
@@ -108,6 +110,8 @@ class Pair:
             self._newest = stamp
             self._came.clear()
             self._forwarded.clear()
+        if len(self._came) == FRAMES and (name, frame) not in self._came:
+            return False
         self._came[name, frame] += 1
         if self._came[name, frame] <= self._forwarded[frame]:
             return False

@@ -21,13 +21,12 @@ import threading
 import time
 from typing import Any, Optional
 
-from ament_index_python.packages import get_package_prefix
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rosidl_runtime_py.utilities import get_message
 
+from fogros2 import ros_types
 from fogros2_share.wire import decode, DEEPEST, Echoes, encode, Form, LARGEST, LINE
 
 #: The socket in the folder of a machine.
@@ -180,10 +179,9 @@ class Relay(Node):
     def _imported(self, kind: str) -> Any:
         """Return the class of a type, None for none; complain if no ROS package here has it."""
         try:
-            get_package_prefix(kind.partition('/')[0])
-            return get_message(kind)
-        except (ImportError, AttributeError, ValueError, LookupError) as error:
-            self._complain(f"the type '{kind}' of a topic can't be imported: {error}")
+            return ros_types.message(kind)
+        except LookupError as error:
+            self._complain(f'a topic is not shared: {error}')
 
     # -- from this launch to other robots -------------------------------------------------------
 

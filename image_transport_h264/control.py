@@ -9,7 +9,7 @@ import math
 from typing import Optional
 
 from image_transport_h264.codec import Settings
-from image_transport_h264.rate import Governor, LEAST_BITRATE, LEAST_BITS
+from image_transport_h264.rate import Governor, LEAST_BITRATE, LEAST_BITS, MOST_RECEIVERS
 
 #: Seconds after which a silent receiver no longer limits the others.
 SILENT = 3.0
@@ -64,6 +64,8 @@ class Control:
         """Record an acknowledgement of a receiver."""
         governor = self._governors.get(receiver)
         if governor is None:
+            if len(self._governors) == MOST_RECEIVERS:
+                return
             governor = self._governors[receiver] = Governor(self.asked.bitrate)
         governor.acknowledged(sequence, lost, now)
 

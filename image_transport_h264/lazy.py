@@ -151,11 +151,16 @@ class LazyNode(Node):
         return self._counts[publisher]
 
     def complain(self, cause: str, message: str) -> None:
-        """Log a warning for the first message of each cause."""
+        """
+        Log a warning for the first message of each cause.
+
+        :param message: may have texts of other computers, which must control no terminal.
+        """
         with self._complaining:
             if cause in self._complained or len(self._complained) >= MOST_CAUSES:
                 return
             self._complained.add(cause)
+        message = ''.join(c if c.isprintable() else '?' for c in message)
         self.get_logger().warning(f'{message} (further ones of this kind go unmentioned)')
 
     def offer(

@@ -36,6 +36,8 @@ LOSS_MEMORY = 20.0
 #: Minimum bits per pixel; below it, fewer pictures look better than worse ones.
 LEAST_BITS = 0.03
 LEAST_BITRATE = 50_000
+#: Number of receivers that are waited for; a message names its receiver as it likes.
+MOST_RECEIVERS = 64
 
 
 @dataclasses.dataclass

@@ -27,7 +27,9 @@ MOST, UNLIMITED = 1e12, 1e9
 LIMITED, ROOM, STEADY = 0.6, 2.0, (1.4, 3.0)
 #: Maximum number of streams of a link, and of links of a stream.
 MOST_STREAMS, MOST_LINKS = 64, 16
-_TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
+#: Names of links. A machine chooses among them: an encoder publishes nowhere else, such as on the
+#: topic of a controller that takes the same type.
+_LINK = re.compile(r'/fogros2/\w+/link_(in|out)', re.ASCII)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,4 +136,4 @@ def claim_of(message: Any) -> Optional[tuple[str, Claim]]:
 def links_of(message: Any) -> dict[str, float]:
     """Return the links of a decoder's announcement with their bandwidths; skip invalid ones."""
     return {dim.label: bandwidth for dim, bandwidth in zip(message.layout.dim, message.data)
-            if _TOPIC.fullmatch(dim.label) and 0 < bandwidth <= MOST}
+            if _LINK.fullmatch(dim.label) and 0 < bandwidth <= MOST}

@@ -70,8 +70,9 @@ class Layout:
         :raises CloudError: the cloud has no x, y, z as float32, or the sizes contradict each
             other, or the data have more than ``max_bytes``.
         """
-        sizes = (self.row_step * self.height, 12 * self.points, self.height, self.width,
-                 self.row_step)
+        # rows and columns take memory, even without points
+        height, width = max(self.height, 1), max(self.width, 1)
+        sizes = (self.row_step * height, 12 * height * width)
         if max(sizes) > max_bytes or self.point_step > MAX_POINT:
             raise CloudError('more points or bytes than allowed')
         if self.row_step < self.width * self.point_step:
@@ -81,9 +82,9 @@ class Layout:
             raise CloudError(f'more than {MOST_FIELDS} fields, or a name of more bytes')
         for field in self.fields:
             if not 0 < field.datatype < len(SIZES):
-                raise CloudError(f"field '{field.name}' has an unknown datatype")
+                raise CloudError('a field has an unknown datatype')
             if field.offset + field.size > self.point_step:
-                raise CloudError(f"field '{field.name}' ends after the point")
+                raise CloudError('a field ends after the point')
         self.places()
 
     def places(self) -> list[int]:

@@ -14,6 +14,7 @@ from collections import deque
 from typing import Optional
 
 from image_transport_h264.pacing import Pace, Sent
+from image_transport_h264.rate import MOST_RECEIVERS
 from point_cloud_stream.codec import Coded
 
 #: Seconds without an acknowledgement after which parts are given up.
@@ -30,8 +31,6 @@ BUSY, AIM = 0.85, 0.6
 IN_A_ROW, SECONDS_IN_A_ROW = 3, 0.6
 #: Seconds until the resolution becomes finer, and the factor.
 CALM, FINER = 1.0, 0.5
-#: Number of receivers that are waited for.
-MOST_RECEIVERS = 64
 #: Most bits of a number to give up at once.
 MOST_BITS = 4.0
 

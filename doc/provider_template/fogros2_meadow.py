@@ -105,8 +105,12 @@ class Meadow(VmCloud):
         """Delete ``machine.vm`` in ``machine.region``; return when it is gone or was gone."""
         raise NotImplementedError
 
-    def end_attempt(self, region: str, attempt: str) -> None:
-        """Delete the machines with the tag fogros2-attempt ``attempt``; do not wait."""
+    def end_attempt(self, region: str, attempt: str) -> bool:
+        """
+        Delete the machines with the tag fogros2-attempt ``attempt``; do not wait.
+
+        Return whether there was one.
+        """
         raise NotImplementedError
 
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:

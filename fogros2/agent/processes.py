@@ -26,9 +26,8 @@ COMMAND_TIMEOUT, CHECK_TIMEOUT = 30.0, 10.0
 #: (seconds, signal): when processes that the launch process left behind get each signal.
 SWEEP = ((0.0, signal.SIGINT), (3.0, signal.SIGTERM), (6.0, signal.SIGKILL))
 SWEEP_QUICKLY = ((0.0, signal.SIGINT), (0.4, signal.SIGTERM), (0.8, signal.SIGKILL))
-#: Events that a watch may send, and maximum bytes of the command's output in them.
-WATCHED = ('notice', 'idle')
-REASON = 2000
+#: Maximum bytes of a watch's output in its event, and its poll interval in seconds.
+REASON, WATCH_INTERVAL = 2000, 5.0
 #: The variable that marks the descendants of the launch process.
 MARK = 'FOGROS2_AGENT_MARK'
 
@@ -263,16 +262,8 @@ class Checks:
 
         self.processes.spawn(kept.alive, checked, timeout=CHECK_TIMEOUT)
 
-    def watch(self, request: Json) -> None:
-        """
-        Start a watch, or replace the one with the same ``what``.
-
-        :raises Refused: there is no such watch.
-        """
-        what, argv = request['what'], words(request['argv'])
-        interval = max(0.05, float(request.get('interval', 5.0)))
-        if what not in WATCHED or not argv:
-            raise Refused(f"there is no watch for '{what}'", ', '.join(WATCHED))
+    def watch(self, what: Any, argv: list[str], interval: float = WATCH_INTERVAL) -> None:
+        """Start a watch ('notice' or 'idle'), or replace the one with the same ``what``."""
         watch = self.watched[what] = object()
 
         def look() -> None:

@@ -14,9 +14,9 @@ A request is ``{"id": 1, "command": ..., ...}``. A reply is ``{"id": 1, "ok": tr
                still has the machine; the request may have been delayed until after a release.
 ``keep``       ``what``, ``alive`` argv, ``repair`` and ``down`` lists of argv, ``interval`` (s):
                health check with repair
-``watch``      ``what`` (notice or idle), ``argv``, run as root every ``interval`` (s, default
-               5). When it exits with 0, the agent sends one event named ``what``, with the
-               output as ``reason``, and ends the watch.
+``watch``      ``what`` (idle), ``argv``, run as root every ``interval`` (s, default 5). When it
+               exits with 0, the agent sends one event named ``what``, with the output as
+               ``reason``, and ends the watch. The watch ``notice`` is part of the configuration.
 ``launch``     start the process that will run the nodes, ahead of time
 ``start``      ``nodes``: list of NodeSpec; nodes with a known id are ignored
 ``stop``       ``nodes``: ids, or null for all; replies at once, ``exited`` events follow
@@ -74,6 +74,8 @@ CONFIG: dict[str, tuple[tuple[type, ...], Any]] = {
     'environment': ((dict,), {}),
     'setup': ((list,), []),
     'ros_command': ((list,), []),
+    # command of the watch for a preemption notice; fixed for a launch once it is not None
+    'notice': ((list, type(None)), None),
     'log_bytes': ((int,), LOG_BYTES),
     # file that says, after a reboot, until when a launch has kept this machine; '' for none
     'kept_until': ((str,), ''),

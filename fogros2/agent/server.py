@@ -24,8 +24,14 @@ import time
 from fogros2.agent.journal import BLOCK, Journal
 from fogros2.agent.loop import Channel, Loop
 from fogros2.agent.nodes import Nodes
-from fogros2.agent.processes import Checks, Identity, Processes, remove_tree
-from fogros2.agent.protocol import checked, CONFIG, dump, MAX_LINE, Refused, say
+from fogros2.agent.processes import (
+    Checks,
+    Identity,
+    Processes,
+    remove_tree,
+    WATCH_INTERVAL,
+)
+from fogros2.agent.protocol import checked, CONFIG, dump, MAX_LINE, Refused, say, words
 from fogros2.agent.watchdog import Heartbeats, Watchdog
 
 TYPE_CHECKING = False
@@ -306,6 +312,7 @@ class Agent:
         except Refused as error:
             say(str(error))
         self.nodes.trim_log()
+        self._watch_notice()
         if self.journal.next > 1:
             # the nodes end with the agent that died here, and nothing has reported it
             self.nodes.sweep_former()
@@ -382,10 +389,14 @@ class Agent:
         new = checked(request)
         for fixed in ('directory', 'user', 'log_bytes', 'kept_until'):
             new.pop(fixed, None)
+        notice = self.config['notice']
         if self.ending:
             raise Refused('this machine is ending', 'launch again', 'ending')
         owner = self.config['launch']  # '' after a reboot: no owner until a launch comes
         taken_over = new.get('launch', owner) != owner
+        if notice is not None and not taken_over and new.get('notice', notice) != notice:
+            # a node could report with another command that the provider reclaims the machine
+            raise Refused('the command for the preemption notice is fixed', kind='fixed')
         if taken_over and request.get('again'):
             raise Refused(f"launch '{new['launch']}' doesn't have this machine any more",
                           kind='released')
@@ -425,10 +436,14 @@ class Agent:
             self.adopted = True
             self.nodes.states.clear()
             new.setdefault('heartbeat', None)
+            self.config['notice'] = None
         self.released = self.released and not new.get('launch')
         if new.get('heartbeat', self.config['heartbeat']) != self.config['heartbeat']:
             self.watchdog.number = 0  # of another key
+        fixed = self.config['notice'] is not None
         self.config.update(new)
+        if not fixed:
+            self._watch_notice()
         if taken_over:
             self.watchdog.disarm()
             self.watchdog.boot_from = self.loop.clock()
@@ -437,6 +452,10 @@ class Agent:
         self._note_kept()
         self.heartbeats.open()
         return {'machine': self.config['machine'], 'next': self.journal.next, 'signed': True}
+
+    def _watch_notice(self) -> None:
+        if self.config['notice']:
+            self.checks.watch('notice', self.config['notice'])
 
     def _restart_watchdog(self) -> None:
         self.watchdog.configured(self.loop.clock(), heartbeat=bool(self.config['heartbeat']))
@@ -461,7 +480,10 @@ class Agent:
     def do_watch(self, client: Client, request: Json) -> Empty:
         """Start a watch, or replace the one with the same ``what``."""
         self._check_held()
-        self.checks.watch(request)
+        argv, interval = words(request['argv']), float(request.get('interval', WATCH_INTERVAL))
+        if request['what'] != 'idle' or not argv:
+            raise Refused(f"there is no watch for '{request['what']}'", 'idle')
+        self.checks.watch('idle', argv, max(0.05, interval))
         return {}
 
     def do_launch(self, client: Client, request: Json) -> Launched:

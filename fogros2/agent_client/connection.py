@@ -6,13 +6,12 @@ from __future__ import annotations
 from collections.abc import Callable
 import contextlib
 import itertools
-import json
 import math
 import threading
 import time
 from typing import Any, cast, Optional
 
-from fogros2 import events
+from fogros2 import events, untrusted
 from fogros2.errors import (
     AgentAbsent,
     AgentError,
@@ -248,11 +247,13 @@ class AgentClient:
         try:
             for line in iter(stream.readline, b''):
                 self._heard = time.monotonic()
-                message = _parsed(line)
-                if message is None:
+                try:
+                    message = _parsed(line)
+                except untrusted.InvalidMessage:
                     if spoke and line.endswith(b'\n'):
-                        raise events.InvalidMessage('not an event or an answer')
-                elif message.get('kind') == 'absent' and 'ok' not in message:
+                        raise
+                    continue  # the output of a login script
+                if message.get('kind') == 'absent' and 'ok' not in message:
                     self._absent = str(message.get('error'))
                 else:
                     self._ever = spoke = True
@@ -263,7 +264,7 @@ class AgentClient:
                         self._deliver(message)
                     else:
                         self._answer(message)
-        except events.InvalidMessage as error:
+        except untrusted.InvalidMessage as error:
             self._error = AgentError(
                 f'the agent sent an invalid message ({error})',
                 'the machine may be hijacked: delete it')
@@ -368,11 +369,17 @@ class AgentClient:
             self._send(stream, line)
 
 
-def _parsed(line: bytes) -> Optional[dict[str, Any]]:
-    """Return a message, None for other text, such as the output of a login script."""
+def _parsed(line: bytes) -> dict[str, Any]:
+    """
+    Return a message.
+
+    :raises InvalidMessage: the line is other text.
+    """
+    what = 'not an event or an answer'
     try:
-        message = events.cleaned(json.loads(line))
-    except (ValueError, RecursionError):
-        return None
-    known = isinstance(message, dict) and message.keys() & {'event', 'ok', 'kind'}
-    return message if known else None
+        message: dict[str, Any] = untrusted.parsed(line, dict[str, Any])
+    except untrusted.InvalidMessage as error:
+        raise untrusted.InvalidMessage(f'{what}: {error}') from error
+    if not message.keys() & {'event', 'ok', 'kind'}:
+        raise untrusted.InvalidMessage(what)
+    return message

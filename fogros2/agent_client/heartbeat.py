@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import socket
 import threading
 import time
 from typing import Any, Optional
 
-from fogros2 import events
+from fogros2 import events, untrusted
 from fogros2.agent.protocol import ANSWER, BEAT, DATAGRAM, sign, verify
 from fogros2.clock import ClockOffset, OffsetFilter
 from fogros2.model import to_json
@@ -111,7 +110,7 @@ class Heartbeat:
             now = time.monotonic()
             try:
                 answer = events.heartbeat(self._parsed(data))
-            except (ValueError, RecursionError):
+            except untrusted.InvalidMessage:
                 continue  # an invalid message, perhaps of a stranger
             if peer != self._target or answer['launch'] != self._launch_id:
                 continue
@@ -122,6 +121,6 @@ class Heartbeat:
 
     def _parsed(self, data: bytes) -> Any:
         if not self._key:
-            return json.loads(data)
+            return untrusted.parsed(data)
         fields = verify(self._key, ANSWER, data)
         return fields and {'launch': self._launch_id, 't': fields[1], 'clock': fields[2]}

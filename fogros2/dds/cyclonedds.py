@@ -21,13 +21,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 import ipaddress
-import json
 from pathlib import Path
 import re
 from types import MappingProxyType
 from typing import ClassVar, Optional
 from xml.sax.saxutils import quoteattr
 
+from fogros2 import untrusted
 from fogros2.dds import check_discovery, DdsVendor, is_address, local_only, static_peers
 from fogros2.errors import DdsError
 from fogros2.model import Command, DdsInterface
@@ -97,7 +97,7 @@ class CycloneDds(DdsVendor):
         :raises DdsError: the output is not that of ``ip``.
         """
         try:
-            for link in json.loads(output or '[]'):
+            for link in untrusted.parsed(output or '[]'):
                 name, flags = link.get('ifname', ''), link.get('flags', ())
                 if (link.get('addr_info') and 'MULTICAST' in flags
                         and 'POINTOPOINT' not in flags and not _NOT_LAN.match(name)):

@@ -14,6 +14,7 @@ Each step pushes its undo before it runs. The modules, each imports only those b
 ``checks``        checks before anything is created
 ``context``       what the steps of one machine use
 ``machine_job``   what the steps of one machine learn and change, and how they are undone
+``requests``      the end of a creation that got no answer
 ``steps``         a module for each step
 ``running``       a machine that is up
 ``deployment``    the order of the steps

@@ -10,7 +10,7 @@ from typing import Optional
 from fogros2 import plan
 from fogros2 import shell as shells
 from fogros2.errors import ConfigurationError, FogError, Unsupported
-from fogros2.host import bootstrap, containers, undeclared, wheels, workspace
+from fogros2.host import bootstrap, containers, undeclared, workspace
 from fogros2.host.programs import check_program
 from fogros2.model import MachineSpec
 from fogros2.provider import Provider
@@ -82,10 +82,10 @@ def check_architecture(spec: MachineSpec, provider: Provider) -> None:
 
     :raises WorkspaceError: the workspace is compiled for another processor.
     """
-    if spec.workspace is None and spec.bootstrap not in ('embedded', 'apt'):
+    if spec.workspace is None and spec.bootstrap not in ('pip', 'apt'):
         return  # only the machine's system decides
     architecture: Optional[str] = provider.architecture(spec)
     if architecture:
         bootstrap.check_architecture(
             spec, architecture,
-            workspace.inspect(spec.workspace) if spec.workspace else None, wheels.collect)
+            workspace.inspect(spec.workspace) if spec.workspace else None)

@@ -12,7 +12,6 @@ import functools
 import os
 from pathlib import Path
 import secrets
-import shutil
 import threading
 from typing import Optional
 
@@ -33,7 +32,7 @@ from fogros2.journal import Journal
 from fogros2.model import DdsInterface, MachineSpec
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent, StepFailed, Warned
-from fogros2.store import Record, Store, this_process, write_private
+from fogros2.store import delete_folder, Record, Store, this_process, write_private
 from fogros2.vpn import addresses
 from fogros2.waiting import Timeouts
 
@@ -292,7 +291,7 @@ class Launch:
     def _remove_folder(self, folder: Path) -> None:
         """Remove the launch's folder, unless `ros2 fog gc` needs it to find the interface."""
         if self._vpn is None or self._vpn.down:
-            shutil.rmtree(folder, ignore_errors=True)
+            delete_folder(folder)
 
     def _address(self, index: int) -> str:
         """Return the VPN address of the ``index``-th machine."""

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 import os
 from pathlib import Path
 from typing import Optional
@@ -23,6 +23,7 @@ from fogros2.waiting import Timeouts
 def join(
     text: str, store: Store, environment: Mapping[str, str] = os.environ, *,
     owner: Optional[Mapping[str, object]] = None,
+    agreed: Callable[[str], bool] = lambda question: False,
 ) -> Path:
     """
     Bring up this computer's end of a machine's VPN; return the folder for its terminals.
@@ -32,8 +33,9 @@ def join(
     also ends the interface.
 
     :param owner: the fields of a record that name a process.
+    :param agreed: asks the user whether to route public addresses into the VPN.
     :raises FogError: the invitation is not for this computer, has expired, or collides with a
-        network here; or the interface cannot be created.
+        network here; the user does not agree; or the interface cannot be created.
     """
     key = own_key(store)
     invitation = unseal(text, key)
@@ -43,6 +45,13 @@ def join(
     up = is_up(invitation)
     if up and read(folder) == invitation:
         return folder
+    if not invitation.private and not agreed(
+            f'{invitation.network} has public addresses. Send what is for them to the computer '
+            f"that wrote this invitation, '{invitation.machine}' at {invitation.endpoint}?"):
+        raise ConfigurationError(
+            f"the invitation to '{invitation.machine}' would take the public addresses "
+            f'{invitation.network}',
+            'ros2 fog join in a terminal asks whether you want that; a launch does not')
     check_robot()
     before = joined(store).get(invitation.machine, folder)
     if before != folder:

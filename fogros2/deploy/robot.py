@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 import os
 from pathlib import Path
-import shutil
 import threading
 from typing import Optional
 
@@ -16,7 +15,7 @@ from fogros2.model import Command
 from fogros2.provider import Provider
 from fogros2.provider.cheapest import Cheapest
 from fogros2.report import Reporter, silent, step
-from fogros2.store import Record, Store
+from fogros2.store import delete_folder, Record, Store
 from fogros2.vpn import helped, Vpn
 from fogros2.waiting import Timeouts
 
@@ -115,4 +114,4 @@ def clear(folder: Path) -> None:
     ros2_daemon.stop(folder)
     vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')()
     run(vpn.down(interface), timeout=Timeouts().vpn)
-    shutil.rmtree(folder, ignore_errors=True)
+    delete_folder(folder)

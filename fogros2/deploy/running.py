@@ -15,11 +15,12 @@ from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob, SILENCE_TIMEOUT, Step
 from fogros2.deploy.steps.containers import Containers
 from fogros2.deploy.steps.installing import Modules
-from fogros2.deploy.steps.watching import Watch
-from fogros2.errors import AgentError, FogError
+from fogros2.deploy.steps.watching import POLL_INTERVAL, Watch
+from fogros2.errors import AgentError, DeadlineExceeded, FogError
 from fogros2.events import Event
 from fogros2.host import idle
 from fogros2.model import host_port, Machine, NodeSpec
+from fogros2.waiting import wait_until
 
 
 class RunningMachine(Step):
@@ -160,6 +161,25 @@ class RunningMachine(Step):
             self._lost, callback = reason, self._callback
         if callback is not None:
             callback({'event': 'lost', 'reason': reason})
+
+    def reclaimed(self, timeout: float) -> bool:
+        """
+        Return whether the provider confirms a notice of the machine within ``timeout`` seconds.
+
+        :raises Cancelled: the launch ends.
+        """
+        def confirmed() -> bool:
+            with contextlib.suppress(FogError):  # it does not answer: asked again
+                return self._context.provider.reclaims(self._job.machine_id)
+            return False
+
+        try:
+            wait_until(lambda: self._lost or confirmed(), timeout=timeout, interval=2.0,
+                       longest=POLL_INTERVAL, cancel=self._context.cancel,
+                       what='the provider to confirm the notice')
+        except DeadlineExceeded:
+            return False
+        return not self._lost
 
     def retire(self) -> None:
         """

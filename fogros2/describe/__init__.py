@@ -3,8 +3,8 @@
 Machines as launch files describe them: keywords and values that become a MachineSpec.
 
 In reading order: ``values`` resolves substitutions, ``networks`` and ``names`` read and generate
-single values, ``kinds`` reads the annotations of
-constructors, ``choices`` requests a region or a type, ``machines`` and ``machines_cloud`` have
+single values, ``variables`` keeps the robot's own variables here, ``kinds`` reads the annotations
+of constructors, ``choices`` requests a region or a type, ``machines`` and ``machines_cloud`` have
 the classes of machines, ``keywords`` reads their arguments from text, and ``overrides`` reads
 ``--machine``.
 """

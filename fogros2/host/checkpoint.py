@@ -10,17 +10,21 @@ before, so that only changes cross the network.
 from __future__ import annotations
 
 from pathlib import Path
-import shutil
+import re
 import threading
 from typing import Optional
 
+from fogros2 import untrusted
 from fogros2.errors import ConfigurationError, ConnectError, FogError, ShellError
 from fogros2.model import Command
 from fogros2.shell import Shell
 from fogros2.shell.command_line import remote_path
+from fogros2.store import delete_folder
 
 #: Largest folder in bytes.
 LIMIT = 2 << 30
+#: The form of a hash.
+_HASH = re.compile('[0-9a-f]{64}')
 #: Seconds for one copy.
 TIMEOUT = 600.0
 #: Attempts to copy a folder that changes meanwhile.
@@ -91,12 +95,12 @@ class Checkpoint:
             partial = self._store / 'partial'
             try:
                 self._store.mkdir(0o700, parents=True, exist_ok=True)
-                shell.fetch(self.folder, partial, known=self.newest, timeout=TIMEOUT,
-                            cancel=self._cancel)
+                shell.fetch(self.folder, partial, known=self.newest, limit=LIMIT,
+                            timeout=TIMEOUT, cancel=self._cancel)
             except ConnectError:
                 raise  # the next copy continues this one
             except (FogError, OSError) as error:
-                shutil.rmtree(partial, ignore_errors=True)
+                delete_folder(partial)
                 if isinstance(error, FogError):
                     raise
                 raise ShellError(f'{self._store} can not be written: {error.strerror}') from error
@@ -112,22 +116,27 @@ class Checkpoint:
         words = shell.run(
             Command.script(_LOOK.format(remote_path(self.folder)), what=f'read {self.folder}'),
             timeout=60.0, cancel=self._cancel).stdout.split()
-        if words[0] == 'unreadable':
+        if words[:1] == ['unreadable']:
             raise ShellError(f'{" ".join(words[1:])} in {self.folder} can not be read',
                              'give the login user the right to read it')
-        if words[0] == 'missing':
+        if words[:1] == ['missing']:
             return ''
-        if int(words[0]) > LIMIT:
+        try:
+            size, found = untrusted.number(words[0]), untrusted.matched(_HASH, words[1])
+        except (untrusted.InvalidMessage, IndexError) as error:
+            raise ShellError(f'the size of {self.folder} is not known: {error}',
+                             'the machine may be hijacked: delete it') from error
+        if size > LIMIT:
             raise ShellError(
-                f'{self.folder} has {int(words[0]) / 1e9:.1f} GB, and a checkpoint at most '
+                f'{self.folder} has {size / 1e9:.1f} GB, and a checkpoint at most '
                 f'{LIMIT / 1e9:.1f} GB', 'write what a restart needs to a folder of its own')
-        return words[1]
+        return found
 
     def _commit(self, partial: Path) -> None:
         before = self.newest
         partial.rename(self._store / f'{int(before.name) + 1 if before else 1:08d}')
         if before is not None:
-            shutil.rmtree(before, ignore_errors=True)
+            delete_folder(before)
 
     def restore(self, shell: Shell, aside: str = '') -> bool:
         """

@@ -206,9 +206,10 @@ def dds_options(
     Return a container's options, after options that connect its nodes to the machine's nodes.
 
     The launch file's options come last and win: for the engine, ``-e`` overrides all files of
-    variables, and a later file an earlier one. The container shares the machine's memory, because
-    nodes on one host use shared memory. A mount of ``FOGROS2_FILE`` becomes a mount of the
-    launch's configuration. A container with a separate network does not get the machine's DDS.
+    variables, and a later file an earlier one. The container shares the machine's memory,
+    which nodes with a configuration of their own may use. A mount of ``FOGROS2_FILE`` becomes a
+    mount of the launch's configuration. A container with a separate network does not get the
+    machine's DDS.
 
     :param configuration: path of the middleware's configuration on the machine.
     :param variables: path of a file there with ``dds_variables``, '' for none.

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import dataclasses
+import ipaddress
 from typing import Optional
 
 from fogros2.model import Command
+from fogros2.untrusted import matched, number, PATH
 
 DISTRO = 'jazzy'
 MIN_PYTHON = (3, 10)
@@ -169,7 +171,7 @@ def parse_facts(output: str) -> HostFacts:
     """
     Parse the output of :func:`probe`; ignore other lines in it.
 
-    :raises ValueError: something that must be a number is none.
+    :raises InvalidMessage: a value is not a number, or the home is no path.
     """
     found: dict[str, list[str]] = {}
     for line in output.splitlines():
@@ -183,7 +185,7 @@ def parse_facts(output: str) -> HostFacts:
         words = [value.split(' ', number - 1) for value in found.get(key, ())]
         return [each for each in words if len(each) == number]
 
-    pythons = {path: Python(path, (int(major), int(minor)), venv == '1')
+    pythons = {path: Python(path, (number(major), number(minor)), venv == '1')
                for major, minor, venv, path in split('python', 4)}
     rmw: dict[str, tuple[str, ...]] = {}
     for distro, name in split('rmw', 2):
@@ -192,13 +194,21 @@ def parse_facts(output: str) -> HostFacts:
     uid, _, user = one('user', '0 root').partition(' ')
     disk = one('disk')
     return HostFacts(
-        system=system, release=release, architecture=one('arch'), uid=int(uid), user=user,
-        home=one('home', '/root'),
+        system=system, release=release, architecture=one('arch'), uid=number(uid), user=user,
+        home=matched(PATH, one('home', '/root')),
         libc=one('libc'), root='root' in found, pythons=tuple(pythons.values()),
         programs=frozenset(found.get('program', ())), ros=dict(split('ros', 2)), rmw=rmw,
         kernel_wireguard='kernel-wireguard' in found,
-        free_bytes=int(disk) * 1024 if disk.isdecimal() else None,
-        routes=tuple(to for to in found.get('route', ()) if to != 'default'),
+        free_bytes=number(disk) * 1024 if disk.isdecimal() else None,
+        routes=tuple(filter(_is_network, found.get('route', ()))),
         network=one('network'), installed=frozenset(found.get('installed', ())),
         environments={path: signature for signature, path in split('environment', 2)},
         cloud_launch=one('cloud_launch'))
+
+
+def _is_network(text: str) -> bool:
+    """Return whether a route leads to a network; others begin with a word such as default."""
+    try:
+        return bool(ipaddress.IPv4Interface(text))
+    except ValueError:
+        return False

@@ -12,12 +12,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 import re
+from typing import Optional
 
 from fogros2.errors import PrerequisiteError
 
 FILE = Path(__file__).with_name('locked.txt')
-#: Start of the line in the file with the distributions that have wheels only for x86_64.
-X86_64_ALONE = '# Wheels for x86_64 alone:'
+#: Start of the names of ROS 2's distributions.
+ROS = 'ros-'
 #: Options of pip besides the requirements. Sources would be built by programs without hashes.
 OPTIONS = ('--no-deps', '--require-hashes', '--only-binary', ':all:')
 
@@ -40,10 +41,13 @@ def parse(text: str) -> dict[str, list[str]]:
     return found
 
 
-def requirements(names: Iterable[str]) -> list[str]:
+def requirements(
+    names: Iterable[str], python: Optional[tuple[int, int]] = None,
+) -> list[str]:
     """
     Return the lines of a requirements file for some distributions.
 
+    :param python: version of the interpreter that they are for; by default each version's.
     :raises PrerequisiteError: a distribution is not pinned.
     """
     entries = parse(FILE.read_text())
@@ -53,22 +57,26 @@ def requirements(names: Iterable[str]) -> list[str]:
             raise PrerequisiteError(
                 f'{name} is compiled for this robot, and no other build of it is pinned',
                 'choose a machine with the same Python, processor and C library as the robot')
-        lines += entries[name_of(name)]
+        found = entries[name_of(name)]
+        lines += found if python is None else filter(
+            None, (_for_python(line, python) for line in found))
     return lines
 
 
-def lacking(names: Iterable[str], architecture: str) -> list[str]:
-    """
-    Return the distributions that have no wheel for a processor architecture.
+def _for_python(line: str, python: tuple[int, int]) -> str:
+    """Return an entry without its marker, '' if the marker excludes a version of Python."""
+    from packaging.markers import Marker
+    requirement, _, options = line.partition(' --hash')
+    name, _, marker = requirement.partition(' ; ')
+    if marker and not Marker(marker).evaluate(
+            {'python_full_version': '{}.{}.0'.format(*python)}):
+        return ''
+    return f'{name} --hash{options}'
 
-    :param architecture: in the form of ``uname -m``.
-    """
-    if architecture == 'x86_64':
-        return []
-    lines = FILE.read_text().splitlines()
-    without = {name for line in lines if line.startswith(X86_64_ALONE)
-               for name in line.removeprefix(X86_64_ALONE).split()}
-    return [name for name in names if name_of(name) in without]
+
+def ros() -> list[str]:
+    """Return the names of the distributions of ROS 2 that nodes need."""
+    return [name for name in parse(FILE.read_text()) if name.startswith(ROS)]
 
 
 def from_file(path: str, sha256: str, name: str) -> str:

@@ -20,8 +20,9 @@ import platform
 import re
 import shlex
 import sys
-from typing import Optional
+from typing import Any, Optional
 
+from fogros2 import untrusted
 from fogros2.errors import PrerequisiteError
 from fogros2.host import locked
 from fogros2.host.wheels import libc_for, runs_on
@@ -211,10 +212,16 @@ def answer(output: str) -> Answer:
     :raises PrerequisiteError: the machine's nodes have no Python.
     """
     try:
-        python, architecture, libc, missing = json.loads(output.strip().splitlines()[-1])
-        return Answer((int(python[0]), int(python[1])), str(architecture), str(libc),
-                      tuple(map(str, missing)), tuple(filter(None, map(str, missing.values()))))
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        (major, minor), architecture, libc, missing = untrusted.parsed(
+            output.strip().splitlines()[-1], list[Any])
+        untrusted.checked([major, minor], list[int])
+        untrusted.checked([architecture, libc], list[str])
+        untrusted.checked(missing, dict[str, str])
+        if not missing.keys() <= MODULES.keys():
+            raise untrusted.InvalidMessage('it names modules that were not asked for')
+        return Answer((major, minor), architecture, libc, tuple(missing),
+                      tuple(filter(None, missing.values())))
+    except (ValueError, LookupError, TypeError) as error:
         raise PrerequisiteError(
             f'no Python of the machine could list its modules: {output[-200:]!r}',
             'is python3 there at least 3.10, and does a login there print nothing?') from error

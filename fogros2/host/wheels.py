@@ -29,13 +29,15 @@ import urllib.parse
 import zipfile
 
 from fogros2 import process
-from fogros2.errors import ConfigurationError, PrerequisiteError
+from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError
 from fogros2.host import locked
 from fogros2.model import Command
 
 OWN, EMBEDDED, PIP = 'fogros2', 'ros2-embedded', 'pip'
 #: Distributions that only the robot uses.
-_ROBOT_ONLY = frozenset({'cryptography', 'paramiko', 'setuptools'})
+_ROBOT_ONLY = frozenset({'cryptography', 'packaging', 'paramiko', 'setuptools'})
+#: Folders of ROS 2's distributions that no node needs, half of their size.
+_BUILD = frozenset({'cmake', 'include'})
 #: Seconds for which a result is reused without a check.
 FRESH = 5.0
 #: Date of all files in a wheel, so that equal files give equal wheels.
@@ -52,7 +54,7 @@ class Wheels:
     :param python: version of the interpreter they are for, with ``architecture`` and ``libc``.
     :param fogros2: file name of our own wheel, for any Python.
     :param pip: file name of pip's wheel.
-    :param embedded: whether they contain the embedded default, which a robot with ROS 2 lacks.
+    :param ros: whether they contain ROS 2; a robot with an installation of ROS 2 has no wheels.
     :param hashes: SHA-256 of each wheel in hexadecimal digits, by file name.
     """
 
@@ -63,7 +65,7 @@ class Wheels:
     libc: str
     fogros2: str
     pip: str = ''
-    embedded: bool = True
+    ros: bool = True
     hashes: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
@@ -128,6 +130,66 @@ def _collect(folder: Path) -> Wheels:
         dict(listed.values()))
 
 
+@dataclasses.dataclass(frozen=True)
+class Fetched:
+    """
+    Wheels from this computer's package index for the Python of a machine.
+
+    :param hashes: SHA-256 of each wheel in hexadecimal digits, by file name.
+    """
+
+    folder: str
+    hashes: Mapping[str, str]
+
+
+def fetch(
+    names: Iterable[str], python: tuple[int, int], *, timeout: float,
+    folder: Optional[Path] = None,
+) -> Fetched:
+    """
+    Return pinned wheels for another Python, from FOGROS2_WHEELS or this computer's package index.
+
+    pip compares the hashes, also of the files that an earlier call has left in the cache.
+
+    :param timeout: seconds.
+    :param folder: the cache, by default ``cache_folder()``.
+    :raises PrerequisiteError: a distribution is not pinned, or cannot be fetched.
+    """
+    lines = locked.requirements(names, python)
+    key = hashlib.sha256(json.dumps([python, lines]).encode()).hexdigest()[:16]
+    target = (folder or cache_folder()) / f'fetched-{key}'
+    target.mkdir(parents=True, exist_ok=True)
+    source = os.environ.get('FOGROS2_WHEELS', '')
+    version = '{}{}'.format(*python)
+    with tempfile.NamedTemporaryFile('w', suffix='.txt') as file:
+        file.write('\n'.join(lines))
+        file.flush()
+        try:
+            process.run(Command((
+                sys.executable, '-m', 'pip', 'download', '--quiet', '--disable-pip-version-check',
+                *locked.OPTIONS, *(('--no-index', '--find-links', source) if source else ()),
+                '--find-links', str(target), '--dest', str(target),
+                '--python-version', version, '--implementation', 'cp', '--abi', f'cp{version}',
+                '--abi', 'abi3', '--abi', 'none',
+                *(word for one in _PLATFORMS for word in ('--platform', one)),
+                '--requirement', file.name), what='fetch ROS 2 for a machine'), timeout=timeout)
+        except CommandError as error:
+            raise PrerequisiteError(
+                "neither the machine nor this computer could fetch ROS 2's packages: "
+                f'{error.result.stderr.strip()[-300:]}',
+                'FOGROS2_WHEELS names a folder with them; or use an image that has ROS 2'
+            ) from error
+    return Fetched(str(target), {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in target.glob('*.whl')})
+
+
+#: Platforms of wheels that a machine can use, see ``bootstrap.WHEELS_LIBC``.
+_PLATFORMS = ('manylinux_2_28_x86_64', 'manylinux_2_27_x86_64', 'manylinux_2_24_x86_64',
+              'manylinux_2_17_x86_64', 'manylinux2014_x86_64', 'manylinux_2_12_x86_64',
+              'manylinux2010_x86_64', 'manylinux_2_5_x86_64', 'manylinux1_x86_64')
+
+
 def names() -> list[str]:
     """
     Return the names of the distributions that ``collect`` packs.
@@ -141,7 +203,7 @@ def runs_on(needed: str, libc: str) -> bool:
     """Return whether a C library (such as ``glibc 2.36``) is at least the needed one."""
     def parts(text: str) -> tuple[str, tuple[int, ...]]:
         kind, _, version = text.partition(' ')
-        return kind, tuple(int(n) for n in version.split('.') if n.isdigit())
+        return kind, tuple(map(int, re.findall('[0-9]{1,9}', version)))
 
     return parts(needed)[0] == parts(libc)[0] and parts(needed) <= parts(libc)
 
@@ -162,11 +224,11 @@ def libc_for(files: Iterable[str]) -> str:
 
 def _closure() -> Iterator[metadata.Distribution]:
     """
-    Yield the distributions to send: ours, the embedded default, pip, and their dependencies.
+    Yield the distributions to send: ours, ROS 2, pip, and their dependencies.
 
-    A robot with ROS 2 sends only this package, to machines that have ROS 2 too.
+    A robot with an installation of ROS 2 sends only this package, to machines that have one too.
     """
-    todo, seen = [OWN, EMBEDDED, PIP], set(_ROBOT_ONLY)
+    todo, seen = [OWN, EMBEDDED, PIP, *locked.ros()], set(_ROBOT_ONLY)
     try:
         metadata.distribution(EMBEDDED)
     except metadata.PackageNotFoundError:
@@ -300,7 +362,8 @@ def _contents(
                 ('RECORD', 'INSTALLER', 'REQUESTED', 'direct_url.json')}
     for file in distribution.files or []:
         source = Path(os.path.normpath(str(distribution.locate_file(file))))
-        if str(file) in left_out or file.suffix == '.pyc' or not source.is_file():
+        if str(file) in left_out or file.suffix == '.pyc' or not source.is_file() \
+                or (distribution.name.startswith(locked.ROS) and _BUILD.intersection(file.parts)):
             continue
         if file.parts[0] != '..':
             yield str(file), source

@@ -210,6 +210,4 @@ def _yaml(key: str, value: Any) -> str:
     if not isinstance(value, (bool, int, float, str)):
         raise ConfigurationError(f"option '{key}' of a stream is {value!r}",
                                  'give a number, a text, true or false')
-    # JSON is valid YAML, but YAML reads 1e-05 as text
-    return repr(value) if isinstance(value, float) and 'e' not in repr(value) else (
-        f'{value:.20f}'.rstrip('0') if isinstance(value, float) else json.dumps(value))
+    return json.dumps(value)  # which rcl reads as YAML, also 1e-05 and Infinity

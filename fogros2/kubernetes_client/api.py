@@ -30,7 +30,7 @@ from fogros2.kubernetes_client.answers import (
     Unreachable,
 )
 from fogros2.kubernetes_client.configuration import words
-from fogros2.waiting import cancellable, wait_until
+from fogros2.waiting import cancellable, ON_ITS_WAY, wait_until
 
 if TYPE_CHECKING:
     import websocket
@@ -99,7 +99,8 @@ class Api:
         def attempt() -> Optional[dict[str, Any]]:
             try:
                 return cancellable(lambda: self._once(method, path, body, query, answer), cancel,
-                                   what=f'asking the API server {self.server}')
+                                   what=f'asking the API server {self.server}',
+                                   grace=lambda: 0.0 if method == 'GET' else ON_ITS_WAY)
             except Unreachable as error:
                 last[:] = [error]
             except ApiError as error:

@@ -17,7 +17,7 @@ from decimal import Decimal
 import threading
 from typing import ClassVar, Optional
 
-from fogros2.errors import ProviderError, Unsupported
+from fogros2.errors import MachineNotFound, ProviderError, Unsupported
 from fogros2.model import CreateRequest, Image, Machine, MachineSpec, MachineState
 from fogros2.provider.offers import Offer, Offers, Region, Wants
 from fogros2.waiting import wait_until
@@ -29,6 +29,8 @@ TAG_LAUNCH = 'fogros2-launch'
 TAG_EXPIRES = 'fogros2-expires'
 TAG_ON_EXIT = 'fogros2-on-exit'
 TAG_DEPENDENCIES = 'fogros2-dependencies'
+#: Seconds after which a request without an answer creates no machine any more.
+SETTLED = 900.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -210,6 +212,20 @@ class Provider(abc.ABC):
         :raises MachineNotFound: the machine does not exist (any more).
         """
 
+    def reclaims(self, machine_id: str) -> bool:
+        """
+        Return whether the provider itself reports that it reclaims a machine, or has done so.
+
+        The launch asks after a machine's notice, which a node there may have forged.
+
+        :raises FogError: the provider does not answer.
+        """
+        try:
+            state = self.describe(machine_id).state
+        except MachineNotFound:
+            return True
+        return state not in (MachineState.PENDING, MachineState.RUNNING)
+
     @abc.abstractmethod
     def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
         """
@@ -288,6 +304,15 @@ class Provider(abc.ABC):
         :param dead: tokens of requests (``CreateRequest``) whose launches have died.
         """
         return []
+
+    def may_create(self, token: str, age: float) -> bool:
+        """
+        Return whether a request for a machine that got no answer may still create one.
+
+        :param token: of the request (``CreateRequest``).
+        :param age: seconds since the launch stopped waiting for the answer.
+        """
+        return self.capabilities.owned and age < SETTLED
 
     # -- its network ----------------------------------------------------------------------------
 

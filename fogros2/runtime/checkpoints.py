@@ -87,13 +87,17 @@ class Checkpoints:
     def _due(self) -> None:
         async def save() -> None:
             begin = self._context.asyncio_loop.time()
-            ready = await self.ask() if self._session.shell else False
-            # the machine may have been interrupted meanwhile
-            if ready is not False and (shell := self._session.shell):
-                await self.save(shell, still=bool(ready))
+            await self.take()
             self._later(self._context.asyncio_loop.time() - begin)
         if not self._context.is_shutdown:
             self._session.request(save)
+
+    async def take(self) -> None:
+        """Copy the folders of the machine now, unless a node refuses."""
+        ready = await self.ask() if self._session.shell else False
+        # the machine may have been interrupted meanwhile
+        if ready is not False and (shell := self._session.shell):
+            await self.save(shell, still=bool(ready))
 
     async def ask(self) -> Optional[bool]:
         """

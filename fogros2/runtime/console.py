@@ -22,6 +22,7 @@ from fogros2.report import (
     StepStarted,
     Warned,
 )
+from fogros2.untrusted import clean
 
 _WIDTH = 24
 
@@ -30,11 +31,14 @@ class Console:
     """
     Receive events from any thread and show them through launch's logger ``fogros2``.
 
+    All that this logger shows is cleaned of control characters.
+
     :param stream: shows the progress line, if it is a terminal.
     """
 
     def __init__(self, stream: Optional[TextIO] = None) -> None:
         self._logger = launch.logging.get_logger('fogros2')
+        self._logger.addFilter(_cleaned)
         self._stream = stream or sys.stdout
         self._lock = threading.RLock()
         self._running: dict[tuple[str, str], str] = {}
@@ -110,6 +114,12 @@ class Console:
             self._stream.write('   '.join(parts)[:shutil.get_terminal_size().columns - 1])
             self._stream.flush()
             self._drawn = True
+
+
+def _cleaned(record: logging.LogRecord) -> bool:
+    """Clean what this logger says: details, reasons and names may come from machines."""
+    record.msg, record.args = clean(record.getMessage()), ()
+    return True
 
 
 def _where(machine: str) -> str:

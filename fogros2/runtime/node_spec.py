@@ -18,6 +18,7 @@ from launch.utilities import normalize_to_list_of_substitutions, perform_substit
 from launch_ros.substitutions import ExecutableInPackage
 
 from fogros2 import plan
+from fogros2.describe.variables import LOCAL_VARIABLES, to_send
 from fogros2.errors import ConfigurationError
 from fogros2.host import workspace
 from fogros2.host.programs import check_program
@@ -26,13 +27,6 @@ from fogros2.model import MachineSpec, NodeSpec, Text, TextPart
 
 #: ROS arguments followed by a file name; the file is sent to the machine.
 _FILE_ARGUMENTS = ('--params-file', '--log-config-file')
-
-#: Variables that describe the robot's own system; a launch file's changes of them stay here.
-LOCAL_VARIABLES = frozenset({
-    'AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'CYCLONEDDS_URI', 'HOME',
-    'LD_LIBRARY_PATH', 'LOGNAME', 'OLDPWD', 'PATH', 'PWD', 'PYTHONPATH', 'RMW_IMPLEMENTATION',
-    'ROS_HOME', 'ROS_LOG_DIR', 'SHELL', 'SHLVL', 'TMPDIR', 'USER', '_',
-})
 
 
 class ProgramName(Substitution):
@@ -182,16 +176,15 @@ def _environment(
     """Return the variables that the launch file set, for this process or for all processes."""
     description = action.process_description
     final: Mapping[str, str] = description.final_env or {}
+    names = [perform_substitutions(context, key) for key, _ in description.additional_env or ()]
+    added = to_send({name: final[name] for name in names}, base)
     if description.env is not None:
         # a complete environment: the machine adds it to the variables that ROS needs there
-        return dict(final)
-    changed = {
+        listed = {key: value for key, value in final.items() if key not in names}
+        return {**to_send(listed, base), **added}
+    return {**{
         key: value for key, value in final.items()
-        if base.get(key) != value and key not in LOCAL_VARIABLES}
-    for key, _ in description.additional_env or ():
-        name = perform_substitutions(context, key)
-        changed[name] = final[name]
-    return changed
+        if base.get(key) != value and key not in LOCAL_VARIABLES}, **added}
 
 
 def _emulate_tty(action: ExecuteLocal, context: LaunchContext) -> bool:

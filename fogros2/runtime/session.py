@@ -47,6 +47,8 @@ _UNREPORTED = -9
 #: 'robot' then holds exits back for so many seconds, until it knows whether the machine is gone.
 _LAST_EVENTS = ('watchdog', 'ending')
 _HOLD = 60.0
+#: Seconds in which the provider may confirm a notice; EC2 gives two minutes' notice.
+_CONFIRM = 150.0
 #: Seconds, at least, before nodes with respawn start again because their launch process ended.
 _RESPAWN_DELAY = 1.0
 
@@ -93,6 +95,8 @@ class Session:
         #: Whether the machine is gone.
         self.lost = False
         self._ending = False
+        #: Whether the provider is asked about a notice.
+        self._confirming = False
         #: Whether nobody used the machine, so that the launch has ended it.
         self._ended = False
         #: Whether all processes of a machine that is being replaced have ended there.
@@ -366,8 +370,11 @@ class Session:
             if self.spec.idle_timeout is not None:
                 self.request(self._end_idle)
             return
-        if event['event'] == 'notice' or event['event'] == 'lost':
-            self._interrupted(event['event'] == 'lost', event['reason'] or 'no reason')
+        if event['event'] == 'lost':
+            self._interrupted(True, event['reason'] or 'no reason')
+            return
+        if event['event'] == 'notice':
+            self._announced(event['reason'] or 'no reason')
             return
         kind: str = event['event']
         if event['event'] == 'connection':
@@ -393,6 +400,36 @@ class Session:
                 self._fail(AgentError(
                     f"{', '.join(run.node.name for run in respawning)} can't respawn: the agent "
                     f"of '{self.spec.name}' is gone", 'launch again'))
+
+    def _announced(self, reason: str) -> None:
+        """Handle the machine's report that its provider reclaims it, which may be forged."""
+        if self.spec.on_interrupt == 'robot':
+            self._interrupted(False, reason)  # its nodes move, nothing ends
+        elif not (self.interrupted or self._confirming):
+            self._confirming = True
+            self._logger.warning(
+                f'{self.spec.name}: the machine reports that its provider reclaims it: {reason}; '
+                'its nodes go on until the provider confirms that, or the machine is gone')
+            self.request(functools.partial(self._confirm, reason))
+
+    async def _confirm(self, reason: str) -> None:
+        running = self.running
+        assert running is not None
+        try:
+            confirmed = await self._in_thread(running.reclaimed, 0.0)
+            if not confirmed:
+                if self.checkpoints:
+                    self.request(self.checkpoints.take)
+                confirmed = await self._in_thread(running.reclaimed, _CONFIRM)
+            if running is not self.running or self.interrupted:
+                return
+            if confirmed:
+                self._interrupted(False, reason)
+            else:
+                self._logger.info(
+                    f'{self.spec.name}: its provider has not confirmed that it reclaims it')
+        finally:
+            self._confirming = False
 
     def _interrupted(self, lost: bool, reason: str) -> None:
         first = not self.interrupted

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 import dataclasses
 from typing import Any, Optional, TYPE_CHECKING
 
-from fogros2.describe import values
+from fogros2.describe import keywords, kinds, values
 from fogros2.errors import ConfigurationError
 from fogros2.image_transport import streams, topics
 from fogros2.image_transport.streams import Entry, StreamTopic
@@ -216,7 +216,5 @@ def _parameter(context: LaunchContext, value: Any) -> Any:
     text = values.resolve(context, value)
     if not isinstance(text, str):
         return text
-    # a substitution turns every value into a text; YAML finds its type, as in a parameter file
-    import yaml
-    typed = yaml.safe_load(text)
-    return typed if isinstance(typed, (bool, int, float)) else text
+    # a substitution turns every value into a text: find its type as for one that is written out
+    return keywords.read(kinds.Keyword('a parameter', 'scalar'), text)

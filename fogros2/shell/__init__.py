@@ -83,13 +83,14 @@ class Shell(Protocol):
         """
 
     def fetch(
-        self, source: str, target: Path, *, known: Optional[Path], timeout: float,
+        self, source: str, target: Path, *, known: Optional[Path], limit: int, timeout: float,
         cancel: Optional[threading.Event] = None,
     ) -> None:
         """
         Make the local folder ``target`` equal to the folder ``source`` on the machine.
 
         :param known: a local folder; files that are equal there become hard links to it.
+        :param limit: bytes that ``target`` may take on this computer.
         :param timeout: seconds.
         """
 

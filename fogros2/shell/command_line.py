@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 
 from fogros2.errors import CommandError
-from fogros2.events import clean
 from fogros2.model import Command, Result
 
 _ANNOUNCE = 'echo $$; exec "$@"'
@@ -72,7 +70,6 @@ def checked(command: Command, result: Result, where: str) -> Result:
     :raises CommandError: the exit status is not zero.
     """
     if result.returncode != 0:
-        result = dataclasses.replace(result, stdout=clean(result.stdout))
         raise CommandError(
             command, result, where, hint_for(result.returncode, result.stderr, where))
     return result

@@ -17,7 +17,6 @@ import threading
 from typing import Optional
 
 from fogros2.errors import AuthenticationError, ConnectError
-from fogros2.events import clean
 from fogros2.model import Endpoint
 from fogros2.shell.multiplexed import Link, MultiplexedShell
 
@@ -66,7 +65,7 @@ def admitted(endpoint: Endpoint, name: str, timeout: float) -> socket.socket:
                                       'ask for a new one: ros2 fog invite') from error
         if text != b'\n':
             raise ConnectError(f"'{name}' has no room for this computer: "
-                               f'{clean(text.decode(errors="replace")).strip()}',
+                               f'{text.decode(errors="replace").strip()}',
                                'the machine needs useradd, of the package passwd')
         link.settimeout(_STALL)
         failed.pop_all()

@@ -28,11 +28,13 @@ if [ -n "$listener" ]; then
     case $line in *' -f '*) config=${line#* -f }; config=${config%% *} ;; esac
 fi
 key=
-for each in $("$server" -T ${config:+-f "$config"} 2>/dev/null | sed -n 's/^hostkey //p') \
-        /etc/ssh/ssh_host_ed25519_key; do
+while IFS= read -r each; do
     [ -s "$each" ] || continue
     case $(ssh-keygen -y -P '' -f "$each" 2>/dev/null) in ssh-ed25519*) key=$each; break ;; esac
-done
+done <<END
+$("$server" -T ${config:+-f "$config"} 2>/dev/null | sed -n 's/^hostkey //p')
+/etc/ssh/ssh_host_ed25519_key
+END
 [ -n "$key" ] || { echo 'its SSH server has no Ed25519 host key' >&2; exit 1; }
 umask 077
 rm -f "$key.new" "$key.new.pub"

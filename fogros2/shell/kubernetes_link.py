@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from pathlib import Path
 import ssl
 import struct
 import time
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
-from fogros2 import kubernetes_client
+from fogros2 import kubernetes_client, untrusted
 from fogros2.errors import ConnectError, DeadlineExceeded, FogError, ShellError
 from fogros2.kubernetes_client import ApiError, Unreachable
 from fogros2.model import Endpoint
@@ -25,6 +24,8 @@ if TYPE_CHECKING:
 #: middle of a frame would block all other threads, including the end of the launch.
 STALL = 10.0
 _STDIN, _STDOUT, _STDERR, _ERROR = range(4)
+#: Last bytes of an error before the first frame.
+_ERRORS = 4096
 #: Program that reads the multiplexer's source from the start of its standard input.
 _LOADER = ('import os,sys;n={size};s=b""\n'
            'while len(s)<n:\n'
@@ -115,7 +116,7 @@ class Link(multiplexed.Link):
             data = _bytes(link.recv())
             kind, data = (data[0], data[1:]) if data else (_ERROR, b'')
             if kind == _STDERR:
-                errors += data
+                errors = (errors + data)[-_ERRORS:]
             elif kind == _ERROR:
                 raise self._no_program(errors + data)
             elif kind == _STDOUT:
@@ -131,8 +132,8 @@ class Link(multiplexed.Link):
             return ShellError(
                 f"the image of '{self._name}' has no python3",
                 'take one that has, such as ros:jazzy-ros-base; `ros2 fog image create` makes one')
-        with contextlib.suppress(ValueError):
-            text = json.loads(text).get('message', text)
+        with contextlib.suppress(untrusted.InvalidMessage):
+            text = untrusted.parsed(text, dict[str, Any]).get('message', text)
         return ConnectError(f"'{self._name}' can not begin a command: {' '.join(text.split())}")
 
     def _refused(self, error: ApiError, *, passing: bool) -> FogError:

@@ -9,7 +9,7 @@ import threading
 from typing import Optional, Protocol
 
 from fogros2.errors import ConnectError, FogError
-from fogros2.events import clean
+from fogros2.process import Tail
 
 #: Maximum bytes of a line, so that a machine cannot fill the robot's memory: JSON of empty lists
 #: takes 40 times as much when it is parsed. An agent's longest messages are output of 64 K
@@ -149,7 +149,7 @@ class Output:
         self.pid = 0
         self._head: Optional[bytes] = b'' if announced else None
         self._on_output = on_output
-        self._out, self._err = _Tail(), _Tail()
+        self._out, self._err = Tail(KEPT), Tail(KEPT)
         self._rest = b''
 
     def add(self, out: bytes = b'', err: bytes = b'') -> None:
@@ -167,29 +167,11 @@ class Output:
                 lines.append(self._rest)
                 self._rest = b''
             for line in lines:
-                self._on_output(clean(line.decode(errors='replace')))
+                self._on_output(line.decode(errors='replace'))
 
     def text(self) -> tuple[str, str]:
-        """Return standard output, and standard error cleaned; pass an incomplete last line on."""
+        """Return standard output and standard error; pass an incomplete last line on."""
         if self._on_output is not None and self._rest:
-            self._on_output(clean(self._rest.decode(errors='replace')))
+            self._on_output(self._rest.decode(errors='replace'))
             self._rest = b''
-        return self._out.text(), clean(self._err.text())
-
-
-class _Tail:
-    """The last bytes of a stream."""
-
-    def __init__(self) -> None:
-        self._data = bytearray()
-        self._dropped = 0
-
-    def add(self, data: bytes) -> None:
-        self._data += data
-        if len(self._data) > KEPT + MAX_LINE:
-            self._dropped += len(self._data) - KEPT
-            del self._data[:-KEPT]
-
-    def text(self) -> str:
-        text = self._data.decode(errors='replace')
-        return f'[{self._dropped} earlier bytes were dropped]\n{text}' if self._dropped else text
+        return self._out.text(), self._err.text()

@@ -14,7 +14,7 @@ from typing import Optional
 from fogros2 import process
 from fogros2.errors import ConnectError, PrerequisiteError
 from fogros2.model import Command, Endpoint, Result
-from fogros2.shell import Stream, sync
+from fogros2.shell import relay, Stream, sync
 
 
 class LocalShell(sync.RsyncShell):
@@ -36,8 +36,8 @@ class LocalShell(sync.RsyncShell):
         return process.run(
             command, timeout=timeout, check=check, cancel=cancel, on_output=on_output)
 
-    def _remote_shell(self) -> contextlib.AbstractContextManager[sync.RemoteShell]:
-        return contextlib.nullcontext(('', (), []))
+    def _remote_shell(self) -> contextlib.AbstractContextManager[relay.RemoteShell]:
+        return contextlib.nullcontext(({}, (), []))
 
     def open(self, command: Command) -> Stream:
         """Start a program; closing the returned stream ends the program."""

@@ -42,20 +42,31 @@ class Channel:
         self._timeout: Optional[float] = None
         self._credit = mux.CREDIT
         self._owed = 0
+        #: Bytes that the machine may still send; each of two threads there exceeds by a chunk.
+        self._room = mux.CREDIT + 2 * mux.CHUNK
         #: Set when the exit status is known, or will never be known.
         self.status_event = threading.Event()
 
     # -- from the link --------------------------------------------------------------------------
 
     def take(self, kind: int, payload: bytes) -> None:
-        """Process a frame from the multiplexer."""
+        """
+        Process a frame from the multiplexer.
+
+        :raises ValueError: it is none, or the machine sends more than it may.
+        """
         with self._changed:
             if kind == mux.EXIT:
                 self._status, = struct.unpack('>i', payload)
                 self.status_event.set()
             elif kind == mux.WINDOW:
                 self._credit += struct.unpack('>I', payload)[0]
+            elif kind not in self._waiting:
+                raise ValueError(f'a frame of kind {kind}')
             elif payload:
+                self._room -= len(payload)
+                if self._room < 0:
+                    raise ValueError('more output than was asked for')
                 self._waiting[kind] += payload
             else:
                 self._open.discard(kind)
@@ -104,6 +115,7 @@ class Channel:
             self._owed += len(data)
             owed = self._owed if self._owed >= mux.CREDIT // 4 else 0
             self._owed -= owed
+            self._room += owed
         if owed:
             with contextlib.suppress(ConnectError):  # what has arrived can be read
                 self._link.send(mux.WINDOW, self._number, struct.pack('>I', owed))

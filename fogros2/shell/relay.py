@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import os
 from pathlib import Path
@@ -15,41 +15,47 @@ import threading
 from fogros2.errors import FogError
 from fogros2.shell.lines import Channel
 
-_HELPER = Path(__file__).with_name('rsh.py')
+#: The value of rsync's ``-e``. rsync splits it into words, so it contains no value; the values
+#: are in variables.
+RSH = """sh -c 'exec "$FOGROS2_PYTHON" -I -S "$FOGROS2_RSH" "$FOGROS2_LINK" "$@"' sh"""
+#: Variables of rsync, without any for this computer; files that it inherits; errors.
+RemoteShell = tuple[Mapping[str, str], Sequence[int], list[FogError]]
 
 
 @contextlib.contextmanager
-def remote_shell(
-    start: Callable[[str], Channel],
-) -> Iterator[tuple[str, Sequence[int], list[FogError]]]:
+def remote_shell(run: Callable[[str, int, int, int], int]) -> Iterator[RemoteShell]:
     """
-    Yield the value of rsync's ``-e``, the files that rsync inherits, and a list for errors.
+    Yield how rsync reaches a machine, by ``RSH``.
 
-    :param start: function that starts a command line on the machine.
+    :param run: runs a command line on the machine with a standard input, output and error, until
+        it ends; returns its exit status.
     """
     failures: list[FogError] = []
     ours, theirs = socket.socketpair()
     thread = threading.Thread(
-        target=_serve, args=(ours, start, failures), name='fog-rsync', daemon=True)
+        target=_serve, args=(ours, run, failures), name='fog-rsync', daemon=True)
     with ours, theirs:
         thread.start()
         try:
-            yield (f"'{sys.executable}' -I -S '{_HELPER}' {theirs.fileno()}", [theirs.fileno()],
-                   failures)
+            yield {
+                'FOGROS2_PYTHON': sys.executable,
+                'FOGROS2_RSH': str(Path(__file__).with_name('rsh.py')),
+                'FOGROS2_LINK': str(theirs.fileno())}, [theirs.fileno()], failures
         finally:
             theirs.shutdown(socket.SHUT_RDWR)  # wakes the thread if rsync never called its end
             thread.join(5.0)
 
 
 def _serve(
-    link: socket.socket, start: Callable[[str], Channel], failures: list[FogError],
+    link: socket.socket, run: Callable[[str, int, int, int], int], failures: list[FogError],
 ) -> None:
     line, streams, _, _ = socket.recv_fds(link, 1 << 16, 3)
     for stream in streams:
         os.set_blocking(stream, True)  # rsync may have set its own ends otherwise
     try:
         if len(streams) == 3:
-            link.sendall(bytes([relay(start(line.decode()), *streams)]))
+            status = run(line.decode(), *streams)
+            link.sendall(bytes([status if 0 <= status < 256 else 255]))
     except FogError as error:
         failures.append(error)
     except OSError:
@@ -60,7 +66,7 @@ def _serve(
 
 
 def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
-    """Relay bytes until the remote program ends; return its exit status (255: lost)."""
+    """Relay bytes until the remote program ends; return its exit status (-1: lost)."""
     ended, end = os.pipe()
 
     def up() -> None:
@@ -93,7 +99,7 @@ def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
         os.close(end)  # wakes the thread that reads standard input
         threads[0].join(5.0)
         os.close(ended)
-    return status if 0 <= status < 256 else 255
+    return status
 
 
 def _write(target: int, data: bytes) -> None:

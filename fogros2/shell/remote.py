@@ -101,7 +101,8 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
                 return connection
             connection = cancellable(
                 lambda: self._connect(max(0.5, until - time.monotonic()), cancel), cancel,
-                what=f"connecting to '{self.name}'", late=lambda late: late.close())
+                what=f"connecting to '{self.name}'", grace=lambda: 1.0,
+                late=lambda late: late.close())
             with self._lock:
                 if closings == self._closings:
                     self._connection = connection
@@ -229,8 +230,9 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
         raise ConnectError(f"the connection to '{self.name}' was lost while "
                            f'{_what(command)} ran there', "check the robot's network")
 
-    def _remote_shell(self) -> contextlib.AbstractContextManager[sync.RemoteShell]:
-        return relay.remote_shell(self.start)
+    def _remote_shell(self) -> contextlib.AbstractContextManager[relay.RemoteShell]:
+        return relay.remote_shell(
+            lambda line, *streams: relay.relay(self.start(line), *streams))
 
     def open(self, command: Command) -> Stream:
         """Start a program on the machine; closing the returned stream ends the program."""

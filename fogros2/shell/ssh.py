@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 #: Time-out of one attempt to connect or to open a session, in seconds.
 _ATTEMPT = 10.0
+#: Bytes that a server may send before they are read.
+_WINDOW = 1 << 22
 
 
 class SSHShell(RemoteShell['paramiko.Transport']):
@@ -59,7 +61,8 @@ class SSHShell(RemoteShell['paramiko.Transport']):
             begin = time.monotonic()
             limit = min(timeout, _ATTEMPT)
             try:
-                return transport.open_session(window_size=1 << 22, timeout=limit)
+                return ssh_connection.limited(
+                    transport.open_session(window_size=_WINDOW, timeout=limit), _WINDOW)
             except (paramiko.SSHException, EOFError, OSError) as error:
                 # Either the connection was lost before. Or the server allows no more sessions,
                 # and one of ours will end. Neither the exception (paramiko keeps one for all

@@ -31,6 +31,8 @@ OWN_KEYS = ('id_ed25519', 'id_ecdsa', 'id_rsa')
 #: connection: it survives a cut of 30 s, and a robot with a new address connects again.
 KEEPALIVE = 15
 USER_TIMEOUT = 60
+#: Maximum bytes of a packet; OpenSSH's is 256 kB.
+_PACKET = 1 << 19
 _IMPORT = threading.Lock()
 
 
@@ -43,7 +45,13 @@ class PromptSocket(socket.socket):
     """
 
     def recv(self, size: int, flags: int = 0) -> bytes:
-        """Receive, and acknowledge at once."""
+        """
+        Receive, and acknowledge at once.
+
+        :raises EOFError: the server announces a packet that would fill the memory.
+        """
+        if size > _PACKET:
+            raise EOFError(f'a packet of {size} bytes')
         data = super().recv(size, flags)
         if data:
             self.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
@@ -180,6 +188,21 @@ def _choose(transport: paramiko.Transport, key_types: Sequence[str]) -> None:
     else:
         first = [n for n in options.key_types if n == 'ssh-ed25519']
         options.key_types = first + [n for n in options.key_types if n not in first]
+
+
+def limited(channel: paramiko.Channel, window: int) -> paramiko.Channel:
+    """Let a channel close its connection if the server sends more than its window."""
+    import paramiko
+    from paramiko.buffered_pipe import BufferedPipe
+
+    class Limited(BufferedPipe):  # type: ignore[type-arg]
+        def feed(self, data: bytes) -> None:
+            if len(self) + len(data) > window:
+                raise paramiko.SSHException('the server sends more than its window')
+            super().feed(data)
+
+    channel.in_buffer, channel.in_stderr_buffer = Limited(), Limited()
+    return channel
 
 
 def known_keys(endpoint: Endpoint) -> list[str]:

@@ -10,7 +10,7 @@ goes over OpenSSH, whose ciphers take a third of the processor time of Python's.
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import os
 from pathlib import Path
@@ -31,20 +31,19 @@ from fogros2.errors import (
     WorkspaceError,
 )
 from fogros2.model import Command, Endpoint, Result, SyncReport
-from fogros2.shell import command_line, Shell, ssh_connection
+from fogros2.shell import command_line, relay, Shell, ssh_connection
+from fogros2.shell.lines import KEPT
 
 #: Bytes from which a separate connection of OpenSSH is faster.
 BULK = 64 << 20
+#: Bytes that a file takes at least.
+BLOCK = 4096
 #: Exit status of rsync for vanished source files, which is normal with editors and compilers.
 VANISHED = 24
 #: Exit statuses of rsync for errors in socket or protocol, and of the remote shell.
 _LOST = (10, 12, 255)
 #: Exit status of rsync for files that the receiver could not write.
 _NOT_WRITTEN = 11
-
-
-#: The value of rsync's ``-e``, '' for this computer; the files that rsync inherits; errors.
-RemoteShell = tuple[str, Sequence[int], list[FogError]]
 
 
 class RsyncShell(Shell):
@@ -55,7 +54,7 @@ class RsyncShell(Shell):
     where: str
 
     @abc.abstractmethod
-    def _remote_shell(self) -> contextlib.AbstractContextManager[RemoteShell]:
+    def _remote_shell(self) -> contextlib.AbstractContextManager[relay.RemoteShell]:
         """Return how rsync reaches the machine."""
 
     def put(self, data: bytes, target: str, *, mode: int, timeout: float = 60.0) -> None:
@@ -83,10 +82,10 @@ class RsyncShell(Shell):
             and process.which('ssh') is not None and is_large(source, BULK)
         with open_ssh(self.endpoint) if bulk else self._remote_shell() as (rsh, files, failures):
             result = process.run(
-                rsync(source, place(target, rsh), excludes=excludes, includes=includes, rsh=rsh,
+                rsync(source, target, excludes=excludes, includes=includes, rsh=rsh,
                       compress=bulk, progress=on_progress is not None),
                 timeout=max(0.1, timeout - (time.monotonic() - begin)), cancel=cancel,
-                check=False, inherited=files,
+                check=False, inherited=files, kept=KEPT,
                 on_output=None if on_progress is None else Progress(on_progress))
         if failures:
             raise failures[0]
@@ -95,28 +94,73 @@ class RsyncShell(Shell):
         return report(result.stdout, time.monotonic() - begin)
 
     def fetch(
-        self, source: str, target: Path, *, known: Optional[Path], timeout: float,
+        self, source: str, target: Path, *, known: Optional[Path], limit: int, timeout: float,
         cancel: Optional[threading.Event] = None,
     ) -> None:
         """
         Make the local folder ``target`` equal to the machine's ``source``; see the protocol.
 
-        The machine is not trusted: no special files, no links out of the folder, no set-uid bits.
+        The machine is not trusted: no special files, no links out of the folder, no set-uid bits,
+        and the target is measured while it grows.
         """
+        room = Room(target, limit, cancel, f'{self.where} has sent more than '
+                    f'{limit / 1e9:.1f} GB in place of {source}')
         process.require(['rsync'])
         words = ['rsync', '-rltp', '-s', '--delete', '--safe-links', '--chmod=u-s,g-s']
         words += [f'--link-dest={known.resolve()}'] if known is not None else []
         with self._remote_shell() as (rsh, files, failures):
-            words += ['-e', rsh] if rsh else []
+            words += ['-e', relay.RSH] if rsh else []
             result = process.run(
-                Command((*words, '--', place(source, rsh), f'{target}/'),
-                        environment={'LC_ALL': 'C'}, what='rsync'),
-                timeout=timeout, cancel=cancel, check=False, inherited=files)
+                Command((*words, '--', place(source, remote=bool(rsh)), f'{target}/'),
+                        environment={'LC_ALL': 'C', **rsh}, what='rsync'),
+                timeout=timeout, cancel=room, check=False, inherited=files,
+                kept=KEPT)
         if failures:
             raise failures[0]
+        room.measure()
         if result.returncode != 0:
             lost = result.returncode in _LOST and 'No space left' not in result.stderr
             raise explained(result, Path(source), self.where if lost else process.HERE)
+
+
+class Room(threading.Event):
+    """
+    Is set with another event; raises an error while it is asked, if a folder becomes too large.
+
+    :param limit: bytes on the disk. Each file and folder counts as a block at least, because a
+        disk has room for a number of them.
+    :param message: of the error.
+    """
+
+    def __init__(
+        self, folder: Path, limit: int, cancel: Optional[threading.Event], message: str,
+    ) -> None:
+        super().__init__()
+        self._folder, self._limit, self._cancel = folder, limit, cancel
+        self._message = message
+        self._next = 0.0
+
+    def is_set(self) -> bool:
+        """Return whether the other event is set; measure the folder now and then."""
+        if time.monotonic() >= self._next:
+            self.measure()
+        return self._cancel is not None and self._cancel.is_set()
+
+    def measure(self) -> None:
+        """
+        Measure the folder.
+
+        :raises ShellError: it is too large.
+        """
+        begin, size = time.monotonic(), 0
+        for folder, folders, files in os.walk(self._folder):
+            for name in (*folders, *files):
+                with contextlib.suppress(OSError):  # deleted meanwhile
+                    size += max(BLOCK, 512 * os.lstat(os.path.join(folder, name)).st_blocks)
+            if size > self._limit:
+                raise ShellError(self._message, 'the machine may be hijacked: delete it')
+        # a tenth of the time at most
+        self._next = time.monotonic() + max(0.1, 10 * (time.monotonic() - begin))
 
 
 def check_source(source: Path) -> None:
@@ -143,9 +187,9 @@ def is_large(source: Path, limit: int) -> bool:
     return False
 
 
-def place(folder: str, rsh: str) -> str:
-    """Return a folder as rsync takes it: one of this computer, or of the host behind ``rsh``."""
-    if not rsh:
+def place(folder: str, *, remote: bool) -> str:
+    """Return a folder as rsync takes it: one of this computer, or of the machine."""
+    if not remote:
         return f'{os.path.expanduser(folder)}/'
     inside = folder.removeprefix('~/') or '.'  # rsync begins in the login user's home
     return f'machine:{inside}/'
@@ -153,13 +197,12 @@ def place(folder: str, rsh: str) -> str:
 
 def rsync(
     source: Path, target: str, *, excludes: Sequence[str], includes: Sequence[str],
-    rsh: str = '', compress: bool = False, progress: bool = False,
+    rsh: Mapping[str, str] = {}, compress: bool = False, progress: bool = False,
 ) -> Command:
     """
     Return the command that makes ``target`` equal to ``source``.
 
-    :param target: a local folder, or ``machine:folder``.
-    :param rsh: remote shell of rsync (``-e``) that connects to ``machine``.
+    :param rsh: variables of ``relay.RSH`` if the target is on a machine.
     :param compress: use the best common compression, mostly zstd, which is faster than most links.
     :param progress: print the progress as lines.
     """
@@ -172,13 +215,13 @@ def rsync(
     if progress:
         words += ['--info=progress2', '--no-inc-recursive']
     if rsh:
-        words += ['-e', rsh]
-    words += ['--', f'{source}/', target]
+        words += ['-e', relay.RSH]
+    words += ['--', f'{source}/', place(target, remote=bool(rsh))]
     if progress:
         # rsync rewrites one line with carriage returns; convert them to lines.
         script = 'set -o pipefail; "$@" | stdbuf -oL tr "\\r" "\\n"'
         words = ['bash', '-c', script, 'rsync', *words]
-    return Command(tuple(words), environment={'LC_ALL': 'C'}, what='rsync')
+    return Command(tuple(words), environment={'LC_ALL': 'C', **rsh}, what='rsync')
 
 
 class Progress:
@@ -188,7 +231,7 @@ class Progress:
     rsync prints whole percents; each line narrows the possible total down.
     """
 
-    _LINE = re.compile(r'^\s*(\d+)\s+(\d+)%')
+    _LINE = re.compile(r'^\s*([0-9]{1,18})\s+([0-9]{1,3})%')
 
     def __init__(self, report: Callable[[int, int], None], interval: float = 0.1) -> None:
         self._report = report
@@ -219,7 +262,7 @@ def report(output: str, seconds: float) -> SyncReport:
 
 
 def _number(output: str, label: str) -> int:
-    match = re.search(rf'^{label}: ([\d,.]+)', output, re.MULTILINE)
+    match = re.search(rf'^{label}: ([0-9,.]{{1,24}})$', output, re.MULTILINE)
     return int(re.sub(r'\D', '', match[1])) if match else 0
 
 
@@ -253,9 +296,9 @@ def explained(result: Result, source: Path, where: str) -> FogError:
 
 
 @contextlib.contextmanager
-def open_ssh(endpoint: Endpoint) -> Iterator[RemoteShell]:
+def open_ssh(endpoint: Endpoint) -> Iterator[relay.RemoteShell]:
     """
-    Yield a remote shell by a connection of OpenSSH with the same pinned host key.
+    Yield how rsync reaches a machine by a connection of OpenSSH with the same pinned host key.
 
     :raises HostKeyError: known_hosts cannot be read.
     :raises PrerequisiteError: the temporary file with the host key cannot be created.
@@ -263,7 +306,7 @@ def open_ssh(endpoint: Endpoint) -> Iterator[RemoteShell]:
     words = [
         'ssh', '-F', 'none', '-T', '-p', str(endpoint.port),
         '-l', ssh_connection.user_of(endpoint),
-        '-o', f'HostName={endpoint.host}', '-o', 'BatchMode=yes', '-o', 'ControlPath=none',
+        '-o', 'BatchMode=yes', '-o', 'ControlPath=none',
         '-o', 'StrictHostKeyChecking=yes', '-o', 'UpdateHostKeys=no', '-o', 'LogLevel=ERROR',
         '-o', 'PreferredAuthentications=publickey', '-o', 'GSSAPIAuthentication=no',
         '-o', 'Compression=no', '-o', 'ForwardX11=no', '-o', 'ForwardAgent=no',
@@ -284,9 +327,18 @@ def open_ssh(endpoint: Endpoint) -> Iterator[RemoteShell]:
         known.flush()
         words += ['-o', 'HostKeyAlias=machine', '-o', f'UserKnownHostsFile={known.name}',
                   '-o', 'GlobalKnownHostsFile=/dev/null']
-        yield ' '.join(_word(word) for word in words), (), []
+        children = []
 
+        def run(line: str, stdin: int, stdout: int, stderr: int) -> int:
+            child = process.start(Command((*words, '--', endpoint.host, line)),
+                                  stdin=stdin, stdout=stdout, stderr=stderr)
+            children.append(child)
+            return child.wait()
 
-def _word(word: str) -> str:
-    """Quote a word for rsync's ``-e`` if it contains a space."""
-    return f"'{word}'" if ' ' in word else word
+        with relay.remote_shell(run) as remote:
+            try:
+                yield remote
+            finally:
+                for child in children:
+                    if child.poll() is None:
+                        process.end(child, sudo=False)

@@ -339,7 +339,7 @@ class FakeShell:
         return SyncReport(0, 0, 0.0)
 
     def fetch(
-        self, source: str, target: Path, *, known: Optional[Path], timeout: float,
+        self, source: str, target: Path, *, known: Optional[Path], limit: int, timeout: float,
         cancel: Optional[threading.Event] = None,
     ) -> None:
         """Fetch nothing."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 import ipaddress
-import json
 import socket
 
+from fogros2 import untrusted
 from fogros2.errors import ConfigurationError, VpnError
+from fogros2.invitation import PREFIX
 from fogros2.model import Command
 
 #: RFC 2544's range for benchmarks. Home and company networks (RFC 1918), providers' NAT and
@@ -21,8 +22,7 @@ POOL_VARIABLE = 'FOGROS2_VPN_POOL'
 #: Variable with the robot's UDP port, for robots behind a router that forwards a port. Machines
 #: that have to dial the robot, such as pods that cannot be dialled from outside, use that port.
 PORT_VARIABLE = 'FOGROS2_VPN_PORT'
-#: Prefix length of a launch's subnet: one robot, up to 222 machines, and guests.
-PREFIX = 24
+#: A launch's subnet has one robot, up to 222 machines, and guests.
 #: The last addresses of the subnet belong to computers that an invitation admits to a machine.
 FIRST_GUEST, GUEST_PREFIX = 224, 27
 #: TCP port of a machine on its VPN address at which guests' robots reach their accounts.
@@ -107,7 +107,7 @@ def parse_used(output: str) -> list[str]:
     found: set[str] = set()
     try:
         for line in output.splitlines():
-            for entry in json.loads(line):
+            for entry in untrusted.parsed(line):
                 # an interface that is down has addresses but no routes
                 for address in entry.get('addr_info', ()):
                     found.add(f"{address['local']}/{address['prefixlen']}")

@@ -40,6 +40,7 @@ import os
 from pathlib import Path
 import pwd
 import re
+import secrets
 import shutil
 import socket
 import socketserver
@@ -54,9 +55,24 @@ INTERVAL = 10.0
 PROOF_TIMEOUT, CONNECTIONS = 10.0, 8
 #: Bytes of a challenge, and of its answer by HMAC-SHA256.
 CHALLENGE = 32
-#: Folder of the guests' homes; where else their files may be.
-HOMES = Path('/var/lib/fogros2')
-ELSEWHERE = ('/tmp', '/var/tmp', '/dev/shm', '/var/spool/cron')  # noqa: S108 - only deleted there
+#: Folder of the guests' homes.
+HOMES = Path('/var/lib/fogros2-guests')
+#: Ids of guests, which no account has; and ids for a namespace of users that lacks them.
+IDS, FEW_IDS = range(0x7c000000, 0x7ffe0000), range(20000, 60000)
+#: Types of file systems with no files of users, and of those on other computers.
+OTHERS = ('proc', 'sysfs', 'cgroup', 'cgroup2', 'devpts', 'debugfs', 'tracefs', 'securityfs',
+          'bpf', 'pstore', 'autofs', 'nfs', 'nfs4', 'cifs', 'smb3', '9p', 'fuse.sshfs')
+#: Deletes the files of the user with the id $1 in all folders where all users may write, and
+#: where programs write for users. The search may take long, and no account gets the id again, so
+#: nobody waits for it.
+CLEAN = f"""\
+exec >/dev/null 2>&1 </dev/null
+{{
+    find / ! -type d -o '(' ! -perm -0001 -o -fstype {' -o -fstype '.join(OTHERS)} ')' -prune \\
+        -o -perm -0002 -print0 -prune | xargs -0 -I @ find @ -xdev -uid "$1" -delete
+    find /var/spool -xdev -uid "$1" -delete
+}} &
+"""
 #: Ends all other processes of an account; fails until there are none.
 KILL = """\
 import os
@@ -196,12 +212,25 @@ def evict(user: str) -> None:
             (sys.executable, '-ISc', KILL), user=found.pw_uid, group=found.pw_gid,
             extra_groups=(), stderr=subprocess.DEVNULL).returncode:
         time.sleep(0.02)
-    subprocess.run(('userdel', user), stderr=subprocess.DEVNULL)
+    for words in (('userdel', user), ('groupdel', user)):  # mostly, the group goes with the user
+        subprocess.run(words, stderr=subprocess.DEVNULL)
     shutil.rmtree(HOMES / user, ignore_errors=True)
-    subprocess.run(('find', *ELSEWHERE, '-xdev', '-uid', str(found.pw_uid), '-delete'),
-                   stderr=subprocess.DEVNULL)
+    subprocess.run(('sh', '-c', CLEAN, 'sh', str(found.pw_uid)), start_new_session=True)
     with contextlib.suppress(OSError):
         HOMES.rmdir()  # of the last guest
+
+
+def new_id() -> int:
+    """Return an id for an account: by chance, so that no file of a former guest has it."""
+    mapped = [[int(word) for word in line.split()]
+              for line in Path('/proc/self/uid_map').read_text().splitlines()]
+    some = IDS if any(first + count > IDS[-1] for first, _, count in mapped) else FEW_IDS
+    while True:
+        number = secrets.choice(some)
+        try:
+            pwd.getpwuid(number)
+        except KeyError:
+            return number
 
 
 class Door(socketserver.ThreadingTCPServer):
@@ -305,9 +334,13 @@ class Door(socketserver.ThreadingTCPServer):
             found = pwd.getpwnam(user)
         except KeyError:
             HOMES.mkdir(mode=0o755, exist_ok=True)
-            subprocess.run(
-                ('useradd', '--system', '--user-group', '--no-create-home', '--home-dir', home,
-                 '--shell', '/bin/sh', user), check=True, stderr=subprocess.PIPE, text=True)
+            number = str(new_id())
+            for words in (
+                    ('groupadd', '--gid', number, user),
+                    # the list of last logins would become as long as the number is high
+                    ('useradd', '--system', '--no-log-init', '--uid', number, '--gid', number,
+                     '--no-create-home', '--home-dir', home, '--shell', '/bin/sh', user)):
+                subprocess.run(words, check=True, stderr=subprocess.PIPE, text=True)
             found = pwd.getpwnam(user)
             home.mkdir(mode=0o700)
             (home / 'agent.py').write_text(self.agent)

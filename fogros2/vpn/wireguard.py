@@ -331,8 +331,13 @@ def _confine(
 
     The group is a child of the group of the process, so that limits and systemd's units stay. The
     step prints a line and does not fail where control groups (version 2) cannot be used.
+
+    Other users can make control groups, with any name, in a group that is theirs. So the undo
+    removes only the group whose path the step wrote into a file of root's. Another launch of the
+    same process has its group below: the last launch removes the groups of those that ended.
     """
     name = _name(interface)
+    record, owed = f'/run/{name}.group', f'/run/{name}.owed'
     match = f'{RTPS} socket cgroupv2 level %s "%s"'
     if interface.firewall:
         rules = [
@@ -352,38 +357,48 @@ def _confine(
     text = shlex.quote('\n'.join([f'table inet {name} {{', *rules, '}', '}', '']))
     process = interface.process
     pid = process if process.isdigit() else f'$(cat {shlex.quote(process)})'
-    # the name of the group enters the rules, and users can make groups
+    ends = f"""\
+empty_group() {{
+  n=0
+  # a group in its place that is another user's stays
+  until [ ! -O "$1" ] || rmdir "$1" 2>/dev/null; do
+    [ $((n += 1)) -lt 10 ] || return
+    for each in $(cat "$1/cgroup.procs"); do
+      echo "$each" >"${{1%/*}}/cgroup.procs" || :
+    done 2>/dev/null
+  done
+}}
+end_groups() {{
+  [ ! -e {record} ] || mv {record} {owed}
+  read -r own 2>/dev/null <{owed} || return 0
+  while grep -qsxF "$own" "/run/${{own##*/}}.owed"; do
+    [ ! -O "$own" ] || [ -z "$(find "$own" -mindepth 1 -type d)" ] || return 0
+    empty_group "$own" && rm -f "/run/${{own##*/}}.owed" || return
+    own=${{own%/*}}
+  done
+}}"""
+    # the name of the group enters the rules
     do = f"""\
+{ends}
 confine() {{
   pid={pid}
   {_GROUPS}
   group=$(sed -n 's/^0:://p' "/proc/$pid/cgroup") || return
-  group=${{group%/{name}}}; group=${{group%/}}/{name}
+  read -r kept 2>/dev/null <{record} || kept=none
+  case $top$group/ in
+    "$kept"/*) group=${{kept#"$top"}};;
+    *) end_groups; group=${{group%/{name}}}; group=${{group%/}}/{name};;
+  esac
   case $group in *[!-A-Za-z0-9/_.@:\\\\]* | */..*) echo "odd name: $group"; return 1;; esac
-  mkdir -p "$top$group" && echo "$pid" >"$top$group/cgroup.procs" || return
+  [ "$kept" = "$top$group" ] || {{
+    printf "%s\\n" "$top$group" >{record}
+    mkdir -p "$top$group" && echo "$pid" >"$top$group/cgroup.procs" || return
+  }}
   path=${{top#/sys/fs/cgroup}}$group
   printf {text} "$(($(printf %s "$group" | tr -cd / | wc -c)))" "${{path#/}}" | nft -f -
 }}
 said=$(confine 2>&1) || echo "no control group for process {process}: $said" """
-    undo = f"""\
-groups() {{ {_GROUPS}; find $top -type d -name {name}; }}
-for group in $(groups 2>/dev/null); do
-  # another launch of this process has a group below, and the last one removes all
-  while [ -z "$(find "$group" -mindepth 1 -type d)" ]; do
-    n=0
-    until rmdir "$group" 2>/dev/null || [ $n -gt 9 ]; do
-      n=$((n + 1))
-      for pid in $(cat "$group/cgroup.procs"); do
-        echo "$pid" >"$group/../cgroup.procs" || :
-      done 2>/dev/null
-    done
-    [ ! -e "$group" ] || {{ failed=1; break; }}
-    group=${{group%/*}}
-    case ${{group##*/}} in fog{'[0-9a-f]' * 6}*) ;; *) break;; esac
-    ! nft list table inet "${{group##*/}}" >/dev/null 2>&1 || break
-  done
-done"""
-    return _Step(do, undo)
+    return _Step(do, f'{ends}\nend_groups')
 
 
 def _outside(interface: VpnInterface) -> str:
@@ -427,10 +442,9 @@ else
   echo "no WireGuard in this kernel ($said) and no wireguard-go" >&2; exit 1
 fi"""
     undo = f"""\
-for each in $(grep -lsxz {name} /proc/[0-9]*/cmdline); do
-  each=${{each%/cmdline}}
-  read -r program 2>/dev/null <$each/comm || continue
-  [ "$program" = wireguard-go ] && [ $each/ns/net -ef /proc/self/ns/net ] || continue
+for each in /proc/[0-9]*; do
+  read -r program 2>/dev/null <$each/comm && [ "$program" = wireguard-go ] \\
+    && [ $each/ns/net -ef /proc/self/ns/net ] && grep -qsxz {name} $each/cmdline || continue
   kill -9 ${{each#/proc/}} || :
 done
 rm -f {socket}

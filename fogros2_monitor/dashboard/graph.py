@@ -34,6 +34,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray
 
+from fogros2 import ros_types
 from fogros2_monitor.dashboard.meter import Meter
 from fogros2_monitor.dashboard.ways import (
     Crossing,
@@ -45,7 +46,6 @@ from fogros2_monitor.dashboard.ways import (
     streams,
     Topic,
 )
-from fogros2_monitor.definitions import message_class
 from image_transport_h264.sharing import claim_of, UNLIMITED, VALID
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class _Ear:
     def __init__(self, node: Node, topic: str, kind: str) -> None:
         self.meter = Meter(time.monotonic())
         self._node, self._topic = node, topic
-        self._class = message_class(kind)
+        self._class = ros_types.message(kind)
         self._subscription: Optional[Subscription] = None
 
     def look(self, *, wanted: bool) -> None:

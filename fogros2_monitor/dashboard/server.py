@@ -15,7 +15,7 @@ import contextlib
 import hashlib
 import hmac
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 import json
 from pathlib import Path
 import re
@@ -97,17 +97,12 @@ class Dashboard:
             self._server.server_close()
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
+class _Server(accounts.OwnServer):
     block_on_close = False
 
     def __init__(self, address: tuple[str, int], dashboard: Dashboard) -> None:
         self.dashboard = dashboard
         super().__init__(address, _Handler)
-
-    def verify_request(self, request: Any, client_address: Any) -> bool:
-        """Refuse other accounts of this computer: each connection takes a thread."""
-        return not accounts.is_foreign(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore errors of clients that disconnect."""

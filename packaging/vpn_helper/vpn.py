@@ -235,6 +235,12 @@ class Record:
         """Return what knows the commands."""
         return WireGuard(domain=self.domain, ports=self.ports, asked=self.asked)
 
+    def alive(self) -> bool:
+        """Return whether the launch goes on: another process may have its id by now."""
+        with contextlib.suppress(Refused):
+            return not self.pid or begun(self.pid, self.uid) == self.started
+        return False
+
     def save(self, folder: Path) -> None:
         """Write it into its folder, whole or not at all."""
         aside = folder / 'record.new'
@@ -429,6 +435,7 @@ def up(request: Mapping[str, Any], uid: int) -> None:
     address = own_address(request['address'], network)
     peers = peers_of(request['peers'], network, address)
     with own(request['name'], uid) as before:
+        _refuse_ended(before)
         record = dataclasses.replace(
             before, network=network, address=address, port=port, domain=domain, ports=ports,
             asked=asked)
@@ -443,11 +450,17 @@ def up(request: Mapping[str, Any], uid: int) -> None:
         run(record.vpn().up(record.interface(), peers))
 
 
+def _refuse_ended(record: Record) -> None:
+    if not record.alive():
+        raise Refused(f'the launch of {record.name}, process {record.pid}, has ended')
+
+
 def _with_peers(
     what: Callable[[Record, list[Peer]], Iterable[Command]],
 ) -> Callable[[Mapping[str, Any], int], None]:
     def act(request: Mapping[str, Any], uid: int) -> None:
         with own(request['name'], uid) as record:
+            _refuse_ended(record)
             if not record.network:
                 raise Refused(f'{record.name} has not been brought up')
             run(what(record, peers_of(request['peers'], record.network, record.address)))
@@ -474,11 +487,7 @@ def tidy() -> None:
     """Take away the interfaces of launches that are gone, each though another stays."""
     failed = False
     for record in records():
-        try:
-            alive = not record.pid or begun(record.pid) == record.started
-        except Refused:
-            alive = False
-        if not alive:
+        if not record.alive():
             print(f'{record.name}: its launch, process {record.pid}, is gone', flush=True)
             try:
                 down({'name': record.name}, 0)

@@ -4,7 +4,7 @@ from importlib.machinery import ModuleSpec
 import sys
 from types import ModuleType
 
-from rosidl_embedded.lacking import LACKING
+from embedded_default.lacking import LACKING
 
 #: Modules whose names don't follow from a class or function in them.
 _OTHERS = {

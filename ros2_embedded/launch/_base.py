@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import collections.abc
-from typing import Any, Callable, Iterable, Optional, TYPE_CHECKING, Union
+import os
+from typing import Any, Callable, Iterable, Optional, Union
 
-if TYPE_CHECKING:
-    from .frontend import Entity, Parser
-    from .launch_context import LaunchContext
+from .launch_context import LaunchContext
 
 __all__ = [
     'Action', 'BaseEventHandler', 'Condition', 'Event', 'EventHandler', 'InvalidLaunchFileError',
@@ -36,8 +35,45 @@ class Substitution:
         raise NotImplementedError('perform() not implemented for Substitution base class.')
 
 
-SomeSubstitutionsType = Union[str, Substitution, Iterable[Union[str, Substitution]]]
-SomeSubstitutionsType_types_tuple = (str, Substitution, collections.abc.Iterable)
+SomeSubstitutionsType = Union[str, 'os.PathLike[str]', Substitution, Iterable[
+    Union[str, 'os.PathLike[str]', Substitution]]]
+SomeSubstitutionsType_types_tuple = (str, os.PathLike, Substitution, collections.abc.Iterable)
+
+
+class TextSubstitution(Substitution):
+
+    def __init__(self, *, text: str) -> None:
+        if not isinstance(text, str):
+            raise TypeError(f"TextSubstitution expected Text object got '{type(text)}' instead.")
+        self.text = text
+
+    def describe(self) -> str:
+        return f"'{self.text}'"
+
+    def perform(self, context: LaunchContext) -> str:
+        return self.text
+
+
+def normalize_to_list_of_substitutions(subs: SomeSubstitutionsType) -> list[Substitution]:
+    """
+    Return substitutions, texts and paths as TextSubstitution.
+
+    :raises TypeError: for an item that is none of these.
+    """
+    normalized: list[Substitution] = []
+    for item in [subs] if isinstance(subs, (str, os.PathLike, Substitution)) else subs:
+        if isinstance(item, (str, os.PathLike)):
+            item = TextSubstitution(text=os.fspath(item))
+        elif not isinstance(item, Substitution):
+            raise TypeError(
+                f"Failed to normalize given item of type '{type(item)}', when only 'str', "
+                "'pathlib.Path' or 'launch.Substitution' were expected.")
+        normalized.append(item)
+    return normalized
+
+
+def perform_substitutions(context: LaunchContext, subs: Iterable[Substitution]) -> str:
+    return ''.join([context.perform_substitution(sub) for sub in subs])
 
 
 class Condition:
@@ -53,8 +89,48 @@ class Condition:
         return False if self._predicate is None else self._predicate(context)
 
 
+_TRUTHS = {'true': True, '1': True, 'false': False, '0': False}
+
+
+class InvalidConditionExpressionError(ValueError):
+    pass
+
+
+def evaluate_condition_expression(context: LaunchContext, expression: list[Substitution]) -> bool:
+    """
+    Return what the expression says: 'true' or '1', 'false' or '0', in upper or lower case.
+
+    :raises InvalidConditionExpressionError: for anything else.
+    """
+    text = perform_substitutions(context, expression).strip().lower()
+    if text not in _TRUTHS:
+        origin = ' + '.join(str(sub) for sub in expression)
+        raise InvalidConditionExpressionError(
+            f"invalid condition expression, expected one of [{', '.join(_TRUTHS)}] "
+            f"but got '{text}', expanded from '{origin}'")
+    return _TRUTHS[text]
+
+
+class IfCondition(Condition):
+
+    def __init__(self, predicate_expression: SomeSubstitutionsType) -> None:
+        self.__predicate_expression = normalize_to_list_of_substitutions(predicate_expression)
+        super().__init__(predicate=self._predicate_func)
+
+    def _predicate_func(self, context: LaunchContext) -> bool:
+        return evaluate_condition_expression(context, self.__predicate_expression)
+
+
+class UnlessCondition(IfCondition):
+
+    def _predicate_func(self, context: LaunchContext) -> bool:
+        return not super()._predicate_func(context)
+
 class LaunchDescriptionEntity:
     """Something that launch visits, with other entities below it."""
+
+    #: What it is for the search for launch arguments: 'argument', 'include', 'reset' or nothing.
+    _role = ''
 
     def describe(self) -> str:
         return repr(self)
@@ -138,13 +214,12 @@ class Action(LaunchDescriptionEntity):
         self.__condition = condition
 
     @classmethod
-    def parse(cls, entity: Entity, parser: Parser) -> ParsedAction:
+    def parse(cls, entity: Any, parser: Any) -> ParsedAction:
         """
         Return the class and the keyword arguments that a frontend's entity gives.
 
         :raises RuntimeError: for both ``if`` and ``unless``.
         """
-        from .conditions import IfCondition, UnlessCondition
         kwargs: dict[str, Any] = {}
         for name, kind in (('if', IfCondition), ('unless', UnlessCondition)):
             expression = entity.get_attr(name, optional=True)

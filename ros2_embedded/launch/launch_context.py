@@ -9,8 +9,6 @@ from typing import Any, Iterable, MutableMapping
 
 import launch.logging
 
-from ._base import BaseEventHandler, Event, Substitution
-
 
 class _Locals:
     """Read-only attributes of the context."""
@@ -48,8 +46,8 @@ class LaunchContext:
         #: The loop that the launch runs in; None while it doesn't.
         self.asyncio_loop: Any = None
         self.launch_configurations: dict[str, Any] = {}
-        self._event_queue: asyncio.Queue[Event] = asyncio.Queue()
-        self._event_handlers: collections.deque[BaseEventHandler] = collections.deque()
+        self._event_queue: asyncio.Queue[Any] = asyncio.Queue()
+        self._event_handlers: collections.deque[Any] = collections.deque()
         self._completion_futures: list[asyncio.Future[Any]] = []
         self.__globals: dict[str, Any] = {}
         self.__locals: dict[str, Any] = {}
@@ -115,26 +113,27 @@ class LaunchContext:
     def environment(self) -> MutableMapping[str, str]:
         return os.environ
 
-    def would_handle_event(self, event: Event) -> bool:
+    def would_handle_event(self, event: Any) -> bool:
         return any(handler.matches(event) for handler in self._event_handlers)
 
     def register_event_handler(
-        self, event_handler: BaseEventHandler, append: bool = False
+        self, event_handler: Any, append: bool = False
     ) -> None:
         """Add a handler, before all others or after them."""
         add = self._event_handlers.append if append else self._event_handlers.appendleft
         add(event_handler)
 
-    def unregister_event_handler(self, event_handler: BaseEventHandler) -> None:
+    def unregister_event_handler(self, event_handler: Any) -> None:
         self._event_handlers.remove(event_handler)
 
-    def emit_event_sync(self, event: Event) -> None:
+    def emit_event_sync(self, event: Any) -> None:
         self.__logger.debug(f"emitting event synchronously: '{event.name}'")
         self._event_queue.put_nowait(event)
 
-    async def emit_event(self, event: Event) -> None:
+    async def emit_event(self, event: Any) -> None:
         self.__logger.debug(f"emitting event: '{event.name}'")
         await self._event_queue.put(event)
 
-    def perform_substitution(self, substitution: Substitution) -> str:
-        return substitution.perform(self)
+    def perform_substitution(self, substitution: Any) -> str:
+        text: str = substitution.perform(self)
+        return text

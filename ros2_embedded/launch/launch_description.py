@@ -2,16 +2,18 @@
 """A description of what to launch, and where one may come from."""
 from __future__ import annotations
 
-from typing import Any, Iterable, TYPE_CHECKING
+from typing import Any, Iterable
 
 import launch.logging
 
-from ._base import Entities, LaunchDescriptionEntity, SomeSubstitutionsType
+from ._base import (
+    Entities,
+    LaunchDescriptionEntity,
+    normalize_to_list_of_substitutions,
+    perform_substitutions,
+    SomeSubstitutionsType,
+)
 from .launch_context import LaunchContext
-from .utilities import normalize_to_list_of_substitutions, perform_substitutions
-
-if TYPE_CHECKING:
-    from .actions import DeclareLaunchArgument
 
 
 class LaunchDescription(LaunchDescriptionEntity):
@@ -36,32 +38,31 @@ class LaunchDescription(LaunchDescriptionEntity):
     def describe_sub_entities(self) -> Entities:
         return self.entities
 
-    def get_launch_arguments(self) -> list[DeclareLaunchArgument]:
+    def get_launch_arguments(self) -> list[Any]:
         """Return the arguments declared here and below, the first of each name."""
         pairs = self.get_launch_arguments_with_include_launch_description_actions()
         return [argument for argument, _ in pairs]
 
     def get_launch_arguments_with_include_launch_description_actions(
         self
-    ) -> list[tuple[DeclareLaunchArgument, list[Any]]]:
+    ) -> list[tuple[Any, list[Any]]]:
         """Return the arguments, each with the includes on the way to it."""
-        from . import actions
-        found: list[tuple[DeclareLaunchArgument, list[Any]]] = []
+        found: list[tuple[Any, list[Any]]] = []
 
         def collect(
             entities: Iterable[LaunchDescriptionEntity], conditional: bool, includes: list[Any]
         ) -> None:
+            entity: Any
             for entity in entities:
-                if isinstance(entity, actions.DeclareLaunchArgument):
+                if entity._role == 'argument':
                     if any(entity.name == argument.name for argument, _ in found):
                         continue
                     entity._conditionally_included = conditional or entity.condition is not None
                     found.append((entity, includes))
-                if isinstance(entity, actions.ResetLaunchConfigurations):
+                if entity._role == 'reset':
                     # What follows can't see the arguments of this launch.
                     return
-                is_include = isinstance(entity, actions.IncludeLaunchDescription)
-                inner = [*includes, entity] if is_include else includes
+                inner = [*includes, entity] if entity._role == 'include' else includes
                 collect(entity.describe_sub_entities(), False, inner)
                 for _, conditional_entities in entity.describe_conditional_sub_entities():
                     collect(conditional_entities, True, inner)

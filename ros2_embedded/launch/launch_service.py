@@ -152,8 +152,8 @@ class LaunchService:
             self.__context._push_locals()
             entities = handler.handle(event, self.__context)
             if not isinstance(entities, collections.abc.Iterable):
-                entities = (entities,)  # type: ignore[assignment]
-            for entity in entities:  # type: ignore[union-attr]
+                entities = (entities,)
+            for entity in entities:
                 if entity is None:
                     continue
                 if not isinstance(entity, LaunchDescriptionEntity):

@@ -7,13 +7,13 @@ from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Any
 
+from embedded_default.lacking import lacking
 from launch import LaunchContext, SomeSubstitutionsType, SomeSubstitutionsType_types_tuple
 from launch.frontend.parse_substitution import parse_substitution
 from launch.substitutions import SubstitutionFailure
 from launch.utilities import ensure_argument_type, perform_substitutions
 from launch.utilities import normalize_to_list_of_substitutions as normalize
 from launch.utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
-from rosidl_embedded.lacking import lacking
 
 __getattr__ = lacking(__name__, 'Parameter')
 

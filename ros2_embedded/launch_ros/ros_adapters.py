@@ -56,7 +56,7 @@ def call_service(
 
     Blocks: call it in an executor's thread.
     """
-    from rclpy.exceptions import InvalidHandle, RCLError
+    from rclpy._rclpy_pybind11 import InvalidHandle, RCLError
 
     def given_up(what: str = '') -> bool:
         if context.is_shutdown:

@@ -2,11 +2,16 @@
 """A YAML mapping or sequence as an entity."""
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, List
 
 from launch.frontend import Entity as BaseEntity
 from launch.frontend.type_utils import check_is_list_entity
+from launch.utilities.ros_yaml import Plain, typed
 from launch.utilities.type_utils import is_instance_of
+
+
+def _typed(value: Any) -> Any:
+    return typed(value) if isinstance(value, Plain) else value
 
 
 class Entity(BaseEntity):
@@ -65,6 +70,8 @@ class Entity(BaseEntity):
                 f"Can not find attribute '{name}' in Entity '{self.type_name}'")
         self.__read_keys.add(name)
         value = self._element[name]
+        if data_type not in (str, List[str]):
+            value = [_typed(item) for item in value] if isinstance(value, list) else _typed(value)
         if check_is_list_entity(data_type):
             if isinstance(value, list) and value and isinstance(value[0], dict):
                 return [Entity(child, name, self) for child in value]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Set, Tuple
 
 from launch import frontend
+from launch.utilities.ros_yaml import load_launch_file
 
 from .entity import Entity
 
@@ -20,11 +21,10 @@ class Parser(frontend.Parser):
         :raises yaml.YAMLError: with line and column.
         :raises RuntimeError: for a file with more than one root, or none.
         """
-        import yaml
         if not hasattr(file, 'read'):
             with open(file) as opened:
                 return cls.load(opened)
-        tree = yaml.safe_load(file)
+        tree = load_launch_file(file)
         if not isinstance(tree, dict) or len(tree) != 1:
             raise RuntimeError('Expected only one root')
         [(type_name, element)] = tree.items()

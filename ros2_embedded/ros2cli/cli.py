@@ -15,17 +15,11 @@ def set_up_environment() -> None:
     """
     Do what sourcing ``setup.bash`` does for ROS 2, for this process and those it starts.
 
-    Nodes then find this Python, and the ament index the packages installed into it.
+    Nodes then find this Python. (The ament index is set at each start of this Python.)
     """
-    def prepend(name: str, path: str) -> None:
-        paths = [one for one in os.environ.get(name, '').split(os.pathsep) if one]
-        if path not in paths:
-            # Behind overlays' prefixes, but before other Pythons' executables.
-            paths.insert(len(paths) if name == 'AMENT_PREFIX_PATH' else 0, path)
-            os.environ[name] = os.pathsep.join(paths)
-
-    prepend('PATH', os.path.join(sys.prefix, 'bin'))
-    prepend('AMENT_PREFIX_PATH', sys.prefix)
+    paths = os.environ.get('PATH', '').split(os.pathsep)
+    if (programs := os.path.join(sys.prefix, 'bin')) not in paths:
+        os.environ['PATH'] = os.pathsep.join([programs, *filter(None, paths)])
     os.environ.setdefault('ROS_DISTRO', 'jazzy')
     os.environ.setdefault('ROS_VERSION', '2')
     os.environ.setdefault('ROS_PYTHON_VERSION', '3')

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Interfaces by name, and messages as text and dictionaries."""
+"""Interfaces by name, and messages as text and dictionaries: not in any package index."""
 
-from rosidl_embedded.lacking import lacking
+from embedded_default.lacking import lacking
 
 from rosidl_runtime_py.convert import message_to_ordereddict, message_to_yaml
 from rosidl_runtime_py.set_message import set_message_fields

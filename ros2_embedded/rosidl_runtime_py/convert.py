@@ -3,23 +3,22 @@
 
 import array
 from collections import OrderedDict
+import re
 import sys
 from typing import Any
-
-from rosidl_embedded.definition import Field
-from rosidl_embedded.message import IDL_NAMES
 
 
 def _is_many(value: Any) -> bool:
     return isinstance(value, (list, tuple, array.array)) or hasattr(value, 'ndim') and value.ndim
 
 
-def _abbreviated(value: Any, field: Field) -> str:
-    base = IDL_NAMES.get(field.base, field.base)
-    if field.kind == 'array':
-        return f'<array type: {base}[{field.size}]>'
-    bound = f'[{field.size}]' if field.size else ''
-    return f'<sequence type: {base}{bound}, length: {len(value)}>'
+def _abbreviated(value: Any, kind: str) -> str:
+    """Describe a field by its type, such as ``sequence<uint8, 3>`` or ``double[36]``."""
+    sequence = re.fullmatch(r'sequence<([^,]+)(?:, (\d+))?>', kind)
+    if sequence is None:
+        return f'<array type: {kind}>'
+    bound = f'[{sequence[2]}]' if sequence[2] else ''
+    return f'<sequence type: {sequence[1]}{bound}, length: {len(value)}>'
 
 
 def message_to_yaml(msg: Any, *, truncate_length: int | None = None, no_arr: bool = False,
@@ -53,11 +52,11 @@ def message_to_ordereddict(msg: Any, *, truncate_length: int | None = None, no_a
     return converted
 
 
-def _convert(value: Any, field: Field | None, *how: Any) -> Any:
+def _convert(value: Any, kind: str | None, *how: Any) -> Any:
     truncate_length, no_arr, no_str = how
-    if hasattr(value, '_definition'):
-        return OrderedDict((one.name, _convert(getattr(value, one.name), one, *how))
-                           for one in value._definition.fields)
+    if hasattr(value, 'get_fields_and_field_types'):
+        return OrderedDict((name, _convert(getattr(value, name), kind, *how))
+                           for name, kind in value.get_fields_and_field_types().items())
     if isinstance(value, (bytes, str)):
         if no_str and isinstance(value, str):
             return f'<string length: <{len(value)}>>'
@@ -66,8 +65,8 @@ def _convert(value: Any, field: Field | None, *how: Any) -> Any:
             return text[:truncate_length] + '...'
         return text
     if _is_many(value):
-        if no_arr and field is not None:
-            return _abbreviated(value, field)
+        if no_arr and kind is not None:
+            return _abbreviated(value, kind)
         items = [_convert(item, None, *how) for item in value[:truncate_length]]
         if truncate_length is not None and len(value) > truncate_length:
             items.append('...')

@@ -4,17 +4,18 @@
 import importlib
 from typing import Any
 
-from rosidl_embedded.lacking import NotEmbeddedError
+from ament_index_python import has_resource
 
 
 def _import(identifier: str, kind: str | None) -> Any:
     parts = identifier.split('/')
     if len(parts) == 2 and kind is not None:
         parts.insert(1, kind)
-    if len(parts) != 3:
+    if len(parts) != 3 or parts[1] not in ('msg', 'srv', 'action'):
         raise ValueError(f"'{identifier}' is not of the form package/kind/Name")
-    if parts[1] == 'action':
-        raise NotEmbeddedError(f'the action {identifier}')
+    # The name may come from any node of the network: import no other module than a package's.
+    if not has_resource('rosidl_interfaces', parts[0]):
+        raise ModuleNotFoundError(f"No package '{parts[0]}' with interfaces is installed")
     return getattr(importlib.import_module('.'.join(parts[:2])), parts[2])
 
 
@@ -54,16 +55,28 @@ def get_service(identifier: str) -> Any:
     return interface
 
 
+def get_action(identifier: str) -> Any:
+    """
+    Give the class of ``package/action/Name`` or ``package/Name``; see :func:`get_message`.
+
+    :raises ValueError: it is no action.
+    """
+    interface = _import(identifier, 'action')
+    if not is_action(interface):
+        raise ValueError(f"Expected the full name of an action, got '{identifier}'")
+    return interface
+
+
 def is_message(interface: Any) -> bool:
     """Say whether it is a message's class."""
-    return hasattr(interface, '_definition')
+    return hasattr(interface, '_fields_and_field_types')
 
 
 def is_service(interface: Any) -> bool:
     """Say whether it is a service's class."""
-    return hasattr(interface, '_service')
+    return hasattr(interface, 'Request') and hasattr(interface, 'Response')
 
 
 def is_action(interface: Any) -> bool:
-    """Say no: there are none."""
-    return False
+    """Say whether it is an action's class."""
+    return hasattr(interface, 'Goal') and hasattr(interface, 'Result')

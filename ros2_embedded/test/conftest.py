@@ -8,15 +8,10 @@ from rigs.domains import taken
 
 # before anything of ROS is imported
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
-os.environ['RMW_IMPLEMENTATION'] = 'rmw_cyclonedds_cpp'
 _held = contextlib.ExitStack()
 os.environ['ROS_DOMAIN_ID'] = _held.enter_context(taken())  # until this process ends
-os.environ['CYCLONEDDS_URI'] = (  # this computer's loopback and nothing else
-    '<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/></Interfaces>'
-    '<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto'
-    '</ParticipantIndex><MaxAutoParticipantIndex>40</MaxAutoParticipantIndex><Peers>'
-    '<Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>')
-os.environ.pop('ROS_AUTOMATIC_DISCOVERY_RANGE', None)
-os.environ.pop('ROS_STATIC_PEERS', None)
-os.environ.pop('ROS_LOCALHOST_ONLY', None)
+# this computer and nothing else
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+for name in ('RMW_IMPLEMENTATION', 'ROS_STATIC_PEERS', 'ROS_LOCALHOST_ONLY'):
+    os.environ.pop(name, None)
 os.environ['RCUTILS_COLORIZED_OUTPUT'] = '0'

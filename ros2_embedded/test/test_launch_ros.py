@@ -167,8 +167,11 @@ def test_global_parameters_and_remappings_come_first(tmp_path):
         SetParametersFromFile(str(file)), SetRemap('x', [LaunchConfiguration('i'), 'y']),
         configurations={'i': '2'}, remappings=[('p', 'q')], parameters=[{'own': 3}])
     own = context_words[context_words.index('--params-file', 10) + 1]
+    # ROS 2 writes an array as Python does, which rcl takes for a text
+    array = context_words[4]
+    assert array in ("bc:=('x', 'y')", 'bc:=["x", "y"]')
     assert context_words == [
-        '--ros-args', '-p', 'a:=1', '-p', "bc:=('x', 'y')", '-p', 's:=1', '-p', 't:=2',
+        '--ros-args', '-p', 'a:=1', '-p', array, '-p', 's:=1', '-p', 't:=2',
         '--params-file', str(file), '--params-file', own, '-r', 'x:=2y', '-r', 'p:=q']
     assert yaml.safe_load(Path(own).read_text()) == {'/**': {'ros__parameters': {'own': 3}}}
     assert action.expanded_remapping_rules == [('x', '2y'), ('p', 'q')]

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lifecycle nodes: transitions asked for and told, over real services and topics."""
 
+import inspect
 import sys
 
 from launch import LaunchDescription, LaunchService
 from launch.actions import EmitEvent, OpaqueFunction, RegisterEventHandler, Shutdown, TimerAction
 from launch.event_handlers import OnProcessIO
 import launch.logging
+from launch.substitutions import TextSubstitution
 from launch_ros.actions import LifecycleNode
 from launch_ros.event_handlers import OnStateTransition
 from launch_ros.events.lifecycle import ChangeState
@@ -39,6 +41,7 @@ class Managed(Node):
             event = TransitionEvent()
             event.transition.label, event.start_state.label, event.goal_state = NEXT[number]
             self.publisher.publish(event)
+            print(event.transition.label, flush=True)
         return response
 
 
@@ -59,13 +62,39 @@ def _log_into(tmp_path, monkeypatch):
     launch.logging.reset()
 
 
-def test_launch_configures_and_activates_a_node(tmp_path, capsys):
-    path = tmp_path / 'managed'
-    path.write_text(NODE)
-    path.chmod(0o755)
+@pytest.fixture
+def path(tmp_path):
+    """Return the path of the node's program."""
+    made = tmp_path / 'managed'
+    made.write_text(NODE)
+    made.chmod(0o755)
+    return made
+
+
+@pytest.mark.skipif('autostart' not in inspect.signature(LifecycleNode).parameters,
+                    reason='launch_ros is older than 0.26.7')
+def test_autostart_configures_and_activates_a_node(path):
+    seen = b''
+    node = LifecycleNode(executable=path, name='managed', namespace='/ns',
+                         autostart=TextSubstitution(text='true'))
+
+    def note(event):
+        nonlocal seen
+        before, seen = seen, seen + event.text
+        return Shutdown() if b'activate' in seen and b'activate' not in before else None
+
+    service = LaunchService(noninteractive=True)
+    service.include_launch_description(LaunchDescription([
+        RegisterEventHandler(OnProcessIO(target_action=node, on_stdout=note)),
+        node, TimerAction(period=30.0, actions=[Shutdown(reason='too late')])]))
+    assert service.run() == 0
+    assert seen.split() == [b'ready', b'configure', b'activate']
+
+
+def test_launch_configures_and_activates_a_node(path, capsys):
     notes = []
     node = LifecycleNode(
-        executable=str(path), name='managed', namespace='/ns', output='screen')
+        executable=path, name='managed', namespace='/ns', output='screen')
 
     def note(context):
         event = context.locals.event

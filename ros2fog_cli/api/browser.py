@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import contextlib
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 import secrets
 import threading
 import time
+
+from fogros2_monitor.accounts import OwnServer
 
 #: Seconds within which a started browser must open the ticket's address.
 _VALID = 60.0
@@ -19,7 +21,8 @@ class Ticket:
     A loopback URL that redirects a browser to a page, once and within a minute.
 
     The page's own URL contains the token. Other users of this computer could read that URL in
-    the command line of the started browser.
+    the command line of the started browser. They can read the ticket's URL there, and the server
+    refuses their connections.
 
     :param page: URL of the page.
     """
@@ -48,7 +51,7 @@ class Ticket:
                 """Log nothing: the terminal shows the pages."""
 
         # Threads, because browsers open connections in advance that send no request.
-        self._server = ThreadingHTTPServer(('127.0.0.1', 0), Handler)
+        self._server = OwnServer(('127.0.0.1', 0), Handler)
         self.url = f'http://127.0.0.1:{self._server.server_port}{target}'
         self._thread = threading.Thread(
             target=self._server.serve_forever, name='fog-ticket', daemon=True)

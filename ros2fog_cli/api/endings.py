@@ -18,6 +18,7 @@ from typing import Optional
 from fogros2 import deploy, plugin_system
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
+from fogros2.deploy import requests
 from fogros2.deploy.robot import clear
 from fogros2.errors import (
     AgentError,
@@ -91,7 +92,8 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
         if entry.machine is None and entry.asked and record.machine_id is not None:
             machines.load(record.provider).destroy(record.machine_id)
         elif entry.machine is None and entry.asked and record.token:
-            machines.load(record.provider).tidy(dead=[record.token])
+            if not requests.end(machines.load(record.provider), record):
+                store.set_aside(record)
         if record.damage:
             store.delete(record.name)
             return
@@ -260,6 +262,9 @@ def due(
         elif dead and record is not None and not record.damage:
             yield Due('leftovers of', entry.name, 'its launch is gone',
                       functools.partial(let_go, record, store))
+    for record, age in store.requests():
+        yield Due('machine', record.name, 'its provider had not answered the request for it',
+                  functools.partial(end_request, record, age, store))
     folders = leftovers(store, now)
     known = {record.launch for record in store.machines()}
     folders += [store.root / 'launches' / launch for launch in owner.abandoned(store.root)
@@ -267,6 +272,22 @@ def due(
     for folder in folders:
         yield Due('leftovers of launch', folder.name, 'the launch is gone',
                   functools.partial(clear, folder))
+
+
+def end_request(record: Record, age: float, store: Store) -> None:
+    """
+    Delete the machine of a request that got no answer; forget the request.
+
+    :raises FogError: the machine may still appear, or the provider does not answer.
+    """
+    if not requests.end(machines.load(record.provider), record, age):
+        raise requests.late(record)
+    store.answered(record)
+
+
+def awaited(store: Store, name: str) -> list[str]:
+    """Return warnings of the machines with a name that may still appear."""
+    return [str(requests.late(record)) for record, _ in store.requests() if record.name == name]
 
 
 def why_end(
@@ -284,7 +305,7 @@ def why_end(
     if not entry.asked or not entry.own:
         return ''
     if entry.gone:
-        return 'gone at its provider'
+        return 'gone at its provider' if entry.machine_id else 'its launch is gone'
     assert entry.machine is not None
     if entry.machine.state is MachineState.STOPPED:
         since = stopped_at if stopped_at is not None else entry.created

@@ -5,14 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import ipaddress
-import json
-import math
 from pathlib import Path
 import secrets
 import time
 from typing import Optional, TypedDict
 
-from fogros2 import invitation, plugin_system
+from fogros2 import invitation, plugin_system, untrusted
 from fogros2.deploy import membership
 from fogros2.errors import CommandError, ConfigurationError, VpnError
 from fogros2.model import host_port
@@ -121,8 +119,9 @@ def ask(shell: Shell, record: Record, verb: str, request: object = None) -> list
     assert record.vpn is not None
     output = shell.run(guest_request(record.vpn, verb, request), timeout=15.0).stdout
     try:
-        return [_checked(guest, record.vpn.network) for guest in json.loads(output)]
-    except (ValueError, LookupError, TypeError, ConfigurationError, RecursionError) as error:
+        return [_checked(guest, record.vpn.network)
+                for guest in untrusted.parsed(output, list[Guest])]
+    except (ValueError, ConfigurationError) as error:
         raise VpnError(f"'{record.name}' sent an invalid list of guests",
                        'the machine may be hijacked: delete it') from error
 
@@ -132,11 +131,10 @@ def _checked(guest: Guest, network: str) -> Guest:
     label, key = invitation.parse_key(
         f"{guest['label']}:{guest['key']}" if guest['label'] else guest['key'])
     address = ipaddress.IPv4Address(guest['address'])
-    heard = None if guest['heard'] is None else float(guest['heard'])
-    if address not in ipaddress.IPv4Network(addresses.guests(network)) or not math.isfinite(
-            guest['left'] + (heard or 0.0)):
+    if address not in ipaddress.IPv4Network(addresses.guests(network)):
         raise ValueError
-    return Guest(key=key, label=label, address=str(address), left=guest['left'], heard=heard)
+    return Guest(key=key, label=label, address=str(address), left=guest['left'],
+                 heard=guest['heard'])
 
 
 def revoke(name: str, who: Optional[str], warn: Callable[[str], None]) -> list[str]:

@@ -101,7 +101,7 @@ class Entry:
         if self.known.state is MachineState.STOPPED:
             return None
         tag = self.known.tags.get(TAG_EXPIRES, '')
-        known = [float(tag)] if tag.isdecimal() else []
+        known = [float(tag)] if tag.isdecimal() and len(tag) < 13 else []
         record = self.record
         if record is not None and record.armed:
             # If a launch reused the machine, this is later than the tag of the creation.

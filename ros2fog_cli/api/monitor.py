@@ -5,14 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import contextlib
-import http.client
 from pathlib import Path
+import re
 import socket
 import threading
 from typing import Optional
-import urllib.parse
 
-from fogros2 import monitor_addresses
+from fogros2 import monitor_addresses, untrusted
 from fogros2.deploy.machine_job import AGENT_FOLDER
 from fogros2.errors import AgentError, CommandError, ConfigurationError
 from fogros2.model import Command
@@ -25,6 +24,8 @@ from ros2fog_cli.api.machines import Entry
 
 #: Time-out of the answer of the machine's gate, in seconds.
 _TIMEOUT = 15.0
+#: The form of ``credentials.make_token``.
+_TOKEN = re.compile('[A-Za-z0-9_-]{1,100}')
 
 
 @contextlib.contextmanager
@@ -43,19 +44,6 @@ def carrying(tunnel: Tunnel) -> Iterator[threading.Event]:
     finally:
         tunnel.close()
         thread.join(5.0)
-
-
-def has_application(port: int, token: str) -> bool:
-    """Return whether the gate at a loopback port serves the web application."""
-    connection = http.client.HTTPConnection('localhost', port, timeout=_TIMEOUT)
-    with contextlib.closing(connection):
-        try:
-            connection.request('GET', f'/?{urllib.parse.urlencode({"token": token})}')
-            answer = connection.getresponse()
-        except (OSError, http.client.HTTPException):
-            return False  # the tunnel reports the error
-        # The gate redirects to the application, to remove the token from the URL.
-        return answer.status == 303
 
 
 def on_robot(name: str) -> Optional[tuple[int, str]]:
@@ -80,7 +68,7 @@ def token_of(entry: Entry, shell: Shell, port: int) -> str:
         or machines.load(entry.provider).capabilities.agent_directory \
         or f'{AGENT_FOLDER}/{entry.name}'
     return _read(entry, shell, ('sh', '-c', 'cat "$1"/*/token', 'sh',
-                                str(Path(monitor_addresses.folder_of(folder, port, '')))))
+                                str(Path(monitor_addresses.folder_of(folder, port, '')))))[0]
 
 
 def credentials_of(entry: Entry, shell: Shell) -> tuple[str, str, str]:
@@ -100,15 +88,26 @@ def credentials_of(entry: Entry, shell: Shell) -> tuple[str, str, str]:
             "monitor_allow=['198.51.100.0/28'] in its launch file lets others in")
     made = credentials.Credentials(Path(
         monitor_addresses.folder_of(record.agent, record.monitor, record.launch)))
-    said = _read(entry, shell, ('cat', str(made.token), str(made.certificate)))
-    token, _, certificate = said.partition('\n')
-    return record.monitor_open, token.strip(), credentials.fingerprint(certificate)
-
-
-def _read(entry: Entry, shell: Shell, words: tuple[str, ...]) -> str:
+    token, certificate = _read(entry, shell, ('cat', str(made.token), str(made.certificate)))
     try:
-        return shell.run(Command(words, sudo=True, what='read the token'),
-                         timeout=_TIMEOUT).stdout.strip()
+        return record.monitor_open, token, credentials.fingerprint(certificate)
+    except ValueError as error:
+        raise _wrong(entry, 'certificate') from error
+
+
+def _read(entry: Entry, shell: Shell, words: tuple[str, ...]) -> tuple[str, str]:
+    """Run a command that prints the token, and return the token and what follows it."""
+    try:
+        token, _, rest = shell.run(Command(words, sudo=True, what='read the token'),
+                                   timeout=_TIMEOUT).stdout.partition('\n')
+        return untrusted.matched(_TOKEN, token.strip()), rest
+    except untrusted.InvalidMessage as error:
+        raise _wrong(entry, 'token') from error
     except CommandError as error:
         raise AgentError(f"'{entry.name}' has no token yet, or can't make one: {error}",
                          f'ros2 fog logs {entry.name}') from error
+
+
+def _wrong(entry: Entry, what: str) -> AgentError:
+    return AgentError(f"'{entry.name}' sent an invalid {what}",
+                      'the machine may be hijacked: delete it')

@@ -8,6 +8,8 @@ import contextlib
 import sys
 
 from fogros2.report import Event, StepFailed
+from fogros2.untrusted import one_line
+from ros2fog_cli.api.output import uncleaned
 
 
 def report(event: Event) -> None:
@@ -25,7 +27,7 @@ def line() -> Iterator[Callable[[str], None]]:
     def show(text: str) -> None:
         nonlocal shown_now
         if sys.stderr.isatty():
-            print(f'\r\x1b[K{text}', end='', file=sys.stderr, flush=True)
+            print(f'\r\x1b[K{one_line(text)}', end='', file=uncleaned(sys.stderr), flush=True)
             shown_now = text
         elif text.split(',')[0] != shown_now:
             # Not a terminal: print each state once, not every second.
@@ -36,4 +38,4 @@ def line() -> Iterator[Callable[[str], None]]:
         yield show
     finally:
         if shown_now and sys.stderr.isatty():
-            print('\r\x1b[K', end='', file=sys.stderr, flush=True)
+            print('\r\x1b[K', end='', file=uncleaned(sys.stderr), flush=True)

@@ -10,7 +10,9 @@ import os
 from typing import Any, TextIO
 
 from fogros2.report import size
+from fogros2.untrusted import one_line
 from ros2fog_cli.api import replicas
+from ros2fog_cli.api.output import uncleaned
 from ros2fog_cli.api.table import cost, duration, NODES, nodes, shares, table
 
 #: Enter and leave the alternate screen; meanwhile the cursor is hidden and long lines are cut,
@@ -42,12 +44,6 @@ def painter(stream: TextIO) -> Paint:
 def plain(text: str, style: str) -> str:
     """Return the text without a style."""
     return text
-
-
-def clean(text: str) -> str:
-    """Replace control characters in text that came from elsewhere."""
-    return ''.join(c if c.isprintable() else ' ' if c == '\t' else '\N{REPLACEMENT CHARACTER}'
-                   for c in text)
 
 
 def frame(
@@ -87,10 +83,10 @@ def frame(
     room = rows - len(parts) - 1
     if lines and room > 0:
         parts.append(('', ''))
-        parts += [(f"[{line['node']}] {line['text']}" if line['node'] else line['text'], 'dim')
-                  for line in lines[-room:]]
+        parts += [(f"[{each['node']}] {each['text']}" if each['node'] else each['text'], 'dim')
+                  for each in lines[-room:]]
     # Clean and cut the text before it is painted: escape sequences take no columns.
-    return [paint(clean(text)[:columns], style) for text, style in parts[:rows]]
+    return [paint(one_line(text)[:columns], style) for text, style in parts[:rows]]
 
 
 def _more(machine: dict[str, Any], now: float) -> str:
@@ -173,8 +169,7 @@ def _table(
     header: Sequence[str], rows: Sequence[Sequence[str]], *, column: int,
 ) -> list[tuple[str, str]]:
     styles = ['dim', *(_OF_STATE.get(row[column], '') for row in rows)]
-    clean_rows = [[clean(word).replace('\n', ' ') for word in row] for row in rows]
-    return list(zip(table(header, clean_rows).split('\n'), styles))
+    return list(zip(table(header, rows).split('\n'), styles))
 
 
 def summary(machine: dict[str, Any]) -> str:
@@ -186,16 +181,17 @@ def summary(machine: dict[str, Any]) -> str:
     parts += [f"{node['name']} {node['state']}"
               + (f", {node['restarts']} restarts" if node['restarts'] else '')
               for node in machine['nodes']]
-    return clean(f"{machine['name']}: " + '; '.join([*parts, *machine['problems']]))
+    return one_line(f"{machine['name']}: " + '; '.join([*parts, *machine['problems']]))
 
 
 @contextlib.contextmanager
 def alternate(stream: TextIO) -> Iterator[Callable[[Sequence[str]], None]]:
     """Yield a function that draws lines in the alternate screen; leave that screen at the end."""
+    stream = uncleaned(stream)
     stream.write(_ENTER)
 
     def draw(lines: Sequence[str]) -> None:
-        stream.write(_HOME + '\r\n'.join(f'{line}{_LINE}' for line in lines) + _REST)
+        stream.write(_HOME + '\r\n'.join(f'{each}{_LINE}' for each in lines) + _REST)
         stream.flush()
 
     try:

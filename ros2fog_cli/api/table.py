@@ -9,6 +9,8 @@ import shutil
 import sys
 from typing import Any, Optional
 
+from fogros2.untrusted import one_line
+
 #: Columns of :func:`nodes`.
 NODES = ('NODE', 'STATE', 'PID', 'EXIT', 'RESTARTS')
 #: Shown for a missing value.
@@ -45,7 +47,7 @@ def table(
     left = [name for name in optional if name not in empty]
     while True:
         keep = [column for column, name in enumerate(header) if name not in empty]
-        text = _columns([[line[column] for column in keep] for line in [header, *rows]])
+        text = _columns([[one_line(row[column]) for column in keep] for row in [header, *rows]])
         if not width or not left or max(map(len, text)) <= width:
             return '\n'.join(text)
         empty.add(left.pop(0))
@@ -57,9 +59,9 @@ def terminal_width() -> int:
 
 
 def _columns(lines: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    return ['  '.join(word.ljust(width) for word, width in zip(line, widths)).rstrip()
-            for line in lines]
+    widths = [max(len(row[column]) for row in lines) for column in range(len(lines[0]))]
+    return ['  '.join(word.ljust(width) for word, width in zip(row, widths)).rstrip()
+            for row in lines]
 
 
 def duration(seconds: Optional[float]) -> str:

@@ -8,6 +8,8 @@ from typing import Any, Optional, Union
 
 from ros2cli.command import add_subparsers_on_demand, CommandExtension
 
+from ros2fog_cli.api import output
+
 
 class FogCommand(CommandExtension):
     """Look after the cloud machines of launch files."""
@@ -27,5 +29,6 @@ class FogCommand(CommandExtension):
         if not hasattr(args, '_verb'):
             self._subparser.print_help()
             return 0
-        status: Union[int, str, None] = args._verb.main(args=args)
+        with output.cleaned():
+            status: Union[int, str, None] = args._verb.main(args=args)
         return status

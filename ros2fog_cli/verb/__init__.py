@@ -109,9 +109,17 @@ def agreed(one: str, several: str, number: int) -> bool:
     if not sys.stdin.isatty():
         warn('not deleted: there is no terminal to ask at (--yes answers)')
         return False
-    what = one if number == 1 else f'these {number} {several}'
+    return confirmed(f"Delete {one if number == 1 else f'these {number} {several}'}?")
+
+
+def confirmed(question: str) -> bool:
+    """Ask the user a question; without a terminal, the answer is no."""
+    if not sys.stdin.isatty():
+        return False
+    # a program may read what the verb prints
+    print(f'{question} [y/N] ', end='', file=sys.stderr, flush=True)
     try:
-        return input(f'Delete {what}? [y/N] ').strip().lower() in ('y', 'yes')
+        return input().strip().lower() in ('y', 'yes')
     except EOFError:  # Ctrl-D
-        print()
+        warn('')
         return False

@@ -57,6 +57,8 @@ class DeleteVerb(VerbExtension):
         for entry, error in endings.delete_all(entries, store, progress.report, force=args.force):
             if error is None:
                 print(f'deleted {entry.name}')
+                for warning in endings.awaited(store, entry.name):
+                    warn(warning)
             else:
                 warn(f'{entry.name}: {error}')
                 failed = 1

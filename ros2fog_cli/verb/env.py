@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 
 from ros2fog_cli.verb import add_json, add_name, VerbExtension
 
@@ -20,10 +21,11 @@ class EnvVerb(VerbExtension):
     def main(self, *, args: argparse.Namespace) -> int:
         """Print lines for ``eval "$(ros2 fog env NAME)"``."""
         from fogros2.store import Store
-        from ros2fog_cli.api import joining
+        from ros2fog_cli.api import joining, output
         folder, variables = joining.launch_of(args.name, Store())
         if args.json:
             print(json.dumps(variables, indent=2))
         else:
-            print(*joining.shell_lines(folder, variables), sep='\n')
+            print(*joining.shell_lines(folder, variables), sep='\n',
+                  file=output.uncleaned(sys.stdout))
         return 0

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import argparse
+import sys
 
-from ros2fog_cli.verb import VerbExtension
+from ros2fog_cli.verb import confirmed, VerbExtension
 
 
 class JoinVerb(VerbExtension):
@@ -19,7 +20,8 @@ class JoinVerb(VerbExtension):
         """Print lines for ``eval "$(ros2 fog join INVITATION)"``."""
         from fogros2.deploy import membership
         from fogros2.store import Store
-        from ros2fog_cli.api import joining, reach
-        folder = membership.join(args.invitation, Store())
-        print(*joining.shell_lines(folder, reach.variables_of(folder)), sep='\n')
+        from ros2fog_cli.api import joining, output, reach
+        folder = membership.join(args.invitation, Store(), agreed=confirmed)
+        print(*joining.shell_lines(folder, reach.variables_of(folder)), sep='\n',
+              file=output.uncleaned(sys.stdout))
         return 0

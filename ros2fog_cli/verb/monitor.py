@@ -61,8 +61,7 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
         with monitor.carrying(tunnel) as ended:
             try:
                 page = say(f'{entry.name} is at {{}} until Ctrl-C; in a browser:',
-                           host_port('localhost', tunnel.port), token,
-                           application=monitor.has_application(tunnel.port, token))
+                           host_port('localhost', tunnel.port), token)
                 with browser_at(page, start=browser):
                     ended.wait()
             except KeyboardInterrupt:
@@ -80,14 +79,12 @@ def show_here(name: str, port: int, token: str, *, browser: bool) -> int:
     return 0
 
 
-def say(what: str, where: str, token: str, *, application: bool = False) -> str:
-    """Print a bridge's address (at ``{}``) and its pages; return the first page."""
+def say(what: str, where: str, token: str) -> str:
+    """Print a bridge's address (at ``{}``) and its page; return the page."""
     from fogros2_monitor import urls
-    address = urls.with_token(where, token)
-    pages = [urls.served(where, token)] if application else \
-        [urls.app(address, at) for at in (urls.FOXGLOVE, urls.LICHTBLICK)]
-    print(what.format(address), *pages, sep='\n', flush=True)
-    return pages[0]
+    page = urls.served(where, token)
+    print(what.format(urls.with_token(where, token)), page, sep='\n', flush=True)
+    return page
 
 
 def share(entry: Entry) -> int:
@@ -100,7 +97,7 @@ def share(entry: Entry) -> int:
     print(f'{address}\n\n'
           'Open this page once, so that the browser accepts the certificate:\n'
           f'https://{address[len("wss://"):]}\n'
-          f'its SHA-256 is {fingerprint}\n')
-    for at in (urls.LICHTBLICK, urls.FOXGLOVE):
-        print(urls.app(address, at))
+          f'its SHA-256 is {fingerprint}\n\n'
+          f'Then open one of these pages, and choose {urls.HOW}:\n'
+          f'{urls.LICHTBLICK}\n{urls.FOXGLOVE}')
     return 0

@@ -929,21 +929,21 @@ def test_health_check_ends_with_its_launch(rig, how):
 def test_watch_reports_its_command_once(rig):
     rig.serve()
     client = rig.client()
-    notice = rig.folder / 'notice'
-    client.request('watch', what='notice', argv=['cat', str(notice)], interval=0.05)
+    unused = rig.folder / 'unused'
+    client.request('watch', what='idle', argv=['cat', str(unused)], interval=0.05)
     client.request('ping')
     aside = rig.folder / 'aside'
-    aside.write_text('terminate at noon\n' + 'x' * 5000)
-    aside.rename(notice)
-    reason = rig.wait('notice')['reason']
-    assert reason.startswith('terminate at noon\n') and len(reason) == 2000
+    aside.write_text('since noon\n' + 'x' * 5000)
+    aside.rename(unused)
+    reason = rig.wait('idle')['reason']
+    assert reason.startswith('since noon\n') and len(reason) == 2000
     # a second one, for another launch: by its time the first would have told again
     client.request('configure', launch='def456', force='abc123')
-    client.request('watch', what='notice', argv=['echo', 'again'], interval=0.05)
-    rig.wait('notice', reason='again')
-    assert len([e for e in rig.events if e['event'] == 'notice']) == 2
-    for wrong in ({'what': 'output', 'argv': ['true']}, {'what': 'notice', 'argv': []},
-                  {'what': 'notice', 'argv': 'true'}, {'what': 'notice'}):
+    client.request('watch', what='idle', argv=['echo', 'again'], interval=0.05)
+    rig.wait('idle', reason='again')
+    assert len([e for e in rig.events if e['event'] == 'idle']) == 2
+    for wrong in ({'what': 'notice', 'argv': ['true']}, {'what': 'idle', 'argv': []},
+                  {'what': 'idle', 'argv': 'true'}, {'what': 'idle'}):
         with pytest.raises(AgentError):
             client.request('watch', **wrong)
 
@@ -951,13 +951,13 @@ def test_watch_reports_its_command_once(rig):
 def test_watch_ends_with_its_launch(rig):
     rig.serve(on_exit='keep')
     client = rig.client()
-    notice = rig.folder / 'notice'
-    client.request('watch', what='notice', argv=['cat', str(notice)], interval=0.05)
+    unused = rig.folder / 'unused'
+    client.request('watch', what='idle', argv=['cat', str(unused)], interval=0.05)
     client.request('release', on_exit='keep')
-    notice.write_text('too late')
+    unused.write_text('too late')
     client.request('configure', launch='def456')
-    client.request('watch', what='notice', argv=['echo', 'ours'], interval=0.05)
-    assert rig.wait('notice')['reason'] == 'ours'
+    client.request('watch', what='idle', argv=['echo', 'ours'], interval=0.05)
+    assert rig.wait('idle')['reason'] == 'ours'
 
 
 def test_signalled_agent_reports_before_its_nodes_end(rig):

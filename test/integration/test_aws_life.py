@@ -689,6 +689,7 @@ def test_policy_has_exactly_the_calls_that_are_made(aws):
     provider.stop(machine_id)
     provider.adopt(machine_id, ask()[0], {})
     provider.start(machine_id)
+    assert not provider.reclaims(machine_id)
     image = provider.bake(machine_id, 'planner', 'abcd')
     list(provider.images())
     provider.delete_image(image)

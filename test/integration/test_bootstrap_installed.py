@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The embedded default, packed as wheels and installed as on a machine."""
+"""ROS 2 from its wheels, packed and installed as on a machine."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
 from pathlib import Path
+import shutil
 import subprocess
 import sys
+from typing import Any, Optional
+import zipfile
 
 import pytest
 
@@ -16,8 +19,9 @@ from fogros2.host import bootstrap, wheels
 from fogros2.host import inspection as host
 from fogros2.host.inspection import HostFacts, Python
 from fogros2.host.wheels import Wheels
-from fogros2.model import MachineSpec
+from fogros2.model import Command, Endpoint, MachineSpec, Result
 from fogros2.plan import Underlay
+from fogros2.shell.local import LocalShell
 
 TOOLS = frozenset({'ip', 'nft', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'})
 ROS = HostFacts(
@@ -25,7 +29,7 @@ ROS = HostFacts(
     user='ubuntu', home='/home/ubuntu', libc='glibc 2.39', root=True,
     pythons=(Python('/usr/bin/python3', (3, 12), True),), programs=TOOLS | {'colcon', 'rosdep'},
     free_bytes=50 << 30, ros={'jazzy': '/opt/ros/jazzy'},
-    rmw={'jazzy': ('rmw_cyclonedds_cpp',)})
+    rmw={'jazzy': ('rmw_fastrtps_cpp',)})
 UNDER = Underlay(('/robot/.venv',), '/robot/.venv/bin/ros2', {
     'PATH': '/robot/.venv/bin:/usr/bin', 'AMENT_PREFIX_PATH': '/robot/.venv',
     'ROS_DISTRO': 'jazzy'})
@@ -44,24 +48,30 @@ def test_wheels_hold_this_installation(packed: Wheels) -> None:
     assert packed.python == sys.version_info[:2]
     names = os.listdir(packed.folder)
     assert packed.fogros2 in names
-    assert (packed.pip in names) == packed.embedded  # a machine with ROS 2 has its own
+    assert (packed.pip in names) == packed.ros  # a machine with ROS 2 has its own
     assert not [name for name in names if name.startswith(('paramiko', 'pytest', 'mypy'))]
-    if packed.embedded:
-        assert [name for name in names if name.startswith('cyclonedds')]
+    if packed.ros:
+        assert [name for name in names if name.startswith('ros_rclpy')]
+        # a library that several distributions bring is sent once, and no header
+        files = [file for name in names if name.endswith('.whl')
+                 for file in zipfile.ZipFile(Path(packed.folder, name)).namelist()]
+        assert len([file for file in files if '/libcrypto-' in file]) == 1
+        assert not [file for file in files if file.endswith(('.h', '.hpp', '.cmake'))
+                    and not file.startswith('numpy')]
 
 
-def test_the_embedded_default_is_installed_without_a_network(
+def test_ros_is_installed_without_a_network(
     packed: Wheels, tmp_path: Path,
 ) -> None:
-    if not packed.embedded:
-        pytest.skip('this interpreter has ROS 2 and no embedded default to send')
+    if not packed.ros:
+        pytest.skip('this interpreter has an installation of ROS 2 and no wheels of it')
     facts = dataclasses.replace(
         host.parse_facts(process.run(host.probe(), timeout=30).stdout), home=str(tmp_path),
         pythons=(Python(sys.executable, sys.version_info[:2], True),),
         programs=TOOLS)
-    spec = MachineSpec('m', 'ssh', bootstrap='embedded')
+    spec = MachineSpec('m', 'ssh', bootstrap='pip')
     todo = bootstrap.plan(spec, facts, facts, UNDER, packed)
-    assert todo.mode == 'embedded'
+    assert todo.mode == 'pip'
     target = Path(todo.wheels_target)
     target.mkdir(parents=True)
     subprocess.run(['cp', '-r', f'{packed.folder}/.', str(target)], check=True)
@@ -72,7 +82,9 @@ def test_the_embedded_default_is_installed_without_a_network(
         subprocess.run([*offline, *command.argv], check=True, env=environment)
     python = f'{tmp_path}/.local/share/fogros2/{packed.key}/venv/bin/python'
     said = subprocess.run(
-        [python, '-c', 'import fogros2, rclpy, launch, std_msgs.msg; print(fogros2.__file__)'],
+        [python, '-c', 'import fogros2, rclpy, launch, std_msgs.msg as m; rclpy.init(); '
+         'node = rclpy.create_node("n"); node.create_publisher(m.String, "t", 1); '
+         'print(fogros2.__file__)'],
         check=True, capture_output=True, text=True, env=environment, cwd=tmp_path).stdout
     assert str(tmp_path) in said
     assert Path(todo.install.command[-1]).is_file()
@@ -82,6 +94,59 @@ def test_the_embedded_default_is_installed_without_a_network(
     # the next launch sees it and has nothing to do
     facts = dataclasses.replace(facts, installed=frozenset({packed.key}))
     assert bootstrap.plan(spec, facts, facts, UNDER, packed).commands == ()
+
+
+def other_python() -> Optional[Python]:
+    """Return an interpreter for which there are wheels of ROS 2, and which is not this one."""
+    for path in [os.environ.get('FOGROS2_OTHER_PYTHON', ''), *(
+            f'python3.{minor}' for minor in range(10, 15) if minor != sys.version_info[1])]:
+        done = path and shutil.which(path) and subprocess.run(
+            [path, '-c', 'import sys, venv, ssl; print(sys.executable, sys.version_info[1])'],
+            capture_output=True, text=True)
+        if done and done.returncode == 0:
+            executable, minor = done.stdout.split()
+            return Python(executable, (3, int(minor)), True)
+    return None
+
+
+class Machine(LocalShell):
+    """This computer as a machine: another home and Python, and no network if asked for."""
+
+    def __init__(self, home: Path, python: Python, offline: bool) -> None:
+        super().__init__(Endpoint('local'), name='m')
+        self.home, self.python, self.offline = home, python, offline
+
+    def run(self, command: Command, **options: Any) -> Result:
+        if command.argv[-1:] != ('probe',) and command.what != 'look at the machine':
+            words = ('env', f'HOME={self.home}', *command.argv)
+            words = ('unshare', '-n', *words) if self.offline else words
+            return super().run(dataclasses.replace(command, argv=words), **options)
+        text = super().run(command, **options).stdout
+        kept = [line for line in text.splitlines() if line.split(' ')[0] not in (
+            'python', 'home', 'ros', 'rmw', 'environment', 'cloud_launch', 'installed')]
+        return Result(0, '\n'.join([
+            *kept, f'home {self.home}',
+            f'python 3 {self.python.version[1]} 1 {self.python.path}']), '')
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize('offline', [False, True], ids=['own index', 'sent by the robot'])
+def test_machine_with_another_python_gets_ros(
+    packed: Wheels, tmp_path: Path, offline: bool,
+) -> None:
+    """From its package index, and where it reaches none, from the robot's."""
+    python = other_python()
+    if not packed.ros or python is None or os.geteuid() != 0:
+        pytest.skip('needs root, and another Python from 3.10 to 3.14 (FOGROS2_OTHER_PYTHON)')
+    install, note = bootstrap.ensure(
+        Machine(tmp_path, python, offline), UNDER, MachineSpec('m', 'ssh', bootstrap='pip'),
+        timeout=500)
+    assert note == 'ROS 2 installed by pip'
+    talk = ('import rclpy, std_msgs.msg as m; rclpy.init(); node = rclpy.create_node("n"); '
+            'node.create_publisher(m.String, "t", 1).publish(m.String(data="x")); print("done")')
+    assert subprocess.run(
+        [Path(install.command[0]).parent / 'python', '-c', talk], check=True, text=True,
+        capture_output=True, env={'HOME': str(tmp_path)}).stdout == 'done\n'
 
 
 def test_fogros2_is_unpacked_beside_a_ros_that_is_there(packed: Wheels, tmp_path: Path) -> None:

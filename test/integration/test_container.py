@@ -28,7 +28,8 @@ from fogros2.errors import (
     Unsupported,
 )
 from fogros2.model import Command, MachineState
-from fogros2.provider.container import ContainerProvider
+from fogros2.provider.container import ContainerProvider, filter_name, login_ids
+from fogros2.provider.container import machine as container_machine
 from fogros2.provider.container import root as container_root
 from fogros2.shell.ssh import SSHShell
 from fogros2.testing import ProviderContract
@@ -86,7 +87,7 @@ def test_nothing_of_this_computer_s_own_is_seen(cloud, tmp_path):
         shadow = said(shell, 'cat', '/etc/shadow', sudo=True)
         assert all(line.split(':')[1] == '*' for line in shadow.splitlines())
         people = [line for line in said(shell, 'cat', '/etc/passwd').splitlines()
-                  if 1000 <= int(line.split(':')[2]) < 65534]
+                  if int(line.split(':')[2]) >= 1000 and 'nobody' not in line]
         assert [line.split(':')[0] for line in people] == ['fog']
         assert os.uname().nodename not in said(shell, 'cat', '/etc/hosts').split()
 
@@ -310,7 +311,7 @@ def test_an_agent_that_waits_in_vain_ends_the_machine(cloud):
 
 @pytest.fixture
 def image(engine: str) -> Iterator[str]:
-    """Return an image without users or keys; its programs are this computer's, by mounts."""
+    """Return an image with one user and no key; its programs are this computer's, by mounts."""
     name = f'localhost/fogt{uuid.uuid4().hex[:8]}'
     archive = container_root.Archive()
     for folder in ('proc', 'sys', 'dev', 'tmp', 'etc/ssh', 'usr', 'root', 'home', 'var/mail'):
@@ -322,11 +323,14 @@ def image(engine: str) -> Iterator[str]:
         if os.path.exists(path):
             archive.file(path[1:], Path(path).read_bytes())
     archive.file('etc/passwd', b'root:x:0:0:root:/root:/bin/sh\n'
-                 b'sshd:x:102:65534::/run/sshd:/usr/sbin/nologin\n')
-    archive.file('etc/group', b'root:x:0:\nnogroup:x:65534:\n')
-    archive.file('etc/shadow', b'root:*:::::::\n', 0o600)
+                 b'sshd:x:102:65534::/run/sshd:/usr/sbin/nologin\n'
+                 b'worker:x:1000:1000::/home/worker:/bin/sh\n')
+    archive.file('etc/group', b'root:x:0:\nnogroup:x:65534:\nworker:x:1000:\n')
+    archive.file('etc/shadow', b'root:*:::::::\nworker:!:::::::\n', 0o600)
+    archive.folder('home/worker', 0o700, 1000)
+    archive.file('home/worker/own', b'', 0o600, 1000)
     archive.file('etc/sudoers', b'root ALL=(ALL:ALL) ALL\n', 0o440)
-    for service in ('sudo', 'other', 'useradd', 'chpasswd'):
+    for service in ('sudo', 'other', 'useradd', 'usermod', 'chpasswd'):
         archive.file(f'etc/pam.d/{service}', b''.join(
             b'%s sufficient pam_permit.so\n' % kind
             for kind in (b'auth', b'account', b'session', b'password')))
@@ -347,10 +351,11 @@ def test_an_image_gets_user_key_and_server_at_boot(image, cloud):
     with cloud.shell(machine) as shell:
         assert said(shell, 'hostname') == spec.name
         assert said(shell, 'pwd') == '/home/fog'
+        assert int(said(shell, 'id', '-u')) in login_ids.IDS
         assert said(shell, 'id', '-u', sudo=True) == '0'
         shell.put(b'kept', '~/file', mode=0o600)
     assert cloud.create(spec, token=machine.id.split(':')[2]) == machine.id
-    packet_filter = f'fogros2-{machine.id.split(":")[2]}'
+    packet_filter = filter_name(container_machine.directory(machine.id.split(':')[2]))
     assert cloud.traces().count(packet_filter) == 2
     cloud.provider.stop(machine.id)
     assert packet_filter not in cloud.traces()
@@ -360,6 +365,15 @@ def test_an_image_gets_user_key_and_server_at_boot(image, cloud):
     assert again.shell.host_key == machine.shell.host_key
     with cloud.shell(again) as shell:
         assert said(shell, 'cat', 'file') == 'kept'
+
+
+@pytest.mark.skipif(not os.path.islink('/bin'), reason='needs a system with a merged /usr')
+def test_user_of_an_image_gets_an_id_that_nobody_has(image, cloud):
+    with cloud.machine(options={'image': image, 'mounts': ['/usr'], 'user': 'worker'}) as (
+            _, shell):
+        number = said(shell, 'id', '-u')
+        assert int(number) in login_ids.IDS
+        assert said(shell, 'stat', '-c', '%u', 'own') == number
 
 
 def test_incomplete_image_is_reported(image, cloud):

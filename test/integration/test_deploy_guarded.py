@@ -173,7 +173,6 @@ def test_a_robot_that_comes_from_another_address_is_let_in(cloud, spec, monkeypa
 
 
 def test_end_of_a_machine_is_reported(cloud, spec, monkeypatch):
-    monkeypatch.setattr('fogros2.deploy.steps.arming.NOTICE_POLL_INTERVAL', 0.5)
     monkeypatch.setattr('fogros2.deploy.steps.watching.SILENCE', 2.5)
     launch = Launch()
     heard = []
@@ -188,6 +187,7 @@ def test_end_of_a_machine_is_reported(cloud, spec, monkeypatch):
         engine.call('kill', identity, what='take the machine away')
         wait_until(lambda: any(e['event'] == 'lost' for e in heard), timeout=25,
                    what='the loss')
+        assert not machine.reclaimed(0.0), 'it is gone, so nobody has to confirm a notice'
     finally:
         begin = time.monotonic()
         assert launch.down() == []

@@ -68,7 +68,7 @@ class First:
 
     def accounts(self) -> list[str]:
         """Return the accounts of guests on the machine, and their processes."""
-        return self.there('grep "^fog.*g2" /etc/passwd; ls /var/lib/fogros2; '
+        return self.there('grep "^fog.*g2" /etc/passwd; ls /var/lib/fogros2-guests; '
                           'for p in /proc/[0-9]*; do stat -c %U $p; done | grep "^fog.*g2"'
                           ).split()
 
@@ -123,7 +123,7 @@ def test_nodes_of_a_second_robot_end_with_its_heartbeat(
     host.launched.wait_for('I heard')  # the first robot's node there hears the second's too
     (account,) = {name for name in host.accounts() if ':' not in name}
     for script in ('cat /{0}/config.json', 'sudo -n true', 'kill -0 1', 'ls /home/*',
-                   'cat /run/fog*.guests.json', 'touch /var/lib/fogros2/x'):
+                   'cat /run/fog*.guests.json', 'touch /var/lib/fogros2-guests/x'):
         said = host.there(f"su -s /bin/sh -c '{script.format(AGENT_DIRECTORY)}' {account} "
                           '2>/dev/null && echo may')
         assert 'may' not in said, (script, said)
@@ -159,7 +159,7 @@ def test_workspace_is_in_the_home_of_the_guest(
     (prefix / 'lib/own/where').chmod(0o755)
     joined = join(first('delete').invited(second), str(prefix.parents[1]))
     joined.wait_for(f'/ws{prefix}/lib/own/where', timeout=120.0)
-    assert any('/var/lib/fogros2/fog' in line for line in joined.said), joined.text
+    assert any('/var/lib/fogros2-guests/fog' in line for line in joined.said), joined.text
     joined.wait_for('I heard')
 
 
@@ -261,8 +261,8 @@ def test_guest_of_an_ssh_host_gets_what_its_nodes_need(
         assert joined.ended() == 0, joined.text
         assert ros2('fog', 'revoke', name).returncode == 0
         wait_until(lambda: not computer.run(
-            'ls -d /sys/class/net/fog* /run/fog* /var/lib/fogros2 || :').stdout, timeout=60.0,
-            what='the guest and the VPN to be gone')
+            'ls -d /sys/class/net/fog* /run/fog* /var/lib/fogros2-guests || :').stdout,
+            timeout=60.0, what='the guest and the VPN to be gone')
         assert computer.run('grep -c ^fog.*g2 /etc/passwd || :').stdout == '0\n'
         deleted = ros2('fog', 'delete', '--yes', name)
         assert deleted.returncode == 0, deleted.stderr

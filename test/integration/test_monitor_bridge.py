@@ -32,9 +32,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, Imu
 from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 
-from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.errors import DeadlineExceeded
-from fogros2.model import DdsInterface
 from fogros2.waiting import wait_until
 from rigs import viewer as viewers
 from rigs.domains import taken
@@ -120,12 +118,8 @@ def client() -> None:
 
 
 @pytest.fixture
-def bench(client: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    vendor = CycloneDds()
-    path = tmp_path / 'dds.xml'
-    path.write_text(vendor.render([DdsInterface('lo')], []))
-    for key, value in vendor.environment(str(path), {}).items():
-        monkeypatch.setenv(key, value)
+def bench(client: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     with taken() as domain:
         monkeypatch.setenv('ROS_DOMAIN_ID', domain)
         made = Bench()

@@ -11,10 +11,9 @@ import subprocess
 import sys
 import threading
 
+from nav_msgs.srv import LoadMap
 import pytest
-
-pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
-from example_interfaces.srv import AddTwoInts
+from rcl_interfaces.srv import ListParameters as Sum
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
@@ -117,18 +116,18 @@ def test_first_answer_of_a_service_wins(bench):
 
     def slow(request, response):
         held.wait(30)
-        response.sum = -1
+        response.result.names = ['-1']
         return response
 
     def quick(request, response):
-        response.sum = request.a + request.b
+        response.result.names = [str(sum(map(int, request.prefixes)))]
         return response
 
-    bench.serve('a', AddTwoInts, slow)
-    bench.serve('b', AddTwoInts, quick)
+    bench.serve('a', Sum, slow)
+    bench.serve('b', Sum, quick)
     bench.start(['/plan'])
     bench.all_live()
-    assert bench.answer(bench.call(AddTwoInts, AddTwoInts.Request(a=2, b=3))).sum == 5
+    assert bench.answer(bench.call(Sum, Sum.Request(prefixes=['2', '3']))).result.names == ['5']
     held.set()
     bench.until(lambda: bench.rows()['a']['latency'] is not None, 'the late answer')
     assert [bench.rows()[name]['won'] for name in 'ab'] == [0, 1]
@@ -160,21 +159,21 @@ def test_reported_death_sends_the_request_on(bench):
             asked.append(name)
             if len(asked) == 3:
                 held.wait(30)
-            response.sum = 7
+            response.result.names = ['7']
             return response
         return answer
 
     for name in 'ab':
-        bench.serve(name, AddTwoInts, answer_of(name))
+        bench.serve(name, Sum, answer_of(name))
     bench.start(['/plan'], hedge_after=60_000)
     bench.all_live()
     # the first request goes to both: their latencies are not known
-    bench.answer(bench.call(AddTwoInts, AddTwoInts.Request()))
+    bench.answer(bench.call(Sum, Sum.Request()))
     bench.until(lambda: len(asked) == 2, 'two requests')
-    future = bench.call(AddTwoInts, AddTwoInts.Request())
+    future = bench.call(Sum, Sum.Request())
     bench.until(lambda: len(asked) == 3, 'a request')
     (bench.folder / 'first.events').write_text(f'died {asked[2]}\n')
-    assert bench.answer(future).sum == 7
+    assert bench.answer(future).result.names == ['7']
     assert len(set(asked[2:])) == 2
     held.set()
     bench.until(lambda: bench.rows()[asked[2]]['state'] == 'died', 'the state')
@@ -231,13 +230,13 @@ def test_outputs_without_stamps_come_from_one_replica(bench):
 
 
 def test_type_that_is_missing_here_is_one_error(bench, monkeypatch):
-    bench.serve('a', AddTwoInts, lambda request, response: response)
+    bench.serve('a', LoadMap, lambda request, response: response)
     # the robot lacks the package that the machines have
-    hidden = bench.folder / 'example_interfaces'
+    hidden = bench.folder / 'nav_msgs'
     hidden.mkdir()
     (hidden / '__init__.py').write_text('raise ImportError("no such package")')
     bench.start(['/plan'], first=[str(bench.folder)])
-    bench.said("/plan: its type 'example_interfaces/srv/AddTwoInts' can't be imported on the "
+    bench.said("/plan: its type 'nav_msgs/srv/LoadMap' can't be imported on the "
                'robot')
     bench.until(bench.rows, 'figures')
     assert ''.join(bench.lines).count("can't be imported") == 1
@@ -245,15 +244,15 @@ def test_type_that_is_missing_here_is_one_error(bench, monkeypatch):
 
 def test_different_types_are_reported_and_left_out(bench):
     def answer(request, response):
-        response.sum = 3
+        response.result.names = ['3']
         return response
 
-    bench.serve('a', AddTwoInts, answer)
+    bench.serve('a', Sum, answer)
     bench.start(['/plan'])
     bench.until(lambda: bench.rows() and bench.rows()['a']['state'] == 'live', 'the first one')
     bench.serve('b', SetBool, lambda request, response: response)
     bench.said('/plan: replicas have different types')
-    assert bench.answer(bench.call(AddTwoInts, AddTwoInts.Request())).sum == 3
+    assert bench.answer(bench.call(Sum, Sum.Request())).result.names == ['3']
     assert bench.rows()['b']['state'] == 'absent'
 
 

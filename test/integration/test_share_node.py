@@ -28,8 +28,6 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int32, String
 
-from fogros2.dds.cyclonedds import CycloneDds
-from fogros2.model import DdsInterface
 from fogros2.waiting import wait_until
 from fogros2_share.node import NAME
 from fogros2_share.wire import encode, Form
@@ -96,11 +94,7 @@ class Robot:
 @pytest.fixture
 def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Robot]]:
     """Return what makes a robot; their DDS stays on the loopback, in domains of their own."""
-    vendor = CycloneDds()
-    path = tmp_path / 'dds.xml'
-    path.write_text(vendor.render([DdsInterface('lo')], []))
-    for key, value in vendor.environment(str(path), {}).items():
-        monkeypatch.setenv(key, value)
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     # a path of a socket is short
     fleet = Path(tempfile.mkdtemp(prefix='fogt'))
     with contextlib.ExitStack() as undo:

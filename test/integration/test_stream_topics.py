@@ -90,8 +90,8 @@ try:
 finally:
     both = [one for one in seen if one in taken]
     traffic = 0
-    with open(os.environ['CYCLONEDDS_URI'].rpartition('file://')[2]) as file:
-        interface = re.search('fog[0-9a-f]{6}', file.read())[0]
+    # .../launches/ID/dds.xml
+    interface = 'fog' + os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'].split('/')[-2]
     for way in ('rx', 'tx'):
         with open(f'/sys/class/net/{interface}/statistics/{way}_bytes') as file:
             traffic += int(file.read())

@@ -70,7 +70,7 @@ def rsyncs() -> list[str]:
 def test_both_ways_make_the_folder_equal(shell, source, tmp_path, monkeypatch, bulk):
     if bulk:
         monkeypatch.setattr(sync, 'BULK', 1000)
-        monkeypatch.delattr(relay, 'remote_shell')  # it has to do without
+        monkeypatch.delattr(relay, 'relay')  # it has to do without
     else:
         monkeypatch.delattr(sync, 'open_ssh')
     target = tmp_path / 'sync-target'

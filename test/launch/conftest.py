@@ -33,6 +33,8 @@ class FakeMachine:
         self.signals = []
         self.answers = True
         self.exits_on_stop = True
+        #: Whether the provider confirms a notice.
+        self.confirms = True
         self.pids = iter(range(4001, 5000))
 
     def start(self, nodes):
@@ -53,6 +55,10 @@ class FakeMachine:
             for node in self.all:
                 if node.id in ids:
                     self.say('exited', node, returncode=-2, respawns=False)
+
+    def reclaimed(self, timeout):
+        self.launch.note('reclaimed', self.spec.name, timeout)
+        return self.confirms
 
     def end(self, reason):
         self.launch.note('end', self.spec.name, reason)

@@ -163,6 +163,26 @@ def test_interrupted_machine_ends_the_launch_by_default(run, fake, talker, watch
     assert 'says-' in errors[1] and len(errors) == 2, 'the node was ended, by SIGINT'
 
 
+def test_notice_that_the_provider_denies_ends_nothing(run, fake, talker, watch, capfd):
+    """A node can forge it; the launch ends when the machine is gone."""
+    machine = ContainerInstance(name='planner', ros_workspace='')
+
+    def forged(event):
+        fake.machines['planner'].confirms = False
+        return says(fake, 'notice', reason=REASON)(event)
+
+    def later(context):
+        context.asyncio_loop.call_later(
+            0.3, lambda: fake.machines['planner'].say('lost', reason='it was deleted'))
+
+    watch.at_start = {1: lambda event: [*forged(event), OpaqueFunction(function=later)]}
+    assert run(LaunchDescription([*watch(), talker(machine=machine)])) == 1
+    assert "the machine 'planner' is gone: it was deleted" in watch.shutdowns[0]
+    assert watch.interrupted == [('planner', 'it was deleted', True)]
+    assert [note[1] for note in fake.noted('reclaimed')] == [0.0, 150.0]
+    assert 'its provider has not confirmed' in capfd.readouterr().out
+
+
 def test_lost_machine_ends_the_launch_by_default(run, fake, talker, watch, capfd):
     machine = ContainerInstance(name='planner', ros_workspace='')
     watch.at_start = {1: says(fake, 'lost', reason='it was deleted')}

@@ -11,8 +11,10 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import (
     DeclareLaunchArgument,
     EmitEvent,
+    GroupAction,
     IncludeLaunchDescription,
     RegisterEventHandler,
+    TimerAction,
 )
 from launch.conditions import IfCondition
 from launch.event_handlers import OnProcessStart
@@ -129,6 +131,15 @@ def test_node_runs_on_its_machine(run, fake, planner, cls):
     assert run.context.environment['RMW_IMPLEMENTATION'] == 'rmw_cyclonedds_cpp'
 
 
+def test_timed_node_has_namespace_and_remappings_of_its_group(run, fake, planner):
+    fake.on_start = ends
+    assert run(LaunchDescription([GroupAction([
+        launch_ros.actions.PushROSNamespace('front'), launch_ros.actions.SetRemap('a', 'b'),
+        TimerAction(period=0.05, actions=[node(machine=planner)])])])) == 0
+    [sent] = fake.machines['planner'].all
+    assert {'__ns:=/front', 'a:=b'} <= {*sent.arguments}
+
+
 @pytest.mark.parametrize('name', [
     'planner', LaunchConfiguration('which'), ['plan', LaunchConfiguration('half')]])
 def test_a_machine_is_named_by_text_or_substitution(run, fake, planner, name):
@@ -234,6 +245,8 @@ def fogros_launch(text):
     '<node_container machine="planner" pkg="demo" exec="talker" exec_name="one" name="box" '
     'namespace=""><composable_node pkg="demo" plugin="demo::View" name="view" if="false"/>'
     '</node_container>',
+    '<lifecycle_node machine="planner" pkg="demo" exec="talker" exec_name="one" name="box" '
+    'namespace="" autostart="false"/>',
 ])
 def test_machine_on_an_element_anywhere_below(run, fake, text):
     fake.on_start = ends

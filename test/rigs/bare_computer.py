@@ -87,8 +87,9 @@ def bare_computer(
                          '-f', str(key))), timeout=30.0)
     archive = container_root.Archive()
     container_entry.add(
-        archive, user=USER, authorized_key=key.with_suffix('.pub').read_text(),
+        archive, user=USER, number=1000, authorized_key=key.with_suffix('.pub').read_text(),
         environment={}, agent_config={})
+    container_root.accounts(archive, USER, 1000)
     engine = container_engine.named('podman')
     words = [
         '--rm', '--name', name, '--hostname', name, '--network', network, '--no-hosts',
@@ -104,7 +105,7 @@ def bare_computer(
         undo.callback(process.run, Command(('rm', '-rf', '--', str(root)), sudo=True), timeout=60)
         process.run(Command(
             ('sh', '-ec', 'mkdir "$1"; tar -xpf - --numeric-owner -C "$1"', 'sh', str(root)),
-            sudo=True, input=container_root.skeleton(USER) + archive.data(),
+            sudo=True, input=container_root.skeleton() + archive.data(),
             what='make a root'), timeout=60.0)
         undo.callback(engine.call, 'rm', '-f', '-t', '0', name, what='remove a computer',
                       check=False)

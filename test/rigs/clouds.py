@@ -62,8 +62,9 @@ class Cloud(abc.ABC):
     announced: ClassVar[str]
     #: The most requests of a listing over all regions.
     listing: ClassVar[int]
-    #: Actions of requests that create something.
+    #: Actions of requests that create something, and the pattern of the one for a machine.
     creating: ClassVar[frozenset[str]]
+    order: ClassVar[str]
     #: Refusals that stay: code, the other words of ``box.fail``, and words of the message.
     refusals: ClassVar[Sequence[tuple[str, Mapping[str, Any], str]]]
     #: Mistakes of a user: words of the message, launch arguments, variables.
@@ -207,6 +208,7 @@ class Aws(Cloud):
     elsewhere, announced = 'eu-central-1', 'an EC2 instance'
     listing = 36  # the regions, and one request for each
     creating = frozenset({'RunInstances', 'ImportKeyPair', 'CreateSecurityGroup'})
+    order = 'Action=RunInstances'
     refusals = (
         ('InsufficientInstanceCapacity', {'action': 'RunInstances'}, 't3.medium'),
         ('UnauthorizedOperation', {'action': 'CreateSecurityGroup'}, 'ec2:CreateSecurityGroup'),
@@ -335,6 +337,7 @@ class Gcp(Cloud):
     elsewhere, announced, checked = 'europe-west3', '', 'gcp: project robots, us-central1'
     listing = 1
     creating = frozenset({'instances.insert', 'firewalls.insert'})
+    order = '^POST .*/instances '
     refusals = (
         ('QUOTA_EXCEEDED', {'action': 'instances.insert'}, 'Quotas'),
         ('forbidden', {'action': 'firewalls.insert'}, 'doc/gcp.md'),
@@ -440,6 +443,7 @@ class Azure(Cloud):
     elsewhere, announced = 'eastus', 'a resource group'
     listing = 2
     creating = frozenset({'PUT'})
+    order = '^PUT .*/virtualMachines/[^/]* '
     refusals = (
         ('QuotaExceeded', {'method': 'PUT', 'kind': 'virtualMachines'}, 'quota'),
         ('AuthorizationFailed', {'status': 403, 'method': 'PUT', 'kind': 'resourceGroups'},

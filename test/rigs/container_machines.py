@@ -75,12 +75,13 @@ class Cloud:
 
         mounts = Path('/proc/self/mountinfo').read_text()
         parts = [machine_id.split(':') for machine_id in self.ids]
+        folders = [container_machine.directory(p[2]).name for p in parts]
         return [
             *(n for n in lines('podman', 'ps', '-a', '--format', '{{.Names}}')
               if n in [f'fogros2-{name}' for name in self.names]),
-            *(t for t in lines('ls', str(container_machine.ROOTS)) if t in [p[2] for p in parts]),
+            *(t for t in lines('ls', str(container_machine.ROOTS)) if t in folders),
             *(t for t in lines('nft', 'list', 'tables')
-              if t in [f'fogros2-{p[2]}' for p in parts]),
+              if t in [f'fogros2-{name}' for name in folders]),
             *(p[1] for p in parts if p[1] in mounts)]
 
     def create(self, spec: MachineSpec, **changes: object) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import threading
 from typing import Any
 
-from fogros2.dds.cyclonedds import CycloneDds
+from fogros2.dds.fastdds import FastDds
 from fogros2.deploy.choosing import Choices
 from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob
@@ -44,6 +44,6 @@ def job(
         'vpn': RobotVpn(ROBOT, FakeVpn(), report=report, undo=UndoStack(report, '', failures),
                         timeout=30.0, cancel=cancel, ending=ending,
                         choose_port=addresses.choose_port),
-        'dds': CycloneDds(), **changes}
+        'dds': FastDds(), **changes}
     context = Context(**fields)
     return context, MachineJob(context, spec)

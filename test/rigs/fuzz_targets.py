@@ -22,7 +22,7 @@ from typing import Any, cast, Optional
 
 import numpy
 
-from fogros2 import agent_client, events
+from fogros2 import agent_client, events, untrusted
 from fogros2.agent import protocol
 from fogros2.agent_client import connection
 from fogros2.dds.cyclonedds import CycloneDds
@@ -34,8 +34,8 @@ from fogros2_examples.lidar import message
 from fogros2_monitor import request as gate
 from fogros2_monitor.dashboard import server as dashboard
 from fogros2_replicas.pairs import header_of
-from image_transport_h264 import repair, stills
 from image_transport_h264 import message as images
+from image_transport_h264 import repair, stills
 from image_transport_h264.cdr import CdrError, Header
 from image_transport_h264.codec import Decoder, Encoder, Picture
 from image_transport_h264.picture import CodecError
@@ -159,11 +159,13 @@ def _agent_messages() -> Iterator[Target]:
     commands = sorted({command for command, _ in recorded_agent.answers()})
 
     def read(data: bytes) -> None:
-        message = dict(connection._parsed(data) or {})
+        message: dict[str, Any] = {}
+        with contextlib.suppress(untrusted.InvalidMessage):
+            message = connection._parsed(data)
         for command in commands:
-            with contextlib.suppress(events.InvalidMessage):
+            with contextlib.suppress(untrusted.InvalidMessage):
                 events.answer(command, dict(message))
-        with contextlib.suppress(events.InvalidMessage):
+        with contextlib.suppress(untrusted.InvalidMessage):
             events.event(message)
     yield Target(valid, read, ())
 

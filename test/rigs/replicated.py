@@ -20,44 +20,46 @@ BETWEEN = 60
 SERVER = f"""
 import os, sys, time
 import rclpy
-from example_interfaces.srv import AddTwoInts
+from rcl_interfaces.srv import ListParameters
 
 def answer(request, response):
     time.sleep({TAKES})
-    if request.b == number:
+    called, dies = map(int, request.prefixes)
+    if dies == number:
         print(f'dies at {{time.monotonic()}}', flush=True)
         os._exit(1)
-    response.sum = request.a * 100 + number
+    response.result.names = [str(called), str(number)]
     return response
 
 rclpy.init()
 node = rclpy.create_node('planner')
 number = int(os.uname().nodename.rpartition('-')[2])
-node.create_service(AddTwoInts, 'plan', answer)
+node.create_service(ListParameters, 'plan', answer)
 rclpy.spin(node)
 """
 
 CLIENT = f"""
 import time
 import rclpy
-from example_interfaces.srv import AddTwoInts
+from rcl_interfaces.srv import ListParameters
 
 rclpy.init()
 node = rclpy.create_node('client')
-client = node.create_client(AddTwoInts, '/plan')
+client = node.create_client(ListParameters, '/plan')
 client.wait_for_service()
 number = by = 0
 while rclpy.ok():
     number += 1
     dies = by if number % {BETWEEN} == 0 else -1
     begin = time.monotonic()
-    future = client.call_async(AddTwoInts.Request(a=number, b=dies))
+    future = client.call_async(ListParameters.Request(prefixes=[str(number), str(dies)]))
     rclpy.spin_until_future_complete(node, future, timeout_sec=30)
     taken = time.monotonic() - begin
-    if not future.done() or future.result().sum // 100 != number:
+    answer = future.result().result.names if future.done() else []
+    if answer[:1] != [str(number)]:
         print(f'call {{number}} is lost', flush=True)
         continue
-    by = future.result().sum % 100
+    by = int(answer[1])
     print(f'call {{number}} by {{by}}: {{1e3 * taken:.1f}} ms', flush=True)
     if dies >= 0:
         # the one that died took as long before it did

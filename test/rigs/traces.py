@@ -2,9 +2,9 @@
 """
 What launches leave on this computer, told from what others do on it at the same time.
 
-A trace is taken for this run's if it carries the id of a launch, or the token of a machine, that a
-state folder of this run has known while a test ran, or if it is among the run's own files or comes
-from a process of its own. So another run of tests, or the user's own robot, disturbs nobody.
+A trace is taken for this run's if it carries the id of a launch, or the folder of a machine, that
+a state folder of this run has known while a test ran, or if it is among the run's own files or
+comes from a process of its own. So another run of tests, or the user's own robot, disturbs nobody.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ import re
 import threading
 from typing import Any
 
-from fogros2.errors import DeadlineExceeded
+from fogros2.errors import DeadlineExceeded, MachineNotFound
 from fogros2.model import Command
 from fogros2.process import run, which
+from fogros2.provider.container.machine import directory
 from fogros2.waiting import wait_until
 
 #: Variable by which a process is known to come from a run of tests; its value is the run's own.
@@ -47,7 +48,7 @@ class Trace:
     Something that a launch may leave behind.
 
     :param what: a line for people.
-    :param marks: ids of launches and tokens of machines that it carries.
+    :param marks: ids of launches and folders of machines that it carries.
     :param ours: whether it is this run's, whatever it carries.
     """
 
@@ -188,7 +189,8 @@ class _Container:
 
     @property
     def trace(self) -> Trace:
-        return Trace(f'container {self.name}', frozenset({self.launch, self.token} - {''}))
+        return Trace(
+            f'container {self.name}', frozenset({self.launch, _folder(self.token)} - {''}))
 
     def is_among(self, files: Path) -> bool:
         """Return whether it is a computer among a test's own files, such as an SSH machine."""
@@ -278,8 +280,17 @@ def _known(folder: Path) -> set[str]:
             told = json.loads((path / 'record.json').read_text())
         except (OSError, ValueError):
             continue
-        marks |= {told[key] for key in ('launch', 'last', 'token') if told.get(key)}
+        marks |= {told[key] for key in ('launch', 'last') if told.get(key)}
+        marks |= {_folder(told.get('token', ''))} - {''}
     return marks
+
+
+def _folder(token: str) -> str:
+    """Return the name of the folder of the container machine with a token, '' for no token."""
+    try:
+        return directory(token).name
+    except MachineNotFound:
+        return ''
 
 
 def _listed(folder: Path) -> list[Path]:

@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip('zstandard', reason='the extra "point_clouds" is not installed')
 from point_cloud_stream import codec
 from point_cloud_stream.cloud import Field, Layout, MAX_BYTES
+from point_cloud_stream.numbers import Writer
 
 #: Bytes that decoding may take.
 LIMIT = 300e6
@@ -72,3 +73,37 @@ def test_absurd_sizes_are_refused_before_memory_is_taken(
     struct.pack_into('<IIII', data, 13, height, width, point_step, row_step)
     taken, said = decode(tmp_path, bytes(data))
     assert not said.isdecimal() and taken < 20e6, (taken, said)
+
+
+def zeros(height: int, width: int) -> bytes:
+    """Return a range image of points that are all odd, at zero; most columns take no bytes."""
+    layout = Layout(height, width, FIELDS, 12, 12 * width)
+    out = Writer()
+    out.differences(numpy.zeros((layout.points + 7) // 8, numpy.uint8))
+    for count in (*3 * (layout.points,), width, height, height, *4 * (0,)):
+        out.differences(numpy.zeros(count, '<i4'))
+    return codec._HEAD.pack(codec.MAGIC, codec.LIDAR, 0.01) + layout.pack() + out.data()
+
+
+@pytest.mark.parametrize(('height', 'width'), [(1 << 25, 0), (0, 1 << 25), (1 << 25, 1)])
+def test_lines_without_points_are_refused(tmp_path: Path, height: int, width: int) -> None:
+    data = zeros(height, width)
+    assert len(data) < 10_000
+    taken, said = decode(tmp_path, data)
+    assert said == 'more points or bytes than allowed' and taken < 20e6, (taken, said)
+
+
+@pytest.mark.parametrize(('height', 'width'), [
+    (MAX_BYTES // 12, 1), (1, MAX_BYTES // 12), (MAX_BYTES // 12, 0), (0, MAX_BYTES // 12),
+    (1672, 1672)])
+def test_any_allowed_shape_stays_below_the_limit(
+    tmp_path: Path, height: int, width: int,
+) -> None:
+    taken, said = decode(tmp_path, zeros(height, width))
+    assert int(said) == 12 * height * width and taken < LIMIT, (taken, said)
+
+
+def test_empty_cloud_is_a_cloud(tmp_path: Path) -> None:
+    """Nodes publish a cloud without points when they see nothing."""
+    data = codec.encode(Layout(1, 0, FIELDS, 12, 0), b'', 0.01).data
+    assert decode(tmp_path, data)[1] == '0'

@@ -3,14 +3,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 import sys
 
+from fogros2.model import Command
+from fogros2.vpn import guests
 from fogros2.vpn.addresses import guest_heartbeats, GUEST_PORT
 from fogros2.waiting import wait_until
+from rigs.container_machines import Cloud, cloud, cloud_network, engine, key
 from rigs.vpn_guest import GUEST, Guest, guest
 from rigs.vpn_lab import Child, Lab, MACHINE, ROBOT
 
-__all__ = ['guest']
+__all__ = ['cloud', 'cloud_network', 'engine', 'guest', 'key']
 
 #: Prints what arrives at its arguments, KIND:HOST:PORT.
 LISTENER = '''
@@ -47,6 +51,35 @@ PORTS = ['tcp:0.0.0.0:22', 'tcp:0.0.0.0:8765', 'udp:0.0.0.0:7399', 'udp:0.0.0.0:
 DDS = 'udp:0.0.0.0:7410'
 #: What a guest reaches besides DDS: the door, and the port for its heartbeats.
 OWN = [f'tcp:0.0.0.0:{GUEST_PORT}', f'udp:0.0.0.0:{guest_heartbeats(GUEST)}']
+#: Gives a guest an account, whose program leaves files; ends it, and gives another one. Prints
+#: the ids of both.
+ACCOUNTS = """
+import os, pwd, socket, subprocess, sys, types
+guests = types.ModuleType('guests')
+exec(compile(sys.stdin.read(), 'guests', 'exec'), guests.__dict__)
+LEAVE = '''
+import os, shutil, sys
+for folder in sys.argv[1:]:
+    os.mkdir(folder + '/of a guest')
+    shutil.copy('/usr/bin/id', folder + '/of a guest')
+    os.chmod(folder + '/of a guest/id', 0o6755)
+'''
+FOLDERS = ['/run/lock', '/tmp', '/dev/shm', '/srv/any body']
+os.mkdir(FOLDERS[-1])
+os.chmod(FOLDERS[-1], 0o1777)
+door = types.SimpleNamespace(agent='', request={'machine': 'm', 'shell': 'pass'})
+ids = []
+for _ in range(2):
+    here, there = socket.socketpair()
+    guests.Door.begin(door, there, 'fogabc123m0g224').wait()
+    found = pwd.getpwnam('fogabc123m0g224')
+    ids.append(found.pw_uid)
+    if len(ids) == 1:
+        subprocess.run([sys.executable, '-c', LEAVE, *FOLDERS], user=found.pw_uid,
+                       group=found.pw_gid, extra_groups=(), check=True)
+    guests.evict('fogabc123m0g224')
+print(*ids)
+"""
 #: Seconds in which WireGuard makes a second attempt at a handshake.
 ATTEMPTS = 6.0
 
@@ -133,3 +166,16 @@ def test_changed_peers_and_repairs_keep_the_guest(vpn: Lab, guest: Guest) -> Non
         assert vpn.ping('guest', MACHINE, timeout=5.0)
     vpn.do('machine', vpn.vpn.down(interface))
     assert vpn.shell('machine', f'ls /run/{interface.name}.* || :') == ''
+
+
+def test_next_guest_owns_no_file_of_a_former_one(cloud: Cloud) -> None:
+    """Both have an account on a machine, at the same address of the VPN."""
+    with cloud.machine() as (_, shell):
+        said = shell.run(Command(
+            ('python3', '-c', ACCOUNTS), sudo=True, input=Path(guests.__file__).read_bytes()),
+            timeout=60.0).stdout
+        wait_until(lambda: not shell.run(Command(
+            ('find', '/', '/dev/shm', '-xdev', '-name', '*of a guest*'), sudo=True),
+            timeout=60.0).stdout, timeout=60.0, what='all files of the guest to be gone')
+    first, second = map(int, said.split())
+    assert first != second and first in guests.IDS and second in guests.IDS

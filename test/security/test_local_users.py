@@ -8,6 +8,8 @@ The account is ``nobody``: it owns nothing and belongs to no group.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import http.client
 import os
 from pathlib import Path
 import re
@@ -16,16 +18,24 @@ import socket
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
+import urllib.parse
+
+import pytest
 
 from fogros2 import process
 from fogros2.model import Command
 from fogros2.shell import relay
 from fogros2.testing.fakes import FakeShell
+from fogros2.vpn.guests import Door
+from fogros2.waiting import wait_until
+from fogros2_monitor import accounts
 from fogros2_monitor.dashboard.server import Dashboard
 from fogros2_monitor.gate import Gate
 from fogros2_monitor.tunnel import Tunnel
 from rigs import loops
 from rigs.stranger import stranger
+from ros2fog_cli.api.browser import Ticket
 
 ROOT = Path(__file__).resolve().parents[2]
 #: The helper's folder, as an older version left it or not there yet, is opened by another account
@@ -77,10 +87,43 @@ finally:
     os.kill(child, signal.SIGKILL)
     shutil.rmtree(top)
 """
+#: Root makes a name a user's own; the launch ends, and another process gets its id. Prints what
+#: the helper says to the requests that concern this process, and what it does for them.
+REUSED = """\
+import importlib.util, os, shutil, subprocess, sys, tempfile
+from pathlib import Path
+spec = importlib.util.spec_from_file_location('vpn_helper', sys.argv[1])
+vpn = sys.modules['vpn_helper'] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(vpn)
+top = Path(tempfile.mkdtemp(dir='/run'))
+vpn.RECORDS = top / 'records'
+vpn.prepare()
+vpn.run = lambda commands: print('root acts on', launch.pid)
+launch = subprocess.Popen(['sleep', '60'])
+try:
+    vpn.claim('fog0a1b2c', 0, launch.pid)
+    request = {'name': 'fog0a1b2c', 'network': '198.18.7.0/24', 'address': '198.18.7.1',
+               'port': 51820, 'domain': 0, 'ports': [], 'asked': [], 'peers': []}
+    vpn.up(request, 0)
+    launch.kill(), launch.wait()
+    Path('/proc/sys/kernel/ns_last_pid').write_text(str(launch.pid - 1))
+    other = subprocess.Popen(['sleep', '60'])
+    assert other.pid == launch.pid
+    for verb in 'up', 'peers', 'repair':
+        try:
+            vpn.VERBS[verb](request, 0)
+        except vpn.Refused as error:
+            print(error)
+    other.kill(), other.wait()
+finally:
+    shutil.rmtree(top)
+"""
+#: The loopback interface for sockets of both address families.
+FAMILIES = pytest.mark.parametrize('address', ['127.0.0.1', '::ffff:127.0.0.1'])
 #: Opens many connections to a port of the loopback, and counts those that the server closes.
 MANY = """\
 import socket
-links = [socket.create_connection(('127.0.0.1', int(sys.argv[1]))) for _ in range(150)]
+links = [socket.create_connection((sys.argv[2], int(sys.argv[1]))) for _ in range(150)]
 closed = 0
 for link in links:
     link.settimeout(10)
@@ -92,6 +135,24 @@ for link in links:
         break
 print(closed, flush=True)
 sys.stdin.read()
+"""
+#: Asks a port of the loopback for a page, and says what it answered.
+ASK = """\
+import socket
+link = socket.create_connection((sys.argv[2], int(sys.argv[1])), 10)
+try:
+    link.sendall(f'GET {sys.argv[3]} HTTP/1.0\\r\\n\\r\\n'.encode())
+    print(link.recv(1000), flush=True)
+except ConnectionError:
+    print(b'', flush=True)
+"""
+#: Opens a connection, and closes its socket at once.
+LEAVE = """\
+import socket
+link = socket.create_connection((sys.argv[2], int(sys.argv[1])), 10)
+link.sendall(b'GET / HTTP/1.0\\r\\n\\r\\n')
+link.close()
+print('left', flush=True)
 """
 
 
@@ -132,6 +193,17 @@ def test_the_vpn_helper_waits_for_a_lock_until_a_deadline(root: None) -> None:
     assert 'another process has held' in helper('new', 'stays')
 
 
+def test_vpn_helper_knows_a_process_id_that_was_used_again(root: None) -> None:
+    if not Path('/proc/sys/kernel/ns_last_pid').exists():
+        pytest.skip('needs a kernel that lets root choose the next process id')
+    said = process.run(Command((
+        'unshare', '--pid', '--fork', '--mount-proc', sys.executable, '-I', '-c', REUSED,
+        str(ROOT / 'packaging/vpn_helper/vpn.py')), sudo=True), timeout=30.0).stdout
+    first, *others = said.splitlines()
+    assert first.startswith('root acts on') and len(others) == 3
+    assert all(line.endswith('has ended') for line in others), said
+
+
 def test_a_stopped_terminal_does_not_stop_the_vpn_helper(root: None) -> None:
     """A user's terminal sends SIGTSTP to root's programs too."""
     code = ('import importlib.util, os, signal, sys\n'
@@ -149,21 +221,25 @@ def test_a_stopped_terminal_does_not_stop_the_vpn_helper(root: None) -> None:
 
 def test_no_account_can_connect_to_a_sync() -> None:
     """Its socket has no name; rsync's remote shell inherits it."""
-    with relay.remote_shell(lambda line: Said()) as (rsh, inherited, failures):
+    with relay.remote_shell(lambda line, *streams: relay.relay(Said(), *streams)) \
+            as (variables, inherited, failures):
         # a test that runs beside this one holds its DDS domain by a name of its own
         named = re.findall('@fogros2(?!-test-domain).*', Path('/proc/net/unix').read_text())
         assert named == []
         # as rsync starts it
-        done = subprocess.run([*shlex.split(rsh), 'machine', 'rsync', '--server'], timeout=10,
-                              stdin=subprocess.DEVNULL, capture_output=True, pass_fds=inherited)
+        done = subprocess.run(
+            [*shlex.split(relay.RSH), 'machine', 'rsync', '--server'], timeout=10,
+            stdin=subprocess.DEVNULL, capture_output=True, pass_fds=inherited,
+            env={**os.environ, **variables})
     assert (done.stdout, done.returncode, failures) == (b'from the machine\n', 7, [])
 
 
-def test_no_account_takes_up_the_dashboard_s_threads(root: None) -> None:
+@FAMILIES
+def test_no_account_takes_up_the_dashboard_s_threads(root: None, address: str) -> None:
     dashboard = Dashboard(None)  # type: ignore[arg-type]
     threading.Thread(target=dashboard.serve, daemon=True).start()
     before = threading.active_count()
-    with stranger(MANY, str(dashboard.port)) as child:
+    with stranger(MANY, str(dashboard.port), address) as child:
         assert child.stdout and child.stdout.readline() == b'150\n'
         assert threading.active_count() == before
         with socket.create_connection(('127.0.0.1', dashboard.port)) as own:
@@ -172,23 +248,25 @@ def test_no_account_takes_up_the_dashboard_s_threads(root: None) -> None:
     dashboard.close()
 
 
-def test_no_account_starts_programs_through_the_tunnel(root: None) -> None:
+@FAMILIES
+def test_no_account_starts_programs_through_the_tunnel(root: None, address: str) -> None:
     shell = FakeShell(streams=[])
     made = Tunnel(shell, ('127.0.0.1', 9))
     threading.Thread(target=made.serve, daemon=True).start()
-    with stranger(MANY, str(made.port)) as child:
+    with stranger(MANY, str(made.port), address) as child:
         assert child.stdout and child.stdout.readline() == b'150\n'
     assert shell.opened == []
     made.close()
 
 
-def test_no_account_takes_up_the_gate_s_connections(root: None) -> None:
+@FAMILIES
+def test_no_account_takes_up_the_gate_s_connections(root: None, address: str) -> None:
     async def knock() -> bytes:
         listener = socket.create_server(('127.0.0.1', 0))
         listener.setblocking(False)
         port = listener.getsockname()[1]
         serving = asyncio.ensure_future(Gate(('127.0.0.1', 9), 'token').serve(listener))
-        with stranger(MANY, str(port)) as child:
+        with stranger(MANY, str(port), address) as child:
             assert child.stdout
             closed = await asyncio.to_thread(child.stdout.readline)
             assert closed == b'150\n'
@@ -200,3 +278,70 @@ def test_no_account_takes_up_the_gate_s_connections(root: None) -> None:
         return answer
 
     assert loops.run(knock()).startswith(b'HTTP/1.1 401 ')
+
+
+@FAMILIES
+def test_no_account_takes_up_the_door_for_guests(
+    root: None, address: str, tmp_path: Path,
+) -> None:
+    (tmp_path / 'guests').write_text('[]')
+    door = Door(SimpleNamespace(state=tmp_path / 'guests'),  # type: ignore[arg-type]
+                {'address': '127.0.0.1', 'port': 0, 'agent': __file__})
+    threading.Thread(target=door.serve_forever, daemon=True).start()
+    with stranger(MANY, str(door.server_address[1]), address) as child:
+        assert child.stdout and child.stdout.readline() == b'150\n'
+    door.shutdown()
+    door.server_close()
+
+
+@FAMILIES
+def test_no_account_gets_the_page_of_a_browser(root: None, address: str) -> None:
+    """Every account can read the ticket on the command line of the browser."""
+    with contextlib.closing(Ticket('http://127.0.0.1:9/#token')) as ticket:
+        place = urllib.parse.urlsplit(ticket.url)
+        with stranger(ASK, str(place.port), address, place.path) as child:
+            assert child.stdout and child.stdout.readline() == b"b''\n"
+        # the ticket is not used up either
+        with contextlib.closing(http.client.HTTPConnection(place.netloc, timeout=10)) as own:
+            own.request('GET', place.path)
+            assert own.getresponse().getheader('Location') == 'http://127.0.0.1:9/#token'
+
+
+def unowned(link: socket.socket) -> bool:
+    """Return whether the kernel lists a client's socket without its account."""
+    ports = [f':{name[1]:04X}' for name in (link.getpeername(), link.getsockname())]
+    lines = [line.split() for table in ('tcp', 'tcp6')
+             for line in Path('/proc/net', table).read_text().splitlines()[1:]]
+    return ['0'] == [fields[7] for fields in lines
+                     if all(map(str.endswith, fields[1:3], ports))]
+
+
+@FAMILIES
+def test_closed_socket_of_an_account_is_foreign(root: None, address: str) -> None:
+    """The kernel lists a closed socket as root's."""
+    with socket.create_server(('127.0.0.1', 0)) as listener:
+        with stranger(LEAVE, str(listener.getsockname()[1]), address) as child:
+            assert child.stdout and child.stdout.readline() == b'left\n'
+        with listener.accept()[0] as link:
+            wait_until(lambda: unowned(link), timeout=10.0, what='the last ACK')
+            assert accounts.is_foreign(link)
+
+
+@pytest.mark.parametrize(('peer', 'foreign'), [
+    (('127.0.0.1', 1), True), (('127.3.2.1', 1), True), (('::1', 1, 0, 0), True),
+    (('::ffff:127.0.0.1', 1, 0, 0), True), (('198.51.100.7', 1), False),
+    (('::ffff:198.51.100.7', 1, 0, 0), False), (('2001:db8::7', 1, 0, 0), False)])
+def test_unlisted_client_is_foreign_on_this_computer(
+    peer: tuple[str, int], foreign: bool,
+) -> None:
+    """The gate serves computers of the VPN too, whose accounts are unknown here."""
+    link = SimpleNamespace(getpeername=lambda: peer, getsockname=lambda: peer)
+    assert accounts.is_foreign(link) == foreign  # type: ignore[arg-type]
+
+
+@FAMILIES
+def test_own_client_is_not_foreign(address: str) -> None:
+    with socket.create_server(('127.0.0.1', 0)) as listener, \
+            socket.create_connection((address, listener.getsockname()[1])), \
+            listener.accept()[0] as link:
+        assert not accounts.is_foreign(link)

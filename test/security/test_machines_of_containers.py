@@ -15,6 +15,8 @@ import pytest
 
 from fogros2.model import Command
 from fogros2.process import run
+from fogros2.provider import container
+from fogros2.provider.container import machine as container_machine
 from fogros2.shell.ssh import SSHShell
 from fogros2.waiting import wait_until
 from rigs.container_machines import Cloud, cloud, cloud_network, engine, key
@@ -211,7 +213,8 @@ def test_started_machine_reaches_no_port_either(
         cloud: Cloud, robot: Robot, cloud_network: str) -> None:
     machine = cloud.reached(cloud.create(cloud.spec(on_exit='stop')))
     cloud.provider.stop(machine.id)
-    assert f'fogros2-{machine.id.split(":")[2]}' not in cloud.traces(), 'the filter stays'
+    name = container.filter_name(container_machine.directory(machine.id.split(':')[2]))
+    assert name not in cloud.traces(), 'the filter stays'
     cloud.provider.start(machine.id)
     with cloud.shell(cloud.reached(machine.id)) as shell:
         attack(robot, shell, cloud_network)

@@ -3,19 +3,31 @@
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Iterator
+import dataclasses
+import io
 import json
+import logging
+from pathlib import Path
 import queue
 import re
+import sys
 from typing import Any
 
 import pytest
 
+from fogros2 import report
 from fogros2.agent_client import AgentClient
-from fogros2.errors import CommandError
+from fogros2.errors import CommandError, FogError, ShellError
+from fogros2.host.checkpoint import Checkpoint
 from fogros2.model import Command, Result
-from fogros2.shell import command_line, lines
+from fogros2.shell import command_line, sync
+from fogros2.testing import FakeShell
 from fogros2.waiting import wait_until
-from ros2fog_cli.verb import logs
+from ros2fog_cli.api import output, progress, table
+from ros2fog_cli.command.fog import FogCommand
+from ros2fog_cli.verb import logs, VerbExtension, warn
 
 #: Writes the clipboard, sets the title, clears the screen, types an answer, moves up, hides text
 #: by its direction; in 8-bit form; overwrites the line; a lone surrogate.
@@ -99,15 +111,91 @@ def test_a_machine_cannot_overwrite_the_name_of_its_node(
     assert capsys.readouterr().out == '[talker] 10 %\n[talker] 20 %\n'
 
 
-@pytest.mark.parametrize('attack', ATTACKS[:-1])
-def test_no_output_of_a_command_controls_the_terminal(attack: str) -> None:
-    said: list[str] = []
-    output = lines.Output(said.append)
-    output.add(f'{attack}\nend{attack}'.encode(), attack.encode())
-    out, err = output.text()
-    assert harmless(err) and all(map(harmless, said)), ascii(err)
-    assert out == f'{attack}\nend{attack}', 'programs read it'
-    for result in (Result(1, out, ''), Result(1, '', err)):
-        with pytest.raises(CommandError) as failed:
-            command_line.checked(Command(('x',)), result, "'planner'")
-        assert harmless(str(failed.value)), ascii(str(failed.value))
+@pytest.mark.parametrize('attack', ATTACKS)
+def test_no_error_controls_the_terminal(attack: str, tmp_path: Path) -> None:
+    result = Result(1, f'out{attack}', '')
+    unreadable = FakeShell(handlers={'sh': lambda _: Result(0, f'unreadable ./a{attack}', '')})
+    with pytest.raises(ShellError) as lied:
+        Checkpoint('~/map', tmp_path).save(unreadable, still=True)
+    with pytest.raises(CommandError) as failed:
+        command_line.checked(Command(('x',)), result, f"'{attack}'")
+    for error in (lied.value, failed.value, FogError(attack, attack),
+                  CommandError(Command(('x',)), dataclasses.replace(result, stderr=attack), 'm'),
+                  sync.explained(Result(23, '', f'rsync: {attack}'), Path('/ws'), "'planner'"),
+                  sync.explained(Result(23, '', f'noise {attack}'), Path('/ws'), "'planner'")):
+        for text in (str(error), *map(str, error.args), error.hint):
+            assert harmless(text), ascii(text)
+    assert str(FogError(f'{RED}\ta\nb', 'c')) == f'{RED}\ta\nb (c)'
+
+
+@pytest.fixture
+def logged(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[list[str]]:
+    """Collect what launch's logger ``fogros2`` shows."""
+    import launch.logging
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path))
+    texts: list[str] = []
+    handler = logging.StreamHandler()
+    handler.emit = lambda record: texts.append(record.getMessage())  # type: ignore
+    logger = launch.logging.get_logger('fogros2')
+    logger.addHandler(handler)
+    yield texts
+    logger.removeHandler(handler)
+    launch.logging.reset()
+
+
+@pytest.mark.parametrize('attack', ATTACKS)
+def test_no_step_of_a_launch_controls_the_terminal(attack: str, logged: list[str]) -> None:
+    import launch.logging
+
+    from fogros2.runtime.console import Console
+    console = Console(io.StringIO())
+    console(report.StepDone('planner', 'ROS 2', 1.0, f'installed a{attack}'))
+    console(report.StepFailed('planner', 'ROS 2', 1.0, attack, fatal=False))
+    console(report.Warned('planner', f'may lack {attack}', attack))
+    # other parts of a launch use this logger, too
+    launch.logging.get_logger('fogros2').warning('%s: %s', attack, {'reason': attack})
+    assert len(logged) == 4 and all(map(harmless, logged)), ascii(logged)
+
+
+class Names(VerbExtension):
+    """A verb that prints what other computers say."""
+
+    def __init__(self, attack: str) -> None:
+        super().__init__()
+        self.attack = attack
+
+    def main(self, *, args: argparse.Namespace) -> int:
+        print(f'deleted {self.attack}', self.attack, RED)
+        sys.stdout.write(self.attack)
+        warn(self.attack)
+        progress.report(report.StepFailed(self.attack, 'VPN', 1.0, self.attack))
+        print(table.table(('NAME', 'IMAGE'), [(f'a{self.attack}\nb', self.attack), ('c', 'd')]))
+        return 0
+
+
+@pytest.mark.parametrize('attack', ATTACKS)
+def test_no_verb_lets_a_name_control_the_terminal(
+    attack: str, capsys: pytest.CaptureFixture[str],
+) -> None:
+    parser = argparse.ArgumentParser()
+    assert FogCommand().main(
+        parser=parser, args=argparse.Namespace(_verb=Names(attack))) == 0
+    out, err = capsys.readouterr()
+    assert harmless(out + err), ascii(out + err)
+    assert RED in out and 'VPN failed' in err
+
+
+def test_a_name_makes_no_row_of_its_own() -> None:
+    text = table.table(('NAME', 'STATE'), [('a  running\nb', 'gone'), ('c', '\x1b[1mok')])
+    assert text.splitlines() == ['NAME          STATE', 'a  running b  gone',
+                                 'c             \N{REPLACEMENT CHARACTER}[1mok']
+
+
+def test_progress_line_still_moves_the_cursor(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr('sys.stderr.isatty', lambda: True)
+    with output.cleaned(), progress.line() as show:
+        show('making\x1b[2J')
+    assert capsys.readouterr().err == (
+        '\r\x1b[Kmaking\N{REPLACEMENT CHARACTER}[2J\r\x1b[K')

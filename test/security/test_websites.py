@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import contextlib
+import html
 import os
 from pathlib import Path
 import re
@@ -18,11 +19,17 @@ import ssl
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
+import urllib.parse
 
 import pytest
 
 from fogros2.waiting import wait_until
+from fogros2_monitor import page, request, urls
 from rigs.domains import taken
+from ros2fog_cli.api import monitor as monitor_api
+from ros2fog_cli.api import reach
+from ros2fog_cli.verb import monitor
 
 pytest.importorskip('foxglove', reason='the extra "monitor" is not installed')
 
@@ -167,3 +174,28 @@ def test_log_has_no_token(bridge):
     wait_until(lambda: 'turned away 127.0.0.1: a wrong token' in bridge.text,
                timeout=20, what='the refusal')
     assert bridge.token not in bridge.text
+
+
+@pytest.mark.parametrize('encrypted', [True, False])
+def test_no_link_to_another_site_has_the_token(
+    encrypted: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The servers of a hosted application would get it in the address that a browser requests."""
+    token, where = 'sesame-0123456789', '198.51.100.7:8766' if encrypted else 'localhost:8765'
+    monkeypatch.setattr(reach, 'session', lambda entry: contextlib.nullcontext())
+    monkeypatch.setattr(monitor_api, 'credentials_of', lambda *_: (where, token, 'AB:CD'))
+    if encrypted:
+        monitor.share(SimpleNamespace())  # type: ignore[arg-type]
+    else:
+        monitor.say('{}', where, token)
+    asked = request.parse(f'GET /?token={token} HTTP/1.1\r\nHost: {where}\r\n\r\n'.encode())
+    answer = page.links(asked, 'planner', token, encrypted=encrypted).decode()
+    for text in (capsys.readouterr().out, html.unescape(answer)):
+        found = re.findall(r'\w+://[^\s"\'<>]+', text)
+        own = [url for url in found if urllib.parse.urlsplit(url).netloc == where]
+        assert own and all(token in url for url in own)
+        others = {url for url in found if url not in own}
+        assert not any(token in url for url in others)
+        assert others <= {urls.FOXGLOVE, urls.LICHTBLICK}
+    assert b'Referrer-Policy: no-referrer' in page.links(
+        asked, 'planner', token, encrypted=encrypted)

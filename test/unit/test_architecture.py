@@ -24,9 +24,9 @@ PACKAGES = ('fogros2_replicas', 'fogros2_share', 'image_transport_h264', 'point_
 #: modules (``name``), lowest first. All imports count, also late ones and those for types.
 #: ``image_transport`` is above ``host``, which knows the modules that its nodes import.
 ORDER = """
-    model errors events clock
+    model untrusted errors events clock
     waiting report process
-    agent cloud_launch
+    agent cloud_launch ros_types
     plugin_system store journal ros2_daemon monitor_addresses sealing invitation
     kubernetes_client
     shell vpn dds
@@ -61,8 +61,9 @@ UNLISTED = {
 }
 #: Where plugins live: each plugin is one module or package below one of these.
 INTERFACES = ('provider', 'shell', 'vpn', 'dds', 'image_transport')
-#: Only these may import launch or rclpy; the last runs on the machine.
-ROS_ALLOWED = ('describe', 'launch_internals', 'runtime', 'actions', 'cloud_launch')
+#: Only these may import launch or rclpy; the last two are for programs of ROS 2.
+ROS_ALLOWED = (
+    'describe', 'launch_internals', 'runtime', 'actions', 'cloud_launch', 'ros_types')
 ROS = ('launch', 'launch_ros', 'rclpy', 'ros2cli', 'ament_index_python')
 #: SDKs belong to one plugin each.
 SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_client',
@@ -70,6 +71,8 @@ SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_c
         'foxglove': 'fogros2_monitor'}
 #: Found by their entry points, or started by the user: the core imports none of them.
 ABOVE = ('fogros2_monitor', 'fogros2_replicas', 'fogros2_share', 'ros2fog_cli', 'rigs')
+#: All of the core but the import of types.
+BUT_TYPES = r'fogros2(?! import ros_types$)'
 
 
 def python_files(folder: Path) -> list[Path]:
@@ -180,8 +183,8 @@ def test_exceptions_name_what_exists() -> None:
 
 @pytest.mark.parametrize(('folder', 'above'), [
     ('fogros2', ABOVE), ('fogros2_monitor', ABOVE[1:]),
-    ('fogros2_replicas', ('fogros2', 'fogros2_monitor', 'ros2fog_cli', 'rigs')),
-    ('fogros2_share', ('fogros2', 'fogros2_monitor', 'ros2fog_cli', 'rigs')),
+    ('fogros2_replicas', (BUT_TYPES, 'fogros2_monitor', 'ros2fog_cli', 'rigs')),
+    ('fogros2_share', (BUT_TYPES, 'fogros2_monitor', 'ros2fog_cli', 'rigs')),
     ('point_cloud_stream', (*ABOVE, 'fogros2')),
     ('image_transport_h264', (*ABOVE, 'fogros2', 'point_cloud_stream'))])
 def test_package_imports_nothing_above_it(folder: str, above: tuple[str, ...]) -> None:
@@ -265,8 +268,9 @@ def test_forbidden_words(pattern: str) -> None:
 
 def test_only_one_module_starts_processes() -> None:
     """A command that is waited for goes through ``process``; streams and daemons are few."""
-    # cloud_launch, guests and idle are programs for machines
-    allowed = {'process.py', 'cloud_launch.py', 'guests.py', 'idle.py', 'serve.py'}
+    # cloud_launch, guests, idle and relocation are programs for machines
+    allowed = {'process.py', 'cloud_launch.py', 'guests.py', 'idle.py', 'relocation.py',
+               'serve.py'}
     for path in (*python_files(CORE), *python_files(ROOT / 'fogros2_monitor')):
         if path.name not in allowed and 'subprocess' in path.read_text():
             names = {name for name, _ in imports(path)}

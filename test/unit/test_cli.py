@@ -296,7 +296,7 @@ def test_delete_asks_for_confirmation(
     assert 'no terminal to ask at' in capsys.readouterr().err
     for answer, status in (('n', 1), ('', 1), ('y', 0)):
         monkeypatch.setattr('sys.stdin.isatty', lambda: True, raising=False)
-        monkeypatch.setattr('builtins.input', lambda text, answer=answer: answer)
+        monkeypatch.setattr('builtins.input', lambda answer=answer: answer)
         assert run('delete', 'a') == status
     assert not Memory.machines
     machine('a')

@@ -34,7 +34,15 @@ from fogros2.model import (
     Result,
     VpnInterface,
 )
-from fogros2.provider import Capabilities, TAG_DEPENDENCIES, TAG_EXPIRES, TAG_NAME, TAG_ROBOT
+from fogros2.provider import (
+    Capabilities,
+    SETTLED,
+    TAG_DEPENDENCIES,
+    TAG_EXPIRES,
+    TAG_LAUNCH,
+    TAG_NAME,
+    TAG_ROBOT,
+)
 from fogros2.provider.offers import MachineType, Offer, Offers, ranked, Region, Wants
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.testing.fakes import FakeProvider, FakeShell
@@ -283,17 +291,43 @@ def test_gc_tidies_up_providers(
     assert not Cloud.asked
 
 
-def test_gc_clears_what_a_killed_creation_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The launch died before it saved the machine's id."""
+@pytest.mark.parametrize('verb', [('gc',), ('delete', 'slam', '--yes')])
+def test_request_of_a_killed_launch_is_watched(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], verb: Sequence[str],
+) -> None:
+    """The launch died before it saved the machine's id: the machine may appear later."""
     def tidy(self: Cloud, dead: Collection[str] = ()) -> list[str]:
         self.asked.append(('tidy', *dead))
         return []
 
     monkeypatch.setattr(Cloud, 'tidy', tidy)
     record('slam', machine_id=None, token='t1', launch='abc123')
-    assert run('gc') == 0
+    run(*verb)
     assert ('tidy', 't1') in Cloud.asked
-    assert not Store().machine('slam').exists()
+    assert not Store().machine('slam').exists(), 'another launch may use the name'
+    assert "'slam' may still appear" in ''.join(capfd.readouterr())
+    record('slam', alive=True, machine_id='id-2', launch='def456')
+    late = machine('slam')
+    Cloud.machines['id-slam'] = dataclasses.replace(
+        late, tags={**late.tags, TAG_LAUNCH: 'abc123'})
+    Cloud.machines['id-2'] = dataclasses.replace(
+        late, id='id-2', tags={**late.tags, TAG_LAUNCH: 'def456'})
+    assert run('gc', '--dry-run') == 0
+    assert capfd.readouterr().out == (
+        'would clear machine slam: its provider had not answered the request for it\n')
+    assert run('gc') == 0
+    assert [*Cloud.machines] == ['id-2'] and Store().exists('slam')
+    assert run('gc') == 0
+    assert capfd.readouterr().out.endswith('nothing to clear\n')
+
+
+def test_old_request_creates_nothing_any_more() -> None:
+    Store().set_aside(record('slam', machine_id=None, token='t1', last='abc123'))
+    assert run('gc') == 1
+    (path,) = (Store().root / 'requests').iterdir()
+    os.utime(path, (0, time.time() - SETTLED - 1))
+    assert run('gc') == 0
+    assert not path.exists()
 
 
 # -- the firewall -------------------------------------------------------------------------

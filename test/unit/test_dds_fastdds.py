@@ -9,7 +9,7 @@ from xml.etree.ElementTree import Element
 
 import pytest
 
-from fogros2.dds.fastdds import ASKED, DISCOVERY_GROUP, FastDds, VARIABLE
+from fogros2.dds.fastdds import ASKED, DISCOVERY_GROUP, FastDds, RECEIVE_BUFFER, VARIABLE
 from fogros2.errors import DdsError
 
 NS = {'': 'http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles'}
@@ -29,9 +29,24 @@ def test_the_robot_keeps_all_its_interfaces_and_asks_as_ever() -> None:
     interfaces = dds.robot_interfaces('fog1', None, {})
     assert interfaces == []
     root = parsed(dds.render(interfaces, ()))
-    assert root.find('.//transport_descriptors', NS) is None
+    assert root.find('.//interfaceWhiteList', NS) is None
+    assert root.find('.//netmask_filter', NS) is None
     assert root.find('.//initialPeersList', NS) is None
     assert root.findtext('.//leaseDuration/sec', '', NS) == '60'
+
+
+@pytest.mark.parametrize('user', [{}, {'ROS_LOCALHOST_ONLY': '1'}])
+def test_no_node_uses_shared_memory(user: dict[str, str]) -> None:
+    dds = FastDds()
+    for interfaces in (dds.robot_interfaces('fog1', None, user), dds.machine_interfaces('fog1m0')):
+        root = parsed(dds.render(interfaces, (), user))
+        assert root.findtext('.//useBuiltinTransports', '', NS) == 'false'
+        used = [one.text for one in root.iterfind('.//userTransports/transport_id', NS)]
+        descriptors = root.findall('.//transport_descriptor', NS)
+        assert [(one.findtext('transport_id', '', NS), one.findtext('type', '', NS),
+                 one.findtext('receiveBufferSize', '', NS)) for one in descriptors] == [
+            (used[0], 'UDPv4', str(RECEIVE_BUFFER))]
+        assert len(used) == 1
 
 
 def test_more_addresses_are_kept_than_a_robot_has() -> None:
@@ -80,15 +95,20 @@ def test_a_users_profiles_are_taken_over(tmp_path: Path) -> None:
 <profiles xmlns="{NS['']}">
   <data_writer profile_name="/scan"><topic><historyQos/></topic></data_writer>
   <participant profile_name="mine" is_default_profile="true">
-    <rtps><builtin><discovery_config>
+    <rtps><listenSocketBufferSize>99999</listenSocketBufferSize><builtin><discovery_config>
       <leaseDuration><sec>5</sec></leaseDuration></discovery_config></builtin></rtps>
   </participant>
+  <transport_descriptors/>
 </profiles>""")
     root = parsed(FastDds().render([], (), {VARIABLE: str(path)}))
     assert root.find('data_writer', NS) is not None
     assert len(root.findall('participant', NS)) == 1
     assert root.findtext('.//leaseDuration/sec', '', NS) == '5'
     assert root.findtext('.//leaseAnnouncement/sec', '', NS) == '3'
+    assert root.findtext('.//receiveBufferSize', '', NS) == '99999'
+    # Fast DDS reads the file in order
+    assert [one.tag.rpartition('}')[2] for one in root] == [
+        'transport_descriptors', 'data_writer', 'participant']
 
 
 @pytest.mark.parametrize(('content', 'words'), [

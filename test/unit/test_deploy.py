@@ -138,6 +138,45 @@ def test_a_machine_that_may_have_been_made_is_not_forgotten(launch, provider):
     assert launch.store.exists(SPEC.name)
 
 
+@pytest.mark.parametrize(('error', 'appears', 'kept'), [
+    (Cancelled('the request'), False, True),
+    (DeadlineExceeded('no answer for 30 s'), False, True),
+    (Cancelled('the request'), True, False),
+    (ProviderError('not enough money'), False, False)])
+def test_request_without_an_answer_is_kept(launch, provider, monkeypatch, error, appears, kept):
+    create = provider.create
+
+    def cut(spec, request):
+        if appears:
+            create(spec, request)
+        raise error
+
+    monkeypatch.setattr(provider, 'create', cut)
+    with pytest.raises(type(error)):
+        launch.up(SPEC)
+    assert list(provider.find({})) == [] and not launch.store.exists(SPEC.name)
+    requests = [record for record, _ in launch.store.requests()]
+    assert [record.last for record in requests] == [launch.id] * kept
+    errors = launch.down()
+    assert [f"'{SPEC.name}' may still appear" in str(error) for error in errors] == [True] * kept
+
+
+def test_next_launch_keeps_the_request_of_a_killed_one(launch, provider):
+    killed, job = begun(launch)
+    with launch.store.lock(SPEC.name):
+        Creation(killed, job)._claim('token')
+    launch.store.save(dataclasses.replace(
+        launch.store.load(SPEC.name), launch='abc123', last='abc123', pid=0))
+    provider.failures.update(create=ProviderError('no more'))
+    with pytest.raises(ProviderError, match='no more'):
+        launch.up(SPEC)
+    ((record, age),) = launch.store.requests()
+    assert (record.token, record.last, record.name) == ('token', 'abc123', SPEC.name)
+    assert age < 60.0 and not launch.store.exists(SPEC.name)
+    launch.store.answered(record)
+    assert launch.store.requests() == []
+
+
 def test_unknown_error_of_a_machine_keeps_no_interface(launch):
     def fail():
         raise KeyError('InstanceId')

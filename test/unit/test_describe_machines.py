@@ -129,7 +129,7 @@ def test_substitutions_are_resolved_when_executed(context):
     (lambda: ContainerInstance(name='x' * 41), 'is no name for a machine'),
     (lambda: ContainerInstance(name=''), 'is no name for a machine'),
     (lambda: ContainerInstance(on_exit='delet'), "did you mean 'delete'?"),
-    (lambda: ContainerInstance(bootstrap='pip'), 'use one of auto, apt, embedded, none'),
+    (lambda: ContainerInstance(bootstrap='embedded'), 'use one of auto, apt, pip, none'),
     (lambda: ContainerInstance(on_exit='keep'), "a machine with on_exit='keep' needs a name"),
     (lambda: ContainerInstance(lifetime='soon'), 'is no duration'),
     (lambda: ContainerInstance(robot_timeout=0), 'is no duration'),

@@ -43,6 +43,14 @@ def test_robot_to_cloud() -> None:
     assert to_json(encoder)
 
 
+@pytest.mark.parametrize('value, text', [
+    (1e-05, '1e-05'), (5e-324, '5e-324'), (1e20, '1e+20'), (float('inf'), 'Infinity'),
+    (0.1, '0.1'), ('123E5', '"123E5"'), ('a"b', '"a\\"b"')])
+def test_option_keeps_its_value_and_type(value: object, text: str) -> None:
+    stream = Stream('/a', 'h264', target='m', options={'quality': value})
+    assert words(H264().encoder(stream).arguments)['quality'] == text
+
+
 def test_cloud_to_robot() -> None:
     encoder, decoder = H264().encoder(FROM_CLOUD), H264().decoder(FROM_CLOUD)
     assert words(encoder.arguments)['image'] == '/fogros2/planner_1/annotated'

@@ -306,7 +306,7 @@ def test_ctrl_c_ends_a_request_without_an_answer(api, server, call):
     interrupting.start()
     begin = time.monotonic()
     if call == 'request':
-        raised(Cancelled, lambda: api.request('POST', '/api/v1/pods', {}, cancel=cancel))
+        raised(Cancelled, lambda: api.request('GET', '/api/v1/pods', cancel=cancel))
     else:
         raised(Cancelled, lambda: follow(api, lambda kind, thing: None, cancel=cancel))
     interrupting.join()
@@ -319,7 +319,7 @@ def test_what_is_made_just_after_a_ctrl_c_is_known(api, server):
 
     def late() -> Answer:
         cancel.set()
-        threading.Event().wait(0.2)
+        threading.Event().wait(1.5)
         return 201, {'made': 'it'}
 
     server.answers = [late]

@@ -17,8 +17,14 @@ import pytest
 import yaml
 
 from fogros2 import kubernetes_client
-from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
-from fogros2.kubernetes_client import ApiError
+from fogros2.errors import (
+    Cancelled,
+    ConfigurationError,
+    FogError,
+    MachineNotFound,
+    ProviderError,
+)
+from fogros2.kubernetes_client import ApiError, Unreachable
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.provider.kubernetes import (
@@ -295,6 +301,32 @@ def test_pods_that_differ_by_name_alone_are_tried_once(monkeypatch):
         create(name)
     create('larger', mb=64)
     assert asked[1:] == ['pods All', 'jobs', 'jobs', 'pods All', 'jobs']
+
+
+@pytest.mark.parametrize(('fails', 'error', 'certain'), [
+    ('pods', Unreachable('no answer'), True),
+    ('pods', Cancelled('the dry run'), True),
+    ('jobs', Unreachable('no answer'), False),
+    ('jobs', Cancelled('the request'), False),
+    ('jobs', ApiError('etcd is slow', status=500), False),
+    ('jobs', ApiError('quota', status=403), True),
+    ('services', Cancelled('the request'), True)])
+def test_only_a_job_without_an_answer_may_appear(monkeypatch, fails, error, certain):
+    class Cluster:
+        context, namespace, server = 'here', 'robots', 'https://198.51.100.1'
+
+        def request(self, method, target, body=None, **more):
+            if target.endswith(fails):
+                raise error
+            return {'metadata': {'name': 'it', 'uid': 'its-uid', 'namespace': 'robots'}}
+
+    monkeypatch.setattr(kubernetes_client, 'connect', lambda context='': Cluster())
+    provider, ended = KubernetesProvider(), []
+    monkeypatch.setattr(provider, 'destroy', ended.append)
+    spec = MachineSpec('planner', 'kubernetes', {'expose': 'node_port'})
+    told = raised(FogError, lambda: provider.create(spec, REQUEST))
+    assert told.refused is certain
+    assert len(ended) == (fails == 'services')
 
 
 @pytest.mark.parametrize(('options', 'nodes', 'architecture'), [

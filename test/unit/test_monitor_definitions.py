@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import pytest
 
-from fogros2_monitor.definitions import definition, message_class
+from fogros2 import ros_types
+from fogros2_monitor.definitions import definition
 
 RULE = '=' * 80
 
@@ -45,4 +46,4 @@ def test_types_of_fields_are_those_of_message_files(name, line):
     'std_msgs/msg/a/b'])
 def test_missing_message_is_named(name):
     with pytest.raises(LookupError, match=name):
-        message_class(name)
+        ros_types.message(name)

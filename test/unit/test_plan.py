@@ -15,8 +15,8 @@ from fogros2.model import Machine, MachineSpec, MachineState, Peer
 NETWORK = '198.18.7.0/24'
 
 
-def test_rmw_is_cyclone_unless_the_user_has_one():
-    assert plan.choose_rmw({}, ['rmw_cyclonedds_cpp']) == 'rmw_cyclonedds_cpp'
+def test_rmw_is_that_of_ros_unless_user_has_one():
+    assert plan.choose_rmw({}, ['rmw_fastrtps_cpp']) == 'rmw_fastrtps_cpp'
     known = ['rmw_cyclonedds_cpp', 'rmw_x']
     assert plan.choose_rmw({'RMW_IMPLEMENTATION': 'rmw_x'}, known) == 'rmw_x'
 
@@ -191,16 +191,18 @@ def test_a_middleware_has_to_be_there_and_to_be_one_for_all(tmp_path: Path) -> N
     index = tmp_path / 'share/ament_index/resource_index/rmw_typesupport'
     index.mkdir(parents=True)
     (index / 'rmw_fastrtps_cpp').touch()
-    here = [str(tmp_path), '/nowhere']
+    here, wheels = [str(tmp_path), '/nowhere'], str(tmp_path / 'wheels')
+    info = 'lib/python3.12/site-packages/ros_rclpy-7.1.6.dist-info'
+    (tmp_path / 'wheels' / info).mkdir(parents=True)
     like = MachineSpec('m', 'ssh', environment={'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp'})
     plan.check_rmw('rmw_fastrtps_cpp', here, [like, MachineSpec('n', 'ssh')])
     plan.check_rmw(plan.DEFAULT_RMW, ['/nowhere'], [MachineSpec('n', 'ssh')])
     for rmw, prefixes, spec, words in (
             ('rmw_cyclonedds_cpp', here, like, 'rmw_cyclonedds_cpp is not installed'),
-            ('rmw_fastrtps_cpp', ['/nowhere'], like, 'needs ROS 2'),
+            ('rmw_cyclonedds_cpp', [wheels], like, 'the wheels of ROS 2, which have rmw_fast'),
             ('rmw_cyclonedds_cpp', ['/nowhere'], like, 'would not hear each other'),
-            ('rmw_fastrtps_cpp', here, MachineSpec('m', 'ssh', bootstrap='embedded'),
-             'would get the embedded default')):
+            ('rmw_cyclonedds_cpp', ['/nowhere'], MachineSpec('m', 'ssh', bootstrap='pip'),
+             'would get ROS 2 by pip')):
         with pytest.raises(DdsError, match=words) as caught:
             plan.check_rmw(rmw, prefixes, [spec])
         assert caught.value.hint

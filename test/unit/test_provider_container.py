@@ -8,6 +8,7 @@ import io
 import json
 import os
 from pathlib import Path
+import secrets
 import stat
 import subprocess
 import tarfile
@@ -35,14 +36,6 @@ from fogros2.provider.container.engine import Engine
 from fogros2.provider.container.options import Options
 
 REQUEST = CreateRequest('0123-token', 'ssh-ed25519 AAAA me', {'fogros2-name': 'm'}, 51820)
-
-
-def test_tokens_of_machines_are_not_listed_for_others(tmp_path: Path) -> None:
-    roots = tmp_path / 'fogros2'
-    words = ('sh', str(roots / '0123-token'), '', '', '', '', 'true')
-    subprocess.run(['sh', '-c', container._CREATE, *words], input=archive(), check=True)
-    assert (roots / '0123-token/root').is_dir()
-    assert stat.S_IMODE(roots.stat().st_mode) == 0o711
 
 
 def archive() -> bytes:
@@ -133,29 +126,29 @@ def test_large_folder_is_mounted_only_if_all_of_it_is_public(etc):
 
 def test_accounts_are_the_system_s_and_the_login_user_s(etc):
     archive = container_root.Archive()
-    container_root.accounts(archive, 'fog', etc)
+    container_root.accounts(archive, 'fog', 2013265999, etc)
     data = archive.data()
     assert text(data, 'etc/passwd').splitlines() == [
         'root:x:0:0:root:/root:/bin/bash',
         'sshd:x:102:65534::/run/sshd:/usr/sbin/nologin',
         'nobody:x:65534:65534:nobody:/nonexistent:/usr/sbin/nologin',
-        'fog:x:1000:1000::/home/fog:/bin/bash']
+        'fog:x:2013265999:2013265999::/home/fog:/bin/bash']
     assert 'alice' not in text(data, 'etc/group')
     assert text(data, 'etc/shadow').splitlines()[0] == 'root:*:::::::'
     found = content(data)
     assert found['etc/shadow'].mode == 0o600
     assert found['etc/sudoers'].mode == 0o440
-    assert (found['home/fog'].uid, found['home/fog'].mode) == (1000, 0o750)
-    assert found['home/fog/.bashrc'].uid == 1000
+    assert (found['home/fog'].uid, found['home/fog'].mode) == (2013265999, 0o750)
+    assert found['home/fog/.bashrc'].uid == 2013265999
 
 
 def test_the_skeleton_of_this_computer_holds_no_home_and_no_key():
-    data = container_root.skeleton('fog') + container_root.Archive().data()
+    data = container_root.skeleton() + container_root.Archive().data()
     found = content(data)
     for name in ('home', 'root', 'srv', 'opt', 'mnt', 'media', 'var/lib', 'run', 'tmp'):
         assert found[name].isdir()
     files = [name for name, member in found.items() if not member.isdir()]
-    allowed = ('etc/', 'home/fog/.', 'var/run', 'var/lock')
+    allowed = ('etc/', 'var/run', 'var/lock')
     assert all(name.startswith(allowed) or '/' not in name for name in files)
     secret = ('etc/ssh/', 'etc/wireguard', 'etc/kubernetes')
     assert not any(name.startswith(secret) for name in files)
@@ -250,11 +243,11 @@ def test_options_are_taken_as_they_are_meant(tmp_path):
     for pair in (('--cpus', '2'), ('--memory', '1g'), ('-p', '80:80'), ('--gpus', 'all'),
                  ('--network', 'n'), ('--ip', '198.51.100.7'), ('--hostname', 'm'),
                  ('--name', 'fogros2-m'), ('--device', '/dev/net/tun'),
-                 ('--label', 'fogros2-name=m'), ('--label', 'fogros2-token=0123-token'),
+                 ('--label', 'fogros2-name=m'),
                  ('--cap-add', 'NET_ADMIN')):
         assert any(words[i:i + 2] == list(pair) for i in range(len(words))), pair
     assert '--privileged' not in words
-    assert 'AAAA' not in ' '.join(words)
+    assert not any(secret in ' '.join(words) for secret in ('AAAA', '0123-token'))
 
 
 @pytest.mark.parametrize('spec', [
@@ -282,8 +275,8 @@ def test_relays_of_one_user_meet_in_folders_of_their_own(monkeypatch, tmp_path):
     words = list(container_options.common_flags(Engine('podman'), spec, REQUEST, Options()))
     folder = container_machine.share_folder('0123-token')
     # a machine writes into its own folder alone
-    assert f'{folder}:/opt/fogros2/share' in words
-    assert f'{folder.parent}:/opt/fogros2/shared:ro' in words
+    assert f'{folder}:/opt/fogros2/share:rw,nosuid,nodev,noexec' in words
+    assert f'{folder.parent}:/opt/fogros2/shared:ro,nosuid,nodev,noexec' in words
     assert not any('fogros2/share' in word for word in container_options.common_flags(
         Engine('podman'), MachineSpec('m', 'container'), REQUEST, Options()))
     with container._sharing(spec, '0123-token'):
@@ -292,10 +285,11 @@ def test_relays_of_one_user_meet_in_folders_of_their_own(monkeypatch, tmp_path):
     with container._sharing(spec, 'other-token'), pytest.raises(ProviderError):
         with container._sharing(spec, 'third-token'):
             raise ProviderError('no more memory')
-    assert {path.name for path in folder.parent.iterdir()} == {'0123-token', 'other-token'}
+    names = {container_machine.directory(token).name for token in ('0123-token', 'other-token')}
+    assert {path.name for path in folder.parent.iterdir()} == names
     monkeypatch.setattr(container.packet_filter, 'unset', lambda name: 'true')
-    for token in ('0123-token', 'other-token'):
-        subprocess.run(['sh', '-c', container.clean(tmp_path / 'roots' / token)], check=True)
+    for name in names:
+        subprocess.run(['sh', '-c', container.clean(tmp_path / 'roots' / name)], check=True)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -395,7 +389,8 @@ def test_times_of_both_engines_are_read():
 def entry_files(**changes) -> bytes:
     archive = container_root.Archive()
     container_entry.add(archive, **{
-        'user': 'fog', 'authorized_key': 'ssh-ed25519 AAAA me', 'environment': {'A': 'b c'},
+        'user': 'fog', 'number': 2013265999, 'authorized_key': 'ssh-ed25519 AAAA me',
+        'environment': {'A': 'b c'},
         'agent_config': {'machine': 'm', 'end_command': []}, **changes})
     return archive.data()
 
@@ -499,7 +494,8 @@ def test_docker_machine_gets_its_packet_filter_at_once(monkeypatch):
     container.ContainerProvider().start('docker:0123456789ab:0123-token')
     assert [command.argv[1] for command in commands] == [
         'container', 'start', 'container', '-c']
-    assert commands[-1].argv[-1] == 'fogros2-0123-token' and commands[-1].sudo
+    name = container_machine.directory('0123-token').name
+    assert commands[-1].argv[-1] == f'fogros2-{name}' and commands[-1].sudo
     assert json.loads(commands[-1].input) == {'pid': 77}
 
 
@@ -518,7 +514,7 @@ def test_isolated_machine_sees_nothing_of_this_computers_system(tmp_path):
     (tmp_path / 'etc/os-release').write_text('ID=other\n')
     assert container_root.system_mounts(str(tmp_path)) == ('/usr', '/var/lib')
     found = content(
-        container_root.skeleton('fog', str(tmp_path)) + container_root.Archive().data())
+        container_root.skeleton(str(tmp_path)) + container_root.Archive().data())
     assert found['bin'].linkname == 'usr/bin'
     assert 'etc/os-release' in found and 'etc/ssl/certs' not in found
 
@@ -557,3 +553,15 @@ def test_computer_without_own_sources_gets_a_hint(system, targets):
 def test_packages_of_a_container_image_are_its_own(options, own):
     spec = MachineSpec('m', 'container', options)
     assert container.ContainerProvider().has_own_packages(spec) is own
+
+
+def test_request_may_create_while_a_program_works_at_it():
+    provider, token = container.ContainerProvider(), secrets.token_hex(8)
+    assert not provider.may_create(token, 0.0)
+    engine = subprocess.Popen(['sh', '-c', 'read line', 'podman', 'run', f'--label={token}'],
+                              stdin=subprocess.PIPE)
+    try:
+        assert provider.may_create(token, 1e9)
+    finally:
+        engine.communicate(b'')
+    assert not provider.may_create(token, 0.0)

@@ -87,6 +87,21 @@ def test_create_asks_the_host_for_a_container(on: dict[str, Any], shell: FakeShe
     assert {*request['tags']} == {'fogros2-name', 'fogros2-hosted'}
 
 
+def test_host_may_go_on_with_a_lost_request(on: dict[str, Any], shell: FakeShell) -> None:
+    def lost(command: Command) -> Result:
+        raise ConnectError('the connection is lost')
+
+    for handler in (lost, lambda command: Result(0, 'Welcome!', '')):
+        shell._handlers['sh'] = handler
+        with pytest.raises(FogError) as caught:
+            HostedProvider().create(spec_on(on), request_for(spec_on(on)))
+        assert caught.value.refused is False
+    record = Record('planner', 'hosted', spec_on(on), token='0123-token', last='abc123')
+    Store().set_aside(record)
+    shell._handlers['sh'] = lambda command: Result(0, json.dumps({'result': [REPORT]}), '')
+    assert [found.name for found in HostedProvider().find({})] == ['planner']
+
+
 def test_robots_have_containers_of_different_names(
     on: dict[str, Any], shell: FakeShell, monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -154,6 +154,17 @@ def test_entries_are_resolved_when_executed() -> None:
         StreamTopic('/b', 'h264', bitrate=1_000_000, lossless=True, preset='fast')]
 
 
+@pytest.mark.parametrize('text, value', [
+    ('1e-3', 0.001), ('5e-06', 5e-06), ('3', 3), ('true', True), ('False', False),
+    ('1_000', '1_000'), ('12:30', '12:30'), ('fast', 'fast')])
+def test_substituted_parameter_has_the_type_that_rcl_gives(text: str, value: Any) -> None:
+    context = LaunchContext()
+    context.launch_configurations['p'] = text
+    [entry] = streaming.resolve(
+        context, [StreamTopic('/b', 'h264', p=LaunchConfiguration('p'))], '/', lambda _: None)
+    assert (entry.parameters['p'], type(entry.parameters['p'])) == (value, type(value))
+
+
 @pytest.mark.parametrize('entry', ['/camera', ('/camera',), ('/camera', 'vhs'), ('/a b', 'h264'),
                                    StreamTopic('/camera', 'h264', 'up')])  # type: ignore
 def test_plain_nonsense_is_found_at_once(entry: Any) -> None:

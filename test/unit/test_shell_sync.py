@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
+import shlex
 import socket
 import subprocess
 import sys
@@ -13,34 +15,51 @@ import threading
 import paramiko
 import pytest
 
+from fogros2 import process
 from fogros2.errors import CommandError, ConnectError, ShellError
 from fogros2.model import Endpoint, Result
-from fogros2.shell import multiplexed, multiplexer, sync
+from fogros2.shell import multiplexed, multiplexer, relay, sync
 
 PINNED = Endpoint('ssh', '198.51.100.7', 2222, 'fog', 'ssh-ed25519 AAAA', '/keys/my key')
 
 
 def test_includes_come_before_excludes():
-    words = sync.rsync(Path('/ws'), 'machine:/ws/', excludes=['build/*'], includes=['build/a'],
-                       rsh='ssh').argv
+    words = sync.rsync(Path('/ws'), '/ws', excludes=['build/*'], includes=['build/a'],
+                       rsh={'FOGROS2_LINK': '3'}).argv
     assert words.index('--include=build/a') < words.index('--exclude=build/*')
     assert words[-2:] == ('/ws/', 'machine:/ws/')
     assert '--delete' in words
     assert words[-3] == '--'
 
 
-def test_openssh_is_pinned_as_we_are():
-    with sync.open_ssh(PINNED) as (rsh, _, _):
-        words = rsh.split()
-        for option in ('StrictHostKeyChecking=yes', 'BatchMode=yes', 'IdentitiesOnly=yes',
-                       'GlobalKnownHostsFile=/dev/null', 'HostKeyAlias=machine',
-                       'HostName=198.51.100.7'):
-            assert option in words
-        assert "'/keys/my key'" in rsh
+@contextlib.contextmanager
+def openssh(endpoint, folder, monkeypatch):
+    """Yield what OpenSSH is called with for an endpoint, and the known hosts that it gets."""
+    program = folder / 'ssh'
+    program.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
+    program.chmod(0o755)
+    monkeypatch.setitem(process._ENVIRONMENT, 'PATH', f'{folder}:/usr/bin:/bin')
+    with sync.open_ssh(endpoint) as (variables, inherited, failures):
+        # as rsync starts it
+        said = subprocess.run(
+            [*shlex.split(relay.RSH), 'machine', 'rsync', '--server'], pass_fds=inherited,
+            stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=10,
+            env={**os.environ, **variables})
+        words = said.stdout.splitlines()
         known, = (Path(w.partition('=')[2]) for w in words if w.startswith('UserKnownHostsFile='))
+        assert (said.returncode, failures) == (0, [])
+        yield words, known
+    assert not known.exists()
+
+
+def test_openssh_is_pinned_as_we_are(tmp_path, monkeypatch):
+    with openssh(PINNED, tmp_path, monkeypatch) as (words, known):
+        for option in ('StrictHostKeyChecking=yes', 'BatchMode=yes', 'IdentitiesOnly=yes',
+                       'GlobalKnownHostsFile=/dev/null', 'HostKeyAlias=machine'):
+            assert option in words
+        assert '/keys/my key' in words and words[-3:] == ['--', '198.51.100.7', 'rsync --server']
         assert known.read_text() == 'machine ssh-ed25519 AAAA\n'
         assert known.stat().st_mode & 0o077 == 0
-    assert not known.exists()
 
 
 def test_openssh_accepts_the_known_hosts_of_home(tmp_path, monkeypatch):
@@ -49,10 +68,9 @@ def test_openssh_accepts_the_known_hosts_of_home(tmp_path, monkeypatch):
     (tmp_path / '.ssh').mkdir()
     key = f'ecdsa-sha2-nistp256 {paramiko.ECDSAKey.generate().get_base64()}'
     (tmp_path / '.ssh/known_hosts').write_text(f'[host.example]:2222 {key}\n')
-    with sync.open_ssh(Endpoint('ssh', 'host.example', 2222, 'fog')) as (rsh, _, _):
-        assert 'HostKeyAlias=machine' in rsh and 'StrictHostKeyChecking=yes' in rsh
-        known, = (Path(w.partition('=')[2]) for w in rsh.split()
-                  if w.startswith('UserKnownHostsFile='))
+    endpoint = Endpoint('ssh', 'host.example', 2222, 'fog')
+    with openssh(endpoint, tmp_path, monkeypatch) as (words, known):
+        assert 'HostKeyAlias=machine' in words and 'StrictHostKeyChecking=yes' in words
         assert known.read_text() == f'machine {key}\n'
 
 
@@ -138,11 +156,12 @@ def test_large_folders_go_both_ways(shell, tmp_path):
         (tmp_path / f'source/{number}').write_bytes(os.urandom(300_000))
     there = str(tmp_path / 'there')
     assert shell.sync(tmp_path / 'source', there, excludes=[], timeout=60.0).files == 20
-    shell.fetch(there, tmp_path / 'back', known=None, timeout=60.0)
+    shell.fetch(there, tmp_path / 'back', known=None, limit=1 << 30, timeout=60.0)
     assert (tmp_path / 'back/19').read_bytes() == (tmp_path / 'source/19').read_bytes()
     before = set(os.listdir('/proc/self/fd'))
     with pytest.raises(CommandError, match='No such file'):
-        shell.fetch(f'{there}/nowhere', tmp_path / 'back', known=None, timeout=60.0)
+        shell.fetch(f'{there}/nowhere', tmp_path / 'back', known=None, limit=1 << 30,
+                    timeout=60.0)
     assert set(os.listdir('/proc/self/fd')) == before
 
 
@@ -151,5 +170,6 @@ def test_large_folders_go_both_ways(shell, tmp_path):
 ])
 def test_folders_begin_in_the_home(folder, there, monkeypatch):
     monkeypatch.setenv('HOME', '/home/robot')
-    assert sync.place(folder, 'ssh') == f'machine:{there}'
-    assert sync.place(folder, '').rstrip('/') == folder.replace('~', '/home/robot').rstrip('/')
+    assert sync.place(folder, remote=True) == f'machine:{there}'
+    here = sync.place(folder, remote=False)
+    assert here.rstrip('/') == folder.replace('~', '/home/robot').rstrip('/')

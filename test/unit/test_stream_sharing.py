@@ -135,8 +135,9 @@ def test_invalid_report_is_no_claim(labels: list[str], data: list[float]) -> Non
 
 def test_report_and_announcement_are_read() -> None:
     assert claim_of(message(['/a'], [1, 2, 3, 4, 5, 6])) == ('/a', Claim(1, 2, 3, 4, 5, 6))
-    assert links_of(message(['/a/in', 'no topic', '/b', '/c', '/d'], [
-        1e6, 1e6, 0.0, math.nan, 2e6])) == {'/a/in': 1e6, '/d': 2e6}
+    names = [f'/fogros2/{name}/link_in' for name in 'abcd']
+    assert links_of(message([names[0], 'no topic', *names[1:]], [
+        1e6, 1e6, 0.0, math.nan, 2e6])) == {names[0]: 1e6, names[3]: 2e6}
 
 
 def test_share_below_the_minimum_is_reported_once() -> None:
@@ -147,7 +148,7 @@ def test_share_below_the_minimum_is_reported_once() -> None:
     report_now = node.create_timer.call_args.args[1]
     warning = node.get_logger.return_value.warning
     budget.sent(1000, floor=1e5, latency=0.0)
-    join(message(['/link'], [1e6]))
+    join(message(['/fogros2/m/link_in'], [1e6]))
     report_now()
     assert (announced, warning.call_count) == ('/camera/h264/link', 0)
     budget.sent(1000, floor=1e6, latency=0.0)

@@ -31,7 +31,7 @@ def test_full_zone_is_tried_once_for_each_type() -> None:
         title='Meadow', find=lambda *_: [], begin=lambda *_: None, insert=insert,
         prepare=lambda region, order, types: dict.fromkeys(types),
         places=lambda *_: ['a', 'b'],  # a list: an adapter need not write a generator
-        undo_begin=lambda *_: [], end_attempt=lambda *_: None)
+        undo_begin=lambda *_: [], end_attempt=lambda *_: False)
     creation = Creation(
         cloud, cloud, MachineSpec('planner', 'meadow', {}), CreateRequest('token', 'key', {}, 1),
         Options(region='north'), sources=lambda: [], price=lambda *_: None)

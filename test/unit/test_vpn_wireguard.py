@@ -107,7 +107,7 @@ def test_only_the_launch_is_filtered_where_it_is_a_guest() -> None:
     text = script(*WireGuard().up(guest, [TO_ROBOT]))
     assert f'{RTPS} drop' not in text and f'{RTPS} socket cgroupv2 level %s "%s" drop' in text
     assert 'pid=$(cat /run/a/agent.pid)' in text
-    assert 'rmdir "$group"' in script(*WireGuard().down(guest))
+    assert '/run/foga1b2c3m0.group' in script(*WireGuard().down(guest))
 
 
 def test_robot_sends_to_the_hosts_that_the_user_names() -> None:
@@ -123,7 +123,7 @@ def test_group_with_an_odd_name_enters_no_rule(tmp_path: Path, odd: str) -> None
     (tmp_path / 'cgroup.procs').touch()
     robot = dataclasses.replace(ROBOT, process='77')
     text = script(*WireGuard().up(robot, []))
-    text = text[text.index('confine() {'):text.index('[ -e /sys/class/net')]
+    text = text[text.index('empty_group() {'):text.index('[ -e /sys/class/net')]
     text = text.replace('/proc/', f'{tmp_path}/').replace('/sys/fs/cgroup', str(tmp_path))
     said = subprocess.run(['sh', '-ec', text], capture_output=True, text=True, check=True).stdout
     assert said.startswith('no control group for process 77: odd name: /a')

@@ -53,7 +53,7 @@ def install(root: Path) -> Path:
 
 @pytest.fixture
 def colcon(tmp_path, monkeypatch):
-    """Have this package installed by colcon, beside a ROS 2 without the embedded default."""
+    """Have this package installed by colcon, beside a ROS 2 without our launch."""
     prefix = install(tmp_path / 'ws')
     (info,) = prefix.glob('lib/*/site-packages/*.egg-info')
 
@@ -68,7 +68,7 @@ def colcon(tmp_path, monkeypatch):
 
 def test_a_wheel_is_made_of_what_colcon_installed(colcon, tmp_path):
     packed = wheels.collect(tmp_path / 'cache')
-    assert (packed.fogros2, packed.pip, packed.embedded) == (
+    assert (packed.fogros2, packed.pip, packed.ros) == (
         'fogros2-0.1.0-py3-none-any.whl', '', False)
     with zipfile.ZipFile(Path(packed.folder, packed.fogros2)) as archive:
         assert set(archive.namelist()) == {
@@ -119,7 +119,7 @@ def test_workspace_with_fogros2_brings_the_cloud_launch_file(tmp_path):
         'ubuntu', '24.04', 'x86_64', 1000, 'u', '/home/u', 'glibc 2.39', True,
         (Python('/usr/bin/python3', (3, 12), True),),
         frozenset({'ip', 'nft', 'rsync', 'wg', 'wireguard-go', 'colcon', 'rosdep'}),
-        {'jazzy': '/opt/ros/jazzy'}, {'jazzy': ('rmw_cyclonedds_cpp',)},
+        {'jazzy': '/opt/ros/jazzy'}, {'jazzy': ('rmw_fastrtps_cpp',)},
         environments={'/opt/ros/jazzy': '1-1'})
     under = Underlay(('/opt/ros/jazzy',), '/opt/ros/jazzy/bin/ros2', {
         'AMENT_PREFIX_PATH': f'{root}/install/fogros2:/opt/ros/jazzy'})
@@ -131,7 +131,7 @@ def test_workspace_with_fogros2_brings_the_cloud_launch_file(tmp_path):
 
     # a machine with a ROS 2 of its own needs no wheel either
     other = dataclasses.replace(robot, environments={})
-    packed = Wheels('/cache', 'k', (3, 12), 'x86_64', 'glibc 2.28', 'f.whl', embedded=False)
+    packed = Wheels('/cache', 'k', (3, 12), 'x86_64', 'glibc 2.28', 'f.whl', ros=False)
     todo = bootstrap.plan(spec, other, robot, under, packed, [workspace])
     assert not todo.wheels_target and todo.commands == ()
     assert todo.install.command == alike.install.command

@@ -19,7 +19,7 @@ from fogros2.actions.frontend.entity import (
     text,
     value,
 )
-from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, Node
+from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, LifecycleNode, Node
 from fogros2.actions.replicated import Replicated
 from fogros2.describe import keywords, kinds, values
 from fogros2.errors import ConfigurationError, did_you_mean
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
     from fogros2.actions.frontend.entity import Parsed
 
-#: Attributes and elements of ``<node>`` and ``<node_container>`` that launch_ros reads.
+#: Attributes and elements of nodes that launch_ros reads.
 _NODE = (
-    'additional_env', 'args', 'composable_node', 'cwd', 'emulate_tty', 'env', 'exec', 'exec_name',
-    'launch-prefix', 'name', 'namespace', 'on_exit', 'output', 'output_format', 'param', 'pkg',
-    'remap', 'respawn', 'respawn_delay', 'respawn_max_retries', 'ros_args', 'shell',
-    'sigkill_timeout', 'sigterm_timeout')
+    'additional_env', 'args', 'autostart', 'composable_node', 'cwd', 'emulate_tty', 'env', 'exec',
+    'exec_name', 'launch-prefix', 'name', 'namespace', 'on_exit', 'output', 'output_format',
+    'param', 'pkg', 'remap', 'respawn', 'respawn_delay', 'respawn_max_retries', 'ros_args',
+    'shell', 'sigkill_timeout', 'sigterm_timeout')
 _GROUP = ('forwarding', 'keep', 'scoped')
 _STREAM = ('topic', 'transport', 'direction', 'source')
 
@@ -110,7 +110,8 @@ def node(entity: Entity, parser: Parser, cls: type[Node]) -> Parsed:
 
 
 #: Elements that may have a machine inside ``<fogros_launch>``.
-_WITH_MACHINE = {'node': Node, 'node_container': ComposableNodeContainer}
+_WITH_MACHINE = {'node': Node, 'node_container': ComposableNodeContainer,
+                 'lifecycle_node': LifecycleNode}
 
 
 def _node_with_machine(entity: Entity, parser: Parser) -> Optional[Action]:

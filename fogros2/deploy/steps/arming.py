@@ -24,9 +24,6 @@ from fogros2.host import bootstrap
 from fogros2.model import Command
 from fogros2.waiting import Periodic, wait_until
 
-#: Poll interval of the provider's preemption notice in seconds.
-NOTICE_POLL_INTERVAL = 5.0
-
 # Install and start the agent in one round trip. Standard input is the configuration in one line,
 # then the agent's source; sh reads the line byte by byte, so that cat gets the rest.
 # $1 folder of all agents, $2 this agent's folder, $3 program, $4 our configuration, $5 login user.
@@ -83,10 +80,13 @@ class Arming(Step):
         """
         context, job, program = self._context, self._job, self._job.capabilities.agent_program
         endpoint = job.machine.shell
+        notice = context.provider.capabilities_of(job.machine).preemption_notice
         config = {
             **plan.agent_config(
                 job.spec, context.launch, job.directory, job.machine.end_command),
             'user': endpoint.user if endpoint else '',
+            # fixed before any node starts, even if there is none
+            'notice': list(notice),
             # the launch keeps in touch from now on: by re-arming the agent, then by heartbeats
             'boot_timeout': job.spec.robot_timeout}
         with job.step('watchdog'):
@@ -113,10 +113,6 @@ class Arming(Step):
             self.undo_nodes()
             self._rearming = Periodic('fog-rearm', job.spec.robot_timeout / 4, self._rearm)
             job.undo.callback(self._rearming.close)
-            notice = context.provider.capabilities_of(job.machine).preemption_notice
-            if notice:
-                agent.request('watch', timeout=context.timeouts.agent, what='notice',
-                              argv=list(notice), interval=NOTICE_POLL_INTERVAL)
 
     def _rearm(self) -> None:
         # a later call may get through; the current step reports a lasting failure

@@ -108,7 +108,7 @@ class Containers(Step):
                     "build it for the machine's processors too, or choose another machine"
                     if 'processors, and the machine has' in error.result.stderr else
                     'is its name right, and may anybody download it?') from error
-            self._images[image, rmw] = printed.split()[-1]
+            self._images[image, rmw] = (printed.split() or [image])[-1]
         return self._images[image, rmw]
 
     def _ensure_engine(self) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 import contextlib
 import dataclasses
 import json
@@ -12,6 +11,7 @@ from typing import Any, Optional
 import uuid
 
 from fogros2 import model, monitor_addresses, plan, process
+from fogros2.deploy import requests
 from fogros2.deploy.machine_job import Step
 from fogros2.errors import (
     ConfigurationError,
@@ -19,7 +19,6 @@ from fogros2.errors import (
     MachineNotFound,
     NameTaken,
     PrerequisiteError,
-    Unsupported,
 )
 from fogros2.host import bootstrap
 from fogros2.model import Command, CreateRequest, Machine, MachineState
@@ -37,8 +36,9 @@ from fogros2.store import robot_id, this_process
 class Creation(Step):
     """Create or reuse the machine of a deployment, and end it by its ``on_exit``."""
 
-    #: Whether the provider was asked to create the machine, and whether it refused at once.
-    _asked = _refused = False
+    #: Whether the provider was asked to create the machine, whether it refused at once, and
+    #: whether it did not answer.
+    _asked = _refused = _unanswered = False
 
     def run(self) -> None:
         """
@@ -93,11 +93,8 @@ class Creation(Step):
                 f'give the machine another name=, or: ros2 fog delete {job.name}')
         if before.machine_id is None:
             # that launch was killed before it saved the id of its machine, if it has one
-            with contextlib.suppress(Unsupported):
-                for machine in self._find(before.last or before.launch):
-                    context.provider.destroy(machine.id)
-            if before.token:
-                context.provider.tidy(dead=[before.token])
+            if not requests.end(context.provider, before):
+                context.store.set_aside(before)
             return None
         found: Optional[Machine] = None
         with contextlib.suppress(MachineNotFound):
@@ -111,9 +108,6 @@ class Creation(Step):
         job.record = dataclasses.replace(before, spec=job.spec)
         job.former = before.last or before.launch
         return found
-
-    def _find(self, launch: str) -> Iterable[Machine]:
-        return self._context.provider.find({TAG_NAME: self._job.name, TAG_LAUNCH: launch})
 
     def _check_alike(self, before: Any, machine: Machine) -> None:
         """Raise if the kept machine was created with other options than this launch asks for."""
@@ -175,7 +169,9 @@ class Creation(Step):
             # after a refusal, no machine has to be looked for
             self._asked = not error.refused
             # without an answer a machine may exist: only a search by tags shows it
-            self._refused = isinstance(error, (ConfigurationError, PrerequisiteError))
+            self._unanswered = error.refused is False
+            self._refused = error.refused is None and isinstance(
+                error, (ConfigurationError, PrerequisiteError))
             for failure in error.undo_failures:
                 job.undo.failed('undo', failure)
             raise
@@ -223,9 +219,7 @@ class Creation(Step):
         try:
             with job.step(mode if context.capabilities.owned else 'let go'):
                 if mode == 'delete':
-                    for machine_id in self._made():
-                        context.provider.destroy(machine_id)
-                    context.store.delete(job.name)
+                    self._delete()
                     return
                 if mode == 'stop' and job.record.machine_id is not None:
                     context.provider.stop(job.record.machine_id)
@@ -233,18 +227,18 @@ class Creation(Step):
         finally:
             context.choices.end(job.name)
 
-    def _made(self) -> list[str]:
-        """Return the machine's id; find the machine of a failed creation by its tags."""
-        job = self._job
+    def _delete(self) -> None:
+        """Delete the machine and its record; find that of a failed creation by its tags."""
+        context, job = self._context, self._job
         if job.record.machine_id is not None:
-            return [job.record.machine_id]
-        if not self._asked:
-            return []
-        try:
-            return [machine.id for machine in self._find(self._context.launch)]
-        except Unsupported:
-            return []
-        except FogError:
-            if not self._refused:
-                raise
-            return []  # the creation was refused before the provider was asked
+            context.provider.destroy(job.record.machine_id)
+        elif self._asked:
+            try:
+                settled = requests.end(context.provider, job.record, tidy=False)
+            except FogError:
+                if not self._refused:
+                    raise
+                settled = True  # the creation was refused before the provider was asked
+            if self._unanswered and not settled:
+                raise requests.set_aside(context.store, job.record)
+        context.store.delete(job.name)

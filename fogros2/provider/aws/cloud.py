@@ -89,6 +89,15 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network):
         self._account.disks[vm] = instances.own_disks(found[0])
         return instances.vm_of(region, found[0])
 
+    def is_marked(self, machine: VmId) -> bool:
+        """Ask the spot request, which EC2 marks two minutes before the instance's end."""
+        found = self._account.call(
+            'ec2', machine.region, 'describe_spot_instance_requests',
+            f'asking whether {machine.vm} is reclaimed',
+            Filters=[{'Name': 'instance-id', 'Values': [machine.vm]}])['SpotInstanceRequests']
+        return any(str(one.get('Status', {}).get('Code', '')).startswith('marked-for-')
+                   for one in found)
+
     def prepare(self, region: str, order: Order, types: Sequence[str]) -> dict[str, Any]:
         """Return the image of each type, looked up once for all types that use the same."""
         found: dict[tuple[str, bool], Mapping[str, Any]] = {}

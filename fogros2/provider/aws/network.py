@@ -269,12 +269,13 @@ class Ec2Network(VmCloud):
         for disk in found:
             account.remove(region, 'delete_volume', 'deleting a disk', VolumeId=disk['VolumeId'])
 
-    def end_attempt(self, region: str, attempt: str) -> None:
+    def end_attempt(self, region: str, attempt: str) -> bool:
         found = self._instances(region, {TAG_ATTEMPT: attempt}, 'looking for what was made',
                                 instances.in_states(instances.ALIVE))
         if found:
             self._account.remove(region, 'terminate_instances', 'ending what was made',
                                  InstanceIds=[instance['InstanceId'] for instance in found])
+        return bool(found)
 
     def remains(self, region: str) -> list[dict[str, str]]:
         # the end of a machine deletes its disk and address, but not its group and key

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import re
 
+from fogros2 import untrusted
 from fogros2.errors import ConfigurationError
 from fogros2.provider.vm.options import VmOptions
 
@@ -34,7 +35,7 @@ class Options(VmOptions):
         'ec2_instance_type': (r'cheapest|[a-z0-9-]+\.[a-z0-9-]+', "'t3.medium' or 'cheapest'"),
         'ami_image': (r'ami-[0-9a-f]+', 'ami-...'),
         'subnet': (r'subnet-[0-9a-f]+', 'subnet-...'),
-        'user': (r'[a-z_][a-z0-9_-]{0,31}', "a login name, such as 'ubuntu'"),
+        'user': (untrusted.NAME.pattern, "a login name, such as 'ubuntu'"),
     }
 
     def check(self) -> None:

@@ -168,7 +168,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
 
     def undo_begin(
         self, region: str, attempt: str, created: Sequence[str],
-    ) -> Iterator[tuple[str, Callable[[], None]]]:
+    ) -> Iterator[tuple[str, Callable[[], object]]]:
         yield 'the resource group', lambda: self._drop(attempt, created)
 
     def insert(
@@ -184,10 +184,11 @@ class Azure(prices.AzurePrices, images.AzureImages):
                 {'location': place.region,
                  'tags': {**order.tags, TAG_MADE: str(int(time.time()))}})
             self._insert(name, place, order, prepared, tags)
-        except FogError:
+        except FogError as error:
             # the next place has a group of its own; what stays is undone at the end, or by gc
             with contextlib.suppress(FogError):
                 self.until(None)._drop(order.attempt, [name], empty=[name])
+                error.refused = True  # Azure creates nothing in a group that it deletes
             raise
         return name
 
@@ -290,9 +291,9 @@ class Azure(prices.AzurePrices, images.AzureImages):
     def _drop(
         self, attempt: str, names: Iterable[str] = (), *, wait: bool = False,
         empty: Optional[Collection[str]] = None,
-    ) -> None:
+    ) -> bool:
         """
-        Delete the groups of an attempt with everything in them.
+        Delete the groups of an attempt with everything in them; return whether there were any.
 
         :param names: groups that a list may not have yet.
         :param empty: only these of the groups.
@@ -315,13 +316,14 @@ class Azure(prices.AzurePrices, images.AzureImages):
         chosen = sorted(name for name in {*names, *listed} if empty is None or name in empty)
         with ThreadPoolExecutor(max(1, min(8, len(chosen))), 'fog-azure') as pool:
             list(pool.map(drop, chosen))
+        return bool(chosen)
 
     def delete(self, machine: VmId) -> None:
         self._account.seen.pop(machine.vm, None)
         self._drop(machine.attempt, [machine.vm], wait=True)
 
-    def end_attempt(self, region: str, attempt: str) -> None:
-        self._drop(attempt)
+    def end_attempt(self, region: str, attempt: str) -> bool:
+        return self._drop(attempt)
 
     def remains(self, region: str) -> list[Mapping[str, str]]:
         """Return the tags of the groups in which no machine is left, as after an eviction."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import re
 
+from fogros2 import untrusted
 from fogros2.errors import ConfigurationError
 from fogros2.provider.vm.options import VmOptions
 
@@ -35,7 +36,7 @@ class Options(VmOptions):
         'image': (rf'{OLD_UBUNTU}|{_PART}:{_PART}:{_PART}:{_PART}|/subscriptions/[\w./()-]+',
                   "'publisher:offer:sku:version' or the resource id of an image"),
         'resource_group': (r'[\w.()-]{1,89}[\w()-]', 'the name of a resource group'),
-        'user': (r'[a-z_][a-z0-9_-]{0,31}', "a login name, such as 'ubuntu'"),
+        'user': (untrusted.NAME.pattern, "a login name, such as 'ubuntu'"),
     }
 
     def check(self) -> None:

@@ -3,10 +3,10 @@
 Run machines on this computer: containers of podman or docker, each with an SSH server.
 
 ``engine`` calls podman and docker. ``root`` and ``debian_root`` make the root file system of a
-machine without an image, ``entry`` makes its first process. ``packet_filter`` keeps machines from
-this computer's ports. ``machine`` reads the reports of the engine, ``options`` parses the options
-in launch files. ``served`` is a program for a computer that hosts machines of others, and
-``hosted`` the robot's end of it.
+machine without an image, ``login_ids`` chooses the id of its user, ``entry`` makes its first
+process. ``packet_filter`` keeps machines from this computer's ports. ``machine`` reads the reports
+of the engine, ``options`` parses the options in launch files. ``served`` is a program for a
+computer that hosts machines of others, and ``hosted`` the robot's end of it.
 """
 
 from __future__ import annotations
@@ -16,12 +16,11 @@ import contextlib
 import json
 import os
 from pathlib import Path
-import re
 import stat
 import tempfile
 from typing import Any, ClassVar, Optional
 
-from fogros2 import process
+from fogros2 import process, untrusted
 from fogros2.errors import (
     CommandError,
     DeadlineExceeded,
@@ -33,7 +32,7 @@ from fogros2.errors import (
 )
 from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider
-from fogros2.provider.container import debian_root, packet_filter
+from fogros2.provider.container import debian_root, login_ids, packet_filter
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import entry as container_entry
 from fogros2.provider.container import machine as container_machine
@@ -48,11 +47,14 @@ from fogros2.waiting import wait_until
 _NO_UPPER = ('overlay', 'nfs', 'nfs4', 'cifs', 'vfat', 'exfat', 'ntfs', '9p', 'virtiofs', 'fuse')
 
 # One process does all steps, in its own session: a launch that is killed meanwhile leaves either
-# nothing or a machine with its watchdog. From the sixth argument on, the words are the engine's.
+# nothing or a machine with its watchdog. After the fourth argument come the paths of layers, an
+# empty word, and the engine's words. The input is a line with a label, and the root's archive.
+#
+# The machine has this computer's user ids, and root there makes any file. So no other account
+# enters the folder, and no file in it gives rights or leads to a device, even where it is shown.
 _CREATE = """\
-top=$1 begin=$2 end=$3 clean=$4 layers=$5
-shift 5
-engine=$1
+top=$1 begin=$2 end=$3 clean=$4
+shift 4
 umask 022
 failed() {
     code=$?
@@ -62,19 +64,21 @@ failed() {
     exit $code
 }
 tries=0
-until mkdir "$top" 2>/dev/null; do
+until install -d -m 700 "${top%/*}" && mkdir -m 700 "$top" 2>/dev/null; do
     # it exists: another attempt with this token, or one that was interrupted
     [ -e "$top" ] || [ $tries -gt 9 ] && exit 17  # _TOKEN_USED
-    mkdir -p "${top%/*}"
-    chmod 711 "${top%/*}"
     tries=$((tries + 1))
 done
 trap failed EXIT
+mount --bind -o nosuid,nodev "$top" "$top"
 mkdir "$top/root" "$top/hooks"
-chmod 711 "$top"
+IFS= read -r label
+printf '%s\n' "$label" >"$top/labels"
 printf %s "$begin" >"$top/hooks/begin.json"
 printf %s "$end" >"$top/hooks/end.json"
-for layer in $layers; do mkdir -p "$top/layers$layer/upper" "$top/layers$layer/work"; done
+while [ -n "$1" ]; do mkdir -p "$top/layers$1/upper" "$top/layers$1/work"; shift; done
+shift
+engine=$1
 tar -xpf - --numeric-owner -C "$top/root"
 "$@"
 """
@@ -82,7 +86,8 @@ tar -xpf - --numeric-owner -C "$top/root"
 # Podman forgets the folder of a container's hooks when the container has started.
 _START = """\
 top=$1
-install -d -m 711 "${top%/*}" "$top" "$top/hooks"
+install -d -m 700 "${top%/*}" "$top" "$top/hooks"
+[ ! -e "$top/root" ] || mountpoint -q "$top" || mount --bind -o nosuid,nodev "$top" "$top"
 printf %s "$2" >"$top/hooks/begin.json"
 printf %s "$3" >"$top/hooks/end.json"
 shift 3
@@ -96,9 +101,8 @@ umask 077
 until mkdir -p "$1" && chmod 1777 "$1" && chmod 755 "${1%/*}"; do sleep 0.1; done
 """
 
-#: Maximum size of a host key's file in bytes, and the form of a key.
+#: Maximum size of a host key's file in bytes.
 _KEY_BYTES = 4096
-_HOST_KEY = re.compile('ssh-[a-z0-9-]+ [A-Za-z0-9+/=]+')
 _READ_PLAIN = f'[ -f "$1" ] && [ ! -L "$1" ] && head -c {_KEY_BYTES} -- "$1"'
 
 #: Exit statuses of a regular end, SIGKILL and SIGTERM.
@@ -152,6 +156,12 @@ class ContainerProvider(Provider):
             container_engine.check_architecture(engine, options.image)
         else:
             check_root(isolated=options.isolated)
+            for path in () if options.isolated else container_root.environment_mounts(
+                    *spec.workspaces):
+                if options.user != 'root' and not os.stat(path).st_mode & 0o004:
+                    raise PrerequisiteError(
+                        f"the user of a container machine can't read {path}",
+                        f'chmod -R o+rX {path}')
 
     def architecture(self, spec: MachineSpec) -> str:
         """Return the image's architecture; the engine downloads images for this computer's."""
@@ -224,18 +234,21 @@ class ContainerProvider(Provider):
             words += ['-v', f"{base}{path}:{path}:O{upper if kept else ''}"]
         for mount in () if base else container_root.environment_mounts(*spec.workspaces):
             words += ['-v', f'{mount}:{mount}:ro']
-        archive = _entry(spec, request, options)
+        number = login_ids.login_id(request.token)
+        archive = _entry(spec, request, options, number)
+        container_root.accounts(archive, options.user, number, Path(f'{base}/etc'))
         if base:
             archive.file('etc/apt/sources.list', ''.join(
                 f'{line}\n' for line in debian_root.release().sources).encode())
             archive.file('etc/apt/apt.conf.d/90fogros2', debian_root.connection().encode())
         command = Command(
             ('sh', '-ec', _CREATE, 'sh', str(top), *hooks(top, kept=kept), clean(top),
-             ' '.join(system) if kept else '',
-             engine.name, *engine.flags, *hook_flags(top), 'run', '-d', '--cidfile', f'{top}/cid',
-             *words, '--rootfs', f'{top}/root', '/bin/sh', f'/{container_entry.FOLDER}/entry.sh'),
+             *(system if kept else ()), '', engine.name, *engine.flags, *hook_flags(top),
+             'run', '-d', '--cidfile', f'{top}/cid', '--label-file', f'{top}/labels', *words,
+             '--rootfs', f'{top}/root', '/bin/sh', f'/{container_entry.FOLDER}/entry.sh'),
             sudo=engine.sudo, what=f"creating container machine '{spec.name}'",
-            input=container_root.skeleton(options.user, base) + archive.data())
+            input=container_machine.token_label(request.token).encode()
+            + container_root.skeleton(base) + archive.data())
         try:
             return process.run(command, timeout=120.0).stdout.split()[-1]
         except CommandError as error:
@@ -251,14 +264,16 @@ class ContainerProvider(Provider):
         what = f"creating container machine '{spec.name}' from {options.image}"
         identity = engine.call(
             'create', *container_options.common_flags(engine, spec, request, options),
-            '--user', '0:0', '--entrypoint', '/bin/sh', options.image,
-            f'/{container_entry.FOLDER}/entry.sh', what=what, timeout=1800.0,
+            '--label-file', '/dev/stdin', '--user', '0:0', '--entrypoint', '/bin/sh',
+            options.image, f'/{container_entry.FOLDER}/entry.sh', what=what, timeout=1800.0,
+            data=container_machine.token_label(request.token).encode(),
             cancel=self.cancel).stdout.split()[-1]
         try:
             # podman keeps what it has copied in its folder for temporary files
             with tempfile.TemporaryDirectory() as aside:
                 engine.call('cp', '-', f'{identity}:/', what=what, variables=(f'TMPDIR={aside}',),
-                            data=_entry(spec, request, options).data())
+                            data=_entry(spec, request, options,
+                                        login_ids.login_id(request.token)).data())
             _start(engine, identity, request.token, kept=spec.on_exit == 'stop', what=what)
         except BaseException:
             with contextlib.suppress(ProviderError, DeadlineExceeded):
@@ -302,6 +317,14 @@ class ContainerProvider(Provider):
                     running = container_machine.state_of(entry) is MachineState.RUNNING
                     yield container_machine.machine_of(
                         engine, entry, self._host_key(engine, entry) if running else None)
+
+    def may_create(self, token: str, age: float) -> bool:
+        """Return whether an engine still works at a request: it may outlive its launch."""
+        for path in Path('/proc').glob('[0-9]*/cmdline'):
+            with contextlib.suppress(OSError):
+                if token.encode() in path.read_bytes():
+                    return True
+        return False
 
     def destroy(self, machine_id: str) -> None:
         """Remove a container and its root; return when both are removed."""
@@ -363,7 +386,7 @@ class ContainerProvider(Provider):
                 Command(('sh', '-c', _READ_PLAIN, 'sh', str(path)), sudo=True), timeout=10.0,
                 check=False).stdout
         key = ' '.join(text.split()[:2])
-        if not _HOST_KEY.fullmatch(key):
+        if not untrusted.HOST_KEY.fullmatch(key):
             return None
         self._host_keys[identity] = key
         return key
@@ -427,11 +450,13 @@ def _start(engine: Engine, identity: str, token: str, *, kept: bool, what: str) 
         raise container_engine.translate(error) from error
 
 
-def _entry(spec: MachineSpec, request: CreateRequest, options: Options) -> Archive:
+def _entry(
+    spec: MachineSpec, request: CreateRequest, options: Options, number: int,
+) -> Archive:
     """Return an archive with the first process of a machine, and the files that it needs."""
     archive = Archive()
     container_entry.add(
-        archive, user=options.user, authorized_key=request.authorized_key,
+        archive, user=options.user, number=number, authorized_key=request.authorized_key,
         environment=options.env, agent_config=request.agent_config,
         nested=container_options.runs_containers(spec, options))
     return archive
@@ -465,7 +490,7 @@ def filter_name(top: Path) -> str:
 
 def clean(top: Path) -> str:
     """Return shell text that removes a machine's packet filter, root and folder of its relay."""
-    return (f'{packet_filter.unset(filter_name(top))}; '
+    return (f'{packet_filter.unset(filter_name(top))}; umount -l {top} 2>/dev/null; '
             f'rm -rf -- {top} {container_machine.SHARED}/*/{top.name}; rmdir -- {top.parent} '
             f'{container_machine.SHARED}/* {container_machine.SHARED} 2>/dev/null; true')
 

@@ -158,7 +158,9 @@ def root(
     target = path(folder, own, packages)
     if target.is_dir():
         return target
-    folder.mkdir(parents=True, exist_ok=True)
+    # its programs with root's rights may be older than this computer's: no other account runs them
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    folder.chmod(0o700)
     with open(folder / 'lock', 'w') as lock:
         wait_until(lambda: _lock(lock), timeout=TIMEOUT, cancel=cancel, longest=0.5,
                    what='another launch to make the root')

@@ -42,8 +42,12 @@ if [ -n "$missing" ]; then
         openssh-server sudo rsync python3 iproute2 >&2 \\
         || fail "the image lacks$missing, and apt-get could not install them"
 fi
-id "$user" >/dev/null 2>&1 || useradd -m -s /bin/bash "$user" \\
-    || fail "no user $user can be made in the image"
+case $(id -u "$user" 2>/dev/null) in
+    0 | {number}) ;;
+    # the list of last logins would become as long as the number is high
+    '') rm -f /var/log/lastlog; useradd -l -m -u {number} -s /bin/bash "$user" ;;
+    *) rm -f /var/log/lastlog; usermod -u {number} "$user" ;;
+esac || fail "no user $user with the id {number} can be made in the image"
 # without PAM, sshd refuses users with a locked password; no typed password equals '*'
 if grep -q "^$user:!" /etc/shadow; then usermod -p '*' "$user"; fi
 if [ "$user" != root ] && ! grep -q "^$user .*NOPASSWD: ALL" /etc/sudoers; then
@@ -140,17 +144,19 @@ SetEnv {environment}
 
 
 def add(
-    archive: Archive, *, user: str, authorized_key: str, environment: Mapping[str, str],
-    agent_config: Mapping[str, Any], nested: bool = False,
+    archive: Archive, *, user: str, number: int, authorized_key: str,
+    environment: Mapping[str, str], agent_config: Mapping[str, Any], nested: bool = False,
 ) -> None:
     """
     Add the script of the first process, and the files that it needs, to a machine's root.
 
+    :param number: id of the login user, if the user is not root.
     :param nested: whether the machine runs containers.
     """
     names = {
-        'user': user, 'folder': FOLDER, 'host_key': HOST_KEY, 'error_mark': ERROR_MARK,
-        'host_key_mark': HOST_KEY_MARK, 'agent_directory': AGENT_DIRECTORY,
+        'user': user, 'number': number, 'folder': FOLDER, 'host_key': HOST_KEY,
+        'error_mark': ERROR_MARK, 'host_key_mark': HOST_KEY_MARK,
+        'agent_directory': AGENT_DIRECTORY,
         'root': 'prohibit-password' if user == 'root' else 'no',
     }
     start_agent = _AGENT.format(**names) if agent_config else _IDLE

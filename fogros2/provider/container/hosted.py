@@ -10,22 +10,22 @@ robot reaches the container at ports that the engine publishes on the host.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+import contextlib
 import dataclasses
 import functools
 import gzip
 import hashlib
-import json
+import ipaddress
 from pathlib import Path
-from typing import Any, ClassVar, Optional
+from typing import Any, ClassVar, Optional, TypedDict
 
-from fogros2 import errors, model, plugin_system
+from fogros2 import errors, model, plugin_system, untrusted
 from fogros2.errors import FogError, MachineNotFound, ProviderError, Unsupported
-from fogros2.events import clean
 from fogros2.model import Command, CreateRequest, Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider, TAG_NAME
 from fogros2.provider.container import ContainerProvider
 from fogros2.provider.container.entry import END_COMMAND
-from fogros2.provider.container.machine import HOSTED
+from fogros2.provider.container.machine import HOSTED, ID
 from fogros2.provider.container.options import Options
 from fogros2.provider.container.root import Archive
 from fogros2.provider.options import parsed
@@ -56,6 +56,34 @@ mv -T "$aside" "$folder" 2>/dev/null || [ -d "$folder" ]
 """
 
 
+class _Answer(TypedDict, total=False):
+    """The line that ``served`` prints: a result, or an error."""
+
+    result: Any
+    error: str
+    message: str
+    hint: str
+
+
+class _Shell(TypedDict):
+    port: int
+    user: str
+    host_key: str
+
+
+class _Machine(TypedDict):
+    """A machine as its host reports it."""
+
+    id: str
+    state: str
+    created: float
+    shell: Optional[_Shell]
+    vpn_host: str
+    vpn_port: int
+    image: str
+    tags: dict[str, str]
+
+
 @functools.lru_cache(maxsize=1)
 def program() -> tuple[bytes, str]:
     """Return the archive of the modules that a host runs, and its hash."""
@@ -74,14 +102,16 @@ def result_of(text: str, name: str) -> Any:
     :raises FogError: the error of the call on the host.
     """
     try:
-        found = json.loads(text.splitlines()[-1])
-        if 'error' not in found:
-            return found['result']
-        kind = getattr(errors, found['error']) if found['error'] in _KINDS else ProviderError
-        error: FogError = kind(clean(str(found['message'])), clean(str(found['hint'])))
-    except (ValueError, LookupError, TypeError) as invalid:
-        raise ProviderError(f"the host '{name}' sent no answer, but {text[-200:]!r}",
-                            'its login must print nothing after a command') from invalid
+        answer: _Answer = untrusted.parsed(text.splitlines()[-1], _Answer)
+        if 'error' not in answer:
+            return answer['result']
+        kind = getattr(errors, answer['error']) if answer['error'] in _KINDS else ProviderError
+        error: FogError = kind(answer['message'], answer['hint'])
+    except (untrusted.InvalidMessage, LookupError) as invalid:
+        error = ProviderError(f"the host '{name}' sent no answer, but {text[-200:]!r}",
+                              'its login must print nothing after a command')
+        error.refused = False
+        raise error from invalid
     raise error
 
 
@@ -172,35 +202,51 @@ class HostedProvider(Provider):
         host = self._find_host(on)
         options['ports'] = [*(options.get('ports') or ()), '22', f'{request.vpn_port}/udp']
         robot = f'-{hashlib.sha256(robot_id().encode()).hexdigest()[:8]}'
-        identity = self._call(
-            host, 'create', _CREATE_TIMEOUT,
-            spec={'name': spec.name, 'provider': ContainerProvider.name, 'options': options,
-                  'on_exit': spec.on_exit, 'containers': spec.containers, 'share': spec.share},
-            request=dataclasses.replace(request, tags={**request.tags, HOSTED: robot}))
-        return f'{_SCHEME}{identity}@{host}'
+        try:
+            identity = self._call(
+                host, 'create', _CREATE_TIMEOUT,
+                spec={'name': spec.name, 'provider': ContainerProvider.name, 'options': options,
+                      'on_exit': spec.on_exit, 'containers': spec.containers,
+                      'share': spec.share},
+                request=dataclasses.replace(request, tags={**request.tags, HOSTED: robot}))
+        except errors.ShellError as error:
+            error.refused = False  # the host may go on without the connection
+            raise
+        with self._reading(host):
+            return f'{_SCHEME}{untrusted.matched(ID, identity)}@{host}'
 
     def describe(self, machine_id: str) -> Machine:
         """Return the state of a container, from the host."""
         return self._machine(_parse(machine_id)[0], self._call_of(machine_id, 'describe'))
 
-    def _machine(self, host: str, found: Any) -> Machine:
-        """Return a machine as the robot sees it, from the JSON of one on its host."""
+    @contextlib.contextmanager
+    def _reading(self, host: str) -> Iterator[None]:
+        """Turn the error of a wrong report into one that names the host."""
+        try:
+            yield
+        except ValueError as error:
+            raise ProviderError(f"the host '{self._host(host)[0].name}' reports a machine "
+                                f'wrongly: {error}', 'the host may be hijacked') from error
+
+    def _machine(self, host: str, report: Any) -> Machine:
+        """Return a machine as the robot sees it, from the report of its host."""
         outside, _ = self._host(host)
         assert outside.shell is not None
-        try:
-            tags = {str(name): str(value) for name, value in found['tags'].items()}
-            shell = found['shell'] and Endpoint(
-                'ssh', outside.shell.host, int(found['shell']['port']),
-                str(found['shell']['user']), str(found['shell']['host_key']))
+        with self._reading(host):
+            untrusted.checked(report, _Machine)
+            found: _Machine = report
+            login, address = found['shell'], found['vpn_host']
             return Machine(
-                f"{_SCHEME}{found['id']}@{host}", tags.get(TAG_NAME, ''), self.name,
-                MachineState(found['state']), float(found['created']), shell, outside.vpn_host,
+                f"{_SCHEME}{untrusted.matched(ID, found['id'])}@{host}",
+                found['tags'].get(TAG_NAME, ''), self.name, MachineState(found['state']),
+                found['created'], login and Endpoint(
+                    'ssh', outside.shell.host, untrusted.port(login['port']),
+                    untrusted.matched(untrusted.NAME, login['user']),
+                    untrusted.matched(untrusted.HOST_KEY, login['host_key'])),
                 # the host's packet filter admits no machine to the host's ports
-                int(found['vpn_port']), private_network=host, private_ip=str(found['vpn_host']),
-                region=outside.name, image=str(found['image']), tags=tags, end_command=END_COMMAND)
-        except (LookupError, TypeError, ValueError, AttributeError) as error:
-            raise ProviderError(
-                f"the host '{outside.name}' reports a machine wrongly: {error!r}") from error
+                outside.vpn_host, untrusted.port(found['vpn_port']), private_network=host,
+                private_ip=address and str(ipaddress.ip_address(address)), region=outside.name,
+                image=found['image'], tags=found['tags'], end_command=END_COMMAND)
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
         """
@@ -210,7 +256,8 @@ class HostedProvider(Provider):
         :raises FogError: a host does not answer, after the machines of all others.
         """
         known = [*self._asked, *(
-            record.spec.options['on'] for record in Store().machines()
+            record.spec.options['on'] for record in (
+                *Store().machines(), *(record for record, _ in Store().requests()))
             if record.provider == self.name)]
         if not known:
             raise Unsupported('only its host knows a container machine on another computer')
@@ -219,15 +266,17 @@ class HostedProvider(Provider):
         for on in known:
             try:
                 host = self._find_host(on)
-                answer = [] if host in asked else self._call(host, 'find', tags=tags)
+                if host in asked:
+                    continue
+                answer = self._call(host, 'find', tags=tags)
+                with self._reading(host):
+                    untrusted.checked(answer, list[Any])
+                machines = [self._machine(host, report) for report in answer]
             except FogError as error:
                 failure = error
                 continue
             asked.add(host)
-            for found in answer:
-                machine = self._machine(host, found)
-                if HOSTED in machine.tags:
-                    yield machine
+            yield from (machine for machine in machines if HOSTED in machine.tags)
         if failure is not None:
             raise failure
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import datetime
+import hashlib
 import os
 from pathlib import Path
 import re
@@ -31,6 +32,8 @@ _OURS = (ATTEMPT, LOGIN, MACHINE, DIRECTORY, ENDS_STOPPED, VPN_PORT)
 ROOTS = Path('/var/lib/fogros2')
 #: Folders by which relays of shared topics meet: of each user of this computer, of each machine.
 SHARED = Path('/var/lib/fogros2-share')
+#: A machine's id: its engine, its container's id, its token.
+ID = re.compile(r'(podman|docker):([0-9a-f]{12}):([A-Za-z0-9_-]+)')
 
 _STATES = {
     'created': MachineState.PENDING, 'configured': MachineState.PENDING,
@@ -49,13 +52,18 @@ def container_name(machine: str, tags: Mapping[str, str] = {}) -> str:
 
 def directory(token: str) -> Path:
     """
-    Return the folder of the root of the machine with this token.
+    Return the folder of the root of the machine with this token, which its name does not tell.
 
     :raises MachineNotFound: the token is not ours, so that no other folder is ever removed.
     """
     if not re.fullmatch(r'[A-Za-z0-9][A-Za-z0-9_-]{3,63}', token):
         raise MachineNotFound(f"'{token}' is no token of a container machine")
-    return ROOTS / token
+    return ROOTS / hashlib.sha256(token.encode()).hexdigest()[:16]
+
+
+def token_label(token: str) -> str:
+    """Return the line of a file with the label of a machine's token."""
+    return f'{ATTEMPT}={token}\n'
 
 
 def share_folder(token: str) -> Path:
@@ -74,7 +82,7 @@ def parse_id(machine_id: str) -> tuple[Engine, str, str]:
 
     :raises MachineNotFound: it is no id of this provider.
     """
-    match = re.fullmatch(r'(podman|docker):([0-9a-f]{12}):([A-Za-z0-9_-]+)', machine_id)
+    match = ID.fullmatch(machine_id)
     if not match:
         raise MachineNotFound(f"'{machine_id}' is no container machine")
     return container_engine.named(match[1]), match[2], match[3]

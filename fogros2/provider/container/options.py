@@ -12,13 +12,13 @@ from pathlib import Path
 import re
 from typing import Any
 
+from fogros2 import untrusted
 from fogros2.errors import ConfigurationError
 from fogros2.model import CreateRequest, MachineSpec
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container.engine import Engine
 from fogros2.provider.container.entry import FOLDER
 from fogros2.provider.container.machine import (
-    ATTEMPT,
     container_name,
     DIRECTORY,
     ENDS_STOPPED,
@@ -90,7 +90,7 @@ def _check_values(options: Options) -> None:
     if options.engine == 'docker' and not options.image:
         raise ConfigurationError("docker can't use this computer's own root",
                                  "name an image with image='...', or take engine='podman'")
-    if not re.fullmatch(r'[a-z_][a-z0-9_-]{0,31}', options.user):
+    if not untrusted.NAME.fullmatch(options.user):
         raise ConfigurationError(
             f"'{options.user}' can't be a user name",
             'user= takes small letters, digits, - and _, beginning with a letter')
@@ -183,10 +183,10 @@ def network_subnets(output: str) -> list[ipaddress.IPv4Network]:
 def common_flags(
     engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
 ) -> Iterator[str]:
-    """Yield the engine's flags for a spec, with or without an image."""
+    """Yield the engine's flags for a spec, with or without an image; the token is not in them."""
     yield from ('--name', container_name(spec.name, request.tags), '--hostname', spec.name)
     labels = {
-        **request.tags, ATTEMPT: request.token, LOGIN: options.user, MACHINE: spec.name,
+        **request.tags, LOGIN: options.user, MACHINE: spec.name,
         DIRECTORY: '' if options.image else 'root', VPN_PORT: str(request.vpn_port),
     }
     if spec.on_exit == 'stop':
@@ -218,7 +218,9 @@ def common_flags(
         yield from ('-p', port)
     if spec.share:
         folder, (own, others) = share_folder(request.token), SHARE_FOLDERS
-        yield from ('-v', f'{folder}:{own}', '-v', f'{folder.parent}:{others}:ro')
+        # a program of another machine gives no rights here
+        safe = ',nosuid,nodev,noexec' if engine.name == 'podman' else ''
+        yield from ('-v', f'{folder}:{own}:rw{safe}', '-v', f'{folder.parent}:{others}:ro{safe}')
     for mount in options.mounts:
         source, _, target = mount.partition(':')
         yield from ('-v', f'{source}:{target or source}:ro')

@@ -222,8 +222,12 @@ def _add(archive: Archive, path: str, name: str) -> None:
             archive.file(name, file.read(), 0o755 if mode & 0o111 else 0o644)
 
 
-def accounts(archive: Archive, user: str, etc: Path = Path('/etc')) -> None:
-    """Add the system's accounts and the login ``user`` (uid 1000), all without a password."""
+def accounts(archive: Archive, user: str, number: int, etc: Path = Path('/etc')) -> None:
+    """
+    Add the system's accounts and the login ``user``, all without a password.
+
+    :param number: id of the login user and its group, if the user is not root.
+    """
     people, groups = [], []
     for line in (etc / 'passwd').read_text().splitlines():
         words = line.split(':')
@@ -234,8 +238,8 @@ def accounts(archive: Archive, user: str, etc: Path = Path('/etc')) -> None:
         if len(words) == 4 and _system(words[2]) and words[0] != user:
             groups.append([*words[:3], ''])
     if user != 'root':
-        people.append([user, 'x', '1000', '1000', '', f'/home/{user}', '/bin/bash'])
-        groups.append([user, 'x', '1000', ''])
+        people.append([user, 'x', str(number), str(number), '', f'/home/{user}', '/bin/bash'])
+        groups.append([user, 'x', str(number), ''])
     else:
         people.append(['root', 'x', '0', '0', 'root', '/root', '/bin/bash'])
         groups.append(['root', 'x', '0', ''])
@@ -254,11 +258,11 @@ def accounts(archive: Archive, user: str, etc: Path = Path('/etc')) -> None:
         'root ALL=(ALL:ALL) ALL\n'
         f'{user} ALL=(ALL:ALL) NOPASSWD: ALL\n').encode(), 0o440)
     if user != 'root':
-        archive.folder(f'home/{user}', 0o750, 1000)
+        archive.folder(f'home/{user}', 0o750, number)
         for name in ('.bashrc', '.profile'):
             path = etc / 'skel' / name
             if path.is_file() and _fit(str(path)):
-                archive.file(f'home/{user}/{name}', path.read_bytes(), 0o644, 1000)
+                archive.file(f'home/{user}/{name}', path.read_bytes(), 0o644, number)
 
 
 def _system(number: str) -> bool:
@@ -266,9 +270,11 @@ def _system(number: str) -> bool:
 
 
 @functools.lru_cache(maxsize=4)
-def skeleton(user: str, base: str = '') -> bytes:
+def skeleton(base: str = '') -> bytes:
     """
     Return the part of the root that all machines share, as an archive without end mark.
+
+    The accounts are missing: see :func:`accounts`.
 
     Each process reads /etc only once for all machines of a launch.
 
@@ -287,7 +293,6 @@ def skeleton(user: str, base: str = '') -> bytes:
     archive.link('var/lock', '/run/lock')
     archive.link('etc/mtab', '../proc/self/mounts')
     settings(archive, f'{base}/etc')
-    accounts(archive, user, Path(f'{base}/etc'))
     return archive.data(last=False)
 
 

@@ -221,9 +221,11 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
         self._account.labels.pop(machine.vm, None)
         self._drop_rules(machine.vm.partition('/')[0], machine.attempt)
 
-    def end_attempt(self, region: str, attempt: str) -> None:
-        for vm in self._instances({TAG_ATTEMPT: attempt}):
+    def end_attempt(self, region: str, attempt: str) -> bool:
+        found = self._instances({TAG_ATTEMPT: attempt})
+        for vm in found:
             self._account.remove(_path(vm.id), f'deleting {vm.id}')
+        return bool(found)
 
     def sweep(self, region: str, attempt: str) -> None:
         """Delete an instance that ended itself, and the firewall rules."""

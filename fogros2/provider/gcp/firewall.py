@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import json
 from typing import Any
 
+from fogros2 import untrusted
 from fogros2.errors import ConfigurationError, ProviderError
 from fogros2.provider.gcp.account import Account
 from fogros2.provider.vm.address import ADDRESS_VARIABLE
@@ -45,8 +46,8 @@ def rule(
 def tags_of(found: Mapping[str, Any]) -> dict[str, str]:
     """Return the tags in the description of a rule; {} if it is not ours."""
     try:
-        return {str(key): str(value) for key, value in json.loads(found['description']).items()}
-    except (ValueError, KeyError, AttributeError):
+        return untrusted.parsed(found['description'], dict[str, str])  # type: ignore[no-any-return]
+    except (untrusted.InvalidMessage, KeyError):
         return {}
 
 

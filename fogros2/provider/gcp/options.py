@@ -8,6 +8,7 @@ import dataclasses
 import re
 from typing import Any
 
+from fogros2 import untrusted
 from fogros2.errors import ConfigurationError
 from fogros2.provider.vm.options import VmOptions
 
@@ -43,7 +44,7 @@ class Options(VmOptions):
         'accelerators': (rf'{_NAME}(:[1-9]\d?)?', "'nvidia-tesla-t4' or 'nvidia-tesla-t4:2'"),
         'service_account': (r'[^@\s]+@[^@\s]+', 'the email address of one'),
         'network': (_NAME, 'the name of a VPC network of the project'),
-        'user': (r'[a-z_][a-z0-9_-]{0,31}', "a login name, such as 'ubuntu'"),
+        'user': (untrusted.NAME.pattern, "a login name, such as 'ubuntu'"),
     }
 
     @classmethod

@@ -17,14 +17,23 @@ import threading
 import time
 from typing import Any, ClassVar, Optional
 
-from fogros2 import kubernetes_client
+from fogros2 import kubernetes_client, untrusted
 from fogros2.errors import (
     ConfigurationError,
+    FogError,
     MachineNotFound,
     NameTaken,
     PrerequisiteError,
 )
-from fogros2.kubernetes_client import Api, ApiError, existing, items, path, selector
+from fogros2.kubernetes_client import (
+    Api,
+    ApiError,
+    existing,
+    items,
+    path,
+    selector,
+    Unreachable,
+)
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider, TAG_ON_EXIT
 from fogros2.provider.kubernetes import boot, ending, hints, manifests, names, pods, ways
@@ -140,12 +149,17 @@ class KubernetesProvider(Provider):
             existing = self._existing(api, namespace, spec, request)
             if existing is None:
                 raise refused(error, f"the pod of '{spec.name}'", namespace) from error
+        except FogError as error:
+            error.refused = True  # a dry run creates nothing
+            raise
         job = existing or self._make_job(api, namespace, spec, request, options)
         machine_id = str(MachineId.of(job, api.context))
         try:
             service = ways.make(api, namespace, spec, request, options, job, self.cancel)
-        except BaseException:
+        except BaseException as error:
             self.destroy(machine_id)
+            if isinstance(error, FogError):
+                error.refused = True
             raise
         self._made[machine_id] = job
         self._services[machine_id] = service
@@ -158,9 +172,14 @@ class KubernetesProvider(Provider):
         try:
             return api.request('POST', path('jobs', namespace),
                                manifests.job(spec, request, options), cancel=self.cancel)
+        except Unreachable as error:
+            error.refused = False
+            raise
         except ApiError as error:
             if error.reason != 'AlreadyExists':
-                raise refused(error, f"the Job of '{spec.name}'", namespace) from error
+                told = refused(error, f"the Job of '{spec.name}'", namespace)
+                told.refused = error.status < 500
+                raise told from error
             existing = self._existing(api, namespace, spec, request)
             if existing is None:
                 raise NameTaken(
@@ -309,11 +328,12 @@ class KubernetesProvider(Provider):
         tags = names.tags_of(job)
         status = (pod or {}).get('status') or {}
         shell = None
-        if pod is not None and state is MachineState.RUNNING:
+        user = names.annotation(job, names.LOGIN)
+        if pod is not None and state is MachineState.RUNNING and untrusted.NAME.fullmatch(user):
             shell = Endpoint(
                 'kubernetes', names.endpoint_host(
                     where.namespace, str(pod['metadata']['name']), where.context),
-                0, names.annotation(job, names.LOGIN))
+                0, user)
         address = str(status.get('podIP') or '')
         return Machine(
             id=str(where), name=tags.get('fogros2-name', where.job), provider=self.name,

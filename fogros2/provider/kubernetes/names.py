@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import dataclasses
-import json
 import re
 from typing import Any
 
+from fogros2 import untrusted
 from fogros2.errors import MachineNotFound
 
 #: Label of all our objects.
@@ -96,11 +96,10 @@ def wanted(tags: Mapping[str, str]) -> dict[str, str]:
 def tags_of(job: Mapping[str, Any]) -> dict[str, str]:
     """Return the tags of a Job."""
     try:
-        found = json.loads(annotation(job, TAGS) or '{}')
-    except ValueError:
+        found: dict[str, str] = untrusted.parsed(annotation(job, TAGS) or '{}', dict[str, str])
+    except untrusted.InvalidMessage:
         return {}
-    return {str(key): str(value) for key, value in found.items()} \
-        if isinstance(found, dict) else {}
+    return found
 
 
 def annotation(thing: Mapping[str, Any], name: str) -> str:

@@ -8,6 +8,7 @@ import dataclasses
 import re
 from typing import Any
 
+from fogros2 import untrusted
 from fogros2.errors import ConfigurationError
 from fogros2.provider.options import convert, parsed
 
@@ -102,7 +103,7 @@ def _check_values(options: Options) -> None:
     if options.namespace and not _LABEL.fullmatch(options.namespace):
         raise ConfigurationError(f"'{options.namespace}' can't be a namespace",
                                  'lower-case letters, digits and - make one, 63 at most')
-    if not re.fullmatch(r'[a-z_][a-z0-9_-]{0,31}', options.user):
+    if not untrusted.NAME.fullmatch(options.user):
         raise ConfigurationError(f"'{options.user}' can't be a user name",
                                  'lower-case letters, digits, _ and - make one, 32 at most')
     if any(c.isspace() or c in '/@' for c in options.robot_host):

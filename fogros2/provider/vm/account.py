@@ -10,14 +10,12 @@ from typing import Any, Optional, TypeVar
 
 from fogros2.errors import Cancelled, FogError
 from fogros2.provider.vm.failures import CodedError, Silent
-from fogros2.waiting import cancellable
+from fogros2.waiting import cancellable, ON_ITS_WAY
 
 #: Attempts of a request that the cloud throttles or that fails there; without any answer, two.
 ATTEMPTS = 8
 #: Seconds of the first pause between attempts, which doubles, and of the longest.
 PAUSE, LONGEST = 1.0, 20.0
-#: Seconds to wait for the answer to a sent request, which may create something.
-ON_ITS_WAY = 4.0
 
 Own = TypeVar('Own', bound='Account')
 T = TypeVar('T')

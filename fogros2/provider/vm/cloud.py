@@ -19,7 +19,7 @@ import uuid
 
 from fogros2.errors import ProviderError, Unsupported
 from fogros2.model import CreateRequest, Image, MachineSpec, MachineState
-from fogros2.provider import TAG_DEPENDENCIES, TAG_NAME, TAG_ROBOT
+from fogros2.provider import SETTLED, TAG_DEPENDENCIES, TAG_NAME, TAG_ROBOT
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.options import VmOptions
 from fogros2.provider.vm.regions import Regions
@@ -39,8 +39,6 @@ TAG_SSH_FROM = 'fogros2-ssh-from'
 TAG_BAKED = 'fogros2-baked'
 #: Only on resources beside the machine: seconds since the epoch of their creation.
 TAG_MADE = 'fogros2-made'
-#: Seconds after which a resource of an attempt without a machine is a leftover.
-SETTLED = 900.0
 _LOGGER = logging.getLogger(__name__)
 
 Adapter = TypeVar('Adapter', bound='VmCloud')
@@ -297,6 +295,10 @@ class VmCloud(abc.ABC):
         :raises MachineNotFound: it does not exist (any more).
         """
 
+    def is_marked(self, machine: VmId) -> bool:
+        """Return whether the API announces the end of a spot machine that still runs."""
+        return False
+
     def prepare(self, region: str, order: Order, types: Sequence[str]) -> Mapping[str, Any]:
         """
         Look up what ``insert`` needs for each type, such as the image; create nothing.
@@ -311,7 +313,7 @@ class VmCloud(abc.ABC):
 
     def undo_begin(
         self, region: str, attempt: str, created: Sequence[str],
-    ) -> Iterator[tuple[str, Callable[[], None]]]:
+    ) -> Iterator[tuple[str, Callable[[], object]]]:
         """Yield the steps that delete what ``begin`` created: a name for people, a function."""
         yield from ()
 
@@ -341,8 +343,12 @@ class VmCloud(abc.ABC):
         """Delete a machine and everything of its attempt; return when all of it is gone."""
 
     @abc.abstractmethod
-    def end_attempt(self, region: str, attempt: str) -> None:
-        """Delete the machines of an attempt whose creation failed, without waiting."""
+    def end_attempt(self, region: str, attempt: str) -> bool:
+        """
+        Delete the machines of an attempt whose creation failed, without waiting.
+
+        :returns: whether there was one.
+        """
 
     @abc.abstractmethod
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:

@@ -144,7 +144,8 @@ class Creation:
 
     def _end(self, region: str, attempt: str) -> None:
         try:
-            self.lasting.end_attempt(region, attempt)
+            if self.lasting.end_attempt(region, attempt):
+                self.unsure = False
         except FogError:
             self.unsure = True  # the caller may find the machine by its tags
             raise
@@ -153,7 +154,7 @@ class Creation:
         for what, undo in self.lasting.undo_begin(region, attempt, created):
             self._undo(region, what, undo)
 
-    def _undo(self, region: str, what: str, undo: Callable[..., None], *words: str) -> None:
+    def _undo(self, region: str, what: str, undo: Callable[..., object], *words: str) -> None:
         """Run an undo step; record its error, so that the other steps run."""
         try:
             undo(*words)
@@ -179,7 +180,7 @@ class Creation:
                 return self.cloud.insert(
                     place, order, prepared[place.kind], created, {**tags, **priced})
             except FogError as error:
-                self.unsure = self.unsure or not error.refused
+                self.unsure = self.unsure or error.refused is False
                 if not isinstance(error, CloudError) or not error.full:
                     raise
                 # a quota holds for the whole region, a lack of machines for a zone

@@ -45,5 +45,7 @@ class LabelRules:
             while f'{key}_{index}' in labels:
                 coded += labels[f'{key}_{index}']
                 index += 1
-            tags[key] = re.sub('_([0-9a-f]+)_', lambda found: chr(int(found[1], 16)), coded)
+            # no other number is a character's
+            tags[key] = re.sub('_([0-9a-f]{1,5}|10[0-9a-f]{4})_',
+                               lambda found: chr(int(found[1], 16)), coded)
         return tags

@@ -15,6 +15,7 @@ import threading
 import time
 from typing import Any, ClassVar, Optional, TypeVar
 
+from fogros2 import untrusted
 from fogros2.errors import (
     ConfigurationError,
     FogError,
@@ -203,9 +204,10 @@ class VmProvider(Provider):
     def machine_of(self, vm: Vm) -> Machine:
         """Convert the cloud's report of a machine."""
         tags, running = vm.tags, vm.state is MachineState.RUNNING
-        key = tags.get(TAG_HOST_KEY)
-        shell = Endpoint('ssh', vm.address, user=tags.get(TAG_USER, 'ubuntu'), host_key=key) \
-            if running and vm.address and key else None
+        user, key = tags.get(TAG_USER, 'ubuntu'), tags.get(TAG_HOST_KEY, '')
+        # everybody with rights in the cloud's account can write tags
+        shell = Endpoint('ssh', vm.address, user=user, host_key=key) if running and vm.address \
+            and untrusted.NAME.fullmatch(user) and untrusted.HOST_KEY.fullmatch(key) else None
         disk = tags.get(TAG_DISK, '')
         return Machine(
             self._text(VmId(vm.region, vm.id, tags.get(TAG_ATTEMPT, '0' * 16))),
@@ -246,6 +248,9 @@ class VmProvider(Provider):
         return wait_until(
             look, timeout=timeout, cancel=self.cancel, first=0.5, interval=1.5, longest=5.0,
             what=f"'{name}' ({machine.vm}) to run")
+
+    def reclaims(self, machine_id: str) -> bool:
+        return super().reclaims(machine_id) or self._until().is_marked(self._id(machine_id))
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
         cloud = self._until()
@@ -421,7 +426,7 @@ class VmProvider(Provider):
 
 
 def _dollars(text: str) -> Optional[Decimal]:
-    try:
-        return Decimal(text)
-    except InvalidOperation:
-        return None
+    with contextlib.suppress(InvalidOperation):
+        price = Decimal(text)
+        return price if price.is_finite() and 0 <= price < 10 ** 6 else None
+    return None

@@ -9,8 +9,9 @@ import functools
 from typing import Any, ClassVar, NamedTuple, Optional
 
 from fogros2.errors import FogError
-from fogros2.provider.vm.account import Account, ON_ITS_WAY
+from fogros2.provider.vm.account import Account
 from fogros2.provider.vm.failures import CodedError, not_the_cloud, one_line, Silent
+from fogros2.waiting import ON_ITS_WAY
 
 
 class Answer(NamedTuple):

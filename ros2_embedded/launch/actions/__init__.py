@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a launch can do."""
-from rosidl_embedded.lacking import lacking
+from embedded_default.lacking import lacking
 
 from ._simple import *  # noqa: F403
 from ._structure import *  # noqa: F403

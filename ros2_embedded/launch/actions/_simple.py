@@ -153,6 +153,8 @@ class PopLaunchConfigurations(_base.Action):
 class ResetLaunchConfigurations(_base.Action):
     """Removes all launch configurations and sets the given ones, evaluated before that."""
 
+    _role = 'reset'
+
     def __init__(
         self, launch_configurations: dict[Any, Any] | None = None, **kwargs: Any
     ) -> None:
@@ -184,6 +186,7 @@ class DeclareLaunchArgument(_base.Action):
     :raises RuntimeError: for no choices, or a default that isn't one of them.
     """
 
+    _role = 'argument'
     _texts = {'default_value': 'default?'}
 
     def __init__(

@@ -15,6 +15,7 @@ from ..events import TimerEvent
 from ..frontend.expose import expose_action
 from ..launch_context import LaunchContext
 from ..launch_description import LaunchDescriptionSource
+from ..launch_description_sources import AnyLaunchDescriptionSource
 from ..utilities import ensure_argument_type, perform_substitutions
 from ..utilities import normalize_to_list_of_substitutions as normalize
 from ..utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
@@ -83,6 +84,7 @@ class GroupAction(_base.Action):
 class IncludeLaunchDescription(_base.Action):
     """Sets launch configurations, then visits a launch description from elsewhere."""
 
+    _role = 'include'
     _texts = {'launch_description_source': 'file'}
 
     def __init__(
@@ -92,7 +94,6 @@ class IncludeLaunchDescription(_base.Action):
     ) -> None:
         super().__init__(**kwargs)
         if not isinstance(launch_description_source, LaunchDescriptionSource):
-            from ..launch_description_sources import AnyLaunchDescriptionSource
             launch_description_source = AnyLaunchDescriptionSource(launch_description_source)
         self.launch_description_source = launch_description_source
         self.launch_arguments = tuple(launch_arguments or ())
@@ -101,7 +102,9 @@ class IncludeLaunchDescription(_base.Action):
     @classmethod
     def parse(cls, entity: Entity, parser: Parser) -> _base.ParsedAction:
         _, kwargs = super().parse(entity, parser)
-        kwargs['launch_arguments'] = (simple.parse_pairs(entity, parser, 'arg') or {}).items()
+        kwargs['launch_arguments'] = [
+            pair for element in ('arg', 'let')
+            for pair in (simple.parse_pairs(entity, parser, element) or {}).items()]
         return cls, kwargs
 
     def get_sub_entities(self) -> _base.Entities:
@@ -157,7 +160,9 @@ class TimerAction(_base.Action):
         ensure_argument_type(actions, collections.abc.Iterable, 'actions', 'TimerAction')
         self.period = normalize_typed_substitution(period, float)
         self.actions = actions
-        self.__context_locals: dict[str, Any] = {}
+        self.__seconds = 0.0
+        self.__locals: dict[str, Any] = {}
+        self.__configurations: dict[str, Any] = {}
         self._completed_future: asyncio.Future[Any] | None = None
         self.__canceled = False
         self._canceled_future: asyncio.Future[Any] | None = None
@@ -175,17 +180,20 @@ class TimerAction(_base.Action):
 
     async def _wait_to_fire_event(self, context: LaunchContext) -> None:
         assert self._canceled_future is not None and self._completed_future is not None
-        await asyncio.wait(
-            [self._canceled_future],
-            timeout=perform_typed_substitution(context, self.period, float))
+        await asyncio.wait([self._canceled_future], timeout=self.__seconds)
         if not self._canceled_future.done():
             await context.emit_event(TimerEvent(timer_action=self))
         self._completed_future.set_result(None)
 
     def handle(self, context: LaunchContext) -> _base.SomeEntitiesType | None:
-        """Return what is to be visited, in the locals of when the timer was started."""
-        context.extend_locals(self.__context_locals)
-        return self.actions
+        """Return the actions, in the locals and launch configurations of the timer's start."""
+        context.extend_locals(self.__locals)
+        return [simple.PushLaunchConfigurations(),
+                simple.OpaqueFunction(function=self.__set_configurations),
+                *self.actions, simple.PopLaunchConfigurations()]
+
+    def __set_configurations(self, context: LaunchContext) -> None:
+        context.launch_configurations = dict(self.__configurations)
 
     def cancel(self) -> None:
         """Cancel the timer, started or not."""
@@ -208,7 +216,12 @@ class TimerAction(_base.Action):
                 entities=simple.OpaqueFunction(
                     function=lambda context: context.locals.event.timer_action.handle(context))))
             vars(context)['_TimerAction__event_handler_has_been_installed'] = True
-        self.__context_locals = context.get_locals_as_dict()
+        self.__seconds = perform_typed_substitution(context, self.period, float)
+        self.__locals = context.get_locals_as_dict()
+        # Lists grow in place: namespace, remappings and parameters of launch_ros.
+        self.__configurations = {
+            name: list(value) if isinstance(value, list) else value
+            for name, value in context.launch_configurations.items()}
         context.asyncio_loop.create_task(self._wait_to_fire_event(context))
         if perform_typed_substitution(context, self.__cancel_on_shutdown, bool):
             context.register_event_handler(

@@ -123,7 +123,7 @@ async def _start_process(
     return transport, protocol
 
 
-class ExecuteLocal(_base.Action):
+class ExecuteLocal(process.ProcessAction):
     """
     Executes something, and emits events for its start, output and end.
 

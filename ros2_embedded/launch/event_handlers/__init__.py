@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import collections.abc
-from typing import Any, Callable, TYPE_CHECKING
+from typing import Any, Callable
 
-from rosidl_embedded.lacking import lacking
+from embedded_default.lacking import lacking
 
 from .. import _base
 from ..events import IncludeLaunchDescription, Shutdown
-from ..events.process import ProcessExited, ProcessIO, ProcessStarted
+from ..events.process import ProcessAction, ProcessExited, ProcessIO, ProcessStarted
+from ..launch_context import LaunchContext
 from ..utilities import is_a_subclass
-
-if TYPE_CHECKING:
-    from ..launch_context import LaunchContext
 
 __getattr__ = lacking(__name__, 'OnExecutionComplete')
 
@@ -82,10 +80,9 @@ class OnProcessExit(OnActionEventBase):
     def __init__(
         self, *, target_action: SomeTarget = None, on_exit: SomeReaction, **kwargs: Any
     ) -> None:
-        from ..actions import ExecuteLocal
         super().__init__(
             action_matcher=target_action, on_event=on_exit,
-            target_event_cls=ProcessExited, target_action_cls=ExecuteLocal, **kwargs)
+            target_event_cls=ProcessExited, target_action_cls=ProcessAction, **kwargs)
 
 
 class OnProcessIO(OnActionEventBase):
@@ -94,8 +91,6 @@ class OnProcessIO(OnActionEventBase):
         self, *, target_action: SomeTarget = None, on_stdin: OnOutput = None,
         on_stdout: OnOutput = None, on_stderr: OnOutput = None, **kwargs: Any
     ) -> None:
-        from ..actions import ExecuteLocal
-
         def handle(event: ProcessIO, _: LaunchContext) -> _base.SomeEntitiesType | None:
             handler = (
                 on_stdout if event.from_stdout else on_stderr if event.from_stderr else on_stdin)
@@ -103,7 +98,7 @@ class OnProcessIO(OnActionEventBase):
 
         super().__init__(
             action_matcher=target_action, on_event=handle,
-            target_event_cls=ProcessIO, target_action_cls=ExecuteLocal, **kwargs)
+            target_event_cls=ProcessIO, target_action_cls=ProcessAction, **kwargs)
 
 
 class OnProcessStart(OnActionEventBase):
@@ -111,22 +106,21 @@ class OnProcessStart(OnActionEventBase):
     def __init__(
         self, *, target_action: SomeTarget = None, on_start: SomeReaction, **kwargs: Any
     ) -> None:
-        from ..actions import ExecuteProcess
         super().__init__(
             action_matcher=target_action, on_event=on_start,
-            target_event_cls=ProcessStarted, target_action_cls=ExecuteProcess, **kwargs)
+            target_event_cls=ProcessStarted, target_action_cls=ProcessAction, **kwargs)
 
 
-class OnIncludeLaunchDescription(_base.EventHandler):
+class OnIncludeLaunchDescription(_base.BaseEventHandler):
     """Visits what IncludeLaunchDescription events carry."""
 
     def __init__(self, **kwargs: Any) -> None:
-        from ..actions import OpaqueFunction
         super().__init__(
-            matcher=lambda event: is_a_subclass(event, IncludeLaunchDescription),
-            entities=OpaqueFunction(
-                function=lambda context: [context.locals.event.launch_description]),
-            **kwargs)
+            matcher=lambda event: is_a_subclass(event, IncludeLaunchDescription), **kwargs)
+
+    def handle(self, event: Any, context: LaunchContext) -> _base.SomeEntitiesType | None:
+        super().handle(event, context)
+        return [event.launch_description]
 
 
 class OnShutdown(_base.BaseEventHandler):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Callable
 
-from rosidl_embedded.lacking import lacking
+from embedded_default.lacking import lacking
 
 from .._base import Action, Event
 from . import process as process

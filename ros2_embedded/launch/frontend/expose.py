@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import functools
 import inspect
-from typing import Any, Callable, Iterable, TYPE_CHECKING, TypeVar
+from typing import Any, Callable, Iterable, TypeVar
 
-if TYPE_CHECKING:
-    from .._base import Action, SomeSubstitutionsType, Substitution
-    from .parser import Parser
-    from .type_utils import Entity
+from .._base import Action, SomeSubstitutionsType, Substitution
 
 T = TypeVar('T')
 
@@ -24,12 +21,12 @@ def _parse(kind: str, methods: dict[str, Any], name: str, unknown: str, *args: A
     if name in methods:
         return methods[name](*args)
     if name in _LACKING[kind].split():
-        from rosidl_embedded.lacking import NotEmbeddedError
+        from embedded_default.lacking import NotEmbeddedError
         raise NotEmbeddedError(f"the {kind} '{name}' in launch files")
     raise RuntimeError(f'{unknown}: {name}')
 
 
-def instantiate_action(entity: Entity, parser: Parser) -> Action:
+def instantiate_action(entity: Any, parser: Any) -> Action:
     action_type, kwargs = _parse(
         'action', action_parse_methods, entity.type_name, 'Unrecognized entity of the type',
         entity, parser)
@@ -58,7 +55,7 @@ def _expose(name: str, methods: dict[str, Any], kind: str) -> Callable[[T], T]:
             raise RuntimeError(f'Two {kind} parsing methods exposed with the same name: [{name}].')
 
         @functools.wraps(parse)
-        def parse_completely(entity: Entity, parser: Parser) -> Any:
+        def parse_completely(entity: Any, parser: Any) -> Any:
             parsed = parse(entity, parser)
             entity.assert_entity_completely_parsed()
             return parsed

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from typing import Any, NoReturn
 
-from .._base import Substitution
+from .._base import Substitution, TextSubstitution
 from .expose import instantiate_substitution
 
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_-]*')
@@ -64,7 +64,6 @@ class _Reader:
         return self.__parts(_WORD, quote) or self.__refuse()
 
     def __plain(self, pattern: str, quote: str) -> Substitution | None:
-        from ..substitutions import TextSubstitution
         if quote:
             # The other quote is a character like any other in here.
             pattern = pattern.replace('\'"', '')
@@ -97,7 +96,6 @@ def parse_substitution(string_value: str) -> list[Substitution]:
     :raises ValueError: for a text that isn't well formed.
     :raises RuntimeError: for a substitution that doesn't exist.
     """
-    from ..substitutions import TextSubstitution
     if not string_value:
         return [TextSubstitution(text=string_value)]
     return _Reader(string_value).read_all()
@@ -109,7 +107,6 @@ def parse_if_substitutions(value: Any) -> Any:
 
     :raises ValueError: for a list whose items aren't of one type.
     """
-    from ..substitutions import TextSubstitution
     kinds = set()
 
     def parse(item: Any) -> Any:

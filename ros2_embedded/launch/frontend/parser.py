@@ -2,12 +2,14 @@
 """Finds the parser for a launch file, and builds what its entities describe."""
 from __future__ import annotations
 
+import importlib
 import os
-from typing import Any, Iterable, TYPE_CHECKING
+from typing import Any, Iterable
 
 from ros2cli.entry_points import load_entry_points
 
 from .._base import Action, InvalidLaunchFileError
+from ..launch_description import LaunchDescription
 from .expose import instantiate_action
 from .parse_substitution import (
     parse_if_substitutions,
@@ -15,9 +17,6 @@ from .parse_substitution import (
     replace_escaped_characters,
 )
 from .type_utils import Entity
-
-if TYPE_CHECKING:
-    from ..launch_description import LaunchDescription
 
 
 class InvalidFrontendLaunchFileError(InvalidLaunchFileError):
@@ -40,15 +39,14 @@ class Parser:
         """Import, once, all that exposes actions and substitutions."""
         if not Parser.extensions_loaded:
             Parser.extensions_loaded = True
-            import launch_ros  # noqa: F401
+            importlib.import_module('launch_ros')
             load_entry_points('launch.frontend.launch_extension')
 
     @classmethod
     def _parsers(cls) -> dict[str, type[Parser]]:
         if Parser.frontend_parsers is None:
-            import launch_xml
-            import launch_yaml
-            parsers = {'xml': launch_xml.Parser, 'yaml': launch_yaml.Parser}
+            parsers = {name: importlib.import_module(f'launch_{name}').Parser
+                       for name in ('xml', 'yaml')}
             parsers.update(load_entry_points('launch.frontend.parser'))
             Parser.frontend_parsers = dict(sorted(parsers.items()))
         return Parser.frontend_parsers
@@ -62,7 +60,6 @@ class Parser:
     escape_characters = staticmethod(replace_escaped_characters)
 
     def parse_description(self, entity: Entity) -> LaunchDescription:
-        from ..launch_description import LaunchDescription
         if entity.type_name != 'launch':
             raise RuntimeError("Expected 'launch' as root tag")
         self.load_launch_extensions()

@@ -8,10 +8,10 @@ import math
 import os
 from typing import Any, Iterable, Sequence
 
+from embedded_default.lacking import lacking
 import launch.logging
-from rosidl_embedded.lacking import lacking
 
-from .._base import SomeSubstitutionsType, Substitution
+from .._base import SomeSubstitutionsType, Substitution, TextSubstitution
 from ..frontend.expose import expose_substitution
 from ..launch_context import LaunchContext
 from ..utilities import normalize_to_list_of_substitutions, perform_substitutions
@@ -20,8 +20,9 @@ from ..utilities.type_utils import is_substitution, perform_typed_substitution
 __all__ = [
     'AndSubstitution', 'Command', 'EqualsSubstitution', 'EnvironmentVariable', 'FileContent',
     'FindExecutable', 'LaunchConfiguration', 'LocalSubstitution', 'NotSubstitution',
-    'NotEqualsSubstitution', 'OrSubstitution', 'PathJoinSubstitution', 'PythonExpression',
-    'SubstitutionFailure', 'TextSubstitution', 'ThisLaunchFile', 'ThisLaunchFileDir']
+    'NotEqualsSubstitution', 'OrSubstitution', 'PathJoinSubstitution', 'PathSubstitution',
+    'PythonExpression', 'SubstitutionFailure', 'TextSubstitution', 'ThisLaunchFile',
+    'ThisLaunchFileDir']
 __getattr__ = lacking(__name__, 'AllSubstitution AnonName AnySubstitution BooleanSubstitution '
                                 'IfElseSubstitution LaunchLogDir')
 
@@ -72,20 +73,6 @@ class ParsedSubstitution(Substitution):
     def describe(self) -> str:
         shown = [described(getattr(self, name)) for name in self._parameters if name[-1] != '?']
         return f"{self._label or type(self).__name__}({', '.join(shown)})"
-
-
-class TextSubstitution(Substitution):
-
-    def __init__(self, *, text: str) -> None:
-        if not isinstance(text, str):
-            raise TypeError(f"TextSubstitution expected Text object got '{type(text)}' instead.")
-        self.text = text
-
-    def describe(self) -> str:
-        return f"'{self.text}'"
-
-    def perform(self, context: LaunchContext) -> str:
-        return self.text
 
 
 @expose_substitution('var')
@@ -148,15 +135,27 @@ class LocalSubstitution(Substitution):
 
 
 class PathJoinSubstitution(Substitution):
+    """Parts of a path, joined; ``/`` adds one more."""
 
-    def __init__(self, substitutions: Iterable[str | Substitution]) -> None:
-        self.substitutions = normalize_to_list_of_substitutions(substitutions)
+    def __init__(self, substitutions: Iterable[SomeSubstitutionsType]) -> None:
+        self.substitutions = [
+            sub for part in substitutions for sub in normalize_to_list_of_substitutions(part)]
+
+    def __truediv__(self, part: SomeSubstitutionsType) -> PathJoinSubstitution:
+        return PathJoinSubstitution([self, part])
 
     def describe(self) -> str:
         return f"PathJoin('{described(self.substitutions)}')"
 
     def perform(self, context: LaunchContext) -> str:
         return os.path.join(*(sub.perform(context) for sub in self.substitutions))
+
+
+class PathSubstitution(PathJoinSubstitution):
+    """A path to which ``/`` adds parts; base of substitutions that find a directory."""
+
+    def __init__(self, path: SomeSubstitutionsType) -> None:
+        super().__init__([path])
 
 
 @expose_substitution('filename')
@@ -173,9 +172,12 @@ class ThisLaunchFile(ParsedSubstitution):
 
 
 @expose_substitution('dirname')
-class ThisLaunchFileDir(ThisLaunchFile):
+class ThisLaunchFileDir(ThisLaunchFile, PathSubstitution):
 
     _local = 'current_launch_file_directory'
+
+    def __init__(self) -> None:
+        super().__init__(())
 
 
 @expose_substitution('command')

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-from typing import Any, Iterable, TYPE_CHECKING
+from typing import Any, Iterable
 
-from .._base import Entities, LaunchDescriptionEntity, SomeSubstitutionsType, Substitution
+from .._base import (
+    Entities,
+    LaunchDescriptionEntity,
+    normalize_to_list_of_substitutions,
+    perform_substitutions,
+)
+from ..launch_context import LaunchContext
 from .signal_management import AsyncSafeSignalManager
-
-if TYPE_CHECKING:
-    from ..launch_context import LaunchContext
 
 __all__ = [
     'AsyncSafeSignalManager', 'ensure_argument_type', 'is_a', 'is_a_subclass',
@@ -51,29 +54,6 @@ def normalize_to_list_of_entities(entities: Iterable[Any]) -> Entities:
     for entity in entities:
         flat.extend([entity] if isinstance(entity, LaunchDescriptionEntity) else entity)
     return flat
-
-
-def normalize_to_list_of_substitutions(subs: SomeSubstitutionsType) -> list[Substitution]:
-    """
-    Return substitutions, texts as TextSubstitution.
-
-    :raises TypeError: for an item that is neither.
-    """
-    from ..substitutions import TextSubstitution
-    normalized: list[Substitution] = []
-    for item in [subs] if isinstance(subs, (str, Substitution)) else subs:
-        if isinstance(item, str):
-            item = TextSubstitution(text=item)
-        elif not isinstance(item, Substitution):
-            raise TypeError(
-                f"Failed to normalize given item of type '{type(item)}', when only 'str' or "
-                "'launch.Substitution' were expected.")
-        normalized.append(item)
-    return normalized
-
-
-def perform_substitutions(context: LaunchContext, subs: Iterable[Substitution]) -> str:
-    return ''.join([context.perform_substitution(sub) for sub in subs])
 
 
 def visit_all_entities_and_collect_futures(

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import collections.abc
-from typing import Any, List, TYPE_CHECKING
+import os
+from typing import Any, List
 
-from rosidl_embedded.lacking import lacking
+from embedded_default.lacking import lacking
 
-from .._base import Substitution
-from . import ensure_argument_type, normalize_to_list_of_substitutions, perform_substitutions
-
-if TYPE_CHECKING:
-    from ..launch_context import LaunchContext
+from .._base import normalize_to_list_of_substitutions, perform_substitutions, Substitution
+from ..launch_context import LaunchContext
+from . import ensure_argument_type
+from .ros_yaml import load
 
 __getattr__ = lacking(
     __name__, 'AllowedTypesTuple AllowedTypesType AllowedValueType ListTypesTuple ListTypesType '
@@ -67,7 +67,7 @@ is_instance_of_valid_type = is_instance_of
 
 def coerce_to_type(value: str, data_type: Any = None, *, can_be_str: bool = False) -> Any:
     """
-    Read a text as the type; without one, as YAML.
+    Read a text as the type; without one, as rcl reads YAML.
 
     :param can_be_str: whether the text itself will do where it isn't of the type.
     :raises ValueError: if it can't be read so.
@@ -87,7 +87,7 @@ def coerce_to_type(value: str, data_type: Any = None, *, can_be_str: bool = Fals
     import yaml
     given = {'1': 'true', '0': 'false'}.get(value, value) if data_type is bool else value
     try:
-        output = yaml.safe_load(given)
+        output = load(given)
     except yaml.YAMLError as exc:
         if can_be_str:
             return value
@@ -137,6 +137,8 @@ def normalize_typed_substitution(value: Any, data_type: Any) -> Any:
 
     :raises TypeError: if it can't be, or become, of the type.
     """
+    if isinstance(value, os.PathLike):
+        value = os.fspath(value)
     error = TypeError(f"value='{value}' of {type(value)} is not an instance of {data_type}")
     if isinstance(value, ScalarTypesTuple):
         if not is_instance_of(value, data_type):

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a launch can do with nodes."""
-from rosidl_embedded.lacking import lacking
+from embedded_default.lacking import lacking
 
 from ._composition import ComposableNodeContainer as ComposableNodeContainer
 from ._composition import get_composable_node_load_request as get_composable_node_load_request

@@ -11,19 +11,18 @@ from typing import Any, Iterable, List, Sequence
 from launch import LaunchDescriptionEntity, SomeSubstitutionsType
 from launch._base import ParsedAction
 from launch.actions import ExecuteProcess
-from launch.actions._simple import parse_pairs
 from launch.frontend import Entity, expose_action, Parser
-from launch.frontend.type_utils import get_data_type_from_identifier
 from launch.launch_context import LaunchContext
 import launch.logging
 from launch.substitutions import LocalSubstitution
 from launch.utilities import ensure_argument_type, perform_substitutions
 from launch.utilities import normalize_to_list_of_substitutions as normalize
+from launch.utilities.ros_yaml import dump
 
-from ..parameter_descriptions import ParameterFile, ParameterValue
+from .._parsing import parse_nested_parameters, parse_remappings
 from ..substitutions import ExecutableInPackage
 from ..utilities import names
-from ..utilities.parameters import evaluate_parameters, normalize_parameters
+from ..utilities.parameters import as_argument, evaluate_parameters, normalize_parameters
 
 
 @expose_action('node')
@@ -43,6 +42,7 @@ class Node(ExecuteProcess):
               'exec_name': 'exec_name?', 'namespace': 'namespace?'}
     UNSPECIFIED_NODE_NAME = '<node_name_unspecified>'
     UNSPECIFIED_NODE_NAMESPACE = '<node_namespace_unspecified>'
+    parse_nested_parameters = staticmethod(parse_nested_parameters)
 
     def __init__(
         self, *, executable: SomeSubstitutionsType, package: SomeSubstitutionsType | None = None,
@@ -77,53 +77,6 @@ class Node(ExecuteProcess):
         self.__final_node_name: str | None = None
         self.__expanded_remappings: list[tuple[str, str]] | None = None
         self.__logger = launch.logging.get_logger(__name__)
-
-    @staticmethod
-    def parse_nested_parameters(params: list[Entity], parser: Parser) -> list[Any]:
-        """Return ``parameters`` from ``<param name= value=/>`` and ``<param from=/>``."""
-        def read_named(elements: list[Entity]) -> dict[Any, Any]:
-            values: dict[Any, Any] = {}
-            for element in elements:
-                name = tuple(parser.parse_substitution(element.get_attr('name')))
-                identifier = element.get_attr('type', data_type=None, optional=True)
-                kind = None if identifier is None else (
-                    get_data_type_from_identifier(identifier))
-                value = element.get_attr('value', data_type=kind, optional=True)
-                nested = element.get_attr('param', data_type=List[Entity], optional=True)
-                element.assert_entity_completely_parsed()
-                if nested:
-                    for other, given in (('value', value), ('type', kind)):
-                        if given is not None:
-                            raise RuntimeError(
-                                f'nested parameters and {other} attributes are mutually '
-                                'exclusive')
-                    values[name] = read_named(nested)
-                elif value is not None:
-                    values[name] = ParameterValue(
-                        parser.parse_if_substitutions(value), value_type=kind)
-                else:
-                    raise RuntimeError('either a value attribute or nested params are needed')
-            return values
-
-        parameters: list[Any] = []
-        for param in params:
-            file = param.get_attr('from', optional=True)
-            allow_substs = param.get_attr('allow_substs', data_type=bool, optional=True)
-            name = param.get_attr('name', optional=True)
-            if file is not None and name is not None:
-                raise RuntimeError('name and from attributes are mutually exclusive')
-            if file is not None:
-                param.assert_entity_completely_parsed()
-                parameters.append(ParameterFile(
-                    parser.parse_substitution(file), allow_substs=bool(allow_substs)))
-            elif name is not None:
-                if allow_substs is not None:
-                    raise RuntimeError(
-                        "'allow_substs' can only be used together with 'from' attribute")
-                parameters.append(read_named([param]))
-            else:
-                raise ValueError('param Entity should have name or from attribute')
-        return parameters
 
     @classmethod
     def parse(
@@ -168,13 +121,9 @@ class Node(ExecuteProcess):
                 and self.UNSPECIFIED_NODE_NAMESPACE not in self.node_name)
 
     def _create_params_file_from_dict(self, params: dict[str, Any]) -> str:
-        import yaml
         node = self.node_name if self.is_node_name_fully_specified() else '/**'
         with NamedTemporaryFile(mode='w', prefix='launch_params_', delete=False) as file:
-            values = {
-                name: list(value) if isinstance(value, tuple) else value
-                for name, value in params.items()}
-            yaml.dump({node: {'ros__parameters': values}}, file, default_flow_style=False)
+            file.write(dump({node: {'ros__parameters': params}}))
         # not sooner: a node that is started again reads it again
         atexit.register(pathlib.Path(file.name).unlink, missing_ok=True)
         return file.name
@@ -201,7 +150,7 @@ class Node(ExecuteProcess):
     def __expand_parameters(self, context: LaunchContext) -> None:
         for given in context.launch_configurations.get('global_params', ()):
             if isinstance(given, tuple):
-                self.__extend_cmd('-p', f'{given[0]}:={given[1]}')
+                self.__extend_cmd('-p', f'{given[0]}:={as_argument(given[1])}')
                 continue
             path = os.path.abspath(given)
             if not os.path.isfile(path):
@@ -252,9 +201,3 @@ class Node(ExecuteProcess):
             if warning := names.add_node_name(context, self.node_name):
                 launch.logging.get_logger(self.name).warning(warning)
         return entities
-
-
-def parse_remappings(entity: Entity, parser: Parser) -> list[Any] | None:
-    """Return ``remappings`` from ``<remap from= to=/>`` elements, if there are any."""
-    pairs = parse_pairs(entity, parser, 'remap', 'from', 'to')
-    return None if pairs is None else list(pairs.items())

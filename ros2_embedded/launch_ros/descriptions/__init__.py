@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from typing import Any, List, Sequence
 
+from embedded_default.lacking import lacking
 from launch import Action, Condition, SomeSubstitutionsType
 from launch.frontend import Entity, Parser
 from launch.substitutions import normalized_default
 from launch.utilities import normalize_to_list_of_substitutions
 
-from ..parameter_descriptions import __getattr__ as __getattr__
+from .._parsing import parse_nested_parameters, parse_remappings
 from ..parameter_descriptions import ParameterFile as ParameterFile
 from ..parameter_descriptions import ParameterValue as ParameterValue
 from ..utilities import normalize_parameters, normalize_remap_rules
+
+__getattr__ = lacking(__name__, 'ComposableLifecycleNode Parameter')
 
 
 class ComposableNode:
@@ -40,8 +43,6 @@ class ComposableNode:
 
     @classmethod
     def parse(cls, parser: Parser, entity: Entity) -> tuple[type[ComposableNode], dict[str, Any]]:
-        from ..actions import Node
-        from ..actions.node import parse_remappings
         _, kwargs = Action.parse(entity, parser)
         for name, attribute in (('package', 'pkg'), ('plugin', 'plugin'), ('name', 'name')):
             kwargs[name] = parser.parse_substitution(entity.get_attr(attribute))
@@ -50,7 +51,7 @@ class ComposableNode:
             kwargs['namespace'] = parser.parse_substitution(namespace)
         parameters = entity.get_attr('param', data_type=List[Entity], optional=True)
         if parameters is not None:
-            kwargs['parameters'] = Node.parse_nested_parameters(parameters, parser)
+            kwargs['parameters'] = parse_nested_parameters(parameters, parser)
         kwargs['remappings'] = parse_remappings(entity, parser)
         extra = entity.get_attr('extra_arg', data_type=List[Entity], optional=True) or ()
         kwargs['extra_arguments'] = [

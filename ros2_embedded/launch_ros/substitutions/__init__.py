@@ -6,24 +6,29 @@ import os
 import shutil
 
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
+from embedded_default.lacking import lacking
 from launch import SomeSubstitutionsType
 from launch.frontend.expose import expose_substitution
 from launch.launch_context import LaunchContext
-from launch.substitutions import described, ParsedSubstitution, SubstitutionFailure
+from launch.substitutions import (
+    described,
+    ParsedSubstitution,
+    PathSubstitution,
+    SubstitutionFailure,
+)
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
-from rosidl_embedded.lacking import lacking
 
 __all__ = ['ExecutableInPackage', 'FindPackage', 'FindPackagePrefix', 'FindPackageShare']
 __getattr__ = lacking(__name__, 'Parameter')
 
 
-class FindPackage(ParsedSubstitution):
+class FindPackage(ParsedSubstitution, PathSubstitution):
     """Base of those that find a package; PackageNotFoundError if there is no such."""
 
     _parameters: tuple[str, ...] = ('package',)
 
     def __init__(self, package: SomeSubstitutionsType) -> None:
-        super().__init__()
+        super().__init__(())
         self.package = normalize_to_list_of_substitutions(package)
 
     def find(self, package_name: str) -> str:

@@ -3,12 +3,15 @@
 Parameters of nodes: normalized, evaluated, and as rclpy's.
 
 Normalized ones have flat names, and texts as substitutions. A plain text stays a text whatever it
-looks like, so it is quoted as YAML does: what substitutions become is read as YAML.
+looks like, so it is quoted as in YAML: what substitutions become is read as rcl reads YAML.
 """
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import contextlib
+import os
 import pathlib
+import re
 from typing import Any, Iterator
 
 from launch import SomeSubstitutionsType_types_tuple, Substitution
@@ -16,6 +19,7 @@ from launch.launch_context import LaunchContext
 from launch.substitutions import TextSubstitution
 from launch.utilities import ensure_argument_type, perform_substitutions
 from launch.utilities import normalize_to_list_of_substitutions as normalize
+from launch.utilities.ros_yaml import dump, load
 
 from ..parameter_descriptions import ParameterFile, ParameterValue
 
@@ -26,13 +30,23 @@ _WRAP = ('If the parameter is meant to be a string, try wrapping it in '
          'launch_ros.parameter_descriptions.ParameterValue(value, value_type=str)')
 
 
-def as_yaml(value: Any) -> str:
+def as_argument(value: Any) -> str:
+    """
+    Return a parameter's value for ``-p``, where rcl finds its type.
+
+    A text that launch too takes for another type is written as in ROS 2.
+    """
     import yaml
-    return str(yaml.dump(value))
+    if isinstance(value, str):
+        with contextlib.suppress(yaml.YAMLError):
+            if load(value) == value or isinstance(yaml.safe_load(value), (int, float, list)):
+                return value
+    return dump(value)
 
 
 def _normalize_array(value: Sequence[Any]) -> tuple[Any, ...]:
     kinds = set()
+    value = [os.fspath(item) if isinstance(item, os.PathLike) else item for item in value]
     for item in value:
         ensure_argument_type(
             item, (float, int, str, bool, *SomeSubstitutionsType_types_tuple), 'subvalue')
@@ -48,7 +62,7 @@ def _normalize_array(value: Sequence[Any]) -> tuple[Any, ...]:
         return tuple(normalize(value))
     return tuple(
         normalize(
-            as_yaml(item) if isinstance(item, (float, int, bool, str)) else item)
+            dump(item) if isinstance(item, (float, int, bool, str)) else item)
         for item in value)
 
 
@@ -68,8 +82,8 @@ def normalize_parameter_dict(
         name = tuple(parts)
         if isinstance(value, Mapping):
             normalized.update(normalize_parameter_dict(value, _prefix=name))
-        elif isinstance(value, str):
-            normalized[name] = tuple(normalize(as_yaml(value)))
+        elif isinstance(value, (str, os.PathLike)):
+            normalized[name] = tuple(normalize(dump(os.fspath(value))))
         elif isinstance(value, Substitution):
             normalized[name] = (value,)
         elif isinstance(value, (ParameterValue, float, bool, int, bytes)):
@@ -112,7 +126,7 @@ def _uniform(name: str, items: Sequence[Any]) -> Any:
 def _from_text(name: str, text: str) -> Any:
     import yaml
     try:
-        value = yaml.safe_load(text or "''")
+        value = load(text or "''")
     except yaml.YAMLError as exc:
         raise TypeError(
             f'Unable to parse the value of parameter {name} as yaml. {_WRAP}') from exc
@@ -135,9 +149,7 @@ def _evaluate(context: LaunchContext, name: str, value: Any) -> Any:
     if isinstance(value[0], Substitution):
         return _from_text(name, perform_substitutions(context, value))
     if isinstance(value[0], Sequence):
-        import yaml
-        return _uniform(
-            name, [yaml.safe_load(perform_substitutions(context, item)) for item in value])
+        return _uniform(name, [load(perform_substitutions(context, item)) for item in value])
     return value
 
 
@@ -171,13 +183,19 @@ def _nodes_of(content: dict[str, Any], names: tuple[str, ...] = ()) -> Iterator[
             yield from _nodes_of(value, (*names, key.strip('/')))
 
 
-def _read(path: pathlib.Path, node: str) -> dict[str, Any]:
-    import yaml
-    content = yaml.safe_load(path.read_text()) or {}
-    nodes = dict(_nodes_of(content))
-    if not nodes:
-        return dict(content)
-    return {**nodes.get('**', {}), **nodes.get(node, {})}
+def _matches(pattern: str, node: str) -> bool:
+    """Say whether a key of a parameter file means a node: * is one part of its name, ** any."""
+    parts = [{'*': '/[^/]+', '**': '(/[^/]+)*'}.get(part, '/' + re.escape(part))
+             for part in pattern.split('/') if part]
+    return re.fullmatch(''.join(parts), f'/{node}') is not None
+
+
+def _read(path: pathlib.Path, node: str) -> list[dict[str, Any]]:
+    """Return the parts of a parameter file that are for a node; a later part wins, as in rcl."""
+    content = load(path.read_text()) or {}
+    nodes = list(_nodes_of(content))
+    return [values or {} for pattern, values in nodes if _matches(pattern, node)] if nodes else [
+        content]
 
 
 def to_parameters_list(
@@ -193,8 +211,10 @@ def to_parameters_list(
     node = '/'.join(part.strip('/') for part in (namespace or '', node_name) if part.strip('/'))
     parameters = []
     for given in evaluated_parameters:
-        values = given if isinstance(given, dict) else evaluate_parameter_dict(
-            context, normalize_parameter_dict(_read(given, node)))
+        values: dict[str, Any] = {}
+        for part in [given] if isinstance(given, dict) else _read(given, node):
+            values |= part if part is given else evaluate_parameter_dict(
+                context, normalize_parameter_dict(part))
         for name, value in values.items():
             kind = next((kind for kind in Parameter.Type if kind.check(value)), None)
             if kind is None:

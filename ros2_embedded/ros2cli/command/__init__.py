@@ -62,7 +62,7 @@ class _Lacking:
         self.name = name
 
     def main(self, **_: Any) -> None:
-        from rosidl_embedded.lacking import NotEmbeddedError
+        from embedded_default.lacking import NotEmbeddedError
         raise NotEmbeddedError(f"'{self.name}'")
 
 

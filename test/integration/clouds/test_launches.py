@@ -268,7 +268,10 @@ def test_new_spot_machine_replaces_a_reclaimed_one(cloud, robot, box, name):
     run.wait_for(f'I heard: [Hello World from {name} ')
     (first,) = box.alive()
     box.interrupt(first.id, notice=30.0)
-    run.wait_for(f"the machine '{name}' is being reclaimed")
+    run.wait_for(f'{name}: the machine reports that its provider reclaims it')
+    # EC2 confirms the notice at once, the others show the machine's end
+    run.wait_for(f"the machine '{name}' is {'being reclaimed' if cloud.name == 'aws' else ''}",
+                 timeout=60)
     run.wait_for(f'I heard: [Hello World from {os.uname().nodename} ')
     run.wait_for(f'{name}: a new machine runs the nodes', timeout=90)
     heard = run.text.count(f'I heard: [Hello World from {name} ')
@@ -317,6 +320,54 @@ def test_fault_at_each_step_leaves_nothing(cloud, robot, box, name):
         box.heal()
         wait_until(lambda: not box.alive() and not robot.things(), timeout=30,
                    what=f'nothing to be left after {code} {words}')
+
+
+def interrupted(cloud, robot, box, name, pattern, seconds):
+    """Return a launch that was interrupted while a request was under way."""
+    box.slow(pattern, seconds)
+    before = box.held()
+    run = robot.own(name)
+    wait_until(lambda: run.child.poll() is not None or box.held() > before, timeout=60,
+               longest=0.05, what='a request that creates something')
+    assert run.child.poll() is None, run.text
+    run.interrupt()
+    return run
+
+
+@pytest.mark.parametrize('seconds', [
+    4.0, *(pytest.param(seconds, marks=pytest.mark.soak) for seconds in (0.5, 10.0))])
+def test_interrupted_request_for_a_machine_leaves_none(cloud, robot, box, name, seconds):
+    run = interrupted(cloud, robot, box, name, cloud.order, seconds)
+    assert run.ended() == 0, run.text
+    assert run.errors == [] and box.alive() == [] and not box.held()
+    assert robot.fog('gc') == 'nothing to clear\n'
+
+
+@pytest.mark.soak
+def test_interrupted_requests_before_the_machine_leave_nothing(cloud, robot, box, name):
+    for number, seconds in enumerate((0.5, 3.0)):
+        run = interrupted(cloud, robot, box, f'{name}-{number}', '^(POST|PUT) ', seconds)
+        assert run.ended() == 0, run.text
+        assert run.errors == [] and box.alive() == []
+
+
+def test_machine_that_appears_after_its_launch_is_cleared(cloud, robot, box, name):
+    """The launch does not wait for ever; one that is killed does not wait at all."""
+    killed, ended = (interrupted(cloud, robot, box, f'{name}-{what}', cloud.order, 25.0)
+                     for what in ('killed', 'ended'))
+    killed.kill()
+    # where the cloud needs what the launch has deleted by now, no machine can appear
+    assert (ended.ended() == 1) == (cloud.name != 'azure'), ended.text
+    assert (f"'{name}-ended' may still appear" in ended.text) == (cloud.name != 'azure')
+    assert 'Traceback' not in ended.text
+    early = robot.ros2('fog', 'gc')
+    assert f"could not clear machine {name}-killed: '{name}-killed' may still appear" \
+        in early.stdout and early.returncode == 1
+    wait_until(lambda: box.held() == 0, timeout=60, what='the requests to be carried out')
+    assert len(box.alive()) == (2 if cloud.name == 'gcp' else 0)
+    late = robot.ros2('fog', 'gc')
+    assert (late.returncode == 0) == (cloud.name == 'gcp'), late.stdout
+    assert box.alive() == []
 
 
 @pytest.mark.soak

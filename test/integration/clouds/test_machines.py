@@ -80,13 +80,15 @@ def test_spot_machine_gets_the_notice_and_is_deleted(provider, box, make, name):
         return 'NOTICED' in box.run(
             instance.id, f'{shlex.join(notice)} && echo NOTICED', check=False)
 
-    assert not noticed()
+    assert not noticed() and not provider.reclaims(machine.id)
     box.interrupt(instance.id, notice=4.0)
     assert noticed()
+    assert provider.reclaims(machine.id) == (provider.name == 'aws')
     box.wait_for(instance.id, 'terminated', timeout=20)
     with pytest.raises(MachineNotFound):
         wait_until(lambda: provider.describe(machine.id).state is MachineState.DELETED,
                    timeout=5, what='the end')
+        assert provider.reclaims(machine.id)
         raise MachineNotFound('EC2 still reports an instance that has ended')
     provider.destroy(machine.id)
 

@@ -246,8 +246,17 @@ class Box:
     # -- what goes wrong ------------------------------------------------------------------
 
     def heal(self) -> None:
-        """Order no more errors."""
+        """Order no more errors, and no slow answers."""
         self._ask({'do': 'clear_faults'})
+        self.slow('', 0.0)
+
+    def slow(self, pattern: str, seconds: float) -> None:
+        """Carry out requests so late whose method, path and body fit the pattern."""
+        self._ask({'do': 'slow', 'pattern': pattern, 'seconds': seconds})
+
+    def held(self) -> int:
+        """Return how many slow requests are under way."""
+        return int(self._ask({'do': 'held'}))
 
     def set_boot_delay(self, seconds: float) -> None:
         """Let the next instances take that long to boot."""

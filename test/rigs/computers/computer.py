@@ -105,13 +105,14 @@ def new_disk(folder: Path) -> None:
             top, _, below = place.partition('/')
             archive.file('/'.join(filter(None, ('layers', top, 'upper', below, program))),
                          text.encode(), 0o755)
-    skeleton = container_root.skeleton(USER)
+    skeleton, people = container_root.skeleton(), container_root.Archive()
+    container_root.accounts(people, USER, 1000)
     process.run(
         Command(('sh', '-ec', _NEW, 'sh', str(folder), ' '.join(layers)), sudo=True,
                 input=archive.data(), what='make a disk'), timeout=60.0)
     process.run(
         Command(('tar', '-xpf', '-', '--numeric-owner', '-C', str(folder / 'root')), sudo=True,
-                input=skeleton + container_root.Archive().data(), what='make a disk'),
+                input=skeleton + people.data(), what='make a disk'),
         timeout=60.0)
 
 

@@ -12,12 +12,15 @@ import abc
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import contextlib
 import dataclasses
+import io
 import json
 import os
 from pathlib import Path
+import re
 import signal
 import sys
 import threading
+import time
 from typing import Any, ClassVar
 
 from fogros2.errors import FogError
@@ -126,7 +129,8 @@ class Box(abc.ABC):
         inside = netns.listener(self.net.router, ROUTER, PORT)
         # accepts connections and answers nothing: the nearest region is the quickest to connect
         regions = netns.listener(self.net.router, ROUTER, 443)
-        app = checkip(self.api)
+        self.slow = Slow(checkip(self.api))
+        app = self.slow
         servers = [
             make_server('127.0.0.1', 0, app, threaded=True, request_handler=Quiet),
             make_server(ROUTER, PORT, app, threaded=True, request_handler=Quiet,
@@ -166,11 +170,41 @@ class Box(abc.ABC):
             return self.cloud.machines[order['instance']].computer.console()
         elif what == 'move_robot':
             self.net.move_robot(order['address'])
+        elif what == 'slow':
+            self.slow.pattern, self.slow.seconds = order['pattern'], float(order['seconds'])
+        elif what == 'held':
+            return self.slow.held
         elif what == 'boot_delay':
             self.cloud.boot_delay = float(order['seconds'])
         else:
             return self.do(order)
         return None
+
+
+class Slow:
+    """
+    A WSGI application that holds requests back, and carries them out then, answered or not.
+
+    :ivar pattern: of the requests: their method, path and body; '' for none.
+    :ivar held: number of the requests that are held back now.
+    """
+
+    def __init__(self, inner: Callable[..., Iterable[bytes]]) -> None:
+        self._inner = inner
+        self.pattern, self.seconds, self.held = '', 0.0, 0
+
+    def __call__(
+        self, environ: dict[str, Any], start_response: Callable[..., Any],
+    ) -> Iterable[bytes]:
+        """Answer a request, late if it fits."""
+        body = environ['wsgi.input'].read(int(environ.get('CONTENT_LENGTH') or 0))
+        environ['wsgi.input'] = io.BytesIO(body)
+        words = f"{environ['REQUEST_METHOD']} {environ['PATH_INFO']} {body.decode('latin-1')}"
+        if self.pattern and re.search(self.pattern, words):
+            self.held += 1
+            time.sleep(self.seconds)
+            self.held -= 1
+        return self._inner(environ, start_response)
 
 
 def checkip(inner: Callable[..., Iterable[bytes]]) -> Callable[..., Iterable[bytes]]:

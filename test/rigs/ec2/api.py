@@ -145,6 +145,8 @@ class Api:
             return self._pass_on(environ)
         if action == 'DescribeSpotPriceHistory':
             return self._spot_prices(region, params)
+        if action == 'DescribeSpotInstanceRequests':
+            return self._spot_requests(params)
         rules.check(region, action, params, self._cloud)
         if action == 'RunInstances':
             return self._run(environ, region, params)
@@ -226,6 +228,17 @@ class Api:
         known = {entry['Name'] for entry in found}
         return answers.of_json({
             'Parameters': found, 'InvalidParameters': [n for n in names if n not in known]})
+
+    def _spot_requests(self, params: Mapping[str, str]) -> Answer:
+        if params.get('Filter.1.Name') != 'instance-id':
+            raise Refusal('InvalidParameterValue', 'a box looks requests up by instance-id')
+        machine = self._cloud.machines.get(params.get('Filter.1.Value.1', ''))
+        code = 'marked-for-termination' if machine and machine.notice else 'fulfilled'
+        return answers.of_ec2('DescribeSpotInstanceRequests', '<spotInstanceRequestSet>' + (
+            f'<item><spotInstanceRequestId>sir-{machine.id[-8:]}</spotInstanceRequestId>'
+            f'<instanceId>{machine.id}</instanceId><state>active</state><status><code>{code}'
+            '</code></status></item>' if machine and machine.spot else '')
+            + '</spotInstanceRequestSet>')
 
     def _spot_prices(self, region: str, params: Mapping[str, str]) -> Answer:
         named = [value for key, value in params.items() if key.startswith('InstanceType.')]

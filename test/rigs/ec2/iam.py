@@ -16,6 +16,7 @@ LOOK = (
     'ec2:DescribeRegions',
     'ec2:DescribeSecurityGroups',
     'ec2:DescribeSnapshots',
+    'ec2:DescribeSpotInstanceRequests',
     'ec2:DescribeSubnets',
     'ec2:DescribeTags',
     'ec2:DescribeVolumes',

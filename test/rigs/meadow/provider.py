@@ -23,7 +23,7 @@ from fogros2.provider.vm.labels import LabelRules
 from fogros2.provider.vm.options import VmOptions
 from fogros2.provider.vm.provider import VmProvider
 from fogros2.provider.vm.regions import Regions
-from fogros2.waiting import cancellable, wait_until
+from fogros2.waiting import cancellable, ON_ITS_WAY, wait_until
 
 RULES = LabelRules(plain='a-z0-9-', longest=63)
 STATES = {'pending': MachineState.PENDING, 'running': MachineState.RUNNING,
@@ -66,7 +66,9 @@ class Meadow(VmCloud):
                 return json.load(answer)
 
         try:
-            return cancellable(ask, self.cancel, what=what)
+            # nobody waits for an answer that changes nothing
+            return cancellable(ask, self.cancel, what=what,
+                               grace=lambda: 0.0 if method == 'GET' else ON_ITS_WAY)
         except urllib.error.HTTPError as error:
             code = json.load(error)['code']
             if code == 'bad_token':
@@ -75,8 +77,10 @@ class Meadow(VmCloud):
             raise CloudError(f'{what} failed: {code}', gone=code == 'no_such_machine',
                              full='zone' if code == 'exhausted' else '') from error
         except OSError as error:
-            raise PrerequisiteError(f'{what} failed: Meadow does not answer: {error}',
-                                    'check MEADOW_URL') from error
+            silent = PrerequisiteError(f'{what} failed: Meadow does not answer: {error}',
+                                       'check MEADOW_URL')
+            silent.refused = method == 'GET'
+            raise silent from error
 
     def _path(self, region: str, vm: str = '', action: str = '') -> str:
         return '/'.join(filter(None, ['/regions', region, 'machines', vm, action]))
@@ -168,10 +172,12 @@ class Meadow(VmCloud):
         if not gone('DELETE'):
             wait_until(lambda: gone('GET'), timeout=60.0, what=f'{machine.vm} to be deleted')
 
-    def end_attempt(self, region: str, attempt: str) -> None:
+    def end_attempt(self, region: str, attempt: str) -> bool:
         """Delete the machines of an attempt."""
-        for vm in self.find(region, {'fogros2-attempt': attempt}):
+        found = self.find(region, {'fogros2-attempt': attempt})
+        for vm in found:
             self._call(f'deleting {vm.id}', 'DELETE', self._path(region, vm.id))
+        return bool(found)
 
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
         """Change the firewall."""

@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import functools
 import signal as signal_module
-from typing import Any, Callable, TYPE_CHECKING
+from typing import Any, Callable
 
-from ..._base import Event
+from ..._base import Action, Event
 from ...utilities import ensure_argument_type
 
-if TYPE_CHECKING:
-    from ...actions import ExecuteProcess
-
 Matcher = Callable[[Any], bool]
+
+
+class ProcessAction(Action):
+    """What events need of ExecuteLocal, which handles them."""
+
+    process_details: Any
+
+
+# Errors name the class that users know.
+ProcessAction.__name__ = 'ExecuteLocal'
 
 
 class RunningProcessEvent(Event):
     """Something happened to a process; its name is unique in the launch."""
 
     def __init__(
-        self, *, action: ExecuteProcess, name: str, cmd: list[str], cwd: str | None,
+        self, *, action: ProcessAction, name: str, cmd: list[str], cwd: str | None,
         env: dict[str, str] | None, pid: int
     ) -> None:
         self.action = self.execute_process_action = action

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keep the robot's own variables here where a launch file copies its whole environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+#: Variables that describe the robot's own system; a launch file's changes of them stay here.
+LOCAL_VARIABLES = frozenset({
+    'AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'CYCLONEDDS_URI', 'HOME',
+    'LD_LIBRARY_PATH', 'LOGNAME', 'OLDPWD', 'PATH', 'PWD', 'PYTHONPATH', 'RMW_IMPLEMENTATION',
+    'ROS_HOME', 'ROS_LOG_DIR', 'SHELL', 'SHLVL', 'TMPDIR', 'USER', '_',
+})
+#: Share of the robot's variables from which a list is a copy of its environment.
+COPY = 0.8
+_reported: set[str] = set()
+
+
+def to_send(given: Mapping[str, str], robot: Mapping[str, str]) -> dict[str, str]:
+    """
+    Return the variables that a machine gets; of a copy of the robot's, only what differs.
+
+    The robot's environment has credentials, such as ``AWS_SECRET_ACCESS_KEY``, and
+    ``env={**os.environ, ...}`` copies them. A warning names the variables that stay here, once.
+
+    :param robot: the robot's variables.
+    """
+    same = [name for name, value in robot.items() if given.get(name) == value]
+    if not same or len(same) < COPY * len(robot):
+        return dict(given)
+    sent = {name: value for name, value in given.items()
+            if robot.get(name) != value and name not in LOCAL_VARIABLES}
+    new = sorted(given.keys() - sent.keys() - _reported)
+    if new:
+        import launch.logging
+        _reported.update(new)
+        launch.logging.get_logger('fogros2').warning(
+            "a launch file copies the robot's environment; these variables stay here: "
+            f"{', '.join(new)}\nname those that a machine needs one by one")
+    return sent

@@ -1,5 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Where the index is."""
-
-RESOURCE_INDEX_SUBFOLDER = 'share/ament_index/resource_index'
-AMENT_PREFIX_PATH_ENV_VAR = 'AMENT_PREFIX_PATH'

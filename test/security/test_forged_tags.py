@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A tag that another person writes neither reaches a command line nor ends a list of machines."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from fogros2.model import Machine, MachineState
+from fogros2.provider import TAG_NAME
+from fogros2.provider.gcp import firewall
+from fogros2.provider.kubernetes import names
+from fogros2.provider.vm.cloud import TAG_HOST_KEY, TAG_PRICE, TAG_USER, Vm
+from fogros2.provider.vm.labels import LabelRules
+from fogros2.provider.vm.provider import VmProvider
+from ros2fog_cli.api import machines, table
+
+TAGS = {TAG_NAME: 'planner', TAG_USER: 'ubuntu', TAG_HOST_KEY: 'ssh-ed25519 AA', TAG_PRICE: '0.1'}
+
+
+def machine_of(**tags: str) -> Machine:
+    """Return a machine of a cloud as the provider reports it."""
+    cloud: Any = SimpleNamespace(end_command=lambda tags: ())
+    provider: Any = SimpleNamespace(_cloud=cloud, _text=str, name='cloud')
+    return VmProvider.machine_of(provider, Vm(
+        'i-1', 'region', MachineState.RUNNING, address='203.0.113.1', tags={**TAGS, **tags}))
+
+
+@pytest.mark.parametrize('user', [
+    "x' -o ProxyCommand='touch /tmp/pwned", '-oProxyCommand=true', 'a b', 'fog\n', ''])
+def test_machine_whose_login_is_no_name_is_not_reached(user: str) -> None:
+    assert machine_of().shell is not None
+    found = machine_of(**{TAG_USER: user})
+    assert found.shell is None and found.name == 'planner', 'it is listed'
+
+
+@pytest.mark.parametrize('key', ['', 'ssh-ed25519 AA\n* ssh-ed25519 BB', '@cert-authority AA'])
+def test_machine_whose_host_key_is_none_is_not_reached(key: str) -> None:
+    assert machine_of(**{TAG_HOST_KEY: key}).shell is None
+
+
+@pytest.mark.parametrize('price', ['NaN', 'sNaN', 'Infinity', '-1', '1e40', '9' * 200, 'x'])
+def test_odd_price_is_none(price: str) -> None:
+    assert table.cost(machine_of(**{TAG_PRICE: price}).cost_per_hour) == '-'
+
+
+@pytest.mark.parametrize('end', ['9' * 400, '9' * 14])
+def test_odd_end_of_a_lifetime_is_none(end: str) -> None:
+    entry = machines.Entry('planner', 'cloud', machine_of(**{'fogros2-expires': end}), None)
+    assert entry.expires is None and table.duration(entry.expires) == '-'
+
+
+@pytest.mark.parametrize('value', ['_ffffffff_', '_110000_', '_d800_'])
+def test_label_that_is_no_character_is_read(value: str) -> None:
+    assert LabelRules().decode({'fogros2-name': value})
+
+
+@pytest.mark.parametrize('text', [
+    '[' * 200_000, '7', '{"a": []}', 'NaN', '{"a": "%s"}' % ('9' * (1 << 20))],
+    ids=lambda text: text[:10])
+def test_odd_tags_of_a_pod_or_a_rule_are_none(text: str) -> None:
+    assert names.tags_of({'metadata': {'annotations': {names.TAGS: text}}}) == {}
+    assert firewall.tags_of({'description': text}) == {}

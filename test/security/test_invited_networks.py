@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An invitation takes no address of the internet from the computer that it is pasted into."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+from pathlib import Path
+import time
+from typing import Any
+
+import pytest
+
+from fogros2 import invitation
+from fogros2.deploy import membership
+from fogros2.errors import ConfigurationError
+from fogros2.invitation import Invitation
+from fogros2.model import Command
+from fogros2.store import Store
+from ros2fog_cli import verb
+
+KEY = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
+
+
+def text(store: Store, network: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Return an invitation that another program wrote, for a network."""
+    first = ipaddress.IPv4Network(network, strict=False).network_address
+    monkeypatch.setattr(invitation, 'to_json', json.dumps)
+    content: Any = {
+        'machine': 'planner', 'key': KEY, 'address': str(first + 2),
+        'endpoint': '203.0.113.9:30000', 'joiner': str(first + 1), 'network': network,
+        'rmw': 'rmw_cyclonedds_cpp', 'domain': 7, 'expires': time.time() + 60}
+    return invitation.seal(content, invitation.public_text(invitation.own_key(store)))
+
+
+class Robot:
+    """A computer that joins; ``ran`` are the commands of root that it would run."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.store, self.ran, self.asked = Store(folder), list[Command](), list[str]()
+        self.monkeypatch = monkeypatch
+        monkeypatch.setattr(membership, 'check_robot', lambda: None)
+        monkeypatch.setattr(
+            membership, 'run', lambda commands, **_: self.ran.extend(commands) or '')
+
+    def join(self, network: str, **options: Any) -> None:
+        with self.monkeypatch.context() as patch:
+            written = text(self.store, network, patch)
+        membership.join(written, self.store, {}, **options)
+
+    def agree(self, question: str) -> bool:
+        self.asked.append(question)
+        return True
+
+
+@pytest.fixture
+def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Robot:
+    return Robot(tmp_path / 'state', monkeypatch)
+
+
+@pytest.mark.parametrize('network', [
+    '8.8.8.0/24', '140.0.0.0/24', '172.32.0.0/24', '100.128.0.0/24', '198.20.0.0/24',
+    '9.9.9.8/30'])
+def test_public_addresses_are_taken_only_after_a_question(robot: Robot, network: str) -> None:
+    with pytest.raises(ConfigurationError, match=f'take the public addresses {network}'):
+        robot.join(network)
+    assert robot.ran == [] and invitation.joined(robot.store) == {}
+    robot.join(network, agreed=robot.agree)
+    assert network in robot.asked[0] and 'public addresses' in robot.asked[0]
+    assert 'planner' in invitation.joined(robot.store)
+
+
+@pytest.mark.parametrize('network', [
+    '140.0.0.0/8', '10.0.0.0/8', '0.0.0.0/0', '128.0.0.0/1', '198.18.0.0/23', '127.0.0.0/24',
+    '169.254.169.0/24', '224.0.0.0/24', '255.255.255.0/24'])
+def test_network_that_no_launch_has_is_refused(robot: Robot, network: str) -> None:
+    with pytest.raises(ConfigurationError, match='this is no invitation: '):
+        robot.join(network, agreed=robot.agree)
+    assert robot.ran == [] and robot.asked == []
+
+
+@pytest.mark.parametrize('network', [
+    '198.18.7.0/24', '10.213.4.0/24', '172.31.0.0/24', '192.168.78.0/24', '100.64.1.0/24'])
+def test_private_addresses_need_no_question(robot: Robot, network: str) -> None:
+    robot.join(network)
+    assert robot.ran and robot.asked == []
+
+
+@pytest.mark.parametrize('network', [7, None, ['198.18.7.0/24'], '198.18.7.0/24\n'])
+def test_network_that_is_no_text_is_refused(network: Any) -> None:
+    with pytest.raises(ValueError):
+        Invitation('planner', KEY, '198.18.7.2', '203.0.113.9:30000', '198.18.7.1', network,
+                   'rmw_cyclonedds_cpp', 7, time.time() + 60)
+
+
+def test_question_is_not_in_what_a_shell_evaluates(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As ``ros2 fog join`` prints lines for ``eval``."""
+    assert not verb.confirmed('Take 8.8.8.0/24?'), 'nobody is asked without a terminal'
+    monkeypatch.setattr('sys.stdin.isatty', lambda: True)
+    monkeypatch.setattr('builtins.input', lambda: 'y')
+    assert verb.confirmed('Take 8.8.8.0/24?')
+    out, err = capsys.readouterr()
+    assert out == '' and err == 'Take 8.8.8.0/24? [y/N] '

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A checkpoint takes no more of the robot's disk than its limit, and its snapshots end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import os
+from pathlib import Path
+import subprocess
+import sys
+import tempfile
+
+import pytest
+
+from fogros2 import process
+from fogros2.errors import ShellError
+from fogros2.host import checkpoint
+from fogros2.host.checkpoint import Checkpoint
+from fogros2.model import Endpoint, Result
+from fogros2.shell.local import LocalShell
+from fogros2.store import delete_folder
+from rigs.stranger import NOBODY
+
+pytestmark = pytest.mark.skipif(process.which('rsync') is None, reason='needs rsync')
+
+
+class Lying(LocalShell):
+    """A machine that says that its folder has a hundred bytes."""
+
+    def run(self, *_: object, **__: object) -> Result:
+        return Result(0, f"100\n{'0' * 64}  -\n", '')
+
+
+@pytest.fixture
+def shell() -> Lying:
+    return Lying(Endpoint('local'), name='planner')
+
+
+def used(folder: Path) -> int:
+    return sum(512 * path.lstat().st_blocks for path in folder.rglob('*'))
+
+
+def test_machine_cannot_send_more_than_it_says(
+    shell: Lying, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(checkpoint, 'LIMIT', 1 << 20)
+    (tmp_path / 'map').mkdir()
+    (tmp_path / 'map/large').write_bytes(bytes(4 << 20))
+    with pytest.raises(ShellError, match='this computer has sent more than 0.0 GB in place of'):
+        Checkpoint(str(tmp_path / 'map'), tmp_path / 'robot').save(shell, still=True)
+    assert not list((tmp_path / 'robot').iterdir())
+
+
+def test_copy_ends_when_it_is_too_large(shell: Lying, tmp_path: Path) -> None:
+    (tmp_path / 'map').mkdir()
+    with open(tmp_path / 'map/large', 'wb') as file:
+        file.truncate(4 << 30)
+    with pytest.raises(ShellError, match='has sent more than 0.0 GB'):
+        shell.fetch(str(tmp_path / 'map'), tmp_path / 'robot', known=None, limit=1 << 20,
+                    timeout=60.0)
+    assert used(tmp_path / 'robot') < 2 << 30, 'it was noticed while it came'
+
+
+def test_files_without_content_are_counted(shell: Lying, tmp_path: Path) -> None:
+    (tmp_path / 'map').mkdir()
+    for number in range(300):
+        (tmp_path / f'map/{number}').touch()
+    with pytest.raises(ShellError, match='has sent more than'):
+        shell.fetch(str(tmp_path / 'map'), tmp_path / 'robot', known=None, limit=1 << 20,
+                    timeout=60.0)
+
+
+@pytest.fixture
+def home() -> Iterator[Path]:
+    """Return a folder of an account that is not root's."""
+    with tempfile.TemporaryDirectory() as name:
+        if os.geteuid() == 0:
+            os.chown(name, NOBODY, NOBODY)
+        yield Path(name)
+
+
+#: Makes six snapshots of a folder with folders that nobody may write, as another account.
+SIX = f"""\
+import os, sys
+from pathlib import Path
+from fogros2.host.checkpoint import Checkpoint
+from fogros2.model import Endpoint
+from fogros2.shell.local import LocalShell
+from fogros2.store import Store
+if os.geteuid() == 0:
+    os.setgroups([]), os.setgid({NOBODY}), os.setuid({NOBODY})
+home = Path(sys.argv[1])
+source, store = home / 'map', home / 'state/machines/planner/checkpoint'
+(source / 'a/b').mkdir(parents=True)
+(source / 'a/b/file').touch()
+(source / 'a/outside').symlink_to('/')
+kept = Checkpoint(str(source), store)
+for number in range(6):
+    (source / 'number').write_text(str(number))
+    for folder in ('a/b', 'a'):
+        (source / folder).chmod(0o555)
+    assert kept.save(LocalShell(Endpoint('local'), name='planner'), still=True)
+    print(sorted(path.name for path in store.iterdir()))
+Store(home / 'state').delete('planner')
+print(list((home / 'state/machines').iterdir()))
+for folder in ('a', 'a/b'):
+    (source / folder).chmod(0o755)
+"""
+
+
+def test_snapshots_of_folders_without_rights_are_deleted(home: Path) -> None:
+    done = subprocess.run([sys.executable, '-c', SIX, str(home)], capture_output=True, text=True,
+                          timeout=60)
+    assert done.stdout.splitlines() == [
+        *(str([f'{number:08}']) for number in range(1, 7)), '[]'], done.stderr
+
+
+def test_deletion_follows_no_link(tmp_path: Path) -> None:
+    outside = tmp_path / 'outside'
+    outside.mkdir(mode=0o555)
+    (tmp_path / 'inside').mkdir()
+    (tmp_path / 'inside/link').symlink_to(outside)
+    delete_folder(tmp_path / 'inside')
+    assert not (tmp_path / 'inside').exists() and outside.stat().st_mode & 0o777 == 0o555
