@@ -2,7 +2,8 @@
 """
 Transport images as H.264, by a codec without ROS and two nodes.
 
-``annexb`` parses H.264 streams, ``picture`` describes images. ``deep`` codes deep images,
+``cdr`` reads and writes serialized messages, also for other packages. ``annexb`` parses H.264
+streams, ``picture`` describes images. ``deep`` codes deep images,
 ``codec`` all others, ``stills`` JPEG and PNG. ``worker`` runs work in a thread. ``pacing`` limits
 images in flight, ``rate`` estimates a link, ``control`` adapts the encoder to all links,
 ``repair`` corrects losses, ``turns`` lets nodes send in turn, ``memory`` keeps freed memory.
