@@ -86,7 +86,7 @@ class Camera:
                 shown = self._picture(data)
                 if shown is not None:
                     self._show(shots.jpeg(shown))
-            except CodecError as error:
+            except (CodecError, RuntimeError) as error:  # RMWError of bytes that are no message
                 self._done()
                 self._tell({'picture': self._name, 'note': str(error)})
 
