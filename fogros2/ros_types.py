@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Import the classes of messages and services by names from a ROS graph.
+Read names from a ROS graph, and import the classes of messages and services by them.
 
 A node of another computer chooses these names. Python would import a module of any name: a file of
 the current folder, or a part of the standard library that acts when it is imported.
@@ -17,6 +17,17 @@ from typing import Any
 from ament_index_python import get_resource
 
 _NAME = re.compile(r'([A-Za-z]\w*)/(?:(msg|srv|action)/)?([A-Z]\w*)', re.ASCII)
+_TOPIC = re.compile(r'(/[A-Za-z_]\w*)+', re.ASCII)
+
+
+def topics(node: Any) -> dict[str, str]:
+    """
+    Return the topics of a node's graph with the first type of each.
+
+    Names and types that ROS 2 does not allow are left out: they may control a terminal.
+    """
+    return {name: kinds[0] for name, kinds in node.get_topic_names_and_types()
+            if _TOPIC.fullmatch(name) and kinds and _NAME.fullmatch(kinds[0])}
 
 
 def message(name: str) -> Any:

@@ -221,7 +221,7 @@ class BridgeNode(Node, ServerListener):
 
     def _look(self) -> None:
         """Add new topics and remove topics that are gone."""
-        found = {name: kinds[0] for name, kinds in self.get_topic_names_and_types()
+        found = {name: kind for name, kind in ros_types.topics(self).items()
                  if '/_' not in name  # hidden by ROS 2's naming convention
                  and any(fnmatch.fnmatchcase(name, pattern) for pattern in self._patterns)}
         for name in self._topics.keys() - found.keys():

@@ -97,10 +97,16 @@ class Tunnel:
                     self._say(f'nothing answers at {host}:{port} there')
                     return
                 threading.Thread(target=_up, args=(link, stream), daemon=True).start()
-                while line := stream.readline():
-                    link.sendall(base64.b64decode(line))
+                try:
+                    while line := stream.readline():
+                        link.sendall(base64.b64decode(line))
+                finally:
+                    with contextlib.suppress(OSError):
+                        link.shutdown(socket.SHUT_RDWR)  # the other thread reads from it
         except FogError as error:
             self._say(str(error))
+        except ValueError:
+            self._say(f'{host}:{port} there sends no base64')
         except OSError:
             pass  # the viewer disconnected
         finally:

@@ -37,8 +37,9 @@ from fogros2_replicas.calls import Action, Answer, Calls
 from fogros2_replicas.pairs import Header, header_of, Pair
 
 #: Seconds between two looks at the graph, between two writes of the figures, and after which
-#: missing names are reported. Requests of one replica that may be without an answer.
-LOOK, WRITE, MISSING, MOST = 0.25, 1.0, 30.0, 256
+#: missing names are reported. Requests of one replica that may be without an answer, and names and
+#: texts that are remembered because they were reported.
+LOOK, WRITE, MISSING, MOST, WARNINGS = 0.25, 1.0, 30.0, 256, 1000
 #: Reads the header of a serialized message.
 Read = Callable[[bytes], Optional[Header]]
 #: Names that every node has.
@@ -236,7 +237,8 @@ class FirstAnswer(Node):
 
     def complain(self, text: str) -> None:
         """Log an error once."""
-        if text not in self._complained:
+        text = _printable(text)
+        if text not in self._complained and len(self._complained) < WARNINGS:
             self._complained.add(text)
             self.get_logger().error(text)
 
@@ -264,11 +266,11 @@ class FirstAnswer(Node):
                 continue  # the node has just ended
             shared = sorted({name for name, _ in names if not _EVERYWHERE.fullmatch(name)
                              and not name.startswith('/fogros2/')} - self._complained)
-            if shared:
+            if shared and len(self._complained) < WARNINGS:
                 self._complained.update(shared)
-                self.get_logger().warning(
+                self.get_logger().warning(_printable(
                     f"{', '.join(shared)}: the node '{node[0]}' of each replica has this name; "
-                    'declare it in services= or topics=, or expect all of them at once')
+                    'declare it in services= or topics=, or expect all of them at once'))
 
     # -- events and figures ---------------------------------------------------------------------
 
@@ -309,6 +311,11 @@ class FirstAnswer(Node):
                 os.open, mode=0o600)) as file:
             file.write(text)
         os.replace(f'{self._path}.new', f'{self._path}.json')
+
+
+def _printable(text: str) -> str:
+    """Return a text without what controls a terminal: it has names of other computers' nodes."""
+    return ''.join(c if c.isprintable() else '?' for c in text)
 
 
 def _reader(message: Any) -> Read:

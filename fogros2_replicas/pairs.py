@@ -22,7 +22,8 @@ REMEMBERED, MISSES = 512, 10
 #: Without matching stamps: messages of another replica, with none of the chosen one between them,
 #: that make this other one the chosen one.
 STREAK = 3
-#: An input that is so many nanoseconds older than the newest one means that time was set back.
+#: An input that is so many nanoseconds older than the newest one means that time was set back; an
+#: output that is so much newer than the newest input is dropped.
 SET_BACK = 1_000_000_000
 #: Bytes of a frame id that are compared; maximum number of different ids of one stamp.
 FRAME, FRAMES = 256, 1000
@@ -86,6 +87,8 @@ class Pair:
         elif not self.matches:
             self._misses += 1
             self.unmatched = self._misses >= MISSES
+        elif header is not None and header[0] > self._latest + SET_BACK:
+            return False  # it answers no input, and would make all others old
         first = self._is_first(name, header) if self.matches and header is not None \
             else self._is_chosen(name)
         replica.won += first

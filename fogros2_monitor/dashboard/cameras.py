@@ -86,7 +86,7 @@ class Camera:
                 shown = self._picture(data)
                 if shown is not None:
                     self._show(shots.jpeg(shown))
-            except (CdrError, CodecError) as error:
+            except (CdrError, CodecError, RuntimeError) as error:  # RMWError is a RuntimeError
                 self._done()
                 self._tell({'picture': self._name, 'note': str(error)})
 

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 #: Poll interval of the graph in seconds.
 LOOK = 0.5
-#: Maximum number of topics with a measured rate.
+#: Maximum number of topics with a measured rate, and of streams with pictures.
 MOST = 64
 #: Compatible with every publisher; best effort, so that no publisher waits for this node.
 _QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=32,
@@ -109,8 +109,7 @@ class GraphNode(Node):
             sys.stdout.flush()
 
     def _look(self) -> None:
-        topics = [self._topic(name, kinds[0]) for name, kinds in self.get_topic_names_and_types()
-                  if kinds]
+        topics = [self._topic(*found) for found in ros_types.topics(self).items()]
         streamed = streams(topics, self.get_node_names(), self._hosts)
         others = crossing(topics, self._hosts, streamed)
         ways = {one.between: one for one in streamed}
@@ -151,7 +150,7 @@ class GraphNode(Node):
             return  # all streams are between machines, so the robot may lack the image libraries
         by_name = {topic.name: topic for topic in topics}
         wanted: dict[str, tuple[type[Camera], str, bool]] = {}
-        for one in streamed:
+        for one in streamed[:MOST]:
             image = by_name.get(one.topic)
             if one.source and one.target:
                 kind = Camera if one.kind == _IMAGE else StreamCamera

@@ -18,6 +18,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from types import SimpleNamespace
 import urllib.parse
 
@@ -145,6 +146,21 @@ try:
     print(link.recv(1000), flush=True)
 except ConnectionError:
     print(b'', flush=True)
+"""
+#: Opens connections to a port and accepts them, up to a number or its limit.
+CROWD = """\
+import resource, socket
+most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+listener = socket.create_server(('127.0.0.1', 0))
+links = []
+try:
+    while len(links) < int(sys.argv[1]):
+        links += [socket.create_connection(listener.getsockname()), listener.accept()[0]]
+except OSError:
+    links = links[:-10]
+print(len(links), flush=True)
+sys.stdin.read()
 """
 #: Opens a connection, and closes its socket at once.
 LEAVE = """\
@@ -345,3 +361,16 @@ def test_own_client_is_not_foreign(address: str) -> None:
             socket.create_connection((address, listener.getsockname()[1])), \
             listener.accept()[0] as link:
         assert not accounts.is_foreign(link)
+
+
+def test_sockets_of_an_account_do_not_slow_the_check(root: None) -> None:
+    """A server that checks each connection for 0.3 s has no time for its user."""
+    with stranger(CROWD, '8000') as child, socket.create_server(('127.0.0.1', 0)) as listener:
+        assert child.stdout
+        opened = int(child.stdout.readline())
+        if opened < 8000:
+            pytest.skip(f'an account may open only {opened} sockets here')
+        with socket.create_connection(listener.getsockname()), listener.accept()[0] as link:
+            begin = time.process_time()
+            assert not any(accounts.is_foreign(link) for _ in range(20))
+            assert time.process_time() - begin < 0.5
