@@ -219,7 +219,7 @@ def common_flags(
         yield from ('-p', port)
     if spec.share:
         folder, (own, others) = share_folder(request.token), SHARE_FOLDERS
-        yield from ('-v', f'{folder}:{own}', '-v', f'{folder.parent}:{others}:ro')
+        yield from ('-v', f'{folder}/own:{own}', '-v', f'{folder.parent}:{others}:ro')
     for mount in options.mounts:
         source, _, target = mount.partition(':')
         yield from ('-v', f'{source}:{target or source}:ro')
