@@ -3,6 +3,9 @@
 The relay of one machine: publishes here what other robots publish, and sends them what is here.
 
 Messages pass as bytes. Types and QoS come from the ROS graphs, so a launch file names only topics.
+The folder of each machine belongs to the host's root. It has the list of the machine's topics, and
+a folder in which only the machine's relay writes: its socket is there, and what proves to other
+relays which machine reads from them.
 The main thread has rclpy's executor, and sends to other machines from its callbacks. A thread for
 each other machine publishes here, so a message changes threads once in each process.
 """
@@ -12,14 +15,17 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 import contextlib
+import fcntl
 import json
 import os
 from pathlib import Path
+import selectors
 import socket
+import stat
 import sys
 import threading
 import time
-from typing import Any, Optional
+from typing import Any, cast, Optional
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
@@ -29,12 +35,14 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from fogros2 import ros_types
 from fogros2_share.wire import decode, DEEPEST, Echoes, encode, Form, LARGEST, LINE
 
-#: The socket in the folder of a machine.
-NAME = 'relay'
+#: In the folder of a machine: its topics in lines, and the folder of its relay, with its socket
+#: and with a file for each other machine.
+TOPICS, OWN, NAME, PROOF = 'topics', 'own', 'relay', 'to-{}'
 #: Seconds between two looks at the graph and at the other machines, and between two changes of
 #: the type or QoS of another machine's topic. Messages that a publisher or subscription queues.
 LOOK, CHANGE, DEPTH = 0.25, 1.0, 10
-#: Maximum number of other machines, and of bytes that wait for one of them.
+#: Maximum number of other machines, and of connections that have not said which machine they are
+#: of; maximum bytes that wait for a machine.
 MOST, WAITING = 64, 1 << 27
 #: Bytes that are read at once.
 BUFFER = 1 << 16
@@ -61,11 +69,15 @@ class Reader:
     """
     Another relay that reads from here. Its messages wait in memory while it is slow.
 
+    :param topics: those that it gets.
     :param waiting: what to send first.
     """
 
-    def __init__(self, link: socket.socket, waiting: Iterable[bytes]) -> None:
+    def __init__(
+        self, link: socket.socket, topics: frozenset[str], waiting: Iterable[bytes],
+    ) -> None:
         self._link = link
+        self.topics = topics
         self._waiting = deque[memoryview](memoryview(part) for part in waiting)
         self._news, self._left = threading.Condition(), False
         threading.Thread(target=self._send, name='fog-share-send', daemon=True).start()
@@ -128,11 +140,15 @@ class Relay(Node):
         super().__init__(f'share_{os.urandom(4).hex()}', start_parameter_services=False)
         self._shared = {name: Shared() for name in settings['topics']}
         self._own, self._others = map(Path, settings['folders'])
+        #: The name of this machine's folder.
+        self._machine = next(folder.name for folder in self._others.iterdir()
+                          if os.path.samefile(folder / OWN, self._own))
         #: Guards everything below, and the topics.
         self._lock = threading.Lock()
         self._robots: dict[Path, threading.Thread] = {}
         self._links: set[socket.socket] = set()
-        self._readers: list[Reader] = []
+        #: By machine.
+        self._readers: dict[str, Reader] = {}
         self._complained: set[str] = set()
         (self._own / NAME).unlink(missing_ok=True)
         self._server = socket.socket(socket.AF_UNIX)
@@ -140,20 +156,23 @@ class Relay(Node):
         # the users of machines have any number
         (self._own / NAME).chmod(0o666)
         self._server.listen()
+        listed = topics_of(self._others / self._machine)
+        if missing := sorted(self._shared.keys() - listed):
+            self._complain(f"{', '.join(missing)} of other robots are not heard: the machine was "
+                           f"made for {', '.join(sorted(listed))}; delete it, and launch again")
         threading.Thread(target=self._serve, name='fog-share-serve', daemon=True).start()
         self.create_timer(LOOK, self._tick)
 
     def _tick(self) -> None:
         """Look for changes of the topics and of the other machines."""
         with self._lock:
-            for reader in [one for one in self._readers if one.has_left()]:
-                self._readers.remove(reader)
-                reader.close()
+            for name in [name for name, one in self._readers.items() if one.has_left()]:
+                self._readers.pop(name).close()
         for name, shared in self._shared.items():
             self._look(name, shared)
         with contextlib.suppress(OSError):  # a machine ends
             for folder in sorted(self._others.iterdir())[:MOST]:
-                if folder not in self._robots and not os.path.samefile(folder, self._own):
+                if folder not in self._robots and folder.name != self._machine:
                     self._robots[folder] = threading.Thread(
                         target=self._follow, args=(folder,), name='fog-share', daemon=True)
                     self._robots[folder].start()
@@ -164,7 +183,7 @@ class Relay(Node):
             for link in (self._server, *self._links):
                 with contextlib.suppress(OSError):  # it may not be connected
                     link.shutdown(socket.SHUT_RDWR)
-            for reader in self._readers:
+            for reader in self._readers.values():
                 reader.close()
             threads = list(self._robots.values())
         for thread in threads:
@@ -214,22 +233,56 @@ class Relay(Node):
             if len(data) > LARGEST:
                 return self._complain(f'{name}: {len(data)} bytes are too large to be shared')
             head = encode(name, form, len(data))
-            for reader in self._readers:
-                reader.put(head, data)
+            for reader in self._readers.values():
+                if name in reader.topics:
+                    reader.put(head, data)
             shared.kept.append((head, data))
 
     def _serve(self) -> None:
-        """Accept other relays."""
-        with contextlib.suppress(OSError):
+        """Accept other relays; the oldest of too many connections that say nothing goes."""
+        silent: list[socket.socket] = []
+        with selectors.DefaultSelector() as chosen, contextlib.suppress(OSError):
+            chosen.register(self._server, selectors.EVENT_READ)
             while True:
-                link, _ = self._server.accept()
-                with self._lock:
-                    if len(self._readers) < MOST:
-                        self._readers.append(Reader(link, [
-                            part for shared in self._shared.values()
-                            for frame in shared.kept for part in frame]))
-                    else:
-                        link.close()
+                for key, _ in chosen.select():
+                    link = cast(socket.socket, key.fileobj)
+                    if link is self._server:
+                        silent.append(self._server.accept()[0])
+                        chosen.register(silent[-1], selectors.EVENT_READ)
+                        link = silent[0]
+                    if len(silent) > MOST or link is key.fileobj and link in silent:
+                        chosen.unregister(link)
+                        silent.remove(link)
+                        if link is not key.fileobj or not self._admit(link):
+                            link.close()
+        for link in silent:
+            link.close()
+
+    def _admit(self, link: socket.socket) -> bool:
+        """Add a reader that proves of which machine it is, in place of an earlier one of it."""
+        try:
+            said, files, _, _ = socket.recv_fds(link, 256, 1)
+        except OSError:
+            return False
+        with contextlib.ExitStack() as undo:
+            for file in files:
+                undo.callback(os.close, file)
+            try:
+                name = said.decode()
+                folder = self._others / name
+                if not files or folder.parent != self._others or not proven(
+                        files[0], folder / OWN / PROOF.format(self._machine)):
+                    return False
+                topics = topics_of(folder)
+            except (OSError, ValueError):
+                return False
+        with self._lock:
+            if before := self._readers.pop(name, None):
+                before.close()
+            self._readers[name] = Reader(link, topics, [
+                part for topic, shared in self._shared.items() if topic in topics
+                for frame in shared.kept for part in frame])
+        return True
 
     # -- from another robot to this launch ------------------------------------------------------
 
@@ -240,7 +293,7 @@ class Relay(Node):
         with self._lock:
             self._links.add(link)
         try:
-            link.connect(str(folder / NAME))
+            self._connect(link, folder)
             with link.makefile('rb', BUFFER) as stream:
                 while line := stream.readline(LINE):
                     name, form, size = decode(line)
@@ -267,6 +320,25 @@ class Relay(Node):
                 link.close()
                 del self._robots[folder]
 
+    def _connect(self, link: socket.socket, folder: Path) -> None:
+        """
+        Connect to the relay of another machine, and prove to it of which machine this one is.
+
+        A machine could make its socket a link to a socket of this machine.
+
+        :raises OSError: there is no relay.
+        """
+        proof = self._own / PROOF.format(folder.name)
+        with contextlib.ExitStack() as undo:
+            place = os.open(folder / OWN / NAME, os.O_PATH | os.O_NOFOLLOW)
+            undo.callback(os.close, place)
+            if not stat.S_ISSOCK(os.fstat(place).st_mode):
+                raise FileNotFoundError
+            link.connect(f'/proc/self/fd/{place}')
+            file = os.open(proof, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+            undo.callback(os.close, file)
+            socket.send_fds(link, [self._machine.encode()], [file])
+
     def _take(
         self, folder: Path, publishers: Publishers, name: str, form: Form, data: bytes,
     ) -> None:
@@ -292,6 +364,22 @@ class Relay(Node):
         shared.theirs[folder].append(hash(data))
         if shared.subscription is not None:
             shared.echoes.add(now, data)
+
+
+def proven(file: int, path: Path) -> bool:
+    """
+    Return whether an open file is the one of a path, and open for writing.
+
+    Others can reach the file of a machine at most for reading, because their folders are mounted
+    so.
+    """
+    return os.path.samestat(os.fstat(file), os.stat(path, follow_symlinks=False)) \
+        and fcntl.fcntl(file, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDWR
+
+
+def topics_of(folder: Path) -> frozenset[str]:
+    """Return the topics that a machine was made for, from its folder."""
+    return frozenset((folder / TOPICS).read_text().split())
 
 
 def profile(form: Form, least: int = 1) -> QoSProfile:

@@ -13,7 +13,13 @@ from typing import Any, Optional, TYPE_CHECKING
 import launch.logging
 
 from fogros2.describe import values
-from fogros2.errors import AgentError, ConfigurationError, FogError
+from fogros2.errors import (
+    AgentError,
+    ConfigurationError,
+    ConnectError,
+    DeadlineExceeded,
+    FogError,
+)
 from fogros2.events import Event
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2.runtime import streaming
@@ -325,6 +331,11 @@ class Session:
                     self.running.start,
                     [streaming.remapped(run.node, {**self.names, **self.replicated})
                      for run in runs])
+        except (AgentError, ConnectError, DeadlineExceeded) as error:
+            # the machine's doing: the nodes of the robot go on
+            for run in runs:
+                run.on_event({'event': 'refused', 'node': run.node.id, 'name': run.node.name,
+                              'error': str(error.args[0]), 'hint': error.hint})
         except FogError:
             for run in runs:
                 run.end()

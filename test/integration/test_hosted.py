@@ -187,6 +187,9 @@ def test_robots_hear_shared_topics_of_each_other_alone(
     assert not heard(one, 'sees') & {'/of_two'} and not heard(two, 'sees') & {'/of_one'}
     assert one.text.count('heard map of two') == two.text.count('heard map of one') == 1
 
+    # no other account of a machine writes where its relay does
+    assert set(host.shared().values()) == {'fog 711'}
+
     # both are in both lists, each its own robot's
     for robot in ('one', 'two'):
         rows = [row for row in json.loads(fog(host, robot, 'list', '--json'))

@@ -5,118 +5,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import contextlib
-import json
-import os
 from pathlib import Path
-import shutil
-import signal
 import socket
-import subprocess
-import sys
-import tempfile
 import threading
-from typing import Any, Optional
 
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed')
 from nav_msgs.msg import OccupancyGrid
-import rclpy
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int32, String
 
 from fogros2.waiting import wait_until
-from fogros2_share.node import NAME
+from fogros2_share.node import NAME, OWN
 from fogros2_share.wire import encode, Form
-from rigs.domains import taken
+from rigs.sharing import BEST_EFFORT, LATCHED, repeated, Robot, robot
 
-ROOT = Path(__file__).parents[2]
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+__all__ = ['robot']
 pytestmark = pytest.mark.timeout(120)
-
-
-class Robot:
-    """A robot: a domain with a node of the test, and the relay of its machine."""
-
-    def __init__(self, fleet: Path, name: str, domain: str) -> None:
-        self.folder, self.fleet, self.domain = fleet / name, fleet, domain
-        self.folder.mkdir()
-        self.lines: list[str] = []
-        self.relay: Optional[subprocess.Popen[str]] = None
-        self.context = Context()
-        rclpy.init(context=self.context, domain_id=int(domain))
-        self.node = Node('planner', context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
-        self.thread.start()
-
-    def start(self, *topics: str) -> None:
-        """Start its relay."""
-        self.relay = subprocess.Popen(
-            [sys.executable, str(ROOT / 'fogros2_share/scripts/share'), json.dumps({
-                'topics': topics, 'folders': [str(self.folder), str(self.fleet)]})],
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-            env={**os.environ, 'ROS_DOMAIN_ID': self.domain, 'PYTHONPATH': os.pathsep.join(
-                filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))})
-        threading.Thread(target=lambda: self.lines.extend(self.relay.stdout), daemon=True).start()
-
-    def stop(self) -> int:
-        """Interrupt its relay."""
-        assert self.relay is not None
-        self.relay.send_signal(signal.SIGINT)
-        return self.relay.wait(15)
-
-    def heard(self, kind: Any, topic: str, qos: Any = 10) -> list[Any]:
-        """Return the messages that its node hears, a list that grows."""
-        found: list[Any] = []
-        self.node.create_subscription(kind, topic, found.append, qos)
-        return found
-
-    def publisher(self, kind: Any, topic: str, qos: Any = 10) -> Any:
-        return self.node.create_publisher(kind, topic, qos)
-
-    def close(self) -> None:
-        if self.relay is not None and self.relay.poll() is None:
-            self.relay.kill()
-            self.relay.wait()
-        self.executor.shutdown()
-        self.thread.join(10)
-        self.node.destroy_node()
-        self.context.try_shutdown()
-
-
-@pytest.fixture
-def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Robot]]:
-    """Return what makes a robot; their DDS stays on the loopback, in domains of their own."""
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    # a path of a socket is short
-    fleet = Path(tempfile.mkdtemp(prefix='fogt'))
-    with contextlib.ExitStack() as undo:
-        undo.callback(shutil.rmtree, fleet)
-
-        def make(name: str) -> Robot:
-            made = Robot(fleet, name, undo.enter_context(taken()))
-            undo.callback(made.close)
-            return made
-
-        yield make
-
-
-def repeated(publisher: Any, make: Callable[[int], Any], heard: list[Any], count: int = 5) -> None:
-    """Publish until so many messages were heard."""
-    numbers = iter(range(10_000))
-
-    def look() -> bool:
-        publisher.publish(make(next(numbers)))
-        return len(heard) >= count
-
-    wait_until(look, timeout=40, longest=0.05, what='the shared messages')
 
 
 def test_listed_topics_reach_the_other_robots_only(robot: Callable[[str], Robot]) -> None:
@@ -217,15 +123,16 @@ def test_type_of_another_robot_has_to_match(robot: Callable[[str], Robot]) -> No
 @contextlib.contextmanager
 def stranger(folder: Path, *data: bytes) -> Iterator[list[bool]]:
     """Stand for a hijacked machine, whose relay sends ``data``; yield its connections' fates."""
-    folder.mkdir()
+    (folder / OWN).mkdir(parents=True)
     fates: list[bool] = []
     with socket.socket(socket.AF_UNIX) as server:
-        server.bind(str(folder / NAME))
+        server.bind(str(folder / OWN / NAME))
         server.listen()
 
         def answer(connection: socket.socket) -> None:
             with connection:
                 try:
+                    connection.recv(256)  # which machine it is
                     for part in data:
                         connection.sendall(part)
                     fates.append(connection.recv(1) == b'')
@@ -277,12 +184,10 @@ def test_message_after_a_quick_change_of_qos_arrives(robot: Callable[[str], Robo
     assert {message.data for message in (*heard, *late)} == {'b'}
 
 
-def test_foreign_types_and_links_reach_nothing(robot: Callable[[str], Robot]) -> None:
+def test_foreign_types_reach_nothing(robot: Callable[[str], Robot]) -> None:
     one, two = robot('one'), robot('two')
-    (one.fleet / 'link').mkdir()
-    (one.fleet / 'link' / NAME).symlink_to(one.folder / NAME)
-    (one.fleet / 'file').mkdir()
-    (one.fleet / 'file' / NAME).write_text('no socket')
+    (one.fleet / 'file' / OWN).mkdir(parents=True)
+    (one.fleet / 'file' / OWN / NAME).write_text('no socket')
     forged = [encode(topic, Form(kind, True, 1), 4) + b'\0\1\0\0' for topic, kind in (
         ('/secret', 'std_msgs/msg/String'), ('/chat', 'antigravity/msg/String'),
         ('/chat', 'json/msg/String'), ('/chat', 'std_msgs/msg/NoSuch'))]
@@ -299,6 +204,7 @@ def test_foreign_types_and_links_reach_nothing(robot: Callable[[str], Robot]) ->
 
 def test_relay_without_its_folder_says_why(robot: Callable[[str], Robot]) -> None:
     one = robot('one')
+    (one.folder / OWN).rmdir()
     one.folder.rmdir()
     one.start('/chat')
     assert one.relay is not None and one.relay.wait(20) == 1

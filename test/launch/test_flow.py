@@ -572,7 +572,7 @@ def test_a_program_may_be_in_the_image_alone(run, fake):
     assert fake.machines['planner'].nodes['program'].package == 'theirs'
 
 
-def test_failing_node_start_ends_the_launch(run, fake, planner, monkeypatch, capfd):
+def test_failing_node_start_ends_the_node(run, fake, planner, monkeypatch, capfd):
     def start(self, nodes):
         raise AgentError('the agent is gone')
 
@@ -586,8 +586,8 @@ def test_failing_node_start_ends_the_launch(run, fake, planner, monkeypatch, cap
         return machine
 
     fake.up = up
-    assert run(LaunchDescription([talker(planner)])) == 1
-    assert 'the agent is gone' in capfd.readouterr().out
+    assert run(LaunchDescription([talker(planner)])) == 0
+    assert "process can't be started: the agent is gone" in capfd.readouterr().out
 
 
 def test_failing_undo_gives_status_1(run, fake, planner, capfd):

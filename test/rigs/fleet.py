@@ -122,6 +122,12 @@ class Fleet:
                          for one in found.values()}
         return found
 
+    def shared(self) -> dict[str, str]:
+        """Return owner and mode of the folders in which relays write, by container."""
+        return {name: run(Command((
+            'podman', 'exec', name, 'stat', '-c', '%U %a', '/opt/fogros2/share'), sudo=True),
+            timeout=30.0).stdout.strip() for name in self.containers()}
+
     def traces(self) -> list[str]:
         """Return what is left of machines on the host."""
         tables = run(Command(('nft', 'list', 'tables'), sudo=True), timeout=30.0).stdout

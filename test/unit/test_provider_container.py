@@ -275,13 +275,15 @@ def test_relays_of_one_user_meet_in_folders_of_their_own(monkeypatch, tmp_path):
     words = list(container_options.common_flags(Engine('podman'), spec, REQUEST, Options()))
     folder = container_machine.share_folder('0123-token')
     # a machine writes into its own folder alone
-    assert f'{folder}:/opt/fogros2/share:rw,nosuid,nodev,noexec' in words
+    assert f'{folder}/own:/opt/fogros2/share:rw,nosuid,nodev,noexec' in words
     assert f'{folder.parent}:/opt/fogros2/shared:ro,nosuid,nodev,noexec' in words
     assert not any('fogros2/share' in word for word in container_options.common_flags(
         Engine('podman'), MachineSpec('m', 'container'), REQUEST, Options()))
     with container._sharing(spec, '0123-token'):
         assert [stat.S_IMODE(path.stat().st_mode) for path in (
-            folder, folder.parent, folder.parent.parent)] == [0o1777, 0o755, 0o700]
+            folder / 'own', folder, folder.parent, folder.parent.parent,
+            folder / 'topics')] == [0o1777, 0o755, 0o755, 0o700, 0o644]
+        assert (folder / 'topics').read_text() == '/map\n'
     with container._sharing(spec, 'other-token'), pytest.raises(ProviderError):
         with container._sharing(spec, 'third-token'):
             raise ProviderError('no more memory')

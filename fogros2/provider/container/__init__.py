@@ -94,11 +94,18 @@ shift 3
 "$@"
 """
 
-# The machine's users have any number. Only machines of one user of this computer meet: no other
-# user enters the outermost folder. The end of the last machine removes the outer folders.
+# The machine's login user has any number; the first process gives it the folder 'own'. The topics
+# stay root's. Only machines of one user of this computer meet: no other user enters the outermost
+# folder. The end of the last machine removes the outer folders.
 _SHARE = """\
 umask 077
-until mkdir -p "$1" && chmod 1777 "$1" && chmod 755 "${1%/*}"; do sleep 0.1; done
+top=$1
+shift
+until mkdir -p "$top/own" && chmod 1777 "$top/own" && chmod 755 "$top" "${top%/*}"; do
+    sleep 0.1
+done
+umask 022
+printf '%s\\n' "$@" >"$top/topics"
 """
 
 #: Maximum size of a host key's file in bytes.
@@ -414,7 +421,8 @@ def _sharing(spec: MachineSpec, token: str) -> Iterator[None]:
     with contextlib.ExitStack() as failed:
         if spec.share:
             failed.callback(process.run, Command(('rm', '-rf', folder), sudo=True), timeout=10.0)
-            process.run(Command(('sh', '-ec', _SHARE, 'sh', folder), sudo=True), timeout=10.0)
+            process.run(Command(('sh', '-ec', _SHARE, 'sh', folder, *spec.share), sudo=True),
+                        timeout=10.0)
         yield
         failed.pop_all()
 
