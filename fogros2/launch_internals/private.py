@@ -16,6 +16,7 @@ The names are those of Jazzy (launch 3.4), which the embedded default shares;
 from __future__ import annotations
 
 import asyncio
+import collections
 from collections.abc import Awaitable, Callable, Iterable
 import contextlib
 import functools
@@ -30,8 +31,9 @@ from launch import (
     LaunchDescriptionSource,
 )
 from launch.actions import ExecuteLocal, TimerAction
+from launch.events import Shutdown
 from launch.events.process import ProcessExited, ShutdownProcess
-from launch.utilities import AsyncSafeSignalManager
+from launch.utilities import AsyncSafeSignalManager, visit_all_entities_and_collect_futures
 
 #: The method of ExecuteLocal that starts the process and awaits its end.
 EXECUTE_PROCESS = '_ExecuteLocal__execute_process'
@@ -198,6 +200,58 @@ def kept_environments(context: LaunchContext) -> list[dict[str, str]]:
 def waiting_events(context: LaunchContext) -> int:
     """Return the number of events that launch has yet to process."""
     return int(context._event_queue.qsize())
+
+
+def guard_shutdown(
+    context: LaunchContext, failed: Callable[[BaseException], None],
+) -> None:
+    """
+    Let all handlers of a shutdown run, although one of them fails, as one that prints may.
+
+    launch passes an exception on and calls no further handler: the other processes, and the
+    machines, would never hear of the shutdown.
+
+    :param failed: called with the exception.
+    """
+    handlers = _Handlers(failed)
+    for handler in context._event_handlers:
+        handlers.append(handler)
+    context._event_handlers = handlers
+
+
+class _Handlers(collections.deque[Any]):
+    """The handlers of a launch, each of which may fail at the shutdown."""
+
+    def __init__(self, failed: Callable[[BaseException], None]) -> None:
+        super().__init__()
+        self._failed = failed
+
+    def append(self, handler: Any) -> None:
+        super().append(self._guarded(handler))
+
+    def appendleft(self, handler: Any) -> None:
+        super().appendleft(self._guarded(handler))
+
+    def _guarded(self, handler: Any) -> Any:
+        vars(handler)['handle'] = functools.partial(_handle_all, handler.handle, self._failed)
+        return handler
+
+
+def _handle_all(
+    handle: Callable[[Event, LaunchContext], Any], failed: Callable[[BaseException], None],
+    event: Event, context: LaunchContext,
+) -> Any:
+    if not isinstance(event, Shutdown):
+        return handle(event, context)
+    try:
+        entities = handle(event, context)
+        for entity in entities if isinstance(entities, Iterable) else (entities,):
+            if entity is not None:
+                for _, future in visit_all_entities_and_collect_futures(entity, context):
+                    context.add_completion_future(future)
+    except Exception as error:  # noqa: BLE001 - of a launch file's own function
+        failed(error)
+    return None
 
 
 def signal_manager() -> Optional[AsyncSafeSignalManager]:

@@ -3,11 +3,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+import contextlib
+import functools
 import logging
+import os
+import queue
 import shutil
 import sys
 import threading
-from typing import Optional, TextIO
+from typing import Optional, TextIO, Union
 
 import launch.logging
 
@@ -25,6 +30,65 @@ from fogros2.report import (
 from fogros2.untrusted import clean
 
 _WIDTH = 24
+#: Number of texts that wait for a screen that is not read; further ones are dropped.
+_LONGEST = 10_000
+
+
+class Screen:
+    """
+    A text stream that neither blocks nor fails: a closed terminal or a full pipe ends no launch.
+
+    :param stream: where a thread writes the text.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+        self.closed = False
+        self._texts: queue.Queue[Union[str, threading.Event]] = queue.Queue(_LONGEST)
+        threading.Thread(target=self._write_all, name='fog-screen', daemon=True).start()
+
+    def write(self, text: str) -> int:
+        """Write a text soon."""
+        with contextlib.suppress(queue.Full):
+            self._texts.put_nowait(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Do nothing, because the thread flushes."""
+
+    def isatty(self) -> bool:
+        """Return whether the stream is a terminal."""
+        return self.stream.isatty()
+
+    def drain(self) -> bool:
+        """Return whether all texts are written, at the latest after a second."""
+        written = threading.Event()
+        with contextlib.suppress(queue.Full):
+            self._texts.put_nowait(written)
+            return written.wait(1.0) and not self.closed
+        return False
+
+    def _write_all(self) -> None:
+        while True:
+            text = self._texts.get()
+            if isinstance(text, threading.Event):
+                text.set()
+            elif not self.closed:
+                try:
+                    self._write(text)
+                except (OSError, ValueError):
+                    self.closed = True
+
+    def _write(self, text: str) -> None:
+        try:
+            handle = self.stream.fileno()
+        except OSError:  # it has no file, such as a test's
+            self.stream.write(text)
+            return
+        # a buffer whose lock this thread holds would end the interpreter with a fatal error
+        data = text.encode(self.stream.encoding, 'backslashreplace')
+        while data:
+            data = data[os.write(handle, data):]
 
 
 class Console:
@@ -32,21 +96,27 @@ class Console:
     Receive events from any thread and show them through launch's logger ``fogros2``.
 
     All that this logger shows is cleaned of control characters.
+    Until ``close``, all lines of launch go through a :class:`Screen`.
 
-    :param stream: shows the progress line, if it is a terminal.
+    :param stream: replaces the stream of launch's screen handler.
     """
 
     def __init__(self, stream: Optional[TextIO] = None) -> None:
         self._logger = launch.logging.get_logger('fogros2')
         self._logger.addFilter(_cleaned)
-        self._stream = stream or sys.stdout
+        self._handler = launch.logging.launch_config.get_screen_handler()
+        self._stream = Screen(stream or self._handler.stream)
+        self._handler.setStream(self._stream)
+        log = launch.logging.launch_config.get_log_file_handler()
+        log.handleError = functools.partial(self._on_log_error, log.handleError)
+        self._log_fails = False
         self._lock = threading.RLock()
         self._running: dict[tuple[str, str], str] = {}
         self._drawn = False
         self._live = self._stream.isatty()
         if self._live:
             # a log line overwrites the progress line instead of following it
-            launch.logging.launch_config.get_screen_handler().addFilter(self._before_line)
+            self._handler.addFilter(self._before_line)
 
     def __call__(self, event: Event) -> None:
         """Show an event."""
@@ -88,9 +158,21 @@ class Console:
         with self._lock:
             self._running.clear()
             self._erase()
-            if self._live:
-                launch.logging.launch_config.get_screen_handler().removeFilter(
-                    self._before_line)
+            self._handler.removeFilter(self._before_line)
+            if self._stream.drain():
+                self._handler.setStream(self._stream.stream)
+
+    def _on_log_error(
+        self, otherwise: Callable[[logging.LogRecord], None], record: logging.LogRecord,
+    ) -> None:
+        """Report once that launch's log file cannot be written, instead of each traceback."""
+        error = sys.exc_info()[1]
+        if not isinstance(error, OSError):
+            otherwise(record)
+        elif not self._log_fails:
+            self._log_fails = True
+            self._stream.write(f"[WARNING] [fogros2]: launch's log file can't be written: "
+                               f'{error.strerror}\nthe launch goes on without it\n')
 
     def _before_line(self, record: logging.LogRecord) -> bool:
         with self._lock:
@@ -100,7 +182,6 @@ class Console:
     def _erase(self) -> None:
         if self._drawn:
             self._stream.write('\r\x1b[K')
-            self._stream.flush()
             self._drawn = False
 
     def _draw(self) -> None:
@@ -112,7 +193,6 @@ class Console:
                 f'{_where(machine)}: {step}{bar}'
                 for (machine, step), bar in self._running.items()]
             self._stream.write('   '.join(parts)[:shutil.get_terminal_size().columns - 1])
-            self._stream.flush()
             self._drawn = True
 
 

@@ -158,6 +158,7 @@ class Coordinator:
         self._launch = self._make_launch(
             report=self._console, environment=dict(context.environment), cancel=self._cancel)
         self._restore_signals = signals.take_over(context)
+        private.guard_shutdown(context, self._fail)
         if self._dds is not None:
             self._launch.use_dds(self._dds)
         self._set_dds_environment()

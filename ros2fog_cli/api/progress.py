@@ -16,7 +16,8 @@ def report(event: Event) -> None:
     """Print a failed step to standard error; a :data:`fogros2.report.Reporter`."""
     if isinstance(event, StepFailed):
         where = f'{event.machine}: ' if event.machine else ''
-        print(f'{where}{event.step} failed: {event.reason}', file=sys.stderr)
+        with contextlib.suppress(OSError):  # the terminal is closed, and the work goes on
+            print(f'{where}{event.step} failed: {event.reason}', file=sys.stderr)
 
 
 @contextlib.contextmanager

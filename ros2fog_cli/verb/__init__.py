@@ -99,9 +99,24 @@ def add_page(parser: argparse.ArgumentParser) -> None:
                         help='print the address, but start no browser')
 
 
+def say(text: str, *, error: bool = False) -> None:
+    """
+    Print a line; a closed terminal or pipe does not end the verb.
+
+    :param error: print it to standard error.
+    """
+    import os
+    stream = sys.stderr if error else sys.stdout
+    try:
+        print(text, file=stream, flush=True)
+    except OSError:
+        # the stream keeps the text, and the exit would fail to write it again
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
 def warn(text: str) -> None:
     """Print a line to standard error."""
-    print(text, file=sys.stderr)
+    say(text, error=True)
 
 
 def agreed(one: str, several: str, number: int) -> bool:

@@ -5,7 +5,15 @@ from __future__ import annotations
 
 import argparse
 
-from ros2fog_cli.verb import add_region, agreed, complete, machine_names, VerbExtension, warn
+from ros2fog_cli.verb import (
+    add_region,
+    agreed,
+    complete,
+    machine_names,
+    say,
+    VerbExtension,
+    warn,
+)
 
 
 class DeleteVerb(VerbExtension):
@@ -39,14 +47,14 @@ class DeleteVerb(VerbExtension):
                 warn(f'{len(others)} of other robots left out (--any-robot takes them)')
         if not entries:
             if name is None:
-                print('no machines')
+                say('no machines')
                 return 0
             warn(f"there is no machine '{name}' (ros2 fog list shows those there are)")
             return 1
         for entry in entries:
             whose = '' if entry.own else f' of the robot {entry.robot}'
-            print(f"{'would delete' if args.dry_run else 'delete'} {entry.name}{whose}: "
-                  f"{entry.provider} {entry.machine_id or '-'}, {entry.state}")
+            say(f"{'would delete' if args.dry_run else 'delete'} {entry.name}{whose}: "
+                f"{entry.provider} {entry.machine_id or '-'}, {entry.state}")
         if args.dry_run:
             return 0
         for entry in entries:
@@ -56,7 +64,7 @@ class DeleteVerb(VerbExtension):
         failed = 0
         for entry, error in endings.delete_all(entries, store, progress.report, force=args.force):
             if error is None:
-                print(f'deleted {entry.name}')
+                say(f'deleted {entry.name}')
                 for warning in endings.awaited(store, entry.name):
                     warn(warning)
             else:

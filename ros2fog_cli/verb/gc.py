@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from ros2fog_cli.verb import add_json, add_region, VerbExtension, warn
+from ros2fog_cli.verb import add_json, add_region, say, VerbExtension, warn
 
 
 class GcVerb(VerbExtension):
@@ -34,7 +34,7 @@ class GcVerb(VerbExtension):
             done.append({'what': what, 'name': name, 'reason': reason, 'error': error or None})
             if not args.json:
                 verb = 'would clear' if args.dry_run else 'cleared'
-                print(f"{'could not clear' if error else verb} {what} {name}: {error or reason}")
+                say(f"{'could not clear' if error else verb} {what} {name}: {error or reason}")
 
         entries = machines.survey(warn, regions=args.region, store=store)
         for due in endings.due(entries, store, args.keep_stopped * 86400, progress.report):
@@ -50,7 +50,7 @@ class GcVerb(VerbExtension):
             for what in endings.tidy(warn, regions=args.region):
                 note('leftover', what, 'its machine ended by itself')
         if args.json:
-            print(json.dumps(done, indent=2))
+            say(json.dumps(done, indent=2))
         elif not done:
-            print('nothing to clear')
+            say('nothing to clear')
         return int(any(one['error'] for one in done))

@@ -14,6 +14,7 @@ from ros2fog_cli.verb import (
     agreed,
     complete,
     machine_names,
+    say,
     VerbExtension,
     warn,
 )
@@ -172,8 +173,8 @@ def _delete(args: argparse.Namespace, words: list[str]) -> int:
     from ros2fog_cli.api import images
     found = images.named(images.survey(warn, regions=args.region), words)
     for image in found:
-        print(f"{'would delete' if args.dry_run else 'delete'} {image.name}: "
-              f'{image.provider} {image.id}, {image.state}')
+        say(f"{'would delete' if args.dry_run else 'delete'} {image.name}: "
+            f'{image.provider} {image.id}, {image.state}')
     if args.dry_run:
         return 0
     if not args.yes and not agreed('this image', 'images', len(found)):
@@ -182,7 +183,7 @@ def _delete(args: argparse.Namespace, words: list[str]) -> int:
     for image in found:
         try:
             images.delete(image)
-            print(f'deleted {image.name}')
+            say(f'deleted {image.name}')
         except FogError as error:
             warn(f'{image.name}: {error}')
             failed = 1

@@ -3,11 +3,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
 from pathlib import Path
+import pty
+import selectors
 import shutil
 import signal
 import subprocess
+import termios
 import threading
 import uuid
 
@@ -15,6 +20,7 @@ import pytest
 
 from fogros2 import process
 from fogros2.model import Command
+from fogros2.store import Store
 from fogros2.waiting import wait_until
 
 pytestmark = [
@@ -55,21 +61,50 @@ def own_group() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-class Launched:
-    """A ``ros2 launch`` process, its output read all the time."""
+def own_terminal() -> None:
+    os.setsid()
+    fcntl.ioctl(1, termios.TIOCSCTTY, 0)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    def __init__(self, path: Path) -> None:
+
+class Launched:
+    """
+    A ``ros2 launch`` process, its output read until ``deafen``.
+
+    :param terminal: give it a terminal of its own instead of a pipe.
+    """
+
+    def __init__(self, path: Path, *, terminal: bool = False) -> None:
         self.said: list[str] = []
+        reader, writer = pty.openpty() if terminal else os.pipe()
         self.child = subprocess.Popen(
-            ['ros2', 'launch', '--debug', str(path)], stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT, text=True, preexec_fn=own_group)
+            ['ros2', 'launch', '--debug', str(path)], stdin=writer if terminal else None,
+            stdout=writer, stderr=writer, preexec_fn=own_terminal if terminal else own_group)
+        os.close(writer)
+        self._output = os.fdopen(reader, 'rb', buffering=0)
+        self._deaf = threading.Event()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
     def _read(self) -> None:
-        assert self.child.stdout is not None
-        for line in self.child.stdout:
-            self.said.append(line)
+        rest = b''
+        with selectors.DefaultSelector() as chosen, contextlib.suppress(OSError):
+            chosen.register(self._output, selectors.EVENT_READ)
+            while not self._deaf.is_set():
+                if not chosen.select(0.05):
+                    continue
+                data = self._output.read(4096)
+                if not data:
+                    break
+                *lines, rest = (rest + data).split(b'\n')
+                self.said += [f'{line.decode(errors="replace")}\n' for line in lines]
+
+    def deafen(self, *, close: bool) -> None:
+        """Read no more of its output; ``close`` the terminal or the pipe."""
+        self._deaf.set()
+        self._reader.join(5)
+        if close:
+            self._output.close()
 
     def wait_for(self, words: str, timeout: float = 60.0) -> None:
         """Wait until a line with ``words`` came."""
@@ -86,6 +121,8 @@ class Launched:
         """Return the exit status."""
         code = self.child.wait(timeout)
         self._reader.join(5)
+        if not self._output.closed:
+            self._output.close()
         return code
 
 
@@ -93,10 +130,10 @@ class Launched:
 def launched(tmp_path, cloud_network):
     started = []
 
-    def start(timeout=120):
+    def start(timeout=120, **words):
         path = tmp_path / 'planner.launch.py'
         path.write_text(LAUNCH.format(name=NAME, network=cloud_network, timeout=timeout))
-        started.append(Launched(path))
+        started.append(Launched(path, **words))
         return started[-1]
 
     yield start
@@ -126,11 +163,51 @@ def test_a_second_interrupt_does_not_stop_the_way_back(launched):
     launch.ended()
 
 
-def test_a_closed_terminal_takes_everything_back(launched):
-    launch = launched()
-    launch.wait_for(STEPS['running'])
-    launch.child.send_signal(signal.SIGHUP)
-    launch.ended()
+def end_at(launch, step, deafen):
+    """Make a launch's output fail in a step, and end the launch."""
+    launch.wait_for(STEPS['running' if step == 'ending' else step])
+    if step == 'ending':
+        launch.child.send_signal(signal.SIGINT)
+        launch.wait_for('SIGINT')
+    deafen()
+    if step != 'ending' and launch.child.poll() is None:
+        launch.child.send_signal(signal.SIGINT)
+    assert launch.ended() in (0, 1)
+    assert containers() == [] and not Store().exists(NAME)
+
+
+@pytest.mark.parametrize('output', ['terminal', 'pipe', 'unread pipe'])
+@pytest.mark.parametrize('step', ['create', 'running', 'ending'])
+def test_closed_output_takes_everything_back(launched, step, output):
+    """A closed terminal also sends SIGHUP; `| less` does not read until it is asked to."""
+    launch = launched(terminal=output == 'terminal')
+    end_at(launch, step, lambda: launch.deafen(close=output != 'unread pipe'))
+
+
+@pytest.mark.parametrize('variable', ['ROS_LOG_DIR', 'FOGROS2_STATE_HOME', 'TMPDIR'])
+@pytest.mark.parametrize('step', ['create', 'running', 'ending'])
+def test_full_disk_takes_everything_back(launched, monkeypatch, tmp_path, step, variable):
+    disk = tmp_path / 'small'
+    disk.mkdir()
+    if process.run(Command(('mount', '-t', 'tmpfs', '-o', 'size=512k,mode=1777', 'tmpfs',
+                            str(disk)), sudo=True), timeout=10.0, check=False).returncode != 0:
+        pytest.skip('needs the right to mount')
+    try:
+        monkeypatch.setenv(variable, str(disk))
+        launch = launched()
+        end_at(launch, step, lambda: fill(disk))
+        assert variable != 'ROS_LOG_DIR' or 'Logging error' not in ''.join(launch.said)
+    finally:
+        process.run(Command(('umount', '-l', str(disk)), sudo=True), timeout=10.0)
+
+
+def fill(disk: Path) -> None:
+    """Leave no byte of a disk."""
+    with open(disk / 'all', 'wb', buffering=0) as file:
+        for size in (4096, 1):
+            with contextlib.suppress(OSError):
+                while True:
+                    file.write(b'x' * size)
 
 
 @pytest.mark.parametrize('step', STEPS)

@@ -16,8 +16,10 @@ SCRIPT = """
 import sys, threading
 sys.path.insert(0, {folder!r})
 from conftest import FakeLaunch
-from launch import LaunchDescription, LaunchService
-from launch.actions import ExecuteProcess
+from launch import EventHandler, LaunchDescription, LaunchService
+from launch.actions import ExecuteProcess, OpaqueFunction, RegisterEventHandler
+from launch.event_handlers import OnShutdown
+from launch.events import Shutdown
 from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 from fogros2.runtime.coordinator import Coordinator
 
@@ -34,6 +36,9 @@ class Fake(FakeLaunch):
         self.note('all is gone')
         return []
 
+def fail():
+    raise OSError('the handler failed')
+
 fake = Fake()
 if {never_up}:
     fake.waits['planner'] = threading.Event()
@@ -42,6 +47,7 @@ Coordinator(service.context, make_launch=fake)
 planner = ContainerInstance(name='planner', ros_workspace='')
 service.include_launch_description(FogROSLaunchDescription([
     CloudNode(machine=planner, package='demo', executable='talker'),
+    {entities}
     ExecuteProcess(cmd=['sleep', '600'], name='robot'),
 ]))
 status = service.run()
@@ -55,7 +61,7 @@ class Program:
 
     def __init__(self, package, tmp_path, *, ignore=(), **settings):
         text = SCRIPT.format(folder=str(Path(__file__).parent), **{
-            'never_up': False, 'slow_down': False, **settings})
+            'never_up': False, 'slow_down': False, 'entities': '', **settings})
 
         def defaults():
             os.setsid()
@@ -162,3 +168,18 @@ def test_a_signal_ignored_from_the_start_stays_ignored(program):
     assert launch.end() == 0
     text = '\n'.join(launch.lines)
     assert 'SIGTERM: shutting down' in text and 'SIGHUP' not in text
+
+
+@pytest.mark.parametrize('entities', [
+    'OnShutdown(on_shutdown=lambda event, context: fail())',
+    'OnShutdown(on_shutdown=[OpaqueFunction(function=lambda context: fail())])',
+    'EventHandler(matcher=lambda event: isinstance(event, Shutdown), '
+    'entities=[OpaqueFunction(function=lambda context: fail())])'])
+def test_failing_handler_of_the_shutdown_stops_no_other(program, entities):
+    """Such as one that prints to a terminal that is closed."""
+    launch = program(entities=f'RegisterEventHandler({entities}),')
+    launch.wait_for('[robot-')
+    launch.send(signal.SIGTERM)
+    assert launch.end() == 1
+    assert launch.notes()[-4:] == ['stop', 'down', 'all', 'status'], '\n'.join(launch.lines)
+    assert 'the handler failed' in '\n'.join(launch.lines)

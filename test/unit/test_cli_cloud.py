@@ -677,3 +677,18 @@ def test_doctor_gives_up_a_silent_provider(monkeypatch: pytest.MonkeyPatch) -> N
     assert 'no answer within 0.1 s' in doctor.provider('cloud', timeout=0.1).detail
     assert time.monotonic() - begin < 5
     over.set()
+
+
+@pytest.mark.parametrize('verb', [('gc',), ('delete', 'all', '--yes')])
+def test_closed_pipe_ends_no_deletion(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, verb: Sequence[str],
+) -> None:
+    for name in ('one', 'two', 'three'):
+        machine(name, expires=time.time() - 3600)
+        record(name)
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, 'w') as closed:
+        monkeypatch.setattr('sys.stdout', closed)
+        assert run(*verb) == 0
+    assert not Cloud.machines and not Store().machines()

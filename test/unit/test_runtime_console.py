@@ -5,6 +5,9 @@ from __future__ import annotations
 
 import io
 import logging
+import os
+import pty
+import time
 
 import launch.logging
 import pytest
@@ -19,7 +22,7 @@ from fogros2.report import (
     StepStarted,
     Warned,
 )
-from fogros2.runtime.console import Console
+from fogros2.runtime.console import Console, Screen
 
 
 class Terminal(io.StringIO):
@@ -85,10 +88,10 @@ def test_progress_on_a_terminal_only():
         console(StepStarted('planner', 'sync'))
         console(Progress('planner', 'sync', 250_000_000, 1_000_000_000))
         console(Progress('planner', 'sync', 2_000, 0))
+        console.close()
         assert ('[######.' in stream.getvalue()) == drawn
         assert ('250.0 MB of 1.0 GB' in stream.getvalue()) == drawn
         assert ('2.0 kB' in stream.getvalue()) == drawn
-        console.close()
         assert stream.getvalue() == '' or stream.getvalue().endswith('\r\x1b[K')
 
 
@@ -103,3 +106,65 @@ def test_silence_and_its_end_are_a_line_each(lines):
 def test_warning_has_its_remedy_on_a_line_of_its_own(lines):
     Console(io.StringIO())(Warned('planner', 'it may lack x', "add pip=['x']"))
     assert lines == [('WARNING', "it may lack x\nadd pip=['x']")]
+
+
+def dead(how):
+    """Return a stream to a terminal or pipe that is closed, or that nobody reads."""
+    reader, writer = pty.openpty() if how == 'terminal' else os.pipe()
+    if how == 'full':
+        os.set_blocking(writer, False)
+        try:
+            while os.write(writer, b'x' * 4096):
+                pass
+        except BlockingIOError:
+            os.set_blocking(writer, True)
+    else:
+        os.close(reader)
+    return os.fdopen(writer, 'w'), reader
+
+
+@pytest.mark.parametrize('how', ['terminal', 'pipe', 'full'])
+def test_dead_screen_neither_fails_nor_blocks(lines, how):
+    launch.logging.launch_config.level = logging.INFO
+    stream, reader = dead(how)
+    begin = time.monotonic()
+    console = Console(stream)
+    console._live = True
+    for number in range(100):
+        console(StepStarted('planner', 'sync'))
+        console(Progress('planner', 'sync', number, 100))
+        console(StepDone('planner', 'sync', 1.0))
+    console.close()
+    assert time.monotonic() - begin < 5.0
+    assert len(lines) == 100
+    if how == 'full':
+        os.close(reader)  # frees the thread
+
+
+def test_screen_keeps_the_order_and_what_a_locale_lacks(capfd):
+    reader, writer = os.pipe()
+    with os.fdopen(writer, 'w', encoding='ascii') as stream:
+        screen = Screen(stream)
+        for number in range(1000):
+            screen.write(f'{number}\n')
+        screen.write('±\n')
+        assert screen.drain()
+    with os.fdopen(reader) as file:
+        assert file.read().splitlines() == [*map(str, range(1000)), '\\xb1']
+
+
+def test_full_disk_of_the_log_is_one_line(lines, capfd, monkeypatch):
+    full = open('/dev/full', 'w')
+    handler = launch.logging.launch_config.get_log_file_handler()
+    monkeypatch.setattr(handler, 'emit', lambda record: logging.StreamHandler.emit(
+        handler, record))
+    monkeypatch.setattr(handler, 'stream', full)
+    screen = io.StringIO()
+    console = Console(screen)
+    for _ in range(3):
+        console(StepDone('planner', 'sync', 1.0))
+    console.close()
+    with pytest.raises(OSError):
+        full.close()
+    assert screen.getvalue().count("launch's log file can't be written: No space left") == 1
+    assert 'Traceback' not in ''.join(capfd.readouterr())
