@@ -75,7 +75,7 @@ setup(
                      for name in ('aws', 'azure', 'gcp')},
                   'fogros2_monitor': ['dashboard/page.html']},
     data_files=list(data_files()),
-    install_requires=['setuptools', 'cryptography', 'paramiko', 'PyYAML'],
+    install_requires=['setuptools', 'catkin_pkg', 'cryptography', 'paramiko', 'PyYAML'],
     extras_require={
         'applications': APPLICATIONS,
         'aws': AWS,

@@ -35,7 +35,7 @@ from fogros2.model import Command
 
 OWN, EMBEDDED, PIP = 'fogros2', 'ros2-embedded', 'pip'
 #: Distributions that only the robot uses.
-_ROBOT_ONLY = frozenset({'cryptography', 'paramiko', 'setuptools'})
+_ROBOT_ONLY = frozenset({'catkin-pkg', 'cryptography', 'paramiko', 'setuptools'})
 #: Seconds for which a result is reused without a check.
 FRESH = 5.0
 #: Date of all files in a wheel, so that equal files give equal wheels.
