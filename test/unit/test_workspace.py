@@ -243,7 +243,8 @@ def test_real_rosdep_goes_on_without_a_rule(root: Path, tmp_path: Path) -> None:
     done = process.run(dataclasses.replace(command, argv=(
         *command.argv[:-1], command.argv[-1].replace('. /opt/ros/jazzy/setup.sh\n', '')),
         environment={**rosdep_source(tmp_path / 'lists', {'fogt_key': '[fogt]'}),
-                     'HOME': str(tmp_path), 'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}'}),
+                     'HOME': str(tmp_path),
+                     'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}'}),
         timeout=60.0, check=False)
     assert done.returncode == 0, done.stderr
     assert 'Cannot locate rosdep definition for [fogt_none]' in done.stderr
