@@ -75,7 +75,8 @@ setup(
                      for name in ('aws', 'azure', 'gcp')},
                   'fogros2_monitor': ['dashboard/page.html']},
     data_files=list(data_files()),
-    install_requires=['setuptools', 'cryptography', 'packaging', 'paramiko', 'PyYAML'],
+    install_requires=['setuptools', 'catkin_pkg', 'cryptography', 'packaging', 'paramiko',
+                      'PyYAML'],
     extras_require={
         'applications': APPLICATIONS,
         'aws': AWS,

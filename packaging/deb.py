@@ -40,6 +40,7 @@ UBUNTU = {
     'iproute2': 'iproute2',
     'openssh-client': 'openssh-client',
     'python3-boto3': 'python3-boto3 (>= 1.34)',
+    'python3-catkin-pkg-modules': 'python3-catkin-pkg-modules (>= 0.5)',
     'python3-cryptography': 'python3-cryptography (>= 41.0)',
     'python3-google-auth': 'python3-google-auth (>= 2.0)',
     'python3-numpy': 'python3-numpy (>= 1:1.26)',

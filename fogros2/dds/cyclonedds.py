@@ -25,6 +25,8 @@ from pathlib import Path
 import re
 from types import MappingProxyType
 from typing import ClassVar, Optional
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 from xml.sax.saxutils import quoteattr
 
 from fogros2 import untrusted
@@ -66,6 +68,12 @@ LOOPBACK = '127.0.0.1'
 _NOT_LAN = re.compile('lo$|fog')
 #: <linux/if.h>
 _IFF_MULTICAST = 0x1000
+#: A comment or declaration; or a tag, with quotes around > in attributes.
+_MARKUP = re.compile(
+    r'''<!--.*?-->|<\?.*?\?>|<![^>]*>|<(?P<end>/?)(?P<name>[^\s<>/]*)'''
+    r'''(?:[^<>"']|"[^"]*"|'[^']*')*?(?P<empty>/?)>''', re.DOTALL)
+#: Attributes about XML itself, some with a prefix that nothing declares.
+_NAMESPACE = re.compile(r'''\s(?:xmlns|\w+:\w+)\s*=\s*(?:"[^"]*"|'[^']*')''')
 
 
 class CycloneDds(DdsVendor):
@@ -79,9 +87,8 @@ class CycloneDds(DdsVendor):
 
     def asked(self, user: Mapping[str, str]) -> list[str]:
         """Return the hosts of ROS_STATIC_PEERS, and those of each ``<Peer>``."""
-        text = ''.join(xml for _, xml in fragments(user.get('CYCLONEDDS_URI', '')))
-        return [*static_peers(user), *re.findall(
-            r'<Peer\b[^>]*\baddress=["\']([^"\':]+)', text, re.IGNORECASE)]
+        return [*static_peers(user), *(
+            _attribute(peer, 'address').partition(':')[0] for peer in self._find('peer', user))]
 
     def ask_lan(self) -> Command:
         """Return the command whose output :meth:`parse_lan` reads."""
@@ -119,21 +126,32 @@ class CycloneDds(DdsVendor):
         :raises DdsError: the user's configuration cannot be read or extended, or blocks the
             announcements of machines.
         """
-        text = ''.join(xml for _, xml in fragments(user.get('CYCLONEDDS_URI', '')))
-        if '<NetworkInterfaceAddress' in text:
+        if self._find('networkinterfaceaddress', user):
             raise DdsError(
                 "CYCLONEDDS_URI's NetworkInterfaceAddress excludes the VPN",
                 'write <Interfaces><NetworkInterface name="..."/></Interfaces> instead')
-        has_peers = bool(re.search(r'<Peer\b', text) or user.get('ROS_STATIC_PEERS'))
-        listed = re.findall(r'<NetworkInterface\b([^>]*)>', text)
+        has_peers = bool(self._find('peer', user) or user.get('ROS_STATIC_PEERS'))
+        listed = self._find('networkinterface', user)
         _check_multicast(listed)
         interfaces = []
-        if not any(re.search(r'"lo"|"127\.', attributes) for attributes in listed):
+        if not any(_attribute(one, 'name') == 'lo' or _attribute(one, 'address').startswith('127.')
+                   for one in listed):
             interfaces.append(DdsInterface('lo', -5 if has_peers else 20, multicast=True))
         if lan is not None and not listed and not local_only(user):
             interfaces.append(DdsInterface(lan, 10, required=False, multicast=True))
         # below 0, the default priority of the user's own interfaces
         return [*interfaces, DdsInterface(vpn, -10, required=False, multicast=True)]
+
+    def _find(self, tag: str, user: Mapping[str, str]) -> list[Element]:
+        """Return the user's settings with a tag, in lower case, that are for our domain."""
+        found: list[Element] = []
+        for _, root in fragments(user.get('CYCLONEDDS_URI', ''), user):
+            # Cyclone accepts <Domain> and its settings without what is around them
+            for part in root if root.tag.lower() == 'cyclonedds' else [root]:
+                if part.tag.lower() != 'domain' or _attribute(part, 'id').lower() in (
+                        '', 'any', str(self.domain)):
+                    found += [one for one in part.iter() if one.tag.lower() == tag]
+        return found
 
     def machine_interfaces(self, vpn: str) -> list[DdsInterface]:
         """Return the interfaces of a machine's nodes; their peers are the other machines."""
@@ -222,7 +240,7 @@ class CycloneDds(DdsVendor):
             raise DdsError(f'Cyclone DDS reads {path} as two files', 'use a path without a comma')
         # Cyclone opens the path after file:// without decoding it
         ours = f'file://{path}'
-        theirs = user.get('CYCLONEDDS_URI', '').strip().rstrip(',')
+        theirs = closed(user.get('CYCLONEDDS_URI', '').strip().rstrip(','))
         if theirs.endswith(ours):
             uri = theirs
         else:
@@ -230,22 +248,42 @@ class CycloneDds(DdsVendor):
         return {'RMW_IMPLEMENTATION': self.rmw, 'CYCLONEDDS_URI': uri}
 
 
-def fragments(uri: str) -> Iterator[tuple[str, str]]:
+def fragments(
+    uri: str, variables: Mapping[str, str] = MappingProxyType({}),
+) -> Iterator[tuple[str, Element]]:
     """
-    Yield each part of a CYCLONEDDS_URI: its path, or the begin of inline text; and its XML.
+    Yield each part of a CYCLONEDDS_URI: its path, or the begin of inline text; and its element.
 
-    :raises DdsError: a file cannot be read.
+    :param variables: values of variables in the XML, such as ``${INTERFACE}``.
+    :raises DdsError: a file cannot be read, or a part is no XML.
     """
+    def value(match: re.Match[str]) -> str:
+        return variables.get(match[1]) or match[2] or ''
+
+    for place, text in _parts(uri):
+        try:
+            yield place, ElementTree.fromstring(
+                re.sub(r'\$\{(\w+)(?::-([^}]*))?\}', value, text))
+        except ElementTree.ParseError as error:
+            raise DdsError(f'{place} of CYCLONEDDS_URI is no XML: {error}',
+                           'nodes would refuse to start; correct or unset CYCLONEDDS_URI'
+                           ) from error
+
+
+def _parts(uri: str) -> Iterator[tuple[str, str]]:
+    """Yield each part of a CYCLONEDDS_URI as Cyclone splits it: its place and its XML."""
     rest = uri.strip(' ,\n\t')
     while rest:
         if rest.startswith('<'):
-            inline, end, rest = rest.partition('</CycloneDDS>')
-            yield f'{inline[:60]}...', inline + end
+            begin = rest[:60]
+            xml, _, rest = _element(rest)
+            yield f'{begin}...', xml
         else:
             name, _, rest = rest.partition(',')
             path = Path(name.removeprefix('file://'))
             try:
-                yield str(path), path.read_text(errors='replace')
+                yield str(path), _MARKUP.sub(
+                    lambda tag: _NAMESPACE.sub('', tag[0]), path.read_text(errors='replace'))
             except OSError as error:
                 raise DdsError(
                     f"CYCLONEDDS_URI names {path}, which can't be read: {error.strerror}",
@@ -253,22 +291,61 @@ def fragments(uri: str) -> Iterator[tuple[str, str]]:
         rest = rest.strip(' ,\n\t')
 
 
-def _check_multicast(listed: Sequence[str]) -> None:
+def _element(text: str) -> tuple[str, str, str]:
+    """
+    Return the first element of inline text as XML, its missing end, and the text behind it.
+
+    There, Cyclone takes ``</>`` for the end of any element, and the end of the text for all ends.
+    """
+    found, names, at = '', list[str](), 0
+    for tag in _MARKUP.finditer(text):
+        found += text[at:tag.start()]
+        at = tag.end()
+        if tag['name'] is None:
+            continue  # a comment, or the declaration
+        if tag['end']:
+            found += f"</{tag['name'] or ''.join(names[-1:])}>"
+            names = names[:-1]
+        else:
+            found += _NAMESPACE.sub('', tag[0])
+            names += [] if tag['empty'] else [tag['name']]
+        if not names:
+            return found, '', text[at:]
+    missing = ''.join(f'</{name}>' for name in reversed(names))
+    return found + text[at:] + missing, missing, ''
+
+
+def closed(uri: str) -> str:
+    """Return a CYCLONEDDS_URI behind which Cyclone reads more: inline XML has its end."""
+    rest = uri
+    while (begin := re.search(r'(^|,)[\s,]*<', rest)) is not None:
+        _, missing, rest = _element(rest[begin.end() - 1:])
+        if missing:
+            return uri + missing
+    return uri
+
+
+def _attribute(element: Element, name: str) -> str:
+    """Return an attribute, whose name Cyclone reads in any case; '' if it is missing."""
+    return next((value for key, value in element.items() if key.lower() == name), '')
+
+
+def _check_multicast(listed: Sequence[Element]) -> None:
     """
     Refuse a user's interface that disables multicast on all interfaces.
 
     Cyclone 0.10 (ROS 2 Jazzy) then disables multicast for the whole process, and machines are
     found by multicast.
 
-    :param listed: the attributes of each ``<NetworkInterface>``.
+    :param listed: each ``<NetworkInterface>``.
     """
-    for attributes in listed:
-        name = re.search(r'\bname="([^"]*)"', attributes)
-        if name and 'multicast="true"' not in attributes and not _has_multicast(name[1]):
+    for one in listed:
+        name, multicast = _attribute(one, 'name'), _attribute(one, 'multicast').lower()
+        if multicast == 'false' or name and multicast != 'true' and not _has_multicast(name):
             raise DdsError(
-                f'CYCLONEDDS_URI makes nodes use {name[1]} without multicast, so they would'
-                ' discover no machine',
-                f'write <NetworkInterface name="{name[1]}" multicast="true"/>')
+                f"CYCLONEDDS_URI makes nodes use {name or _attribute(one, 'address')} without "
+                'multicast, so they would discover no machine',
+                f'write <NetworkInterface name="{name}" multicast="true"/>')
 
 
 def _has_multicast(interface: str) -> bool:

@@ -7,7 +7,8 @@ What a machine needs, and how the machine gets it.
 ``workspace`` sends workspaces, ``programs`` checks that the programs of nodes exist.
 ``dependencies`` names the packages that nodes declare, ``undeclared`` finds imports that nodes do
 not declare. ``bootstrap`` installs ROS 2, ``relocation`` sets up the libraries of its wheels.
-``container_scripts`` has the scripts that run containers, ``containers`` the commands with them.
+``container_scripts`` has the scripts that run containers, ``docker_lines`` reads the lines that
+describe them, ``containers`` has the commands.
 ``checkpoint`` has the snapshots of a folder. ``idle`` decides, on the machine, when nobody uses
 it.
 """

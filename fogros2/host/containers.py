@@ -13,13 +13,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
+import itertools
 import posixpath
 import re
 import shlex
 from typing import Any, Union
 
-from fogros2.errors import ConfigurationError, DdsError
+from fogros2.errors import ConfigurationError, DdsError, did_you_mean
 from fogros2.host import container_scripts as scripts
+from fogros2.host import docker_lines
 from fogros2.model import Command, NodeSpec, Text
 
 #: Program in the agent's folder that follows a container; its arguments are the container's name
@@ -27,16 +29,11 @@ from fogros2.model import Command, NodeSpec, Text
 FOLLOWER = 'follow-container'
 #: Label of containers with the launch's id.
 LABEL = 'fogros2-launch'
-#: Options of ``docker run`` without a value.
-_FLAGS = {
-    'detach', 'disable-content-trust', 'help', 'init', 'interactive', 'no-healthcheck',
-    'no-hosts', 'oom-kill-disable', 'privileged', 'publish-all', 'quiet', 'read-only', 'replace',
-    'rm', 'sig-proxy', 'tty',
-}
-_SHORT_FLAGS = 'diPqt'
 #: Options that our own commands set.
 _OURS = {'-d', '--detach', '-i', '--interactive', '-t', '--tty', '--rm'}
 _ENGINES = ('podman', 'docker')
+_SUDO_FLAGS = {'-E', '-H', '-n', '-S', '--non-interactive', '--preserve-env'}
+_ASSIGNMENT = re.compile(r'[A-Za-z_]\w*=')
 #: Names of the scripts that are sent with a process.
 _OUTER, _INNER = 'container', 'in-container'
 _VARIABLE = re.compile('[A-Za-z_][A-Za-z0-9_]*')
@@ -69,7 +66,8 @@ class Container:
     """
     The container of a ``docker run`` line.
 
-    :param options: options before the image, without those that our own commands set.
+    :param options: options before the image, without those that our own commands set; in them and
+        in the command, an expansion stands between two ``docker_lines.MARK``.
     :param gpus: 'all' or a number, '' for none.
     :param name: name in the launch file, '' for none.
     :param restart: restart policy such as 'always', '' for none.
@@ -108,23 +106,32 @@ def parse(line: str) -> Container:
     """
     Parse a ``docker run`` line.
 
-    The result has neither ``sudo`` nor ``--detach``, which our own commands set.
+    The result has neither ``sudo`` nor ``--detach``, which our own commands set. Expansions in it
+    are those of :func:`docker_lines.words`.
 
-    :raises ConfigurationError: it is no such line, or has no image.
+    :raises ConfigurationError: it is no such line, has no image, or is more than one command.
     """
-    def wrong(why: str) -> ConfigurationError:
-        return ConfigurationError(
-            f"add_docker_container: '{line}' {why}",
-            "write 'docker run [options] image [command]', or give image= and the rest by name")
+    def wrong(why: str, hint: str = '') -> ConfigurationError:
+        return ConfigurationError(f"add_docker_container: '{line.strip()}' {why}", hint or (
+            "write 'docker run [options] image [command]', or give image= and the rest by name"))
 
     try:
-        words = shlex.split(line)
+        words = docker_lines.words(line)
     except ValueError as error:
-        raise wrong(f'is no command line: {error}') from error
-    while words and (words[0] == 'sudo' or words[0] == '-n'):
-        words.pop(0)
+        raise wrong(str(error), "quote it, or give the container the command sh -c '...'"
+                    ) from error
+    if words[:1] == ['sudo']:
+        words = [*itertools.dropwhile(_SUDO_FLAGS.__contains__, words[1:])]
+        if words and words[0].startswith('-'):
+            raise wrong(f'has {words[0]} of sudo', 'leave it out: the engine runs as root')
+    if words and _ASSIGNMENT.match(words[0]):
+        raise wrong(f'sets {words[0]} for the engine',
+                    'leave it out, or give it to the container: docker run -e ...')
     if not words or posixpath.basename(words.pop(0)) not in _ENGINES:
         raise wrong('is no line of docker or podman')
+    if words and words[0].startswith('-'):
+        raise wrong(f"has {words[0]} in front of 'run'",
+                    "leave it out: the machine's own engine runs the container")
     if words[:1] == ['container']:
         words.pop(0)
     if words[:1] != ['run']:
@@ -139,7 +146,7 @@ def parse(line: str) -> Container:
             break
         name, equals, value = word.partition('=')
         if not word.startswith('--'):
-            rest = word[1:].lstrip(_SHORT_FLAGS)
+            rest = word[1:].lstrip(docker_lines.SHORT_FLAGS)
             options += ['-P'] if 'P' in word[:len(word) - len(rest)] else []
             if not rest:
                 continue
@@ -147,9 +154,13 @@ def parse(line: str) -> Container:
             name, equals, value = word[:2], word[2:], word[2:].lstrip('=')
         if name in _OURS:
             continue
-        if name.startswith('--') and name[2:] in _FLAGS:
+        if name[2:] in docker_lines.FLAGS:
             options.append(word)
             continue
+        if name[2:] not in docker_lines.VALUES and name[1:] not in {*docker_lines.SHORT_VALUES}:
+            raise wrong(f'has {name}, which is no option of docker run', did_you_mean(
+                name, [f'--{each}' for each in docker_lines.FLAGS | docker_lines.VALUES],
+                'correct it'))
         if not equals:
             if at >= len(words):
                 raise wrong(f'has nothing after {word}')
@@ -161,6 +172,10 @@ def parse(line: str) -> Container:
             options += [name, value]
     if at >= len(words):
         raise wrong('names no image')
+    for text in (words[at], *found.values()):
+        if docker_lines.MARK in text:
+            raise wrong(f"has {text.replace(docker_lines.MARK, '')} as image, name, gpus or "
+                        'restart', 'write it out: the launch has to know it')
     return Container(words[at], tuple(options), tuple(words[at + 1:]), found['--gpus'],
                      found['--name'], found['--restart'])
 
@@ -300,11 +315,15 @@ def run(
     :param image: output of ``fetch``.
     :param configuration: see ``dds_options``, as for ``variables``.
     """
-    options = dds_options(container, configuration, variables)
-    name = called(container, number, launch)
+    words = ('--label', f'{LABEL}={launch}', *dds_options(container, configuration, variables),
+             image, *container.command)
+    script = scripts.RUN
+    if any(docker_lines.MARK in word for word in words):
+        # expanded by the login user's shell, before the engine runs as root
+        script = f'set -- "$@" {" ".join(map(docker_lines.expression, words))}\n{script}'
+        words = ()
     return Command(
-        ('sh', '-ec', scripts.RUN, 'sh', name, container.gpus,
-         '--label', f'{LABEL}={launch}', *options, image, *container.command),
+        ('sh', '-ec', script, 'sh', called(container, number, launch), container.gpus, *words),
         what=f"start the container '{container.image}'")
 
 

@@ -35,7 +35,7 @@ from fogros2.model import Command
 
 OWN, EMBEDDED, PIP = 'fogros2', 'ros2-embedded', 'pip'
 #: Distributions that only the robot uses.
-_ROBOT_ONLY = frozenset({'cryptography', 'packaging', 'paramiko', 'setuptools'})
+_ROBOT_ONLY = frozenset({'catkin-pkg', 'cryptography', 'packaging', 'paramiko', 'setuptools'})
 #: Folders of ROS 2's distributions that no node needs, half of their size.
 _BUILD = frozenset({'cmake', 'include'})
 #: Seconds for which a result is reused without a check.

@@ -20,7 +20,7 @@ from typing import Optional
 import xml.etree.ElementTree as ElementTree
 
 from fogros2 import process
-from fogros2.errors import WorkspaceError
+from fogros2.errors import CommandError, WorkspaceError
 from fogros2.host.inspection import DISTRO, HostFacts
 from fogros2.model import Command
 from fogros2.plugin_system import OWN_PACKAGES
@@ -37,6 +37,14 @@ BUILT = ('build', 'install', 'log')
 _ELF_MACHINES = {3: 'i686', 40: 'armv7l', 62: 'x86_64', 183: 'aarch64', 243: 'riscv64'}
 _LIBRARY = re.compile(r'\.so(\.[0-9.]+)?$')
 _SKIPPED = {'.git', '.hg', '.svn', '__pycache__', '.venv', 'node_modules'}
+#: Variables of conditions in manifests (REP 149), besides those of the robot's environment.
+_ROS = {'ROS_VERSION': '2', 'ROS_DISTRO': DISTRO, 'ROS_PYTHON_VERSION': '3'}
+_RUN = ('depend', 'exec_depend', 'run_depend')
+#: What rosdep installs.
+_ALL = (*_RUN, 'build_depend', 'build_export_depend', 'buildtool_depend',
+        'buildtool_export_depend', 'test_depend')
+#: What rosdep reports of a key without a rule.
+_NO_RULE = re.compile(r'(?:rosdep definition for|No definition of) \[([^\]]+)\]')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,22 +185,17 @@ def dependencies(*paths: str | os.PathLike[str]) -> list[str]:
     needed: set[str] = set()
     for name, manifest in manifests.items():
         if name not in OWN_PACKAGES and manifest.is_file():
-            needed |= {(element.text or '').strip() for element in _parsed(manifest)
-                       if element.tag == 'depend' or element.tag.endswith('_depend')}
+            needed |= {*_texts(manifest, *_ALL)}
     return sorted(needed - {''} - set(manifests))
 
 
 def run_dependencies(manifest: Path) -> set[str]:
     """
-    Return a package's run-time dependencies (``depend``, ``exec_depend``) for ROS 2.
+    Return a package's run-time dependencies (``depend``, ``exec_depend``) for ROS 2 Jazzy.
 
     :raises WorkspaceError: the manifest cannot be read.
     """
-    if not manifest.is_file():
-        return set()
-    return {(element.text or '').strip() for element in _parsed(manifest)
-            if element.tag in ('depend', 'exec_depend', 'run_depend')
-            and '$ROS_VERSION == 1' not in element.get('condition', '')}
+    return {*_texts(manifest, *_RUN)} if manifest.is_file() else set()
 
 
 def plan(
@@ -295,12 +298,20 @@ def transfer(
         on_progress=on_progress) for folder in linked]
     if any(way.commands for way in ways):
         before_build()
+    unknown: dict[str, None] = {}
     for command in [command for way in ways for command in way.commands]:
-        shell.run(command, timeout=timeouts.build, cancel=cancel)
+        try:
+            unknown |= dict.fromkeys(_NO_RULE.findall(
+                shell.run(command, timeout=timeouts.build, cancel=cancel).stderr))
+        except CommandError as error:
+            raise CommandError(
+                error.command, error.result, error.where, error.hint or unknown
+                and f"rosdep has no rule for {', '.join(unknown)}" or '') from error
     sent = (f'{sum(report.files for report in reports)} files, '
             f'{size(sum(report.bytes for report in reports))}')
     return ', '.join([sent, *(
-        f'built there: {way.reason}' for way in ways if way.commands)])
+        f'built there: {way.reason}' for way in ways if way.commands), *(
+        [f"the machine may lack {', '.join(unknown)}"] if unknown else [])])
 
 
 def _why_build(workspace: Workspace, machine: HostFacts, robot: HostFacts) -> str:
@@ -337,10 +348,12 @@ def _build(workspace: Workspace, ros_setup: Sequence[str]) -> Iterator[Command]:
     yield Command.script(
         # rosdep finds packages of underlays, which have no rule, in the sourced environment
         f'{source}'
-        '[ -e /etc/ros/rosdep/sources.list.d/20-default.list ] || sudo -n rosdep init\n'
+        '[ -n "${ROSDEP_SOURCE_PATH-}" ] || [ -e /etc/ros/rosdep/sources.list.d/20-default.list ]'
+        ' || sudo -n rosdep init\n'
         f'rosdep update --rosdistro {DISTRO}\n'
         f'cd {root}\n'
-        f'rosdep install --rosdistro {DISTRO} --from-paths {below} --ignore-src -y\n',
+        # -r: a key without a rule may be one that the build does not need
+        f'rosdep install --rosdistro {DISTRO} --from-paths {below} --ignore-src -y -r\n',
         what="install the workspace's dependencies")
     yield Command.script(
         f'{source}cd {root}\n'
@@ -388,8 +401,26 @@ def _parsed(manifest: Path) -> ElementTree.Element:
                              'correct it, or put a COLCON_IGNORE beside it') from error
 
 
+def _texts(manifest: Path, *tags: str) -> Iterator[str]:
+    """Yield the texts of a manifest's elements with these tags whose condition is true."""
+    for element in _parsed(manifest).iter():
+        if element.tag in tags and _is_true(element.get('condition'), manifest):
+            yield (element.text or '').strip()
+
+
+def _is_true(condition: Optional[str], manifest: Path) -> bool:
+    if condition is None:
+        return True
+    from catkin_pkg.condition import evaluate_condition  # slow, and few manifests need it
+    try:
+        return bool(evaluate_condition(condition, {**os.environ, **_ROS}))
+    except ValueError as error:
+        raise WorkspaceError(f'{manifest}: {error}', 'such as condition="$ROS_VERSION == 2"'
+                             ) from error
+
+
 def _build_type(folder: Path) -> str:
-    return (_parsed(folder / 'package.xml').findtext('export/build_type') or '').strip()
+    return next(_texts(folder / 'package.xml', 'build_type'), '')
 
 
 def _inspect_installed(workspace: Workspace) -> Workspace:

@@ -15,7 +15,6 @@ import re
 import sys
 import threading
 from typing import Literal, Optional
-import xml.etree.ElementTree as ElementTree
 
 from fogros2 import deploy, plan, plugin_system, process
 from fogros2.dds import cyclonedds
@@ -241,14 +240,11 @@ def cyclone_uri() -> Check:
     """Check that the user's Cyclone configuration is readable; FogROS2 appends its own."""
     name, uri = 'CYCLONEDDS_URI', os.environ.get('CYCLONEDDS_URI', '').strip()
     try:
-        for place, text in cyclonedds.fragments(uri):
-            try:
-                ElementTree.fromstring(text)
-            except ElementTree.ParseError as error:
-                return Check(name, 'failed', f'{place} is no XML: {error}',
-                             'correct it, or unset it')
+        list(cyclonedds.fragments(uri, os.environ))
     except FogError as error:
         return _failed(name, error)
+    if missing := cyclonedds.closed(uri)[len(uri):]:
+        return Check(name, 'failed', f'its XML has no {missing}', f'add {missing} at its end')
     return Check(name, 'ok', 'readable; ours is appended' if uri else 'not set')
 
 

@@ -35,7 +35,8 @@ SUITE = 'trixie'
 REAL = ('iproute2', 'openssh-client', 'python3', 'python3-cryptography', 'python3-paramiko',
         'python3-requests', 'python3-yaml', 'rsync', 'wireguard-tools')
 #: Too large for what they would add to this test.
-HEAVY = ('python3-boto3', 'python3-google-auth', 'python3-numpy', 'python3-opencv')
+HEAVY = ('python3-boto3', 'python3-google-auth', 'python3-numpy', 'python3-opencv',
+         'python3-catkin-pkg-modules')  # of ROS's own repository
 #: debootstrap finds no package by what it provides, as python3-cryptography asks for this one.
 INCLUDE = (*REAL, 'python3-cffi-backend')
 #: A system that lives for a minute needs nothing synced to the disk.

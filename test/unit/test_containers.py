@@ -22,7 +22,7 @@ from fogros2.deploy.steps.containers import Containers
 from fogros2.describe import values
 from fogros2.describe.machines import ContainerInstance
 from fogros2.errors import ConfigurationError, DdsError, PrerequisiteError, Unsupported
-from fogros2.host import container_scripts, containers
+from fogros2.host import container_scripts, containers, docker_lines
 from fogros2.host.containers import Container, parse
 from fogros2.model import Command, MachineSpec, NodeSpec, Result
 from fogros2.provider import Provider
@@ -60,6 +60,113 @@ def test_a_line_is_understood(line, meant):
 def test_what_is_none_is_refused(line, why):
     with pytest.raises(ConfigurationError, match=why):
         parse(line)
+
+
+@pytest.mark.parametrize('line', [
+    'a  b\tc', 'a \\\n  b \\\n\tc', 'a\\\nb', 'a \\\r\n b', "a 'b  c' \"d  e\"", 'a "" \'\' b',
+    'a\\ b \\$c', '$HOME/x ${HOME}/x "$HOME"/x "${HOME} x" \'$HOME\'', '~ ~/x x~ x=~/y "~"',
+    '$PWD "$(pwd)" `pwd`', '$(id -u):$(id -g) "`id -un`" $(hostname) $(uname -m)',
+    '${FOGT_NO:-/d} "${FOGT_NO-}" ${HOME:-x}', 'a # b $(c) > d', 'a#b c#',
+    r'"\"" "\$HOME" "\\" "\n"', '"a\\\nb"', 'x$ "y$" a=b c:d e,f @% ^ ! [ ] { }',
+    '"it\'s" \'say "x"\'', 'ä"ö ü" \'\u2028\'', '"a; b && c | d > e" \'$(f) `g`\'', 'a \\'])
+def test_words_are_those_of_a_shell(line, tmp_path):
+    def split(script: str) -> list[str]:
+        done = subprocess.run(['sh', '-efc', script], capture_output=True, text=True, check=True,
+                              cwd=tmp_path, env={**os.environ, 'HOME': '/home/ro bot'})
+        return done.stdout.split('\0')[:-1]
+
+    # a shell splits what is not in quotes; here every word stays one
+    theirs = split('IFS=\nprintf "%s\\0" ' + line.replace('\r\n', '\n').removesuffix('\\'))
+    ours = split('printf "%s\\0" ' + ' '.join(map(docker_lines.expression,
+                                                  docker_lines.words(line))))
+    assert ours == theirs
+
+
+@pytest.mark.parametrize(('more', 'named'), [
+    ('&& echo done', '&& echo done'), ('; docker run b', '; docker run b'), ('| tee log', '| tee'),
+    ('&', '&'), ('> /dev/null 2>&1', '> /dev/null'), ('< x', '< x'), ('|| true', r'\|\| true'),
+    ('\ndocker run b', 'a second line'), ('$(cat x)', r'\$\(cat x\)'), ('`date`', '`date`'),
+    ('"$(date)"', r'\$\(date\)'), ('$1', r'\$1'), ('$$', r'\$\$'), ('$@', r'\$@'),
+    ('${X%.*}', r'\$\{X%'), ("$'a'", r"\$'a'"), ('~bob/x', '~bob/x'), ('(a)', r'\(a\)'),
+    ("'a", 'a quote has no end'), ('"a', 'a quote has no end'), ('\0$(x)\0', 'a NUL character')])
+def test_what_takes_more_of_a_shell_is_refused(more, named):
+    for line in (f'docker run image {more}', f'docker run -e A=b image {more}'):
+        with pytest.raises(ConfigurationError, match=named):
+            parse(line)
+    machine = ContainerInstance(name='m')
+    with pytest.raises(ConfigurationError, match=named):
+        machine.add_docker_container(f'docker run image {more}')
+
+
+@pytest.mark.parametrize('line', ['sudo -E docker run image', 'sudo -n -H docker run image',
+                                  'docker run \\\n  --rm \\\n  image  # the agent'])
+def test_beginning_of_a_pasted_line_is_left_out(line):
+    assert parse(line) == Container('image')
+
+
+@pytest.mark.parametrize(('line', 'named'), [
+    ('sudo -u fog docker run a', '-u of sudo'), ('X=1 docker run a', 'sets X=1'),
+    ('sudo DOCKER_HOST=a docker run a', 'sets DOCKER_HOST=a'), ('X=1 sudo docker run a', 'X=1'),
+    ('docker --context b run a', "--context in front of 'run'"), ('docker -H b run a', '-H in'),
+    ('docker run --no-trunc a b', '--no-trunc, which is no option'), ('docker run -k a b', '-k, '),
+    ('docker run --volums /a:/b a', "volums.*did you mean '--volume'"),
+    ('docker run $IMAGE', 'has \\${IMAGE} as image'), ('docker run a/$USER', r'\${USER} as im'),
+    ('docker run --name $X a', r'\${X} as image, name'), ('docker run $OPTIONS a', 'OPTIONS} as')])
+def test_part_of_a_line_that_cannot_work_is_named(line, named):
+    with pytest.raises(ConfigurationError, match=named):
+        parse(line)
+
+
+def test_container_gets_values_of_the_machine(engine, tmp_path):
+    container = parse('docker run -v ~/maps:/maps -v "$HOME/my maps":/more -e A=\'$HOME\' '
+                      '--user "$(id -u)" -e B=${FOGT_NO:-b} image sh -c "ls $HOME"')
+    told = done(containers.run(container, 0, 'abc', 'image', '/run/dds.xml', ''),
+                HOME='/home/robot')[1]
+    assert told[-1].endswith(
+        '-v /home/robot/maps:/maps -v /home/robot/my maps:/more -e A=$HOME '
+        f'--user {os.getuid()} -e B=b image sh -c ls /home/robot')
+    assert told[-1].startswith(f'{engine} run -d --name fogros2-abc-0-image --label ')
+
+
+@pytest.mark.parametrize(('name', 'text'), [
+    ('a.launch.yaml', """
+launch:
+- fog_machine:
+    name: m
+    provider: container
+    docker_container:
+    - cmd: |
+        docker run \\
+          --rm \\
+          -v $HOME/maps:/maps \\
+          image:7
+"""), ('a.launch.xml', """<launch><fog_machine name="m" provider="container">
+  <docker_container cmd="docker run \\
+      --rm \\
+-v $HOME/maps:/maps image:7"/></fog_machine></launch>"""),
+    ('b.launch.xml', """<launch><let name="v" value="7"/>
+  <fog_machine name="m" provider="container">
+  <docker_container cmd="docker run \\
+      --rm -v $HOME/maps:/maps image:$(var v)"/></fog_machine></launch>""")])
+def test_line_continues_in_a_launch_file(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    description = get_launch_description_from_any_launch_file(str(tmp_path / name))
+    context = LaunchContext()
+    context.launch_configurations['v'] = '7'
+    [given] = description.entities[-1]._containers
+    container = parse(values.resolve(context, given['cmd']))
+    assert container == Container('image:7', ('-v', '\0${HOME}\0/maps:/maps'))
+
+
+@pytest.mark.parametrize(('name', 'text'), [
+    ('a.launch.yaml', 'launch: [{fog_machine: {name: m, provider: container, docker_container: '
+                      '[{cmd: docker run a > b}]}}]'),
+    ('a.launch.xml', '<launch><fog_machine name="m" provider="container"><docker_container '
+                     'cmd="docker run a &gt; b"/></fog_machine></launch>')])
+def test_wrong_line_is_refused_when_the_file_is_read(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(Exception, match='has > b where a shell'):
+        get_launch_description_from_any_launch_file(str(tmp_path / name))
 
 
 def test_parts_make_a_line():

@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
+import subprocess
+import sys
 from xml.etree import ElementTree
 
 import pytest
@@ -137,6 +140,127 @@ def test_a_loopback_that_turns_multicast_off_is_refused() -> None:
     with pytest.raises(DdsError, match='use lo without multicast') as caught:
         CYCLONE.robot_interfaces('foga1b2c3', 'eth0', {'CYCLONEDDS_URI': uri})
     assert 'name="lo" multicast="true"' in caught.value.hint
+
+
+INSIDE = '<CycloneDDS><Domain><General><Interfaces>{}</Interfaces></General></Domain></CycloneDDS>'
+#: Forms of CYCLONEDDS_URI that Cyclone reads, and the interfaces that it takes from them.
+FORMS = {
+    'comments': ('<!-- <NetworkInterface name="eth1"/> --><CycloneDDS><!-- </CycloneDDS> '
+                 '<NetworkInterface name="eth1"/> <NetworkInterfaceAddress>a'
+                 '</NetworkInterfaceAddress><Peer address="1.2.3.4"/> --><Domain/></CycloneDDS>',
+                 ['eth0', 'lo', 'vpn']),
+    'single quotes': (INSIDE.format("<NetworkInterface multicast='true' name='lo'/>"), ['vpn']),
+    'spaces': (INSIDE.format('<NetworkInterface\n\tname = "lo" multicast = "true" />'), ['vpn']),
+    'any case': (INSIDE.format('<networkinterface NAME="lo" Multicast="TRUE"/>').lower(), ['vpn']),
+    'address': (INSIDE.format("<NetworkInterface address='127.0.0.1' multicast='true'/>"),
+                ['vpn']),
+    'variable': (INSIDE.format('<NetworkInterface name="${FOGT_IF}" multicast="true"/>'),
+                 ['vpn']),
+    'default of a variable': (
+        INSIDE.format('<NetworkInterface name="${FOGT_NONE:-lo}" multicast="true"/>'), ['vpn']),
+    'ends without a name': ('<CycloneDDS><Domain><General><Interfaces><NetworkInterface '
+                            'name="lo" multicast="true"/></></></></>', ['vpn']),
+    'no ends': ('<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo" '
+                'multicast="true"/>', ['vpn']),
+    'no root': ('<General><Interfaces><NetworkInterface name="lo" multicast="true"/></Interfaces>'
+                '</General>', ['vpn']),
+    'another domain': ('<CycloneDDS><Domain Id="7"><General><NetworkInterfaceAddress>eth1'
+                       '</NetworkInterfaceAddress></General></Domain></CycloneDDS>',
+                       ['eth0', 'lo', 'vpn']),
+    'this domain': ('<CycloneDDS><Domain id="0"><General><Interfaces><NetworkInterface name="lo" '
+                    'multicast="true"/></Interfaces></General></Domain></CycloneDDS>', ['vpn']),
+    'several': ('<CycloneDDS/><CycloneDDS><Domain/></CycloneDDS>, '
+                + INSIDE.format('<NetworkInterface name="lo" multicast="true"/>'), ['vpn']),
+    'declaration': ('<?xml version="1.0" encoding="UTF-8" ?>\n<CycloneDDS '
+                    'xmlns="https://cdds.io/config" xsi:schemaLocation="a b"><Domain/>'
+                    '</CycloneDDS>', ['eth0', 'lo', 'vpn']),
+    'gt in a value': ('<CycloneDDS><Domain><Tracing><OutputFile>/tmp/a>b</OutputFile></Tracing>'
+                      '</Domain></CycloneDDS>', ['eth0', 'lo', 'vpn']),
+}
+
+
+def written(form: str, tmp_path: Path) -> list[str]:
+    """Return URIs with the XML of a form: inline, and in files."""
+    text = FORMS[form][0]
+    (tmp_path / 'a.xml').write_text(text)
+    (tmp_path / 'b.xml').write_text('<!-- <Peer address="1.2.3.4"/> --><CycloneDDS/>')
+    # a file has one root of that name, and no short ends
+    files = [] if form in ('several', 'ends without a name', 'no ends', 'no root') else [
+        f'file://{tmp_path}/a.xml', f'{tmp_path}/a.xml,', f' {tmp_path}/b.xml,\n{tmp_path}/a.xml',
+        f'file://{tmp_path}/b.xml, {text}']
+    return [text, f'{text} ,', *files]
+
+
+@pytest.mark.parametrize('form', FORMS)
+def test_configuration_is_read_as_cyclone_reads_it(form: str, tmp_path: Path) -> None:
+    for uri in written(form, tmp_path):
+        found = CYCLONE.robot_interfaces('vpn', 'eth0', {'CYCLONEDDS_URI': uri, 'FOGT_IF': 'lo'})
+        assert [one.name for one in sorted(
+            found, key=lambda one: -one.priority)] == sorted(FORMS[form][1], key=[
+                'lo', 'eth0', 'vpn'].index), uri
+        assert CYCLONE.asked({'CYCLONEDDS_URI': uri}) == []
+
+
+#: Creates a participant for each configuration; each in a domain of its own, whose it is.
+CREATE = """
+import json, os, sys
+from cyclonedds.domain import DomainParticipant
+for number, (uri, domain) in enumerate(json.load(sys.stdin)):
+    os.environ['CYCLONEDDS_URI'] = uri.replace('Id="7"', 'Id="231"')
+    sys.stderr.write(f'\\n@@{number}\\n')
+    sys.stderr.flush()
+    try:
+        DomainParticipant(0 if domain else number + 100)
+    except Exception as error:
+        sys.stderr.write(f'{type(error).__name__}\\n')
+    sys.stderr.flush()
+"""
+
+
+def test_cyclone_reads_our_file_behind_each_form(tmp_path: Path) -> None:
+    """Ours asks for an interface that is missing, so a participant is refused if it is read."""
+    pytest.importorskip('cyclonedds')
+    ours = tmp_path / 'ours.xml'
+    ours.write_text(INSIDE.format('<NetworkInterface name="fogtmissing"/>'))
+    cases = []
+    for form in FORMS:
+        folder = tmp_path / form.replace(' ', '-')
+        folder.mkdir()
+        cases += [(CYCLONE.environment(str(ours), {'CYCLONEDDS_URI': uri})['CYCLONEDDS_URI'],
+                   form == 'this domain') for uri in written(form, folder)]
+    done = subprocess.run(
+        [sys.executable, '-c', CREATE], input=json.dumps(cases), capture_output=True, text=True,
+        timeout=120, env={**os.environ, 'FOGT_IF': 'lo'}, cwd=tmp_path)
+    blocks = done.stderr.split('\n@@')[1:]
+    assert len(blocks) == len(cases)
+    for (uri, _), block in zip(cases, blocks):
+        assert 'fogtmissing: does not match an available interface' in block, (uri, block)
+
+
+@pytest.mark.parametrize('uri, address', [
+    (f'<CycloneDDS><Domain><Discovery><Peers><{peer}/></Peers></Discovery></Domain></CycloneDDS>',
+     '192.168.0.7') for peer in (
+         'Peer address="192.168.0.7"', "peer Address = '192.168.0.7:7410'",
+         "Peer\n prune_delay='1s' address='192.168.0.7'")])
+def test_peers_are_found(uri: str, address: str) -> None:
+    user = {'CYCLONEDDS_URI': uri}
+    assert CYCLONE.asked(user) == [address]
+    assert CYCLONE.robot_interfaces('vpn', 'eth0', user)[0].priority < 0
+
+
+@pytest.mark.parametrize('uri', ['<CycloneDDS><Domain></CycloneDDS>', '<CycloneDDS a=1/>',
+                                 '<CycloneDDS><Domain>&none;</Domain></CycloneDDS>', '<'])
+def test_configuration_that_is_no_xml_is_refused(uri: str, tmp_path: Path) -> None:
+    (tmp_path / 'a.xml').write_text(uri)
+    for place in (uri, f'file://{tmp_path}/a.xml'):
+        with pytest.raises(DdsError, match='of CYCLONEDDS_URI is no XML'):
+            CYCLONE.robot_interfaces('vpn', None, {'CYCLONEDDS_URI': place})
+
+
+def test_interface_without_multicast_is_refused() -> None:
+    uri = INSIDE.format("<NetworkInterface address='192.0.2.1' multicast='false'/>")
+    with pytest.raises(DdsError, match='use 192.0.2.1 without multicast'):
+        CYCLONE.robot_interfaces('vpn', None, {'CYCLONEDDS_URI': uri})
 
 
 def test_missing_configuration_is_reported_before_nodes_start() -> None:

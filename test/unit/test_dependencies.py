@@ -173,7 +173,7 @@ def test_keys_are_what_packages_and_nodes_run_with(tmp_path: Path) -> None:
     manifest(tmp_path, 'fogros2', '<exec_depend>fogros2-av-pip</exec_depend>')
     found = workspace.inspect(tmp_path)
     assert workspace.dependencies(tmp_path) == [
-        'eigen', 'gtest', 'python3-scipy', 'rospy', 'tf2_ros']
+        'eigen', 'gtest', 'python3-scipy', 'tf2_ros']
     assert dependencies.keys([found], ['mine', 'slam_toolbox']) == (
         'python3-scipy', 'slam_toolbox', 'tf2_ros')
     assert dependencies.keys([], ['slam_toolbox']) == ('slam_toolbox',)

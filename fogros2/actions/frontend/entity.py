@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 import re
 from typing import Any, List, Optional, TYPE_CHECKING, Union
 
@@ -47,12 +47,15 @@ def attribute(entity: Entity, parser: Parser, name: str) -> Optional[ParsedText]
     return found
 
 
-def value(entity: Entity, parser: Parser, keyword: kinds.Keyword) -> Any:
+def value(
+    entity: Entity, parser: Parser, keyword: kinds.Keyword, prepare: Callable[[str], str] = str,
+) -> Any:
     """
     Return the value of a keyword, converted to its kind; None if it is missing.
 
     Texts with substitutions are resolved when the action is executed.
 
+    :param prepare: applied to a text before launch parses it.
     :raises ConfigurationError: the value is of another kind.
     """
     if keyword.kind == 'mapping':
@@ -67,7 +70,7 @@ def value(entity: Entity, parser: Parser, keyword: kinds.Keyword) -> Any:
             raise _wrong(entity, keyword, raw)
         return [text(parser, item) for item in raw]
     if isinstance(raw, str):
-        parsed = text(parser, raw)
+        parsed = text(parser, prepare(raw))
         if isinstance(parsed, str):
             return keywords.read(keyword, parsed)
         return values.List(parsed) if keyword.kind == 'list' else parsed

@@ -23,7 +23,8 @@ from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, LifecycleN
 from fogros2.actions.replicated import Replicated
 from fogros2.describe import keywords, kinds, values
 from fogros2.errors import ConfigurationError, did_you_mean
-from fogros2.host.containers import described
+from fogros2.host import docker_lines
+from fogros2.host.containers import described, parse
 from fogros2.image_transport.streams import StreamTopic
 from fogros2.launch_internals.parsers import scoped
 
@@ -69,13 +70,17 @@ def fog_machine(entity: Entity, parser: Parser) -> Parsed:
 def _container(entity: Entity, parser: Parser) -> dict[str, Any]:
     """Read ``<docker_container cmd="docker run redis"/>``, or ``image=`` and its keywords."""
     known = {'cmd': kinds.Keyword('cmd', 'text'), **kinds.parameters_of(described)}
-    given = {name: value(entity, parser, keyword) for name, keyword in known.items()}
+    given = {name: value(entity, parser, keyword, docker_lines.joined if name == 'cmd' else str)
+             for name, keyword in known.items()}
     complete(entity, known)
     found = {name: values.items(content) if known[name].kind == 'list' else content
              for name, content in given.items() if content is not None}
     if ('cmd' in found) == ('image' in found) or ('cmd' in found and len(found) > 1):
         raise ConfigurationError('a docker_container takes a cmd, or an image and what it needs',
                                  'cmd="docker run --net=host IMAGE", or image="IMAGE"')
+    line = found.get('cmd')
+    if isinstance(line, str):
+        parse(line)
     return found
 
 

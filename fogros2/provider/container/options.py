@@ -220,7 +220,8 @@ def common_flags(
         folder, (own, others) = share_folder(request.token), SHARE_FOLDERS
         # a program of another machine gives no rights here
         safe = ',nosuid,nodev,noexec' if engine.name == 'podman' else ''
-        yield from ('-v', f'{folder}/own:{own}:rw{safe}', '-v', f'{folder.parent}:{others}:ro{safe}')
+        yield from ('-v', f'{folder}/own:{own}:rw{safe}')
+        yield from ('-v', f'{folder.parent}:{others}:ro{safe}')
     for mount in options.mounts:
         source, _, target = mount.partition(':')
         yield from ('-v', f'{source}:{target or source}:ro')

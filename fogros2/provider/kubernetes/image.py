@@ -100,7 +100,7 @@ def _containerfile(
             '    && { [ -e /etc/ros/rosdep/sources.list.d/20-default.list ] || rosdep init; } \\\n'
             f'    && rosdep update --rosdistro {distro} \\\n'
             f'    && DEBIAN_FRONTEND=noninteractive rosdep install --rosdistro {distro} \\\n'
-            '        --from-paths /tmp/fogros2 --ignore-src -y \\\n'
+            '        --from-paths /tmp/fogros2 --ignore-src -y -r \\\n'
             '    && rm -rf /tmp/fogros2 /var/lib/apt/lists/*']
     if user != 'root':
         # The first launch then need not create the user.
