@@ -109,6 +109,8 @@ umask 077
 until mkdir -p "$1" && chmod 1777 "$1" && chmod 755 "${1%/*}"; do sleep 0.1; done
 """
 
+_UNSHARE = 'rm -rf "$1"; rmdir "${1%/*}" "${1%/*/*}" 2>/dev/null'
+
 #: Maximum size of a host key's file in bytes, and the form of a key.
 _KEY_BYTES = 4096
 _HOST_KEY = re.compile('ssh-[a-z0-9-]+ [A-Za-z0-9+/=]+')
@@ -417,7 +419,8 @@ def _sharing(spec: MachineSpec, token: str) -> Iterator[None]:
     folder = str(container_machine.share_folder(token))
     with contextlib.ExitStack() as failed:
         if spec.share:
-            failed.callback(process.run, Command(('rm', '-rf', folder), sudo=True), timeout=10.0)
+            failed.callback(process.run, Command(('sh', '-c', _UNSHARE, 'sh', folder), sudo=True),
+                            timeout=10.0, check=False)
             process.run(Command(('sh', '-ec', _SHARE, 'sh', folder), sudo=True), timeout=10.0)
         yield
         failed.pop_all()
