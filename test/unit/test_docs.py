@@ -22,7 +22,8 @@ from fogros2.waiting import Timeouts
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'doc').rglob('*.md'))]
 #: Pages without a limit of words: generated ones, and lists that readers search.
-REFERENCES = ('migration.md', 'not_verified.md', 'paper.md', 'troubleshooting.md')
+REFERENCES = ('migration.md', 'not_verified.md', 'paper.md', 'security.md',
+              'security_attackers.md', 'troubleshooting.md')
 _BLOCK = re.compile(r'^( *)```(\w+)\n(.*?)^\1```$', re.MULTILINE | re.DOTALL)
 
 
