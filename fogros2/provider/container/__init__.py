@@ -120,6 +120,9 @@ _UNSHARE = 'rm -rf "$1"; rmdir "${1%/*}" "${1%/*/*}" 2>/dev/null'
 #: Maximum size of a host key's file in bytes.
 _KEY_BYTES = 4096
 _READ_PLAIN = f'[ -f "$1" ] && [ ! -L "$1" ] && head -c {_KEY_BYTES} -- "$1"'
+#: Maximum size of the part of a machine's log that is read, in bytes.
+_LOG_BYTES = 1 << 20
+_READ_LOG = f'"$@" 2>/dev/null | head -c {_LOG_BYTES}'
 
 #: Exit statuses of a regular end, SIGKILL and SIGTERM.
 _GOOD_ENDS = (0, 137, 143)
@@ -396,7 +399,11 @@ class ContainerProvider(Provider):
         labels = container_machine.labels_of(entry)
         path = container_machine.host_key_file(labels[container_machine.ATTEMPT])
         if not labels.get(container_machine.DIRECTORY):
-            log = engine.call('logs', identity, what='reading the host key', check=False).stdout
+            # the machine writes its log, so only its beginning is read
+            log = process.run(
+                Command(('sh', '-c', _READ_LOG, 'sh', *engine.argv('logs', identity)),
+                        sudo=engine.sudo, what='reading the host key'),
+                timeout=60.0, check=False).stdout
             text = _after(log, container_entry.HOST_KEY_MARK)
         elif os.geteuid() == 0:
             text = read_plain(path)
@@ -419,7 +426,8 @@ class ContainerProvider(Provider):
         if int(entry['State']['ExitCode']) in _GOOD_ENDS:
             return
         identity = str(entry['Id'])[:12]
-        log = engine.call('logs', identity, what='reading its log', check=False)
+        log = engine.call('logs', '--tail', '100', identity, what='reading its log', check=False,
+                          kept=_LOG_BYTES)
         reason = _after(log.stdout, container_entry.ERROR_MARK) \
             or container_engine.last_line(f'{log.stderr}\n{log.stdout}')
         raise ProviderError(f'container {identity} could not start: {reason}',
