@@ -2,8 +2,8 @@
 """
 The robot's side of a launch on launch's event loop: machines, remote processes, streams.
 
-In reading order: ``console`` shows steps, ``cost`` formats prices, ``signals`` makes SIGTERM an
-orderly shutdown, ``uncompressed`` warns of images that should be streamed, ``node_spec`` converts
+In reading order: ``log_file`` survives a full disk, ``console`` shows steps, ``cost`` formats
+prices, ``signals`` makes SIGTERM an orderly shutdown, ``uncompressed`` warns of images that should be streamed, ``node_spec`` converts
 a process action to a NodeSpec, ``streaming`` collects the streams, ``republishers`` has the
 processes that FogROS2 adds, ``backlog`` holds a machine's events until launch takes them,
 ``replacement`` decides how a new machine replaces another one, ``checkpoints`` saves folders of

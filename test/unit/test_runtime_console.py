@@ -13,6 +13,7 @@ import launch.logging
 import pytest
 
 from fogros2.clock import ClockOffset
+from fogros2.errors import ConfigurationError
 from fogros2.report import (
     ClockMeasured,
     Progress,
@@ -22,6 +23,7 @@ from fogros2.report import (
     StepStarted,
     Warned,
 )
+from fogros2.runtime import log_file
 from fogros2.runtime.console import Console, Screen
 
 
@@ -159,12 +161,21 @@ def test_full_disk_of_the_log_is_one_line(lines, capfd, monkeypatch):
     monkeypatch.setattr(handler, 'emit', lambda record: logging.StreamHandler.emit(
         handler, record))
     monkeypatch.setattr(handler, 'stream', full)
-    screen = io.StringIO()
-    console = Console(screen)
+    log_file.prepare()
+    console = Console(io.StringIO())
     for _ in range(3):
         console(StepDone('planner', 'sync', 1.0))
     console.close()
     with pytest.raises(OSError):
         full.close()
-    assert screen.getvalue().count("launch's log file can't be written: No space left") == 1
+    assert [text for level, text in lines if level == 'WARNING'] == [
+        "launch's log file can't be written: No space left on device\n"
+        'the launch goes on without it']
     assert 'Traceback' not in ''.join(capfd.readouterr())
+
+
+def test_log_folder_that_cannot_be_made_has_a_remedy(monkeypatch):
+    monkeypatch.setenv('ROS_LOG_DIR', '/dev/null/log')
+    launch.logging.reset()
+    with pytest.raises(ConfigurationError, match='Not a directory .ROS_LOG_DIR names another'):
+        log_file.prepare()
