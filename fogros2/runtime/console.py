@@ -137,11 +137,12 @@ class Console:
                     f'{what}\nsynchronise both clocks: sudo apt-get install chrony')
             elif isinstance(event, Warned):
                 self._logger.warning(f'{event.text}\n{event.remedy}')
-            elif isinstance(event, Silence) and event.seconds:
+            elif isinstance(event, Silence) and event.over:
+                self._logger.info(
+                    f'{event.machine}: answers again, after {event.seconds:.0f} s')
+            elif isinstance(event, Silence):
                 self._logger.warning(f'{event.machine}: no answer for {event.seconds:.0f} s '
                                      '(VPN); nodes keep running')
-            elif isinstance(event, Silence):
-                self._logger.info(f'{event.machine}: answers again')
             self._draw()
 
     def close(self) -> None:

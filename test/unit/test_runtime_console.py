@@ -100,9 +100,9 @@ def test_progress_on_a_terminal_only():
 def test_silence_and_its_end_are_a_line_each(lines):
     console = Console(io.StringIO())
     console(Silence('planner', 4.7))
-    console(Silence('planner', 0.0))
+    console(Silence('planner', 12.3, over=True))
     assert lines == [('WARNING', 'planner: no answer for 5 s (VPN); nodes keep running'),
-                     ('INFO', 'planner: answers again')]
+                     ('INFO', 'planner: answers again, after 12 s')]
 
 
 def test_warning_has_its_remedy_on_a_line_of_its_own(lines):
