@@ -90,7 +90,7 @@ setup(
     install_requires=['numpy', 'PyYAML'],
     zip_safe=False,
     entry_points={
-        'console_scripts': ['ros2 = ros2cli.cli:main'],
+        'console_scripts': ['ros2 = ros2cli.script:main'],
         'ros2cli.command': [
             'launch = ros2cli.command.launch:LaunchCommand',
             'run = ros2cli.command.run:RunCommand',
