@@ -41,8 +41,9 @@ def encode(picture: Picture, kind: Format, quality: int = 80) -> tuple[str, byte
     layout = picture.layout
     if layout.kind == 'deep' and (kind == 'jpeg' or layout.pixel_bytes != 2):
         png = ", or 'compressed' with format='png'" if layout.pixel_bytes == 2 else ''
-        raise BadPicture(f"{kind.upper()} can't hold {picture.encoding}: use the transport 'h264', "
-                         f'which is lossless for it{png}', f'encoding {picture.encoding!r}')
+        raise BadPicture(f"{kind.upper()} can't hold {picture.encoding}: use the transport "
+                         f"'h264', which is lossless for it{png}",
+                         f'encoding {picture.encoding!r}')
     pixels = bgr(picture)
     target = 'bgr8' if pixels.ndim == 3 else picture.encoding
     return f'{picture.encoding}; {kind} compressed {target}', coded(pixels, kind, quality)
