@@ -37,10 +37,12 @@ class MachineOption:
 
     def prestart(self, args: argparse.Namespace) -> None:
         """
-        Parse the arguments before the launch starts.
+        Parse the arguments before the launch reads its file.
 
         :raises ConfigurationError: an argument is invalid.
         """
+        from fogros2.launch_internals import hints
+        hints.of_actions()
         self._overrides = None
         if args.machine:
             from fogros2.describe.overrides import Overrides
