@@ -41,8 +41,10 @@ class MachineOption:
 
         :raises ConfigurationError: an argument is invalid, or the folder cannot be made.
         """
+        from fogros2.launch_internals import hints
         from fogros2.runtime import log_files
         log_files.prepare()
+        hints.of_actions()
         self._overrides = None
         if args.machine:
             from fogros2.describe.overrides import Overrides
