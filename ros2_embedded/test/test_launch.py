@@ -6,7 +6,6 @@ import importlib.util
 import inspect
 import os
 import re
-import subprocess
 import sys
 import textwrap
 
