@@ -84,7 +84,7 @@ setup(
     python_requires='>=3.10',
     package_dir={'': '.'},  # editable: one .pth line, new packages are found at once
     packages=find_packages(str(HERE), exclude=['test', 'test.*', 'build', 'build.*']),
-    package_data={'': ['py.typed', '*.xsd']},
+    package_data={'': ['py.typed', '*.xml']},
     data_files=index_entries(),
     # rclpy and the messages are pinned in fogros2/host/locked.txt: see tools/setup.sh
     install_requires=['numpy', 'PyYAML'],
