@@ -34,11 +34,11 @@ def argv(command: Command) -> list[str]:
 
 
 def start(
-    command: Command, *, environment: Mapping[str, str], stdin: int, stderr: int,
-    inherited: Sequence[int] = (),
+    command: Command, *, environment: Mapping[str, str] = _ENVIRONMENT, stdin: int, stderr: int,
+    stdout: int = subprocess.PIPE, inherited: Sequence[int] = (),
 ) -> subprocess.Popen[bytes]:
     """
-    Start a command on this computer, with a pipe as standard output; do not wait for it.
+    Start a command on this computer; do not wait for it.
 
     It gets its own session, so that Ctrl-C in the terminal reaches only the launch and does not
     kill an undo step. With sudo it gets a process group instead, which Ctrl-C does not reach
@@ -51,7 +51,7 @@ def start(
     if _through_sudo(command):
         apart = {'process_group': 0} if sys.version_info >= (3, 11) else {
             'preexec_fn': os.setpgrp}
-    return subprocess.Popen(argv(command), env=environment, stdin=stdin, stdout=subprocess.PIPE,
+    return subprocess.Popen(argv(command), env=environment, stdin=stdin, stdout=stdout,
                             stderr=stderr, **apart)
 
 
@@ -239,8 +239,7 @@ def end(child: subprocess.Popen[bytes], *, sudo: bool) -> None:
 
 def _signal_as_root(group: int, number: signal.Signals) -> None:
     command = Command.script(f'kill -s {number.name[3:]} -- -{group}', sudo=True)
-    killer = start(command, environment=_ENVIRONMENT, stdin=subprocess.DEVNULL,
-                   stderr=subprocess.DEVNULL)
+    killer = start(command, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         killer.communicate(timeout=10.0)
     except subprocess.TimeoutExpired:

@@ -191,7 +191,8 @@ class HostedProvider(Provider):
             tags = {str(name): str(value) for name, value in found['tags'].items()}
             shell = found['shell'] and Endpoint(
                 'ssh', outside.shell.host, int(found['shell']['port']),
-                str(found['shell']['user']), str(found['shell']['host_key']))
+                str(found['shell']['user']), str(found['shell']['host_key']),
+                alias=outside.shell.alias)
             return Machine(
                 f"{_SCHEME}{found['id']}@{host}", tags.get(TAG_NAME, ''), self.name,
                 MachineState(found['state']), float(found['created']), shell, outside.vpn_host,
