@@ -126,6 +126,8 @@ class Endpoint:
     :param host_key: the host's public key in OpenSSH form (``ssh-ed25519 AAAA...``), pinned
         before the first connection; None to use ``known_hosts``.
     :param key_file: private key for the login; None for the user's own keys and agent.
+    :param alias: name in the user's configuration of OpenSSH, whose settings then hold; '' for
+        none of them.
     """
 
     kind: str
@@ -134,6 +136,7 @@ class Endpoint:
     user: str = ''
     host_key: Optional[str] = None
     key_file: Optional[str] = None
+    alias: str = ''
 
 
 @dataclasses.dataclass(frozen=True)

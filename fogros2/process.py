@@ -267,8 +267,7 @@ def end(child: subprocess.Popen[bytes], *, sudo: bool) -> None:
 
 def _signal_as_root(group: int, number: signal.Signals) -> None:
     command = Command.script(f'kill -s {number.name[3:]} -- -{group}', sudo=True)
-    killer = start(command, environment=_ENVIRONMENT, stdin=subprocess.DEVNULL,
-                   stderr=subprocess.DEVNULL)
+    killer = start(command, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         killer.communicate(timeout=10.0)
     except subprocess.TimeoutExpired:

@@ -34,6 +34,7 @@ from std_msgs.msg import Empty
 
 from fogros2 import ros_types
 from fogros2_monitor.definitions import definition
+from image_transport_h264 import memory
 from image_transport_h264.cdr import CdrError
 from image_transport_h264.message import coded
 
@@ -259,6 +260,7 @@ def fitting(node: Node, topic: str) -> QoSProfile:
 
 def main() -> None:
     """Run the bridge until a signal."""
+    memory.keep()
     rclpy.init()
     executor = SingleThreadedExecutor()
     node = BridgeNode(executor)

@@ -35,6 +35,7 @@ from fogros2 import ros_types
 from fogros2_replicas import figures
 from fogros2_replicas.calls import Action, Answer, Calls
 from fogros2_replicas.pairs import Header, header_of, Pair
+from image_transport_h264 import memory
 
 #: Seconds between two looks at the graph, between two writes of the figures, and after which
 #: missing names are reported. Requests of one replica that may be without an answer, and names and
@@ -325,6 +326,7 @@ def _reader(message: Any) -> Read:
 
 def main() -> None:
     """Run until a signal; the only argument is the settings as JSON."""
+    memory.keep()
     rclpy.init()
     node = FirstAnswer(json.loads(sys.argv[1]))
     executor = SingleThreadedExecutor()

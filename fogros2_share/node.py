@@ -34,6 +34,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from fogros2 import ros_types
 from fogros2_share.wire import decode, DEEPEST, Echoes, encode, Form, LARGEST, LINE
+from image_transport_h264 import memory
 
 #: In the folder of a machine: its topics in lines, and the folder of its relay, with its socket
 #: and with a file for each other machine.
@@ -392,6 +393,7 @@ def profile(form: Form, least: int = 1) -> QoSProfile:
 
 def main() -> None:
     """Run until a signal; the first argument is the settings as JSON."""
+    memory.keep()
     rclpy.init()
     settings = json.loads(sys.argv[1])
     if not os.path.isdir(settings['folders'][0]):

@@ -76,7 +76,8 @@ class Reader:
 
     def header(self) -> Header:
         """Return the next ``std_msgs/Header``."""
-        return Header(*self.numbers('iI'), self.string())
+        seconds, nanoseconds = self.numbers('iI')
+        return Header(seconds, nanoseconds, self.string())
 
     def _number(self, code: str) -> Any:
         size = struct.calcsize(f'={code}')

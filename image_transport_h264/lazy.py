@@ -193,7 +193,7 @@ class Tap:
 
     def __init__(
         self, node: LazyNode, kind: Any, topic: str, qos: QoSProfile,
-        heard: Callable[[bytes], object], *, adapt: bool = True,
+        heard: Callable[[bytes], None], *, adapt: bool = True,
     ) -> None:
         self._node, self._kind, self._topic = node, kind, topic
         self._qos, self._heard, self._adapt = qos, heard, adapt

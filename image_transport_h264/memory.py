@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Keep freed memory of pictures in the process.
+Keep freed memory of pictures and serialized messages in the process.
 
 A 1080p picture has 6 MB, and passes through several buffers. The C library returns such memory to
 the kernel at each free. The kernel then hands it out page by page and zeroes each page. This took
-7 of the 14 ms for which a decoder worked on such a picture.
+7 of the 14 ms for which a decoder worked on such a picture, and a third of a relay's time for a VGA
+image.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ LARGEST, KEPT = 32 << 20, 256 << 20
 
 def keep() -> bool:
     """
-    Let this process reuse the memory of its pictures; call this before the first thread starts.
+    Let this process reuse the memory of its messages; call this before the first thread starts.
 
     :return: whether the C library supports it.
     """

@@ -45,6 +45,7 @@ UBUNTU = {
     'python3-google-auth': 'python3-google-auth (>= 2.0)',
     'python3-numpy': 'python3-numpy (>= 1:1.26)',
     'python3-opencv': 'python3-opencv (>= 4.6)',
+    'python3-packaging': 'python3-packaging (>= 24.0)',
     'python3-paramiko': 'python3-paramiko (>= 2.12)',
     'python3-requests': 'python3-requests (>= 2.31)',
     'python3-yaml': 'python3-yaml (>= 6.0)',

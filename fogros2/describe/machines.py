@@ -392,10 +392,12 @@ class SSHInstance(CloudInstance):
     """
     An existing computer that accepts the robot's SSH key; it outlives the launch.
 
-    :param host: name or address.
+    ``~/.ssh/config`` holds for it as for ``ssh``.
+
+    :param host: name or address, or a name of ``~/.ssh/config``.
     :param user: login user; None for the user that ``ssh`` would choose.
-    :param port: TCP port of its SSH server.
-    :param key: private key file for the login; None for the user's own keys and agent.
+    :param port: TCP port of its SSH server; None for the port that ``ssh`` would choose.
+    :param key: private key file for the login; None for those that ``ssh`` would try.
     :param host_key: its public host key (``ssh-ed25519 AAAA...``); None to use known_hosts.
     """
 
@@ -403,7 +405,7 @@ class SSHInstance(CloudInstance):
 
     def __init__(
         self, host: SomeSubstitutionsType, user: Optional[SomeSubstitutionsType] = None,
-        port: Value = 22, key: Optional[SomeSubstitutionsType] = None,
+        port: Optional[Value] = None, key: Optional[SomeSubstitutionsType] = None,
         host_key: Optional[SomeSubstitutionsType] = None, **common: Any,
     ) -> None:
         super().__init__(options=options_of(SSHInstance.__init__, locals()), **common)

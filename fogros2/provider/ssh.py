@@ -16,6 +16,7 @@ from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError, U
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider
 from fogros2.provider.options import parsed
+from fogros2.shell import ssh_config
 
 _SCHEME = 'ssh:'
 #: Seconds after which a computer without an answer counts as off.
@@ -27,16 +28,16 @@ class Options:
     """
     Options of an existing computer.
 
-    :param host: name or address.
-    :param user: login user; '' for the name of the user on the robot.
-    :param port: TCP port of its SSH server.
+    :param host: name or address, or a name of OpenSSH's configuration.
+    :param user: login user; '' for the one that ``ssh`` would choose.
+    :param port: TCP port of its SSH server; '' for that of OpenSSH's configuration.
     :param key: private key file; '' for the user's own keys and agent.
     :param host_key: ``ssh-ed25519 AAAA...``; '' to use ``known_hosts``.
     """
 
     host: str = ''
     user: str = ''
-    port: str = '22'
+    port: str = ''
     key: str = ''
     host_key: str = ''
 
@@ -52,7 +53,8 @@ class Options:
                 or options.host.startswith('-') or not _is_name(options.host):
             raise ConfigurationError(f"'{options.host}' can't be the host of an SSH machine",
                                      'host= takes a name or an address')
-        if not options.port.isdecimal() or not 0 < int(options.port) < 65536:
+        if options.port and not (
+                options.port.isdecimal() and 0 < int(options.port) < 65536):
             raise ConfigurationError(f"'{options.port}' can't be the port of an SSH machine",
                                      'port= takes a number from 1 to 65535')
         if options.host_key and len(options.host_key.split()) < 2:
@@ -85,22 +87,25 @@ class SSHProvider(Provider):
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Return the id of the computer if it answers."""
         options = Options.parse(spec.options)
+        found = ssh_config.read(options.host, options.user, options.port)
         try:
-            reach(options.host, int(options.port))
+            reach(found)
         except socket.gaierror as error:
-            raise ProviderError(f"there is no host called '{options.host}'",
+            raise ProviderError(f"there is no host called '{found.host}'",
+                                'it is reached through another computer, and the VPN needs its '
+                                'address: write that as HostName' if found.proxy else
                                 f"check host= of '{spec.name}'") from error
         except ConnectionRefusedError as error:
             raise ProviderError(
-                f'{options.host} refuses connections to port {options.port}',
+                f'{found.host} refuses connections to port {found.port}',
                 'does its SSH server run, and at that port?') from error
         except OSError as error:
             raise ProviderError(
-                f'{options.host} port {options.port} does not answer: {error}',
+                f'{found.host} port {found.port} does not answer: {error}',
                 'is it on, and reachable from this robot?') from error
         return _SCHEME + urlencode({
             'name': spec.name, **dataclasses.asdict(options),
-            'user': options.user or getpass.getuser(),
+            'user': found.user or getpass.getuser(), 'port': found.port,
             'key': str(Path(options.key).expanduser().absolute()) if options.key else ''})
 
     def describe(self, machine_id: str) -> Machine:
@@ -109,14 +114,14 @@ class SSHProvider(Provider):
             raise MachineNotFound(f"'{machine_id}' is no SSH machine")
         words = dict(parse_qsl(machine_id[len(_SCHEME):], keep_blank_values=True))
         try:
-            host, port = words['host'], int(words['port'])
-            shell = Endpoint('ssh', host, port, words['user'], words['host_key'] or None,
-                             words['key'] or None)
-            name = words['name']
+            alias, name, user, port = (words[key] for key in ('host', 'name', 'user', 'port'))
+            host_key, key_file, _ = words['host_key'] or None, words['key'] or None, int(port)
         except (KeyError, ValueError) as error:
             raise MachineNotFound(f"'{machine_id}' is no SSH machine") from error
+        found = ssh_config.read(alias, user, port)
+        shell = Endpoint('ssh', found.host, found.port, user, host_key, key_file, alias)
         try:
-            address = reach(host, port)
+            address = reach(found)
         except OSError:
             return Machine(machine_id, name, self.name, MachineState.STOPPED, owned=False)
         return Machine(
@@ -131,11 +136,13 @@ class SSHProvider(Provider):
         """Do nothing: the launch did not create the computer."""
 
 
-def reach(host: str, port: int) -> str:
+def reach(found: ssh_config.Settings) -> str:
     """
-    Return the address at which a TCP port answers.
+    Return the address at which a computer answers; behind a proxy, the login will tell.
 
-    :raises OSError: no answer.
+    :raises OSError: no answer, or no address.
     """
-    with socket.create_connection((host, port), timeout=_TIMEOUT) as connection:
+    if found.proxy:
+        return str(socket.getaddrinfo(found.host, found.port)[0][4][0])
+    with socket.create_connection((found.host, found.port), timeout=_TIMEOUT) as connection:
         return str(connection.getpeername()[0])

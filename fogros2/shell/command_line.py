@@ -8,6 +8,8 @@ import shlex
 from fogros2.errors import CommandError
 from fogros2.model import Command, Result
 
+#: What a machine prints before the output of a command.
+MARK = b'fogros2 begins here\n'
 _ANNOUNCE = 'echo $$; exec "$@"'
 
 
@@ -30,6 +32,15 @@ def remote_line(command: Command, *, user: str) -> str:
 def announced_line(command: Command, *, user: str) -> str:
     """Return the line of a command that first prints its process id."""
     return f'exec sh -c {shlex.quote(_ANNOUNCE)} sh {remote_line(command, user=user)}'
+
+
+def marked_line(line: str) -> str:
+    """
+    Return a line that prints a mark before the output of its command, in the user's home.
+
+    The login shell may have printed something before, and have changed its folder.
+    """
+    return f"cd; echo {MARK.decode().strip()}; exec {line.removeprefix('exec ')}"
 
 
 def end_script(pid: int) -> str:

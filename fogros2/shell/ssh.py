@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import threading
 import time
 from typing import Optional, TYPE_CHECKING
 
-from fogros2.errors import ConnectError, FogError
+from fogros2.errors import ConnectError, FogError, ShellError
+from fogros2.events import clean
 from fogros2.model import Command
 from fogros2.shell import command_line, ssh_connection
 from fogros2.shell.lines import Channel, Output
@@ -90,15 +92,45 @@ class SSHShell(RemoteShell['paramiko.Transport']):
                 channel.get_pty(kind, columns, rows)
             if command is None:
                 channel.invoke_shell()
-            else:
-                channel.exec_command(command if isinstance(command, str) else
-                                     command_line.remote_line(command, user=self.user))
+                return channel
+            line = command if isinstance(command, str) else \
+                command_line.remote_line(command, user=self.user)
+            if size is None:
+                line = command_line.marked_line(line)
+                vars(channel)['recv'] = functools.partial(self._first, channel, bytearray())
+            channel.exec_command(line)
             return channel
         except (paramiko.SSHException, EOFError, OSError) as error:
             # If another thread closed the connection, is_alive() may still return True.
             if isinstance(error, (EOFError, OSError)) or not connection.is_alive():
                 self._drop(connection)
             raise ConnectError(f"'{self.name}' can not start a command: {error}") from error
+
+    def _first(self, channel: paramiko.Channel, before: bytearray, size: int) -> bytes:
+        """
+        Receive without what the login shell printed before the command, such as in ~/.bashrc.
+
+        :raises ShellError: it printed, and ran no command.
+        """
+        begin = time.monotonic()
+        while True:
+            data = type(channel).recv(channel, size)
+            before += data
+            _, mark, rest = bytes(before).partition(command_line.MARK)
+            if mark or not data:
+                del vars(channel)['recv']
+            if mark:
+                return rest or channel.recv(size)
+            if not data:
+                said = clean(before.decode(errors='replace')).strip().split('\n')[-1]
+                if not said or not channel.get_transport().is_alive():
+                    return b''
+                raise ShellError(f"the login shell of '{self.name}' runs no command, it prints: "
+                                 f'{said}', 'see its ~/.bashrc, and authorized_keys')
+            del before[:-len(command_line.MARK) - 1000]
+            limit = channel.gettimeout()
+            if limit is not None and time.monotonic() - begin >= limit:
+                raise TimeoutError
 
     def _announced(self, command: Command) -> str:
         line = command_line.announced_line(command, user=self.user)

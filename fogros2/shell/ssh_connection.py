@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 import getpass
 import importlib.util
 import logging
@@ -17,6 +17,9 @@ import warnings
 
 from fogros2.errors import AuthenticationError, ConnectError, HostKeyError, PrerequisiteError
 from fogros2.model import Endpoint
+from fogros2.shell import known_hosts, proxy, ssh_config
+from fogros2.shell.known_hosts import Known
+from fogros2.shell.ssh_config import Settings
 
 if TYPE_CHECKING:
     import paramiko
@@ -25,8 +28,6 @@ if TYPE_CHECKING:
 CIPHERS = ('aes128-gcm@openssh.com', 'aes256-gcm@openssh.com', 'aes128-ctr', 'aes256-ctr')
 KEX = ('curve25519-sha256@libssh.org', 'ecdh-sha2-nistp256', 'diffie-hellman-group14-sha256',
        'diffie-hellman-group-exchange-sha256')
-KNOWN_HOSTS = (Path('~/.ssh/known_hosts'), Path('/etc/ssh/ssh_known_hosts'))
-OWN_KEYS = ('id_ed25519', 'id_ecdsa', 'id_rsa')
 #: Seconds of silence after which a packet is sent, and after which an unanswered packet ends the
 #: connection: it survives a cut of 30 s, and a robot with a new address connects again.
 KEEPALIVE = 15
@@ -77,8 +78,8 @@ def _import() -> None:
         # the paramiko of Ubuntu 24.04 names a cipher of which a newer cryptography warns the user
         warnings.simplefilter('ignore')
         if 'paramiko' not in sys.modules and 'invoke' not in sys.modules:
-            # paramiko imports 'invoke' only for a keyword of ssh_config files, which this
-            # project never reads, and works without it. The import takes a third of its time.
+            # paramiko imports 'invoke' only for a keyword of ssh_config files, which OpenSSH reads
+            # for this project, and works without it. The import takes a third of its time.
             sys.modules['invoke'] = None  # type: ignore[assignment]
             try:
                 import paramiko
@@ -91,16 +92,9 @@ def _import() -> None:
         logger.setLevel(logging.CRITICAL)
 
 
-def user_of(endpoint: Endpoint) -> str:
-    """Return the endpoint's login user, else the user of this process."""
+def user_of(endpoint: Endpoint | Settings) -> str:
+    """Return the login user, else the user of this process."""
     return endpoint.user or getpass.getuser()
-
-
-def host_label(endpoint: Endpoint) -> str:
-    """Return the machine's name in ``known_hosts``."""
-    if endpoint.port == 22:
-        return endpoint.host
-    return f'[{endpoint.host}]:{endpoint.port}'
 
 
 def connect(endpoint: Endpoint, *, name: str, timeout: float) -> paramiko.Transport:
@@ -112,12 +106,16 @@ def connect(endpoint: Endpoint, *, name: str, timeout: float) -> paramiko.Transp
     :raises ConnectError: connection refused, no route, no answer, or no SSH server.
     :raises HostKeyError: the host key is unknown, or differs from the pinned one.
     :raises AuthenticationError: the server accepts none of our keys.
+    :raises ConfigurationError: OpenSSH refuses its configuration.
     """
     _import()
     import paramiko
 
-    known = known_keys(endpoint)
-    transport = paramiko.Transport(_dial(endpoint, name, timeout))
+    settings = ssh_config.of(endpoint)
+    known = known_keys(endpoint, settings)
+    sock = proxy.dial(settings.proxy, timeout) if settings.proxy \
+        else _dial(settings, name, timeout)
+    transport = paramiko.Transport(sock)
     # paramiko's own limits follow the clock, which may be set back meanwhile
     late = threading.Event()
 
@@ -132,19 +130,19 @@ def connect(endpoint: Endpoint, *, name: str, timeout: float) -> paramiko.Transp
         transport.daemon = True
         transport.banner_timeout = transport.handshake_timeout = timeout
         transport.auth_timeout = timeout
-        _choose(transport, [key.split()[0] for key in known])
+        _choose(transport, known)
         transport.start_client(timeout=timeout)
-        _verify(endpoint, name, transport.get_remote_server_key(), known)
-        _log_in(transport, endpoint, name)
+        _verify(endpoint, settings, name, transport.get_remote_server_key(), known)
+        _log_in(transport, settings, name)
         transport.set_keepalive(KEEPALIVE)
     except (paramiko.SSHException, EOFError, OSError, AuthenticationError) as error:
         transport.close()
         if late.is_set():
-            raise ConnectError(f"'{name}' ({endpoint.host} port {endpoint.port}) did not complete "
+            raise ConnectError(f"'{name}' ({settings.host} port {settings.port}) did not complete "
                                f'the login within {3 * timeout:g} s', 'try again') from error
         if isinstance(error, AuthenticationError):
             raise
-        raise _explained(error, endpoint, name, bool(known)) from error
+        raise _explained(error, settings, name, bool(known.keys), sock) from error
     except BaseException:
         transport.close()
         raise
@@ -153,12 +151,12 @@ def connect(endpoint: Endpoint, *, name: str, timeout: float) -> paramiko.Transp
     return transport
 
 
-def _dial(endpoint: Endpoint, name: str, timeout: float) -> PromptSocket:
-    where = f"'{name}' ({endpoint.host} port {endpoint.port})"
+def _dial(settings: Settings, name: str, timeout: float) -> PromptSocket:
+    where = f"'{name}' ({settings.host} port {settings.port})"
     try:
-        plain = socket.create_connection((endpoint.host, endpoint.port), timeout=timeout)
+        plain = socket.create_connection((settings.host, settings.port), timeout=timeout)
     except socket.gaierror as error:
-        raise ConnectError(f"'{name}': there is no host called '{endpoint.host}'",
+        raise ConnectError(f"'{name}': there is no host called '{settings.host}'",
                            'check host=') from error
     except ConnectionRefusedError as error:
         raise ConnectError(f'{where} refuses connections', 'does its SSH server run?') from error
@@ -176,18 +174,19 @@ def _dial(endpoint: Endpoint, name: str, timeout: float) -> PromptSocket:
     return sock
 
 
-def _choose(transport: paramiko.Transport, key_types: Sequence[str]) -> None:
+def _choose(transport: paramiko.Transport, known: Known) -> None:
     """Restrict the negotiation to fast and safe algorithms, and to the types of known keys."""
     options = transport.get_security_options()
     options.ciphers = [c for c in CIPHERS if c in options.ciphers] or options.ciphers
     options.kex = [k for k in KEX if k in options.kex] or options.kex
-    if key_types:
-        names = [n for t in key_types for n in (
-            ('rsa-sha2-512', 'rsa-sha2-256') if t == 'ssh-rsa' else (t,))]
-        options.key_types = [n for n in options.key_types if n in names] or options.key_types
-    else:
-        first = [n for n in options.key_types if n == 'ssh-ed25519']
-        options.key_types = first + [n for n in options.key_types if n not in first]
+    names = [n for key in known.keys for n in (
+        ('rsa-sha2-512', 'rsa-sha2-256') if key.startswith('ssh-rsa ') else (key.split()[0],))]
+    types = [n for n in options.key_types if n in names] or sorted(
+        options.key_types, key=lambda n: n != 'ssh-ed25519')
+    if known.authorities:
+        types = [n + known_hosts.CERTIFICATE for n in options.key_types
+                 if n not in ('ssh-rsa', 'ssh-dss')] + types
+    options.key_types = types
 
 
 def limited(channel: paramiko.Channel, window: int) -> paramiko.Channel:
@@ -205,90 +204,136 @@ def limited(channel: paramiko.Channel, window: int) -> paramiko.Channel:
     return channel
 
 
-def known_keys(endpoint: Endpoint) -> list[str]:
+def known_keys(endpoint: Endpoint, settings: Settings | None = None) -> Known:
     """
-    Return the accepted host keys (``type base64``): the pinned one, or those of known_hosts.
+    Return the accepted host keys: the pinned one, or those of known_hosts.
 
     :raises HostKeyError: the pinned key is no key, or known_hosts cannot be read.
     """
-    import paramiko
-    if endpoint.host_key is not None:
-        words = endpoint.host_key.split()
-        if len(words) < 2:
-            raise HostKeyError(f"'{endpoint.host_key}' is no host key",
-                               "host_key= takes 'ssh-ed25519 AAAA...'")
-        return [' '.join(words[:2])]
-    found: list[str] = []
-    for path in KNOWN_HOSTS:
-        file = path.expanduser()
-        if file.is_file():
-            hosts = paramiko.HostKeys()
-            try:
-                hosts.load(str(file))
-            except (paramiko.SSHException, OSError) as error:
-                raise HostKeyError(f'{file} can not be read: {error}') from error
-            entry = hosts.lookup(host_label(endpoint))
-            if entry is not None:
-                found += [f'{kind} {entry[kind].get_base64()}' for kind in entry.keys()]
-    return found
+    if endpoint.host_key is None:
+        return known_hosts.look_up(settings or ssh_config.of(endpoint))
+    words = endpoint.host_key.split()
+    if len(words) < 2:
+        raise HostKeyError(f"'{endpoint.host_key}' is no host key",
+                           "host_key= takes 'ssh-ed25519 AAAA...'")
+    return Known((' '.join(words[:2]),))
 
 
 def _verify(
-    endpoint: Endpoint, name: str, key: paramiko.PKey, known: Sequence[str],
+    endpoint: Endpoint, settings: Settings, name: str, key: paramiko.PKey, known: Known,
 ) -> None:
-    line = f'{key.get_name()} {key.get_base64()}'
-    if line in known:
+    line, label = f'{key.get_name()} {key.get_base64()}', known_hosts.label_of(settings)
+    where = f"'{name}' ({settings.host})"
+    if line in known.revoked:
+        raise HostKeyError(f'{where} shows a host key that known_hosts revokes',
+                           'another machine may answer there, with a stolen key')
+    if known.authorities and key.public_blob is not None:
+        fault = known_hosts.fault_of(
+            key.public_blob.key_blob, settings.label or settings.host, known)
+        if fault:
+            raise HostKeyError(f'the certificate of {where} {fault}',
+                               'ask who signed it for a new one')
+        if fault == '':
+            return
+    if line in known.keys:
         return
     if endpoint.host_key is not None:
         raise HostKeyError(
-            f"'{name}' ({endpoint.host}) shows another host key than the pinned one",
+            f'{where} shows another host key than the pinned one',
             f'another machine answers there; its key is {line}')
-    if known:
+    if known.keys:
         raise HostKeyError(
-            f"'{name}' ({endpoint.host}) shows another host key than known_hosts has",
-            f"if the machine was set up anew: ssh-keygen -R '{host_label(endpoint)}'")
+            f'{where} shows another host key than known_hosts has',
+            f"if the machine was set up anew: ssh-keygen -R '{label}'")
     raise HostKeyError(
-        f"the host key of '{name}' ({endpoint.host}) is unknown",
-        'if it is right, add this line to ~/.ssh/known_hosts: '
-        f'{host_label(endpoint)} {line}')
+        f"the host key of '{name}' ({settings.host}) is unknown",
+        f'if it is right, add this line to {settings.known_hosts[0]}: {label} {line}')
 
 
-def _log_in(transport: paramiko.Transport, endpoint: Endpoint, name: str) -> None:
+def _log_in(transport: paramiko.Transport, settings: Settings, name: str) -> None:
     import paramiko
-    user = user_of(endpoint)
-    tried = 0
-    for key in _keys(endpoint, name):
+    user, tried, locked = user_of(settings), 0, list[str]()
+    where = f"'{name}' ({user}@{settings.host})"
+    for key in _keys(settings, name, locked):
         tried += 1
         try:
             transport.auth_publickey(user, key)
             return
         except paramiko.AuthenticationException:
             if not transport.is_active():
-                break  # the server allows no further keys
-    where = endpoint.key_file or "the user's own keys"
+                raise AuthenticationError(
+                    f'{where} ended the login: it was offered too many keys, {tried}',
+                    'name the right one by key=, or by IdentityFile and IdentitiesOnly in '
+                    '~/.ssh/config') from None
+    add = f'ssh-add {locked[0]}' if locked else ''
+    if add and not os.environ.get('SSH_AUTH_SOCK'):
+        add = f'eval "$(ssh-agent)"; {add}'
+    if not tried:
+        raise AuthenticationError(
+            f"the key {locked[0]} for '{name}' has a passphrase" if locked else
+            f"there is no key to log in to '{name}' with",
+            add or 'give key=, or make one with: ssh-keygen -t ed25519')
+    what = settings.keys[0] if settings.only_keys and settings.keys else "the user's own keys"
     raise AuthenticationError(
-        f"'{name}' ({user}@{endpoint.host}) does not accept {where}" if tried else
-        f"there is no key to log in to '{name}' with",
-        f'add the public key to ~{user}/.ssh/authorized_keys there' if tried else
-        'give key=, or make one with: ssh-keygen -t ed25519')
+        f'{where} does not accept {what}',
+        (f'{add}, which has a passphrase; or ' if add else '')
+        + f'add the public key to ~{user}/.ssh/authorized_keys there')
 
 
-def _keys(endpoint: Endpoint, name: str) -> Iterator[paramiko.PKey]:
+def _keys(settings: Settings, name: str, locked: list[str]) -> Iterator[paramiko.PKey]:
+    """
+    Yield the keys in OpenSSH's order: those of the agent first, of these the named ones.
+
+    :param locked: gets the files of keys with a passphrase.
+    """
     import paramiko
-    if endpoint.key_file is not None:
-        yield load_key(Path(endpoint.key_file).expanduser(), name)
-        return
+    files = [Path(file).expanduser() for file in settings.keys]
+    if not settings.only_keys:
+        held = _agent_keys(settings.agent)
+        named = [public for path in files if (public := _public(path)) in held]
+        yield from (held[public] for public in dict.fromkeys([*named, *held]))
+        files = [path for path in files if path.is_file() and _public(path) not in held]
+    for path in files:
+        try:
+            yield load_key(path, name)
+        except AuthenticationError as error:
+            if not isinstance(error.__cause__, paramiko.PasswordRequiredException):
+                if len(files) == 1 and settings.only_keys:
+                    raise
+                continue
+            held = _agent_keys(settings.agent) if settings.only_keys else {}
+            if _public(path) in held:
+                yield held[_public(path)]
+            else:
+                locked.append(str(path))
+
+
+def _agent_keys(socket_path: str) -> dict[str, paramiko.AgentKey]:
+    """Return the keys of the agent by their base64, none if it does not answer."""
+    import paramiko
+    path = os.path.expandvars(os.path.expanduser(socket_path))
     try:
-        yield from paramiko.Agent().get_keys()
-    except paramiko.SSHException:
-        pass  # ignore an agent that does not answer
-    for own in OWN_KEYS:
-        path = Path('~/.ssh', own).expanduser()
-        if path.is_file():
-            try:
-                yield load_key(path, name)
-            except AuthenticationError:
-                continue  # a key with a passphrase must come from the agent
+        if path in ('', 'SSH_AUTH_SOCK'):
+            keys = paramiko.Agent().get_keys()
+        elif path == 'none':
+            keys = ()
+        else:
+            link = socket.socket(socket.AF_UNIX)
+            link.connect(path)
+            agent = paramiko.agent.AgentSSH()
+            agent._connect(link)  # type: ignore[attr-defined]
+            keys = agent.get_keys()
+    except (paramiko.SSHException, OSError):
+        keys = ()
+    return {key.get_base64(): key for key in keys}
+
+
+def _public(path: Path) -> str:
+    """Return the base64 of a private key's public file, '' without one."""
+    try:
+        return path.with_name(f'{path.name}.pub').read_text().split()[1]
+    except (OSError, ValueError, IndexError):
+        return ''
 
 
 def load_key(path: Path, name: str) -> paramiko.PKey:
@@ -315,14 +360,17 @@ def load_key(path: Path, name: str) -> paramiko.PKey:
 
 
 def _explained(
-    error: Exception, endpoint: Endpoint, name: str, known: bool,
+    error: Exception, settings: Settings, name: str, known: bool, sock: socket.socket,
 ) -> ConnectError | HostKeyError | AuthenticationError:
     text = str(error) or type(error).__name__
     if known and 'host key' in text.lower() or 'ncompatible ssh peer (no acceptable host' in text:
         return HostKeyError(
-            f"'{name}' ({endpoint.host}) has no host key of the type that is known",
+            f"'{name}' ({settings.host}) has no host key of the type that is known",
             'another machine answers there, or the machine was reinstalled')
-    where = f"'{name}' ({endpoint.host} port {endpoint.port})"
+    where = f"'{name}' ({settings.host} port {settings.port})"
+    if isinstance(sock, proxy.ProxySocket) and (said := sock.complaint()):
+        return ConnectError(f'the way to {where} fails: {said}',
+                            f"try it with ssh; it is: {' '.join(settings.proxy)}")
     if 'banner' in text or isinstance(error, EOFError):
         return ConnectError(f'{where} does not answer as an SSH server',
                             'it may still be starting, or limit connections')

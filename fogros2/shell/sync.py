@@ -78,7 +78,7 @@ class RsyncShell(Shell):
             timeout=timeout, cancel=cancel).stdout.split()
         if 'no-rsync' in there:
             raise missing_there(self.where)
-        bulk = not there and self.endpoint.kind == 'ssh' \
+        bulk = not there and self.endpoint.kind == 'ssh' and not self.endpoint.alias \
             and process.which('ssh') is not None and is_large(source, BULK)
         with open_ssh(self.endpoint) if bulk else self._remote_shell() as (rsh, files, failures):
             result = process.run(
@@ -323,7 +323,7 @@ def open_ssh(endpoint: Endpoint) -> Iterator[relay.RemoteShell]:
             f'no temporary file can be made: {error.strerror}',
             'is there room in /tmp? TMPDIR names another folder') from error
     with known:
-        known.writelines(f'machine {key}\n' for key in ssh_connection.known_keys(endpoint))
+        known.writelines(f'machine {key}\n' for key in ssh_connection.known_keys(endpoint).keys)
         known.flush()
         words += ['-o', 'HostKeyAlias=machine', '-o', f'UserKnownHostsFile={known.name}',
                   '-o', 'GlobalKnownHostsFile=/dev/null']

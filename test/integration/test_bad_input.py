@@ -341,7 +341,7 @@ def test_small_home_is_reported(refused, cloud_network, tmp_path):
     with bare_computer(f'fogt-small-{NAME}', tmp_path / 'computer', cloud_network,
                        options=['--tmpfs', '/home/fog:size=1m,mode=1777']) as computer:
         # what is to be sent may have to be made first
-        error, _ = refused(ssh(computer, bootstrap='pip'), within=60.0)
+        error, _ = refused(ssh(computer, bootstrap='pip'), within=150.0)
     assert 'are free in /home/fog, 400 are needed' in error
     assert 'make room there' in error
 

@@ -101,9 +101,8 @@ def test_what_holds_for_any_machine_can_be_said_too():
 
 @pytest.mark.parametrize('text, options', [
     ('p=ssh:robot@planner.local:2222', {'host': 'planner.local', 'user': 'robot', 'port': 2222}),
-    ('p=ssh:planner.local', {'host': 'planner.local', 'port': 22}),
-    ('p=ssh:me@[2001:db8::1],key=/k', {'host': '2001:db8::1', 'user': 'me', 'port': 22,
-                                       'key': '/k'}),
+    ('p=ssh:planner.local', {'host': 'planner.local'}),
+    ('p=ssh:me@[2001:db8::1],key=/k', {'host': '2001:db8::1', 'user': 'me', 'key': '/k'}),
 ])
 def test_a_computer_by_its_address(text, options):
     assert parse(text).machine('p').spec(LaunchContext()).options == options

@@ -381,7 +381,8 @@ def _dds() -> Iterator[Target]:
 TARGETS: dict[str, Callable[[], contextlib.AbstractContextManager[Target]]] = {
     'decoder': _decoder, 'stills': _stills, 'clouds': _clouds, 'parts': _parts,
     'messages': _messages, 'agent messages': _agent_messages, 'heartbeats': _heartbeats,
-    'agent': _agent, 'door': _door, 'gate': _gate, 'dashboard': _dashboard, 'VPN helper': _vpn_helper, 'DDS configuration': _dds}
+    'agent': _agent, 'door': _door, 'gate': _gate, 'dashboard': _dashboard,
+    'VPN helper': _vpn_helper, 'DDS configuration': _dds}
 #: Targets whose readers are Python code in the process that feeds them.
 PYTHON = {'parts', 'messages', 'agent messages', 'heartbeats', 'door', 'gate', 'dashboard',
           'VPN helper', 'DDS configuration'}

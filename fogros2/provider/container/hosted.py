@@ -242,7 +242,8 @@ class HostedProvider(Provider):
                 found['created'], login and Endpoint(
                     'ssh', outside.shell.host, untrusted.port(login['port']),
                     untrusted.matched(untrusted.NAME, login['user']),
-                    untrusted.matched(untrusted.HOST_KEY, login['host_key'])),
+                    untrusted.matched(untrusted.HOST_KEY, login['host_key']),
+                    alias=outside.shell.alias),
                 # the host's packet filter admits no machine to the host's ports
                 outside.vpn_host, untrusted.port(found['vpn_port']), private_network=host,
                 private_ip=address and str(ipaddress.ip_address(address)), region=outside.name,

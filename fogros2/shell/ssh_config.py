@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the user's configuration of OpenSSH says of a host: ``ssh -G`` evaluates it."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+import pwd
+import re
+
+from fogros2 import process
+from fogros2.errors import ConfigurationError
+from fogros2.model import Command, Endpoint
+
+_KEYS = ('~/.ssh/id_ed25519', '~/.ssh/id_ecdsa', '~/.ssh/id_rsa')
+_KNOWN_HOSTS = ('~/.ssh/known_hosts', '/etc/ssh/ssh_known_hosts')
+#: Seconds for the evaluation, which may run the commands of ``Match exec``.
+_TIMEOUT = 10.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """
+    How to connect to a host.
+
+    :param user: '' for the user of this process.
+    :param keys: files of private keys, of which some may not exist.
+    :param only_keys: whether other keys of the agent are left out.
+    :param agent: socket of the agent; '' for that of the environment, 'none' for no agent.
+    :param proxy: command whose streams replace the TCP connection.
+    :param known_hosts: files, of which some may not exist.
+    :param label: name in these files, instead of the host and port.
+    """
+
+    host: str
+    port: int = 22
+    user: str = ''
+    keys: tuple[str, ...] = _KEYS
+    only_keys: bool = False
+    agent: str = ''
+    proxy: tuple[str, ...] = ()
+    known_hosts: tuple[str, ...] = _KNOWN_HOSTS
+    label: str = ''
+
+
+def of(endpoint: Endpoint) -> Settings:
+    """
+    Return how to connect to an endpoint, with the user's settings if it has an alias.
+
+    :raises ConfigurationError: OpenSSH refuses its configuration.
+    """
+    found = read(endpoint.alias, endpoint.user, str(endpoint.port)) if endpoint.alias \
+        else Settings(endpoint.host, endpoint.port, endpoint.user)
+    if endpoint.key_file is not None:
+        found = dataclasses.replace(found, keys=(endpoint.key_file,), only_keys=True)
+    return found
+
+
+def read(name: str, user: str = '', port: str = '') -> Settings:
+    """
+    Return what OpenSSH would do for ``ssh [-l user] [-p port] name``.
+
+    :raises ConfigurationError: it refuses the name or its configuration.
+    """
+    home = os.path.expanduser('~')
+    try:
+        account = pwd.getpwuid(os.geteuid())
+    except KeyError:
+        account = None  # ssh refuses to run
+    if account is None or process.which('ssh') is None:
+        return Settings(name.lower(), int(port or 22), user)
+    files: list[str] = []
+    if account.pw_dir != home:
+        # ssh takes the account's home, Python $HOME
+        own = Path(home, '.ssh/config')
+        files = ['-F', str(own) if own.is_file() else 'none']
+    given = [*(('-l', user) if user else ()), *(('-p', port) if port else ())]
+    done = process.run(Command(('ssh', *files, '-G', '-T', *given, '--', name)),
+                       timeout=_TIMEOUT, check=False)
+    said: dict[str, list[str]] = {}
+    for line in done.stdout.splitlines():
+        keyword, _, value = line.partition(' ')
+        said.setdefault(keyword, []).append(value)
+    if done.returncode != 0 or 'hostname' not in said:
+        raise ConfigurationError(f"OpenSSH has no use for its settings of '{name}': "
+                                 f'{" ".join(done.stderr.split())}', f"try: ssh -G '{name}'")
+
+    def first(keyword: str, default: str = '') -> str:
+        return said.get(keyword, [default])[0]
+
+    host, user, port = first('hostname'), first('user'), first('port')
+    tokens = {'h': host, 'n': name, 'p': port, 'r': user, 'd': home, 'u': account.pw_name}
+
+    def expanded(text: str) -> str:
+        return re.sub('%(.)', lambda found: tokens.get(found[1], found[1] if found[1] == '%'
+                                                       else found[0]), text)
+
+    known = ' '.join(first(f'{kind}knownhostsfile') for kind in ('user', 'global')).split()
+    return Settings(
+        host, int(port), user,
+        keys=tuple(expanded(key) for key in said.get('identityfile', ())),
+        only_keys=first('identitiesonly') == 'yes', agent=expanded(first('identityagent')),
+        proxy=_proxy(first('proxyjump'), expanded(first('proxycommand')), host, port, files),
+        known_hosts=tuple(re.sub(f'^{re.escape(account.pw_dir)}/[.]ssh/', f'{home}/.ssh/',
+                                 expanded(file)) for file in known),
+        label=first('hostkeyalias'))
+
+
+def _proxy(
+    jump: str, command: str, host: str, port: str, files: list[str],
+) -> tuple[str, ...]:
+    """Return the command that ``ProxyJump`` or ``ProxyCommand`` means."""
+    if jump and jump != 'none':
+        *before, last = jump.split(',')
+        return ('ssh', *files, '-T', '-o', 'BatchMode=yes', '-W', f'[{host}]:{port}',
+                *(('-J', ','.join(before)) if before else ()),
+                '--', last if '://' in last else f'ssh://{last}')
+    return ('sh', '-c', f'exec {command}') if command and command != 'none' else ()
