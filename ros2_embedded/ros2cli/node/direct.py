@@ -10,8 +10,8 @@ from typing import Any
 
 from ros2cli.node import NODE_NAME_PREFIX
 
-#: Seconds after which a graph that does not change counts as complete. Fast DDS sends a lost answer
-#: again after 1 s.
+#: Seconds after which a graph that does not change counts as complete. Fast DDS sends a lost
+#: answer again after 1 s.
 STILL = 1.2
 #: Seconds after which the graph is used as it is. Fast DDS takes up to 2.7 s to find a node.
 LONGEST = 3.0
