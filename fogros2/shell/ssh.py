@@ -10,11 +10,11 @@ import time
 from typing import Optional, TYPE_CHECKING
 
 from fogros2.errors import ConnectError, FogError, ShellError
-from fogros2.events import clean
 from fogros2.model import Command
 from fogros2.shell import command_line, ssh_connection
 from fogros2.shell.lines import Channel, Output
 from fogros2.shell.remote import RemoteShell
+from fogros2.untrusted import clean
 from fogros2.waiting import wait_until
 
 if TYPE_CHECKING:
