@@ -13,6 +13,7 @@ import sys
 import threading
 
 from fogros2.errors import FogError
+from fogros2.shell import lines
 from fogros2.shell.lines import Channel
 
 _HELPER = Path(__file__).with_name('rsh.py')
@@ -82,7 +83,8 @@ def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
                threading.Thread(target=errors, name='fog-relay-errors', daemon=True)]
     channel.settimeout(None)
     try:
-        with contextlib.closing(channel):
+        with contextlib.ExitStack() as undo:
+            undo.callback(lines.close, channel)
             for thread in threads:
                 thread.start()
             while data := channel.recv(1 << 18):
