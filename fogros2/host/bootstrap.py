@@ -285,6 +285,12 @@ def _complete(
                  f'{why}', "apt=['...'] or pip=['...'] of the machine installs what it lacks")
         if left and complete:
             notes.append(f"the machine may lack {', '.join(left)}")
+    if pip and run(needs.able(environment, install.setup), check=False).returncode != 0:
+        if not able:
+            raise PrerequisiteError(
+                f"machine '{spec.name}' has no pip, which installs {', '.join(pip)}",
+                'on the machine: apt-get install python3-venv')
+        apt = (*apt, 'python3-venv')
     if apt:
         lacking = run(needs.missing(apt)).stdout.split()
         asked_for = [name for name in lacking if name in spec.apt]
@@ -300,7 +306,8 @@ def _complete(
             notes.append(f"installed {', '.join(lacking)}")
     if not (apt or pip) and install.kind == 'ros':
         return notes
-    with _remedy('pip= of the machine and package.xml of the workspace name packages'):
+    with _remedy('pip= of the machine and package.xml of the workspace name packages; the '
+                 'versions that the machine has stay'):
         run(needs.fill(folder, pip, install.environment, spec.environment, install.setup,
                        complete=complete))
     if pip:

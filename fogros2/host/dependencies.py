@@ -4,7 +4,8 @@ Install what nodes need besides ROS 2: packages in launch files, and rosdep keys
 
 The keys are the packages of the launch's nodes, and what the sent packages declare
 (``exec_depend``). pip's packages go into a separate folder, which Python searches last, so that
-they replace no packages of the system, of ROS 2 or of this project (PEP 668).
+they replace no packages of the system, of ROS 2 or of this project (PEP 668). pip chooses versions
+that fit the packages that the machine has.
 """
 
 from __future__ import annotations
@@ -82,6 +83,62 @@ site.addsitedir(os.path.join(os.path.dirname(_here), 'site'))
 _next = PathFinder.find_spec('sitecustomize', [p for p in sys.path if os.path.abspath(p) != _here])
 if _next is not None:
     _next.loader.exec_module(importlib.util.module_from_spec(_next))
+"""
+
+
+#: Prints the versions of the packages that nodes find, as a constraints file of pip.
+_CONSTRAINTS = """\
+import re
+from importlib import metadata
+found = {}
+for one in metadata.distributions():
+    # Debian appends '+', which no index has
+    version = str(one.metadata['Version']).partition('+')[0]
+    if one.metadata['Name'] and re.fullmatch('[0-9][0-9A-Za-z.]*', version):
+        found.setdefault(re.sub('[-_.]+', '-', one.metadata['Name']).lower(), version)
+for item in sorted(found.items()):
+    print('=='.join(item))
+"""
+#: Runs pip, at first without sources: if nothing fits, it would build one version after another.
+_RUN_PIP = """\
+"$@" --only-binary :all: >pip.log 2>&1 || {
+    # the versions that conflict are in the output that --quiet hides
+    ! grep -E '\\(constraint\\)|^ERROR: Cannot' pip.log >&2 || exit 1
+    "$@" --prefer-binary >pip.log
+}
+"""
+#: Imports what requirements have installed: one module of each at least.
+_IMPORT = """\
+import importlib, os, re, sys
+from importlib import metadata
+# ONNX Runtime would tell Microsoft that it was imported
+os.environ.setdefault('ORT_DISABLE_TELEMETRY', '1')
+status = 0
+for requirement in sys.argv[1:]:
+    try:
+        files = metadata.distribution(re.match('[A-Za-z0-9._-]+', requirement)[0]).files or ()
+    except metadata.PackageNotFoundError:
+        continue
+    tops = {file.parts[0].partition('.')[0] for file in files if file.suffix in ('.py', '.so')
+            and (len(file.parts) == 1 or file.name == '__init__.py' and len(file.parts) == 2)}
+    reasons = []
+    for module in sorted(tops - {'test', 'tests', 'docs', 'examples'}):
+        try:
+            importlib.import_module(module)
+            break
+        except BaseException as error:
+            reasons.append(f"'{module}' of {requirement} can't be imported there: "
+                           f'{type(error).__name__}: {error}')
+    else:
+        if reasons:
+            print(reasons[-1], file=sys.stderr)
+            status = 1
+sys.exit(status)
+"""
+#: Exits with 0 if pip can be used by one of the ways of ``modules.PIP``.
+_ABLE = """\
+python3 -m pip --version || ls "$VIRTUAL_ENV"/../wheels/pip-*.whl ||
+    python3 -c 'import ensurepip, venv'
 """
 
 
@@ -198,6 +255,11 @@ def with_pip_folder(folder: str, environment: Mapping[str, str]) -> dict[str, st
     return {**environment, 'PYTHONPATH': f'{before}:{folder}/last' if before else f'{folder}/last'}
 
 
+def able(environment: Mapping[str, str], setup: Sequence[str]) -> Command:
+    """Return the command that fails if a machine has neither pip nor what installs it."""
+    return modules.among_nodes(environment, setup, _ABLE, 'look for pip')
+
+
 def fill(
     folder: str, requirements: Sequence[str], environment: Mapping[str, str],
     given: Mapping[str, str], setup: Sequence[str], *, complete: bool = True,
@@ -211,14 +273,18 @@ def fill(
     names = ' '.join(name.replace('-', '_') for name in OURS)
     script = modules.PIP.format(folder=shlex.quote(folder)) if requirements else (
         f'set -e\nmkdir -p {shlex.quote(folder)}\ncd {shlex.quote(folder)}\n')
+    script += f'mkdir -p last\nprintf %s {shlex.quote(_LAST_IN_PATH)} >last/sitecustomize.py\n'
+    if requirements:
+        script += (f'python3 -c {shlex.quote(_CONSTRAINTS)} >constraints.txt\n'
+                   f'set -- "$@" --verbose --constraint constraints.txt {shlex.join(requirements)}'
+                   f'\n{_RUN_PIP}')
     script += (
-        (f'"$@" {shlex.join(requirements)}\n' if requirements else '') +
-        'rm -rf pip\n'
+        'rm -rf pip pip.log\n'
         f'for name in {names}; do [ ! -e "site/$name" ] || {{\n'
         "    echo \"one of the packages brings '$name', which is part of FogROS2\" >&2\n"
         '    rm -rf site; exit 1; }\n'
         'done\n'
-        f'mkdir -p last\nprintf %s {shlex.quote(_LAST_IN_PATH)} >last/sitecustomize.py\n'
+        f'python3 -c {shlex.join([_IMPORT, *requirements])} || {{ rm -rf site; exit 1; }}\n'
         f"{': >complete' if complete else ':'}\n")
     return modules.among_nodes(
         plan.extended(environment, given), setup, script, 'install Python packages')

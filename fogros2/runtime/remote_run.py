@@ -25,6 +25,8 @@ _NO_SCREEN = re.compile(
     r'no \$DISPLAY environment variable', re.IGNORECASE)
 #: Seconds that the machine has, beyond a process's own time-outs, to report its end.
 GRACE = 10.0
+#: Seconds after a process's start in which it may still import what handles SIGINT.
+STARTING = 5.0
 
 
 class Home(Protocol):
@@ -73,6 +75,9 @@ class RemoteRun:
         #: Whether it exited and its machine will restart it.
         self.respawning = False
         self._hinted = False
+        self._started_at = 0.0
+        #: Output since the process was stopped while it started; None for other processes.
+        self._withheld: Optional[list[NodeOutput]] = None
         #: Whether it is moving to the robot; whether it runs there as launch's own process.
         self._moving = self._here = False
         self._context = context
@@ -111,6 +116,8 @@ class RemoteRun:
         if self.complete.done() or self.stopping:
             return
         self.stopping = True
+        if not self.started or self._context.asyncio_loop.time() - self._started_at < STARTING:
+            self._withheld = []
         if not self._session.stop(self) or self.respawning:
             # nothing runs, so no exit will be reported
             self.end()
@@ -229,6 +236,7 @@ class RemoteRun:
 
     def _on_started(self, event: NodeStarted) -> None:
         self.started = True
+        self._started_at = self._context.asyncio_loop.time()
         self.respawning = False
         details = self._action.process_details
         assert details is not None
@@ -242,6 +250,9 @@ class RemoteRun:
             self._session.stop(self)
 
     def _on_output(self, event: NodeOutput) -> None:
+        if self._withheld is not None:
+            self._withheld.append(event)
+            return
         if not self._hinted and _NO_SCREEN.search(event['text']):
             self._hinted = True
             self._logger.warning(
@@ -258,7 +269,15 @@ class RemoteRun:
         self._returncode = event['returncode']
         self._details.setdefault('pid', 0)
         pid = self._details['pid']
-        if self._returncode == 0:
+        withheld, self._withheld = self._withheld, None
+        half = withheld is not None and (
+            self._returncode in (-signal.SIGINT, -signal.SIGTERM)
+            or any('KeyboardInterrupt' in output['text'] for output in withheld))
+        for output in () if half else withheld or ():
+            self._on_output(output)
+        if half:
+            self._logger.warning(f'process was ended while it started [pid {pid}]')
+        elif self._returncode == 0:
             self._logger.info(f'process has finished cleanly [pid {pid}]')
         else:
             command = ' '.join(word for word in self._details['cmd'] if word)

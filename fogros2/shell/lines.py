@@ -87,6 +87,13 @@ def take_errors(channel: Channel) -> bytes:
     return b''.join(parts)
 
 
+def close(channel: Channel) -> None:
+    """Close a channel, whose connection may be gone."""
+    # paramiko sends a message for it
+    with contextlib.suppress(OSError, EOFError):
+        channel.close()
+
+
 class LineStream:
     """
     Standard input and output of a program on a machine, line by line.
@@ -131,7 +138,7 @@ class LineStream:
 
     def close(self) -> None:
         """End the program; a ``readline`` in another thread returns b''."""
-        self._channel.close()
+        close(self._channel)
 
 
 class Output:

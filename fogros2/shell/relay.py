@@ -13,6 +13,7 @@ import sys
 import threading
 
 from fogros2.errors import FogError
+from fogros2.shell import lines
 from fogros2.shell.lines import Channel
 
 #: The value of rsync's ``-e``. rsync splits it into words, so it contains no value; the values
@@ -87,7 +88,8 @@ def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
                threading.Thread(target=errors, name='fog-relay-errors', daemon=True)]
     channel.settimeout(None)
     try:
-        with contextlib.closing(channel):
+        with contextlib.ExitStack() as undo:
+            undo.callback(lines.close, channel)
             for thread in threads:
                 thread.start()
             while data := channel.recv(1 << 18):

@@ -13,7 +13,7 @@ from typing import Generic, Optional, TypeVar
 
 from fogros2.errors import Cancelled, ConnectError, DeadlineExceeded, FogError
 from fogros2.model import Command, Endpoint, Result
-from fogros2.shell import command_line, relay, Stream, sync, terminal
+from fogros2.shell import command_line, lines, relay, Stream, sync, terminal
 from fogros2.shell.lines import Channel, Connection, LineStream, Output, take_errors
 from fogros2.waiting import cancellable, wait_until
 
@@ -178,7 +178,7 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
             self._abandon(command, output)
             raise
         finally:
-            channel.close()
+            lines.close(channel)
         result = Result(returncode, *output.text())
         return command_line.checked(command, result, self.where) if check else result
 

@@ -267,7 +267,7 @@ def due(
                   functools.partial(end_request, record, age, store))
     folders = leftovers(store, now)
     known = {record.launch for record in store.machines()}
-    folders += [store.root / 'launches' / launch for launch in owner.abandoned(store.root)
+    folders += [store.root / 'launches' / launch for launch in owner.abandoned()
                 if launch not in known and store.root / 'launches' / launch not in folders]
     for folder in folders:
         yield Due('leftovers of launch', folder.name, 'the launch is gone',
@@ -373,7 +373,7 @@ def _dead(folder: Path, now: float) -> bool:
         return not process_alive(int(data['pid']), int(data['pid_start']),
                                  str(data.get('boot', '')))
     except (OSError, ValueError, KeyError, TypeError):
-        runs = owner.alive(f'fog{folder.name}', folder.parents[1])
+        runs = owner.alive(f'fog{folder.name}')
         try:
             return not runs if runs is not None else now - folder.stat().st_mtime > FOLDER_AGE
         except OSError:

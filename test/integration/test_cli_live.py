@@ -171,7 +171,7 @@ def test_gc_works_without_the_store_of_a_killed_launch(
     assert f'deleted {name}' in fog('delete', name, '--yes').stdout
     monkeypatch.setenv('FOGROS2_STATE_HOME', here)
     assert f'leftovers of {name}' in fog('gc').stdout
-    assert fog('gc').stdout == 'nothing to clear\n'
+    assert name not in fog('gc').stdout
 
 
 @pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)')

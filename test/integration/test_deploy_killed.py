@@ -71,8 +71,8 @@ signal.pause()
 """
 
 
-@pytest.mark.parametrize('what', ['process.json', 'state folder'])
-def test_gc_deletes_interface_without_the_launchs_notes(tun, what):
+@pytest.mark.parametrize('what', ['process.json', 'state folder', 'another state folder'])
+def test_gc_deletes_interface_without_the_launchs_notes(tun, what, monkeypatch, tmp_path):
     """The interface itself names its owner; that of a launch that runs stays."""
     launches = [subprocess.Popen([sys.executable, '-c', ROBOT], stdout=subprocess.PIPE)
                 for _ in range(2)]
@@ -85,18 +85,21 @@ def test_gc_deletes_interface_without_the_launchs_notes(tun, what):
             folder = store.root / 'launches' / name
             if what == 'state folder':
                 shutil.rmtree(folder)
-            else:
+            elif what == 'process.json':
                 (folder / 'process.json').write_text('{"pid"')
+        if what == 'another state folder':
+            monkeypatch.setenv('FOGROS2_STATE_HOME', str(tmp_path))
         said = ros2('fog', 'gc').stdout
         assert f'cleared leftovers of launch {killed}' in said and alive not in said
         assert Path('/sys/class/net', f'fog{alive}').exists()
     finally:
         launches[1].kill()
         launches[1].communicate()
+        monkeypatch.setenv('FOGROS2_STATE_HOME', str(store.root))
         ros2('fog', 'gc')
     assert not any(f'fog{name}' in left for name in (killed, alive) for left in (
         *os.listdir('/sys/class/net'), run(['nft', 'list', 'tables']), run(['ps', '-eo', 'args'])))
-    assert ros2('fog', 'gc').stdout == 'nothing to clear\n'
+    assert killed not in ros2('fog', 'gc').stdout
 
 
 def run(words):

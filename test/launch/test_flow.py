@@ -638,6 +638,28 @@ def test_one_request_stops_several_nodes(run, fake, planner):
     assert len(fake.noted('start')) == 5
 
 
+@pytest.mark.parametrize(('returncode', 'text', 'half'), [
+    (-2, 'its Traceback', True), (-15, '', True), (1, 'KeyboardInterrupt', True),
+    (1, 'out of memory', False), (0, 'bye', False)])
+def test_node_that_ended_while_it_started_is_a_warning(
+        run, fake, planner, capfd, returncode, text, half):
+    def on_start(machine, node):
+        def stop(ids):
+            machine.say('output', node, stream='stderr', text=f'{text}\n')
+            machine.say('exited', node, returncode=returncode, respawns=False)
+        machine.stop = stop
+
+    fake.on_start = on_start
+    node = talker(planner)
+    assert run(LaunchDescription([
+        node, RegisterEventHandler(OnProcessStart(target_action=node, on_start=[Shutdown()])),
+    ])) == 0
+    said = capfd.readouterr().out
+    assert ('was ended while it started [pid 4001]' in said) == half
+    assert ('ERROR' in said) == (returncode == 1 and not half)
+    assert bool(text and text in said) != half and node.return_code == returncode
+
+
 def test_shutdown_cancels_a_machine_that_comes_up(run, fake, planner):
     fake.waits['planner'] = threading.Event()
     assert run(FogROSLaunchDescription([

@@ -17,7 +17,7 @@ import pytest
 from fogros2 import plan
 from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError
 from fogros2.host import bootstrap, dependencies, modules, workspace
-from fogros2.host.dependencies import fill, pip_folder, with_pip_folder
+from fogros2.host.dependencies import able, fill, pip_folder, with_pip_folder
 from fogros2.host.inspection import HostFacts
 from fogros2.model import Command, MachineSpec, Result
 from rigs.rosdep import rosdep_source
@@ -99,25 +99,68 @@ def test_variables_of_a_launch_file_are_on_no_command_line() -> None:
     assert completed(shown).stdout == "it's secret\n"
 
 
-def wheel(folder: Path, name: str, **modules: str) -> None:
+def wheel(folder: Path, name: str, version: str = '1', needs: str = '', **modules: str) -> None:
     """Write a wheel of some modules."""
-    with zipfile.ZipFile(folder / f'{name}-1-py3-none-any.whl', 'w') as archive:
+    with zipfile.ZipFile(folder / f'{name}-{version}-py3-none-any.whl', 'w') as archive:
         for module, text in modules.items():
             archive.writestr(f'{module}.py', text)
-        info = f'{name}-1.dist-info'
-        archive.writestr(f'{info}/METADATA', f'Metadata-Version: 2.1\nName: {name}\nVersion: 1\n')
+        info = f'{name}-{version}.dist-info'
+        archive.writestr(f'{info}/METADATA', (
+            f'Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n'
+            f'{needs and f"Requires-Dist: {needs}"}\n'))
         archive.writestr(f'{info}/WHEEL', 'Wheel-Version: 1.0\nRoot-Is-Purelib: true\n'
                                           'Tag: py3-none-any\n')
         archive.writestr(f'{info}/RECORD', '')
 
 
-def installed(tmp_path: Path, *names: str) -> tuple[str, subprocess.CompletedProcess[str]]:
-    """Install wheels as on a machine, with this interpreter as that of the nodes."""
+def installed(
+    tmp_path: Path, *names: str, system: str = '',
+) -> tuple[str, subprocess.CompletedProcess[str]]:
+    """
+    Install wheels as on a machine, with this interpreter as that of the nodes.
+
+    :param system: a folder with packages that the machine has.
+    """
     folder = pip_folder(MachineSpec('a', 'fake', pip=names), HostFacts(home=str(tmp_path)))
     command = fill(
-        folder, names, {'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}'},
+        folder, names, with_pip_folder(folder, {
+            'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}', 'PYTHONPATH': system}),
         {'PIP_NO_INDEX': '1', 'PIP_FIND_LINKS': str(tmp_path)}, ())
     return folder, completed(command)
+
+
+@RUNS_PIP
+def test_pip_chooses_what_fits_the_machines_packages(tmp_path: Path) -> None:
+    """Debian 12's NumPy 1.24 met a SciPy that was made for NumPy 2."""
+    system = tmp_path / 'system'
+    system.mkdir()
+    (system / 'fogt_base.py').write_text('version = 1')
+    info = system / 'fogt_base-1.dist-info'
+    info.mkdir()
+    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: fogt_base\nVersion: 1+dfsg\n')
+    for version in ('1', '2'):
+        wheel(tmp_path, 'fogt_base', version, fogt_base=f'version = {version}')
+        wheel(tmp_path, 'fogt_user', version, f'fogt-base=={version}', fogt_user=(
+            f'import fogt_base\nassert fogt_base.version == {version}'))
+    folder, done = installed(tmp_path, 'fogt-user', system=str(system))
+    assert done.returncode == 0, done.stderr
+    assert Path(folder, 'site/fogt_user-1.dist-info').exists()
+    folder, done = installed(tmp_path, 'fogt-user==2', system=str(system))
+    assert done.returncode != 0 and 'fogt-base==1' in done.stderr
+
+
+@RUNS_PIP
+def test_package_that_cannot_be_imported_is_reported(tmp_path: Path) -> None:
+    wheel(tmp_path, 'fogt_bad', fogt_bad='import numpy_that_is_newer', test='')
+    wheel(tmp_path, 'fogt_half', fogt_half='1 / 0', other='')
+    folder, done = installed(tmp_path, 'fogt-half')
+    assert done.returncode == 0 and Path(folder, 'complete').exists(), done.stderr
+    folder, done = installed(tmp_path, 'fogt-bad>=1')
+    assert done.stderr.splitlines()[-1] == (
+        "'fogt_bad' of fogt-bad>=1 can't be imported there: ModuleNotFoundError: "
+        "No module named 'numpy_that_is_newer'")
+    assert done.returncode == 1 and not Path(folder, 'site').exists()
+    assert not Path(folder, 'complete').exists()
 
 
 @RUNS_PIP
@@ -295,3 +338,38 @@ def test_package_that_cannot_be_installed_has_a_remedy(
     with pytest.raises(CommandError, match="on 'lab'.*Unable to locate it") as raised:
         bootstrap._complete(spec, install, '/home/fog/pip', [], run, lambda *warning: None)
     assert raised.value.hint.startswith(remedy)
+
+
+@pytest.mark.parametrize('root', [True, False])
+def test_machine_without_pip_is_found_before_apt(root: bool) -> None:
+    facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=root)
+    install = bootstrap.RosInstall('ros', ('ros2',), facts=facts, robot=facts)
+    spec = MachineSpec('lab', 'ssh', apt=('slow',), pip=('scikit-learn',))
+    ran: list[str] = []
+
+    def run(command: Command, **_: object) -> Result:
+        ran.append(command.what)
+        return Result(int(command.what == 'look for pip'),
+                      'python3-venv slow' if 'apt' in command.what else '', '')
+
+    def complete() -> list[str]:
+        return bootstrap._complete(spec, install, '/home/fog/pip', [], run, lambda *_: None)
+
+    if root:
+        assert complete() == ['installed python3-venv, slow', 'installed scikit-learn by pip']
+        return
+    with pytest.raises(PrerequisiteError) as caught:
+        complete()
+    assert str(caught.value) == ("machine 'lab' has no pip, which installs scikit-learn "
+                                 '(on the machine: apt-get install python3-venv)')
+    assert ran == ['look for pip']
+
+
+@pytest.mark.parametrize(('works', 'status'), [
+    ('', 1), ('-m pip --version', 0), ('-c import ensurepip, venv', 0)])
+def test_pip_has_several_ways(tmp_path: Path, works: str, status: int) -> None:
+    python = tmp_path / 'python3'
+    python.write_text(f'#!/bin/sh\n[ "$*" = "{works}" ]\n')
+    python.chmod(0o755)
+    environment = {'PATH': f'{tmp_path}:{os.environ["PATH"]}', 'VIRTUAL_ENV': '/nowhere'}
+    assert bool(completed(able(environment, ())).returncode) == bool(status)

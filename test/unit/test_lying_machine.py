@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from types import SimpleNamespace
 
 import pytest
@@ -11,8 +13,8 @@ pytest.importorskip('launch.actions', reason='launch is not installed')
 
 from fogros2.deploy import RunningMachine
 from fogros2.errors import AgentError, ConnectError
-from fogros2.model import Endpoint, MachineSpec
-from fogros2.shell import lines
+from fogros2.model import Command, Endpoint, MachineSpec
+from fogros2.shell import lines, relay
 from fogros2.shell.ssh import SSHShell
 from fogros2.testing.fakes import FakeProvider
 from rigs import deploying
@@ -61,6 +63,28 @@ def test_a_connection_that_ends_while_a_line_is_written_is_gone(error, why):
     stream = lines.LineStream(SimpleNamespace(sendall=sendall), 'planner')
     with pytest.raises(ConnectError, match=f"the connection to 'planner' is gone: {why}"):
         stream.write(b'line')
+
+
+@pytest.mark.parametrize('error', [EOFError(), OSError('Socket is closed')])
+def test_channel_of_a_lost_connection_closes(monkeypatch, error):
+    """Paramiko sends a message for it; the thread that watches the agent went on no longer."""
+    def fail(*words):
+        raise error
+
+    channel = SimpleNamespace(
+        close=fail, sendall=fail, send=fail, shutdown_write=fail,
+        settimeout=lambda seconds: None, recv=lambda size: b'',
+        recv_stderr=lambda size: b'', recv_stderr_ready=lambda: False,
+        exit_status_ready=lambda: False, recv_exit_status=lambda: -1, eof_received=False,
+        status_event=threading.Event(), get_transport=lambda: SimpleNamespace(
+            is_alive=lambda: False))
+    lines.LineStream(channel, 'planner').close()
+    with open(os.devnull, 'r+b') as null:
+        assert relay.relay(channel, *[null.fileno()] * 3) == 255
+    shell = SSHShell(Endpoint('ssh', '198.51.100.1'), name='planner')
+    monkeypatch.setattr(shell, 'start', lambda *words: channel)
+    with pytest.raises(ConnectError, match='was lost while'):
+        shell.run(Command(('true',)), timeout=5.0)
 
 
 def test_command_starts_anew_after_its_connection_was_closed(monkeypatch):
