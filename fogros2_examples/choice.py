@@ -38,7 +38,7 @@ def arguments(machine: str, name: str, second: str = '') -> list[DeclareLaunchAr
         argument('network', '', "machine:=container: its network; '' for the engine's own"),
         argument('host', '', 'machine:=ssh: name or address of the computer'),
         argument('user', '', 'machine:=ssh: login user there'),
-        argument('port', '', 'machine:=ssh: port of its SSH server'),
+        argument('port', '0', 'machine:=ssh: port of its SSH server; 0: as ssh chooses it'),
         argument('key', '', 'machine:=ssh: private key to log in with'),
         argument('host_key', '', 'machine:=ssh: its public host key; else known_hosts decides'),
         argument('bootstrap', 'auto',

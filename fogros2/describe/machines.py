@@ -396,7 +396,7 @@ class SSHInstance(CloudInstance):
 
     :param host: name or address, or a name of ``~/.ssh/config``.
     :param user: login user; None for the user that ``ssh`` would choose.
-    :param port: TCP port of its SSH server; None for the port that ``ssh`` would choose.
+    :param port: TCP port of its SSH server; None or 0 for the port that ``ssh`` chooses.
     :param key: private key file for the login; None for those that ``ssh`` would try.
     :param host_key: its public host key (``ssh-ed25519 AAAA...``); None to use known_hosts.
     """

@@ -30,14 +30,14 @@ class Options:
 
     :param host: name or address, or a name of OpenSSH's configuration.
     :param user: login user; '' for the one that ``ssh`` would choose.
-    :param port: TCP port of its SSH server; '' for that of OpenSSH's configuration.
+    :param port: TCP port of its SSH server; 0 for that of OpenSSH's configuration.
     :param key: private key file; '' for the user's own keys and agent.
     :param host_key: ``ssh-ed25519 AAAA...``; '' to use ``known_hosts``.
     """
 
     host: str = ''
     user: str = ''
-    port: str = ''
+    port: str = '0'
     key: str = ''
     host_key: str = ''
 
@@ -53,8 +53,7 @@ class Options:
                 or options.host.startswith('-') or not _is_name(options.host):
             raise ConfigurationError(f"'{options.host}' can't be the host of an SSH machine",
                                      'host= takes a name or an address')
-        if options.port and not (
-                options.port.isdecimal() and 0 < int(options.port) < 65536):
+        if not options.port.isdecimal() or int(options.port) > 65535:
             raise ConfigurationError(f"'{options.port}' can't be the port of an SSH machine",
                                      'port= takes a number from 1 to 65535')
         if options.host_key and len(options.host_key.split()) < 2:
@@ -87,7 +86,7 @@ class SSHProvider(Provider):
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Return the id of the computer if it answers."""
         options = Options.parse(spec.options)
-        found = ssh_config.read(options.host, options.user, options.port)
+        found = ssh_config.read(options.host, options.user, int(options.port))
         try:
             reach(found)
         except socket.gaierror as error:
@@ -114,11 +113,12 @@ class SSHProvider(Provider):
             raise MachineNotFound(f"'{machine_id}' is no SSH machine")
         words = dict(parse_qsl(machine_id[len(_SCHEME):], keep_blank_values=True))
         try:
-            alias, name, user, port = (words[key] for key in ('host', 'name', 'user', 'port'))
-            host_key, key_file, _ = words['host_key'] or None, words['key'] or None, int(port)
+            alias, name, user = words['host'], words['name'], words['user']
+            number = int(words['port'])
+            host_key, key_file = words['host_key'] or None, words['key'] or None
         except (KeyError, ValueError) as error:
             raise MachineNotFound(f"'{machine_id}' is no SSH machine") from error
-        found = ssh_config.read(alias, user, port)
+        found = ssh_config.read(alias, user, number)
         shell = Endpoint('ssh', found.host, found.port, user, host_key, key_file, alias)
         try:
             address = reach(found)

@@ -50,14 +50,14 @@ def of(endpoint: Endpoint) -> Settings:
 
     :raises ConfigurationError: OpenSSH refuses its configuration.
     """
-    found = read(endpoint.alias, endpoint.user, str(endpoint.port)) if endpoint.alias \
+    found = read(endpoint.alias, endpoint.user, endpoint.port) if endpoint.alias \
         else Settings(endpoint.host, endpoint.port, endpoint.user)
     if endpoint.key_file is not None:
         found = dataclasses.replace(found, keys=(endpoint.key_file,), only_keys=True)
     return found
 
 
-def read(name: str, user: str = '', port: str = '') -> Settings:
+def read(name: str, user: str = '', port: int = 0) -> Settings:
     """
     Return what OpenSSH would do for ``ssh [-l user] [-p port] name``.
 
@@ -69,13 +69,13 @@ def read(name: str, user: str = '', port: str = '') -> Settings:
     except KeyError:
         account = None  # ssh refuses to run
     if account is None or process.which('ssh') is None:
-        return Settings(name.lower(), int(port or 22), user)
+        return Settings(name.lower(), port or 22, user)
     files: list[str] = []
     if account.pw_dir != home:
         # ssh takes the account's home, Python $HOME
         own = Path(home, '.ssh/config')
         files = ['-F', str(own) if own.is_file() else 'none']
-    given = [*(('-l', user) if user else ()), *(('-p', port) if port else ())]
+    given = [*(('-l', user) if user else ()), *(('-p', str(port)) if port else ())]
     done = process.run(Command(('ssh', *files, '-G', '-T', *given, '--', name)),
                        timeout=_TIMEOUT, check=False)
     said: dict[str, list[str]] = {}
@@ -89,8 +89,8 @@ def read(name: str, user: str = '', port: str = '') -> Settings:
     def first(keyword: str, default: str = '') -> str:
         return said.get(keyword, [default])[0]
 
-    host, user, port = first('hostname'), first('user'), first('port')
-    tokens = {'h': host, 'n': name, 'p': port, 'r': user, 'd': home, 'u': account.pw_name}
+    host, user, number = first('hostname'), first('user'), first('port')
+    tokens = {'h': host, 'n': name, 'p': number, 'r': user, 'd': home, 'u': account.pw_name}
 
     def expanded(text: str) -> str:
         return re.sub('%(.)', lambda found: tokens.get(found[1], found[1] if found[1] == '%'
@@ -98,10 +98,10 @@ def read(name: str, user: str = '', port: str = '') -> Settings:
 
     known = ' '.join(first(f'{kind}knownhostsfile') for kind in ('user', 'global')).split()
     return Settings(
-        host, int(port), user,
+        host, int(number), user,
         keys=tuple(expanded(key) for key in said.get('identityfile', ())),
         only_keys=first('identitiesonly') == 'yes', agent=expanded(first('identityagent')),
-        proxy=_proxy(first('proxyjump'), expanded(first('proxycommand')), host, port, files),
+        proxy=_proxy(first('proxyjump'), expanded(first('proxycommand')), host, number, files),
         known_hosts=tuple(re.sub(f'^{re.escape(account.pw_dir)}/[.]ssh/', f'{home}/.ssh/',
                                  expanded(file)) for file in known),
         label=first('hostkeyalias'))

@@ -121,7 +121,8 @@ def test_machine_has_the_ports_of_its_host(on: dict[str, Any], shell: FakeShell)
     machine_id = provider.create(spec_on(on), request_for(spec_on(on)))
     shell.said = json.dumps({'result': REPORT})  # type: ignore[attr-defined]
     machine = provider.describe(machine_id)
-    assert machine.shell == Endpoint('ssh', '127.0.0.1', 40001, 'fog', 'ssh-ed25519 AA')
+    assert machine.shell == Endpoint('ssh', '127.0.0.1', 40001, 'fog', 'ssh-ed25519 AA',
+                                     alias='127.0.0.1')
     assert (machine.vpn_host, machine.vpn_port) == ('127.0.0.1', 40002)
     assert (machine.id, machine.name, machine.region) == (machine_id, 'planner', '127.0.0.1')
     assert machine.state is MachineState.RUNNING and machine.end_command

@@ -85,7 +85,7 @@ def test_a_computer_that_can_t_be_reached_is_refused_at_once(listener, host, wor
     ({'host': 'me@there'}, "can't be the host"),
     ({'host': 'planner..local'}, "can't be the host"),
     ({'host': 'x' * 300}, "can't be the host"),
-    ({'host': 'h', 'port': 0}, 'from 1 to 65535'),
+    ({'host': 'h', 'port': 65536}, 'from 1 to 65535'),
     ({'host': 'h', 'port': 'ssh'}, 'from 1 to 65535'),
     ({'host': 'h', 'hostkey': 'x'}, "did you mean 'host_key'"),
     ({'host': 'h', 'host_key': 'AAAA'}, "takes 'ssh-ed25519 AAAA...'"),

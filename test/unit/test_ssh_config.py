@@ -49,7 +49,7 @@ Match originalhost lab2 exec "test -e {home}/more"
             '/etc/ssh/ssh_known_hosts2'))
     assert ssh_config.read('lab2').port == 2300
     assert ssh_config.read('other').user == getpass.getuser()
-    chosen = ssh_config.read('lab', 'me', '22')
+    chosen = ssh_config.read('lab', 'me', 22)
     assert (chosen.host, chosen.user, chosen.port) == ('198.51.100.7', 'me', 22)
 
 
@@ -101,4 +101,4 @@ def test_endpoint_without_an_alias_takes_no_settings(home):
 def test_without_openssh_the_name_is_the_host(home, monkeypatch):
     configured(home, 'Host *\n  Port 2200\n')
     monkeypatch.setattr(process, 'which', lambda program: None)
-    assert ssh_config.read('Lab', port='23') == ssh_config.Settings('lab', 23)
+    assert ssh_config.read('Lab', port=23) == ssh_config.Settings('lab', 23)
