@@ -221,7 +221,7 @@ install_ros() {
     pip_in "$1" install --no-deps --require-hashes --only-binary :all: \
         ${FOGROS2_WHEELS:+--no-index --find-links "$FOGROS2_WHEELS"} --requirement "$1/ros.txt"
     "$1/bin/python" -I fogros2/host/relocation.py >>"$log" 2>&1 \
-        || fail "The libraries of ROS 2 could not be set up." "The whole output: $log"
+        || fail "The libraries of ROS 2 could not be set up." "$(tail -n 2 "$log")"
 }
 
 # What goes in beside the package itself; each includes the one before.
