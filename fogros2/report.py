@@ -75,10 +75,11 @@ class Warned:
 
 @dataclasses.dataclass(frozen=True)
 class Silence:
-    """A machine has not answered for ``seconds``; 0: it answers again."""
+    """A machine has not answered for ``seconds``; ``over``: it answers again."""
 
     machine: str
     seconds: float
+    over: bool = False
 
 
 Event = Union[StepStarted, StepDone, StepFailed, Progress, ClockMeasured, Warned, Silence]

@@ -300,40 +300,53 @@ def robot_name() -> str:
     return f'{os.uname().nodename}-{os.getuid()}'
 
 
-def robot_id() -> str:
+def robot_id(*, new: bool = True) -> str:
     """
     Return this robot's id in tags: its name, and random digits that belong to this computer.
 
     The digits are in the file ``robot.json`` of the configuration folder, with the computer's
     machine-id and one MAC address. A copy of the file on another computer gets new digits.
 
+    :param new: make digits if there are none; else return the name alone.
     :raises StoreError: the file can't be written.
     """
     base = os.environ.get('XDG_CONFIG_HOME') or os.path.expanduser('~/.config')
+    folders = (Path(base) / 'fogros2', state_home())
     error: Optional[OSError] = None
-    for folder in (Path(base) / 'fogros2', state_home()):
-        try:
-            return f'{robot_name()}-{_digits(folder)}'
-        except OSError as problem:
-            error = problem
+    for make in (False, True) if new else (False,):
+        for folder in folders:
+            try:
+                digits = _digits(folder, new=make)
+            except OSError as problem:
+                error = problem
+                continue
+            if digits:
+                return f'{robot_name()}-{digits}'
+    if not new:
+        return robot_name()
     assert error is not None
     raise _not_written(state_home() / 'robot.json', error) from error
 
 
 def is_another_robot(noted: str) -> bool:
     """Return whether a tag has the id of another robot; older versions noted only a name."""
-    return bool(re.fullmatch('.*-[0-9]+-[0-9a-f]{8}', noted)) and noted != robot_id()
+    return bool(re.fullmatch('.*-[0-9]+-[0-9a-f]{8}', noted)) and noted != robot_id(new=False)
 
 
-def _digits(folder: Path) -> str:
-    """Return the random digits of a ``robot.json``; renew them if another computer made them."""
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+def _digits(folder: Path, *, new: bool) -> str:
+    """
+    Return the random digits of a ``robot.json``, '' without those of this computer.
+
+    :param new: make digits if there are none of this computer.
+    """
+    if new:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     machine = Path('/etc/machine-id')
     machine_id = machine.read_text().strip() if machine.exists() else ''
     addresses = mac_addresses()
-    with open(folder / 'robot.json', 'a+',
+    with open(folder / 'robot.json', 'a+' if new else 'r',
               opener=lambda path, flags: os.open(path, flags, 0o600)) as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        fcntl.flock(file, fcntl.LOCK_EX if new else fcntl.LOCK_SH)
         file.seek(0)
         try:
             known = json.load(file)
@@ -342,6 +355,8 @@ def _digits(folder: Path) -> str:
             digits, bound = '', ('', '')
         if digits and bound[0] == machine_id and bound[1] in (addresses or ['']):
             return digits
+        if not new:
+            return ''
         digits = secrets.token_hex(4)
         file.truncate(0)
         json.dump({'digits': digits, 'machine_id': machine_id,

@@ -5,17 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import math
-import os
-from pathlib import Path
 from typing import Any, TypeVar
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
+from fogros2_examples.files import check_writable
+
 Number = TypeVar('Number', int, float)
-#: Formats of pictures that OpenCV and matplotlib write.
-PICTURES = ('.png', '.jpg', '.jpeg')
 
 
 class BadParameter(ValueError):
@@ -45,15 +43,11 @@ def writable(node: Node, name: str, endings: Sequence[str] = ()) -> str:
     :raises BadParameter: the file cannot be written.
     """
     text = str(node.declare_parameter(name, '').value)
-    path = Path(text)
-    if not text:
-        return ''
-    if endings and path.suffix.lower() not in endings:
-        raise BadParameter(f"'{name}' is {path}: it has to end in {', '.join(endings)}")
-    if not path.parent.is_dir():
-        raise BadParameter(f"'{name}' is {path}: there is no folder {path.parent}")
-    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise BadParameter(f"'{name}' is {path}: it can't be written")
+    try:
+        if text:
+            check_writable(text, endings)
+    except ValueError as error:
+        raise BadParameter(f"'{name}' is {text}: {error}") from error
     return text
 
 

@@ -49,8 +49,9 @@ class EncoderNode(LazyNode):
         if self.count_publishers(topic):
             return
         others = [name for name, kinds in self.get_topic_names_and_types()
+                  # the topics below /fogros2 are the streams' own copies
                   if 'sensor_msgs/msg/Image' in kinds and name != topic
-                  and self.count_publishers(name)]
+                  and not name.startswith('/fogros2/') and self.count_publishers(name)]
         near = difflib.get_close_matches(named, others, n=1)
         guess = f' (did you mean {near[0]}?)' if near else ''
         self.get_logger().warning(f'no images on {named}{guess}')

@@ -114,7 +114,8 @@ class Picture:
             return LAYOUTS[self.encoding]
         except KeyError:
             known = ', '.join(LAYOUTS)
-            raise BadPicture(f"encoding '{self.encoding}' isn't one of {known}",
+            raise BadPicture(f"encoding '{self.encoding}' isn't one of {known}: use the transport "
+                             "'raw', which carries every encoding, or convert the images",
                              f'encoding {self.encoding!r}') from None
 
     @property

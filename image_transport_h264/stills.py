@@ -38,9 +38,13 @@ def encode(picture: Picture, kind: Format, quality: int = 80) -> tuple[str, byte
     :raises BadPicture: the fields are invalid, or the format cannot hold the encoding.
     """
     picture.check()
+    layout = picture.layout
+    if layout.kind == 'deep' and (kind == 'jpeg' or layout.pixel_bytes != 2):
+        png = ", or 'compressed' with format='png'" if layout.pixel_bytes == 2 else ''
+        raise BadPicture(f"{kind.upper()} can't hold {picture.encoding}: use the transport "
+                         f"'h264', which is lossless for it{png}",
+                         f'encoding {picture.encoding!r}')
     pixels = bgr(picture)
-    if kind == 'jpeg' and pixels.dtype != numpy.uint8:
-        raise BadPicture(f"JPEG can't hold {picture.encoding}", f'encoding {picture.encoding!r}')
     target = 'bgr8' if pixels.ndim == 3 else picture.encoding
     return f'{picture.encoding}; {kind} compressed {target}', coded(pixels, kind, quality)
 
@@ -130,7 +134,7 @@ def bgr(picture: Picture) -> Pixels:
     rows = numpy.ascontiguousarray(picture.rows())
     if layout.kind == 'deep':
         if layout.pixel_bytes != 2:
-            raise BadPicture(f"PNG can't hold {picture.encoding}",
+            raise BadPicture(f'OpenCV has no picture of {picture.encoding}',
                              f'encoding {picture.encoding!r}')
         values = rows.view('>u2' if picture.is_bigendian else '<u2')
         return values.astype(numpy.uint16)

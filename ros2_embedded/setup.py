@@ -84,13 +84,13 @@ setup(
     python_requires='>=3.10',
     package_dir={'': '.'},  # editable: one .pth line, new packages are found at once
     packages=find_packages(str(HERE), exclude=['test', 'test.*', 'build', 'build.*']),
-    package_data={'': ['py.typed', '*.xsd']},
+    package_data={'': ['py.typed', '*.xml']},
     data_files=index_entries(),
     # rclpy and the messages are pinned in fogros2/host/locked.txt: see tools/setup.sh
     install_requires=['numpy', 'PyYAML'],
     zip_safe=False,
     entry_points={
-        'console_scripts': ['ros2 = ros2cli.cli:main'],
+        'console_scripts': ['ros2 = ros2cli.script:main'],
         'ros2cli.command': [
             'launch = ros2cli.command.launch:LaunchCommand',
             'run = ros2cli.command.run:RunCommand',

@@ -30,7 +30,7 @@ def _text(check: doctor.Check) -> str:
         else check.detail
 
 
-class FogCheck(DoctorCheck):  # type: ignore[misc]
+class FogCheck(DoctorCheck):
     """Check whether this computer has what a launch with cloud machines needs."""
 
     def category(self) -> str:
@@ -50,7 +50,7 @@ class FogCheck(DoctorCheck):  # type: ignore[misc]
         return result
 
 
-class FogReport(DoctorReport):  # type: ignore[misc]
+class FogReport(DoctorReport):
     """Report the results of all checks of this computer."""
 
     def category(self) -> str:

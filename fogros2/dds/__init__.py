@@ -24,12 +24,15 @@ class Router:
     :param package: with ``executable`` names a program of the ament index.
     :param variable: environment variable with the path of its configuration file.
     :param config: content of that file.
+    :param beside: address and TCP port of the router of the host's other nodes, if this one does
+        not connect to it.
     """
 
     package: str
     executable: str
     variable: str
     config: str
+    beside: Optional[tuple[str, int]] = None
 
 
 class DdsVendor(abc.ABC):

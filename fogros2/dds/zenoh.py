@@ -5,8 +5,11 @@ Configure Zenoh, ROS 2's ``rmw_zenoh_cpp``: one router per host, connected over 
 Nodes connect only to their host's router, at the host's VPN address. That address belongs to one
 launch, so it cannot conflict with other launches or with a router that runs already. The robot's
 router dials the machines' routers, because the robot admits no TCP from the VPN. The machines'
-routers dial each other. The robot's router also dials the router of the user's other nodes, and
-so reaches the robot's LAN.
+routers dial each other.
+
+Routers forward everything to each other, and a node can use one router only. So the robot's router
+dials no router of the user's unless the user names it: a hijacked machine would reach all nodes
+behind it, those of other launches and of the LAN included.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from fogros2.model import DdsInterface
 
 #: TCP port of routers in the VPN; rmw_zenoh's own router uses 7447 on all interfaces.
 PORT = 7448
-USERS_ROUTER = 'tcp/127.0.0.1:7447'
+USERS_ROUTER = '127.0.0.1', 7447
 #: Milliseconds between attempts to dial a router: the first value, doubled up to the second.
 RETRY, RETRY_MAX = 250, 2000
 #: Milliseconds without a sign of life after which a link counts as broken and is dialled again.
@@ -101,9 +104,10 @@ class Zenoh(DdsVendor):
         :param user: ROS_STATIC_PEERS have routers too, at rmw_zenoh's own port. With
             ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST the router connects only to machines.
         """
-        dialled = [_endpoint(other) for other in others]
-        if user is not None and not local_only(user):
-            dialled += [USERS_ROUTER, *(f'tcp/{host}:7447' for host in static_peers(user))]
+        host, port = USERS_ROUTER
+        wide = user is not None and not local_only(user)
+        named = static_peers(user) if user is not None and wide else []
+        dialled = [*map(_endpoint, others), *(f'tcp/{name}:{port}' for name in named)]
         return Router('rmw_zenoh_cpp', 'rmw_zenohd', 'ZENOH_ROUTER_CONFIG_URI', _text({
             'mode': 'router',
             'listen': {'endpoints': [_endpoint(address)]},
@@ -113,7 +117,7 @@ class Zenoh(DdsVendor):
             'timestamping': {'enabled': {'router': True, 'peer': True, 'client': True}},
             'queries_default_timeout': QUERY_TIMEOUT,
             'transport': _TRANSPORT,
-        }))
+        }), beside=USERS_ROUTER if wide and host not in named else None)
 
     def environment(self, path: str, user: Mapping[str, str]) -> Mapping[str, str]:
         """

@@ -230,6 +230,11 @@ class Launch:
                 if router is not None:
                     # ends after the robot's nodes have ended, and before the VPN goes down
                     self.undo.callback(robot_router.RobotRouter(router, path.parent, user).close)
+                    if router.beside and robot_router.answers(*router.beside):
+                        self.report(Warned(
+                            '', "the launch's nodes do not reach the nodes of another "
+                            f'{router.executable} on this robot',
+                            f'ROS_STATIC_PEERS={router.beside[0]} connects machines to them, too'))
                 self._robot_environment = dict(vendor.environment(str(path), user))
             return dict(self._robot_environment)
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 import os
 from pathlib import Path
+import socket
 import threading
 
 from fogros2 import plan, process
@@ -25,6 +26,15 @@ exec 3<&0 >&2
 { read -r _ <&3; kill $$; } &
 exec 3<&- </dev/null "$0"
 """
+
+
+def answers(host: str, port: int) -> bool:
+    """Return whether something accepts connections at a TCP port of this computer."""
+    try:
+        socket.create_connection((host, port), timeout=0.5).close()
+        return True
+    except OSError:
+        return False
 
 
 class RobotRouter:

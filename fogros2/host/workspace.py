@@ -185,7 +185,7 @@ def dependencies(*paths: str | os.PathLike[str]) -> list[str]:
     needed: set[str] = set()
     for name, manifest in manifests.items():
         if name not in OWN_PACKAGES and manifest.is_file():
-            needed |= {*_texts(manifest, *_ALL)}
+            needed |= {*_field_texts(manifest, *_ALL)}
     return sorted(needed - {''} - set(manifests))
 
 
@@ -195,7 +195,7 @@ def run_dependencies(manifest: Path) -> set[str]:
 
     :raises WorkspaceError: the manifest cannot be read.
     """
-    return {*_texts(manifest, *_RUN)} if manifest.is_file() else set()
+    return {*_field_texts(manifest, *_RUN)} if manifest.is_file() else set()
 
 
 def plan(
@@ -401,7 +401,7 @@ def _parsed(manifest: Path) -> ElementTree.Element:
                              'correct it, or put a COLCON_IGNORE beside it') from error
 
 
-def _texts(manifest: Path, *tags: str) -> Iterator[str]:
+def _field_texts(manifest: Path, *tags: str) -> Iterator[str]:
     """Yield the texts of a manifest's elements with these tags whose condition is true."""
     for element in _parsed(manifest).iter():
         if element.tag in tags and _is_true(element.get('condition'), manifest):
@@ -420,7 +420,7 @@ def _is_true(condition: Optional[str], manifest: Path) -> bool:
 
 
 def _build_type(folder: Path) -> str:
-    return next(_texts(folder / 'package.xml', 'build_type'), '')
+    return next(_field_texts(folder / 'package.xml', 'build_type'), '')
 
 
 def _inspect_installed(workspace: Workspace) -> Workspace:

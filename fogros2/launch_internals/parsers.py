@@ -30,7 +30,11 @@ def scoped(parser: Parser, read: Read) -> Parser:
     inner = copy.copy(parser)
 
     def parse_action(entity: Entity) -> Action:
-        action = read(entity, inner)
+        try:
+            action = read(entity, inner)
+        except Exception as error:
+            vars(error).setdefault('line', getattr(entity, 'line', None))
+            raise
         if action is None:
             action = type(inner).parse_action(inner, entity)
             if isinstance(action, IncludeLaunchDescription):

@@ -2,14 +2,14 @@
 """
 The robot's side of a launch on launch's event loop: machines, remote processes, streams.
 
-In reading order: ``console`` shows steps, ``cost`` formats prices, ``signals`` makes SIGTERM an
-orderly shutdown, ``uncompressed`` warns of images that should be streamed, ``node_spec`` converts
-a process action to a NodeSpec, ``streaming`` collects the streams, ``republishers`` has the
-processes that FogROS2 adds, ``backlog`` holds a machine's events until launch takes them,
-``replacement`` decides how a new machine replaces another one, ``checkpoints`` saves folders of
-its nodes, ``replacer`` carries the decisions out, ``remote_run`` follows one process on a machine,
-``session`` is one machine of the launch, ``interruption`` handles its preemption, ``coordinator``
-connects the launch with its machines, ``foxglove`` runs the bridge, ``remote_process`` is the
-action of a remote process, and ``replicas`` starts the node that serves the public names of
-replicated nodes.
+In reading order: ``log_files`` limits launch's log files and survives a full disk, ``console``
+shows steps, ``cost`` formats prices, ``signals`` makes SIGTERM an orderly shutdown,
+``uncompressed`` warns of images that should be streamed, ``node_spec`` converts a process action
+to a NodeSpec, ``streaming`` collects the streams, ``republishers`` has the processes that FogROS2
+adds, ``backlog`` holds a machine's events until launch takes them, ``replacement`` decides how a
+new machine replaces another one, ``checkpoints`` saves folders of its nodes, ``replacer`` carries
+the decisions out, ``remote_run`` follows one process on a machine, ``session`` is one machine of
+the launch, ``interruption`` handles its preemption, ``coordinator`` connects the launch with its
+machines, ``foxglove`` runs the bridge, ``remote_process`` is the action of a remote process, and
+``replicas`` starts the node that serves the public names of replicated nodes.
 """

@@ -3,14 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import contextlib
-import functools
 import logging
 import os
 import queue
 import shutil
-import sys
 import threading
 from typing import Optional, TextIO, Union
 
@@ -107,9 +104,6 @@ class Console:
         self._handler = launch.logging.launch_config.get_screen_handler()
         self._stream = Screen(stream or self._handler.stream)
         self._handler.setStream(self._stream)
-        log = launch.logging.launch_config.get_log_file_handler()
-        log.handleError = functools.partial(self._on_log_error, log.handleError)
-        self._log_fails = False
         self._lock = threading.RLock()
         self._running: dict[tuple[str, str], str] = {}
         self._drawn = False
@@ -146,11 +140,12 @@ class Console:
                     f'{what}\nsynchronise both clocks: sudo apt-get install chrony')
             elif isinstance(event, Warned):
                 self._logger.warning(f'{event.text}\n{event.remedy}')
-            elif isinstance(event, Silence) and event.seconds:
+            elif isinstance(event, Silence) and event.over:
+                self._logger.info(
+                    f'{event.machine}: answers again, after {event.seconds:.0f} s')
+            elif isinstance(event, Silence):
                 self._logger.warning(f'{event.machine}: no answer for {event.seconds:.0f} s '
                                      '(VPN); nodes keep running')
-            elif isinstance(event, Silence):
-                self._logger.info(f'{event.machine}: answers again')
             self._draw()
 
     def close(self) -> None:
@@ -161,18 +156,6 @@ class Console:
             self._handler.removeFilter(self._before_line)
             if self._stream.drain():
                 self._handler.setStream(self._stream.stream)
-
-    def _on_log_error(
-        self, otherwise: Callable[[logging.LogRecord], None], record: logging.LogRecord,
-    ) -> None:
-        """Report once that launch's log file cannot be written, instead of each traceback."""
-        error = sys.exc_info()[1]
-        if not isinstance(error, OSError):
-            otherwise(record)
-        elif not self._log_fails:
-            self._log_fails = True
-            self._stream.write(f"[WARNING] [fogros2]: launch's log file can't be written: "
-                               f'{error.strerror}\nthe launch goes on without it\n')
 
     def _before_line(self, record: logging.LogRecord) -> bool:
         with self._lock:

@@ -25,6 +25,7 @@ from fogros2.model import MachineSpec, NodeSpec
 from fogros2.runtime import streaming
 from fogros2.runtime.backlog import Backlog
 from fogros2.runtime.checkpoints import Checkpoints
+from fogros2.runtime.log_files import LogFiles
 from fogros2.runtime.node_spec import full_name
 from fogros2.runtime.remote_run import RemoteRun
 from fogros2.runtime.replacer import Replacer
@@ -126,6 +127,7 @@ class Session:
         # keeps moves between robot and machines in order
         self._moves = asyncio.Lock()
         self._logger = launch.logging.get_logger('fogros2')
+        self._logs = LogFiles()
 
     @property
     def ready(self) -> bool:
@@ -368,6 +370,7 @@ class Session:
             f"launch shows them; 'ros2 fog logs {self.spec.name}' has the latest")
 
     def _on_event(self, event: Event) -> None:
+        self._logs.add(sum(len(str(value)) for value in event.values()))
         run = self._runs.get(str(event.get('node', '')))
         if run is not None:
             if event['event'] == 'exited' and self._ending and not run.stopping:

@@ -28,7 +28,7 @@ def remote_shell(run: Callable[[str, int, int, int], int]) -> Iterator[RemoteShe
     Yield how rsync reaches a machine, by ``RSH``.
 
     :param run: runs a command line on the machine with a standard input, output and error, until
-        it ends; returns its exit status.
+        it ends; returns its exit status, at most 255.
     """
     failures: list[FogError] = []
     ours, theirs = socket.socketpair()
@@ -54,8 +54,7 @@ def _serve(
         os.set_blocking(stream, True)  # rsync may have set its own ends otherwise
     try:
         if len(streams) == 3:
-            status = run(line.decode(), *streams)
-            link.sendall(bytes([status if 0 <= status < 256 else 255]))
+            link.sendall(bytes([run(line.decode(), *streams)]))
     except FogError as error:
         failures.append(error)
     except OSError:
@@ -66,7 +65,7 @@ def _serve(
 
 
 def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
-    """Relay bytes until the remote program ends; return its exit status (-1: lost)."""
+    """Relay bytes until the remote program ends; return its exit status (255: lost)."""
     ended, end = os.pipe()
 
     def up() -> None:
@@ -99,7 +98,7 @@ def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
         os.close(end)  # wakes the thread that reads standard input
         threads[0].join(5.0)
         os.close(ended)
-    return status
+    return status if 0 <= status < 256 else 255
 
 
 def _write(target: int, data: bytes) -> None:

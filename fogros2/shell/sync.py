@@ -333,7 +333,8 @@ def open_ssh(endpoint: Endpoint) -> Iterator[relay.RemoteShell]:
             child = process.start(Command((*words, '--', endpoint.host, line)),
                                   stdin=stdin, stdout=stdout, stderr=stderr)
             children.append(child)
-            return child.wait()
+            status = child.wait()
+            return status if status >= 0 else 255
 
         with relay.remote_shell(run) as remote:
             try:

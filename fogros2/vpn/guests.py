@@ -90,6 +90,22 @@ echo
 exec python3 -IS -c "$0"
 """
 
+#: Keeps an account from a cloud's services for its machine, which hold the machine's rights. The
+#: same addresses serve DNS.
+CONFINE = """\
+add table inet {user}
+delete table inet {user}
+table inet {user} {{
+    chain output {{
+        type filter hook output priority filter; policy accept;
+        meta skuid {uid} ip daddr {{ 169.254.169.0/24, 169.254.170.0/24, 168.63.129.16 }} \\
+            meta l4proto {{ tcp, udp }} th dport != 53 reject
+        meta skuid {uid} ip6 daddr {{ fd00:ec2::/32, fd20:ce::254 }} \\
+            meta l4proto {{ tcp, udp }} th dport != 53 reject
+    }}
+}}
+"""
+
 Guest = dict[str, Any]
 
 
@@ -214,6 +230,8 @@ def evict(user: str) -> None:
         time.sleep(0.02)
     for words in (('userdel', user), ('groupdel', user)):  # mostly, the group goes with the user
         subprocess.run(words, stderr=subprocess.DEVNULL)
+    with contextlib.suppress(FileNotFoundError):
+        subprocess.run(('nft', 'delete', 'table', 'inet', user), stderr=subprocess.DEVNULL)
     shutil.rmtree(HOMES / user, ignore_errors=True)
     subprocess.run(('sh', '-c', CLEAN, 'sh', str(found.pw_uid)), start_new_session=True)
     with contextlib.suppress(OSError):
@@ -231,6 +249,16 @@ def new_id() -> int:
             pwd.getpwuid(number)
         except KeyError:
             return number
+
+
+def confine(user: str, uid: int) -> None:
+    """
+    Keep a guest's account from the metadata service of a cloud; idempotent.
+
+    :raises OSError, SubprocessError: the machine has no packet filter.
+    """
+    subprocess.run(('nft', '-f', '-'), input=CONFINE.format(user=user, uid=uid), text=True,
+                   check=True, stderr=subprocess.PIPE)
 
 
 class Door(socketserver.ThreadingTCPServer):
@@ -348,6 +376,7 @@ class Door(socketserver.ThreadingTCPServer):
                 'machine': self.request['machine'], 'directory': f'{home}/agent', 'user': user,
                 'boot_timeout': 120.0}))
             os.chown(home, found.pw_uid, found.pw_gid)
+        confine(user, found.pw_uid)
         link.settimeout(None)
         return subprocess.Popen(
             ('sh', '-c', ENTRY, self.request['shell']), stdin=link.fileno(), stdout=link.fileno(),

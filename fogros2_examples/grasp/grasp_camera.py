@@ -27,6 +27,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
+from fogros2_examples.files import PICTURES
 from fogros2_examples.grasp.bins import camera, depth_image, thrown
 from fogros2_examples.grasp.messages import (
     depth_message,
@@ -35,8 +36,10 @@ from fogros2_examples.grasp.messages import (
     info_message,
 )
 from fogros2_examples.grasp.picture import beside, picture
-from fogros2_examples.parameters import BadParameter, PICTURES, within, writable
+from fogros2_examples.parameters import BadParameter, within, writable
 
+#: Seconds for the answer to the first image; each further one gets twice as long.
+FIRST_PAUSE = 5.0
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -88,9 +91,7 @@ class GraspCamera(Node):
         if not self._until(lambda: self.ready, self.wait):
             self.get_logger().fatal(f'no grasp planner is there after {self.wait:g} s')
             return 2
-        # The transport of the images may start later than the planner: ignore the first images.
-        first = self._bin(self.seed)
-        if not any(self._asked(first, 5.0) is not None for _ in range(max(1, int(self.wait / 5)))):
+        if not self._warm_up(self._bin(self.seed)):
             self.get_logger().fatal(f'no depth image was answered in {self.wait:g} s')
             return 2
         found, pictures = 0, []
@@ -130,13 +131,41 @@ class GraspCamera(Node):
 
     def _asked(self, depth: NDArray[numpy.float32], wait: float) -> Optional[tuple[int, int]]:
         """Publish an image; return its stamp after its grasps arrived, None after ``wait`` s."""
+        key = self._published(depth)
+        return key if self._until(lambda: self._answered(key), wait) else None
+
+    def _warm_up(self, depth: NDArray[numpy.float32]) -> bool:
+        """
+        Publish an image until one is answered, however late; return whether one was.
+
+        The transport of the images may start later than the planner and lose the first images;
+        a slow planner answers the first image when others have followed.
+        """
+        keys: list[tuple[int, int]] = []
+        deadline, pause = time.monotonic() + self.wait, FIRST_PAUSE
+        while not any(map(self._answered, keys)):
+            left = deadline - time.monotonic()
+            if left <= 0:
+                return False
+            keys.append(self._published(depth))
+            self._until(lambda: any(map(self._answered, keys)), min(pause, left))
+            pause *= 2
+        # the first bin's time must not include the planner's time for these images
+        others = (len(keys) - 1) * (max(self.seconds.values()) + 1.0)
+        self._until(lambda: all(map(self._answered, keys)), others)
+        return True
+
+    def _answered(self, key: tuple[int, int]) -> bool:
+        return key in self.answers and key in self.seconds
+
+    def _published(self, depth: NDArray[numpy.float32]) -> tuple[int, int]:
+        """Publish an image, and return its stamp."""
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id='camera')
         key = _key(header.stamp)
         height, width = depth.shape
         self.infos.publish(info_message(width, height, self.eye.focal, header))
         self.images.publish(depth_message(depth, self.encoding, header))
-        there = self._until(lambda: key in self.answers and key in self.seconds, wait)
-        return key if there else None
+        return key
 
     def _show(self, image: NDArray[numpy.uint8]) -> None:
         height, width = image.shape[:2]

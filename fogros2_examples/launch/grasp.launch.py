@@ -8,6 +8,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 
 from fogros2 import CloudNode, FogMachine, FogROSLaunchDescription
 from fogros2_examples.ending import ended
+from fogros2_examples.files import checked, PICTURES
 
 
 def generate_launch_description():
@@ -23,6 +24,7 @@ def generate_launch_description():
         DeclareLaunchArgument('trials', default_value='10',
                               description='how many bins, 0 for ever more'),
         DeclareLaunchArgument('picture', default_value='', description='a PNG file to write'),
+        checked({}, {'picture': PICTURES}),
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'grasping', 'launch_foxglove': LaunchConfiguration('foxglove')}),
         CloudNode(machine='grasping', package='fogros2_examples', executable='grasp_planner',

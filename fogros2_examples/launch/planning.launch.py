@@ -8,6 +8,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 
 from fogros2 import CloudNode, FogMachine, FogROSLaunchDescription
 from fogros2_examples.ending import ended
+from fogros2_examples.files import checked, PICTURES
 
 
 def generate_launch_description():
@@ -25,6 +26,8 @@ def generate_launch_description():
         DeclareLaunchArgument('count', default_value='1',
                               description='how many plans, 0 for ever more'),
         DeclareLaunchArgument('picture', default_value='', description='a PNG file to write'),
+        checked({'environment': 'apartment and cubicles are no files'}, {'picture': PICTURES},
+                made=('apartment', 'cubicles')),
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'planner', 'launch_foxglove': LaunchConfiguration('foxglove')}),
         CloudNode(machine='planner', package='fogros2_examples', executable='motion_planner',

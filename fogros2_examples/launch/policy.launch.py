@@ -8,6 +8,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 
 from fogros2 import CloudNode, FogMachine, FogROSLaunchDescription
 from fogros2_examples.ending import ended
+from fogros2_examples.files import checked, PICTURES
 
 
 def generate_launch_description():
@@ -32,6 +33,7 @@ def generate_launch_description():
                               description='how many times slower the policy runs'),
         *(DeclareLaunchArgument(name, default_value=str(value), description=what)
           for name, (value, what) in shown.items()),
+        checked({'policy': 'make demo-policy trains one'}, {'runs': (), 'picture': PICTURES}),
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'policy', 'launch_foxglove': LaunchConfiguration('foxglove')}),
         CloudNode(machine='policy', package='fogros2_examples', executable='policy_server',

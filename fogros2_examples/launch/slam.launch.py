@@ -8,6 +8,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 
 from fogros2 import CloudNode, FogMachine, FogROSLaunchDescription
 from fogros2_examples.ending import ended
+from fogros2_examples.files import checked, PICTURES
 
 
 def generate_launch_description():
@@ -35,6 +36,8 @@ def generate_launch_description():
                               description="'replace': keep the map, and continue it elsewhere"),
         *(DeclareLaunchArgument(name, default_value=str(value), description=what)
           for name, (value, what) in shown.items()),
+        checked({'dataset': "'' stands for the synthetic room"},
+                {'picture': PICTURES, 'results': ()}),
         FogMachine(LaunchConfiguration('machine'), {'name': 'slam', 'on_interrupt': answer,
                    'launch_foxglove': LaunchConfiguration('foxglove')}),
         CloudNode(machine='slam', package='fogros2_examples', executable='slam', output='screen',

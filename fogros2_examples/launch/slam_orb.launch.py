@@ -8,6 +8,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 
 from fogros2 import CloudNode, FogMachine, FogROSLaunchDescription
 from fogros2_examples.ending import ended
+from fogros2_examples.files import checked, PICTURES
 
 
 def generate_launch_description():
@@ -48,6 +49,8 @@ def generate_launch_description():
             name, default_value=None if value is None else str(value), description=what)
           for name, (value, what) in (asked | shown).items()),
         # Other machines than containers can run containers by default.
+        checked({'dataset': "'' stands for the synthetic room"},
+                {'picture': PICTURES, 'results': ()}),
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'slam', 'mounts': LaunchConfiguration('mounts'),
             'containers': PythonExpression(

@@ -6,6 +6,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription, StreamTopic
+from fogros2_examples.files import checked
 
 
 def generate_launch_description():
@@ -18,6 +19,7 @@ def generate_launch_description():
                               description="'synthetic', a video file, or a device (/dev/video0)"),
         DeclareLaunchArgument('count', default_value='0',
                               description='images after which the launch ends, 0 for never'),
+        checked({'source': 'source:=synthetic takes no camera'}, made=('synthetic',)),
         CloudNode(machine=machine, package='fogros2_examples', executable='image_processor',
                   output='screen', stream_topics=[
                       ('/camera', 'h264'),

@@ -29,8 +29,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
 from visualization_msgs.msg import MarkerArray
 
+from fogros2_examples.files import PICTURES
 from fogros2_examples.meshes import Floats
-from fogros2_examples.parameters import BadParameter, PICTURES, within, writable
+from fogros2_examples.parameters import BadParameter, within, writable
 from fogros2_examples.planning.app_files import BadFile, loaded
 from fogros2_examples.planning.messages import (
     COLOURS,

@@ -19,7 +19,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image, JointState, TimeReference
 from std_msgs.msg import Float64MultiArray, Header
 
-from fogros2_examples.parameters import PICTURES, run, within, writable
+from fogros2_examples.files import PICTURES
+from fogros2_examples.parameters import run, within, writable
 from fogros2_examples.policy import arm
 from fogros2_examples.policy.messages import SENSED
 from fogros2_examples.policy.picture import draw, summary

@@ -32,7 +32,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image, TimeReference
 from std_msgs.msg import Header
 
-from fogros2_examples.parameters import BadParameter, PICTURES, within, writable
+from fogros2_examples.files import PICTURES
+from fogros2_examples.parameters import BadParameter, within, writable
 from fogros2_examples.slam import messages, sources
 from fogros2_examples.slam.evaluation import Accuracy, accuracy
 from fogros2_examples.slam.geometry import Array

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import collections.abc
 import os
+import traceback
 from typing import Any, Callable, Iterable, Optional, Union
 
 from .launch_context import LaunchContext
@@ -265,13 +266,25 @@ class Action(LaunchDescriptionEntity):
 
 
 class InvalidLaunchFileError(Exception):
-    """No loader could read a launch file; the first of their errors is the likeliest."""
+    """
+    No loader could read a launch file.
+
+    :param path: the file, if there is one error, which gets its place in it.
+    """
 
     def __init__(
-        self, extension: str = '', *, likely_errors: list[Exception] | None = None
+        self, extension: str = '', *, likely_errors: list[Exception] | None = None, path: str = ''
     ) -> None:
         text = 'The launch file may have a syntax error, or its format is unknown'
-        if extension and likely_errors:
+        if path and likely_errors and len(likely_errors) == 1:
+            self.__cause__ = error = likely_errors[0]
+            line = vars(error).get('line') or ([None] + [
+                frame.lineno for frame in traceback.extract_tb(error.__traceback__)
+                if frame.filename == path])[-1]
+            place = f'{path}, line {line}' if line else path
+            # YAML's errors have several lines.
+            text = f"{place}: {type(error).__name__}: {' '.join(str(error).split())}"
+        elif extension and likely_errors:
             kind = 'multiple exceptions' if len(likely_errors) > 1 else 'exception'
             text = '\n - '.join([
                 f'Caught {kind} when trying to load file of format [{extension}]:',

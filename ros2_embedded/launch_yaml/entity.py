@@ -39,12 +39,16 @@ class Entity(BaseEntity):
             children = children['children']
         entities: list[BaseEntity] = []
         for child in children:
+            line = getattr(child, 'line', self.line)
             if not isinstance(child, dict) or len(child) != 1:
-                raise RuntimeError(
+                error = RuntimeError(
                     'Subentities must be a dictionary with only one key, '
                     'which is the entity type')
+                vars(error)['line'] = line
+                raise error
             [(type_name, element)] = child.items()
             entities.append(Entity(element, type_name, self))
+            entities[-1].line = line
         return entities
 
     def assert_entity_completely_parsed(self) -> None:

@@ -3,7 +3,9 @@
 
 import asyncio
 import importlib.util
+import inspect
 import os
+import re
 import sys
 import textwrap
 
@@ -350,19 +352,30 @@ def test_launch_file_knows_its_own_path(tmp_path):
     assert ThisLaunchFileDir().perform(context) == str(tmp_path)
 
 
-@pytest.mark.parametrize('content, expected', [
-    ('def broken(:', r'SyntaxError: .*\(broken.launch.py, line 1\)'),
-    ('x = 1', r"does not contain the required function 'generate_launch_description\(\)'"),
-    ('import nothing_of_the_kind', "ModuleNotFoundError: No module named 'nothing_of_the_kind'"),
-])
-def test_broken_launch_file_is_reported(tmp_path, content, expected, capsys):
-    path = tmp_path / 'broken.launch.py'
+@pytest.mark.skipif('path' not in inspect.signature(InvalidLaunchFileError).parameters,
+                    reason='ROS 2 reports the errors of all loaders')
+@pytest.mark.parametrize('name, content, expected', [
+    ('a.py', 'def broken(:', ': SyntaxError: .*line 1'),
+    ('a.py', 'x = 1', ": .* required function 'generate_launch_description()'"),
+    ('a.py', '\nimport nothing_of_it', ", line 2: ModuleNotFoundError: .* 'nothing_of_it'"),
+    ('a.yaml', 'launch:\n- log: {message: a\n', ': ParserError: .*line 3, column 1'),
+    ('a.yaml', 'launch:\n\t- log', ': ScannerError: .*line 2, column 1'),
+    ('a.yaml', 'launch: []\nother: []', ': RuntimeError: Expected only one root'),
+    ('a.yaml', 'launch:\n- log: {message: a}\n- lo: {}', ', line 3: RuntimeError: .*: lo'),
+    ('a.yaml', 'launch:\n- group:\n  - log: {mesage: a}', ", line 3: AttributeError: .*'message'"),
+    ('a.yaml', 'launch:\n- log: {message: a}\n- log:\n  message: b', ', line 3: .* only one key'),
+    ('a.yaml', 'launch:\n- log: {message: $(va a)}', ', line 2: RuntimeError: .*: va'),
+    ('a.xml', '<launch>\n</lauch>', ': ParseError: mismatched tag: line 2, column 2'),
+    ('a.xml', '<launch><log/></launch>', ": AttributeError: .*'message'")])
+def test_mistake_in_launch_file_is_one_line_with_place(tmp_path, name, content, expected, capsys):
+    path = tmp_path / name
     path.write_text(content)
-    with pytest.raises(InvalidLaunchFileError, match=expected):
+    with pytest.raises(InvalidLaunchFileError) as caught:
         AnyLaunchDescriptionSource(str(path)).get_launch_description(LaunchContext())
+    text = str(caught.value)
+    assert re.fullmatch(re.escape(str(path)) + expected.replace('()', r'\(\)') + '.*', text), text
     assert run(IncludeLaunchDescription(str(path))) == 1
-    assert 'Caught multiple exceptions when trying to load file of format [py]' in (
-        capsys.readouterr().out)
+    assert f'{text}\n' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize('name, content', [

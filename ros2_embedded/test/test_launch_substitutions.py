@@ -278,20 +278,6 @@ def test_invalid_launch_file_is_reported(context, tmp_path, capsys, content, err
     assert re.search(error, out)
 
 
-@pytest.mark.parametrize('name, content, error', [
-    ('bad.launch.xml', '<launch>\n<log message=/>\n</launch>',
-     r'ParseError: not well-formed \(invalid token\): line 2, column 13'),
-    ('bad.launch.yaml', 'launch:\n- log: {message: a\n- x',
-     r'ParserError: while parsing a flow mapping\n  in ".*bad.launch.yaml", line 2, column 8'),
-    ('bad.launch.py', 'import launch\ndef f(:\n',
-     r'SyntaxError: invalid syntax \(bad.launch.py, line 2\)')])
-def test_syntax_error_has_file_and_line(context, tmp_path, capsys, name, content, error):
-    (tmp_path / name).write_text(content)
-    assert launch_file(tmp_path / name) == 1
-    out = capsys.readouterr().out
-    assert re.search(error, out) and name in out
-
-
 def test_exposed_action_is_an_element(context, tmp_path, capsys):
     @expose_action('fog_test_action')
     class Exposed(LogInfo):

@@ -311,3 +311,38 @@ def test_incompatible_extension_point_is_refused():
     for version, caret_range in (('0.1', '^0.2'), ('0.2', '^0.1'), ('2.0', '^1.2')):
         with pytest.raises(PluginException):
             satisfies_version(version, caret_range)
+
+
+@embedded_alone
+@pytest.mark.parametrize('module', ['argparse', 'signal', 'ros2cli.command'])
+def test_ctrl_c_during_an_import_is_no_traceback(module):
+    code = textwrap.dedent(f"""
+        import builtins, os, signal
+        found = builtins.__import__
+
+        def interrupted(name, *words):
+            if name == {module!r}:
+                os.kill(os.getpid(), signal.SIGINT)
+            return found(name, *words)
+
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        builtins.__import__ = interrupted
+        from ros2cli.script import main
+        """)
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, '')
+
+
+@embedded_alone
+@pytest.mark.parametrize('handler', ['default_int_handler', 'SIG_IGN'])
+def test_script_gives_ctrl_c_back(handler):
+    """A shell starts a program in the background with SIGINT ignored."""
+    code = textwrap.dedent(f"""
+        import signal
+        signal.signal(signal.SIGINT, signal.{handler})
+        from ros2cli import cli, script
+        cli.main = lambda: signal.getsignal(signal.SIGINT)
+        print(script.main() is signal.{handler})
+        """)
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert done.stdout == 'True\n', done.stderr

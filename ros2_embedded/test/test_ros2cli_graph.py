@@ -9,6 +9,9 @@ import sys
 
 import pytest
 
+ours = pytest.mark.skipif(
+    not importlib.util.find_spec('embedded_default'), reason='is ROS 2 itself')
+
 NODE = '''
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
@@ -107,7 +110,7 @@ def test_topic_pub_publishes_and_ends(worker):
                             values, status=1)
 
 
-@pytest.mark.skipif(not importlib.util.find_spec('embedded_default'), reason='is ROS 2 itself')
+@ours
 def test_first_message_reaches_the_awaited_subscription():
     for number in range(4):
         topic = f'/first{number}'
@@ -181,3 +184,63 @@ def test_param_verbs_list_get_and_set(worker):
         ros2('param', 'set', '/cell/worker', 'speed', 'fast')
     assert 'Node not found' in ros2('param', 'get', '/none', 'speed', status=1)
     assert 'Parameter not set' in ros2('param', 'get', '/cell/worker', 'none', status=1)
+
+
+class Graph:
+    """A node that sees others at certain times of a clock of its own."""
+
+    def __init__(self, *times):
+        self.times, self.now = times, 0.0
+
+    def spin_once(self, node, timeout_sec):
+        self.now += timeout_sec
+
+    def get_node_names_and_namespaces(self):
+        return [(f'n{time}', '/') for time in self.times if time <= self.now]
+
+    def get_topic_names_and_types(self):
+        return []
+
+    get_service_names_and_types = get_topic_names_and_types
+
+
+@ours
+@pytest.mark.parametrize('times, enough, end', [
+    ((0.1,), None, 1.3), ((0.1, 1.2), None, 2.4), ((), None, 3), ((0.1, 1.2, 2.3), None, 3),
+    ((0.5,), lambda node: node.get_node_names_and_namespaces(), 0.5), ((), lambda node: True, 0)])
+def test_discovery_waits_for_answers_sent_again(monkeypatch, times, enough, end):
+    import rclpy
+    from ros2cli.node import direct
+    graph = Graph(*times)
+    monkeypatch.setattr(rclpy, 'spin_once', graph.spin_once)
+    monkeypatch.setattr(direct.time, 'monotonic', lambda: graph.now)
+    node = direct.DirectNode.__new__(direct.DirectNode)
+    node.node = graph
+    node._discover(None, enough)
+    assert end <= graph.now < end + 0.2
+
+
+BUFFERS = '''
+import argparse, os, socket
+from ros2cli.node.direct import DirectNode
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as new:
+    default = new.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+with DirectNode(argparse.Namespace(spin_time=0)):
+    for name in os.listdir('/proc/self/fd'):
+        try:
+            one = socket.socket(fileno=os.dup(int(name)))
+        except OSError:
+            continue
+        with one:
+            if one.type == socket.SOCK_DGRAM and one.family == socket.AF_INET:
+                print(one.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) > default)
+'''
+
+
+@ours
+def test_answers_of_many_nodes_fit_the_receive_buffer():
+    environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
+    del environment['FASTRTPS_DEFAULT_PROFILES_FILE']
+    done = subprocess.run([sys.executable, '-c', BUFFERS], env=environment, text=True,
+                          capture_output=True, timeout=60)
+    assert done.stdout.count('True') >= 2, done.stdout + done.stderr

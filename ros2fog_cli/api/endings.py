@@ -159,7 +159,7 @@ def _sure(record: Record) -> bool:
     A record of an older version, or in a copied state folder, may be another computer's: then
     the machine's agent has to be asked.
     """
-    return record.robot == robot_id()
+    return record.robot == robot_id(new=False)
 
 
 def _hears_launch(client: AgentClient) -> bool:

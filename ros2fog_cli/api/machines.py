@@ -87,7 +87,7 @@ class Entry:
     @property
     def own(self) -> bool:
         """Whether the machine belongs to this robot; older versions used its name in tags."""
-        return self.robot in ('', robot_name(), robot_id())
+        return self.robot in ('', robot_name(), robot_id(new=False))
 
     @property
     def created(self) -> Optional[float]:

@@ -37,10 +37,14 @@ class MachineOption:
 
     def prestart(self, args: argparse.Namespace) -> None:
         """
-        Parse the arguments before the launch starts.
+        Parse the arguments, and make launch's log folder, before the launch starts.
 
-        :raises ConfigurationError: an argument is invalid.
+        :raises ConfigurationError: an argument is invalid, or the folder cannot be made.
         """
+        from fogros2.launch_internals import hints
+        from fogros2.runtime import log_files
+        log_files.prepare()
+        hints.of_actions()
         self._overrides = None
         if args.machine:
             from fogros2.describe.overrides import Overrides

@@ -3,15 +3,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 from pathlib import Path
 import shutil
+import socket
 import uuid
 
 import pytest
 
 from fogros2 import process
+from fogros2.dds.zenoh import USERS_ROUTER
 from fogros2.model import Command
 from rigs.colcon_workspace import colcon_workspace
 from rigs.launched import launching
@@ -143,13 +146,19 @@ def test_zenoh_has_a_router_on_each_side(tmp_path: Path, cloud_network: str) -> 
     root = tmp_path / 'workspace'
     variables = {**os.environ, **colcon_workspace(root, 'rmw_zenoh_cpp', programs={
         'rmw_zenohd': ROUTER, 'talker': TALKER, 'listener': LISTENER})}
+    # zenoh looks for nothing else all the same
+    variables.pop('ROS_AUTOMATIC_DISCOVERY_RANGE')
     index = root / 'install/rmw_zenoh_cpp/share/ament_index/resource_index/rmw_typesupport'
     index.mkdir()
     (index / 'rmw_zenoh_cpp').touch()
     path = tmp_path / 'rmw.launch.py'
     path.write_text(ZENOH.format(name=NAME, network=cloud_network, root=root))
-    with launching() as launch:
+    with contextlib.ExitStack() as users, launching() as launch:
+        # stands for a router of the user's, where there is none
+        with contextlib.suppress(OSError):
+            users.enter_context(socket.create_server(USERS_ROUTER))
         launched = launch(str(path), environment=variables)
+        launched.wait_for('do not reach the nodes of another rmw_zenohd on this robot')
         launched.wait_for('I heard up', times=3)
         launched.wait_for('I heard down', times=3)
         routers = process.run(

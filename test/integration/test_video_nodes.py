@@ -122,6 +122,13 @@ def test_a_mistyped_topic_gets_the_nearest(bench: Bench) -> None:
     assert not any('no images' in line for line in right)
 
 
+def test_streams_own_copy_is_not_suggested(bench: Bench) -> None:
+    bench.node.create_publisher(Image, '/fogros2/slam/camera/image', RELIABLE)
+    lines = bench.start('encoder', '-r', 'image:=/camera/image')
+    bench.until(lambda: any('no images on /camera/image' in line for line in lines), 'a warning')
+    assert not any('did you mean' in line for line in lines)
+
+
 def test_no_subscriber_no_work(bench: Bench) -> None:
     """The raw topic and the stream are subscribed to while someone sees the images."""
     bench.pair()

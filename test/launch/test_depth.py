@@ -151,7 +151,7 @@ def test_settings_of_a_group_reach_its_nodes(run, fake, planner):
     words = [word for word in spec.arguments if isinstance(word, str)]
     assert words[0] == '--fast'
     assert '__node:=mover' in words and '__ns:=/arm' in words
-    assert 'use_sim_time:=True' in words and 'in:=out' in words
+    assert 'use_sim_time:=true' in words and 'in:=out' in words
     (key, content), = spec.files.items()
     assert spec.arguments[words_index(spec.arguments, '--params-file') + 1] == ({'file': key},)
     assert 'speed: 3' in content

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
 from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 import io
@@ -42,6 +43,7 @@ from fogros2.describe.overrides import Overrides
 from fogros2.errors import ConfigurationError
 from fogros2.image_transport.nodes import H264
 from fogros2.testing.plugins import instead
+from ros2fog_cli.option.machine import MachineOption
 
 KINDS = [Node, LifecycleNode, ComposableNodeContainer]
 
@@ -345,8 +347,11 @@ def test_a_node_without_machine_stays_launch_ros_s_in_xml():
 
 # -- other launch files --------------------------------------------------------------------------
 
+ONLY_BELOW = 'node takes a machine only below fogros_launch .* or write cloud_node instead'
+
+
 def fails(text):
-    with pytest.raises(Exception, match='machine'):
+    with pytest.raises(ConfigurationError, match=ONLY_BELOW):
         load(f'<launch>{text}</launch>')
 
 
@@ -371,8 +376,43 @@ def test_machine_is_for_fogros_launch_alone(registry, tmp_path):
     (tmp_path / 'inner.launch.xml').write_text(f'<launch>{talker}</launch>')
     source = AnyLaunchDescriptionSource(str(tmp_path / 'inner.launch.xml'))
     IncludeLaunchDescription(source)
-    with pytest.raises(Exception, match='machine'):
+    with pytest.raises(Exception, match=ONLY_BELOW):
         source.get_launch_description(LaunchContext())
+
+
+@pytest.mark.parametrize(('text', 'said'), [
+    ('<node_container machine="p" pkg="a" exec="b" name="c" namespace=""/>',
+     'node_container takes a machine only below fogros_launch'),
+    ('<lifecycle_node machine="p" pkg="a" exec="b" name="c" namespace=""/>',
+     'lifecycle_node takes a machine only below fogros_launch'),
+    ('<group machine="p"/>', 'group takes no machine .write cloud_group'),
+    ('<fogros_launch><group machine="p"/></fogros_launch>', 'group takes no machine'),
+    ('<include file="a" machine="p"/>', 'include takes no machine .put it into a cloud_group')])
+def test_element_given_a_machine_says_which_takes_one(registry, text, said):
+    with pytest.raises(ConfigurationError, match=said):
+        load(f'<launch>{text}</launch>')
+
+
+class Derived(launch_ros.actions.Node):
+    pass
+
+
+@pytest.mark.parametrize(('cls', 'kwargs', 'said'), [
+    (launch_ros.actions.Node, {'executable': 'a'}, r'Node of launch_ros\S* takes no machine '
+     r'\(use the Node of fogros2: from fogros2 import Node\)'),
+    (Derived, {'executable': 'a'}, 'Derived of .* from fogros2 import Node'),
+    (launch_ros.actions.LifecycleNode, {'executable': 'a', 'name': 'b', 'namespace': ''},
+     'from fogros2 import LifecycleNode'),
+    (launch_ros.actions.ComposableNodeContainer,
+     {'executable': 'a', 'name': 'b', 'namespace': ''},
+     'from fogros2 import ComposableNodeContainer'),
+    (GroupAction, {'actions': []}, r'GroupAction of launch\S* .*CloudGroup\(machine, '),
+    (IncludeLaunchDescription, {'launch_description_source': 'a'}, r'.*CloudGroup\(machine, ')])
+def test_action_given_a_machine_says_what_to_import(planner, cls, kwargs, said):
+    option = MachineOption()
+    option.prestart(Namespace(machine=[]))
+    with pytest.raises(ConfigurationError, match=said):
+        cls(machine=planner, **kwargs)
 
 
 @pytest.mark.parametrize('wrong', [

@@ -21,7 +21,7 @@ EXAMPLES = {
     'talker.container': {'name': 'other', 'on_exit': 'stop', 'network': 'net', 'count': '7'},
     'two_clouds': {'name': 'one', 'second_name': 'two', 'on_exit': 'keep', 'network': 'net',
                    'count': '7'},
-    'video.container': {'name': 'other', 'source': '/dev/video3', 'count': '7'},
+    'video.container': {'name': 'other', 'source': '/dev/null', 'count': '7'},
 }
 
 

@@ -692,3 +692,14 @@ def test_closed_pipe_ends_no_deletion(
         monkeypatch.setattr('sys.stdout', closed)
         assert run(*verb) == 0
     assert not Cloud.machines and not Store().machines()
+
+
+def test_list_writes_nothing(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As with a home that is read-only or full."""
+    machine('slam')
+    monkeypatch.setenv('XDG_CONFIG_HOME', '/dev/null')
+    monkeypatch.setenv('FOGROS2_STATE_HOME', '/dev/null/state')
+    assert run('list') == 0
+    assert 'running (orphan)' in capfd.readouterr().out

@@ -28,12 +28,16 @@ def test_nodes_know_the_router_of_their_host_alone() -> None:
         'RMW_IMPLEMENTATION': 'rmw_zenoh_cpp', 'ZENOH_SESSION_CONFIG_URI': '/x'}
 
 
-def test_the_robots_router_dials_machines_and_what_the_user_has() -> None:
-    router = Zenoh().router(ROBOT, [MACHINE], {'ROS_STATIC_PEERS': 'nuc.local'})
-    assert router is not None
+@pytest.mark.parametrize('user, others, beside', [
+    ({}, [], ('127.0.0.1', 7447)),
+    ({'ROS_STATIC_PEERS': 'nuc.local'}, ['tcp/nuc.local:7447'], ('127.0.0.1', 7447)),
+    ({'ROS_STATIC_PEERS': '127.0.0.1'}, ['tcp/127.0.0.1:7447'], None)])
+def test_robots_router_dials_machines_and_what_the_user_names(
+        user: dict[str, str], others: list[str], beside: tuple[str, int] | None) -> None:
+    router = Zenoh().router(ROBOT, [MACHINE], user)
+    assert router is not None and router.beside == beside
     assert json.loads(router.config)['listen']['endpoints'] == [f'tcp/{ROBOT}:7448']
-    assert dialled(router.config) == [
-        f'tcp/{MACHINE}:7448', 'tcp/127.0.0.1:7447', 'tcp/nuc.local:7447']
+    assert dialled(router.config) == [f'tcp/{MACHINE}:7448', *others]
 
 
 @pytest.mark.parametrize('user', [

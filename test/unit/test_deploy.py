@@ -631,9 +631,38 @@ def test_silence_is_reported_within_5_s_and_its_end(cut, provider):
     wait_until(lambda: bool(reported), timeout=10, what='a report')
     link.cut_at = None
     wait_until(lambda: len(reported) > 1, timeout=5, what='the end')
-    assert [(event.machine, round(event.seconds)) for event in reported] == [
-        ('planner', 5), ('planner', 0)]
-    assert events == []
+    assert [(event.machine, event.over) for event in reported] == [
+        ('planner', False), ('planner', True)]
+    assert all(4.5 < event.seconds < 6.5 for event in reported) and events == []
+
+
+def heard(*silences):
+    """Return what is reported of silences: the seconds of each, and of the answers after it."""
+    alarm, now, due = watching.SilenceAlarm(), 1000.0, []
+    for seconds, answers in silences:
+        for age in (tick / 5 for tick in range(int(5 * seconds) + 1)):
+            due.append(alarm.due(age, now + age))
+        now += seconds
+        for tick in range(int(answers) + 1):
+            due.append(alarm.due(0.5, now + tick))
+        now += answers
+    return [(round(one[0]), one[1]) for one in due if one is not None]
+
+
+def test_many_short_silences_are_reported_once():
+    """46 of them came in 14 minutes on a busy computer."""
+    assert heard(*[(5.5, 12.0), (7.0, 13.0)] * 23) == [(5, False), (5, True)]
+
+
+def test_silence_is_reported_by_its_duration():
+    assert heard((100.0, 5.0)) == [
+        (5, False), (10, False), (20, False), (40, False), (80, False), (100, True)]
+    assert heard((6.0, 5.0), (30.0, 5.0)) == [
+        (5, False), (6, True), (10, False), (20, False), (30, True)]
+
+
+def test_silence_after_a_calm_is_reported_again():
+    assert heard((6.0, watching.CALM + 9), (6.0, 9.0)) == [(5, False), (6, True)] * 2
 
 
 @pytest.mark.parametrize('cut', [True, False], indirect=True)

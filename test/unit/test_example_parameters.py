@@ -13,12 +13,8 @@ from launch import LaunchContext
 from launch.actions import Shutdown
 
 from fogros2_examples.ending import ended
-from fogros2_examples.parameters import (
-    BadParameter,
-    PICTURES,
-    within,
-    writable,
-)
+from fogros2_examples.files import checked, PICTURES
+from fogros2_examples.parameters import BadParameter, within, writable
 
 
 class Given:
@@ -79,3 +75,23 @@ def test_launch_ends_with_the_status_of_its_node():
         exited(2)
     context._set_is_shutdown(True)
     assert exited(2) is None and exited(0) is None
+
+
+@pytest.mark.parametrize(('given', 'said'), [
+    ({'policy': 'absent.onnx'}, 'policy:=absent.onnx: there is no such file here (train one)'),
+    ({'picture': 'here.txt'}, 'picture:=here.txt: it has to end in .png, .jpg, .jpeg'),
+    ({'runs': 'nowhere/runs'}, 'runs:=nowhere/runs: there is no folder nowhere'),
+    ({}, ''), ({'policy': 'synthetic'}, ''), ({'policy': 'there.onnx'}, ''),
+    ({'policy': '.', 'picture': 'new.png', 'runs': 'there.onnx'}, '')])
+def test_files_are_checked_before_the_machine(given, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'there.onnx').touch()
+    context = LaunchContext()
+    context.launch_configurations.update({'policy': '', 'picture': '', 'runs': '', **given})
+    action = checked({'policy': 'train one'}, {'picture': PICTURES, 'runs': ()}, ['synthetic'])
+    if not said:
+        assert not action.execute(context)
+        return
+    with pytest.raises(RuntimeError) as caught:
+        action.execute(context)
+    assert str(caught.value) == said

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy
 import pytest
@@ -13,7 +14,7 @@ pytest.importorskip('cv2', reason='OpenCV is in the extra applications')
 
 from std_msgs.msg import Header
 
-from fogros2_examples.grasp import antipodal, messages
+from fogros2_examples.grasp import antipodal, grasp_camera, messages
 from fogros2_examples.grasp.antipodal import Gripper, margin, plan
 from fogros2_examples.grasp.bins import camera, HEIGHT
 from fogros2_examples.grasp.picture import beside, picture
@@ -105,3 +106,48 @@ def test_grasps_survive_their_marker_messages():
     assert poses.poses[0] == markers.markers[1].pose
     image = picture(numpy.full((60, 80), 0.6, numpy.float32), grasps, 100, 'one')
     assert beside([image] * 3, 2).shape == (90, 120, 3)
+
+
+class SlowPlanner:
+    """Answers depth images in order, each after ``seconds``; the first ``lost`` never come."""
+
+    def __init__(self, monkeypatch, seconds, lost=0, wait=60.0):
+        self.now, self.free, self.lost, self.due = 0.0, 0.0, lost, {}
+        self.seconds_each = seconds
+        self.camera = camera = grasp_camera.GraspCamera.__new__(grasp_camera.GraspCamera)
+        camera.wait, camera.answers, camera.seconds = wait, {}, {}
+        monkeypatch.setattr(camera, '_published', self.published)
+        monkeypatch.setattr(camera, '_until', self.until)
+        monkeypatch.setattr(grasp_camera, 'time', SimpleNamespace(monotonic=lambda: self.now))
+
+    def published(self, depth):
+        key = (round(self.now), len(self.due) + self.lost)
+        if self.lost:
+            self.lost -= 1
+        else:
+            self.free = self.due[key] = max(self.now, self.free) + self.seconds_each
+        return key
+
+    def until(self, true, wait):
+        end = self.now + wait
+        while not true() and self.now < end:
+            self.now += 0.5
+            for key, at in self.due.items():
+                if at <= self.now:
+                    self.camera.answers[key], self.camera.seconds[key] = [], self.seconds_each
+        return true()
+
+
+@pytest.mark.parametrize(('seconds', 'lost', 'works', 'images'), [
+    (0.2, 0, True, 1), (14.0, 0, True, 2), (14.0, 2, True, 3), (50.0, 0, True, 4),
+    (70.0, 0, False, 4), (0.2, 9, False, 4)])
+def test_slow_planner_is_waited_for(monkeypatch, seconds, lost, works, images):
+    planner = SlowPlanner(monkeypatch, seconds, lost)
+    published = planner.published
+    monkeypatch.setattr(planner.camera, '_published', lambda depth: asked.append(1) or published(
+        depth))
+    asked = []
+    assert planner.camera._warm_up(None) is works
+    assert len(asked) == images
+    if works:
+        assert planner.free <= planner.now, 'the first bin waits for no earlier image'

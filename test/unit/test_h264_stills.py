@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
 pytest.importorskip('cv2', reason='OpenCV (the extra "video") is not installed')
 from image_transport_h264 import stills
-from image_transport_h264.codec import Damaged
+from image_transport_h264.codec import Damaged, Decoder, Encoder
 from image_transport_h264.picture import BadPicture, LAYOUTS, Picture
 
 
@@ -60,10 +60,20 @@ def test_yuv_comes_back_as_colours(encoding: str) -> None:
     assert 125 < got.rows().mean() < 135
 
 
-@pytest.mark.parametrize(('encoding', 'kind'), [('16UC1', 'jpeg'), ('32FC1', 'png')])
-def test_picture_that_a_format_cannot_hold_is_refused(encoding: str, kind: stills.Format) -> None:
-    with pytest.raises(BadPicture, match=encoding):
-        stills.encode(picture(encoding), kind)
+@pytest.mark.parametrize(('encoding', 'kind', 'message'), [
+    ('16UC1', 'jpeg', "JPEG can't hold 16UC1.* 'h264'.*or 'compressed' with format='png'"),
+    ('32FC1', 'jpeg', "JPEG can't hold 32FC1: use the transport 'h264'.* for it$"),
+    ('32FC1', 'png', "PNG can't hold 32FC1: use the transport 'h264'.* for it$"),
+    ('bayer_rggb8', 'jpeg', "'bayer_rggb8' isn't one of .* the transport 'raw', which carries"),
+    ('rgb16', 'png', "'rgb16' isn't one of .* the transport 'raw', which carries")])
+def test_refused_picture_names_what_carries_it(
+    encoding: str, kind: stills.Format, message: str,
+) -> None:
+    sent = picture(encoding) if encoding in LAYOUTS else Picture(4, 4, encoding, 24, bytes(96))
+    with pytest.raises(BadPicture, match=message):
+        stills.encode(sent, kind)
+    if encoding in LAYOUTS:
+        assert Decoder().decode(Encoder().encode(sent).data).encoding == encoding
 
 
 @pytest.mark.parametrize('data', [b'', b'nothing of the kind', b'\xff\xd8\xff\xe0' * 9])

@@ -246,7 +246,8 @@ def test_options_are_taken_as_they_are_meant(tmp_path):
                  ('--label', 'fogros2-name=m'),
                  ('--cap-add', 'NET_ADMIN')):
         assert any(words[i:i + 2] == list(pair) for i in range(len(words))), pair
-    assert '--privileged' not in words
+    # flags of podman alone, which docker refuses
+    assert '--privileged' not in words and '--no-hosts' not in words
     assert not any(secret in ' '.join(words) for secret in ('AAAA', '0123-token'))
 
 
@@ -275,10 +276,17 @@ def test_relays_of_one_user_meet_in_folders_of_their_own(monkeypatch, tmp_path):
     words = list(container_options.common_flags(Engine('podman'), spec, REQUEST, Options()))
     folder = container_machine.share_folder('0123-token')
     # a machine writes into its own folder alone
-    assert f'{folder}/own:/opt/fogros2/share:rw,nosuid,nodev,noexec' in words
+    assert f'{folder}/own:/opt/fogros2/share' in words
     assert f'{folder.parent}:/opt/fogros2/shared:ro,nosuid,nodev,noexec' in words
+    # docker's flag -v takes ro alone
+    assert ('type=volume,volume-nocopy,volume-opt=type=none,volume-opt=device='
+            f'{folder.parent},"volume-opt=o=bind,ro,nosuid,nodev,noexec",dst=/opt/fogros2/shared'
+            ) in container_options.common_flags(Engine('docker'), spec, REQUEST, Options())
     assert not any('fogros2/share' in word for word in container_options.common_flags(
         Engine('podman'), MachineSpec('m', 'container'), REQUEST, Options()))
+    with pytest.raises(ProviderError), container._sharing(spec, '0123-token'):
+        raise ProviderError('no image')
+    assert list(tmp_path.iterdir()) == []
     with container._sharing(spec, '0123-token'):
         assert [stat.S_IMODE(path.stat().st_mode) for path in (
             folder / 'own', folder, folder.parent, folder.parent.parent,

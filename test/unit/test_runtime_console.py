@@ -13,6 +13,7 @@ import launch.logging
 import pytest
 
 from fogros2.clock import ClockOffset
+from fogros2.errors import ConfigurationError
 from fogros2.report import (
     ClockMeasured,
     Progress,
@@ -22,6 +23,7 @@ from fogros2.report import (
     StepStarted,
     Warned,
 )
+from fogros2.runtime import log_files
 from fogros2.runtime.console import Console, Screen
 
 
@@ -98,9 +100,9 @@ def test_progress_on_a_terminal_only():
 def test_silence_and_its_end_are_a_line_each(lines):
     console = Console(io.StringIO())
     console(Silence('planner', 4.7))
-    console(Silence('planner', 0.0))
+    console(Silence('planner', 12.3, over=True))
     assert lines == [('WARNING', 'planner: no answer for 5 s (VPN); nodes keep running'),
-                     ('INFO', 'planner: answers again')]
+                     ('INFO', 'planner: answers again, after 12 s')]
 
 
 def test_warning_has_its_remedy_on_a_line_of_its_own(lines):
@@ -159,12 +161,21 @@ def test_full_disk_of_the_log_is_one_line(lines, capfd, monkeypatch):
     monkeypatch.setattr(handler, 'emit', lambda record: logging.StreamHandler.emit(
         handler, record))
     monkeypatch.setattr(handler, 'stream', full)
-    screen = io.StringIO()
-    console = Console(screen)
+    log_files.prepare()
+    console = Console(io.StringIO())
     for _ in range(3):
         console(StepDone('planner', 'sync', 1.0))
     console.close()
     with pytest.raises(OSError):
         full.close()
-    assert screen.getvalue().count("launch's log file can't be written: No space left") == 1
+    assert [text for level, text in lines if level == 'WARNING'] == [
+        "launch's log file can't be written: No space left on device\n"
+        'the launch goes on without it']
     assert 'Traceback' not in ''.join(capfd.readouterr())
+
+
+def test_log_folder_that_cannot_be_made_has_a_remedy(monkeypatch):
+    monkeypatch.setenv('ROS_LOG_DIR', '/dev/null/log')
+    launch.logging.reset()
+    with pytest.raises(ConfigurationError, match='Not a directory .ROS_LOG_DIR names another'):
+        log_files.prepare()

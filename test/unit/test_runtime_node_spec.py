@@ -111,7 +111,7 @@ def test_parameter_files_travel(context, prefix, tmp_path):
     assert keys[0].endswith('arm.yaml')
     assert spec.files[keys[0]] == (
         '/**:\n  ros__parameters:\n    model: ', {'share': 'demo'}, '/arm.urdf\n')
-    assert 'speed: 3' in spec.files[keys[1]]
+    assert '"speed": 3' in spec.files[keys[1]]
 
 
 def test_files_in_plain_arguments_travel(context, tmp_path):

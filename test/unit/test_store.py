@@ -12,7 +12,16 @@ import pytest
 from fogros2 import store as store_module
 from fogros2.errors import ConfigurationError, NameTaken, StoreError
 from fogros2.model import Endpoint, MachineSpec, VpnInterface
-from fogros2.store import boot_id, process_start, Record, Store, write_private
+from fogros2.store import (
+    boot_id,
+    is_another_robot,
+    process_start,
+    Record,
+    robot_id,
+    robot_name,
+    Store,
+    write_private,
+)
 
 
 @pytest.fixture
@@ -179,3 +188,29 @@ def test_a_state_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
     (tmp_path / 'file').touch()
     with pytest.raises(StoreError, match='FOGROS2_STATE_HOME'):
         Store(tmp_path / 'file').save(record())
+
+
+def test_robot_that_cannot_write_has_a_name_to_read_with(monkeypatch):
+    monkeypatch.setenv('XDG_CONFIG_HOME', '/dev/null')
+    monkeypatch.setenv('FOGROS2_STATE_HOME', '/dev/null/state')
+    assert robot_id(new=False) == robot_name()
+    assert is_another_robot(f'{robot_name()}-0123abcd')
+    with pytest.raises(StoreError, match=r'robot\.json can.t be written'):
+        robot_id()
+
+
+def test_readers_find_digits_that_they_may_not_write(monkeypatch, tmp_path):
+    monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path))
+    known = robot_id()
+    (tmp_path / 'fogros2/robot.json').chmod(0o400)
+    monkeypatch.setattr(store_module.os, 'open', read_only(os.open))
+    assert robot_id(new=False) == robot_id() == known and not is_another_robot(known)
+
+
+def read_only(opened):
+    """Return ``os.open`` for a file system that is mounted read-only."""
+    def opener(path, flags, *mode):
+        if flags & (os.O_WRONLY | os.O_RDWR):
+            raise OSError(errno.EROFS, 'Read-only file system')
+        return opened(path, flags, *mode)
+    return opener

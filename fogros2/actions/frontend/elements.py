@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 from launch.frontend import expose_action
 
+from fogros2.launch_internals import hints
+
 if TYPE_CHECKING:
     from launch.frontend import Entity, Parser
 
@@ -27,6 +29,7 @@ def _expose(name: str) -> None:
     expose_action(name)(parse)
 
 
+hints.of_elements()
 for _name in ('fog_machine', 'cloud_node', 'cloud_group', 'replicated', 'stream_topic',
               'fogros_launch'):
     _expose(_name)

@@ -25,6 +25,9 @@ POLL_INTERVAL = 5.0
 #: Seconds without an answer of machine and provider after which a machine is lost.
 LOSS = 37.0
 
+#: Seconds without a silence after which the next one is reported as the first.
+CALM = 600.0
+
 _ENDED = {
     MachineState.DELETED: 'it was deleted', MachineState.STOPPING: 'it is being ended',
     MachineState.STOPPED: 'it was stopped'}
@@ -58,6 +61,37 @@ class ClockComparison:
             self._reported = offset
 
 
+class SilenceAlarm:
+    """
+    Decide which silence to report: the first one, each that is twice as long, and their ends.
+
+    A busy computer or a bad network causes many short silences.
+    """
+
+    def __init__(self) -> None:
+        self._limit, self._seconds, self._last = SILENCE, 0.0, 0.0
+        self._reported = False
+
+    def due(self, age: float, now: float) -> Optional[tuple[float, bool]]:
+        """
+        Return the seconds of a silence to report, and whether it is over, or None.
+
+        :param age: seconds since the last answer.
+        :param now: on a monotonic clock.
+        """
+        if age > SILENCE:
+            self._seconds, self._last = age, now
+            if age > self._limit:
+                self._limit, self._reported = 2 * age, True
+                return age, False
+        elif self._reported:
+            self._reported = False
+            return self._seconds, True
+        elif now - self._last > CALM:
+            self._limit = SILENCE
+        return None
+
+
 class Watch(Step):
     """
     Report a machine that does not answer, and ask its provider whether the machine is gone.
@@ -82,7 +116,7 @@ class Watch(Step):
         self._gone = gone
         self._found = found
         self._lost = lost
-        self._silent = False
+        self._alarm = SilenceAlarm()
         #: Silence of a machine that will be replaced, even if its provider says that it runs.
         self._limit = (job.spec.on_loss_after or job.spec.robot_timeout) \
             if job.spec.on_interrupt == 'replace' else None
@@ -122,9 +156,9 @@ class Watch(Step):
 
     def _look(self) -> None:
         age = self._job.heartbeat.age or 0.0
-        if (age > SILENCE) != self._silent:
-            self._silent = not self._silent
-            self._context.report(Silence(self._job.name, age if self._silent else 0.0))
+        due = self._alarm.due(age, time.monotonic())
+        if due is not None:
+            self._context.report(Silence(self._job.name, *due))
         if self._limit is not None:
             if age > self._limit:
                 self._end(self._lost, f'it is lost: no answer for {age:.0f} s')

@@ -3,10 +3,11 @@
 Run machines on this computer: containers of podman or docker, each with an SSH server.
 
 ``engine`` calls podman and docker. ``root`` and ``debian_root`` make the root file system of a
-machine without an image, ``login_ids`` chooses the id of its user, ``entry`` makes its first
-process. ``packet_filter`` keeps machines from this computer's ports. ``machine`` reads the reports
-of the engine, ``options`` parses the options in launch files. ``served`` is a program for a
-computer that hosts machines of others, and ``hosted`` the robot's end of it.
+machine without an image, ``hidden_files`` leaves out what only root may read, ``login_ids``
+chooses the id of its user, ``entry`` makes its first process. ``packet_filter`` keeps machines
+from this computer's ports. ``machine`` reads the reports of the engine, ``options`` parses the
+options in launch files. ``served`` is a program for a computer that hosts machines of others, and
+``hosted`` the robot's end of it.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from fogros2.errors import (
 )
 from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider
-from fogros2.provider.container import debian_root, login_ids, packet_filter
+from fogros2.provider.container import debian_root, hidden_files, login_ids, packet_filter
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import entry as container_entry
 from fogros2.provider.container import machine as container_machine
@@ -47,14 +48,14 @@ from fogros2.waiting import wait_until
 _NO_UPPER = ('overlay', 'nfs', 'nfs4', 'cifs', 'vfat', 'exfat', 'ntfs', '9p', 'virtiofs', 'fuse')
 
 # One process does all steps, in its own session: a launch that is killed meanwhile leaves either
-# nothing or a machine with its watchdog. After the fourth argument come the paths of layers, an
+# nothing or a machine with its watchdog. After the seventh argument come the paths of layers, an
 # empty word, and the engine's words. The input is a line with a label, and the root's archive.
 #
 # The machine has this computer's user ids, and root there makes any file. So no other account
 # enters the folder, and no file in it gives rights or leads to a device, even where it is shown.
 _CREATE = """\
-top=$1 begin=$2 end=$3 clean=$4
-shift 4
+top=$1 begin=$2 inside=$3 end=$4 look=$5 clean=$6 shown=$7
+shift 7
 umask 022
 failed() {
     code=$?
@@ -75,10 +76,13 @@ mkdir "$top/root" "$top/hooks"
 IFS= read -r label
 printf '%s\n' "$label" >"$top/labels"
 printf %s "$begin" >"$top/hooks/begin.json"
+printf %s "$inside" >"$top/hooks/inside.json"
 printf %s "$end" >"$top/hooks/end.json"
 while [ -n "$1" ]; do mkdir -p "$top/layers$1/upper" "$top/layers$1/work"; shift; done
 shift
 engine=$1
+printf '%s' "$shown" >"$top/shown"
+python3 -IS -c "$look" "$top" </dev/null >/dev/null 2>&1 &
 tar -xpf - --numeric-owner -C "$top/root"
 "$@"
 """
@@ -89,8 +93,11 @@ top=$1
 install -d -m 700 "${top%/*}" "$top" "$top/hooks"
 [ ! -e "$top/root" ] || mountpoint -q "$top" || mount --bind -o nosuid,nodev "$top" "$top"
 printf %s "$2" >"$top/hooks/begin.json"
-printf %s "$3" >"$top/hooks/end.json"
-shift 3
+printf %s "$3" >"$top/hooks/inside.json"
+printf %s "$4" >"$top/hooks/end.json"
+rm -f "$top/hidden"
+if [ -e "$top/shown" ]; then python3 -IS -c "$5" "$top" </dev/null >/dev/null 2>&1 & fi
+shift 5
 "$@"
 """
 
@@ -108,9 +115,14 @@ umask 022
 printf '%s\\n' "$@" >"$top/topics"
 """
 
+_UNSHARE = 'rm -rf "$1"; rmdir "${1%/*}" "${1%/*/*}" 2>/dev/null'
+
 #: Maximum size of a host key's file in bytes.
 _KEY_BYTES = 4096
 _READ_PLAIN = f'[ -f "$1" ] && [ ! -L "$1" ] && head -c {_KEY_BYTES} -- "$1"'
+#: Maximum size of the part of a machine's log that is read, in bytes.
+_LOG_BYTES = 1 << 20
+_READ_LOG = f'"$@" 2>/dev/null | head -c {_LOG_BYTES}'
 
 #: Exit statuses of a regular end, SIGKILL and SIGTERM.
 _GOOD_ENDS = (0, 137, 143)
@@ -234,12 +246,13 @@ class ContainerProvider(Provider):
         base = str(debian_root.root(cancel=self.cancel)) if options.isolated else ''
         system = container_root.system_mounts(base)
         kept = spec.on_exit == 'stop'
+        environment = [] if base else container_root.environment_mounts(*spec.workspaces)
         words = [*container_options.common_flags(engine, spec, request, options)]
         for path in system:
             # Podman deletes its own layer when the container ends; a stopped machine keeps it.
             upper = f',upperdir={top}/layers{path}/upper,workdir={top}/layers{path}/work'
             words += ['-v', f"{base}{path}:{path}:O{upper if kept else ''}"]
-        for mount in () if base else container_root.environment_mounts(*spec.workspaces):
+        for mount in environment:
             words += ['-v', f'{mount}:{mount}:ro']
         number = login_ids.login_id(request.token)
         archive = _entry(spec, request, options, number)
@@ -249,7 +262,9 @@ class ContainerProvider(Provider):
                 f'{line}\n' for line in debian_root.release().sources).encode())
             archive.file('etc/apt/apt.conf.d/90fogros2', debian_root.connection().encode())
         command = Command(
-            ('sh', '-ec', _CREATE, 'sh', str(top), *hooks(top, kept=kept), clean(top),
+            ('sh', '-ec', _CREATE, 'sh', str(top), *hooks(top, kept=kept),
+             hidden_files.source(), clean(top),
+             ''.join(f'{path}\n' for path in (() if base else (*system, *environment))),
              *(system if kept else ()), '', engine.name, *engine.flags, *hook_flags(top),
              'run', '-d', '--cidfile', f'{top}/cid', '--label-file', f'{top}/labels', *words,
              '--rootfs', f'{top}/root', '/bin/sh', f'/{container_entry.FOLDER}/entry.sh'),
@@ -263,7 +278,7 @@ class ContainerProvider(Provider):
                 raise container_engine.translate(error) from error
             raise ProviderError(
                 f'an interrupted attempt to create {spec.name} left {top}',
-                f'sudo rm -rf {top}') from error
+                f'sudo umount -l {top}; sudo rm -rf {top}') from error
 
     def _create_from_image(
         self, engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
@@ -384,7 +399,11 @@ class ContainerProvider(Provider):
         labels = container_machine.labels_of(entry)
         path = container_machine.host_key_file(labels[container_machine.ATTEMPT])
         if not labels.get(container_machine.DIRECTORY):
-            log = engine.call('logs', identity, what='reading the host key', check=False).stdout
+            # the machine writes its log, so only its beginning is read
+            log = process.run(
+                Command(('sh', '-c', _READ_LOG, 'sh', *engine.argv('logs', identity)),
+                        sudo=engine.sudo, what='reading the host key'),
+                timeout=60.0, check=False).stdout
             text = _after(log, container_entry.HOST_KEY_MARK)
         elif os.geteuid() == 0:
             text = read_plain(path)
@@ -407,7 +426,8 @@ class ContainerProvider(Provider):
         if int(entry['State']['ExitCode']) in _GOOD_ENDS:
             return
         identity = str(entry['Id'])[:12]
-        log = engine.call('logs', identity, what='reading its log', check=False)
+        log = engine.call('logs', '--tail', '100', identity, what='reading its log', check=False,
+                          kept=_LOG_BYTES)
         reason = _after(log.stdout, container_entry.ERROR_MARK) \
             or container_engine.last_line(f'{log.stderr}\n{log.stdout}')
         raise ProviderError(f'container {identity} could not start: {reason}',
@@ -420,7 +440,8 @@ def _sharing(spec: MachineSpec, token: str) -> Iterator[None]:
     folder = str(container_machine.share_folder(token))
     with contextlib.ExitStack() as failed:
         if spec.share:
-            failed.callback(process.run, Command(('rm', '-rf', folder), sudo=True), timeout=10.0)
+            failed.callback(process.run, Command(('sh', '-c', _UNSHARE, 'sh', folder), sudo=True),
+                            timeout=10.0, check=False)
             process.run(Command(('sh', '-ec', _SHARE, 'sh', folder, *spec.share), sudo=True),
                         timeout=10.0)
         yield
@@ -444,8 +465,9 @@ def _start(engine: Engine, identity: str, token: str, *, kept: bool, what: str) 
     """Start a container with its packet filter; podman sets the filter before the start."""
     top = container_machine.directory(token)
     if engine.name == 'podman':
-        words = ('-ec', _START, 'sh', str(top), *hooks(top, kept=kept), engine.name,
-                 *engine.flags, *hook_flags(top), 'start', identity)
+        words = ('-ec', _START, 'sh', str(top), *hooks(top, kept=kept),
+                 hidden_files.source(), engine.name, *engine.flags, *hook_flags(top), 'start',
+                 identity)
         state = {}
     else:
         engine.call('start', identity, what=what)
@@ -505,12 +527,14 @@ def clean(top: Path) -> str:
 
 def hooks(top: Path, *, kept: bool) -> Iterator[str]:
     """
-    Yield the hooks by which podman sets a machine's packet filter, and cleans up at its end.
+    Yield the hooks by which podman sets a machine's packet filter and hides files, and cleans up
+    at its end.
 
     :param kept: only the filter ends with the container.
     """
     end = packet_filter.unset(filter_name(top)) if kept else clean(top)
     for stage, words in (('createRuntime', (packet_filter.SET, 'sh', filter_name(top))),
+                         ('createContainer', (hidden_files.HIDE, 'sh', str(top))),
                          ('poststop', (end,))):
         yield json.dumps({
             'version': '1.0.0', 'when': {'always': True}, 'stages': [stage],

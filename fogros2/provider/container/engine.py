@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import dataclasses
 import json
+import math
 import os
 from pathlib import Path
 import re
@@ -58,12 +59,13 @@ class Engine:
         return (self.name, *self.flags, *words)
 
     def call(self, *words: str, what: str, timeout: float = 60.0, check: bool = True,
-             data: bytes = b'', variables: Sequence[str] = (),
+             data: bytes = b'', variables: Sequence[str] = (), kept: float = math.inf,
              cancel: Optional[threading.Event] = None) -> Result:
         """
         Run a sub-command.
 
         :param variables: of its environment, as NAME=VALUE.
+        :param kept: see :func:`fogros2.process.run`.
         :raises ProviderError: the sub-command failed, and ``check`` is set.
         """
         argv = self.argv(*words)
@@ -71,7 +73,7 @@ class Engine:
             argv = ('env', *variables, *argv)  # sudo passes none on
         command = Command(argv, sudo=self.sudo, input=data, what=what)
         try:
-            return process.run(command, timeout=timeout, check=check, cancel=cancel)
+            return process.run(command, timeout=timeout, check=check, cancel=cancel, kept=kept)
         except CommandError as error:
             raise translate(error) from error
 

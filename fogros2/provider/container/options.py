@@ -197,8 +197,9 @@ def common_flags(
     for right in ('NET_ADMIN', 'NET_RAW', 'AUDIT_WRITE', 'MKNOD'):
         yield from ('--cap-add', right)
     yield from ('--device', '/dev/net/tun')
-    # Only the machine's name, not the names in this computer's /etc/hosts.
-    yield '--no-hosts'
+    if engine.name == 'podman':
+        # Only the machine's name, not the names in this computer's /etc/hosts, as docker does it.
+        yield '--no-hosts'
     yield from container_engine.limits()
     if options.network:
         yield from ('--network', options.network)
@@ -218,10 +219,7 @@ def common_flags(
         yield from ('-p', port)
     if spec.share:
         folder, (own, others) = share_folder(request.token), SHARE_FOLDERS
-        # a program of another machine gives no rights here
-        safe = ',nosuid,nodev,noexec' if engine.name == 'podman' else ''
-        yield from ('-v', f'{folder}/own:{own}:rw{safe}')
-        yield from ('-v', f'{folder.parent}:{others}:ro{safe}')
+        yield from ('-v', f'{folder}/own:{own}', *data_mount(engine, folder.parent, others))
     for mount in options.mounts:
         source, _, target = mount.partition(':')
         yield from ('-v', f'{source}:{target or source}:ro')
@@ -229,6 +227,17 @@ def common_flags(
         yield '--rm'
     if runs_containers(spec, options):
         yield from nested_flags(engine)
+
+
+def data_mount(engine: Engine, folder: Path, target: str) -> tuple[str, str]:
+    """Return the flag that shows a folder of others, whose programs and devices are none there."""
+    options = 'ro,nosuid,nodev,noexec'
+    if engine.name == 'podman':
+        return '-v', f'{folder}:{target}:{options}'
+    # only a volume of docker takes them, and a nameless one goes with its container
+    return '--mount', (
+        f'type=volume,volume-nocopy,volume-opt=type=none,volume-opt=device={folder},'
+        f'"volume-opt=o=bind,{options}",dst={target}')
 
 
 def runs_containers(spec: MachineSpec, options: Options) -> bool:

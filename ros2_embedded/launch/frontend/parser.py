@@ -53,7 +53,11 @@ class Parser:
 
     def parse_action(self, entity: Entity) -> Action:
         self.load_launch_extensions()
-        return instantiate_action(entity, self)
+        try:
+            return instantiate_action(entity, self)
+        except Exception as exc:
+            vars(exc).setdefault('line', entity.line)
+            raise
 
     parse_substitution = staticmethod(parse_substitution)
     parse_if_substitutions = staticmethod(parse_if_substitutions)
@@ -86,7 +90,7 @@ class Parser:
     @classmethod
     def load(cls, file: Any) -> tuple[Entity, Parser]:
         """
-        Read a file, by path or open, with the parsers that claim it, then with all others.
+        Read a file, by path or open, with the parsers that claim it, or else with any.
 
         :return: the root entity, and the parser that read it.
         :raises InvalidFrontendLaunchFileError: if none could.
@@ -97,14 +101,14 @@ class Parser:
         name = getattr(file, 'name', '')
         claiming = cls.get_parsers_from_filename(name)
         errors: list[Exception] = []
-        for parser in [*claiming, *(p for p in cls._parsers().values() if p not in claiming)]:
+        for parser in claiming or cls._parsers().values():
             try:
                 return parser.load(file)
             except Exception as exc:  # noqa: BLE001 - Each format has its own errors.
                 errors.append(exc)
                 file.seek(0)
         extension = os.path.splitext(name)[1][1:] if claiming else ''
-        raise InvalidFrontendLaunchFileError(extension, likely_errors=errors)
+        raise InvalidFrontendLaunchFileError(extension, likely_errors=errors, path=name)
 
     @classmethod
     def get_file_extensions(cls) -> set[str]:

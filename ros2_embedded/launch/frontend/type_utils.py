@@ -14,6 +14,8 @@ class Entity:
         self._element = element
         self.type_name = type_name
         self.parent = parent
+        #: Where the file has it, if its parser says so.
+        self.line: int | None = None
 
     @property
     def children(self) -> list[Entity]:

@@ -55,22 +55,23 @@ def get_launch_description_from_any_launch_file(
 
     :raises InvalidLaunchFileError: if nothing can read it.
     """
-    loaders: list[Callable[[str], LaunchDescription]] = [
-        get_launch_description_from_frontend_launch_file,
-        get_launch_description_from_python_launch_file]
     name = os.path.basename(launch_file_path)
-    extension = os.path.splitext(name)[1][1:]
-    if extension == 'py':
-        loaders.reverse()
-    elif not Parser.is_filename_valid(name):
-        extension = ''
+    loaders: list[Callable[[str], LaunchDescription]] = []
+    if not name.endswith('.py'):
+        loaders.append(get_launch_description_from_frontend_launch_file)
+    if not Parser.is_filename_valid(name):
+        loaders.append(get_launch_description_from_python_launch_file)
     errors: list[Exception] = []
     for load in loaders:
         try:
             return load(launch_file_path)
+        except InvalidLaunchFileError as exc:
+            if len(loaders) == 1:
+                raise
+            errors.append(exc)
         except Exception as exc:  # noqa: BLE001 - A launch file can raise anything.
             errors.append(exc)
-    raise InvalidLaunchFileError(extension, likely_errors=errors)
+    raise InvalidLaunchFileError(likely_errors=errors, path=launch_file_path)
 
 
 class _FileSource(LaunchDescriptionSource):

@@ -42,6 +42,12 @@ class Plain(str):
     """A text without quotes that rcl takes for a value of another type, and PyYAML does not."""
 
 
+class Mapping(dict[Any, Any]):
+    """A mapping that knows its line in the file."""
+
+    line: int
+
+
 @functools.cache
 def _classes() -> tuple[Any, Any, Any]:
     import yaml
@@ -77,6 +83,12 @@ def _classes() -> tuple[Any, Any, Any]:
                 return value
             return Plain(text)
 
+        def construct_map(self, node: Any) -> Any:
+            found = Mapping()
+            found.line = node.start_mark.line + 1
+            yield found  # Aliases inside may mean the mapping itself.
+            found.update(self.construct_mapping(node))
+
     class Dumper(yaml.SafeDumper):
 
         def represent_text(self, text: str) -> Any:
@@ -84,6 +96,7 @@ def _classes() -> tuple[Any, Any, Any]:
 
     for loader in (Loader, LaunchFileLoader):
         loader.add_constructor(_TEXT, loader.construct_text)
+    LaunchFileLoader.add_constructor('tag:yaml.org,2002:map', LaunchFileLoader.construct_map)
     Dumper.add_representer(str, Dumper.represent_text)
     return Loader, LaunchFileLoader, Dumper
 
@@ -101,6 +114,8 @@ def load(text: str) -> Any:
 def load_launch_file(file: Any) -> Any:
     """
     Read YAML as launch files have it: y and 1e-3 are names too, and become :class:`Plain`.
+
+    :return: its mappings are each a :class:`Mapping`.
 
     :raises yaml.YAMLError: with line and column.
     """

@@ -2,16 +2,21 @@
 """A node of this process."""
 from __future__ import annotations
 
+from collections.abc import Callable
 import os
+from pathlib import Path
 import time
 from typing import Any
 
 from ros2cli.node import NODE_NAME_PREFIX
 
-#: Seconds after which a graph that does not change counts as complete.
-STILL = 0.7
+#: Seconds after which a graph that does not change counts as complete. Fast DDS sends a lost answer
+#: again after 1 s.
+STILL = 1.2
 #: Seconds after which the graph is used as it is. Fast DDS takes up to 2.7 s to find a node.
 LONGEST = 3.0
+#: Settings of Fast DDS where the user has none.
+_PROFILES = Path(__file__).with_name('fastdds.xml')
 
 
 class DirectNode:
@@ -19,20 +24,23 @@ class DirectNode:
     A node that has had time to discover others; its attributes are the node's.
 
     :param node_name: by default a hidden one.
+    :param enough: ends the discovery when it returns True for the node.
     """
 
-    def __init__(self, args: Any, *, node_name: str | None = None) -> None:
+    def __init__(self, args: Any, *, node_name: str | None = None,
+                 enough: Callable[[Any], bool] | None = None) -> None:
         import rclpy
         from rclpy.parameter import Parameter
+        os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(_PROFILES))
         rclpy.init(args=[])
         self.node = rclpy.create_node(
             node_name or f'{NODE_NAME_PREFIX}_{os.getpid()}', start_parameter_services=False,
             parameter_overrides=[
                 Parameter('use_sim_time', value=getattr(args, 'use_sim_time', False))])
-        self._discover(getattr(args, 'spin_time', None))
+        self._discover(getattr(args, 'spin_time', None), enough)
 
-    def _discover(self, seconds: float | None) -> None:
-        """Spin for some seconds; with None, until the graph has others and is still."""
+    def _discover(self, seconds: float | None, enough: Callable[[Any], bool] | None) -> None:
+        """Spin for some seconds; with None, until there is enough, or others and no change."""
         import rclpy
         limit = LONGEST if seconds is None else seconds
         seen = alone = self._graph()
@@ -42,8 +50,8 @@ class DirectNode:
             now = time.monotonic()
             if (graph := self._graph()) != seen:
                 seen, changed = graph, now
-            still = seconds is None and seen != alone and now - changed > STILL
-            if still or now - begin >= limit:
+            complete = enough(self.node) if enough else seen != alone and now - changed > STILL
+            if seconds is None and complete or now - begin >= limit:
                 return
 
     def _graph(self) -> tuple[Any, ...]:

@@ -38,6 +38,14 @@ def call(node: Any, node_name: str, method: str, *arguments: Any) -> Any:
     return future.result()
 
 
+def _strategy(args: Any, name: str | None) -> NodeStrategy:
+    """Discover until there is a node of that name; with None, all nodes."""
+    if name is None:
+        return NodeStrategy(args)
+    return NodeStrategy(
+        args, enough=lambda node: name in get_node_names(node, args.include_hidden_nodes))
+
+
 class ListVerb(VerbExtension):
     """Output a list of available parameters."""
 
@@ -48,10 +56,10 @@ class ListVerb(VerbExtension):
                             help='Consider hidden nodes as well')
 
     def main(self, *, args: Any) -> Any:
-        with NodeStrategy(args) as strategy:
+        wanted = f"/{args.node_name.removeprefix('/')}" if args.node_name else None
+        with _strategy(args, wanted) as strategy:
             names = get_node_names(strategy, args.include_hidden_nodes)
-            if args.node_name:
-                wanted = f"/{args.node_name.removeprefix('/')}"
+            if wanted is not None:
                 if wanted not in names:
                     return 'Node not found'
                 names = [wanted]
@@ -79,7 +87,7 @@ class GetVerb(VerbExtension):
 
     def main(self, *, args: Any) -> Any:
         name = f"/{args.node_name.removeprefix('/')}"
-        with NodeStrategy(args) as strategy:
+        with _strategy(args, name) as strategy:
             if name not in get_node_names(strategy, args.include_hidden_nodes):
                 return 'Node not found'
             return self.do(strategy.node, name, args)

@@ -2,7 +2,6 @@
 """Verbs of ``ros2 service``."""
 from __future__ import annotations
 
-from argparse import Namespace
 from typing import Any
 
 from ros2cli.node import NODE_NAME_PREFIX
@@ -35,7 +34,7 @@ class CallVerb(VerbExtension):
         except ValueError:
             raise RuntimeError('The passed type is not a service') from None
         package, *_, name = args.service_type.split('/')
-        with DirectNode(Namespace(spin_time=0), node_name=(
+        with DirectNode(args, enough=lambda node: True, node_name=(
                 f'{NODE_NAME_PREFIX}_requester_{package}_{name}')) as direct:
             return self._call(direct.node, kind, args)
 

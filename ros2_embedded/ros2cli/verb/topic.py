@@ -31,6 +31,13 @@ def message_class(name: str, error: str = 'The passed message type is invalid') 
         raise RuntimeError(error) from None
 
 
+def topic_types(node: Any, topic: str) -> list[str] | None:
+    """Return the types of a topic's messages, None if there is no such topic."""
+    types: list[str] | None = dict(node.get_topic_names_and_types()).get(
+        node.resolve_topic_name(topic))
+    return types
+
+
 def get_msg_class(node: Any, topic: str, blocking: bool = False) -> Any:
     """
     Find the class of a topic's messages.
@@ -40,13 +47,12 @@ def get_msg_class(node: Any, topic: str, blocking: bool = False) -> Any:
     :raises RuntimeError: if it has several types, or an unknown one, or its name is invalid.
     """
     import rclpy
-    full = node.resolve_topic_name(topic)
-    types = dict(node.get_topic_names_and_types()).get(full)
+    types = topic_types(node, topic)
     if types is None:
         print(f'WARNING: topic [{topic}] does not appear to be published yet')
     while types is None and blocking and rclpy.ok():
         rclpy.spin_once(node, timeout_sec=0.1)
-        types = dict(node.get_topic_names_and_types()).get(full)
+        types = topic_types(node, topic)
     if types is None:
         return None
     if len(types) > 1:

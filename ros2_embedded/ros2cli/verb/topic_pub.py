@@ -35,7 +35,7 @@ class PubVerb(VerbExtension):
         add_arguments(parser)
 
     def main(self, *, args: Any) -> Any:
-        with DirectNode(args, node_name=args.node_name) as direct:
+        with DirectNode(args, node_name=args.node_name, enough=lambda node: True) as direct:
             return _publish(direct.node, args)
 
 

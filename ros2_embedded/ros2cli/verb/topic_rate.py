@@ -8,14 +8,14 @@ from typing import Any
 
 from ros2cli.node.direct import add_arguments, DirectNode
 from ros2cli.verb import VerbExtension
-from ros2cli.verb.topic import above, get_msg_class
+from ros2cli.verb.topic import above, get_msg_class, topic_types
 
 
 def _measure(args: Any, topic: str, callback: Any, report: Any) -> None:
     """Subscribe to a topic's bytes and report each second, until the end."""
     import rclpy
     from rclpy.qos import qos_profile_sensor_data
-    with DirectNode(args) as direct:
+    with DirectNode(args, enough=lambda node: topic_types(node, topic) is not None) as direct:
         node = direct.node
         kind = get_msg_class(node, topic, blocking=True)
         if kind is None:

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Check files that launch arguments and parameters name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from launch import LaunchContext
+    from launch.actions import OpaqueFunction
+
+#: Formats of pictures that OpenCV and matplotlib write.
+PICTURES = ('.png', '.jpg', '.jpeg')
+
+
+def check_writable(text: str, endings: Sequence[str] = ()) -> None:
+    """
+    Check that a file can be written.
+
+    :param endings: allowed file extensions; empty: all.
+    :raises ValueError: the reason.
+    """
+    path = Path(text)
+    if endings and path.suffix.lower() not in endings:
+        raise ValueError(f'it has to end in {", ".join(endings)}')
+    if not path.parent.is_dir():
+        raise ValueError(f'there is no folder {path.parent}')
+    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise ValueError("it can't be written")
+
+
+def checked(
+    read: Mapping[str, str], written: Mapping[str, Sequence[str]] = {},
+    made: Sequence[str] = (),
+) -> OpaqueFunction:
+    """
+    Return an action that checks files on the robot before the launch creates a machine.
+
+    :param read: launch arguments that name a file or folder, and the remedy if it is missing.
+    :param written: launch arguments that name a file to write, and its file extensions.
+    :param made: values that name no file.
+    """
+    # not imported for nodes
+    from launch.actions import OpaqueFunction
+
+    def check(context: LaunchContext) -> None:
+        given = context.launch_configurations
+        for name, remedy in read.items():
+            if given[name] not in ('', *made) and not os.access(given[name], os.R_OK):
+                raise RuntimeError(f'{name}:={given[name]}: there is no such file here ({remedy})')
+        for name, endings in written.items():
+            try:
+                if given[name]:
+                    check_writable(given[name], endings)
+            except ValueError as error:
+                raise RuntimeError(f'{name}:={given[name]}: {error}') from error
+
+    return OpaqueFunction(function=check)
