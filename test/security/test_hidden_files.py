@@ -5,7 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import json
+import os
 from pathlib import Path
+import subprocess
 import time
 import uuid
 
@@ -13,7 +15,9 @@ import pytest
 
 from fogros2 import process
 from fogros2.model import Command
+from fogros2.provider import container
 from fogros2.provider.container import hidden_files
+from fogros2.provider.container import root as container_root
 from fogros2.waiting import wait_until
 from rigs.container_machines import Cloud, cloud, cloud_network, engine, key
 
@@ -62,6 +66,19 @@ def test_root_on_a_machine_reads_no_file_of_root_here(cloud: Cloud, own: str) ->
     cloud.provider.stop(first)
     cloud.provider.start(first)
     assert seen(cloud, first, own) == {'public'}
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='root alone makes the folder of a machine')
+def test_search_of_a_failed_creation_leaves_no_folder(tmp_path: Path) -> None:
+    """The engine fails at once, while the search is at work in the folder."""
+    top, archive = tmp_path / 'roots/top', container_root.Archive().data()
+    busy = ('import sys\n'
+            'for number in range(10 ** 6): open(f"{sys.argv[1]}/{number}", "w").close()')
+    done = subprocess.run(
+        ['sh', '-ec', container._CREATE, 'sh', top, '', '', '', busy, container.clean(top), '', '',
+         'sh', '-c', f'until [ -e {top}/1000 ]; do :; done; exit 3'], input=b'label\n' + archive)
+    assert done.returncode == 3
+    assert not top.exists()
 
 
 def test_search_finds_what_not_everybody_may_read(tmp_path: Path) -> None:

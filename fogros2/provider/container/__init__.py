@@ -57,9 +57,12 @@ _CREATE = """\
 top=$1 begin=$2 inside=$3 end=$4 look=$5 clean=$6 shown=$7
 shift 7
 umask 022
+search=
 failed() {
     code=$?
     [ $code -eq 0 ] && return
+    # it writes into the folder
+    [ -n "$search" ] && kill "$search" 2>/dev/null && wait "$search" || :
     [ -s "$top/cid" ] && "$engine" rm -f -v "$(cat "$top/cid")" >/dev/null 2>&1
     sh -c "$clean"
     exit $code
@@ -83,6 +86,7 @@ shift
 engine=$1
 printf '%s' "$shown" >"$top/shown"
 python3 -IS -c "$look" "$top" </dev/null >/dev/null 2>&1 &
+search=$!
 tar -xpf - --numeric-owner -C "$top/root"
 "$@"
 """
@@ -97,8 +101,9 @@ printf %s "$3" >"$top/hooks/inside.json"
 printf %s "$4" >"$top/hooks/end.json"
 rm -f "$top/hidden"
 if [ -e "$top/shown" ]; then python3 -IS -c "$5" "$top" </dev/null >/dev/null 2>&1 & fi
+search=$!
 shift 5
-"$@"
+"$@" || { code=$?; kill "$search" 2>/dev/null; exit $code; }
 """
 
 # The machine's login user has any number; the first process gives it the folder 'own'. The topics
