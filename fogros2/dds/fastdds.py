@@ -54,8 +54,8 @@ ANNOUNCEMENT = 3
 LEASE_DURATION = 60
 #: Requested receive buffer in bytes; the kernel limits it to its rmem_max.
 RECEIVE_BUFFER = 4 * 1024 * 1024
-#: Bytes of a datagram: six packets of the VPN (1400 bytes each after IPv4, less UDP's 8). The default
-#: of 65500 is lost with any of its 47 packets: at 5 % loss, messages of 20 kB do not arrive at all.
+#: Bytes of a datagram: six packets of the VPN (1400 bytes each after IPv4, less UDP's 8). The
+#: default of 65500 is lost with any of its 47 packets: at 5 % loss, no message of 20 kB arrives.
 #: Smaller ones cost processor time for large images. It is a property of writers, because a
 #: transport with a smaller size could not receive the datagrams of others.
 DATAGRAM = 6 * 1400 - 8
@@ -258,7 +258,8 @@ def _own_transport(profiles: Element, rtps: Element, names: Sequence[str]) -> No
 def _times(profiles: Element) -> None:
     """Repeat lost samples soon, unless the user's profiles have defaults of their own."""
     for kind, old, delays in (
-            ('data_writer', 'publisher', {'heartbeatPeriod': HEARTBEAT, 'nackResponseDelay': DELAY}),
+            ('data_writer', 'publisher',
+             {'heartbeatPeriod': HEARTBEAT, 'nackResponseDelay': DELAY}),
             ('data_reader', 'subscriber', {'heartbeatResponseDelay': DELAY})):
         if not any(one.tag in (kind, old) and one.get('is_default_profile') == 'true'
                    for one in profiles):

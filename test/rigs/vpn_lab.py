@@ -39,8 +39,7 @@ from fogros2.waiting import wait_until
 TEST = Path(__file__).parents[1]
 RELAY = TEST / 'relay.py'
 NODE = TEST / 'integration/vpn/dds_node.py'
-#: Participants of Cyclone DDS without ROS 2, by the package cyclonedds; tools/setup.sh builds one of
-#: ROS 2 Jazzy's version where it can.
+#: Participants of Cyclone DDS without ROS 2, by the package cyclonedds.
 CYCLONE = TEST / 'integration/vpn/cyclone_node.py'
 #: What ROS 2 Jazzy itself configures for Cyclone DDS.
 STOCK = ('<CycloneDDS><Domain><Discovery><ParticipantIndex>auto</ParticipantIndex>'
