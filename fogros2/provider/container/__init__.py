@@ -251,13 +251,12 @@ class ContainerProvider(Provider):
         base = str(debian_root.root(cancel=self.cancel)) if options.isolated else ''
         system = container_root.system_mounts(base)
         kept = spec.on_exit == 'stop'
-        environment = [] if base else container_root.environment_mounts(*spec.workspaces)
         words = [*container_options.common_flags(engine, spec, request, options)]
         for path in system:
             # Podman deletes its own layer when the container ends; a stopped machine keeps it.
             upper = f',upperdir={top}/layers{path}/upper,workdir={top}/layers{path}/work'
             words += ['-v', f"{base}{path}:{path}:O{upper if kept else ''}"]
-        for mount in environment:
+        for mount in () if base else container_root.environment_mounts(*spec.workspaces):
             words += ['-v', f'{mount}:{mount}:ro']
         number = login_ids.login_id(request.token)
         archive = _entry(spec, request, options, number)
@@ -269,7 +268,7 @@ class ContainerProvider(Provider):
         command = Command(
             ('sh', '-ec', _CREATE, 'sh', str(top), *hooks(top, kept=kept),
              hidden_files.source(), clean(top),
-             ''.join(f'{path}\n' for path in (() if base else (*system, *environment))),
+             '' if base else ''.join(f'{path}\n' for path in system),
              *(system if kept else ()), '', engine.name, *engine.flags, *hook_flags(top),
              'run', '-d', '--cidfile', f'{top}/cid', '--label-file', f'{top}/labels', *words,
              '--rootfs', f'{top}/root', '/bin/sh', f'/{container_entry.FOLDER}/entry.sh'),
