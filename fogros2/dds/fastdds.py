@@ -156,7 +156,7 @@ class FastDds(DdsVendor):
         if not guest:
             # the first group is announced, see max_multicast_locators
             _child(builtin, 'avoid_builtin_multicast').text = 'false'
-            _child(builtin, 'metatrafficMulticastLocatorList').extend(map(self._group, heard))
+            _child(builtin, 'metatrafficMulticastLocatorList')[:0] = map(self._group, heard)
             _child(_child(builtin, 'metatrafficUnicastLocatorList'), 'locator')
         # any initial peer replaces the default one
         _child(builtin, 'initialPeersList').extend([
@@ -164,7 +164,8 @@ class FastDds(DdsVendor):
             *(one for host in [*static_peers(user), *({LOOPBACK} & {*names})]
               for one in self._ports(host))])
         _own_transport(profiles, rtps, names)
-        size = _child(_child(_child(rtps, 'propertiesPolicy'), 'properties'), 'property')
+        size = ElementTree.SubElement(
+            _child(_child(rtps, 'propertiesPolicy'), 'properties'), 'property')
         _text(size, name='fastdds.max_message_size', value=str(DATAGRAM))
         _times(profiles)
         _sort(rtps)
