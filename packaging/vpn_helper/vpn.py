@@ -101,8 +101,8 @@ def network_of(value: object, pools: Iterable[str]) -> str:
         network = ipaddress.IPv4Network(value)
     except ValueError:
         raise Refused('a network is like 198.18.7.0/24') from None
-    if network.prefixlen != addresses.PREFIX:
-        raise Refused(f'a network has {addresses.PREFIX} bits')
+    if network.prefixlen != addresses.NETWORK_PREFIX:
+        raise Refused(f'a network has {addresses.NETWORK_PREFIX} bits')
     allowed = list(pools)
     if not any(network.subnet_of(ipaddress.IPv4Network(pool)) for pool in allowed):
         raise Refused(f'{network} is not in {", ".join(allowed) or "any pool"}: the administrator '

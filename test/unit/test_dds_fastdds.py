@@ -81,7 +81,8 @@ def test_losses_cost_a_few_packets_and_milliseconds() -> None:
     default = next(one for one in root.iterfind('.//data_writer', NS)
                    if one.get('is_default_profile') == 'true')
     assert default.findtext('times/heartbeatPeriod/nanosec', '', NS) == '50000000'
-    assert root.findtext('.//data_reader/times/heartbeatResponseDelay/nanosec', '', NS) == '1000000'
+    assert root.findtext(
+        './/data_reader/times/heartbeatResponseDelay/nanosec', '', NS) == '1000000'
 
 
 def test_machine_uses_the_vpn_alone_and_sends_nowhere_else() -> None:
