@@ -22,15 +22,13 @@ from typing import get_type_hints, Optional
 
 from fogros2 import untrusted
 from fogros2.errors import ConfigurationError
-from fogros2.model import to_json
+from fogros2.model import NETWORK_PREFIX, to_json
 from fogros2.store import check_name, robot_name, Store, write_private
 
 _PREFIX = 'fog1.'
 #: File with the invitation in the folder of a joined machine, which is like a launch's folder;
 #: and the file there with the secret for ``GuestShell``.
 JOINED, SECRET = 'joined.json', 'door.key'
-#: Prefix length of the largest network of a launch (see ``vpn.addresses``).
-PREFIX = 24
 #: Private address space (RFC 1918), shared address space (RFC 6598), and the default pool.
 _PRIVATE = tuple(map(ipaddress.IPv4Network, (
     '10.0.0.0/8', '172.16.0.0/12', '192.168.0.0/16', '100.64.0.0/10', '198.18.0.0/15')))
@@ -69,7 +67,7 @@ class Invitation:
             untrusted.checked(getattr(self, name), kind, name)
         check_name(self.machine)
         subnet = ipaddress.IPv4Network(self.network)
-        if subnet.prefixlen < PREFIX:
+        if subnet.prefixlen < NETWORK_PREFIX:
             raise ValueError(f'{subnet} is larger than the network of a launch')
         if subnet.is_loopback or subnet.is_link_local or subnet.is_multicast or subnet.is_reserved:
             raise ValueError(f'{subnet} is the network of no computer')

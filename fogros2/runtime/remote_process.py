@@ -11,6 +11,7 @@ from typing import Any, cast, Optional, TYPE_CHECKING
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal
 
+from fogros2 import plan
 from fogros2.errors import ConfigurationError
 from fogros2.host.checkpoint import check_folder
 from fogros2.launch_internals import components, private
@@ -71,6 +72,14 @@ class RemoteProcess(private.RemoteStart):
             self, context, coordinator.base_environment, session.spec, coordinator.launch.id,
             self._fogros2_image, self._fogros2_image_options,
             provider.has_own_packages(session.spec), bool(provider.invitation(session.spec)))
+        if not isinstance(self, AddedProcess):
+            found = node_spec.robot_paths(
+                self._fogros2_node, [context.environment.get('HOME', ''), *(plan.ament_prefixes(
+                    coordinator.base_environment) if self._fogros2_image else ())],
+                session.spec.workspaces)
+            shared = provider.shared_folders(session.spec) if found else ()
+            session.warn_of_paths(
+                self._fogros2_node, [path for path in found if not plan.below(path, shared)])
         if session.spec.idle_timeout is not None and (
                 self._fogros2_image or session.spec.containers):
             raise ConfigurationError(

@@ -120,6 +120,8 @@ class Session:
         self._away: list[RemoteRun] = []
         #: Topic names that the first loaded components got; None if none was loaded.
         self._component_names: Optional[dict[str, str]] = None
+        #: Paths of the robot that its nodes get, and of which the user knows.
+        self._paths: set[str] = set()
         #: Requests to the agent that are not answered yet.
         self.requests: set[asyncio.Task[None]] = set()
         # keeps requests to the agent in order
@@ -197,6 +199,16 @@ class Session:
                 f"{self.spec.name}: components were loaded before {', '.join(late)} became a "
                 'stream and get it unencoded; add the stream to the container')
             self._component_names = None
+
+    def warn_of_paths(self, node: NodeSpec, paths: Sequence[str]) -> None:
+        """Warn once of each path of the robot that a node gets."""
+        new = [path for path in paths if path not in self._paths]
+        self._paths.update(new)
+        if new:
+            self._logger.warning(
+                f"{self.spec.name}: {node.name} gets {', '.join(new)} of this robot, as launch "
+                'resolves $(env HOME), $(find-pkg-share) and the like here\nname a path of the '
+                'machine, or a file of a package in the workspace, which travels')
 
     def give_up(self) -> None:
         """Stop waiting for the machine to come up, unless it is up."""

@@ -9,8 +9,7 @@ import socket
 
 from fogros2 import untrusted
 from fogros2.errors import ConfigurationError, VpnError
-from fogros2.invitation import PREFIX
-from fogros2.model import Command
+from fogros2.model import Command, NETWORK_PREFIX
 
 #: RFC 2544's range for benchmarks. Home and company networks (RFC 1918), providers' NAT and
 #: Tailscale (100.64.0.0/10), clouds' VPCs and containers do not use it, so a launch normally does
@@ -59,15 +58,26 @@ def choose_subnet(used: Iterable[str], *, launch_id: str, pool: str = POOL) -> s
     :raises VpnError: the whole pool is in use.
     :raises ConfigurationError: the pool is not an IPv4 network with room for a /24.
     """
-    candidates = list(_pool(pool).subnets(new_prefix=PREFIX))
+    candidates = list(_pool(pool).subnets(new_prefix=NETWORK_PREFIX))
     taken = [network for network in map(_network, used) if network is not None]
     begin = int(launch_id, 16) % len(candidates)
     for candidate in candidates[begin:] + candidates[:begin]:
         if not any(candidate.overlaps(network) for network in taken):
             return str(candidate)
     raise VpnError(
-        f'no /{PREFIX} of {pool} is free for the VPN',
+        f'no /{NETWORK_PREFIX} of {pool} is free for the VPN',
         f'{POOL_VARIABLE}=10.213.0.0/16 names another range')
+
+
+def multicast_group(address: str) -> str:
+    """
+    Return the multicast group of one host, by which other hosts reach all of its participants.
+
+    A VPN interface sends each packet to the one peer that its destination belongs to.
+
+    :param address: the host's VPN address; the VPN's subnet for the range of all groups.
+    """
+    return f"239.{address.partition('.')[2]}"
 
 
 def guests(subnet: str) -> str:
@@ -159,9 +169,9 @@ def _pool(text: str) -> _Network:
     except ValueError as error:
         raise ConfigurationError(
             f"'{text}' is no IPv4 network: {error}", f'{POOL_VARIABLE} is like {POOL}') from error
-    if network.prefixlen > PREFIX:
+    if network.prefixlen > NETWORK_PREFIX:
         raise ConfigurationError(
-            f"'{text}' is smaller than a /{PREFIX}", f'{POOL_VARIABLE} is like {POOL}')
+            f"'{text}' is smaller than a /{NETWORK_PREFIX}", f'{POOL_VARIABLE} is like {POOL}')
     return network
 
 

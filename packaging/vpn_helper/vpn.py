@@ -45,7 +45,7 @@ from fogros2.vpn import addresses  # noqa: E402
 from fogros2.vpn.wireguard import WireGuard  # noqa: E402
 
 #: What both sides mean by the words and fields below.
-PROTOCOL = 3
+PROTOCOL = 4
 #: One folder for each interface: its key, and whose it is. Gone at boot, as interfaces are. Not
 #: where agents are: a robot may be a machine, too.
 RECORDS = Path('/run/fogros2-vpn')
@@ -101,8 +101,8 @@ def network_of(value: object, pools: Iterable[str]) -> str:
         network = ipaddress.IPv4Network(value)
     except ValueError:
         raise Refused('a network is like 198.18.7.0/24') from None
-    if network.prefixlen != addresses.PREFIX:
-        raise Refused(f'a network has {addresses.PREFIX} bits')
+    if network.prefixlen != addresses.NETWORK_PREFIX:
+        raise Refused(f'a network has {addresses.NETWORK_PREFIX} bits')
     allowed = list(pools)
     if not any(network.subnet_of(ipaddress.IPv4Network(pool)) for pool in allowed):
         raise Refused(f'{network} is not in {", ".join(allowed) or "any pool"}: the administrator '

@@ -10,9 +10,10 @@ from ament_index_python.packages import get_package_prefix, PackageNotFoundError
 def get_prefix_path(package_name: str) -> str | None:
     """Return where the package is installed, None if it isn't."""
     try:
-        return get_package_prefix(package_name)
+        prefix: str = get_package_prefix(package_name)
     except (PackageNotFoundError, ValueError):
         return None
+    return prefix
 
 
 def get_executable_paths(package_name: str) -> list[str]:

@@ -126,6 +126,7 @@ class FakeLaunch:
 
     def provider(self, name):
         return SimpleNamespace(has_own_packages=lambda spec: 'image' in spec.options,
+                               shared_folders=lambda spec: ['/shared'],
                                invitation=lambda spec: spec.options.get('invitation', ''))
 
     def expect(self, names):

@@ -154,7 +154,7 @@ def test_settings_of_a_group_reach_its_nodes(run, fake, planner):
     assert 'use_sim_time:=true' in words and 'in:=out' in words
     (key, content), = spec.files.items()
     assert spec.arguments[words_index(spec.arguments, '--params-file') + 1] == ({'file': key},)
-    assert 'speed: 3' in content
+    assert '"speed": 3' in content
 
 
 def words_index(arguments, word):

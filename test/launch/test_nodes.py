@@ -23,7 +23,7 @@ from launch.events import matches_action
 from launch.events.process import ShutdownProcess
 from launch.frontend import expose, Parser
 from launch.launch_description_sources import AnyLaunchDescriptionSource
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import EnvironmentVariable, LaunchConfiguration
 import launch_ros.actions
 from launch_ros.descriptions import ComposableNode
 import pytest
@@ -435,3 +435,15 @@ def test_fogros2_adds_elements_and_replaces_none(registry):
             if parse.__module__.startswith('fogros2')} == {
                 'fog_machine', 'cloud_node', 'cloud_group', 'stream_topic', 'replicated',
                 'fogros_launch'}
+
+
+def test_home_of_the_robot_is_mentioned_once(run, fake, planner, monkeypatch, capfd):
+    monkeypatch.setenv('HOME', '/home/me')
+    fake.on_start = lambda machine, node: machine.say(
+        'exited', node, returncode=0, respawns=False)
+    nodes = [CloudNode(machine=planner, package='demo', executable='talker',
+                       arguments=[EnvironmentVariable('HOME'), '/maps']) for _ in range(2)]
+    assert run(LaunchDescription(nodes)) == 0
+    said = capfd.readouterr().out
+    assert said.count('/home/me of this robot, as launch resolves $(env HOME)') == 1
+    assert 'name a path of the machine' in said

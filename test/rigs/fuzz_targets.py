@@ -372,7 +372,8 @@ def _dds() -> Iterator[Target]:
             for ask in (lambda: vendor.robot_interfaces('fog', 'eth0', {'CYCLONEDDS_URI': text}),
                         lambda: vendor.robot_interfaces('fog', None,
                                                         {'CYCLONEDDS_URI': f'file://{path}'}),
-                        lambda: fast_dds.render([], ['192.0.2.1'], {VARIABLE: str(path)})):
+                        lambda: fast_dds.render(
+                            fast_dds.machine_interfaces('198.18.7.2'), [], {VARIABLE: str(path)})):
                 with contextlib.suppress(FogError):
                     ask()
         yield Target([cyclone, fast, b'file:///nowhere,' + cyclone], read, ())

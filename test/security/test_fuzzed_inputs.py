@@ -19,8 +19,10 @@ pytest.importorskip('cv2', reason='OpenCV (the extra "video") is not installed')
 from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.dds.fastdds import FastDds, VARIABLE
 from fogros2.errors import DdsError
+from fogros2.model import DdsInterface
 from rigs import fuzz_targets, fuzzing
 
+VPN = [DdsInterface('198.18.7.2')]
 #: Bytes that a process may take, with OpenCV and PyAV in it.
 LIMIT = 500e6
 
@@ -50,11 +52,11 @@ def test_dds_configuration_of_another_encoding_is_read(tmp_path: Any) -> None:
     path.write_bytes('<?xml version="1.0" encoding="latin-1"?><dds><!-- für --></dds>'.encode(
         'latin-1'))
     assert CycloneDds().robot_interfaces('fog', None, {'CYCLONEDDS_URI': f'file://{path}'})
-    assert 'fogros2' in FastDds().render([], [], {VARIABLE: str(path)})
+    assert 'fogros2' in FastDds().render(VPN, [], {VARIABLE: str(path)})
 
 
 def test_dds_configuration_of_an_unknown_encoding_is_refused(tmp_path: Any) -> None:
     path = tmp_path / 'user.xml'
     path.write_text('<?xml version="1.0" encoding="nonsense"?><dds/>')
     with pytest.raises(DdsError, match='is no XML'):
-        FastDds().render([], [], {VARIABLE: str(path)})
+        FastDds().render(VPN, [], {VARIABLE: str(path)})

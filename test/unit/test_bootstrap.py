@@ -310,9 +310,29 @@ def test_missing_build_for_another_processor_is_named(tmp_path: Path) -> None:
     check('aarch64', compiled)
     with pytest.raises(WorkspaceError, match='liba.so is built for x86_64.*no src/ to build'):
         check('aarch64', dataclasses.replace(compiled, sources={}))
-    other = dataclasses.replace(compiled, compiled={'aarch64': root / 'install/a/lib/liba.so'})
-    with pytest.raises(WorkspaceError, match="bootstrap='pip' builds nothing"):
-        check('x86_64', other, bootstrap='pip')
+    with pytest.raises(WorkspaceError, match="to be built on .*bootstrap='pip' builds nothing"):
+        check('x86_64', compiled, bootstrap='pip')
+
+
+def test_compiled_workspace_needs_an_installation_of_ros(tmp_path: Path) -> None:
+    root = tmp_path / 'ws'
+    space = bootstrap.workspaces.Workspace(
+        root, {'a': root / 'install/a'}, {'a': root / 'src/a'}, python='python3.13',
+        compiled={'x86_64': root / 'install/a/lib/liba.so'})
+
+    def planned(facts: HostFacts, mode: Bootstrap = 'auto') -> bootstrap.Preparation:
+        return bootstrap.plan(MachineSpec('m', 'ssh', bootstrap=mode), facts, DEBIAN, UNDER,
+                              WHEELS, [space])
+
+    # also where an earlier launch has installed the wheels
+    for facts in (NOBLE, dataclasses.replace(NOBLE, installed=frozenset({'k1'}))):
+        todo = planned(facts)
+        assert todo.mode == 'apt'
+        assert 'colcon build' in scripts(todo.install.workspaces[0].commands)
+        with pytest.raises(PrerequisiteError, match='by pip: the workspace has compiled packages'):
+            planned(facts, 'pip')
+    with pytest.raises(PrerequisiteError, match='compiled packages.*for Ubuntu 24.04 alone'):
+        planned(DEBIAN)
 
 
 def test_wheel_without_a_build_for_the_machine_is_named() -> None:

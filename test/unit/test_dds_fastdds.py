@@ -19,74 +19,102 @@ def parsed(text: str) -> Element:
     return ElementTree.fromstring(text.encode())
 
 
-def peers(text: str) -> list[tuple[str, str]]:
+def locators(text: str, name: str = 'initialPeersList') -> list[tuple[str, str]]:
+    """Return the (address, port) pairs of a list."""
     return [(one.findtext('address', '', NS), one.findtext('port', '', NS))
-            for one in parsed(text).iterfind('.//initialPeersList/locator/udpv4', NS)]
+            for one in parsed(text).iterfind(f'.//{name}/locator/udpv4', NS)]
 
 
-def test_the_robot_keeps_all_its_interfaces_and_asks_as_ever() -> None:
-    dds = FastDds()
-    interfaces = dds.robot_interfaces('fog1', None, {})
-    assert interfaces == []
-    root = parsed(dds.render(interfaces, ()))
+def robot(dds: FastDds, user: dict[str, str] | None = None, **options: bool) -> str:
+    """Return the profile of a robot with one machine."""
+    return dds.render(dds.robot_interfaces('198.18.7.1', None, user or {}), ['198.18.7.2'],
+                      user or {}, **options)
+
+
+def machine(dds: FastDds) -> str:
+    """Return the profile of the first of two machines."""
+    return dds.render(dds.machine_interfaces('198.18.7.2'), ['198.18.7.3'])
+
+
+def test_robot_keeps_all_its_interfaces_and_its_lan() -> None:
+    text = robot(FastDds())
+    root = parsed(text)
     assert root.find('.//interfaceWhiteList', NS) is None
     assert root.find('.//netmask_filter', NS) is None
-    assert root.find('.//initialPeersList', NS) is None
+    # the first is announced; one group for each port can be joined
+    assert locators(text, 'metatrafficMulticastLocatorList') == [
+        ('239.18.7.1', '7402'), (DISCOVERY_GROUP, '7400')]
+    assert root.findtext('.//max_multicast_locators', '', NS) == '1'
+    assert locators(text) == [(DISCOVERY_GROUP, '7400'), ('239.18.7.2', '7402')]
     assert root.findtext('.//leaseDuration/sec', '', NS) == '60'
 
 
-@pytest.mark.parametrize('user', [{}, {'ROS_LOCALHOST_ONLY': '1'}])
-def test_no_node_uses_shared_memory(user: dict[str, str]) -> None:
-    dds = FastDds()
-    for interfaces in (dds.robot_interfaces('fog1', None, user), dds.machine_interfaces('fog1m0')):
-        root = parsed(dds.render(interfaces, (), user))
-        assert root.findtext('.//useBuiltinTransports', '', NS) == 'false'
-        used = [one.text for one in root.iterfind('.//userTransports/transport_id', NS)]
-        descriptors = root.findall('.//transport_descriptor', NS)
-        assert [(one.findtext('transport_id', '', NS), one.findtext('type', '', NS),
-                 one.findtext('receiveBufferSize', '', NS)) for one in descriptors] == [
-            (used[0], 'UDPv4', str(RECEIVE_BUFFER))]
-        assert len(used) == 1
-
-
-def test_more_addresses_are_kept_than_a_robot_has() -> None:
-    dds = FastDds()
-    for interfaces in ([], dds.machine_interfaces('fog1m0')):
-        limit = parsed(dds.render(interfaces, ())).findtext('.//max_unicast_locators', '', NS)
-        assert int(limit) >= 32
-
-
-def test_a_machine_uses_the_vpn_alone_and_sends_nowhere_else() -> None:
-    dds = FastDds(2)
-    text = dds.render(dds.machine_interfaces('fog1m0'), ['198.18.7.3', '198.18.7.3'])
+def test_guest_listens_to_its_lan_and_announces_no_group() -> None:
+    text = robot(FastDds(), guest=True)
     root = parsed(text)
-    assert [one.text for one in root.iterfind('.//interfaceWhiteList/interface', NS)] == [
-        'fog1m0']
-    assert root.findtext('.//netmask_filter', '', NS) == 'ON'
+    assert root.find('.//avoid_builtin_multicast', NS) is None
+    assert root.find('.//metatrafficMulticastLocatorList', NS) is None
+    assert locators(text) == [(DISCOVERY_GROUP, '7400'), ('239.18.7.2', '7402')]
+
+
+@pytest.mark.parametrize('text', [
+    robot(FastDds()), robot(FastDds(), {'ROS_LOCALHOST_ONLY': '1'}), robot(FastDds(), guest=True),
+    machine(FastDds())], ids=['robot', 'local', 'guest', 'machine'])
+def test_nodes_use_udp_only_with_large_buffers(text: str) -> None:
+    root = parsed(text)
     assert root.findtext('.//useBuiltinTransports', '', NS) == 'false'
-    assert peers(text) == [(DISCOVERY_GROUP, '7900')] + [
-        ('198.18.7.3', str(7910 + 2 * index)) for index in range(ASKED)]
+    used = [one.text for one in root.iterfind('.//userTransports/transport_id', NS)]
+    assert [(one.findtext('transport_id', '', NS), one.findtext('type', '', NS),
+             one.findtext('receiveBufferSize', '', NS))
+            for one in root.iterfind('.//transport_descriptor', NS)] == [
+        (used[0], 'UDPv4', str(RECEIVE_BUFFER))]
+    assert len(used) == 1
+    # more than Fast DDS keeps by default, and than a robot has
+    assert int(root.findtext('.//max_unicast_locators', '', NS)) >= 32
+
+
+def test_losses_cost_a_few_packets_and_milliseconds() -> None:
+    root = parsed(robot(FastDds()))
+    assert [(one.findtext('name', '', NS), one.findtext('value', '', NS))
+            for one in root.iterfind('.//rtps/propertiesPolicy/properties/property', NS)] == [
+        ('fastdds.max_message_size', '8392')]
+    default = next(one for one in root.iterfind('.//data_writer', NS)
+                   if one.get('is_default_profile') == 'true')
+    assert default.findtext('times/heartbeatPeriod/nanosec', '', NS) == '50000000'
+    assert root.findtext(
+        './/data_reader/times/heartbeatResponseDelay/nanosec', '', NS) == '1000000'
+
+
+def test_machine_uses_the_vpn_alone_and_sends_nowhere_else() -> None:
+    text = machine(FastDds(2))
+    root = parsed(text)
+    assert [one.text for one in root.iterfind('.//interfaceWhiteList/address', NS)] == [
+        '198.18.7.2']
+    assert root.findtext('.//netmask_filter', '', NS) == 'ON'
+    assert root.findtext('.//avoid_builtin_multicast', '', NS) == 'false'
+    assert locators(text, 'metatrafficMulticastLocatorList') == [('239.18.7.2', '7902')]
+    assert locators(text) == [
+        (DISCOVERY_GROUP, '7900'), ('239.18.7.2', '7902'), ('239.18.7.3', '7902')]
 
 
 @pytest.mark.parametrize('user', [
     {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'localhost'}, {'ROS_LOCALHOST_ONLY': '1'}])
-def test_who_keeps_to_this_computer_has_it_and_the_vpn(user: dict[str, str]) -> None:
-    dds = FastDds()
-    text = dds.render(dds.robot_interfaces('fog1', None, user), (), user)
-    root = parsed(text)
-    assert root.findtext('.//interfaceWhiteList/address', '', NS) == '127.0.0.1'
-    assert root.findtext('.//interfaceWhiteList/interface', '', NS) == 'fog1'
-    assert {host for host, _ in peers(text)} == {DISCOVERY_GROUP, '127.0.0.1'}
+def test_robot_limited_to_itself_has_the_loopback_and_the_vpn(user: dict[str, str]) -> None:
+    text = robot(FastDds(), user)
+    assert [one.text for one in parsed(text).iterfind('.//interfaceWhiteList/address', NS)] == [
+        '127.0.0.1', '198.18.7.1']
+    # terminals without multicast
+    assert locators(text)[2:] == [('127.0.0.1', str(7410 + 2 * index)) for index in range(ASKED)]
     # the middleware itself would bring transports that listen everywhere
-    environment = dds.environment('/x', user)
+    environment = FastDds().environment('/x', user)
     assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SYSTEM_DEFAULT'
     assert environment.get('ROS_LOCALHOST_ONLY') != '1'
 
 
-def test_static_peers_are_asked_beside_the_group() -> None:
-    text = FastDds().render([], (), {'ROS_STATIC_PEERS': '192.168.1.5;nuc.local;'})
-    assert list(dict.fromkeys(host for host, _ in peers(text))) == [
-        DISCOVERY_GROUP, '192.168.1.5', 'nuc.local']
+def test_static_peers_are_asked_beside_the_groups() -> None:
+    text = robot(FastDds(), {'ROS_STATIC_PEERS': '192.168.1.5;nuc.local;'})
+    assert list(dict.fromkeys(host for host, _ in locators(text))) == [
+        DISCOVERY_GROUP, '239.18.7.2', '192.168.1.5', 'nuc.local']
 
 
 def test_a_users_profiles_are_taken_over(tmp_path: Path) -> None:
@@ -96,19 +124,25 @@ def test_a_users_profiles_are_taken_over(tmp_path: Path) -> None:
   <data_writer profile_name="/scan"><topic><historyQos/></topic></data_writer>
   <participant profile_name="mine" is_default_profile="true">
     <rtps><listenSocketBufferSize>99999</listenSocketBufferSize><builtin><discovery_config>
-      <leaseDuration><sec>5</sec></leaseDuration></discovery_config></builtin></rtps>
+      <leaseDuration><sec>5</sec></leaseDuration></discovery_config></builtin>
+      <propertiesPolicy><properties><property><name>a</name><value>b</value></property>
+      </properties></propertiesPolicy></rtps>
   </participant>
+  <publisher profile_name="slow" is_default_profile="true"/>
   <transport_descriptors/>
 </profiles>""")
-    root = parsed(FastDds().render([], (), {VARIABLE: str(path)}))
-    assert root.find('data_writer', NS) is not None
+    root = parsed(robot(FastDds(), {VARIABLE: str(path)}))
+    assert [one.get('profile_name') for one in root.iterfind('data_writer', NS)] == [
+        '/scan', 'ros_discovery_info']
+    assert [one.text for one in root.iterfind('.//property/name', NS)] == [
+        'a', 'fastdds.max_message_size']
     assert len(root.findall('participant', NS)) == 1
     assert root.findtext('.//leaseDuration/sec', '', NS) == '5'
     assert root.findtext('.//leaseAnnouncement/sec', '', NS) == '3'
     assert root.findtext('.//receiveBufferSize', '', NS) == '99999'
     # Fast DDS reads the file in order
-    assert [one.tag.rpartition('}')[2] for one in root] == [
-        'transport_descriptors', 'data_writer', 'participant']
+    assert [one.tag.rpartition('}')[2] for one in root][:4] == [
+        'transport_descriptors', 'data_writer', 'participant', 'publisher']
 
 
 @pytest.mark.parametrize(('content', 'words'), [
@@ -121,7 +155,7 @@ def test_a_users_profiles_that_cannot_be_used_are_refused(
     if content is not None:
         path.write_text(content)
     with pytest.raises(DdsError, match=words) as caught:
-        FastDds().render([], (), {VARIABLE: str(path)})
+        robot(FastDds(), {VARIABLE: str(path)})
     assert caught.value.hint
 
 
@@ -129,10 +163,10 @@ def test_a_users_profiles_that_cannot_be_used_are_refused(
     ('ROS_DISCOVERY_SERVER', '127.0.0.1:11811'), ('FASTDDS_BUILTIN_TRANSPORTS', 'LARGE_DATA')])
 def test_what_keeps_nodes_from_machines_is_refused(name: str, value: str) -> None:
     with pytest.raises(DdsError, match=name):
-        FastDds().robot_interfaces('fog1', None, {name: value})
+        robot(FastDds(), {name: value})
     with pytest.raises(DdsError, match='OFF'):
         FastDds().environment('/x', {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'})
     with pytest.raises(DdsError, match='no DDS ports'):
         FastDds(300)
     with pytest.raises(DdsError, match="'<x>' of ROS_STATIC_PEERS"):
-        FastDds().render([], ['<x>'])
+        robot(FastDds(), {'ROS_STATIC_PEERS': '<x>'})

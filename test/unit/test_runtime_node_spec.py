@@ -15,7 +15,7 @@ from launch_ros.actions import Node
 import pytest
 
 from fogros2.errors import ConfigurationError, WorkspaceError
-from fogros2.model import MachineSpec
+from fogros2.model import MachineSpec, NodeSpec
 from fogros2.runtime import node_spec
 from fogros2.runtime.node_spec import Texts
 
@@ -197,3 +197,16 @@ def test_paths_are_read_as_they_are(context, tmp_path):
     file.write_text('a: 1\n')
     spec = convert(Node(package='demo', executable='talker', parameters=[file]), context)
     assert list(spec.files.values()) == ['a: 1\n']
+
+
+@pytest.mark.parametrize(('changes', 'found'), [
+    ({'arguments': ('map:=/home/me/maps/a.yaml', '/home/me', '/home/meadow/x')},
+     ['/home/me', '/home/me/maps/a.yaml']),
+    ({'environment': {'MAP': '/home/me/a b'}, 'cwd': '/home/me/run'},
+     ['/home/me/a', '/home/me/run']),
+    ({'files': {'0': ("map: '/home/me/b.pgm'", {'share': 'demo'}, '/x')}}, ['/home/me/b.pgm']),
+    ({'arguments': ('/home/me/ws/install/x', 'http://host/home/me/y', ({'file': '0'},))}, []),
+])
+def test_paths_of_the_robot_are_found(changes, found):
+    node = NodeSpec('id', 'talker', **changes)
+    assert node_spec.robot_paths(node, ['/home/me/', ''], ['/home/me/ws']) == found

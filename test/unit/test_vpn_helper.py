@@ -241,7 +241,7 @@ def test_all_other_interfaces_are_root_s_commands() -> None:
 
 
 @pytest.mark.parametrize(('answer', 'expected'), [
-    (Result(0, '3\n', ''), True), (Result(0, '2\n', ''), False),
+    (Result(0, '4\n', ''), True), (Result(0, '3\n', ''), False),
     (Result(1, '', 'sudo: a password is required'), False)])
 def test_it_is_used_where_it_is_permitted(
     monkeypatch: pytest.MonkeyPatch, answer: Result, expected: bool,

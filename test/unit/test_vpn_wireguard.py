@@ -113,7 +113,17 @@ def test_only_the_launch_is_filtered_where_it_is_a_guest() -> None:
 def test_robot_sends_to_the_hosts_that_the_user_names() -> None:
     robot = dataclasses.replace(ROBOT, process='77')
     text = script(*WireGuard(asked=['192.0.2.7']).up(robot, []))
-    assert 'ip daddr { 239.255.0.1, 192.0.2.7 } accept' in text and 'pid=77\n' in text
+    assert 'ip daddr { 239.255.0.1, 239.18.7.1, 192.0.2.7 } accept' in text
+    assert 'pid=77\n' in text
+
+
+def test_groups_of_the_vpn_leave_the_robot_by_the_vpn_only() -> None:
+    text = script(*WireGuard().up(ROBOT, []))
+    rules = [text.index(rule) for rule in (
+        f'oifname "{ROBOT.name}" accept', 'ip daddr 239.18.7.1 ip ttl set 0 accept',
+        'ip daddr 239.18.7.0/24 drop')]
+    assert rules == sorted(rules)
+    assert 'ip daddr != { 198.18.7.1, 239.255.0.1, 239.18.7.1 } drop' in text
 
 
 @pytest.mark.parametrize('odd', ['/a" accept; #', '/a/../b', '/a b', '/a$(id)', '/a\\"'])
@@ -139,11 +149,12 @@ def test_the_filter_lets_in_the_ports_of_the_ros_domain(domain: int, ports: str)
     assert '-'.join(map(str, dds_ports(domain))) == ports
 
 
-def test_peers_get_their_own_address_and_one_the_announcements() -> None:
+def test_peers_get_their_address_and_group_one_the_common_one() -> None:
     other = Peer('tracker', OTHER, '198.18.7.3')
     text = script(*WireGuard().peers(ROBOT, [TO_MACHINE, other]))
-    assert f"'PublicKey = {KEY}' 'AllowedIPs = 198.18.7.2/32, 239.255.0.1/32'" in text
-    assert f"'PublicKey = {OTHER}' 'AllowedIPs = 198.18.7.3/32'" in text
+    assert (f"'PublicKey = {KEY}' 'AllowedIPs = 198.18.7.2/32, 239.18.7.2/32, 239.255.0.1/32'"
+            in text)
+    assert f"'PublicKey = {OTHER}' 'AllowedIPs = 198.18.7.3/32, 239.18.7.3/32'" in text
     assert "'Endpoint = 203.0.113.9:50000'" in text
     assert "'PersistentKeepalive = 25'" in text
 
