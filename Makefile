@@ -95,6 +95,10 @@ soak:
 setup:
 	@tools/setup.sh demo
 
+## interfaces  what builds a workspace's own messages beside ROS 2's wheels
+interfaces:
+	@tools/setup.sh interfaces
+
 ## clean  take away what the targets above made in this folder
 clean:
 	rm -rf .venv .venv-ros .venv-minimum .cache build install log *.egg-info ros2_embedded/*.egg-info
