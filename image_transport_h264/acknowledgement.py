@@ -7,7 +7,6 @@ import ctypes
 import functools
 from typing import Any
 
-from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 
 #: Return codes of rcl (rcl/types.h): RCL_RET_OK, RCL_RET_TIMEOUT.
@@ -20,14 +19,11 @@ def wait_for_all_acked(publisher: Publisher, seconds: float) -> bool:
 
     rclpy's method of this name holds the interpreter's lock while it waits, so no other thread of
     the process could send an image or run a callback. This function calls rcl, without the lock.
-    The embedded default has no rcl, and its method holds no lock.
 
     :param seconds: the time-out.
     :raises RuntimeError: the context is shut down, or the publisher is destroyed.
     """
-    handle = getattr(publisher, 'handle', None)
-    if handle is None:
-        return bool(publisher.wait_for_all_acked(Duration(seconds=seconds)))
+    handle = publisher.handle
     with handle:  # another thread cannot destroy the publisher in this block
         result = _rcl_function()(handle.pointer, int(seconds * 1e9))
     if result not in (_OK, _TIMEOUT):

@@ -4,8 +4,8 @@ Keep freed memory of pictures and serialized messages in the process.
 
 A 1080p picture has 6 MB, and passes through several buffers. The C library returns such memory to
 the kernel at each free. The kernel then hands it out page by page and zeroes each page. This took
-7 of the 14 ms for which a decoder worked on such a picture, and a third of the time that a relay
-took for a VGA image.
+7 of the 14 ms for which a decoder worked on such a picture, and a third of the time for which a
+relay worked on a VGA image.
 """
 
 from __future__ import annotations

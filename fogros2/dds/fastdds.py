@@ -7,8 +7,14 @@ Written for 2.14 (ROS 2 Jazzy). 2.9 reads the profile too, but does not know ``n
 A process announces all of its addresses, and others send to all of them. So the robot keeps all of
 its interfaces, with the VPN's as one of them, and other computers on its LAN work as before. A
 machine uses only the VPN interface, and sends only to addresses of that network: packets to the
-robot's LAN would leave the machine unencrypted. Announcements cross the VPN by multicast (see
-``vpn/wireguard.py``), and machines ask each other by unicast.
+robot's LAN would leave the machine unencrypted.
+
+Discovery uses multicast. WireGuard sends a packet to the one peer that its destination belongs to,
+so each host has a group of its own (``vpn.addresses``), to which the others send announcements and
+descriptions of topics. One packet is for all processes of the host. By unicast each process would
+send each of them to each process: the traffic of 100 processes would be ten times as much. Only
+the robot also listens to the common group, for its LAN. A guest announces no group: it may have
+several VPNs, and addresses of each. Processes that use the default announce none either.
 
 Nodes use UDP only. Shared memory, which Fast DDS uses by default, carries nothing between two
 accounts, or between containers with a common network, and reports no error: the segments of one
@@ -26,18 +32,16 @@ from typing import ClassVar, Optional
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from fogros2.dds import check_discovery, DdsVendor, is_address, local_only, static_peers
+from fogros2.dds import check_discovery, DdsVendor, local_only, static_peers
 from fogros2.errors import DdsError
 from fogros2.model import DdsInterface
+from fogros2.vpn.addresses import multicast_group
 
 #: Environment variable with the path of Fast DDS's profiles.
 VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 NAMESPACE = 'http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles'
-#: Number of processes that a host is asked for. Each participant asks each of their ports in each
-#: interval. An asked process answers, so only two with higher numbers do not find each other.
-ASKED = 10
-#: The same for this computer, where asking uses no network; ROS 2 asks as many.
-ASKED_HERE = 32
+#: Number of processes that a host without multicast is asked for; ROS 2 asks as many.
+ASKED = 32
 #: RTPS 2.5, 9.6.2.3: participant i of a domain listens at 7410 + 250 * domain + 2 * i.
 PORT_BASE = 7410
 PORTS_PER_DOMAIN = 250
@@ -50,10 +54,23 @@ ANNOUNCEMENT = 3
 LEASE_DURATION = 60
 #: Requested receive buffer in bytes; the kernel limits it to its rmem_max.
 RECEIVE_BUFFER = 4 * 1024 * 1024
+#: Bytes of a datagram: six packets of the VPN (1400 bytes each after IPv4, less UDP's 8). The
+#: default of 65500 is lost with any of its 47 packets: at 5 % loss, no message of 20 kB arrives.
+#: Smaller ones cost processor time for large images. It is a property of writers, because a
+#: transport with a smaller size could not receive the datagrams of others.
+DATAGRAM = 6 * 1400 - 8
+#: Milliseconds after which a writer asks whether all samples have arrived (default 3000): without
+#: a following sample, a lost one is noticed only then. Writers ask only while samples are
+#: unacknowledged. DELAY: before an answer to this question, and to a report of a loss (default 5).
+HEARTBEAT, DELAY = 50, 1
+#: Topic of the middleware with the names of a process's nodes.
+NODE_NAMES = 'ros_discovery_info'
 #: Number of stored addresses of another participant. The default is 4, and a robot with containers
 #: easily has more; the VPN's, one of its newest, would be dropped.
 KEPT_ADDRESSES = 32
 LOOPBACK = '127.0.0.1'
+#: Stands for all interfaces.
+ANY = '0.0.0.0'
 #: Values of FASTDDS_BUILTIN_TRANSPORTS that can reach nodes with UDP only.
 _REACHABLE = ('', 'DEFAULT', 'UDPV4')
 _PEER = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
@@ -68,6 +85,8 @@ class FastDds(DdsVendor):
     """
 
     rmw: ClassVar[str] = 'rmw_fastrtps_cpp'
+    by_address: ClassVar[bool] = True
+    asks_machines: ClassVar[bool] = True
     #: Ports at which each process receives the node lists of others (``ros_discovery_info``).
     #: They are the same in every domain, because the middleware itself sets the port.
     ports: ClassVar[Sequence[tuple[int, int]]] = ((7000, 7119),)
@@ -82,7 +101,7 @@ class FastDds(DdsVendor):
         self, vpn: str, lan: Optional[str], user: Mapping[str, str],
     ) -> list[DdsInterface]:
         """
-        Return the interfaces of the robot's nodes; an empty list stands for all interfaces.
+        Return the interfaces of the robot's nodes: all of them, and the VPN's.
 
         :raises DdsError: the user's environment prevents communication with machines.
         """
@@ -95,70 +114,75 @@ class FastDds(DdsVendor):
             raise DdsError(
                 f'with FASTDDS_BUILTIN_TRANSPORTS={transports}, nodes would reach no machine',
                 'unset it: machines speak UDP over IPv4')
-        if local_only(user):
-            return [DdsInterface(LOOPBACK, 10), DdsInterface(vpn, multicast=True)]
-        return []
+        first = LOOPBACK if local_only(user) else ANY
+        return [DdsInterface(first), DdsInterface(vpn)]
 
     def machine_interfaces(self, vpn: str) -> list[DdsInterface]:
         """Return the interface of a machine's nodes; its address also leads to the machine."""
-        return [DdsInterface(vpn, multicast=True)]
+        return [DdsInterface(vpn)]
 
     def render(
         self, interfaces: Sequence[DdsInterface], peers: Sequence[str],
-        user: Mapping[str, str] = MappingProxyType({}),
+        user: Mapping[str, str] = MappingProxyType({}), *, guest: bool = False,
     ) -> str:
         """
         Return the XML: the user's profiles, with our settings in the default participant.
 
-        :param interfaces: empty for all interfaces.
-        :param peers: hosts to ask by unicast, besides multicast if an interface supports it.
+        :param interfaces: by address; the last one is the VPN's, whose group the nodes use.
+        :param peers: VPN addresses of other hosts.
         :param user: the user's environment variables: the profiles of
             FASTRTPS_DEFAULT_PROFILES_FILE are included, and ROS_STATIC_PEERS are asked too.
+        :param guest: announce no group.
         :raises DdsError: the user's profiles cannot be read, or configure transports.
         """
-        multicast = not interfaces or any(one.multicast for one in interfaces)
         root, profiles = _profiles(user.get(VARIABLE, ''))
         participant = _default_participant(profiles)
         rtps = _child(participant, 'rtps')
-        limit = _child(_child(_child(rtps, 'allocation'), 'remote_locators'),
-                       'max_unicast_locators')
+        kept = _child(_child(rtps, 'allocation'), 'remote_locators')
+        limit = _child(kept, 'max_unicast_locators')
         limit.text = limit.text or str(KEPT_ADDRESSES)
+        _child(kept, 'max_multicast_locators').text = '1'
         builtin = _child(rtps, 'builtin')
         discovery = _child(builtin, 'discovery_config')
         for name, seconds in (('leaseDuration', LEASE_DURATION),
                               ('leaseAnnouncement', ANNOUNCEMENT)):
             if discovery.find(name) is None:
                 _child(_child(discovery, name), 'sec').text = str(seconds)
-        asked = list(dict.fromkeys([*peers, *static_peers(user)]))
-        if multicast and (asked or interfaces):
-            # any initial peer replaces the default ones
-            asked.insert(0, DISCOVERY_GROUP)
-        if any(one.name == LOOPBACK for one in interfaces) or not multicast:
-            asked.append(LOOPBACK)
-        listed = builtin.find('initialPeersList')
-        if asked or listed is not None:
-            listed = _child(builtin, 'initialPeersList')
-            for host in asked:
-                listed.extend(self._locators(host))
-        if not multicast:
-            # any configured address disables the default multicast group
+        names = [one.name for one in interfaces]
+        group, common = [multicast_group(names[-1])], [DISCOVERY_GROUP]
+        # the robot's nodes also hear the common group, and so find each other by it
+        heard, found_by = (group, group) if len(names) == 1 else (group + common, [])
+        asked = dict.fromkeys([*common, *found_by, *map(multicast_group, peers)])
+        if not guest:
+            # the first group is announced, see max_multicast_locators
+            _child(builtin, 'avoid_builtin_multicast').text = 'false'
+            _child(builtin, 'metatrafficMulticastLocatorList').extend(map(self._group, heard))
             _child(_child(builtin, 'metatrafficUnicastLocatorList'), 'locator')
-        _own_transport(profiles, rtps, interfaces)
+        # any initial peer replaces the default one
+        _child(builtin, 'initialPeersList').extend([
+            *map(self._group, asked),
+            *(one for host in [*static_peers(user), *({LOOPBACK} & {*names})]
+              for one in self._ports(host))])
+        _own_transport(profiles, rtps, names)
+        size = _child(_child(_child(rtps, 'propertiesPolicy'), 'properties'), 'property')
+        _text(size, name='fastdds.max_message_size', value=str(DATAGRAM))
+        _times(profiles)
         _sort(rtps)
         ElementTree.indent(root)
         return ('<?xml version="1.0" encoding="UTF-8"?>\n'
                 + ElementTree.tostring(root, encoding='unicode') + '\n')
 
-    def _locators(self, host: str) -> list[Element]:
+    def _group(self, address: str) -> Element:
+        # the domain's first port is Fast DDS's default; it joins one group for each port
+        return _locator(address, PORT_BASE + PORTS_PER_DOMAIN * self.domain - (
+            10 if address == DISCOVERY_GROUP else 8))
+
+    def _ports(self, host: str) -> list[Element]:
         if not _PEER.fullmatch(host):
             raise DdsError(f"'{host}' of ROS_STATIC_PEERS is no address or host name",
                            'write addresses or names, separated by ;')
-        if host == DISCOVERY_GROUP:
-            # the domain's first port, which is Fast DDS's default for multicast
-            return [_locator(host, PORT_BASE - 10 + PORTS_PER_DOMAIN * self.domain)]
         begin = PORT_BASE + PORTS_PER_DOMAIN * self.domain
-        count = ASKED_HERE if host == LOOPBACK else ASKED
-        return [_locator(host, begin + 2 * index) for index in range(count)]
+        return [_locator(host, begin + 2 * index) for index in range(ASKED)]
 
     def environment(self, path: str, user: Mapping[str, str]) -> Mapping[str, str]:
         """
@@ -213,10 +237,8 @@ def _default_participant(profiles: Element) -> Element:
         profiles, 'participant', profile_name='fogros2', is_default_profile='true')
 
 
-def _own_transport(
-    profiles: Element, rtps: Element, interfaces: Sequence[DdsInterface],
-) -> None:
-    """Let participants use UDP only; and only these interfaces and their networks, if any."""
+def _own_transport(profiles: Element, rtps: Element, names: Sequence[str]) -> None:
+    """Let participants use UDP only, on these interfaces; send only to their networks."""
     descriptors = _child(profiles, 'transport_descriptors')
     # transports have to precede the participants that use them
     profiles.remove(descriptors)
@@ -224,14 +246,32 @@ def _own_transport(
     udp = ElementTree.SubElement(descriptors, 'transport_descriptor')
     _text(udp, transport_id=_UDP, type='UDPv4', receiveBufferSize=rtps.findtext(
         'listenSocketBufferSize') or str(RECEIVE_BUFFER))
-    if interfaces:
+    if ANY not in names:
         _text(udp, netmask_filter='ON')
         allowed = _child(udp, 'interfaceWhiteList')
-        for one in sorted(interfaces, key=lambda one: -one.priority):
-            kind = 'address' if is_address(one.name) else 'interface'
-            ElementTree.SubElement(allowed, kind).text = one.name
+        for name in names:
+            ElementTree.SubElement(allowed, 'address').text = name
     _text(_child(rtps, 'userTransports'), transport_id=_UDP)
     _child(rtps, 'useBuiltinTransports').text = 'false'
+
+
+def _times(profiles: Element) -> None:
+    """Repeat lost samples soon, unless the user's profiles have defaults of their own."""
+    for kind, old, delays in (
+            ('data_writer', 'publisher',
+             {'heartbeatPeriod': HEARTBEAT, 'nackResponseDelay': DELAY}),
+            ('data_reader', 'subscriber', {'heartbeatResponseDelay': DELAY})):
+        if not any(one.tag in (kind, old) and one.get('is_default_profile') == 'true'
+                   for one in profiles):
+            times = _child(ElementTree.SubElement(
+                profiles, kind, profile_name='fogros2', is_default_profile='true'), 'times')
+            for name, milliseconds in delays.items():
+                _text(_child(times, name), nanosec=str(milliseconds * 1_000_000))
+    # each process has a writer and all others' readers: a question with each sample, as is the
+    # default, would be three quarters of all packets with these names
+    names = ElementTree.SubElement(profiles, 'data_writer', profile_name=NODE_NAMES)
+    _text(_child(names, 'qos'), disable_heartbeat_piggyback='true')
+    _text(_child(_child(names, 'times'), 'heartbeatPeriod'), sec='1')
 
 
 def _locator(address: str, port: int) -> Element:

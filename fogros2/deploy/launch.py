@@ -31,7 +31,7 @@ from fogros2.invitation import Invitation, own_key, unseal
 from fogros2.journal import Journal
 from fogros2.model import DdsInterface, MachineSpec
 from fogros2.provider import Provider
-from fogros2.report import Reporter, silent, StepFailed, Warned
+from fogros2.report import Reporter, silent, step, StepFailed, Warned
 from fogros2.store import delete_folder, Record, Store, this_process, write_private
 from fogros2.vpn import addresses
 from fogros2.waiting import Timeouts
@@ -211,16 +211,19 @@ class Launch:
             if self._robot_environment is None:
                 check_robot()
                 vendor, user = self.dds(), self.user_environment
-                lan = vendor.parse_lan(run(
-                    [vendor.ask_lan()], timeout=self.timeouts.vpn, cancel=self.cancel))
                 vpn = self.robot_vpn()
                 path = self.store.launch(self.id) / vendor.file_name
-                self._interfaces = vendor.robot_interfaces(
-                    vpn.interface.address if vendor.by_address else vpn.interface.name, lan, user)
-                self._write_interfaces()
-                # for terminals that join the launch: they read the domain and the middleware
-                write_private(path.with_name('domain'), str(self.domain).encode())
-                write_private(path.with_name('rmw'), vendor.rmw.encode())
+                with step(self.report, '', 'middleware') as detail:
+                    detail.append(vendor.rmw)
+                    lan = vendor.parse_lan(run(
+                        [vendor.ask_lan()], timeout=self.timeouts.vpn, cancel=self.cancel))
+                    self._interfaces = vendor.robot_interfaces(
+                        vpn.interface.address if vendor.by_address else vpn.interface.name,
+                        lan, user)
+                    self._write_interfaces()
+                    # for terminals that join the launch: they read domain and middleware
+                    write_private(path.with_name('domain'), str(self.domain).encode())
+                    write_private(path.with_name('rmw'), vendor.rmw.encode())
                 vpn.ensure()
                 # the ROS 2 daemon is a node that uses the interface: it has to end first
                 self.undo.callback(ros2_daemon.stop, path.parent)
@@ -241,13 +244,15 @@ class Launch:
     def _write_interfaces(self) -> None:
         """Write the middleware's configuration for nodes of the robot that start from now on."""
         vendor = self.dds()
-        # of all interfaces, the last is the launch's; none stands for all that there are
-        more = [dataclasses.replace(own, name=found.joiner if vendor.by_address else
-                                    f'fog{found.number}')
-                for own in self._interfaces[-1:] for found in self._invitations.values()]
-        # no peers: the machines announce themselves
+        # of all interfaces, the last is the launch's
+        more = [dataclasses.replace(self._interfaces[-1], name=found.joiner if vendor.by_address
+                                    else f'fog{found.number}')
+                for found in self._invitations.values()]
+        peers = [found.address for found in self._invitations.values()] + [
+            self._address(index) for name, index in self._indices.items()
+            if name not in self._invitations] if vendor.asks_machines else []
         write_private(self.store.launch(self.id) / vendor.file_name, vendor.render(
-            [*self._interfaces, *more], (), self.user_environment).encode())
+            [*self._interfaces, *more], peers, self.user_environment, guest=bool(more)).encode())
 
     def join(self, spec: MachineSpec) -> Optional[Invitation]:
         """
@@ -312,8 +317,12 @@ class Launch:
     def expect(self, names: Iterable[str]) -> None:
         """Reserve the VPN addresses of machines, so that nodes that start earlier know them."""
         with self._lock:
+            before = len(self._indices)
             for name in names:
                 self._indices.setdefault(name, len(self._indices))
+            if self._robot_environment is not None and len(self._indices) > before \
+                    and self.dds().asks_machines:
+                self._write_interfaces()
 
     def context(self, spec: MachineSpec) -> Context:
         """

@@ -129,7 +129,9 @@ def _write(
     interfaces = vendor.robot_interfaces(
         interface.address if vendor.by_address else interface.name, lan, environment)
     for name, content in {
-            vendor.file_name: vendor.render(interfaces, (), environment),
+            vendor.file_name: vendor.render(
+                interfaces, [invitation.address] if vendor.asks_machines else [], environment,
+                guest=True),
             'domain': str(invitation.domain), 'rmw': vendor.rmw,
             'process.json': to_json(owner), SECRET: invitation.secret,
             JOINED: to_json(invitation)}.items():

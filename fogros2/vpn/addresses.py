@@ -69,6 +69,17 @@ def choose_subnet(used: Iterable[str], *, launch_id: str, pool: str = POOL) -> s
         f'{POOL_VARIABLE}=10.213.0.0/16 names another range')
 
 
+def multicast_group(address: str) -> str:
+    """
+    Return the multicast group of one host, by which other hosts reach all of its participants.
+
+    A VPN interface sends each packet to the one peer that its destination belongs to.
+
+    :param address: the host's VPN address; the VPN's subnet for the range of all groups.
+    """
+    return f"239.{address.partition('.')[2]}"
+
+
 def guests(subnet: str) -> str:
     """Return the range of a launch's subnet that is for guests, in CIDR form."""
     return str(_Network((int(_Network(subnet)[FIRST_GUEST]), GUEST_PREFIX)))

@@ -262,6 +262,8 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
     """
     name = _name(interface)
     outside = _outside(interface)
+    group = addresses.multicast_group(interface.address)
+    destinations = f'{{ {interface.address}, {DISCOVERY_GROUP}, {group} }}'
     rules = [
         f'table inet {name}',
         f'delete table inet {name}',
@@ -278,7 +280,7 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
             ' update @lan { ip saddr }',
             f'    iifname != "{name}" accept',
             # a peer may send to any address of this computer, a LAN's included
-            f'    ip daddr != {{ {interface.address}, {DISCOVERY_GROUP} }} drop',
+            f'    ip daddr != {destinations} drop',
             '    ct state established,related accept',
             f'    udp dport {_set(ports)} accept',
             '    icmp type echo-request accept',
@@ -287,7 +289,14 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
             '  chain forward {',
             '    type filter hook forward priority filter; policy accept;',
             f'    iifname "{name}" drop',
-            f'    oifname "{name}" drop']
+            f'    oifname "{name}" drop',
+            '  }',
+            '  chain groups {',
+            '    type filter hook output priority filter - 1; policy accept;',
+            # nodes send multicast on all interfaces; Linux keeps what has no hop left
+            f'    oifname "{name}" accept',
+            f'    ip daddr {group} ip ttl set 0 accept',
+            f'    ip daddr {addresses.multicast_group(interface.network)} drop']
     else:
         own = addresses.guests(interface.network)
         admitted = f'iifname "{name}" ip saddr {own}'
@@ -295,7 +304,7 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
                       for guest in ipaddress.IPv4Network(own)]
         rules[3:3] = [
             '  chain guests {',
-            f'    ip daddr != {{ {interface.address}, {DISCOVERY_GROUP} }} drop',
+            f'    ip daddr != {destinations} drop',
             f'    udp dport {_set(ports)} accept',
             '    icmp type echo-request accept',
             f'    tcp dport {addresses.GUEST_PORT} accept',
@@ -338,13 +347,14 @@ def _confine(
     """
     name = _name(interface)
     record, owed = f'/run/{name}.group', f'/run/{name}.owed'
+    group = addresses.multicast_group(interface.address)
     match = f'{RTPS} socket cgroupv2 level %s "%s"'
     if interface.firewall:
         rules = [
             'chain confined {',
             f'udp dport != {_set(ports)} drop',
             'oifname "lo" accept',
-            f'ip daddr {{ {", ".join([DISCOVERY_GROUP, *asked])} }} accept',
+            f'ip daddr {{ {", ".join([DISCOVERY_GROUP, group, *asked])} }} accept',
             'ip daddr @lan accept',
             'drop',
             '}',
@@ -474,7 +484,7 @@ def _configure(
     config = [f'ListenPort = {interface.port}']
     for number, peer in enumerate(peers):
         _check(peer)
-        allowed = f'{peer.address}/32'
+        allowed = f'{peer.address}/32, {addresses.multicast_group(peer.address)}/32'
         if number == 0:
             # an address can belong to one peer only: the robot, or the first machine
             allowed += f', {DISCOVERY_GROUP}/32'

@@ -306,14 +306,19 @@ def firewall() -> Check:
 
 
 def state() -> Check:
-    """Check that the state folder belongs to this user and that no other user can read it."""
+    """Check that the state folder can be written, and by this user alone."""
     folder = state_home()
-    if not folder.exists():
-        parent = next(p for p in folder.parents if p.exists())
-        if os.access(parent, os.W_OK):
-            return Check('state folder', 'ok', f'{folder} will be made')
-        return Check('state folder', 'failed', f'{parent} is not writable',
+    there = next(p for p in (folder, *folder.parents) if p.exists())
+    disk = os.statvfs(there)
+    why = 'is on a read-only file system' if disk.f_flag & os.ST_RDONLY else \
+        'is on a full disk' if disk.f_blocks and not disk.f_bavail \
+        or disk.f_files and not disk.f_ffree else \
+        'is not writable' if there != folder and not os.access(there, os.W_OK) else ''
+    if why:
+        return Check('state folder', 'failed', f'{there} {why}',
                      'FOGROS2_STATE_HOME names another folder')
+    if there != folder:
+        return Check('state folder', 'ok', f'{folder} will be made')
     status = folder.stat()
     if status.st_uid != os.geteuid() or not os.access(folder, os.W_OK):
         return Check('state folder', 'failed', f'{folder} belongs to somebody else',

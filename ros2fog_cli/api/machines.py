@@ -16,6 +16,7 @@ from fogros2 import monitor_addresses, plugin_system
 from fogros2.errors import (
     Cancelled,
     ConfigurationError,
+    did_you_mean,
     FogError,
     MachineNotFound,
     Unsupported,
@@ -383,6 +384,13 @@ def total(entries: Sequence[Entry], now: float) -> Optional[tuple[Decimal, Decim
                                        Decimal(0))
 
 
+def unknown(name: str, store: Optional[Store] = None) -> ConfigurationError:
+    """Return the error for a machine that nobody knows; its hint is the nearest name."""
+    names = [record.name for record in (store or Store()).machines()]
+    return ConfigurationError(f"there is no machine '{name}'", did_you_mean(
+        name, names, 'ros2 fog list shows those there are'))
+
+
 def one(entries: Sequence[Entry], name: str) -> Entry:
     """
     Return the one machine of that name.
@@ -391,8 +399,7 @@ def one(entries: Sequence[Entry], name: str) -> Entry:
     """
     own = [entry for entry in entries if entry.own] or list(entries)
     if not own:
-        raise ConfigurationError(f"there is no machine '{name}'",
-                                 'ros2 fog list shows those there are')
+        raise unknown(name)
     if len(own) > 1:
         places = ', '.join(f'{entry.provider} {entry.machine_id}' for entry in own)
         raise ConfigurationError(f"there are several machines '{name}': {places}",

@@ -13,7 +13,7 @@ from typing import Optional
 
 from fogros2 import monitor_addresses, untrusted
 from fogros2.deploy.machine_job import AGENT_FOLDER
-from fogros2.errors import AgentError, CommandError, ConfigurationError
+from fogros2.errors import AgentError, CommandError, ConfigurationError, DeadlineExceeded
 from fogros2.model import Command
 from fogros2.shell import Shell
 from fogros2.store import Store
@@ -106,6 +106,10 @@ def _read(entry: Entry, shell: Shell, words: tuple[str, ...]) -> tuple[str, str]
     except CommandError as error:
         raise AgentError(f"'{entry.name}' has no token yet, or can't make one: {error}",
                          f'ros2 fog logs {entry.name}') from error
+    except DeadlineExceeded as error:
+        raise DeadlineExceeded(
+            str(error.args[0]),
+            f'the machine is busy or out of reach: ros2 fog status {entry.name}') from error
 
 
 def _wrong(entry: Entry, what: str) -> AgentError:

@@ -20,7 +20,7 @@ from ros2fog_cli.api.table import cost, duration, NODES, nodes, shares, table
 _ENTER, _LEAVE = '\x1b[?1049h\x1b[?25l\x1b[?7l', '\x1b[?7h\x1b[?25h\x1b[?1049l'
 _HOME, _REST, _LINE = '\x1b[H', '\x1b[J', '\x1b[K'
 #: SGR codes: bold, dim, and the colours of states.
-_STYLES = {'bold': '1', 'dim': '2', 'good': '32', 'busy': '36', 'bad': '31'}
+_STYLES = {'bold': '1', 'dim': '2', 'good': '32', 'busy': '36', 'warning': '33', 'bad': '31'}
 _OF_STATE = {
     'running': 'good', 'done': 'good', 'coming': 'busy', 'starting': 'busy', 'ending': 'busy',
     'exited': 'dim', 'gone': 'dim', 'failed': 'bad', 'refused': 'bad', 'live': 'good',

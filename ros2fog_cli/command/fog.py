@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any, Optional, Union
+import functools
+import re
+from typing import Any, NoReturn, Optional, Union
 
 from ros2cli.command import add_subparsers_on_demand, CommandExtension
 
@@ -19,6 +21,7 @@ class FogCommand(CommandExtension):
     ) -> None:
         """Add the verbs; only the chosen one is imported."""
         self._subparser = parser
+        parser.error = functools.partial(_error, parser)  # type: ignore[method-assign]
         add_subparsers_on_demand(
             parser, cli_name, '_verb', 'fogros2.verb', required=False, argv=argv)
 
@@ -32,3 +35,14 @@ class FogCommand(CommandExtension):
         with output.cleaned():
             status: Union[int, str, None] = args._verb.main(args=args)
         return status
+
+
+def _error(parser: argparse.ArgumentParser, message: str) -> NoReturn:
+    """Exit with a message; the nearest verb is part of it."""
+    wrong = re.search(r"invalid choice: '([^']*)'", message)
+    if wrong:
+        from fogros2 import plugin_system
+        from fogros2.errors import did_you_mean
+        hint = did_you_mean(wrong[1], plugin_system.names('fogros2.verb'), all_too=True)
+        message = f"'{wrong[1]}' is no command of ros2 fog ({hint})"
+    type(parser).error(parser, message)

@@ -54,11 +54,42 @@ def machine_names() -> list[str]:
     return [record.name for record in Store().machines()]
 
 
-def add_region(parser: argparse.ArgumentParser) -> None:
-    """Add FogROS2's own ``--region``."""
+def add_region(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
+    """
+    Add FogROS2's own ``--region``.
+
+    :param several: it takes several values, which would swallow a machine's name after it.
+    """
+    more = '' if several else '; may be repeated'
     complete(parser.add_argument(
-        '--region', nargs='*', metavar='REGION',
-        help="regions to ask where a provider has some; 'all' for every one"), region_names)
+        '--region', nargs='*' if several else 1, action='extend', type=region, metavar='REGION',
+        help=f"regions to ask where a provider has some; 'all' for every one{more}"),
+             region_names)
+
+
+def region(text: str) -> str:
+    """
+    Check that some provider has a region, and return its name.
+
+    :raises argparse.ArgumentTypeError: no provider has it.
+    """
+    from fogros2.errors import did_you_mean
+    names = region_names()
+    if text in ('*', *names) or len(names) == 1:
+        return text
+    hint = did_you_mean(text, names, 'ros2 fog regions shows those there are')
+    raise argparse.ArgumentTypeError(f"no provider has a region '{text}' ({hint})")
+
+
+def port(text: str) -> int:
+    """
+    Parse a TCP port, 0 for any free one.
+
+    :raises argparse.ArgumentTypeError: it is none.
+    """
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"'{text}' is no port (0 to 65535)")
+    return int(text)
 
 
 def region_names() -> list[str]:
@@ -93,7 +124,7 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 
 def add_page(parser: argparse.ArgumentParser) -> None:
     """Add the options of verbs that serve a page."""
-    parser.add_argument('--port', type=int, default=0,
+    parser.add_argument('--port', type=port, default=0,
                         help='port of this computer (default: any free port)')
     parser.add_argument('--no-browser', action='store_true',
                         help='print the address, but start no browser')

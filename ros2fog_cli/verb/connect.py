@@ -26,7 +26,8 @@ class ConnectVerb(VerbExtension):
         if words and words[0].startswith('-') and words[0] != '--':
             # argparse takes options after the name for a part of the command.
             end = words.index('--') if '--' in words else len(words)
-            late = argparse.ArgumentParser(prog='ros2 fog connect NAME', add_help=False)
+            late = argparse.ArgumentParser(prog='ros2 fog connect NAME', usage=(
+                '%(prog)s [--region REGION] [--user USER] [-- COMMAND ...]'))
             _add_options(late)
             late.parse_args(words[:end], args)
             words = words[end:]

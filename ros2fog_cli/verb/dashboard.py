@@ -13,7 +13,7 @@ class DashboardVerb(VerbExtension):
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
-        add_region(parser)
+        add_region(parser, several=True)
         add_page(parser)
         parser.add_argument('--no-topics', action='store_true',
                             help='join no launch: measure no rates, take no pictures')
@@ -24,8 +24,6 @@ class DashboardVerb(VerbExtension):
         from fogros2_monitor.dashboard.server import Dashboard
         from ros2fog_cli.api.browser import browser_at
         from ros2fog_cli.api.live import Live
-        if not 0 <= args.port < 65536:
-            raise ConfigurationError(f'--port {args.port} is no port', 'give one up to 65535')
         live = Live(regions=args.region, topics=not args.no_topics, pictures=True)
         try:
             dashboard = Dashboard(live, port=args.port)

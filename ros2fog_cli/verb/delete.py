@@ -21,7 +21,8 @@ class DeleteVerb(VerbExtension):
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
-        name = parser.add_argument('name', help="the machine's name, or 'all' for this robot's")
+        name = parser.add_argument('name', nargs='+',
+                                   help="names of machines, or 'all' for this robot's")
         complete(name, lambda: [*machine_names(), 'all'])
         add_region(parser)
         parser.add_argument('--yes', '-y', action='store_true', help="don't ask for confirmation")
@@ -37,31 +38,38 @@ class DeleteVerb(VerbExtension):
         from fogros2.store import Store
         from ros2fog_cli.api import endings, machines, progress
         store = Store()
-        name = None if args.name == 'all' else args.name
-        entries = machines.survey(warn, name=name, regions=args.region, store=store)
-        others = [entry for entry in entries if not entry.own]
-        # Another robot's machine can be deleted by name, unless this robot has one of that name.
-        if not args.any_robot and (name is None or len(others) < len(entries)):
-            entries = [entry for entry in entries if entry.own]
-            if others:
-                warn(f'{len(others)} of other robots left out (--any-robot takes them)')
+        names = [None] if 'all' in args.name else list(dict.fromkeys(args.name))
+        every = machines.survey(warn, name=names[0] if len(names) == 1 else None,
+                                regions=args.region, store=store)
+        entries, failed = [], 0
+        for name in names:
+            found = [entry for entry in every if name in (None, entry.name)]
+            own = [entry for entry in found if entry.own]
+            # Another robot's machine can be deleted by name, unless this robot has one of that
+            # name.
+            if not args.any_robot and (name is None or own):
+                if len(own) < len(found):
+                    warn(f'{len(found) - len(own)} of other robots left out (--any-robot takes '
+                         'them)')
+                found = own
+            entries += found
+            if name is not None and not found:
+                warn(str(machines.unknown(name, store)))
+                failed = 1
         if not entries:
-            if name is None:
+            if not failed:
                 say('no machines')
-                return 0
-            warn(f"there is no machine '{name}' (ros2 fog list shows those there are)")
-            return 1
+            return failed
         for entry in entries:
             whose = '' if entry.own else f' of the robot {entry.robot}'
             say(f"{'would delete' if args.dry_run else 'delete'} {entry.name}{whose}: "
                 f"{entry.provider} {entry.machine_id or '-'}, {entry.state}")
         if args.dry_run:
-            return 0
+            return failed
         for entry in entries:
             endings.check_free(entry, force=args.force)
         if not args.yes and not agreed('this machine', 'machines', len(entries)):
             return 1
-        failed = 0
         for entry, error in endings.delete_all(entries, store, progress.report, force=args.force):
             if error is None:
                 say(f'deleted {entry.name}')

@@ -11,7 +11,7 @@ import sys
 from ros2fog_cli.verb import add_json, complete, provider_names, VerbExtension
 
 _MARKS = {'ok': ' ok ', 'warning': 'warn', 'failed': 'FAIL'}
-_COLOURS = {'ok': '32', 'warning': '33', 'failed': '31'}
+_STYLES = {'ok': 'good', 'warning': 'warning', 'failed': 'bad'}
 
 
 class DoctorVerb(VerbExtension):
@@ -29,16 +29,14 @@ class DoctorVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print each check, with a remedy unless it passed; return 1 if a check failed."""
-        from ros2fog_cli.api import doctor
+        from ros2fog_cli.api import doctor, screen
         checks = doctor.examine(lan_seconds=args.lan_seconds, providers=args.provider)
         if args.json:
             print(json.dumps([dataclasses.asdict(check) for check in checks], indent=2))
         else:
-            colour = sys.stdout.isatty()
+            paint = screen.painter(sys.stdout)
             for check in checks:
-                mark = _MARKS[check.verdict]
-                if colour:
-                    mark = f'\x1b[{_COLOURS[check.verdict]}m{mark}\x1b[0m'
+                mark = paint(_MARKS[check.verdict], _STYLES[check.verdict])
                 print(f'[{mark}] {check.name}: {check.detail}')
                 if check.remedy and check.verdict != 'ok':
                     print(f'       {check.remedy}')

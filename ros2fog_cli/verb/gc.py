@@ -14,7 +14,7 @@ class GcVerb(VerbExtension):
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
-        add_region(parser)
+        add_region(parser, several=True)
         parser.add_argument('--dry-run', action='store_true', help='print what would be cleared')
         parser.add_argument('--keep-stopped', type=float, default=7.0, metavar='DAYS',
                             help='how long a stopped machine is kept (default: 7)')

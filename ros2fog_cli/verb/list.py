@@ -15,7 +15,7 @@ class ListVerb(VerbExtension):
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
-        add_region(parser)
+        add_region(parser, several=True)
         add_json(parser)
 
     def main(self, *, args: argparse.Namespace) -> int:

@@ -99,7 +99,7 @@ def sent_since(computer, marker):
 
 def test_bare_computer_gets_missing_packages_once(computer, launch, home):
     first = launch(*example(computer, host_key=computer.host_key))
-    assert first.ended() == 0, first.text
+    assert first.ended(150) == 0, first.text
     assert f'I heard: [Hello World from {computer.name}' in first.text
     assert ('ROS 2 installed by pip' in first.text) == embedded()
     assert 'WARNING' not in first.text and first.errors == []

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -28,6 +29,7 @@ from std_msgs.msg import Empty, UInt8MultiArray, UInt64MultiArray
 from image_transport_h264 import annexb, message
 from image_transport_h264.acknowledgement import wait_for_all_acked
 from image_transport_h264.codec import Encoder, peek, Settings
+from image_transport_h264.lazy import LazyNode, MOST_CAUSES
 from rigs.bench import Bench, BEST_EFFORT, RELIABLE
 
 ROOT = Path(__file__).parents[2]
@@ -356,6 +358,17 @@ def test_bad_images_cost_a_line_each_kind(bench: Bench) -> None:
     assert not any('Traceback' in line for line in lines)
 
 
+def test_number_of_warnings_is_limited() -> None:
+    """A sender could otherwise fill the log with names of encodings."""
+    lines: list[str] = []
+    node: Any = SimpleNamespace(
+        _complained=set(), _complaining=threading.Lock(),
+        get_logger=lambda: SimpleNamespace(warning=lines.append))
+    for number in range(10 * MOST_CAUSES):
+        LazyNode.complain(node, f'encoding {number}', 'image not sent')
+    assert len(lines) == MOST_CAUSES
+
+
 def test_packets_that_are_none_cost_a_line(bench: Bench) -> None:
     lines = bench.start('decoder', '-r', 'image:=/seen/camera', '-p', 'stream:=/s')
     seen = bench.heard(Image, '/seen/camera')
@@ -497,7 +510,6 @@ def test_no_subscriber_is_missed_by_a_node_that_asks(bench: Bench) -> None:
     done = subprocess.run([sys.executable, '-c', ASKS], env=bench.environment, text=True,
                           capture_output=True, timeout=60)
     assert (done.returncode, done.stdout) == (0, '[1] 1\n'), done.stderr
-
 
 
 def ignores_interrupts(process: int) -> bool:

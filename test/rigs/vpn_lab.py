@@ -15,6 +15,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 import dataclasses
+import functools
+import importlib.util
 import itertools
 import json
 import os
@@ -27,7 +29,9 @@ from typing import Any
 import pytest
 
 from fogros2 import process
+from fogros2.dds import DdsVendor
 from fogros2.dds.cyclonedds import CycloneDds
+from fogros2.dds.fastdds import FastDds
 from fogros2.model import Command, Peer, Result, VpnInterface
 from fogros2.vpn.wireguard import WireGuard
 from fogros2.waiting import wait_until
@@ -35,6 +39,12 @@ from fogros2.waiting import wait_until
 TEST = Path(__file__).parents[1]
 RELAY = TEST / 'relay.py'
 NODE = TEST / 'integration/vpn/dds_node.py'
+#: Participants of Cyclone DDS without ROS 2, by the package cyclonedds.
+CYCLONE = TEST / 'integration/vpn/cyclone_node.py'
+#: What ROS 2 Jazzy itself configures for Cyclone DDS.
+STOCK = ('<CycloneDDS><Domain><Discovery><ParticipantIndex>auto</ParticipantIndex>'
+         '<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex></Discovery></Domain></CycloneDDS>')
+CYCLONE_0_10 = TEST.parent / '.cache/cyclonedds-0.10'
 NETWORK = '198.18.7.0/24'
 ROBOT, MACHINE, SECOND = '198.18.7.1', '198.18.7.2', '198.18.7.3'
 PORT = 51820
@@ -121,16 +131,21 @@ class Child:
 
 
 class Lab:
-    """The namespaces, and what runs in them."""
+    """
+    The namespaces, and what runs in them.
 
-    def __init__(self, folder: Path) -> None:
+    :param middleware: of the nodes: 'cyclonedds', 'cyclonedds 0.10', or 'fastdds' for ROS 2's.
+    """
+
+    def __init__(self, folder: Path, middleware: str = 'cyclonedds') -> None:
         self.folder = folder
+        self.middleware = middleware
+        self.dds: DdsVendor = FastDds() if middleware == 'fastdds' else CycloneDds()
         # the sockets of wireguard-go are the computer's, so names are unique there
         self.mark = f'fogt{os.getpid() % 100000}x{next(_numbers)}'
         self.spaces = {host: f'{self.mark}{host[0]}' for host in (
             'robot', 'machine', 'net', 'lan')}
-        self.vpn = WireGuard()
-        self.dds = CycloneDds()
+        self.vpn = WireGuard(ports=self.dds.ports)
         self.interfaces = {
             'robot': VpnInterface(f'{self.mark}r', ROBOT, NETWORK, PORT,
                                   str(folder / 'r/vpn.key'), firewall=True),
@@ -299,28 +314,37 @@ class Lab:
                 continue
         return 0
 
-    def node(self, host: str, *words: str, uri: str | None = None) -> Child:
+    def configure(self, host: str) -> Mapping[str, str]:
+        """Write what a deployment configures for a host's nodes; return their variables."""
+        interface = self.interfaces[host]
+        used = interface.address if self.dds.by_address else interface.name
+        machines = [other.address for name, other in self.interfaces.items()
+                    if not other.firewall and name != host]
+        if interface.firewall:
+            text = self.dds.render(
+                self.dds.robot_interfaces(used, self.lan_name, {}),
+                machines if self.dds.asks_machines else [], guest=host == 'guest')
+        else:
+            text = self.dds.render(self.dds.machine_interfaces(used), machines)
+        path = self.folder / f'dds {host}.xml'
+        path.write_text(text)
+        return self.dds.environment(str(path), {})
+
+    def node(self, host: str, *words: str, stock: bool = False) -> Child:
         """
         Start a node and wait until it is there: see ``dds_node.py`` for the words.
 
-        :param uri: in place of what a deployment configures; '' for nothing.
+        :param stock: without what a deployment configures.
         """
-        environment = {'RMW_IMPLEMENTATION': self.dds.rmw}
-        if uri is None:
-            path = self.folder / f'dds {host}.xml'
-            name = self.interfaces[host].name
-            if self.interfaces[host].firewall:
-                text = self.dds.render(self.dds.robot_interfaces(name, self.lan_name, {}), [])
-            else:
-                others = {'machine': SECOND, 'second': MACHINE}
-                peers = [others[host]] if 'second' in self.interfaces else []
-                text = self.dds.render(self.dds.machine_interfaces(name), peers)
-            path.write_text(text)
-            environment.update(self.dds.environment(str(path), {}))
-        elif uri:
-            environment['CYCLONEDDS_URI'] = uri
-        group = self.interfaces[host].name if uri is None else ''
-        child = self.start(host, [sys.executable, str(NODE), *words], group=group, **environment)
+        if reason := missing(self.middleware):
+            pytest.skip(reason)
+        program = NODE if self.middleware == 'fastdds' else CYCLONE
+        environment = {'RMW_IMPLEMENTATION': self.dds.rmw, 'ROS_LOG_DIR': str(self.folder),
+                       **({'CYCLONEDDS_URI': STOCK} if stock else self.configure(host))}
+        if self.middleware == 'cyclonedds 0.10':
+            environment['PYTHONPATH'] = str(CYCLONE_0_10)
+        child = self.start(host, [sys.executable, str(program), *words],
+                           group='' if stock else self.interfaces[host].name, **environment)
         child.wait('ready', timeout=20.0)
         return child
 
@@ -331,10 +355,30 @@ class Lab:
         return self.run(host, Command(words), check=False).returncode == 0
 
 
+@functools.cache
+def missing(middleware: str) -> str:
+    """Return why a middleware's nodes cannot run here, '' if they can."""
+    if middleware == 'cyclonedds 0.10':
+        return '' if CYCLONE_0_10.is_dir() else 'Cyclone DDS 0.10 could not be built here'
+    if middleware == 'cyclonedds':
+        return '' if importlib.util.find_spec('cyclonedds') else 'needs the package cyclonedds'
+    said = subprocess.run(
+        [sys.executable, '-c',
+         'import rclpy; print(rclpy.get_rmw_implementation_identifier())'],
+        env={**os.environ, 'RMW_IMPLEMENTATION': FastDds.rmw}, capture_output=True, text=True)
+    return '' if said.stdout.strip() == FastDds.rmw else f'needs ROS 2 with {FastDds.rmw}'
+
+
 @pytest.fixture
-def lab(tmp_path: Path, tun: None) -> Iterator[Lab]:
+def middleware() -> str:
+    """Return the middleware of the lab's nodes; files of tests have fixtures of their own."""
+    return 'cyclonedds'
+
+
+@pytest.fixture
+def lab(tmp_path: Path, tun: None, middleware: str) -> Iterator[Lab]:
     """Return hosts without a VPN, gone after the test."""
-    network = Lab(tmp_path)
+    network = Lab(tmp_path, middleware)
     try:
         network.open()
         yield network

@@ -3,6 +3,6 @@
 
 from __future__ import annotations
 
-from rigs.vpn_lab import lab, vpn
+from rigs.vpn_lab import lab, middleware, vpn
 
-__all__ = ['lab', 'vpn']
+__all__ = ['lab', 'middleware', 'vpn']

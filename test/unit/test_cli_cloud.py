@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+import contextlib
 import dataclasses
 from decimal import Decimal
 import json
@@ -47,7 +48,7 @@ from fogros2.provider.offers import MachineType, Offer, Offers, ranked, Region, 
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.testing.fakes import FakeProvider, FakeShell
 from fogros2.testing.plugins import instead
-from ros2fog_cli.api import doctor, endings, images, pod_image, reach, table
+from ros2fog_cli.api import doctor, endings, images, monitor, pod_image, reach, table
 from ros2fog_cli.api.machines import Entry
 
 NOW = 1_800_000_000.0
@@ -703,3 +704,90 @@ def test_list_writes_nothing(
     monkeypatch.setenv('FOGROS2_STATE_HOME', '/dev/null/state')
     assert run('list') == 0
     assert 'running (orphan)' in capfd.readouterr().out
+
+
+# -- words that are wrong -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize('words', [
+    ('status', '--region', 'eu-west-1', 'slam'), ('status', 'slam', '--region', 'eu-west-1'),
+    ('delete', '--region', 'eu-west-1', '--region', 'us-east-1', 'slam', '--dry-run'),
+    ('logs', '--region', 'eu-west-1', 'slam')])
+def test_region_swallows_no_name(words: Sequence[str], capfd: pytest.CaptureFixture[str]) -> None:
+    machine('slam')
+    run(*words)
+    regions = [word for word in words if word.startswith(('eu', 'us'))]
+    assert ('regions', *regions) in Cloud.asked
+    assert 'arguments are required' not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize('verb', [('list',), ('gc',), ('status', 'slam'), ('delete', 'slam')])
+def test_unknown_region_gets_the_nearest(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], verb: Sequence[str],
+) -> None:
+    monkeypatch.setattr(Cloud, 'region_names', classmethod(lambda cls: ('eu-west-1', 'here')))
+    for wrong, hint in (('eu-wset-1', "did you mean 'eu-west-1'?"),
+                        ('moon-9', 'ros2 fog regions shows those there are')):
+        with pytest.raises(SystemExit):
+            run(*verb, '--region', wrong)
+        assert f"no provider has a region '{wrong}' ({hint})" in capfd.readouterr().err
+    for right in ('eu-west-1', 'all', '*'):
+        assert run('list', '--region', right) == 0
+
+
+def test_several_machines_are_deleted_by_name(capfd: pytest.CaptureFixture[str]) -> None:
+    for name in ('one', 'two', 'three'):
+        machine(name)
+        record(name)
+    assert run('delete', 'one', 'three', 'two', 'one', '--yes') == 0
+    assert not Cloud.machines
+    assert capfd.readouterr().out.count('deleted') == 3
+    machine('one')
+    record('other')
+    assert run('delete', 'one', 'othr', '--yes') == 1
+    said = capfd.readouterr()
+    assert 'deleted one' in said.out
+    assert "there is no machine 'othr' (did you mean 'other'?)" in said.err
+    machine('one')
+    assert run('delete', 'one', 'all', '--yes') == 0
+    assert not Cloud.machines and not Store().machines()
+
+
+@pytest.mark.parametrize(('words', 'hint'), [
+    (('status', 'slma'), "there is no machine 'slma' (did you mean 'slam'?)"),
+    (('connect', 'slma'), "there is no machine 'slma' (did you mean 'slam'?)"),
+    (('env', 'slma'), "no record of a machine 'slma' (did you mean 'slam'?)"),
+    (('env', 'xyz'), "no record of a machine 'xyz' (ros2 fog list shows")])
+def test_misspelt_machine_gets_the_nearest(words: Sequence[str], hint: str) -> None:
+    record('slam')
+    assert hint in str(run(*words))
+
+
+def test_misspelt_verb_gets_the_nearest(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run('lst')
+    said = capfd.readouterr().err
+    assert "'lst' is no command of ros2 fog (did you mean 'list'? there are: " in said
+    with pytest.raises(SystemExit):
+        run('list', '--nothing')
+    assert 'unrecognized arguments: --nothing' in capfd.readouterr().err
+
+
+@pytest.mark.parametrize('words', [
+    ('shell', 'slam', '--help'), ('shell', 'slam', '-h'), ('connect', 'slam', '--help')])
+def test_help_after_a_name_is_help(
+    words: Sequence[str], capfd: pytest.CaptureFixture[str],
+) -> None:
+    with contextlib.suppress(SystemExit):
+        assert run(*words) == 0
+    assert 'usage: ' in capfd.readouterr().out
+
+
+def test_token_that_takes_long_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Slow(FakeShell):
+        def run(self, command: Any, **_: Any) -> Result:
+            raise DeadlineExceeded("read the token took too long on 'slam'")
+
+    entry = Entry('slam', 'cloud', machine('slam'), record('slam', launch='abc123', agent='/run'))
+    with pytest.raises(DeadlineExceeded, match='ros2 fog status slam'):
+        monitor.token_of(entry, Slow(), 8765)

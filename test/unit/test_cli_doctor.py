@@ -11,6 +11,7 @@ import struct
 import subprocess
 import sys
 import threading
+import types
 
 import pytest
 from ros2cli.cli import main
@@ -232,3 +233,33 @@ def test_firewall_check_names_the_missing_program(program, monkeypatch):
     check = doctor.firewall()
     assert check.verdict == 'warning' and f'{program} not found' in check.detail
     assert program == 'nft' or 'nft' not in check.detail
+
+
+@pytest.mark.parametrize(('changes', 'why'), [
+    ({'f_flag': os.ST_RDONLY}, 'is on a read-only file system'),
+    ({'f_bavail': 0}, 'is on a full disk'), ({'f_ffree': 0}, 'is on a full disk'),
+    ({'f_files': 0, 'f_ffree': 0}, '')])
+@pytest.mark.parametrize('exists', [True, False])
+def test_state_folder_that_cannot_be_written_has_its_reason(
+    monkeypatch: pytest.MonkeyPatch, changes: dict[str, int], why: str, exists: bool,
+) -> None:
+    """Not that it belongs to somebody else; btrfs has no number of files."""
+    if not exists:
+        monkeypatch.setenv('FOGROS2_STATE_HOME', f'{os.environ["FOGROS2_STATE_HOME"]}/new')
+    disk = {'f_flag': 0, 'f_blocks': 9, 'f_bavail': 9, 'f_files': 9, 'f_ffree': 9, **changes}
+    monkeypatch.setattr(os, 'statvfs', lambda path: types.SimpleNamespace(**disk))
+    check = doctor.state()
+    assert (check.verdict == 'failed') == bool(why) and why in check.detail
+    assert not why or check.remedy == 'FOGROS2_STATE_HOME names another folder'
+
+
+def test_doctor_honours_no_color(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(doctor, 'examine', lambda **_: [doctor.Check('it', 'failed', 'is old')])
+    monkeypatch.setattr('sys.stdout.isatty', lambda: True, raising=False)
+    monkeypatch.setenv('TERM', 'xterm')
+    for value, coloured in (('', True), ('1', False)):
+        monkeypatch.setenv('NO_COLOR', value)
+        assert main(argv=['fog', 'doctor']) == 1
+        assert ('\x1b[31m' in capsys.readouterr().out) == coloured

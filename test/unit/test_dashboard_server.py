@@ -214,10 +214,13 @@ def test_content_policy_allows_only_the_pages_script() -> None:
     assert "default-src 'none'" in policy and 'unsafe' not in policy
 
 
-def test_taken_or_invalid_port_is_refused() -> None:
+def test_taken_or_invalid_port_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(('127.0.0.1', 0)) as taken:
         port = taken.getsockname()[1]
         assert 'another --port' in str(main(argv=[
             'fog', 'dashboard', '--no-browser', '--port', str(port)]))
-    for none in ('-1', '70000'):
-        assert 'is no port' in str(main(argv=['fog', 'dashboard', '--port', none]))
+    for verb in (['dashboard'], ['monitor', 'slam']):
+        for none in ('-1', '70000', '99999', '1e3', ''):
+            with pytest.raises(SystemExit):
+                main(argv=['fog', *verb, f'--port={none}'])
+            assert f"'{none}' is no port (0 to 65535)" in capsys.readouterr().err

@@ -57,9 +57,12 @@ _CREATE = """\
 top=$1 begin=$2 inside=$3 end=$4 look=$5 clean=$6 shown=$7
 shift 7
 umask 022
+search=
 failed() {
     code=$?
     [ $code -eq 0 ] && return
+    # it writes into the folder
+    [ -n "$search" ] && kill "$search" 2>/dev/null && wait "$search" || :
     [ -s "$top/cid" ] && "$engine" rm -f -v "$(cat "$top/cid")" >/dev/null 2>&1
     sh -c "$clean"
     exit $code
@@ -83,6 +86,7 @@ shift
 engine=$1
 printf '%s' "$shown" >"$top/shown"
 python3 -IS -c "$look" "$top" </dev/null >/dev/null 2>&1 &
+search=$!
 tar -xpf - --numeric-owner -C "$top/root"
 "$@"
 """
@@ -97,8 +101,9 @@ printf %s "$3" >"$top/hooks/inside.json"
 printf %s "$4" >"$top/hooks/end.json"
 rm -f "$top/hidden"
 if [ -e "$top/shown" ]; then python3 -IS -c "$5" "$top" </dev/null >/dev/null 2>&1 & fi
+search=$!
 shift 5
-"$@"
+"$@" || { code=$?; kill "$search" 2>/dev/null; exit $code; }
 """
 
 # The machine's login user has any number; the first process gives it the folder 'own'. The topics
@@ -246,13 +251,12 @@ class ContainerProvider(Provider):
         base = str(debian_root.root(cancel=self.cancel)) if options.isolated else ''
         system = container_root.system_mounts(base)
         kept = spec.on_exit == 'stop'
-        environment = [] if base else container_root.environment_mounts(*spec.workspaces)
         words = [*container_options.common_flags(engine, spec, request, options)]
         for path in system:
             # Podman deletes its own layer when the container ends; a stopped machine keeps it.
             upper = f',upperdir={top}/layers{path}/upper,workdir={top}/layers{path}/work'
             words += ['-v', f"{base}{path}:{path}:O{upper if kept else ''}"]
-        for mount in environment:
+        for mount in () if base else container_root.environment_mounts(*spec.workspaces):
             words += ['-v', f'{mount}:{mount}:ro']
         number = login_ids.login_id(request.token)
         archive = _entry(spec, request, options, number)
@@ -264,7 +268,7 @@ class ContainerProvider(Provider):
         command = Command(
             ('sh', '-ec', _CREATE, 'sh', str(top), *hooks(top, kept=kept),
              hidden_files.source(), clean(top),
-             ''.join(f'{path}\n' for path in (() if base else (*system, *environment))),
+             '' if base else ''.join(f'{path}\n' for path in system),
              *(system if kept else ()), '', engine.name, *engine.flags, *hook_flags(top),
              'run', '-d', '--cidfile', f'{top}/cid', '--label-file', f'{top}/labels', *words,
              '--rootfs', f'{top}/root', '/bin/sh', f'/{container_entry.FOLDER}/entry.sh'),

@@ -11,22 +11,18 @@ changes, or a file in ``/usr/local``. Elsewhere, a file whose mode alone changes
 
 Runs as python3 -c SOURCE TOP, as root, where TOP is the folder of a machine. Reads ``shown``, the
 folders that the machine shows, one a line. Writes ``hidden``, the paths found, each ended by a
-zero byte. Imports nothing of fogros2.
+zero byte. Imports nothing of fogros2, and no module that takes long.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-import contextlib
-import json
 import os
-from pathlib import Path
-import stat
 import sys
 import time
 
-#: The last result, in a folder of root's.
-CACHE = Path('/var/cache/fogros2/hidden.json')
+#: The last results, in a folder of root's: of each folder, the paths to hide, and the paths that
+#: the result depends on with their times. A letter begins each part, a zero byte ends it.
+CACHE = '/var/cache/fogros2/hidden'
 #: Where administrators put files of their own.
 LOCAL = '/usr/local'
 #: Nanoseconds in which a second change of a path may leave its time as it is.
@@ -55,7 +51,8 @@ xargs -0 -n 1 sh -c '
 
 def source() -> str:
     """Return the text of this program."""
-    return Path(__file__).read_text()
+    with open(__file__) as file:
+        return file.read()
 
 
 def search(top: str, local: str = LOCAL) -> tuple[list[str], dict[str, int]]:
@@ -69,60 +66,93 @@ def search(top: str, local: str = LOCAL) -> tuple[list[str], dict[str, int]]:
     todo, device = [top], os.stat(top).st_dev
     while todo:
         folder = todo.pop()
-        with contextlib.suppress(FileNotFoundError):  # removed meanwhile
+        try:
             status = os.stat(folder)
             if status.st_dev != device:
                 continue  # another file system, which the machine does not show
             changed[folder] = status.st_ctime_ns
-            is_folder = stat.S_ISDIR(status.st_mode)
-            if not status.st_mode & (0o001 if is_folder else 0o005):
+            if not status.st_mode & 0o001:
                 found.append(folder)
                 continue
-            for entry in os.scandir(folder) if is_folder else ():
-                if entry.is_dir(follow_symlinks=False):
-                    todo.append(entry.path)
-                elif entry.is_file(follow_symlinks=False):
-                    with contextlib.suppress(FileNotFoundError):
-                        status = entry.stat(follow_symlinks=False)
-                        if not status.st_mode & 0o005 and status.st_size:
-                            found.append(entry.path)
-                        if folder.startswith(local):
-                            changed[entry.path] = status.st_ctime_ns
+            entries = list(os.scandir(folder))
+        except FileNotFoundError:
+            continue  # removed meanwhile, and so are files
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                todo.append(entry.path)
+            elif entry.is_file(follow_symlinks=False):
+                try:
+                    status = entry.stat(follow_symlinks=False)
+                except FileNotFoundError:
+                    continue
+                if not status.st_mode & 0o005 and status.st_size:
+                    found.append(entry.path)
+                if folder.startswith(local):
+                    changed[entry.path] = status.st_ctime_ns
     return found, changed
 
 
-def unchanged(changed: Mapping[str, int]) -> bool:
+def unchanged(changed: dict[str, int]) -> bool:
     """Return whether no path has changed since."""
+    stat_of = os.stat
     try:
-        return all(os.stat(path).st_ctime_ns == at for path, at in changed.items())
+        return all(stat_of(path).st_ctime_ns == at for path, at in changed.items())
     except OSError:
         return False
 
 
-def main(top: Path, cache: Path = CACHE) -> None:
+def read(path: str) -> dict[str, tuple[list[str], dict[str, int]]]:
+    """Return the last results by folder; none if there is no file, or one of another version."""
+    results: dict[str, tuple[list[str], dict[str, int]]] = {}
+    try:
+        with open(path, 'rb') as file:
+            parts = os.fsdecode(file.read()).split('\0')
+        if parts.pop() != 'end':
+            return {}
+        for part in parts:
+            kind, rest = part[0], part[1:]
+            if kind == 'f':
+                found, changed = results[rest] = [], {}
+            elif kind == 'h':
+                found.append(rest)
+            else:
+                at, _, name = rest.partition(' ')
+                changed[name] = int(at)
+    except (OSError, ValueError, IndexError, UnboundLocalError):
+        return {}
+    return results
+
+
+def write(path: str, data: bytes) -> None:
+    """Replace a file; machines that are made at the same time write the same one."""
+    aside = f'{path}.{os.getpid()}'
+    with open(aside, 'wb') as file:
+        file.write(data)
+    os.replace(aside, path)
+
+
+def main(top: str, cache: str = CACHE) -> None:
     """Write a machine's hidden files, by the last results for its folders where they are valid."""
     begin = time.time_ns()
-    try:
-        results = json.loads(cache.read_text())
-    except (OSError, ValueError):
-        results = {}
-    folders = (top / 'shown').read_text().splitlines()
+    with open(f'{top}/shown') as file:
+        folders = file.read().splitlines()
+    results = read(cache)
     fresh = {folder: search(folder) for folder in folders
              if folder not in results or not unchanged(results[folder][1])}
     results.update(fresh)
-    aside = top / 'hidden.new'
-    aside.write_bytes(b''.join(
+    write(f'{top}/hidden', b''.join(
         os.fsencode(path) + b'\0' for folder in folders for path in results[folder][0]))
-    aside.replace(top / 'hidden')
     if fresh:
-        # a change that was a moment ago may hide another one
-        kept = {folder: results[folder] for folder in folders
-                if max(results[folder][1].values()) < begin - TICK}
-        cache.parent.mkdir(mode=0o700, exist_ok=True)
-        new = cache.with_name(f'{top.name}.new')
-        new.write_text(json.dumps(kept))
-        new.replace(cache)
+        parts = []
+        for folder in folders:
+            found, changed = results[folder]
+            # a change that was a moment ago may hide another one
+            if max(changed.values()) < begin - TICK:
+                parts += [f'f{folder}', *(f'h{path}' for path in found),
+                          *(f'c{at} {path}' for path, at in changed.items())]
+        os.makedirs(os.path.dirname(cache), 0o700, exist_ok=True)
+        write(cache, os.fsencode('\0'.join([*parts, 'end'])))
 
 
 if __name__ == '__main__':
-    main(Path(sys.argv[1]))
+    main(sys.argv[1])

@@ -3,10 +3,17 @@
 
 from __future__ import annotations
 
+import pytest
+
 from rigs.vpn_guest import Guest, guest
 from rigs.vpn_lab import Lab
 
 __all__ = ['guest']
+
+
+@pytest.fixture(params=['cyclonedds', 'fastdds'])
+def middleware(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
 
 
 def test_two_robots_hear_a_machine_and_not_each_other(vpn: Lab, guest: Guest) -> None:

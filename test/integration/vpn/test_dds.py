@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Cyclone DDS on a robot with a VPN that is cut, killed, absent or moved: real nodes and WireGuard.
+DDS on a robot with a VPN that is cut, killed, absent or moved: real participants and WireGuard.
 
-The nodes run on whatever ROS 2 the tests run on, the embedded default or the real one.
+Those of Fast DDS are nodes of ROS 2. Those of Cyclone DDS do without ROS 2, so that its settings
+are judged where ROS 2 has only its default: in ROS 2 Jazzy's version and in the newest.
 """
 
 from __future__ import annotations
@@ -23,6 +24,11 @@ if TYPE_CHECKING:
 RATE = 10
 #: Seconds after the link's return within which messages flow again.
 PROMPT = 1.0
+
+
+@pytest.fixture(params=['cyclonedds 0.10', 'cyclonedds', 'fastdds'])
+def middleware(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
 
 
 def start(lab: Lab) -> tuple[Child, Child, Child]:
@@ -67,9 +73,9 @@ def test_the_lan_and_terminals_talk_with_robot_nodes_as_before(vpn: Lab) -> None
     vpn.lan()
     # a LAN other than the robot's own network: what a node without a configuration takes
     vpn.ip('-n', vpn.spaces['robot'], 'link', 'set', 'e0', 'multicast', 'off')
-    lan = vpn.node('lan', 'from:/to_lan', 'to:/from_lan', uri='')
+    lan = vpn.node('lan', 'from:/to_lan', 'to:/from_lan', stock=True)
     robot = vpn.node('robot', 'to:/to_lan', 'from:/from_lan', 'to:/up', 'from:/down')
-    terminal = vpn.node('robot', 'from:/to_lan', uri='')
+    terminal = vpn.node('robot', 'from:/to_lan', stock=True)
     machine = vpn.node('machine', 'from:/up', 'to:/down')
     for child, topic in ((lan, '/to_lan'), (robot, '/from_lan'), (terminal, '/to_lan'),
                          (machine, '/up'), (robot, '/down')):
