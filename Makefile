@@ -2,7 +2,7 @@
 # Everything below does its own set-up: see tools/setup.sh.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning demo-policy cloud-check test test-fast test-kubernetes test-minimum fresh lint bench soak deb docs clean
+.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning demo-policy cloud-check test test-fast test-kubernetes test-minimum fresh lint bench soak deb docs interfaces clean
 
 ## demo   a launch file puts a talker on a container machine and takes it down again
 demo:
@@ -94,6 +94,10 @@ soak:
 ## setup  only what the others need: system packages and the virtual environment
 setup:
 	@tools/setup.sh demo
+
+## interfaces  what builds a workspace's own messages beside ROS 2's wheels
+interfaces:
+	@tools/setup.sh interfaces
 
 ## clean  take away what the targets above made in this folder
 clean:

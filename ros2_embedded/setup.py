@@ -44,7 +44,7 @@ MANIFEST = """<?xml version="1.0"?>
 #: Where CMake looks after the folder of ROS 2's own wheel of ament_cmake.
 NO_BUILD_FOLDER = 'ament_cmake/share/cmake/ament_cmake'
 NO_BUILD = """message(FATAL_ERROR "Packages of interfaces need more of ROS 2's wheels: \
-'tools/setup.sh interfaces' in the folder of FogROS2 installs them.")
+'make interfaces' in the folder of FogROS2 installs them.")
 """
 
 

@@ -160,5 +160,5 @@ def test_build_without_its_tools_names_their_command(tmp_path: Path) -> None:
         ['cmake', '-B', 'build', f'-DCMAKE_PREFIX_PATH={tmp_path}/prefix'], cwd=tmp_path,
         env={**os.environ, 'PATH': '/usr/bin:/bin'}, capture_output=True, text=True)
     assert done.returncode == 1
-    assert "need more of ROS 2's wheels: 'tools/setup.sh interfaces'" in \
+    assert "need more of ROS 2's wheels: 'make interfaces'" in \
         ' '.join(done.stderr.split())
