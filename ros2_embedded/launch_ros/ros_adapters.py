@@ -28,6 +28,8 @@ class ROSAdapter:
 
     def shutdown(self) -> None:
         import rclpy
+        if not self.ros_context.ok():
+            return  # a launch may be shut down twice
         self.ros_executor.shutdown()
         self.__thread.join()
         self.ros_node.destroy_node()
