@@ -127,9 +127,17 @@ def test_first_message_reaches_the_awaited_subscription():
 
 @pytest.mark.parametrize('options', [(), ('-r', '5'), ('-w', '0')])
 def test_topic_pub_repeats_until_interrupted(worker, options):
-    ros2('topic', 'pub', *options, '/cell/orders', 'std_msgs/msg/String', '{data: again}',
-         until='publishing #3', status=signal.SIGINT)
-    assert [worker.stdout.readline() for _ in range(2)] == ['again\n'] * 2
+    process = subprocess.Popen(
+        ['ros2', 'topic', 'pub', *options, '/cell/orders', 'std_msgs/msg/String', '{data: again}'],
+        stdout=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+    try:
+        assert [worker.stdout.readline() for _ in range(2)] == ['again\n'] * 2
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=40) == signal.SIGINT
+    finally:
+        process.kill()
+        process.wait()
 
 
 @pytest.mark.parametrize('command', [
