@@ -97,6 +97,21 @@ class Periodic:
         self._stop.set()
 
 
+def in_thread(call: Callable[[], T]) -> futures.Future[T]:
+    """Run a call in a thread that does not keep the process; return its result to be."""
+    answer: futures.Future[T] = futures.Future()
+
+    def run() -> None:
+        try:
+            answer.set_result(call())
+        except BaseException as error:  # noqa: BLE001 - its caller raises it again
+            answer.set_exception(error)
+
+    # no pool: at exit the interpreter would wait for its threads
+    threading.Thread(target=run, name='fog-call', daemon=True).start()
+    return answer
+
+
 def cancellable(
     call: Callable[[], T], cancel: Optional[threading.Event], *, what: str,
     grace: Callable[[], float] = lambda: ON_ITS_WAY, late: Optional[Callable[[T], None]] = None,
@@ -117,20 +132,11 @@ def cancellable(
         return call()
     if cancel.is_set():
         raise Cancelled(what)
-    answer: futures.Future[T] = futures.Future()
-
-    def run() -> None:
-        try:
-            answer.set_result(call())
-        except BaseException as error:  # noqa: BLE001 - raised again below
-            answer.set_exception(error)
-
     def pass_on(done: futures.Future[T]) -> None:
         if late is not None and done.exception() is None:
             late(done.result())
 
-    # no pool: at exit the interpreter would wait for its threads
-    threading.Thread(target=run, name='fog-call', daemon=True).start()
+    answer = in_thread(call)
     until: Optional[float] = None
     while not futures.wait([answer], 0.05).done:
         if cancel.is_set():

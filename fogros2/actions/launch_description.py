@@ -31,12 +31,11 @@ from fogros2.errors import ConfigurationError
 from fogros2.launch_internals import private
 from fogros2.launch_internals.wrapping import below, wrap
 from fogros2.model import RobotNodes
-from fogros2.runtime import streaming
-from fogros2.runtime.coordinator import Coordinator
+from fogros2.runtime import node_spec, streaming
+from fogros2.runtime.coordinator import Coordinator, Planned
 from fogros2.runtime.remote_process import RemoteProcess
 
 if TYPE_CHECKING:
-    from fogros2.describe.machines import SomeMachine
     from fogros2.image_transport.streams import Entry
 
 #: Entities that only set something for the entities after them.
@@ -45,6 +44,10 @@ _SETTINGS = (
     SetEnvironmentVariable, SetLaunchConfiguration, UnsetEnvironmentVariable,
     UnsetLaunchConfiguration,
 )
+
+
+#: Those that change what the values of a machine may depend on.
+_SETTERS = tuple(one for one in _SETTINGS if one not in (FogMachine, LogInfo))
 
 
 class FogROSLaunchDescription(LaunchDescription):
@@ -92,7 +95,7 @@ class FogROSLaunchDescription(LaunchDescription):
             coordinator.use_dds(self.dds)
         coordinator.stream_everywhere(
             self.stream_topics, context.launch_configurations.get('ros_namespace', '/'))
-        cloudy: list[SomeMachine] = []
+        planned: list[Planned] = []
         for entity, certain in cloud_entities(self.entities):
             if isinstance(entity, FogMachine):
                 # of several with the same name, the one whose condition holds registers itself
@@ -102,14 +105,16 @@ class FogROSLaunchDescription(LaunchDescription):
             # streams of a process that executes late are checked before a machine is created
             streaming.check(getattr(entity, 'stream_topics', ()))
             if certain:
-                cloudy.append(entity.machine)
-        if cloudy:
+                planned += _planned(entity)
+        if planned:
             # the first cloud process may execute late, from a timer, but nodes here, launch's own
             # included, need the DDS settings before they start. Settings that come first, such as
             # ROS_DOMAIN_ID, have to be applied before that.
             first = next((number for number, entity in enumerate(entities)
                           if not isinstance(entity, _SETTINGS)), len(entities))
-            engage = OpaqueFunction(function=lambda context: coordinator.engage_for(cloudy))
+            settled = not any(map(_sets, entities[first:]))
+            engage = OpaqueFunction(function=lambda context: coordinator.engage_for(
+                planned, settled=settled))
             entities = [*entities[:first], engage, *entities[first:]]
         if self.robot_nodes == 'immediately':
             return entities
@@ -122,6 +127,37 @@ def has_machine(
 ) -> TypeGuard[Union[RemoteProcess, CloudGroup, FogMachine]]:
     """Return whether an entity is a machine, or has one."""
     return isinstance(entity, (RemoteProcess, CloudGroup, FogMachine))
+
+
+def _planned(entity: Union[RemoteProcess, CloudGroup]) -> Iterator[Planned]:
+    """Yield the processes of an entity whose machine is known, or at least the machine."""
+    if isinstance(entity, RemoteProcess):
+        yield entity.planned
+        return
+    yield entity.machine, None
+    for process in _processes(below(entity)):
+        yield entity.machine, node_spec.program_of(process)
+
+
+def _processes(
+    several: Iterable[Iterable[LaunchDescriptionEntity]],
+) -> Iterator[ExecuteLocal]:
+    """Yield the processes without a condition and without a machine of their own, at any depth."""
+    for entities in several:
+        for entity in entities:
+            if getattr(entity, 'condition', None) is not None or has_machine(entity):
+                continue
+            if isinstance(entity, ExecuteLocal):
+                yield entity
+            elif not isinstance(entity, IncludeLaunchDescription):
+                yield from _processes(below(entity))
+
+
+def _sets(entity: LaunchDescriptionEntity) -> bool:
+    """Return whether an entity, or one below it, sets what a machine's values may depend on."""
+    return isinstance(entity, _SETTERS) or (
+        not isinstance(entity, IncludeLaunchDescription)
+        and any(_sets(one) for some in below(entity) for one in some))
 
 
 def cloud_entities(

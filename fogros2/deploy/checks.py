@@ -32,6 +32,24 @@ def check_names(specs: Sequence[MachineSpec]) -> None:
                                      'give each a name= of its own')
 
 
+def check_here(
+    spec: MachineSpec, provider: Provider, programs: Sequence[tuple[str, str]],
+    environment: Mapping[str, str],
+) -> None:
+    """
+    Check what this computer has for a machine, without a right that it has to ask for.
+
+    :param programs: the (package, executable) pairs that will run there, as far as known.
+    :raises FogError: the first problem that was found, with its remedy.
+    """
+    shells.warm(provider.capabilities.shell_kind)
+    if not provider.has_own_packages(spec):
+        for package, executable in programs:
+            check_program(
+                package, executable, plan.ament_prefixes(environment), spec.workspace)
+    provider.check_here(spec)
+
+
 def check(
     spec: MachineSpec, provider: Provider, *, rmw: str, environment: Mapping[str, str],
     programs: Sequence[tuple[str, str]], images: Sequence[str], report: Reporter,

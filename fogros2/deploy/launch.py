@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent import futures
 from concurrent.futures import Future, ThreadPoolExecutor
 import contextlib
 import dataclasses
@@ -18,7 +19,7 @@ from typing import Optional
 from fogros2 import model, plan, plugin_system, ros2_daemon
 from fogros2.dds import addresses_of, DdsVendor
 from fogros2.deploy import membership, robot_router
-from fogros2.deploy.checks import check, check_architecture, check_names
+from fogros2.deploy.checks import check, check_architecture, check_here, check_names
 from fogros2.deploy.choosing import Choices
 from fogros2.deploy.context import Context
 from fogros2.deploy.deployment import bring_up
@@ -34,7 +35,10 @@ from fogros2.provider import Provider
 from fogros2.report import Reporter, silent, step, StepFailed, Warned
 from fogros2.store import delete_folder, Record, Store, this_process, write_private
 from fogros2.vpn import addresses
-from fogros2.waiting import Timeouts
+from fogros2.waiting import in_thread, Timeouts
+
+#: Seconds for the checks that come before the robot's VPN interface.
+_QUICK = 3.0
 
 
 class Launch:
@@ -76,6 +80,24 @@ class Launch:
         self._invitations: dict[str, Invitation] = {}
 
     # -- before anything is created -------------------------------------------------------------
+
+    def check_here(
+        self, specs: Sequence[MachineSpec], programs: Mapping[str, Sequence[tuple[str, str]]] = {},
+    ) -> None:
+        """
+        Check what is quick and needs no rights, before :meth:`robot_environment` asks for them.
+
+        :param specs: machines with different names.
+        :param programs: machine name to the (package, executable) pairs that will run there.
+        :raises FogError: the first problem that was found, with its remedy.
+        """
+        answers = [in_thread(functools.partial(
+            check_here, spec, self.provider(spec.provider), programs.get(spec.name, ()),
+            self.user_environment)) for spec in specs]
+        done = futures.wait(answers, _QUICK, futures.FIRST_EXCEPTION).done
+        for answer in answers:
+            if answer in done:
+                answer.result()
 
     def prepare(
         self, specs: Sequence[MachineSpec],
@@ -209,8 +231,8 @@ class Launch:
         """
         with self._lock:
             if self._robot_environment is None:
-                check_robot()
                 vendor, user = self.dds(), self.user_environment
+                check_robot()
                 vpn = self.robot_vpn()
                 path = self.store.launch(self.id) / vendor.file_name
                 with step(self.report, '', 'middleware') as detail:

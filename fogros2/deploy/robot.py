@@ -58,11 +58,11 @@ def check_robot() -> None:
     :raises PrerequisiteError: a program, a right or a device is missing.
     """
     process.require(list(ROBOT_PROGRAMS), package_of=ROBOT_PROGRAMS)
+    if not Path('/dev/net/tun').exists():
+        raise PrerequisiteError('/dev/net/tun is missing on this computer', 'sudo modprobe tun')
     if os.geteuid() != 0 and not helped.permitted():
         with _ASKING:
             check_sudo(ask=True)
-    if not Path('/dev/net/tun').exists():
-        raise PrerequisiteError('/dev/net/tun is missing on this computer', 'sudo modprobe tun')
 
 
 def check_sudo(*, ask: bool = False) -> None:

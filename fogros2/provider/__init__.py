@@ -130,6 +130,17 @@ class Provider(abc.ABC):
         :raises PrerequisiteError: this computer lacks something.
         """
 
+    def check_here(self, spec: MachineSpec) -> None:
+        """
+        Check what needs no more rights than the user has, before the launch asks for any.
+
+        These are the options, programs, credentials, and whether a host answers. The launch waits
+        a few seconds for it, then continues; ``check`` follows.
+
+        :raises FogError: the first problem that was found, with its remedy.
+        """
+        self.check(spec)
+
     def check_containers(self, spec: MachineSpec) -> None:
         """
         Check that a container engine can run on a machine with this spec.

@@ -83,6 +83,10 @@ class SSHProvider(Provider):
         """Check the options without a connection."""
         Options.parse(spec.options)
 
+    def check_here(self, spec: MachineSpec) -> None:
+        """Check that the computer answers."""
+        self.create(spec, CreateRequest('', '', {}, 0))
+
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Return the id of the computer if it answers."""
         options = Options.parse(spec.options)

@@ -13,6 +13,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+import contextlib
+import copy
 import functools
 import threading
 from typing import Any, Optional, TYPE_CHECKING, Union
@@ -53,6 +55,9 @@ if TYPE_CHECKING:
 
 #: Returns the process of a node on a machine, by the machine's name.
 OnMachine = Callable[[NodeSpec, str], ExecuteLocal]
+
+#: A machine or its name, and the package and executable of a process there, if both are known.
+Planned = tuple[Optional['SomeMachine'], Optional[tuple[str, str]]]
 
 #: Name of the coordinator in ``context.locals``.
 _LOCAL = 'fogros2'
@@ -141,11 +146,13 @@ class Coordinator:
         assert self._launch is not None
         return self._launch
 
-    def engage(self) -> None:
+    def engage(self, planned: Iterable[Planned] = ()) -> None:
         """
         Create the deployment; from now on the launch's nodes get the DDS environment.
 
-        :raises FogError: the environment is unavailable, as for an unknown RMW_IMPLEMENTATION.
+        :param planned: what is checked before the VPN interface, which may need a password.
+        :raises FogError: the environment is unavailable, as for an unknown RMW_IMPLEMENTATION; or
+            this computer lacks something.
         """
         if self._launch is not None:
             return
@@ -161,7 +168,27 @@ class Coordinator:
         private.guard_shutdown(context, self._fail)
         if self._dds is not None:
             self._launch.use_dds(self._dds)
+        self._check_here(planned)
         self._set_dds_environment()
+
+    def _check_here(self, planned: Iterable[Planned]) -> None:
+        """Check what is cheap; a value that cannot be resolved yet is checked later."""
+        specs: dict[str, MachineSpec] = {}
+        programs: dict[str, list[tuple[str, str]]] = {}
+        for machine, program in planned:
+            with contextlib.suppress(FogError, SubstitutionFailure):
+                spec = self._spec_now(machine)
+                if spec.provider == ROBOT or any(map(callable, spec.options.values())):
+                    continue
+                specs.setdefault(spec.name, spec)
+                programs.setdefault(spec.name, []).extend([] if program is None else [program])
+        self.launch.check_here(list(specs.values()), programs)
+
+    def _spec_now(self, machine: Optional[SomeMachine]) -> MachineSpec:
+        """Return the spec of a machine whose values may still change."""
+        if not isinstance(machine, CloudInstance):
+            machine = self._by_name(self._resolved(machine) or '')
+        return self._spec(copy.copy(machine))
 
     def use_dds(self, name: str) -> None:
         """
@@ -231,10 +258,14 @@ class Coordinator:
             machine = self._by_name(machine)
         return self._spec(machine).provider == ROBOT
 
-    def engage_for(self, machines: Iterable[Optional[SomeMachine]]) -> None:
-        """Create the deployment if one of the machines, or an unknown name, needs a provider."""
-        if any(self._may_be_made(machine) for machine in machines):
-            self.engage()
+    def engage_for(self, planned: Sequence[Planned], *, settled: bool = True) -> None:
+        """
+        Create the deployment if one of the machines, or an unknown name, needs a provider.
+
+        :param settled: no later action changes the values of the machines.
+        """
+        if any(self._may_be_made(machine) for machine, _ in planned):
+            self.engage(planned if settled else ())
 
     def _may_be_made(self, machine: Optional[SomeMachine]) -> bool:
         name = machine.own_name if isinstance(machine, CloudInstance) else machine
@@ -265,7 +296,7 @@ class Coordinator:
 
         :raises ConfigurationError: a wrong value, an unknown name, or a duplicate name.
         """
-        self.engage()
+        self.engage([(machine, None)])
         machine = self.resolve(machine)
         if isinstance(machine, str):
             machine = self._by_name(machine)

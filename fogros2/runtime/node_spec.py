@@ -13,7 +13,7 @@ from typing import Optional
 from launch import LaunchContext, Substitution
 from launch.actions import ExecuteLocal
 from launch.conditions import evaluate_condition_expression
-from launch.substitutions import FindExecutable, SubstitutionFailure
+from launch.substitutions import FindExecutable, SubstitutionFailure, TextSubstitution
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 from launch_ros.substitutions import ExecutableInPackage
 
@@ -98,6 +98,21 @@ def robot_command(action: ExecuteLocal, context: LaunchContext) -> list[str]:
                     f'wants it to: {error}',
                     "install it here too, or say on_interrupt='shutdown'") from error
     return command
+
+
+def program_of(action: ExecuteLocal) -> Optional[tuple[str, str]]:
+    """Return the package and executable of a node that names them by plain texts, else None."""
+    package, executable = (
+        _plain(getattr(action, name, None)) for name in ('node_package', 'node_executable'))
+    return (package, executable) if package and executable else None
+
+
+def _plain(value: object) -> Optional[str]:
+    """Return a text that no substitution changes."""
+    parts = value if isinstance(value, (list, tuple)) else [value]
+    texts = [part.text if isinstance(part, TextSubstitution) else part for part in parts]
+    plain = [text for text in texts if isinstance(text, str)]
+    return ''.join(plain) if len(plain) == len(texts) else None
 
 
 def from_action(

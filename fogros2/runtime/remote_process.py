@@ -17,7 +17,7 @@ from fogros2.host.checkpoint import check_folder
 from fogros2.launch_internals import components, private
 from fogros2.model import NodeSpec
 from fogros2.runtime import foxglove, node_spec
-from fogros2.runtime.coordinator import Coordinator
+from fogros2.runtime.coordinator import Coordinator, Planned
 from fogros2.runtime.remote_run import RemoteRun
 from fogros2.runtime.republishers import AddedProcess
 
@@ -55,6 +55,12 @@ class RemoteProcess(private.RemoteStart):
     def machine(self) -> SomeMachine:
         """The machine that the process runs on, or its name."""
         return self._fogros2_machine
+
+    @property
+    def planned(self) -> Planned:
+        """The machine, and the program if nothing can change it."""
+        # only its machine knows what is in an image
+        return self.machine, None if self._fogros2_image else node_spec.program_of(self)
 
     def prepare(self, context: LaunchContext) -> None:
         """Resolve the action, as ExecuteLocal does, and create its NodeSpec."""
@@ -291,6 +297,7 @@ def _execute(
     folder = None
     coordinator = Coordinator.of(context)
     if not context.is_shutdown and not coordinator.on_robot(action.machine):
+        coordinator.engage([action.planned])
         # some actions create a ROS node in this process, which needs the launch's DDS settings
         folder = coordinator.session(action.machine).spec.workspace
     with node_spec.packages_of(folder):

@@ -87,6 +87,7 @@ class ProviderContract:
     def test_check_accepts_the_options_of_create(self) -> None:
         provider, options = self.make()
         provider.check(MachineSpec('planner', provider.name, options))
+        provider.check_here(MachineSpec('planner', provider.name, options))
 
     def test_check_names_an_unknown_option(self) -> None:
         provider, options = self.make()

@@ -103,6 +103,7 @@ class FakeLaunch:
         self.folder = Path('/nonexistent')
         #: Errors of the next calls of ``retire``, one for each call.
         self.retire_errors = []
+        self.here_error = None
         self.prepare_error = None
         self.down_errors = []
         self.costs = []
@@ -135,7 +136,13 @@ class FakeLaunch:
     def join(self, spec):
         """Join nothing: all machines are the launch's own."""
 
+    def check_here(self, specs, programs):
+        self.note('check here', [spec.name for spec in specs], programs)
+        if self.here_error is not None:
+            raise self.here_error
+
     def robot_environment(self):
+        self.note('robot environment')
         return {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp', 'CYCLONEDDS_URI': '<CycloneDDS/>'}
 
     def prepare(self, specs, programs, images):

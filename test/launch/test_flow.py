@@ -14,17 +14,25 @@ from launch.actions import (
     OpaqueFunction,
     RegisterEventHandler,
     SetEnvironmentVariable,
+    SetLaunchConfiguration,
     Shutdown,
     TimerAction,
 )
 from launch.event_handlers import OnProcessExit, OnProcessIO, OnProcessStart
 from launch.events import matches_action
 from launch.events.process import ShutdownProcess, SignalProcess
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 import pytest
 
-from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
-from fogros2.errors import AgentError, ConfigurationError, ProviderError, VpnError
+from fogros2 import CloudGroup, CloudNode, ContainerInstance, FogROSLaunchDescription
+from fogros2.errors import (
+    AgentError,
+    ConfigurationError,
+    PrerequisiteError,
+    ProviderError,
+    VpnError,
+)
 from fogros2.runtime import remote_run, session
 
 
@@ -104,8 +112,6 @@ def test_machine_without_a_node_is_an_error(planner):
 
 def test_waiting_process_keeps_its_configuration(run, fake, planner, capfd):
     """A held process has the configuration of its place, not of the moment it starts."""
-    from launch.actions import SetLaunchConfiguration
-    from launch.substitutions import LaunchConfiguration
     fake.on_start = ends
     entities = []
     for value in ('one', 'two'):
@@ -547,6 +553,45 @@ def test_checks_come_before_any_machine(run, fake, planner, capfd):
     assert run(LaunchDescription([talker(planner)])) == 1
     assert not fake.noted('up')
     assert 'this will not do (do otherwise)' in capfd.readouterr().out
+
+
+@pytest.mark.parametrize('description', [LaunchDescription, FogROSLaunchDescription])
+@pytest.mark.parametrize('what', ['node', 'group', 'timer'])
+def test_cheap_checks_come_before_the_vpn(run, fake, planner, capfd, description, what):
+    fake.here_error = PrerequisiteError('there is no podman', 'install it')
+    inner = Node(package='demo', executable='talker')
+    assert run(description([{
+        'node': lambda: talker(planner),
+        'group': lambda: CloudGroup(planner, [GroupAction([inner])]),
+        'timer': lambda: TimerAction(period=0.1, actions=[talker(planner)]),
+    }[what]()])) == 1
+    assert fake.noted('check here') == [(['planner'], {'planner': [('demo', 'talker')]})]
+    assert not fake.noted('robot environment') and not fake.noted('up')
+    assert 'there is no podman' in capfd.readouterr().out
+
+
+@pytest.mark.parametrize('later', [False, True])
+def test_early_checks_take_only_values_that_stay(run, fake, later):
+    """A configuration that is set after the first node may belong to a machine's values."""
+    fake.on_start = ends
+    machine = ContainerInstance(name='planner', ros_workspace='', image=LaunchConfiguration('x'))
+    settings = [SetLaunchConfiguration('x', 'first'), ExecuteProcess(cmd=['true'])]
+    if later:
+        settings.append(SetLaunchConfiguration('x', 'second'))
+    assert run(FogROSLaunchDescription([*settings, talker(machine)])) == 0
+    assert fake.noted('check here') == [
+        ([], {}) if later else (['planner'], {'planner': [('demo', 'talker')]})]
+    assert machine.spec(None).options['image'] == ('second' if later else 'first')
+
+
+def test_values_that_come_later_are_checked_later(run, fake):
+    fake.on_start = ends
+    machine = ContainerInstance(name='planner', ros_workspace='', image=LaunchConfiguration('x'))
+    assert run(FogROSLaunchDescription([GroupAction([
+        OpaqueFunction(function=lambda context: context.launch_configurations.update(x='a')),
+        talker(machine)])])) == 0
+    assert fake.noted('check here') == [([], {})]
+    assert fake.noted('is up') == [('planner',)]
 
 
 @pytest.mark.parametrize(('where', 'what', 'message'), [

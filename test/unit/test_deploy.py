@@ -41,6 +41,7 @@ from fogros2.errors import (
     ProviderError,
     StoreError,
     VpnError,
+    WorkspaceError,
 )
 from fogros2.host.bootstrap import RosInstall
 from fogros2.model import (
@@ -87,6 +88,51 @@ def begun(launch, spec=SPEC, **changes):
     """Return the context and the job of a machine that is about to be deployed."""
     context = dataclasses.replace(launch.context(spec), **changes)
     return context, MachineJob(context, spec)
+
+
+# -- what is checked before the VPN ---------------------------------------------------------
+
+
+@pytest.fixture
+def checked(provider, monkeypatch):
+    """Return a provider whose machines have a shell of a known kind."""
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(shell_kind='local'))
+    return provider
+
+
+def test_missing_program_is_found_without_the_vpn(launch, checked):
+    with pytest.raises(WorkspaceError, match="no package 'demo'"):
+        launch.check_here([SPEC], {'planner': [('demo', 'talker')]})
+    # only the machine knows its packages
+    checked.has_own_packages = lambda spec: True
+    launch.check_here([SPEC], {'planner': [('demo', 'talker')]})
+    assert checked.calls == ['check']
+    assert list((launch.store.root / 'launches').glob('*/vpn.key')) == []
+
+
+def test_first_problem_ends_the_early_checks(launch, checked, monkeypatch):
+    monkeypatch.setattr(deployed, '_QUICK', 60.0)
+    let_go = threading.Event()
+
+    def check(spec):
+        if spec.name == 'planner':
+            let_go.wait(60.0)
+        raise PrerequisiteError(f'{spec.name} lacks a host')
+
+    monkeypatch.setattr(checked, 'check', check)
+    with pytest.raises(PrerequisiteError, match='slam lacks a host'):
+        launch.check_here([SPEC, dataclasses.replace(SPEC, name='slam')])
+    let_go.set()
+
+
+def test_slow_early_check_does_not_hold_the_launch(launch, checked, monkeypatch):
+    monkeypatch.setattr(deployed, '_QUICK', 0.05)
+    let_go = threading.Event()
+    monkeypatch.setattr(checked, 'check', lambda spec: let_go.wait(60.0))
+    begin = time.monotonic()
+    launch.check_here([SPEC])
+    assert time.monotonic() - begin < 5.0
+    let_go.set()
 
 
 def test_machine_is_deleted_if_its_id_cannot_be_stored(

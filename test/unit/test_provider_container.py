@@ -303,6 +303,27 @@ def test_relays_of_one_user_meet_in_folders_of_their_own(monkeypatch, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(('options', 'missing', 'words'), [
+    ({}, ['podman'], 'podman not found'), ({}, ['sshd'], 'sshd'),
+    ({'image': 'x'}, ['sshd', 'podman'], None),
+    ({'image': 'x', 'engine': 'podman'}, ['podman'], 'podman not found'),
+    ({'image': 'x'}, ['docker', 'podman'], 'no container engine found'),
+    ({'isolated': True}, ['debootstrap'], 'debootstrap'),
+])
+def test_programs_are_missed_before_sudo_asks(monkeypatch, tmp_path, options, missing, words):
+    monkeypatch.setattr(container.process, 'which',
+                        lambda program: None if program in missing else f'/usr/bin/{program}')
+    monkeypatch.setattr(debian_root, 'cache_folder', lambda: tmp_path)
+    monkeypatch.setattr(container.process, 'sudo_trouble', lambda: pytest.fail('asked sudo'))
+    monkeypatch.setattr(container.os.path, 'exists', lambda path: True)
+    provider, spec = container.ContainerProvider(), MachineSpec('m', 'container', options)
+    if words is not None:
+        with pytest.raises(PrerequisiteError, match=words):
+            provider.check_here(spec)
+    else:
+        provider.check_here(spec)
+
+
 def test_control_groups_decide_podman_s_flags():
     flags = container_engine.flags_for
     assert flags(unified=True, systemd=True, runc=True) == ()
@@ -568,9 +589,11 @@ def test_packages_of_a_container_image_are_its_own(options, own):
 def test_request_may_create_while_a_program_works_at_it():
     provider, token = container.ContainerProvider(), secrets.token_hex(8)
     assert not provider.may_create(token, 0.0)
-    engine = subprocess.Popen(['sh', '-c', 'read line', 'podman', 'run', f'--label={token}'],
-                              stdin=subprocess.PIPE)
+    engine = subprocess.Popen(
+        ['sh', '-c', 'echo; read line', 'podman', 'run', f'--label={token}'],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     try:
+        assert engine.stdout is not None and engine.stdout.readline()
         assert provider.may_create(token, 1e9)
     finally:
         engine.communicate(b'')

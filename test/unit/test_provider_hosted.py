@@ -199,6 +199,16 @@ def test_host_that_is_off_is_no_lost_machine(on: dict[str, Any], shell: FakeShel
         HostedProvider().describe(off)
 
 
+def test_host_is_asked_for_an_answer_before_the_vpn() -> None:
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        spec = MachineSpec('planner', 'hosted', {
+            'on': {'host': '127.0.0.1', 'port': server.getsockname()[1]}})
+        HostedProvider().check_here(spec)
+    HostedProvider().check(spec)
+    with pytest.raises(ProviderError, match='refuses connections'):
+        HostedProvider().check_here(spec)
+
+
 @pytest.mark.parametrize(('options', 'words'), [
     ({'on': {'host': 'box'}, 'memry': '2g'}, "has no option 'memry'"),
     ({'on': {'host': 'box'}, 'cpus': 'many'}, "'cpus' can't be"),

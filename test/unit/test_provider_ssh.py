@@ -76,6 +76,9 @@ def test_a_computer_that_can_t_be_reached_is_refused_at_once(listener, host, wor
     spec = MachineSpec('planner', 'ssh', {'host': host, 'port': port})
     with pytest.raises(ProviderError, match=words):
         SSHProvider().create(spec, request_for(spec))
+    with pytest.raises(ProviderError, match=words):
+        SSHProvider().check_here(spec)
+    SSHProvider().check(spec)
 
 
 @pytest.mark.parametrize('given, words', [

@@ -163,17 +163,25 @@ class ContainerProvider(Provider):
         """Return whether an engine is installed."""
         return any(container_engine.installed())
 
+    def check_here(self, spec: MachineSpec) -> None:
+        """Check that the engine, TUN and the programs for a machine without an image exist."""
+        options = Options.parse(spec.options)
+        container_engine.select(options.engine, options.image or None)
+        if not os.path.exists('/dev/net/tun'):
+            raise PrerequisiteError('there is no /dev/net/tun on this computer',
+                                    'sudo modprobe tun')
+        if not options.image:
+            check_programs(isolated=options.isolated)
+
     def check(self, spec: MachineSpec) -> None:
         """Check the engine, the rights, TUN, and what a machine without an image needs."""
+        self.check_here(spec)
         options = Options.parse(spec.options)
         engine = container_engine.select(options.engine, options.image or None)
         trouble = process.sudo_trouble() if engine.sudo else None
         if trouble is not None:
             raise PrerequisiteError(
                 f'{engine.name} needs root on this computer, and {trouble[0]}', trouble[1])
-        if not os.path.exists('/dev/net/tun'):
-            raise PrerequisiteError('there is no /dev/net/tun on this computer',
-                                    'sudo modprobe tun')
         container_engine.answers(engine)
         container_options.check_network(engine, options)
         if options.image:
@@ -553,6 +561,21 @@ def hook_flags(top: Path) -> Iterator[str]:
     yield from ('--hooks-dir', f'{top}/hooks')
 
 
+def check_programs(*, isolated: bool = False) -> None:
+    """
+    Check that the programs exist that a machine without an image needs.
+
+    :param isolated: with the root of a new system.
+    :raises PrerequisiteError: one is missing.
+    """
+    if isolated:
+        debian_root.check_programs()
+    else:
+        process.require(
+            ('sshd', 'ssh-keygen', 'sudo', 'rsync', 'tar'),
+            package_of={'sshd': 'openssh-server', 'ssh-keygen': 'openssh-client'})
+
+
 def check_root(*, isolated: bool = False) -> None:
     """
     Check that this computer's own root can replace an image.
@@ -560,12 +583,9 @@ def check_root(*, isolated: bool = False) -> None:
     :param isolated: check the root of a new system instead.
     :raises PrerequisiteError: it cannot be overlaid, or lacks what a machine needs.
     """
+    check_programs(isolated=isolated)
     if isolated:
         debian_root.check()
-    else:
-        process.require(
-            ('sshd', 'ssh-keygen', 'sudo', 'rsync', 'tar'),
-            package_of={'sshd': 'openssh-server', 'ssh-keygen': 'openssh-client'})
     kinds = Path('/proc/filesystems').read_text().split()
     if 'overlay' not in kinds and not os.path.isdir('/sys/module/overlay'):
         process.run(Command(('modprobe', 'overlay'), sudo=True), timeout=10.0, check=False)

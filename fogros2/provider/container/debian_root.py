@@ -128,14 +128,24 @@ def path(folder: Path, own: Release, packages: Sequence[str] = PACKAGES) -> Path
     return folder / f'{own.codename}-{digits}'
 
 
+def check_programs(folder: Optional[Path] = None) -> None:
+    """
+    Check that the root exists, or that the programs to make it do.
+
+    :raises PrerequisiteError: a program is missing.
+    """
+    if not path(folder or cache_folder(), release()).is_dir():
+        process.require(('debootstrap', 'unshare'), package_of={'unshare': 'util-linux'})
+
+
 def check(folder: Optional[Path] = None) -> None:
     """
     Check that the root exists, or can be made.
 
     :raises PrerequisiteError: a program or root is missing.
     """
+    check_programs(folder)
     if not path(folder or cache_folder(), release()).is_dir():
-        process.require(('debootstrap', 'unshare'), package_of={'unshare': 'util-linux'})
         trouble = process.sudo_trouble()
         if trouble is not None:
             raise PrerequisiteError(

@@ -174,6 +174,11 @@ class HostedProvider(Provider):
             raise Unsupported(f"'{spec.name}' can't open a port of its host for monitor_allow",
                               "leave it out, and use 'ros2 fog monitor'")
 
+    def check_here(self, spec: MachineSpec) -> None:
+        """Check that the host answers."""
+        self.check(spec)
+        self._find_host(self._options(spec)[0])
+
     def _options(self, spec: MachineSpec) -> tuple[Mapping[str, Any], dict[str, Any]]:
         """
         Return the options of the host, and of the container.
