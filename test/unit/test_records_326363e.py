@@ -143,7 +143,7 @@ def test_ids_are_those_of_the_providers() -> None:
     AWSCloudInstance(name='aws', region='us-west-1', ec2_instance_type='t3.large', disk_size=20),
     ContainerInstance(name='container', memory='2g'),
     KubeInstance(name='kubernetes', mcpu=2000, namespace='robots'),
-    SSHInstance(name='ssh', host='198.51.100.30', user='fog')], ids=PROVIDERS)
+    SSHInstance(name='ssh', host='198.51.100.30', user='fog', port=22)], ids=PROVIDERS)
 def test_same_launch_file_takes_kept_machine(instance: Any) -> None:
     """It asks for the options that the record has."""
     spec = instance.spec(LaunchContext())
