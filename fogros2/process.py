@@ -19,6 +19,7 @@ from typing import Any, BinaryIO, Optional
 
 from fogros2.errors import Cancelled, CommandError, DeadlineExceeded, PrerequisiteError
 from fogros2.model import Command, Result
+from fogros2.waiting import noted
 
 HERE = 'this computer'
 #: sudo's reason for refusing without a password, and the remedy.
@@ -181,16 +182,17 @@ def run(
     deadline = time.monotonic() + timeout
     what = command.what or words[0]
     try:
-        while True:
-            left = deadline - time.monotonic()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                # without a cancel event, no polling is needed
-                child.wait(max(0.0, left if cancel is None else min(left, 0.05)))
-                break
-            if cancel is not None and cancel.is_set():
-                raise Cancelled(what)
-            if left <= 0:
-                raise DeadlineExceeded(f'{what} took longer than {timeout:g} s')
+        with noted(what):
+            while True:
+                left = deadline - time.monotonic()
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    # without a cancel event, no polling is needed
+                    child.wait(max(0.0, left if cancel is None else min(left, 0.05)))
+                    break
+                if cancel is not None and cancel.is_set():
+                    raise Cancelled(what)
+                if left <= 0:
+                    raise DeadlineExceeded(f'{what} took longer than {timeout:g} s')
     except BaseException:  # Ctrl-C too: the command must not outlive this call
         end(child, sudo=_through_sudo(command))
         raise

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent import futures
+import contextlib
 import dataclasses
 import threading
 import time
@@ -13,6 +14,8 @@ from typing import Optional, TypeVar
 from fogros2.errors import Cancelled, DeadlineExceeded
 
 T = TypeVar('T')
+#: What each thread is doing, outermost first.
+_doing: dict[int, list[str]] = {}
 #: Seconds to wait for the answer to a sent request, which may create something, after a cancel.
 ON_ITS_WAY = 15.0
 
@@ -29,6 +32,29 @@ class Timeouts:
     vpn: float = 30.0
     agent: float = 30.0
     command: float = 60.0
+
+
+@contextlib.contextmanager
+def noted(what: str) -> Iterator[None]:
+    """Note what this thread does or waits for, for those who look at a slow step."""
+    mine = _doing.setdefault(threading.get_ident(), [])
+    mine.append(what)
+    try:
+        yield
+    finally:
+        mine.pop()
+        if not mine:
+            _doing.pop(threading.get_ident(), None)
+
+
+def doing(thread: int) -> str:
+    """Return what a thread does or waits for, by its identifier; '' if it has not noted it."""
+    return next(iter(_doing.get(thread, ())), '')
+
+
+def everything() -> list[str]:
+    """Return what the threads of this process do or wait for, each text once."""
+    return list(dict.fromkeys(text for text in map(doing, list(_doing)) if text))
 
 
 def wait_until(
@@ -55,18 +81,19 @@ def wait_until(
     """
     deadline = time.monotonic() + timeout
     cancel = cancel or threading.Event()
-    cancel.wait(first)
-    while True:
-        if cancel.is_set():
-            raise Cancelled(f'waiting for {what}')
-        value = probe()
-        if value is not None and value is not False:
-            return value
-        left = deadline - time.monotonic()
-        if left <= 0:
-            raise DeadlineExceeded(f'timed out after {timeout:g} s waiting for {what}', hint)
-        cancel.wait(min(interval, left))
-        interval = min(interval * 1.5, longest)
+    with noted(f'waiting for {what}'):
+        cancel.wait(first)
+        while True:
+            if cancel.is_set():
+                raise Cancelled(f'waiting for {what}')
+            value = probe()
+            if value is not None and value is not False:
+                return value
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise DeadlineExceeded(f'timed out after {timeout:g} s waiting for {what}', hint)
+            cancel.wait(min(interval, left))
+            interval = min(interval * 1.5, longest)
 
 
 class Periodic:
@@ -129,19 +156,22 @@ def cancellable(
     :raises Cancelled: ``cancel`` was set before, or the call did not return in time.
     """
     if cancel is None:
-        return call()
+        with noted(what):
+            return call()
     if cancel.is_set():
         raise Cancelled(what)
+
     def pass_on(done: futures.Future[T]) -> None:
         if late is not None and done.exception() is None:
             late(done.result())
 
     answer = in_thread(call)
     until: Optional[float] = None
-    while not futures.wait([answer], 0.05).done:
-        if cancel.is_set():
-            until = until or time.monotonic() + grace()
-            if time.monotonic() >= until:
-                answer.add_done_callback(pass_on)
-                raise Cancelled(what)
+    with noted(what):
+        while not futures.wait([answer], 0.05).done:
+            if cancel.is_set():
+                until = until or time.monotonic() + grace()
+                if time.monotonic() >= until:
+                    answer.add_done_callback(pass_on)
+                    raise Cancelled(what)
     return answer.result()

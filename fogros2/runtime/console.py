@@ -1,18 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Show the steps of a deployment in the terminal: one line each."""
+"""
+Show the steps of a deployment: a line each at its end.
+
+A terminal also shows the running time of the current steps. Elsewhere there is a line when a step
+starts, and one every 30 seconds while it runs.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import logging
 import os
 import queue
 import shutil
 import threading
+import time
 from typing import Optional, TextIO, Union
 
 import launch.logging
 
+from fogros2 import waiting
 from fogros2.report import (
     ClockMeasured,
     Event,
@@ -25,8 +33,13 @@ from fogros2.report import (
     Warned,
 )
 from fogros2.untrusted import clean
+from fogros2.waiting import Periodic
 
 _WIDTH = 24
+#: Seconds of a step without a line, if there is no terminal.
+STILL = 30.0
+#: Seconds between two looks at the clock.
+TICK = 1.0
 #: Number of texts that wait for a screen that is not read; further ones are dropped.
 _LONGEST = 10_000
 
@@ -105,9 +118,10 @@ class Console:
         self._stream = Screen(stream or self._handler.stream)
         self._handler.setStream(self._stream)
         self._lock = threading.RLock()
-        self._running: dict[tuple[str, str], str] = {}
+        self._running: dict[tuple[str, str], _Running] = {}
         self._drawn = False
         self._live = self._stream.isatty()
+        self._ticks = Periodic('fog-progress', TICK, self._tick)
         if self._live:
             # a log line overwrites the progress line instead of following it
             self._handler.addFilter(self._before_line)
@@ -116,8 +130,10 @@ class Console:
         """Show an event."""
         with self._lock:
             if isinstance(event, StepStarted):
-                self._running[event.machine, event.step] = ''
-                self._logger.debug(f'{_where(event.machine)}: {event.step} ...')
+                # the step runs in the thread that reports it
+                self._running[event.machine, event.step] = _Running(threading.get_ident())
+                self._logger.log(logging.DEBUG if self._live else logging.INFO,
+                                 f'{_where(event.machine)}: {event.step} ...')
             elif isinstance(event, StepDone):
                 self._running.pop((event.machine, event.step), None)
                 detail = f' ({event.detail})' if event.detail else ''
@@ -132,7 +148,9 @@ class Console:
                 else:
                     self._logger.warning(f'{what}: {event.reason}')
             elif isinstance(event, Progress):
-                self._running[event.machine, event.step] = _bar(event)
+                running = self._running.setdefault(
+                    (event.machine, event.step), _Running(threading.get_ident()))
+                running.progress = event
             elif isinstance(event, ClockMeasured) and event.warn:
                 what = (f"the clock of '{event.machine}' is {event.offset}, so TF look-ups and "
                         'stamp matching between the two fail')
@@ -150,12 +168,28 @@ class Console:
 
     def close(self) -> None:
         """Remove the progress line."""
+        self._ticks.close()
         with self._lock:
             self._running.clear()
             self._erase()
             self._handler.removeFilter(self._before_line)
             if self._stream.drain():
                 self._handler.setStream(self._stream.stream)
+
+    def _tick(self) -> None:
+        with self._lock:
+            if self._live:
+                self._draw()
+                return
+            for (machine, step), running in self._running.items():
+                if running.seconds >= running.told + STILL:
+                    running.told += STILL
+                    doing = [running.doing] if running.doing else []
+                    if running.progress is not None:
+                        doing.append(_bytes(running.progress))
+                    self._logger.info(
+                        f'{_where(machine)}: {step}: still working after {running.told:.0f} s'
+                        + f" ({', '.join(doing)})" * bool(doing))
 
     def _before_line(self, record: logging.LogRecord) -> bool:
         with self._lock:
@@ -173,8 +207,12 @@ class Console:
         self._erase()
         if self._running:
             parts = [
-                f'{_where(machine)}: {step}{bar}'
-                for (machine, step), bar in self._running.items()]
+                f'{_where(machine)}: {step}{running.bar}'
+                + f' {running.seconds:.0f} s' * (running.seconds >= 1.0)
+                for (machine, step), running in self._running.items()]
+            if len(parts) == 1:
+                (only,) = self._running.values()
+                parts[0] += f' ({only.doing})' * bool(only.seconds >= STILL and only.doing)
             self._stream.write('   '.join(parts)[:shutil.get_terminal_size().columns - 1])
             self._drawn = True
 
@@ -185,13 +223,39 @@ def _cleaned(record: logging.LogRecord) -> bool:
     return True
 
 
+@dataclasses.dataclass
+class _Running:
+    """A step that runs: its thread, its progress, and the seconds of its last line."""
+
+    thread: int
+    progress: Optional[Progress] = None
+    told: float = 0.0
+    begin: float = dataclasses.field(default_factory=time.monotonic)
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self.begin
+
+    @property
+    def doing(self) -> str:
+        return waiting.doing(self.thread)
+
+    @property
+    def bar(self) -> str:
+        return '' if self.progress is None else _bar(self.progress)
+
+
 def _where(machine: str) -> str:
     return machine or 'robot'
 
 
 def _bar(progress: Progress) -> str:
-    done = size(progress.done)
     if not progress.total:
-        return f' {done}'
+        return f' {_bytes(progress)}'
     full = min(_WIDTH, _WIDTH * progress.done // progress.total)
-    return f" [{'#' * full}{'.' * (_WIDTH - full)}] {done} of {size(progress.total)}"
+    return f" [{'#' * full}{'.' * (_WIDTH - full)}] {_bytes(progress)}"
+
+
+def _bytes(progress: Progress) -> str:
+    of = f' of {size(progress.total)}' if progress.total else ''
+    return size(progress.done) + of

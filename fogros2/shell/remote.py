@@ -15,7 +15,7 @@ from fogros2.errors import Cancelled, ConnectError, DeadlineExceeded, FogError
 from fogros2.model import Command, Endpoint, Result
 from fogros2.shell import command_line, lines, relay, Stream, sync, terminal
 from fogros2.shell.lines import Channel, Connection, LineStream, Output, take_errors
-from fogros2.waiting import cancellable, wait_until
+from fogros2.waiting import cancellable, noted, wait_until
 
 #: Seconds to wait for further output after a command's end, as its children may still write.
 _DRAIN = 2.0
@@ -170,7 +170,8 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
         try:
             feeder = _feed(
                 channel, command.input, end=bool(command.input) or self.ends_empty_input)
-            self._collect(channel, output, begin + timeout, cancel, command)
+            with noted(_what(command)):
+                self._collect(channel, output, begin + timeout, cancel, command)
             returncode = self._status(channel, command)
             if feeder is not None:
                 feeder.join(_DRAIN)

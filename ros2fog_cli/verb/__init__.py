@@ -137,12 +137,14 @@ def say(text: str, *, error: bool = False) -> None:
     :param error: print it to standard error.
     """
     import os
+    from ros2fog_cli.api import progress
     stream = sys.stderr if error else sys.stdout
-    try:
-        print(text, file=stream, flush=True)
-    except OSError:
-        # the stream keeps the text, and the exit would fail to write it again
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    with progress.aside():
+        try:
+            print(text, file=stream, flush=True)
+        except OSError:
+            # the stream keeps the text, and the exit would fail to write it again
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def warn(text: str) -> None:

@@ -70,12 +70,14 @@ class DeleteVerb(VerbExtension):
             endings.check_free(entry, force=args.force)
         if not args.yes and not agreed('this machine', 'machines', len(entries)):
             return 1
-        for entry, error in endings.delete_all(entries, store, progress.report, force=args.force):
-            if error is None:
-                say(f'deleted {entry.name}')
-                for warning in endings.awaited(store, entry.name):
-                    warn(warning)
-            else:
-                warn(f'{entry.name}: {error}')
-                failed = 1
+        with progress.working('deleting'):
+            for entry, error in endings.delete_all(
+                    entries, store, progress.report, force=args.force):
+                if error is None:
+                    say(f'deleted {entry.name}')
+                    for warning in endings.awaited(store, entry.name):
+                        warn(warning)
+                else:
+                    warn(f'{entry.name}: {error}')
+                    failed = 1
         return failed

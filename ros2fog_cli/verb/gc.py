@@ -37,18 +37,19 @@ class GcVerb(VerbExtension):
                 say(f"{'could not clear' if error else verb} {what} {name}: {error or reason}")
 
         entries = machines.survey(warn, regions=args.region, store=store)
-        for due in endings.due(entries, store, args.keep_stopped * 86400, progress.report):
-            error = due.error
-            try:
-                if not args.dry_run:
-                    due.end()
-            except FogError as problem:
-                error = str(problem)
-            note(due.what, due.name, due.reason, error)
-        if not args.dry_run:
-            store.sweep()
-            for what in endings.tidy(warn, regions=args.region):
-                note('leftover', what, 'its machine ended by itself')
+        with progress.working('clearing'):
+            for due in endings.due(entries, store, args.keep_stopped * 86400, progress.report):
+                error = due.error
+                try:
+                    if not args.dry_run:
+                        due.end()
+                except FogError as problem:
+                    error = str(problem)
+                note(due.what, due.name, due.reason, error)
+            if not args.dry_run:
+                store.sweep()
+                for what in endings.tidy(warn, regions=args.region):
+                    note('leftover', what, 'its machine ended by itself')
         if args.json:
             say(json.dumps(done, indent=2))
         elif not done:

@@ -170,7 +170,7 @@ def _make(args: argparse.Namespace, name: str) -> int:
 
 def _delete(args: argparse.Namespace, words: list[str]) -> int:
     from fogros2.errors import FogError
-    from ros2fog_cli.api import images
+    from ros2fog_cli.api import images, progress
     found = images.named(images.survey(warn, regions=args.region), words)
     for image in found:
         say(f"{'would delete' if args.dry_run else 'delete'} {image.name}: "
@@ -180,11 +180,12 @@ def _delete(args: argparse.Namespace, words: list[str]) -> int:
     if not args.yes and not agreed('this image', 'images', len(found)):
         return 1
     failed = 0
-    for image in found:
-        try:
-            images.delete(image)
-            say(f'deleted {image.name}')
-        except FogError as error:
-            warn(f'{image.name}: {error}')
-            failed = 1
+    with progress.working('deleting'):
+        for image in found:
+            try:
+                images.delete(image)
+                say(f'deleted {image.name}')
+            except FogError as error:
+                warn(f'{image.name}: {error}')
+                failed = 1
     return failed

@@ -201,7 +201,7 @@ def test_steps_are_shown_once(run, fake, planner, capfd):
     assert run(LaunchDescription([talker(planner)])) == 0
     output = capfd.readouterr().out
     assert '[INFO] [fogros2]: planner: machine 0.' in output and '(made of air)' in output
-    assert output.count('planner: machine') == 1
+    assert output.count('planner: machine ...') == 1 and output.count('planner: machine') == 2
     assert '\r' not in output and '\x1b' not in output
 
 

@@ -695,6 +695,72 @@ def test_closed_pipe_ends_no_deletion(
     assert not Cloud.machines and not Store().machines()
 
 
+# -- what takes its time ------------------------------------------------------------------
+
+
+class Terminal(io.StringIO):
+
+    def isatty(self) -> bool:
+        return True
+
+
+def slow_cloud(monkeypatch: pytest.MonkeyPatch, over: Callable[[], bool]) -> None:
+    """Make the deletion of a machine wait; let the verbs look at the clock all the time."""
+    destroy = Cloud.destroy
+
+    def slow(self: Cloud, machine_id: str) -> None:
+        wait_until(over, timeout=30.0, what=f'{machine_id} to be terminated')
+        destroy(self, machine_id)
+
+    monkeypatch.setattr(Cloud, 'destroy', slow)
+    monkeypatch.setattr(progress, 'TICK', 0.01)
+
+
+@pytest.mark.parametrize(('verb', 'still'), [
+    (('delete', 'slam', '--yes'), 'still deleting after'), (('gc',), 'still clearing after')])
+def test_slow_deletion_is_told_without_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, verb: Sequence[str], still: str,
+) -> None:
+    machine('slam', expires=time.time() - 3600)
+    said = io.StringIO()
+    slow_cloud(monkeypatch, lambda: said.getvalue().count('still') >= 3)
+    monkeypatch.setattr(progress, 'STILL', 0.05)
+    monkeypatch.setattr(sys, 'stderr', said)
+    assert run(*verb) == 0
+    assert f'{still} 0 s (waiting for id-slam to be terminated)\n' in said.getvalue()
+    assert '\r' not in said.getvalue()
+
+
+def test_running_time_of_a_deletion_makes_room_for_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ('one', 'two'):
+        machine(name, f'id-{name}')
+    shown = Terminal()
+    slow_cloud(monkeypatch, lambda: 'deleting' in shown.getvalue())
+    monkeypatch.setattr(sys, 'stderr', shown)
+    monkeypatch.setattr(sys, 'stdout', shown)
+    assert run('delete', 'all', '--yes') == 0
+    text = shown.getvalue()
+    assert '\r\x1b[Kdeleting 0 s (waiting for id-' in text
+    for name in ('one', 'two'):
+        at = text.index(f'deleted {name}\n')
+        assert text[:at].endswith('\n') or text[:at].endswith('\r\x1b[K')
+    assert text.endswith('\n') or text.endswith('\r\x1b[K')
+    before = shown.getvalue()
+    time.sleep(0.1)
+    assert shown.getvalue() == before, 'it is drawn no more'
+
+
+def test_image_in_progress_is_told_now_and_then(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    with progress.line() as show:
+        for second in range(5):
+            show(f'base: pending, {second} s')
+        monkeypatch.setattr(progress, 'STILL', 0.0)
+        show('base: pending, 31 s')
+    assert capsys.readouterr().err == 'base: pending\nbase: pending, 31 s\n'
+
+
 def test_list_writes_nothing(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -7,24 +7,31 @@ import io
 import logging
 import os
 import pty
+import re
+import threading
 import time
 
 import launch.logging
 import pytest
 
 from fogros2.clock import ClockOffset
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, DeadlineExceeded
+from fogros2.model import Command
+from fogros2.process import run
 from fogros2.report import (
     ClockMeasured,
     Progress,
     Silence,
+    step,
     StepDone,
     StepFailed,
     StepStarted,
     Warned,
 )
+from fogros2.runtime import console as runtime_console
 from fogros2.runtime import log_files
 from fogros2.runtime.console import Console, Screen
+from fogros2.waiting import cancellable, doing, everything, noted, wait_until
 
 
 class Terminal(io.StringIO):
@@ -60,7 +67,7 @@ def test_lines(lines):
     console(StepFailed('', 'VPN interface', 0.5, 'no TUN'))
     console(StepFailed('', 'VPN repair', 0.5, 'no TUN', fatal=False))
     assert lines == [
-        ('DEBUG', 'planner: sync ...'),
+        ('INFO', 'planner: sync ...'),
         ('INFO', 'planner: sync 1.23 s (3 files)'),
         ('INFO', 'robot: VPN interface failed after 0.50 s'),
         ('WARNING', 'robot: VPN repair failed after 0.50 s: no TUN')]
@@ -94,7 +101,88 @@ def test_progress_on_a_terminal_only():
         assert ('[######.' in stream.getvalue()) == drawn
         assert ('250.0 MB of 1.0 GB' in stream.getvalue()) == drawn
         assert ('2.0 kB' in stream.getvalue()) == drawn
-        assert stream.getvalue() == '' or stream.getvalue().endswith('\r\x1b[K')
+        assert stream.getvalue().endswith('\r\x1b[K') == drawn
+
+
+def later(console, seconds):
+    """Let the console look at its steps as if they had begun earlier."""
+    for running in console._running.values():
+        running.begin -= seconds
+    console._tick()
+
+
+def test_slow_step_is_told_with_what_it_waits_for(lines):
+    console = Console(io.StringIO())
+    with step(console, 'planner', 'machine'):
+        with noted("waiting for 'planner' to run"), noted('asking the cloud'):
+            for _ in range(8):
+                later(console, 10.0)
+    with step(console, '', 'choices'):
+        later(console, 29.0)
+        later(console, 2.0)
+    with step(console, 'planner', 'workspace'), noted('sending it'):
+        console(Progress('planner', 'workspace', 2_000, 9_000))
+        later(console, 31.0)
+    later(console, 60.0)
+    console.close()
+    text = [re.sub(r' \d+\.\d\d s', '', line) for _, line in lines]
+    assert text == [
+        'planner: machine ...',
+        "planner: machine: still working after 30 s (waiting for 'planner' to run)",
+        "planner: machine: still working after 60 s (waiting for 'planner' to run)",
+        'planner: machine', 'robot: choices ...', 'robot: choices: still working after 30 s',
+        'robot: choices', 'planner: workspace ...',
+        'planner: workspace: still working after 30 s (sending it, 2.0 kB of 9.0 kB)',
+        'planner: workspace']
+
+
+def test_running_time_is_on_a_terminal(lines):
+    terminal = Terminal()
+    console = Console(terminal)
+    with step(console, 'planner', 'machine'):
+        with step(console, '', 'VPN'):
+            later(console, 1.0)
+            later(console, 40.0)
+        with noted('install sl'):
+            later(console, 1.0)
+    console.close()
+    shown = [text for text in re.split(r'\r\x1b\[K|[^\r\n]*\n', terminal.getvalue()) if text]
+    assert shown == [
+        'planner: machine', 'planner: machine   robot: VPN',
+        'planner: machine 1 s   robot: VPN 1 s', 'planner: machine 41 s   robot: VPN 41 s',
+        'planner: machine 41 s', 'planner: machine 42 s (install sl)']
+    assert len(lines) == 2, 'starts are shown where there is no terminal'
+    console._tick()
+    assert terminal.getvalue().endswith('\r\x1b[K')
+
+
+def test_clock_of_the_console_ticks_until_it_closes(monkeypatch):
+    monkeypatch.setattr(runtime_console, 'TICK', 0.01)
+    ticks = []
+    monkeypatch.setattr(Console, '_tick', lambda self: ticks.append(1) and None)
+    console = Console(io.StringIO())
+    wait_until(lambda: len(ticks) > 3, timeout=10.0, what='the clock')
+    console.close()
+    time.sleep(0.1)
+    count = len(ticks)
+    time.sleep(0.1)
+    assert len(ticks) == count
+
+
+def test_what_threads_do_is_noted_and_forgotten():
+    assert doing(threading.get_ident()) == ''
+    with noted('outer'), noted('inner'):
+        assert doing(threading.get_ident()) == 'outer'
+        assert 'outer' in everything() and 'inner' not in everything()
+        seen = []
+        cancellable(lambda: seen.extend(everything()), threading.Event(), what='asking')
+        assert seen == ['outer']
+    with pytest.raises(DeadlineExceeded):
+        wait_until(lambda: seen.append(doing(threading.get_ident())), timeout=0.01, what='it')
+    assert 'waiting for it' in seen
+    assert cancellable(lambda: doing(threading.get_ident()), None, what='asking') == 'asking'
+    run(Command(('sleep', '0.1'), what='sleep'), timeout=5.0)
+    assert doing(threading.get_ident()) == ''
 
 
 def test_silence_and_its_end_are_a_line_each(lines):
