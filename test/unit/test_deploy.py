@@ -7,6 +7,7 @@ from concurrent.futures import Future
 import contextlib
 import dataclasses
 import json
+from pathlib import Path
 import socket
 import threading
 import time
@@ -54,7 +55,7 @@ from fogros2.model import (
     Peer,
     Result,
 )
-from fogros2.report import StepFailed
+from fogros2.report import StepDone, StepFailed
 from fogros2.shell import host_key
 from fogros2.store import Store
 from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream, FakeVpn
@@ -148,6 +149,21 @@ def test_machine_is_deleted_if_its_id_cannot_be_stored(
     with pytest.raises(StoreError):
         launch.up(SPEC)
     assert list(provider.find({})) == []
+
+
+def test_robot_asks_machines_and_names_its_middleware(launch, events, monkeypatch):
+    monkeypatch.setattr(deployed, 'check_robot', lambda: None)
+    launch.use_dds('fastdds')
+    launch.expect(['first'])
+    path = Path(launch.robot_environment()['FASTRTPS_DEFAULT_PROFILES_FILE'])
+    network = launch.robot_vpn().interface.network.rpartition('.')[0].partition('.')[2]
+    assert f'<address>239.{network}.2</address>' in path.read_text()
+    assert f'<address>239.{network}.3</address>' not in path.read_text()
+    # nodes that start from now on know the second, too
+    launch.expect(['first', 'second'])
+    assert f'<address>239.{network}.3</address>' in path.read_text()
+    assert [one.detail for one in events
+            if isinstance(one, StepDone) and one.step == 'middleware'] == ['rmw_fastrtps_cpp']
 
 
 def test_a_machine_is_ended_whose_creation_failed_half_way(launch, provider, monkeypatch):
