@@ -125,7 +125,8 @@ class LineStream:
                 self._buffer = b''
                 return b''
             data = b''
-            with contextlib.suppress(OSError, FogError):
+            # paramiko's EOFError: the answer that makes room for more could not be sent
+            with contextlib.suppress(OSError, EOFError, FogError):
                 data = self._channel.recv(_CHUNK)
                 take_errors(self._channel)
             if not data:

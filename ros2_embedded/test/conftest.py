@@ -1,20 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tests that hold for ROS 2 and for the embedded default alike."""
 
-import contextlib
-import os
+from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 from rigs.domains import taken
 
-# before anything of ROS is imported
-os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
-_held = contextlib.ExitStack()
-os.environ['ROS_DOMAIN_ID'] = _held.enter_context(taken())  # until this process ends
-# This computer and nothing else. No shared memory either: Fast DDS writes errors to stdout where a
-# process of another network namespace has the same port in /dev/shm.
-os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(Path(__file__).with_name('loopback.xml'))
-for name in ('RMW_IMPLEMENTATION', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_STATIC_PEERS',
-             'ROS_LOCALHOST_ONLY'):
-    os.environ.pop(name, None)
-os.environ['RCUTILS_COLORIZED_OUTPUT'] = '0'
+
+@pytest.fixture(autouse=True, scope='module')
+def ros_of_this_computer() -> Iterator[None]:
+    """
+    Let nodes see no others.
+
+    They use no shared memory either: Fast DDS writes errors to stdout where a process of another
+    network namespace has the same port in /dev/shm.
+    """
+    with pytest.MonkeyPatch.context() as patch, taken() as domain:
+        patch.setenv('ROS_DOMAIN_ID', domain)
+        patch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE',
+                     str(Path(__file__).with_name('loopback.xml')))
+        for name in ('RMW_IMPLEMENTATION', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_STATIC_PEERS',
+                     'ROS_LOCALHOST_ONLY'):
+            patch.delenv(name, raising=False)
+        patch.setenv('RCUTILS_COLORIZED_OUTPUT', '0')
+        yield

@@ -22,17 +22,17 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[2]
 
 
+@pytest.fixture
+def middleware() -> str:
+    return 'fastdds'
+
+
 def start(vpn: Any, host: str, *words: str) -> Any:
     """Start a Python program on a host, configured as a launch's nodes are."""
-    name = vpn.interfaces[host].name
-    interfaces = (vpn.dds.robot_interfaces(name, vpn.lan_name, {}) if host == 'robot'
-                  else vpn.dds.machine_interfaces(name))
-    path = vpn.folder / f'video {host}.xml'
-    path.write_text(vpn.dds.render(interfaces, []))
-    environment = dict(vpn.dds.environment(str(path), {}))
-    found = [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])]
-    environment['PYTHONPATH'] = ':'.join(found)
-    return vpn.start(host, [sys.executable, *words], **environment)
+    path = ':'.join([str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])])
+    return vpn.start(host, [sys.executable, *words], group=vpn.interfaces[host].name,
+                     ROS_LOG_DIR=str(vpn.folder),
+                     **{**vpn.configure(host), 'PYTHONPATH': path})
 
 
 def stream(

@@ -99,7 +99,7 @@ def test_up_again_changes_nothing_and_keeps_the_session(vpn: Lab) -> None:
     assert vpn.wireguard_go('robot') == process_id
     assert vpn.ping('robot', MACHINE)
     assert vpn.shell('robot', f'nft list table inet {vpn.interfaces["robot"].name}').count(
-        'chain ') == 4
+        'chain ') == 5
 
 
 def test_up_takes_over_what_a_killed_launch_left(lab: Lab) -> None:
