@@ -98,9 +98,10 @@ APP_PROBLEMS = {'Home': 27, 'TwistyCool': 7}
 #: Bytes of an answer with grasps, and what headers of WireGuard, UDP and DDS add to each byte.
 ANSWER, PACKETS = 4000, 1.08
 #: How the tables were made.
-NOTE = ('The cloud is a container on this computer with all cores, behind WireGuard and a relay of '
-        '10 Mbit/s without delay. The robot is simulated: its node is held to a share of the same '
-        'cores, smaller by "ratio of compute". Times are medians; those of the paper are means.')
+NOTE = ('The cloud is a container on this computer with all cores, behind WireGuard and a relay '
+        'of 10 Mbit/s without delay. The robot is simulated: its node is held to a share of the '
+        'same cores, smaller by "ratio of compute". Times are medians; those of the paper are '
+        'means.')
 #: What the codecs are called in the paper.
 NAMES = {'': '', 'raw': 'raw', 'png': 'compressed (PNG)', 'jpeg': 'compressed (JPEG)',
          'h264': 'H.264', 'grey': 'H.264, grey'}
@@ -425,8 +426,8 @@ def table(results: Sequence[Result], note: str) -> str:
             lines += ['', 'Seconds from one frame to the next with two under way, a throughput. '
                       'The paper has no such figure.', '', *_rows(paced)]
         if name == 'III':
-            lines += ['', 'Depth crosses as FFV1, which is lossless, where the paper has H.264, which '
-                      'it calls lossy.']
+            lines += ['', 'Depth crosses as FFV1, which is lossless, where the paper has H.264, '
+                      'which it calls lossy.']
         if name == 'II':
             lines += ['', 'The paper, as printed: ORB-SLAM2 on sequences of TUM with 36 cores. It '
                       'has no column of compute, so the ratio of compute is at least the '
