@@ -41,15 +41,16 @@ def captured(source: str, width: int, height: int) -> Iterator[Pixels]:
         read = 0
         try:
             while True:
-                there, frame = capture.read()
+                there, picture = capture.read()
                 if not there:
                     break
+                frame = numpy.asarray(picture, numpy.uint8)
                 if device and not read:
                     width, height = frame.shape[1], frame.shape[0]
                 if frame.shape[:2] != (height, width):
                     frame = letterbox(frame, width, height)
                 read += 1
-                yield numpy.asarray(frame, numpy.uint8)
+                yield frame
         finally:
             capture.release()
         if not read or device:

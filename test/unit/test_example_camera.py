@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy
 import pytest
 
-cv2 = pytest.importorskip('cv2', reason='OpenCV is in the extra video')
+pytest.importorskip('cv2', reason='OpenCV is in the extra video')
+
+import cv2
 
 from fogros2_examples.camera import captured
 
