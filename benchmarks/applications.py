@@ -541,7 +541,7 @@ def write_down(results: Sequence[Result]) -> None:
         {'rows': [dataclasses.asdict(r) for r in results]}, indent=1) + '\n')
 
 
-def others() -> Iterator[Callable[..., Sequence[Result]]]:
+def others() -> Iterator[Callable[..., Iterator[Result]]]:
     """Yield what measures the other tables: modules beside this one named applications_*."""
     for path in sorted(HERE.glob('applications_*.py')):
         yield importlib.import_module(path.stem).measured
@@ -571,6 +571,7 @@ def main() -> None:
     if os.geteuid():
         raise SystemExit('holding a node to a share of a core takes root')
     results: list[Result] = []
+    failed: list[str] = []
     begin = time.monotonic()
     launch = Launch()
     link: Optional[Link] = None
@@ -578,14 +579,19 @@ def main() -> None:
         machine = launch.up(MachineSpec(f'bench-applications-{os.getpid()}', 'container'))
         prepare(machine)
         link = Link(launch, machine)
-        for scenario in scenarios:
-            if arguments.only in scenario.name and not (
-                    arguments.short and scenario.name.endswith('Apartment')):
-                for result in measured(scenario, arguments.short, launch, machine, link):
+        jobs = [measured(scenario, arguments.short, launch, machine, link)
+                for scenario in scenarios if arguments.only in scenario.name and not (
+                    arguments.short and scenario.name.endswith('Apartment'))]
+        jobs += [other(arguments.only, arguments.short, launch, machine, link)
+                 for other in others()]
+        for job in jobs:
+            try:
+                for result in job:
                     results.append(result)
                     print(result, flush=True)
-        for other in others():
-            results += other(arguments.only, arguments.short, launch, machine, link)
+            except RuntimeError as error:
+                # what was measured before counts all the same
+                failed.append(str(error))
     finally:
         if link is not None:
             link.close()
@@ -595,12 +601,14 @@ def main() -> None:
     print(f'took {(time.monotonic() - begin) / 60:.1f} min\n')
     for name in ('slam', 'grasp', 'planning'):
         print(f'ros2 launch fogros2_examples {name}.launch.py machine:=aws')
-    if not arguments.short:
-        measured_now = {result.scenario for result in results}
+    if results and not arguments.short:
+        measured_now = {(result.scenario, result.codec) for result in results}
         results = [dataclasses.replace(one, computer=computer(), date=today())
                    for one in results]
-        results += [one for one in before() if one.scenario not in measured_now]
+        results += [one for one in before() if (one.scenario, one.codec) not in measured_now]
         write_down(sorted(results, key=lambda one: one.table))
+    if failed:
+        raise SystemExit('without a result: ' + '; '.join(failed))
 
 
 if __name__ == '__main__':

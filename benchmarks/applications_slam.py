@@ -10,7 +10,7 @@ The trajectory's errors, as evo has them, are those of trajectories.py.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 import contextlib
 import json
 from pathlib import Path
@@ -21,9 +21,7 @@ import time
 from typing import Any, Optional
 
 import applications
-from applications import (
-    favour, FOLDER, Held, ONE_THREAD, PACKETS, Result, robot_environment, running, words,
-)
+from applications import favour, FOLDER, Held, ONE_THREAD, PACKETS, Result, running, words
 from figures import paper
 import trajectories
 
@@ -58,7 +56,7 @@ def walked(environment: dict[str, str], frames: int, ahead: int,
 def here(frames: int, ahead: int, share: Optional[float], launch: Any,
          grey: bool = False) -> dict[str, Any]:
     """Run all on the robot; SLAM held to a share of a core, None for not."""
-    environment = robot_environment(launch)
+    environment = applications.robot_environment(launch)
     with contextlib.ExitStack() as stack:
         held = None if share is None else Held(share)
         if held is not None:
@@ -80,7 +78,7 @@ def there(codec: str, frames: int, ahead: int, launch: Any, machine: Any,
 
     from fogros2.model import NodeSpec
 
-    environment = robot_environment(launch)
+    environment = applications.robot_environment(launch)
 
     def coding(role: str, topic: str) -> list[str]:
         image = topic if role == 'encoder' else f'/there{topic}'
@@ -142,9 +140,10 @@ def coded_alone(codec: str) -> tuple[float, float]:
     return 2 * statistics.median(times), 2 * statistics.median(sizes)
 
 
-def measured(only: str, short: bool, launch: Any, machine: Any, link: Any) -> Sequence[Result]:
-    """Return the table's rows, one for each way that images cross."""
-    return list(_measured(short, launch, machine, link)) if only in 'visual SLAM' else []
+def measured(only: str, short: bool, launch: Any, machine: Any, link: Any) -> Iterator[Result]:
+    """Yield the table's rows, one for each way that images cross."""
+    if only in 'visual SLAM':
+        yield from _measured(short, launch, machine, link)
 
 
 def _measured(short: bool, launch: Any, machine: Any, link: Any) -> Iterator[Result]:
@@ -183,11 +182,11 @@ def _measured(short: bool, launch: Any, machine: Any, link: Any) -> Iterator[Res
 
 
 def _pace(found: dict[str, Any], frames: int) -> float:
-    """Return the seconds from one pose to the next."""
+    """Return the seconds from one pose to the next; a frame that is lost makes them more."""
     came = found['came']
-    if len(came) < frames:
+    if len(came) < frames / 2:
         raise RuntimeError(f'{len(came)} of {frames} frames were answered')
-    return float((came[-1] - came[WARM_UP]) / (frames - 1 - WARM_UP))
+    return float((came[-1] - came[WARM_UP]) / (len(came) - 1 - WARM_UP))
 
 
 def _network(found: dict[str, Any]) -> list[float]:
