@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 import contextlib
 import dataclasses
 from decimal import Decimal
+import io
 import json
 import os
 from pathlib import Path
