@@ -617,6 +617,14 @@ def test_a_program_may_be_in_the_image_alone(run, fake):
     assert fake.machines['planner'].nodes['program'].package == 'theirs'
 
 
+def test_a_program_may_be_in_the_node_s_image_alone(run, fake):
+    fake.on_start = ends
+    planner = ContainerInstance(name='planner', ros_workspace='')
+    assert run(LaunchDescription([CloudNode(
+        machine=planner, package='theirs', executable='program', image='mine')])) == 0
+    assert fake.machines['planner'].nodes['program'].package == 'theirs'
+
+
 def test_failing_node_start_ends_the_node(run, fake, planner, monkeypatch, capfd):
     def start(self, nodes):
         raise AgentError('the agent is gone')
