@@ -181,6 +181,7 @@ setup(
             'fogros2.verb = ros2fog_cli.verb:VerbExtension',
         ],
         'fogros2.verb': [
+            'bugreport = ros2fog_cli.verb.bugreport:BugreportVerb',
             'connect = ros2fog_cli.verb.connect:ConnectVerb',
             'dashboard = ros2fog_cli.verb.dashboard:DashboardVerb',
             'delete = ros2fog_cli.verb.delete:DeleteVerb',
@@ -200,6 +201,7 @@ setup(
             'revoke = ros2fog_cli.verb.revoke:RevokeVerb',
             'shell = ros2fog_cli.verb.shell:ShellVerb',
             'status = ros2fog_cli.verb.status:StatusVerb',
+            'wait = ros2fog_cli.verb.wait:WaitVerb',
         ],
     },
 )
