@@ -70,7 +70,8 @@ def test_verbs_work_beside_a_running_launch(
     launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]],
 ) -> None:
     name, child, said = launched
-    (entry,) = [e for e in json.loads(fog('list', '--json').stdout) if e['name'] == name]
+    (entry,) = [e for e in json.loads(fog('list', '--json').stdout)['machines']
+                if e['name'] == name]
     assert entry['state'] == 'running' and entry['launch_alive'] and entry['address']
     assert 28000 < entry['time_left'] <= 28800
 
@@ -149,9 +150,10 @@ def test_verbs_clean_up_after_a_killed_launch(
     name, child, _ = launched
     os.killpg(child.pid, signal.SIGKILL)
     child.wait(10)
-    (entry,) = [e for e in json.loads(fog('list', '--json').stdout) if e['name'] == name]
+    (entry,) = [e for e in json.loads(fog('list', '--json').stdout)['machines']
+                if e['name'] == name]
     assert entry['launch_alive'] is False and 'launch gone' in entry['state']
-    would = json.loads(fog('gc', '--dry-run', '--json').stdout)
+    would = json.loads(fog('gc', '--dry-run', '--json').stdout)['cleared']
     assert [w['reason'] for w in would if w['name'] == name] == ['its launch is gone']
     assert f'deleted {name}' in fog('delete', name, '--yes').stdout
     assert not Store().machine(name).exists()
