@@ -200,6 +200,7 @@ setup(
             'regions = ros2fog_cli.verb.regions:RegionsVerb',
             'revoke = ros2fog_cli.verb.revoke:RevokeVerb',
             'shell = ros2fog_cli.verb.shell:ShellVerb',
+            'ssh-config = ros2fog_cli.verb.ssh_config:SshConfigVerb',
             'status = ros2fog_cli.verb.status:StatusVerb',
             'wait = ros2fog_cli.verb.wait:WaitVerb',
         ],
