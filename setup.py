@@ -196,6 +196,7 @@ setup(
             'list = ros2fog_cli.verb.list:ListVerb',
             'logs = ros2fog_cli.verb.logs:LogsVerb',
             'monitor = ros2fog_cli.verb.monitor:MonitorVerb',
+            'plan = ros2fog_cli.verb.plan:PlanVerb',
             'price = ros2fog_cli.verb.price:PriceVerb',
             'regions = ros2fog_cli.verb.regions:RegionsVerb',
             'revoke = ros2fog_cli.verb.revoke:RevokeVerb',
