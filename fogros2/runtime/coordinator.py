@@ -31,7 +31,7 @@ from launch.event_handlers import OnShutdown
 import launch.logging
 from launch.substitutions import SubstitutionFailure
 
-from fogros2.describe import values
+from fogros2.describe import defaults, values
 from fogros2.describe.keywords import ROBOT
 from fogros2.describe.machines import CloudInstance
 from fogros2.errors import Cancelled, ConfigurationError, did_you_mean, FogError
@@ -287,8 +287,7 @@ class Coordinator:
         return resolved
 
     def _spec(self, machine: CloudInstance) -> MachineSpec:
-        spec = machine.spec(self._context)
-        return spec if self._overrides is None else self._overrides.apply(spec, self._context)
+        return defaults.resolved(machine, self._overrides, self._context)
 
     def session(self, machine: SomeMachine) -> Session:
         """
