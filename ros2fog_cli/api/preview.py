@@ -130,7 +130,11 @@ class Preview:
                     continue
             except _UNKNOWN:
                 own = ' (under a condition)'
-            if isinstance(entity, (DeclareLaunchArgument, SetLaunchConfiguration)):
+            if isinstance(entity, DeclareLaunchArgument):
+                if entity.default_value is not None:
+                    self._context.launch_configurations.setdefault(
+                        entity.name, self._text(entity.default_value))
+            elif isinstance(entity, SetLaunchConfiguration):
                 with contextlib.suppress(*_UNKNOWN):
                     entity.execute(self._context)
             elif isinstance(entity, FogMachine):
