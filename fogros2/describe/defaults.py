@@ -107,8 +107,10 @@ def apply(
                        for name, value in tables.get(part, {}).items() if name in known})
     settings = {name: check_setting(name, value) for name, value in wanted.items()
                 if name in SETTINGS and name not in given}
-    options = {name: value for name, value in wanted.items() if name not in SETTINGS}
-    found = dataclasses.replace(spec, options={**options, **spec.options}, **settings)
+    # an empty text is what an argument of a launch file has without a value
+    options = {name: value for name, value in wanted.items()
+               if name not in SETTINGS and spec.options.get(name, '') == ''}
+    found = dataclasses.replace(spec, options={**spec.options, **options}, **settings)
     check_loss(found)
     return found
 

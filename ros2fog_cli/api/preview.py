@@ -30,7 +30,6 @@ from fogros2.describe.overrides import Overrides
 from fogros2.errors import ConfigurationError
 from fogros2.launch_internals.wrapping import below
 from fogros2.model import MachineSpec
-from fogros2.runtime.node_spec import program_of
 from fogros2.runtime.remote_process import RemoteProcess
 
 #: Raised by substitutions and conditions that only a launch can evaluate, and by wrong values.
@@ -63,7 +62,8 @@ class Planned:
         what = self.note
         if self.spec is not None:
             options = ', '.join(f'{name}={_short(value)}' for name, value
-                                in sorted(self.spec.options.items()))
+                                in sorted(self.spec.options.items())
+                                if value not in ('', None, [], ()))
             what = self.spec.provider + f' ({options})' * bool(options)
         if price is not None:
             what += f', ${price.normalize():f} an hour'
@@ -167,8 +167,10 @@ class Preview:
             self._context.launch_configurations.update(configurations)
 
     def _program(self, action: ExecuteLocal) -> str:
-        words = program_of(action) or map(self._text, getattr(action, 'cmd', ()))
-        return _short(' '.join(words) or type(action).__name__)
+        program = [part for name in ('node_package', 'node_executable')
+                   if (part := getattr(action, name, None))]
+        words = program or getattr(action, 'cmd', ())
+        return _short(' '.join(map(self._text, words)) or type(action).__name__)
 
     def _text(self, value: Any) -> str:
         try:

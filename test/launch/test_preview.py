@@ -95,7 +95,7 @@ def test_machines_are_shown_with_their_nodes():
         CloudGroup(machine=ContainerInstance(name='mapper', memory='2g'), actions=[
             Node(package='demo', executable='mapper'),
             ExecuteProcess(cmd=['echo', LaunchConfiguration('x')])]),
-        Node(package='demo', executable='listener')])) == [
+        Node(package=['de', 'mo'], executable=LaunchConfiguration('x', default='listener'))])) == [
         'planner: aws (ec2_instance_type=t3.large, region=eu-west-1)',
         '    demo talker', '    demo late',
         'mapper: container (memory=2g)', '    demo mapper',

@@ -75,6 +75,8 @@ def test_launch_file_wins_over_defaults(own, lifetime):
                                   on_interrupt='shutdown'))
     assert found.lifetime in (28800.0, 3600.0) and found.on_interrupt == 'shutdown'
     assert found.options == {'region': 'us-east-1'}
+    # an argument of a launch file that nobody gives leaves it open
+    assert spec(AWSCloudInstance(name='a', region='')).options == {'region': 'eu-central-1'}
 
 
 def test_command_line_wins_over_defaults(own):
