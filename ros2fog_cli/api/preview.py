@@ -169,7 +169,7 @@ class Preview:
     def _program(self, action: ExecuteLocal) -> str:
         program = [part for name in ('node_package', 'node_executable')
                    if (part := getattr(action, name, None))]
-        words = program or getattr(action, 'cmd', ())
+        words: Sequence[Any] = program or getattr(action, 'cmd', [])
         return _short(' '.join(map(self._text, words)) or type(action).__name__)
 
     def _text(self, value: Any) -> str:

@@ -20,6 +20,8 @@ class PlanVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Ask the clouds for regions, types and prices, and create nothing; 1 if one refuses."""
+        from decimal import Decimal
+
         from launch.launch_description_sources import get_launch_description_from_any_launch_file
 
         from fogros2.deploy import provider
@@ -49,5 +51,5 @@ class PlanVerb(VerbExtension):
                     failed = 1
         say('\n'.join(plan.lines(prices)) or 'The launch file has no machines and no nodes.')
         if len(prices) > 1:
-            say(f'All machines: ${sum(prices.values()).normalize():f} an hour')
+            say(f'All machines: ${sum(prices.values(), Decimal(0)).normalize():f} an hour')
         return failed
