@@ -10,7 +10,7 @@ import inspect
 from pathlib import Path
 from typing import Any, Optional, TYPE_CHECKING
 
-from fogros2.describe import keywords
+from fogros2.describe import keywords, values
 from fogros2.describe.kinds import Kind
 from fogros2.describe.machines import check_loss, check_setting, CloudInstance, SETTINGS
 from fogros2.errors import ConfigurationError, PrerequisiteError
@@ -62,7 +62,20 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
                     isinstance(value, bool) and known[name] not in ('bool', 'scalar')):
                 raise ConfigurationError(f'{path}: {name} = {value!r} has the wrong type',
                                          f'it takes a {known[name]}')
+            if name in SETTINGS:
+                with values.named(str(path)):
+                    check_setting(name, value)
     return tables
+
+
+def check(environment: Mapping[str, str]) -> None:
+    """
+    Check all files.
+
+    :raises FogError: one is wrong, or cannot be read.
+    """
+    for path in files(environment):
+        read(path)
 
 
 def _parsed(path: Path) -> dict[str, Any]:

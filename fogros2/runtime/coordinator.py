@@ -158,6 +158,7 @@ class Coordinator:
             return
         self._check_overrides(early=True)
         context = self._context
+        defaults.check(context.environment)
         self.base_environment = _environment_at_start(context)
         self._console = Console()
         self._pool = ThreadPoolExecutor(_THREADS, 'fogros2')
