@@ -12,7 +12,7 @@ import dataclasses
 from pathlib import Path
 import shlex
 
-from fogros2.errors import Unsupported
+from fogros2.errors import ShellError, Unsupported
 from fogros2.model import Endpoint
 from fogros2.shell import ssh_config
 from fogros2.store import Store, write_private
@@ -39,9 +39,10 @@ def write(entry: Entry, store: Store) -> Path:
     if machines.load(entry.provider).capabilities.firewall:
         to = reach.through_vpn(entry, to) or to
     folder = store.machine(entry.name)
+    text = settings(entry.name, to, folder)
     if to.host_key:
         write_private(folder / KNOWN_HOSTS, f'{label(entry.name)} {to.host_key}\n'.encode())
-    write_private(folder / FILE, settings(entry.name, to, folder).encode())
+    write_private(folder / FILE, text.encode())
     return folder / FILE
 
 
@@ -55,9 +56,11 @@ def settings(name: str, to: Endpoint, folder: Path) -> str:
     Return the settings of a machine, in the form of ssh_config(5).
 
     :param folder: where the file with its host key is.
+    :raises ShellError: a value would be several settings.
     """
     found = ssh_config.of(to)
-    pairs = [('HostName', to.host if to.host_key else found.host), ('Port', str(found.port)),
+    host = to.host if to.host_key else found.host
+    pairs = [('HostName', host.replace('%', '%%')), ('Port', str(found.port)),
              ('User', found.user)]
     if found.proxy:
         pairs.append(('ProxyCommand', shlex.join(found.proxy).replace('%', '%%')))
@@ -73,6 +76,10 @@ def settings(name: str, to: Endpoint, folder: Path) -> str:
         pairs.append(('UserKnownHostsFile', ' '.join(
             _path(one, '%') for one in found.known_hosts)))
     pairs.append(('HostKeyAlias', found.label))
+    for key, value in (*pairs, ('host key', to.host_key or '')):
+        if value and (not value.isprintable() or ' ' in value and key in ('HostName', 'User')):
+            raise ShellError(f"'{name}' has a {key} that ssh would misread: {value!r}",
+                             'its host or its provider may be hijacked')
     return f'Host {name}\n' + ''.join(f'    {key} {value}\n' for key, value in pairs if value)
 
 

@@ -244,6 +244,21 @@ def test_line_for_ssh_is_shown_until_it_is_there(
     assert capsys.readouterr().out == ''
 
 
+@pytest.mark.parametrize('changes', [
+    {'host': '198.51.100.7\n    ProxyCommand id'}, {'user': 'fog\n    PermitLocalCommand yes'},
+    {'user': 'fog evil'}, {'host_key': 'ssh-ed25519 AAAA\n* ssh-ed25519 BBBB'}])
+def test_machine_adds_no_settings_of_its_own(
+    changes: dict[str, Any], capsys: pytest.CaptureFixture[str],
+) -> None:
+    machine('a', shell=dataclasses.replace(
+        Endpoint('ssh', '198.51.100.7', 22, 'fog', 'ssh-ed25519 AAAA'), **changes))
+    record('a')
+    assert run('ssh-config', 'a') == 1
+    assert 'that ssh would misread' in capsys.readouterr().err
+    assert not (Store().machine('a') / 'ssh_config').exists()
+    assert not (Store().machine('a') / 'known_hosts').exists()
+
+
 def test_machine_without_ssh_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     machine('pod', shell=Endpoint('kubernetes', 'pod'))
     record('pod')
