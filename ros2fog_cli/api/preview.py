@@ -32,8 +32,9 @@ from fogros2.launch_internals.wrapping import below
 from fogros2.model import MachineSpec
 from fogros2.runtime.remote_process import RemoteProcess
 
-#: Raised by substitutions and conditions that only a launch can evaluate, and by wrong values.
-_UNKNOWN = (RuntimeError, LookupError, TypeError, ValueError, OSError)
+#: Raised by substitutions and conditions that only a launch can evaluate, by wrong values, and by
+#: the code of included files, which can raise anything.
+_UNKNOWN = Exception
 #: Characters of a value; a longer one is cut.
 _LONGEST = 60
 
@@ -98,7 +99,7 @@ class Preview:
         self._overrides = overrides
         self._machines: dict[str, Planned] = {}
         self._on_robot: set[str] = set()
-        #: Whether a function adds what nobody can foresee.
+        #: Whether a function or an unread file may add something.
         self.open = False
         self._look(description.entities)
 
@@ -117,7 +118,7 @@ class Preview:
         for one in self.machines:
             yield from one.lines(prices.get(one.name))
         if self.open:
-            yield 'Functions of the launch file may add more.'
+            yield 'Not shown: what functions, and files that cannot be read now, may add.'
 
     def _look(
         self, entities: Iterable[LaunchDescriptionEntity], where: str = ROBOT, note: str = '',
@@ -135,10 +136,10 @@ class Preview:
                     self._context.launch_configurations.setdefault(
                         entity.name, self._text(entity.default_value))
             elif isinstance(entity, SetLaunchConfiguration):
-                with contextlib.suppress(*_UNKNOWN):
+                with contextlib.suppress(_UNKNOWN):
                     entity.execute(self._context)
             elif isinstance(entity, FogMachine):
-                with contextlib.suppress(*_UNKNOWN):
+                with contextlib.suppress(_UNKNOWN):
                     self._name(entity.described(self._context))
             elif isinstance(entity, ExecuteLocal):
                 at = self._name(entity.machine) if isinstance(entity, RemoteProcess) else where

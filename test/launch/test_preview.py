@@ -123,7 +123,7 @@ def test_what_only_a_launch_knows_is_said():
         OpaqueFunction(function=lambda context: None)])
     assert found[0].startswith('a: aws: ') and 'nowhere' in found[0]
     assert found[1:] == ['    demo talker', 'b: container', '    demo talker (under a condition)',
-                         'Functions of the launch file may add more.']
+                         'Not shown: what functions, and files that cannot be read now, may add.']
 
 
 def test_preview_runs_no_command(tmp_path: Path):
@@ -149,6 +149,15 @@ def test_included_file_has_its_own_arguments(tmp_path: Path):
     assert lines([GroupAction([included]), included]) == [
         'planner: aws (region=us-east-1)', *['    fogros2_examples talker'] * 2,
         'robot', *['    fogros2_examples listener'] * 2]
+
+
+def test_broken_include_spoils_nothing_else(tmp_path: Path):
+    path = tmp_path / 'x.launch.py'
+    path.write_text('raise KeyboardError')
+    included = IncludeLaunchDescription(AnyLaunchDescriptionSource(str(path)))
+    assert lines([included, node(ContainerInstance(name='a'))]) == [
+        'a: container', '    demo talker',
+        'Not shown: what functions, and files that cannot be read now, may add.']
 
 
 def test_word_that_is_no_argument_is_refused():
