@@ -206,8 +206,8 @@ def test_dashboard_shows_a_launch_until_its_end(
     assert dashboard.close() == 0
 
     def told() -> list[Any]:
-        return [json.loads(line) for line in watching.read_text().splitlines(keepends=True)
-                if line.endswith('\n')]
+        return [json.loads(line)['machine']
+                for line in watching.read_text().splitlines(keepends=True) if line.endswith('\n')]
 
     wait_until(lambda: told()[-1]['phase'] == 'gone', timeout=20.0, what='its end')
     first, *others = told()
