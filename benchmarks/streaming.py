@@ -573,7 +573,7 @@ def rows(outcomes: list[Outcome], limits: dict[str, float], video: bool) -> Iter
             yield Row(f'{o.case.name}: {what}', value, unit, target,
                       'more' if unit in ('1/s', 'dB') else 'less',
                       published=o.case.published if field in ('fps', 'median') else '',
-                      runs=1)
+                      runs=1, high=o.p95 if field == 'median' else None)
         if o.case.name in limits:
             yield Row(f'{o.case.name}: median over limit', o.median / limits[o.case.name], '',
                       1.3)
