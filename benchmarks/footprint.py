@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-
 from figures import Row, write
 
 from fogros2.deploy import Launch
