@@ -40,7 +40,7 @@ class Panel:
 _LIMIT = Panel('Ratio to the limit of link and codec', ': median over limit$', '')
 _STARTS = (Panel('From ros2 launch to the first message', ': to the first message$', 's'),
            Panel('Several machines of one launch', r'instances?, boot delay \d+ s$', 's'))
-_STREAMS = (Panel('From the camera to the decoded image', ': median$', 'ms'), _LIMIT)
+_STREAMS = (Panel('From an image to its answer, median', ': median$', 'ms'), _LIMIT)
 
 #: Benchmarks that have a picture. The table alone shows the others: their values are counts with
 #: a target of 0, or too few to compare.
@@ -62,7 +62,7 @@ PANELS: Mapping[str, Sequence[Panel]] = {
     'machines': (Panel('Until all machines are ready', r'^\d+ machine', 's'),),
     'monitor': (
         Panel('From publisher to viewer', ', publish to viewer, median$', 'ms'),
-        Panel('Load of the robot', '.', '% CPU')),
+        Panel('Processor time, of one core', '.', '% CPU')),
     'nodes': (),
     'point_clouds': (_LIMIT,),
     'policy': (
@@ -82,7 +82,7 @@ PANELS: Mapping[str, Sequence[Panel]] = {
         Panel('Pods of one launch', r'^\d+ .*until', 's')),
     'streaming': _STREAMS,
     'streaming-video': _STREAMS,
-    'sync': (Panel('A workspace of 1 GB in 10,000 files', '.', 's'),),
+    'sync': (Panel('Until the workspace is on the machine', '.', 's'),),
 }
 
 _REACHED, _MISSED, _PLAIN, _INK = '#1f7a5c', '#b3412e', '#5d6b78', '#222222'
