@@ -290,9 +290,10 @@ def _legend(drawn: Sequence[tuple[Panel, Sequence[Point], object]]) -> list[Any]
     if any(point.target for point in points):
         entries.append(Line2D([], [], linestyle='', marker='|', markersize=11, color=_INK,
                               markeredgewidth=2, label='target'))
-    if any(panel.unit == '' for panel, *_ in drawn):
-        entries.append(Line2D([], [], color=_INK, linestyle=(0, (2, 2)), linewidth=1.2,
-                              label='1 (limit, or raw images)'))
+    ratios = [panel.heading for panel, *_ in drawn if panel.unit == '']
+    if ratios:
+        entries.append(Line2D([], [], color=_INK, linestyle=(0, (2, 2)), linewidth=1.2, label=(
+            'limit, or raw images' if any('raw' in heading for heading in ratios) else 'limit')))
     if any(point.at in (0.0, math.inf) for point in points):
         entries.append(Line2D([], [], linestyle='', marker='<', markersize=7, color=_REACHED,
                               label='0, beyond the axis'))

@@ -44,7 +44,7 @@ def screen(
             if not pressed and (until(said.decode(errors='replace'))
                                 or time.monotonic() > deadline):
                 said += b'^C'
-                child.send_signal(signal.SIGINT)
+                os.killpg(child.pid, signal.SIGINT)
                 pressed, deadline = True, time.monotonic() + 60.0
             if select.select([terminal], [], [], 0.2)[0]:
                 try:
