@@ -264,7 +264,7 @@ def span(points: Sequence[Point], ratio: bool) -> tuple[float, float]:
     """Return the ends of an axis that shows all points, three times as large at least."""
     shown = [value for point in points
              for value in (point.at, point.low, point.high, point.target or 0.0)
-             if 0 < value < math.inf] + [1.0] * ratio
+             if 0 < value < math.inf] + [1.0] * ratio or [1.0]
     low, high = min(shown), max(shown)
     wider = max(1.1 * (high / low)**0.04, math.sqrt(3 * low / high))
     return low / wider, high * wider
