@@ -11,8 +11,10 @@ Chromium.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Sequence
 import contextlib
 import html
+import os
 from pathlib import Path
 import re
 import sys
@@ -25,7 +27,7 @@ from rigs.terminal import screen
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Columns of the terminal, and messages that are heard before Ctrl-C.
-COLUMNS, HEARD = 113, 3
+COLUMNS, HEARD = 120, 3
 #: Messages that are heard before the dashboard's picture, which has a curve of the traffic.
 WATCHED = 30
 #: Width and height of a character in the picture, in pixels.
@@ -62,29 +64,37 @@ def terminal(path: Path) -> None:
         words = ('ros2', 'launch', './bringup.launch.py')
         text = screen(*words, folder=Path(folder), columns=COLUMNS, timeout=120.0,
                       until=lambda text: text.count('I heard') >= HEARD)
-    path.write_text(svg(f"$ {' '.join(words)}\n{text}"))
+    # neither this computer nor its user matter
+    for own, other in ((str(Path.home()), '/home/robot'), (f'-{os.uname().nodename}-', '-robot-')):
+        text = text.replace(own, other)
+    path.write_text(svg([f"$ {' '.join(words)}", *lines(text)]))
 
 
-def svg(text: str) -> str:
-    """Return a picture of a terminal that shows a text; its first line is the command."""
-    plain = re.sub(r'\x1b\[[0-9;?]*[A-Za-z]', '', text).replace('\r', '').rstrip()
-    rows = [line[at:at + COLUMNS] for line in plain.split('\n')
-            for at in range(0, max(1, len(line)), COLUMNS)]
+def lines(text: str) -> Iterator[str]:
+    """Yield the lines that a terminal shows of a text; carriage returns overwrite a line."""
+    for line in re.sub(r'\x1b\[[0-9;?]*[A-Za-z]', '', text).rstrip().split('\n'):
+        line = line.rstrip('\r').rpartition('\r')[2]
+        yield from (line[at:at + COLUMNS] for at in range(0, max(1, len(line)), COLUMNS))
+
+
+def svg(rows: Sequence[str]) -> str:
+    """Return a picture of a terminal with these rows, the command first."""
     width, height = COLUMNS * WIDE + 20, len(rows) * HIGH + 50
-    lines = [f'<svg viewBox="0 0 {width:.0f} {height:.0f}" xmlns="http://www.w3.org/2000/svg">',
-             '<title>A terminal: ros2 launch creates the machine planner, the talker there is '
-             'heard here, Ctrl-C deletes the machine</title>',
-             '<style>text {font: 20px Fira Code, DejaVu Sans Mono, monospace; fill: #c5c8c6} '
-             '.command {font-weight: bold; fill: #98a84b}</style>',
-             f'<rect fill="#292929" width="{width:.0f}" height="{height:.0f}" rx="8"/>']
-    lines += [f'<circle cx="{22 + 22 * at}" cy="20" r="7" fill="{colour}"/>'
-              for at, colour in enumerate(('#ff5f57', '#febc2e', '#28c840'))]
+    tags = [
+        f'<svg viewBox="0 0 {width:.0f} {height:.0f}" xmlns="http://www.w3.org/2000/svg">',
+        '<title>A terminal: ros2 launch creates the machine planner, the talker there is heard '
+        'here, Ctrl-C deletes the machine</title>',
+        '<style>text {font: 20px Fira Code, DejaVu Sans Mono, monospace; fill: #c5c8c6} '
+        '.command {font-weight: bold; fill: #98a84b}</style>',
+        f'<rect fill="#292929" width="{width:.0f}" height="{height:.0f}" rx="8"/>']
+    tags += [f'<circle cx="{22 + 22 * at}" cy="20" r="7" fill="{colour}"/>'
+             for at, colour in enumerate(('#ff5f57', '#febc2e', '#28c840'))]
     for at, row in enumerate(rows):
         kind = ' class="command"' if at == 0 else ''
         # each row as wide as its characters, whatever font there is
-        lines.append(f'<text x="10" y="{60 + at * HIGH:.1f}" textLength="{len(row) * WIDE:.1f}"'
-                     f'{kind}>{html.escape(row)}</text>')
-    return '\n'.join([*lines, '</svg>', ''])
+        tags.append(f'<text x="10" y="{60 + at * HIGH:.1f}" textLength="{len(row) * WIDE:.1f}"'
+                    f'{kind}>{html.escape(row)}</text>')
+    return '\n'.join([*tags, '</svg>', ''])
 
 
 def dashboard(path: Path) -> None:
@@ -101,7 +111,8 @@ def dashboard(path: Path) -> None:
         launched.wait_for('I heard', times=WATCHED, timeout=120.0)
         browser.until('[...document.querySelectorAll("figure img")].filter('
                       'image => image.complete && image.naturalWidth === 640).length === 2')
-        browser.screenshot(path, whole=True)
+        browser.size(1400, browser.ask('document.documentElement.scrollHeight'))
+        browser.screenshot(path)
 
 
 def main() -> int:
