@@ -13,10 +13,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 import contextlib
+import ctypes
 import html
 import os
 from pathlib import Path
 import re
+import socket
 import sys
 import tempfile
 
@@ -30,6 +32,8 @@ ROOT = Path(__file__).resolve().parents[2]
 COLUMNS, HEARD = 120, 3
 #: Messages that are heard before the dashboard's picture, which has a curve of the traffic.
 WATCHED = 30
+#: Of Linux' sched.h.
+CLONE_NEWUTS = 0x04000000
 #: Width and height of a character in the picture, in pixels.
 WIDE, HIGH = 12.2, 24.4
 STREAMS = """
@@ -111,8 +115,8 @@ def dashboard(path: Path) -> None:
         launched.wait_for('I heard', times=WATCHED, timeout=120.0)
         browser.until('[...document.querySelectorAll("figure img")].filter('
                       'image => image.complete && image.naturalWidth === 640).length === 2')
-        browser.size(1400, browser.ask('document.documentElement.scrollHeight'))
-        browser.screenshot(path)
+        browser.do('Emulation.setScrollbarsHidden', hidden=True)
+        browser.screenshot(path, whole=True)
 
 
 def main() -> int:
@@ -121,14 +125,19 @@ def main() -> int:
     parser.add_argument('what', nargs='?', choices=('terminal', 'dashboard'))
     parser.add_argument('--folder', type=Path, default=ROOT / 'doc')
     arguments = parser.parse_args()
-    if arguments.what != 'dashboard':
-        terminal(arguments.folder / 'terminal.svg')
-    if arguments.what != 'terminal':
-        if program() is None:
-            print('The dashboard needs a Chromium.\n  sudo apt-get install chromium',
-                  file=sys.stderr)
-            return 1
-        dashboard(arguments.folder / 'dashboard.png')
+    with tempfile.TemporaryDirectory() as state:
+        os.environ['FOGROS2_STATE_HOME'] = state
+        # a robot of its own, as root: this computer's other machines are not in the pictures
+        if ctypes.CDLL(None).unshare(CLONE_NEWUTS) == 0:
+            socket.sethostname('rover')
+        if arguments.what != 'dashboard':
+            terminal(arguments.folder / 'terminal.svg')
+        if arguments.what != 'terminal':
+            if program() is None:
+                print('The dashboard needs a Chromium.\n  sudo apt-get install chromium',
+                      file=sys.stderr)
+                return 1
+            dashboard(arguments.folder / 'dashboard.png')
     return 0
 
 
