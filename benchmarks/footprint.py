@@ -24,7 +24,8 @@ def resident() -> float:
         status = machine.shell.run(Command(('sh', '-c', (
             'for p in /proc/[0-9]*; do tr "\\0" " " <$p/cmdline | grep -q "agent.py serve" && '
             'grep VmRSS $p/status; done; true')), sudo=True), timeout=30).stdout
-        return max(float(line.split()[1]) for line in status.splitlines()) / 1000
+        # Linux says kB for 1024 bytes
+        return max(float(line.split()[1]) for line in status.splitlines()) * 1024 / 1e6
     finally:
         launch.down()
 

@@ -27,7 +27,7 @@ import statistics
 import tempfile
 import time
 
-from figures import Row, write
+from figures import paper, Row, write
 import startup_kubernetes
 
 from fogros2.plugin_system import load
@@ -39,7 +39,8 @@ DELAYS = (0.0, 20.0)
 MANY = 8
 BOXES = {'aws': 'EC2', 'azure': 'Azure', 'gcp': 'Compute Engine'}
 #: What the paper has for AWS, by image.
-PUBLISHED = {'default': '275 s', 'custom': '85 s'}
+PUBLISHED = {'default': f"{paper.STARTUP['AWS default']} s (real EC2, ROS 2 installed)",
+             'custom': f"{paper.STARTUP['AWS custom']} s (real EC2)"}
 
 LAUNCH = """\
 from fogros2 import {machine}, CloudNode, FogROSLaunchDescription
@@ -74,11 +75,12 @@ class Robot:
             raise SystemExit(f'ros2 fog {" ".join(words)} failed:\n{done.stdout}{done.stderr}')
         return time.perf_counter() - begin
 
-    def talker(self, *words: str) -> tuple[float, float, float, int]:
+    def talker(self, *words: str) -> tuple[float, float, float, str, int]:
         """
         Launch the talker until the first message is heard.
 
-        :returns: seconds in all, of the boot, of the installation; requests, the end too.
+        :returns: seconds in all, of the boot, of the installation; what ROS 2 is installed from;
+            requests, the end too.
         """
         self.box.forget_calls()
         with launching() as launch:
@@ -92,7 +94,9 @@ class Robot:
         newest = self.box.instances()[-1]
         found = re.search(r'ROS 2 +([0-9.]+) s \((.*)\)', run.text)
         installed = float(found[1]) if found and 'installed' in found[2] else 0.0
-        return total, newest.ready - newest.asked, installed, len(self.cloud.asked(self.box))
+        how = 'apt' if found and 'from packages' in found[2] else 'its wheels'
+        return (total, newest.ready - newest.asked, installed, how,
+                len(self.cloud.asked(self.box)))
 
     def machines(self, number: int) -> tuple[float, float]:
         """Return the seconds until the nodes of ``number`` machines run, and the launch's CPU."""
@@ -139,13 +143,15 @@ def start(provider: str, runs: int) -> Iterator[Row]:
                 taken = [here.talker() for _ in range(runs)]
                 calls += [asked for *_, asked in taken]
                 total = statistics.median(t for t, *_ in taken)
-                installed = statistics.median(i for _, _, i, _ in taken)
-                share = statistics.median(t - b - i for t, b, i, _ in taken)
-                what = f'{image} image, boot delay {delay:g} s'
+                installed = statistics.median(i for _, _, i, _, _ in taken)
+                how = taken[-1][3]
+                share = statistics.median(t - b - i for t, b, i, _, _ in taken)
+                what = f'simulated {BOXES[provider]}, {image} image, boot delay {delay:g} s'
                 yield Row(f'{what}: to the first message', total, 's', runs=runs,
                           published=PUBLISHED[image] if provider == 'aws' else '')
                 if installed:
-                    yield Row(f'{what}: of it ROS 2 installed', installed, 's', runs=runs)
+                    yield Row(f'{what}: of it ROS 2 installed from {how}', installed, 's',
+                              runs=runs)
                 yield Row(f'{what}: our share', share, 's', 6.0 if image == 'default' else 4.0,
                           runs=runs)
             if image == 'default':
@@ -184,11 +190,12 @@ def several(provider: str, runs: int) -> Iterator[Row]:
             one, spent = map(statistics.median, zip(*(here.machines(1) for _ in range(runs))))
             many, spent_by_many = map(
                 statistics.median, zip(*(here.machines(MANY) for _ in range(runs))))
-            what = f'{MANY} instances, boot delay {delay:g} s'
-            yield Row(f'1 instance, boot delay {delay:g} s', one, 's', runs=runs)
+            box = f'simulated {BOXES[provider]}'
+            what = f'{box}, {MANY} instances, boot delay {delay:g} s'
+            yield Row(f'{box}, 1 instance, boot delay {delay:g} s', one, 's', runs=runs)
             yield Row(what, many, 's', runs=runs)
             yield Row(what, many / one, 'times one', 1.5, runs=runs,
-                      published='one after another')
+                      published='not published; its code: one after another')
             yield Row(f"{what}: the robot's CPU", spent_by_many, 's', runs=runs)
             yield Row(f"{what}: the robot's CPU", spent_by_many / spent, 'times one', runs=runs)
 

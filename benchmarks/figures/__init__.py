@@ -10,7 +10,7 @@ ratios within one run.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 import dataclasses
 import datetime
 from importlib import metadata
@@ -93,6 +93,29 @@ def machine() -> str:
             f'Python {platform.python_version()}, {ros()}')
 
 
+def today() -> str:
+    """Return the date as results have it."""
+    return datetime.date.today().isoformat()
+
+
+def origin(rows: Iterable[tuple[str, str, str]]) -> tuple[str, str]:
+    """
+    Return where rows were measured, and the newest date; several places name their rows.
+
+    :param rows: name, computer and date of each row.
+    """
+    places: dict[tuple[str, str], list[str]] = {}
+    for name, computer, date in rows:
+        names = places.setdefault((computer, date), [])
+        if name not in names:
+            names.append(name)
+    newest = max(date for _, date in places)
+    if len(places) == 1:
+        return next(iter(places))
+    return '; '.join(f"{', '.join(map(repr, names))}: {computer}, {date}"
+                     for (computer, date), names in places.items()), newest
+
+
 def ros() -> str:
     """Return the versions of rclpy and of the middleware that nodes use here."""
     rmw = os.environ.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp'
@@ -106,14 +129,16 @@ def ros() -> str:
 
 def write(
     name: str, title: str, rows: Sequence[Row], results: Path = RESULTS, computer: str = '',
+    date: str = '',
 ) -> None:
     """
     Write the figures as JSON, as a table and as a picture, and print the table.
 
     :param computer: that the rows were measured on, '' for this one.
+    :param date: of the measurement, '' for today.
     """
     results.mkdir(parents=True, exist_ok=True)
-    date = datetime.date.today().isoformat()
+    date = date or today()
     computer = computer or machine()
     data = {'machine': computer, 'date': date, 'rows': [dataclasses.asdict(r) for r in rows]}
     (results / f'{name}.json').write_text(json.dumps(data, indent=1) + '\n')
