@@ -70,7 +70,7 @@ PANELS: Mapping[str, Sequence[Panel]] = {
         _LIMIT),
     'resilience': (
         Panel('One replica killed, one slowed, time of 99 of 100', '^the same: P99', 'ms'),
-        Panel('Replayed plans, time of 99 of 100', '^plans replayed', 'ms'),
+        Panel('Recorded planning times, 99 of 100', '^(plans|recorded) .*P99', 'ms'),
         Panel('A call', '^call', 'ms')),
     'round_trip': (Panel('A message there and back', '^(between|to) ', 'ms'),),
     'shared_link': (Panel('There and back, time of 95 of 100', ': p95$', 'ms'),),
