@@ -137,6 +137,7 @@ def say(text: str, *, error: bool = False) -> None:
     :param error: print it to standard error.
     """
     import os
+
     from ros2fog_cli.api import progress
     stream = sys.stderr if error else sys.stdout
     with progress.aside():

@@ -110,12 +110,12 @@ def dashboard(path: Path) -> None:
         launch = undo.enter_context(launching())
         file = Path(undo.enter_context(tempfile.TemporaryDirectory()), 'streams.launch.py')
         file.write_text(STREAMS)
+        browser.do('Emulation.setScrollbarsHidden', hidden=True)
         browser.open(watched.url)
         launched = launch(str(file))
         launched.wait_for('I heard', times=WATCHED, timeout=120.0)
         browser.until('[...document.querySelectorAll("figure img")].filter('
                       'image => image.complete && image.naturalWidth === 640).length === 2')
-        browser.do('Emulation.setScrollbarsHidden', hidden=True)
         browser.screenshot(path, whole=True)
 
 
