@@ -273,10 +273,19 @@ def asked(scenario: Scenario, environment: dict[str, str], trials: int,
         return [{**json.loads(line), 'sent': count} for line, count in zip(lines, counts)]
 
 
-def here(scenario: Scenario, trials: int, share: Optional[float]) -> list[dict[str, Any]]:
+def robot_environment(launch: Any) -> dict[str, str]:
+    """
+    Return the variables of nodes on the robot, whether or not the cloud helps.
+
+    A launch's filter lets the robot's processes reach only the launch's own domain.
+    """
+    return {**os.environ, **launch.robot_environment(), **ONE_THREAD, 'PYTHONPATH': str(ROOT)}
+
+
+def here(scenario: Scenario, trials: int, share: Optional[float],
+         launch: Any) -> list[dict[str, Any]]:
     """Run a scenario on the robot; ``share`` of a core is what computes held to, None for not."""
-    environment = {**os.environ, **ONE_THREAD, 'PYTHONPATH': str(ROOT), 'ROS_DOMAIN_ID': '84',
-                   'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    environment = robot_environment(launch)
     held = None if share is None else Held(share)
     try:
         def hear(line: str) -> None:
@@ -300,8 +309,7 @@ def there(scenario: Scenario, codec: str, trials: int, launch: Any, machine: Any
 
     from fogros2.model import NodeSpec
 
-    environment = {**os.environ, **launch.robot_environment(), **ONE_THREAD,
-                   'PYTHONPATH': str(ROOT)}
+    environment = robot_environment(launch)
     # a name is for one node, once
     mark = f'{scenario.name.rpartition(" ")[2]}-{codec}'
     computing = words(scenario.module, *scenario.parameters)
@@ -387,8 +395,9 @@ def measured(scenario: Scenario, short: bool, launch: Any, machine: Any,
 
     trials = min(scenario.trials, 4) if short else scenario.trials
     held_trials = min(scenario.held_trials, 2, trials) if short else scenario.held_trials
-    alone = here(scenario, held_trials, scenario.cores / scenario.ratio)
-    hops = statistics.median(f['total'] - f['seconds'] for f in here(scenario, trials, None))
+    alone = here(scenario, held_trials, scenario.cores / scenario.ratio, launch)
+    hops = statistics.median(
+        f['total'] - f['seconds'] for f in here(scenario, trials, None, launch))
     for codec in scenario.codecs:
         figures, sent = there(scenario, codec, trials, launch, machine, link)
         coding = 0.0
