@@ -2,7 +2,7 @@
 # Everything below does its own set-up: see tools/setup.sh.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning demo-policy cloud-check test test-fast test-kubernetes test-minimum fresh lint bench soak deb docs interfaces clean
+.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning demo-policy cloud-check test test-fast test-kubernetes test-minimum fresh lint bench soak pictures deb docs interfaces clean
 
 ## demo   a launch file puts a talker on a container machine and takes it down again
 demo:
@@ -72,6 +72,12 @@ bench:
 	@tools/setup.sh bench
 	@set -e; for script in $(filter-out benchmarks/chaos.py benchmarks/security.py benchmarks/theora.py benchmarks/applications_%,$(wildcard benchmarks/*.py)); do \
 		echo "== $$script"; tools/run.sh best -- python "$$script"; done
+
+## pictures  tables and plots of the stored figures, and the pictures of the pages, anew
+pictures:
+	@tools/setup.sh test
+	@cd benchmarks && ../tools/run.sh embedded -- python -m figures
+	@tools/run.sh embedded -- python -m rigs.pictures
 
 ## docs   the documentation, as pages for a browser
 docs:

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import contextlib
 import json
-import os
 from pathlib import Path
 import statistics
 import subprocess
@@ -22,12 +21,16 @@ import time
 from typing import Any, Optional
 
 import applications
-from applications import favour, FOLDER, Held, ONE_THREAD, PACKETS, Result, ROOT, running, words
+from applications import (
+    favour, FOLDER, Held, ONE_THREAD, PACKETS, Result, robot_environment, running, words,
+)
+from figures import paper
 import trajectories
 
+#: The robot is held to as much less as the paper's fr2/loop is slower without the cloud. The paper
+#: has no times of computing; its cloud computes at least so much faster.
+RATIO = paper.SLAM['fr2/loop'][0] / paper.SLAM['fr2/loop'][3]
 NODE, CAMERA = 'fogros2_examples.slam.node', 'fogros2_examples.slam.camera'
-#: Seconds a frame: robot alone, computing in the cloud (what the total leaves at the most), total.
-PAPER = (0.68, 0.22, 0.22)
 TOPICS = ('/camera/image', '/camera/right/image')
 WIDTH, HEIGHT = 640, 480
 #: The last one is H.264 of grey images, as most stereo cameras make them.
@@ -52,10 +55,10 @@ def walked(environment: dict[str, str], frames: int, ahead: int,
     return found
 
 
-def here(frames: int, ahead: int, share: Optional[float], grey: bool = False) -> dict[str, Any]:
+def here(frames: int, ahead: int, share: Optional[float], launch: Any,
+         grey: bool = False) -> dict[str, Any]:
     """Run all on the robot; SLAM held to a share of a core, None for not."""
-    environment = {**os.environ, **ONE_THREAD, 'PYTHONPATH': str(ROOT), 'ROS_DOMAIN_ID': '85',
-                   'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    environment = robot_environment(launch)
     with contextlib.ExitStack() as stack:
         held = None if share is None else Held(share)
         if held is not None:
@@ -77,8 +80,7 @@ def there(codec: str, frames: int, ahead: int, launch: Any, machine: Any,
 
     from fogros2.model import NodeSpec
 
-    environment = {**os.environ, **launch.robot_environment(), **ONE_THREAD,
-                   'PYTHONPATH': str(ROOT)}
+    environment = robot_environment(launch)
 
     def coding(role: str, topic: str) -> list[str]:
         image = topic if role == 'encoder' else f'/there{topic}'
@@ -150,14 +152,13 @@ def _measured(short: bool, launch: Any, machine: Any, link: Any) -> Iterator[Res
 
     frames, held_frames, rooms = (60, 20, 2) if short else (200, 60, 12)
     errors = trajectories.measured(CODECS, rooms, frames)
-    ratio = PAPER[0] / PAPER[1]
     for codec in CODECS:
         grey = codec == 'grey'
         if codec in ('raw', 'grey'):
             # the robot's own camera is the same however its images would travel
             robot = statistics.median(
-                here(held_frames, 1, 1 / ratio, grey)['round_trips'][WARM_UP:])
-            hops = statistics.median(_network(here(frames, 1, None, grey)))
+                here(held_frames, 1, 1 / RATIO, launch, grey)['round_trips'][WARM_UP:])
+            hops = statistics.median(_network(here(frames, 1, None, launch, grey)))
         # over the link all frames would take too long as they are
         found = there(codec, 20 if codec == 'raw' else frames, 1, launch, machine, link)
         trips = found['round_trips'][WARM_UP:]
@@ -165,18 +166,19 @@ def _measured(short: bool, launch: Any, machine: Any, link: Any) -> Iterator[Res
         coding, size = coded_alone(codec)
         yield Result(
             'visual SLAM', 'II', codec, robot, total - network, network, total, robot / total,
-            ratio,
+            RATIO,
             # an image is handed on once more on either side of the link
             PACKETS * size * 8 / LINK + coding + 3 * hops,
-            PACKETS * size, PAPER, len(trips), held_frames - WARM_UP, errors=errors[codec])
+            PACKETS * size, len(trips), held_frames - WARM_UP, errors=errors[codec])
     for codec in ('h264', 'grey'):
         grey = codec == 'grey'
         robot, compute, total = (_pace(found, held_frames) for found in (
-            here(held_frames, 2, 1 / ratio, grey), here(held_frames, 2, None, grey),
+            here(held_frames, 2, 1 / RATIO, launch, grey),
+            here(held_frames, 2, None, launch, grey),
             there(codec, held_frames, 2, launch, machine, link)))
         yield Result('visual SLAM, two frames under way', 'II', codec, robot, compute,
-                     max(0.0, total - compute), total, robot / total, ratio, 0.0,
-                     PACKETS * coded_alone(codec)[1], PAPER, held_frames - WARM_UP,
+                     max(0.0, total - compute), total, robot / total, RATIO, 0.0,
+                     PACKETS * coded_alone(codec)[1], held_frames - WARM_UP,
                      held_frames - WARM_UP)
 
 

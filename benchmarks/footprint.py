@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import statistics
-
 from figures import Row, write
 
 from fogros2.deploy import Launch
@@ -26,16 +24,17 @@ def resident() -> float:
         status = machine.shell.run(Command(('sh', '-c', (
             'for p in /proc/[0-9]*; do tr "\\0" " " <$p/cmdline | grep -q "agent.py serve" && '
             'grep VmRSS $p/status; done; true')), sudo=True), timeout=30).stdout
-        return max(float(line.split()[1]) for line in status.splitlines()) / 1000
+        # Linux says kB for 1024 bytes
+        return max(float(line.split()[1]) for line in status.splitlines()) * 1024 / 1e6
     finally:
         launch.down()
 
 
 def main() -> None:
     """Take the median."""
-    value = statistics.median(resident() for _ in range(RUNS))
     write('footprint', "The agent's memory", [
-        Row('agent, resident, one node running', value, 'MB', 30.0, runs=RUNS)])
+        Row.of('agent, resident, one node running', [resident() for _ in range(RUNS)], 'MB',
+               30.0)])
 
 
 if __name__ == '__main__':

@@ -2,11 +2,12 @@
 """
 Images from a camera here to a node on a container machine, which answers each: by transport.
 
-Between the two is WireGuard over a relay that limits the link to 10 Mbit/s both ways. The scene is
-``fogros2_examples.scene``, or a video file (``--video``, with results of its own); its frames are
-rendered beforehand, as a camera takes no time of the computer's, and shown forwards and backwards
-in turn. ``--short`` takes a tenth of the images and the small size alone; ``--only`` replaces the
-rows of some cases in the results.
+Between the two is WireGuard over a relay that limits the link to 10 Mbit/s both ways, and delays
+it in some cases, each way, by what their names say. The scene is ``fogros2_examples.scene``, or a
+video file (``--video``, with results of its own); its frames are rendered beforehand, as a camera
+takes no time of the computer's, and shown forwards and backwards in turn. ``--short`` takes a
+tenth of the images, the small size and no delays; ``--only`` replaces the rows of some cases in
+the results; ``--again`` writes the tables from the stored figures.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ FOLDER = '/tmp/fogros2-bench'
 VIDEO = f'{FOLDER}/video'
 RATE = 30.0
 LINK = 10e6
-#: Settings of DDS for nodes that are all on this computer.
-THIS_COMPUTER = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+#: Settings of DDS for nodes that are all on this computer. A launch's own are for its domain alone.
+THIS_COMPUTER = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_DOMAIN_ID': '83'}
 #: Frames rendered, and of those that arrive, how many apart are held against the original.
 FRAMES, SAMPLE = 60, 23
 #: Lines of output that are shown with an error.
@@ -308,15 +309,26 @@ class Case:
     size: str = 'VGA'
     delay: float = 0.0
     loss: float = 0.0
-    published: str = ''
+
+    @property
+    def published(self) -> str:
+        """The paper's figures; '' for a size and a loss that it does not have."""
+        # not above: a machine runs this file without its neighbours
+        from figures import paper
+
+        if self.size != 'VGA' or self.loss or self.codec not in paper.STREAMING:
+            return ''
+        fps, latency = paper.STREAMING[self.codec]
+        return f'{fps} FPS, {latency} ms, delay not stated'
 
 
+#: What Table I has, with the delays of a near and of a far cloud.
+COMPARED = {'raw': 'raw', 'jpeg': 'compressed, JPEG 80', 'theora': 'Theora by FFmpeg in a pipe',
+            'h264': 'H.264'}
 CASES = [
-    Case('raw', 'raw', published='1.42 FPS, 1401 ms'),
-    Case('compressed, JPEG 80', 'jpeg', published='15.0 FPS, 333 ms'),
+    *(Case(name + (f', {1e3 * delay:.0f} ms' if delay else ''), codec, delay=delay)
+      for delay in (0.0, 0.02, 0.05) for codec, name in COMPARED.items()),
     Case('compressed, PNG', 'png'),
-    Case('Theora', 'theora', published='29.6 FPS, 83 ms'),
-    Case('H.264', 'h264', published='29.0 FPS, 38 ms'),
     Case('H.264, 20 ms and 2 % loss', 'h264', delay=0.02, loss=0.02),
     Case('H.264 720p', 'h264', size='720p'),
     Case('H.264 1080p', 'h264', size='1080p'),
@@ -329,6 +341,7 @@ class Outcome:
     What a case came to: times in ms, bytes per image, CPU in percent of a core.
 
     :param fps: images that arrived, by the time in which all were taken.
+    :param computer: on which computer and of what images it was measured, ``date`` the day.
     """
 
     case: Case
@@ -343,6 +356,8 @@ class Outcome:
     worst: float
     cpu_robot: float
     cpu_cloud: float
+    computer: str = ''
+    date: str = ''
 
 
 def pair(case: Case) -> tuple[list[str], list[str]]:
@@ -492,7 +507,7 @@ def hop_alone(size: str, settings: Mapping[str, str] = THIS_COMPUTER) -> float:
     """Return the median time of an image to a node on this computer and its answer, in ms."""
     width, height = SIZES[size]
     words = ['--width', str(width), '--height', str(height)]
-    environment = {**os.environ, **settings, 'PYTHONPATH': str(ROOT), 'ROS_DOMAIN_ID': '83'}
+    environment = {**os.environ, **settings, 'PYTHONPATH': str(ROOT)}
     with tempfile.NamedTemporaryFile() as result:
         node = subprocess.Popen(
             [sys.executable, __file__, '--cloud', '--topic', '/camera', '--result', result.name,
@@ -520,31 +535,50 @@ def limit(launch: Any, outcome: Outcome) -> float:
 def table(title: str, outcomes: list[Outcome], limits: dict[str, float], note: str) -> str:
     """Return the side-by-side table as Markdown."""
     lines = [f'# {title}', '', note, '',
-             '| | FPS | round trip, ms: median | p95 | p99 | limit | lost | bytes/image | '
-             'PSNR, dB | worst | SSIM | CPU robot, % | CPU cloud, % | the paper |',
-             '|---' * 14 + '|']
+             '| | delay each way, ms | FPS | round trip, ms: median | p95 | p99 | limit | lost | '
+             'bytes/image | PSNR, dB | worst | SSIM | CPU robot, % | CPU cloud, % | the paper |',
+             '|---' * 15 + '|']
     for o in outcomes:
         most = limits.get(o.case.name)
         lines.append(
-            f'| {o.case.name} | {o.fps:.2f} | {o.median:.1f} | {o.p95:.1f} | {o.p99:.1f} | '
+            f'| {o.case.name} | {1e3 * o.case.delay:.0f} | {o.fps:.2f} | {o.median:.1f} | '
+            f'{o.p95:.1f} | {o.p99:.1f} | '
             f"{'' if most is None else f'{most:.1f}'} | {o.lost} | {o.size:.0f} | "
             f'{o.psnr:.1f} | {o.worst:.1f} | {o.ssim:.3f} | {o.cpu_robot:.0f} | '
             f'{o.cpu_cloud:.0f} | {o.case.published} |')
     return '\n'.join([*lines, ''])
 
 
-def merged(
-    path: Path, outcomes: list[Outcome], limits: dict[str, float], note: str,
-) -> tuple[list[Outcome], dict[str, float], str]:
-    """Return earlier results with some replaced; their note names the rows that are newer."""
-    before = json.loads(path.read_text())
-    found = {o.case.name: o for o in outcomes}
-    for row in before['rows']:
-        values = {key: math.nan if value is None else value for key, value in row.items()}
-        found.setdefault(row['case']['name'], Outcome(**{**values, 'case': Case(**row['case'])}))
-    newer = ', '.join(o.case.name for o in outcomes)
-    return ([found[case.name] for case in CASES if case.name in found],
-            {**before['limits'], **limits}, f"{before['note']} Measured later: {newer}: {note}")
+def stored(path: Path) -> tuple[list[Outcome], dict[str, float]]:
+    """Return the outcomes in a file, and the limits of cases by name."""
+    values = json.loads(path.read_text())
+    return [Outcome(**{key: math.nan if value is None else value for key, value in row.items()
+                       if key != 'case'}, case=Case(**row['case']))
+            for row in values['rows']], values['limits']
+
+
+def merged(outcomes: list[Outcome], earlier: list[Outcome]) -> list[Outcome]:
+    """Return outcomes in the order of the cases, earlier ones where there is no newer one."""
+    by_name = {o.case.name: o for o in [*earlier, *outcomes]}
+    return [by_name[case.name] for case in CASES if case.name in by_name]
+
+
+def write_down(
+    name: str, title: str, outcomes: list[Outcome], limits: dict[str, float],
+) -> None:
+    """Write the table, and the figures that have targets."""
+    from figures import origin, RESULTS, write
+
+    path = RESULTS / f'{name}-table.json'
+    computer, date = origin((o.case.name, o.computer, o.date) for o in outcomes)
+    write(name, title, list(rows(outcomes, limits, name == 'streaming-video')), RESULTS, computer,
+          date)
+    path.with_suffix('.md').write_text(table(title, outcomes, limits, f'{computer}; {date}.'))
+    path.write_text(json.dumps({
+        'limits': limits,
+        'rows': [{key: None if isinstance(value, float) and math.isnan(value) else value
+                  for key, value in dataclasses.asdict(o).items()} for o in outcomes]},
+        indent=1) + '\n')
 
 
 def rows(outcomes: list[Outcome], limits: dict[str, float], video: bool) -> Iterator[Any]:
@@ -573,7 +607,7 @@ def rows(outcomes: list[Outcome], limits: dict[str, float], video: bool) -> Iter
             yield Row(f'{o.case.name}: {what}', value, unit, target,
                       'more' if unit in ('1/s', 'dB') else 'less',
                       published=o.case.published if field in ('fps', 'median') else '',
-                      runs=1)
+                      runs=1, high=o.p95 if field == 'median' else None)
         if o.case.name in limits:
             yield Row(f'{o.case.name}: median over limit', o.median / limits[o.case.name], '',
                       1.3)
@@ -597,6 +631,8 @@ def main() -> None:
     parser.add_argument('--count', type=int, default=3000)
     parser.add_argument('--only', default='', help='cases whose name has this in it')
     parser.add_argument('--video', default='', help='a video file instead of the scene')
+    parser.add_argument('--again', action='store_true',
+                        help='measure nothing, write the tables from the figures that were stored')
     for hidden in ('--camera', '--cloud', '--compare'):
         parser.add_argument(hidden, action='store_true', help=argparse.SUPPRESS)
     for hidden, default in (('--width', 640), ('--height', 480)):
@@ -611,14 +647,23 @@ def main() -> None:
     if arguments.compare:
         return compare(arguments)
     from figures import machine as computer
-    from figures import RESULTS, write
+    from figures import RESULTS, today
+
+    scene = (f'video {Path(arguments.video).name}' if arguments.video else
+             'the scene of `fogros2_examples/scene.py`')
+    name = 'streaming-video' if arguments.video else 'streaming'
+    title = 'Streaming images over 10 Mbit/s' + (f', {scene}' if arguments.video else '')
+    path = RESULTS / f'{name}-table.json'
+    if arguments.again:
+        write_down(name, title, *stored(path))
+        return None
 
     from fogros2.deploy import Launch
     from fogros2.model import MachineSpec
 
     count = arguments.count // 10 if arguments.short else arguments.count
-    cases = [case for case in CASES if arguments.only in case.name
-             and not (arguments.short and case.size != 'VGA')]
+    cases = [case for case in CASES if arguments.only in case.name and not (
+        arguments.short and (case.size != 'VGA' or case.delay and not case.loss))]
     if shutil.which('ffmpeg') is None:
         cases = [case for case in cases if case.codec != 'theora']
         print('no ffmpeg here: no row for Theora')
@@ -648,25 +693,15 @@ def main() -> None:
             link.close()
         for error in launch.down():
             print(error, file=sys.stderr)
-    scene = (f'video {Path(arguments.video).name}' if arguments.video else
-             'the scene of `fogros2_examples/scene.py`')
-    note = f'{computer()}; {count} images of each at 30 Hz; {scene}.'
-    name = 'streaming-video' if arguments.video else 'streaming'
-    path = RESULTS / f'{name}-table.json'
-    if arguments.only and path.exists():
-        outcomes, limits, note = merged(path, outcomes, limits, note)
-    title = 'Streaming images over 10 Mbit/s' + (f', {scene}' if arguments.video else '')
-    text = table(title, outcomes, limits, note)
-    print(text)
+    how = f'{computer()}, {count} images of each at 30 Hz of {scene}'
+    outcomes = [dataclasses.replace(o, computer=how, date=today()) for o in outcomes]
+    print(table(title, outcomes, limits, how))
     print(f'took {(time.monotonic() - begin) / 60:.1f} min')
     if outcomes and not arguments.short:
-        write(name, title, list(rows(outcomes, limits, bool(arguments.video))))
-        path.with_suffix('.md').write_text(text)
-        path.write_text(json.dumps({
-            'note': note, 'limits': limits,
-            'rows': [{key: None if isinstance(value, float) and math.isnan(value) else value
-                      for key, value in dataclasses.asdict(o).items()} for o in outcomes]},
-            indent=1) + '\n')
+        if arguments.only and path.exists():
+            earlier, known = stored(path)
+            outcomes, limits = merged(outcomes, earlier), {**known, **limits}
+        write_down(name, title, outcomes, limits)
     if failed:
         raise SystemExit(f"without a result: {', '.join(failed)}")
 

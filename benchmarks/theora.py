@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Theora for comparison: FFmpeg's program with libtheora encodes, PyAV decodes.
+Theora for comparison: FFmpeg's program with libtheora encodes through a pipe, PyAV decodes.
 
+This is not ROS's own plugin ``theora_image_transport``, which the paper measured and no wheel has.
 ``encode`` takes images on ``camera`` and publishes the packets of an Ogg stream, as ROS's
 ``theora`` transport does; ``decode`` takes those and publishes ``decoded``.
 """

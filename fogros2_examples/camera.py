@@ -15,6 +15,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
+from fogros2_examples.letterbox import letterbox
 from fogros2_examples.scene import Pixels, Scene
 
 
@@ -26,7 +27,7 @@ def synthetic(width: int, height: int, rate: float) -> Iterator[Pixels]:
 
 def captured(source: str, width: int, height: int) -> Iterator[Pixels]:
     """
-    Yield the frames of a device (``/dev/video0``), or of a file in an endless loop.
+    Yield the frames of a device (``/dev/video0``), or of a file in an endless loop, letterboxed.
 
     :param width: width of the frames in pixels, as ``height``.
     :raises RuntimeError: the source cannot be opened, or has no frame.
@@ -40,15 +41,16 @@ def captured(source: str, width: int, height: int) -> Iterator[Pixels]:
         read = 0
         try:
             while True:
-                there, frame = capture.read()
+                there, picture = capture.read()
                 if not there:
                     break
+                frame = numpy.asarray(picture, numpy.uint8)
                 if device and not read:
                     width, height = frame.shape[1], frame.shape[0]
                 if frame.shape[:2] != (height, width):
-                    frame = cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
+                    frame = letterbox(frame, width, height)
                 read += 1
-                yield numpy.asarray(frame, numpy.uint8)
+                yield frame
         finally:
             capture.release()
         if not read or device:

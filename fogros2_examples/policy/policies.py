@@ -13,13 +13,12 @@ from collections.abc import Mapping, Sequence
 import os
 from typing import Any
 
-import cv2
 import numpy
 from numpy.typing import NDArray
 
+from fogros2_examples.letterbox import letterbox, Pixels
 from fogros2_examples.meshes import Floats
 
-Pixels = NDArray[numpy.uint8]
 Singles = NDArray[numpy.float32]
 #: Name of the task; prefix of a policy that is a server of openpi, whose port follows.
 PROMPT, OPENPI = 'prompt', 'openpi:'
@@ -30,8 +29,8 @@ class BadPolicy(ValueError):
 
 
 def small(image: Pixels, width: int, height: int) -> Singles:
-    """Return an image of RGB as a model takes it: (3, height, width), from 0 to 1."""
-    scaled = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    """Return an image of RGB as a model takes it: (3, height, width), letterboxed, from 0 to 1."""
+    scaled = letterbox(image, width, height)
     return numpy.asarray(scaled.transpose(2, 0, 1) / numpy.float32(255), numpy.float32)
 
 
@@ -40,7 +39,7 @@ class Policy(abc.ABC):
     A policy.
 
     :param runs_on: the hardware or server, for the log.
-    :param sizes: width and height to which an image may be scaled before, by name.
+    :param sizes: width and height to which an image may be letterboxed before, by name.
     """
 
     runs_on: str
@@ -69,8 +68,8 @@ class Onnx(Policy):
     """
     A model whose inputs have the names of an observation.
 
-    Images are float (1, 3, height, width) from 0 to 1, scaled to the size that the model names.
-    States are float (1, n), PROMPT is (1,) of strings. The first output is (1, n, joints).
+    Images are float (1, 3, height, width) from 0 to 1, letterboxed to the size that the model
+    names. States are float (1, n), PROMPT is (1,) of strings. The first output is (1, n, joints).
 
     :param model: name or content of the file.
     :param names: of the observation.

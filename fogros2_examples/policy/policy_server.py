@@ -18,6 +18,7 @@ from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import String, UInt8MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
+from fogros2_examples.letterbox import Pixels
 from fogros2_examples.parameters import BadParameter, run, within
 from fogros2_examples.policy.chunks import SECOND
 from fogros2_examples.policy.matching import Matcher
@@ -97,6 +98,16 @@ class PolicyServer(Node):
         else:
             self.get_logger().info(f'the policy runs on {self.policy.runs_on}')
 
+    def _seen(self, name: str, image: Image) -> Pixels:
+        """Return an image as RGB, of the size that the model names; log if this adds bars."""
+        assert self.policy is not None
+        size = self.policy.sizes.get(name)
+        if size and image.width * size[1] != image.height * size[0]:
+            self.get_logger().warning(
+                f"'{name}' of {image.width}x{image.height} gets black bars, for the model's size "
+                f'of {size[0]}x{size[1]}', once=True)
+        return rgb(image, size)
+
     def answer(self) -> None:
         """Answer the newest observation, if there is a new one."""
         if self.policy is None or (found := self.matcher.newest()) is None:
@@ -104,7 +115,7 @@ class PolicyServer(Node):
         state = found[STATE]
         try:
             actions = self.policy.infer({
-                **{name: rgb(found[name], self.policy.sizes.get(name)) for name in self.images},
+                **{name: self._seen(name, found[name]) for name in self.images},
                 **{name: angles_of(state, joints) for name, joints in self.states.items()},
                 PROMPT: self.task})
             if actions.shape[1] != len(self.joints):

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
+from fogros2_examples.letterbox import letterbox, Pixels
 from fogros2_examples.slam.geometry import Array, Camera, from_quaternion, quaternion
 
-Pixels = NDArray[numpy.uint8]
 #: Bytes of a pixel, and its conversions to grey and to RGB; None: there is nothing to convert.
 _COLOURS = {'bgr8': (3, cv2.COLOR_BGR2GRAY, cv2.COLOR_BGR2RGB),
             'rgb8': (3, cv2.COLOR_RGB2GRAY, None),
@@ -44,15 +44,14 @@ def rgb(image: Image, size: Optional[tuple[int, int]] = None) -> Pixels:
     """
     Return the colours of an image, (height, width, 3) of red, green, blue.
 
-    :param size: width and height that the image is scaled to.
+    :param size: width and height that the image is letterboxed to.
     :raises ValueError: the encoding has no brightness, or the fields contradict each other.
     """
     channels, conversion = _colours(image, 1)
     pixels = _rows(image, channels).reshape(image.height, image.width, channels)
     if size:
-        # before the conversion, which then has fewer pixels; OpenCV drops a single channel
-        pixels = numpy.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), numpy.uint8)
-        pixels = pixels.reshape(size[1], size[0], channels)
+        # before the conversion, which then has fewer pixels
+        pixels = letterbox(pixels, *size)
     return pixels if conversion is None else numpy.asarray(
         cv2.cvtColor(pixels, conversion), numpy.uint8)
 

@@ -19,7 +19,7 @@ PATH = Path(__file__).parents[2] / 'benchmarks/streaming.py'
 @pytest.fixture
 def streaming(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Import the benchmark, which is a program."""
-    monkeypatch.setattr(sys, 'path', [*sys.path])
+    monkeypatch.setattr(sys, 'path', [str(PATH.parent), *sys.path])
     spec = importlib.util.spec_from_file_location('benchmark_streaming', PATH)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -74,12 +74,20 @@ def test_measured_rows_replace_earlier_ones(streaming: Any, tmp_path: Path) -> N
             streaming.CASES[at], fps, 1.0, 1.0, 1.0, 0, 1.0, math.nan, 1.0, 1.0, 1.0, 1.0)
 
     path = tmp_path / 'table.json'
-    rows = [streaming.dataclasses.asdict(outcome(at, 1.0)) for at in (0, 1)]
-    rows[0]['psnr'] = None
-    path.write_text(json.dumps({'note': 'A.', 'limits': {'H.264': 7.0}, 'rows': rows}))
-    found, limits, note = streaming.merged(path, [outcome(1, 24.0)], {}, 'B.')
+    rows = [streaming.dataclasses.asdict(outcome(at, 1.0)) for at in (1, 0)]
+    rows[1]['psnr'] = None
+    path.write_text(json.dumps({'limits': {'H.264': 7.0}, 'rows': rows}))
+    earlier, limits = streaming.stored(path)
+    found = streaming.merged([outcome(1, 24.0)], earlier)
     assert [(o.case.name, o.fps) for o in found] == [
         ('raw', 1.0), ('compressed, JPEG 80', 24.0)]
     assert math.isnan(found[0].psnr)
     assert limits == {'H.264': 7.0}
-    assert note == 'A. Measured later: compressed, JPEG 80: B.'
+
+
+def test_table_one_is_compared_at_the_same_delays(streaming: Any) -> None:
+    delays: dict[float, list[str]] = {}
+    for case in streaming.CASES:
+        if case.published:
+            delays.setdefault(case.delay, []).append(case.codec)
+    assert delays == dict.fromkeys([0.0, 0.02, 0.05], ['raw', 'jpeg', 'theora', 'h264'])

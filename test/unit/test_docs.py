@@ -22,8 +22,8 @@ from fogros2.waiting import Timeouts
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'doc').rglob('*.md'))]
 #: Pages without a limit of words: generated ones, and lists that readers search.
-REFERENCES = ('migration.md', 'not_verified.md', 'paper.md', 'security.md',
-              'security_attackers.md', 'troubleshooting.md')
+REFERENCES = ('migration.md', 'not_verified.md', 'security.md', 'security_attackers.md',
+              'troubleshooting.md')
 _BLOCK = re.compile(r'^( *)```(\w+)\n(.*?)^\1```$', re.MULTILINE | re.DOTALL)
 
 
@@ -149,6 +149,23 @@ def test_end_of_a_machine_that_was_never_reached_is_stated(page):
 def test_all_benchmark_results_are_listed():
     shown = set(re.findall(r'benchmarks/results/(.*\.md)', (ROOT / 'doc/figures.md').read_text()))
     assert shown == {path.name for path in (ROOT / 'benchmarks/results').glob('*.md')}
+
+
+def test_printed_tables_of_the_paper_are_those_of_the_benchmarks():
+    paper = runpy.run_path(str(ROOT / 'benchmarks/figures/paper.py'))
+    page = (ROOT / 'doc/paper_tables.md').read_text()
+    cells = [re.split(r' *\| *', line.strip('| ')) for line in page.splitlines()
+             if line.startswith('|')]
+    values = [[float(cell) for cell in row[1:] if re.fullmatch(r'[\d.]+', cell)] for row in cells]
+    for figures in (*paper['STREAMING'].values(), *paper['SLAM'].values(),
+                    *paper['REGIONS'].values()):
+        assert [*figures] in values, figures
+    for row in (*paper['GRASPS'].values(), *paper['PLANS'].values()):
+        printed = [row.robot, row.compute, row.fogros1_network, row.fogros1_total, row.network,
+                   row.total]
+        assert [one for one in printed if one is not None] in values, row
+    assert all(any(text in line for line in page.splitlines() if line.startswith('|'))
+               for text in paper['STARTUP'].values())
 
 
 def test_files_that_stand_for_the_paper_exist():

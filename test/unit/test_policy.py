@@ -137,6 +137,37 @@ def test_images_are_scaled_to_the_models_size():
     assert (scaled[0, :12] == 1).all() and scaled[0, 12:].max() == scaled[1:].max() == 0
 
 
+def extent(pixels):
+    """Return where an image has something else than black: left, top, width, height."""
+    return cv2.boundingRect(numpy.asarray(pixels > 127, numpy.uint8))
+
+
+@pytest.mark.parametrize('width, height, size, circle', [
+    (640, 480, (224, 224), (77, 77, 70, 70)), (480, 640, (224, 224), (77, 77, 70, 70)),
+    (1280, 720, (224, 224), (94, 94, 35, 35)), (640, 480, (320, 240), (110, 70, 100, 100)),
+    (480, 480, (320, 240), (110, 70, 100, 100)), (160, 120, (640, 480), (220, 140, 200, 200))])
+def test_circle_stays_a_circle(width, height, size, circle):
+    across = circle[2] / min(size[0] / width, size[1] / height)
+    rows, columns = numpy.mgrid[:height, :width]
+    disc = 255 * (numpy.hypot(columns - (width - 1) / 2, rows - (height - 1) / 2) < across / 2)
+    pixels = numpy.repeat(disc.astype(numpy.uint8)[:, :, None], 3, axis=2)
+    scaled = numpy.rint(255 * small(pixels, *size)[0]).astype(numpy.uint8)
+    assert extent(scaled) == pytest.approx(circle, abs=4 if width < size[0] else 2)
+    _, _, wide, high = extent(scaled)
+    assert abs(wide - high) <= 1
+    for encoding, channels in (('mono8', 1), ('bgr8', 3), ('rgba8', 4)):
+        made = image(Header(), pixels[:, :, :1].repeat(channels, axis=2), encoding)
+        assert (rgb(made, size)[:, :, 1] == scaled).all()
+
+
+def test_bars_of_a_wide_image_are_black_and_even():
+    white = numpy.full((360, 640, 3), 255, numpy.uint8)
+    scaled = small(white, 224, 224)
+    assert extent((255 * scaled[2]).astype(numpy.uint8)) == (0, 49, 224, 126)
+    assert set(numpy.unique(scaled)) == {0, 1}
+    assert small(numpy.full((9, 4000, 3), 255, numpy.uint8), 32, 24)[0].sum() == 32
+
+
 @pytest.mark.parametrize('model, names, reason', [
     (b'no model', NAMES, 'cannot be loaded'), (b'', NAMES, 'cannot be loaded'),
     ('/nowhere/policy.onnx', NAMES, 'cannot be loaded'),

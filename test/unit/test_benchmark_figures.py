@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stored results are what the benchmarks write, each beside the paper's own row."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from pathlib import Path
+import sys
+from typing import Any
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / 'benchmarks'
+RESULTS = FOLDER / 'results'
+
+
+@pytest.fixture
+def benchmark_modules(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return a function that imports a module of the benchmarks."""
+    monkeypatch.setattr(sys, 'path', [str(FOLDER), *sys.path])
+    return importlib.import_module
+
+
+def stored() -> list[Path]:
+    """Return the files of results that ``figures.write`` made."""
+    return [path for path in sorted(RESULTS.glob('*.json'))
+            if isinstance(data := json.loads(path.read_text()), dict) and 'machine' in data]
+
+
+@pytest.mark.parametrize('path', stored(), ids=lambda path: path.stem)
+def test_page_of_results_shows_stored_figures(path: Path, benchmark_modules: Any) -> None:
+    figures = benchmark_modules('figures')
+    data, page = json.loads(path.read_text()), path.with_suffix('.md').read_text()
+    title = page.partition('\n')[0].removeprefix('# ')
+    assert page == figures.markdown(title, [figures.Row(**row) for row in data['rows']],
+                                    f"{data['machine']}; {data['date']}")
+
+
+def test_tables_show_stored_figures(benchmark_modules: Any, tmp_path: Path,
+                                    monkeypatch: pytest.MonkeyPatch) -> None:
+    figures = benchmark_modules('figures')
+    monkeypatch.setattr(figures, 'plot', lambda *words: None)
+    applications, streaming = map(benchmark_modules, ('applications', 'streaming'))
+    results = list(applications.before())
+    outcomes = {name: streaming.stored(RESULTS / f'{name}-table.json')
+                for name in ('streaming', 'streaming-video')}
+    monkeypatch.setattr(figures, 'RESULTS', tmp_path)
+    applications.write_down(results)
+    for name, (rows, limits) in outcomes.items():
+        page = (RESULTS / f'{name}-table.md').read_text()
+        streaming.write_down(name, page.partition('\n')[0].removeprefix('# '), rows, limits)
+    for path in tmp_path.glob('*-table.*'):
+        assert path.read_text() == (RESULTS / path.name).read_text(), path.name
+
+
+def test_scenario_is_beside_the_papers_own_row(benchmark_modules: Any) -> None:
+    applications = benchmark_modules('applications')
+    paper = importlib.import_module('figures.paper')
+    scenarios = [*applications.SCENARIOS, *applications.app_scenarios(Path('/app'))]
+    ratios = {scenario.name.rpartition(' ')[2]: round(scenario.ratio, 1) for scenario in scenarios}
+    assert ratios == {'planning': 23.3, 'Apartment': 45.5, 'Cubicles': 23.7, 'Home': 34.2,
+                      'TwistyCool': 35.3}
+    for result in applications.before():
+        row = applications.published(result)
+        if result.table == 'II':
+            assert row is None
+        elif result.table == 'III':
+            assert row is paper.GRASPS[result.codec]
+        else:
+            assert row is paper.PLANS[result.scenario.rpartition(' ')[2]]
+    assert [scenario.asks for scenario in scenarios][-2:] == [
+        ('environment:=/app/Home.cfg',), ('environment:=/app/Twistycool.cfg',)]
