@@ -137,7 +137,7 @@ def test_page_that_explains_is_short(page):
 
 
 @pytest.mark.parametrize('page', [
-    'README.md', 'doc/machines.md', 'doc/security.md', 'doc/machine_life.md',
+    'README.md', 'doc/machines.md', 'doc/developers/security.md', 'doc/developers/machine_life.md',
     'doc/troubleshooting.md', 'fogros2/describe/machines.py'])
 def test_end_of_a_machine_that_was_never_reached_is_stated(page):
     text = ' '.join(re.sub(r'\]\(.*?\)', '', (ROOT / page).read_text()).split())
@@ -147,12 +147,13 @@ def test_end_of_a_machine_that_was_never_reached_is_stated(page):
 
 
 def test_all_benchmark_results_are_listed():
-    shown = set(re.findall(r'benchmarks/results/(.*\.md)', (ROOT / 'doc/figures.md').read_text()))
+    page = (ROOT / 'doc/developers/figures.md').read_text()
+    shown = set(re.findall(r'benchmarks/results/(.*\.md)', page))
     assert shown == {path.name for path in (ROOT / 'benchmarks/results').glob('*.md')}
 
 
 def test_files_that_stand_for_the_paper_exist():
-    named = re.findall(r'`([\w./]+/[\w.]*)`', (ROOT / 'doc' / 'paper.md').read_text())
+    named = re.findall(r'`([\w./]+/[\w.]*)`', (ROOT / 'doc/developers/paper.md').read_text())
     assert len(named) > 50
     assert [name for name in named if not name.startswith('.cache') and not (ROOT / name).exists()
             ] == []
@@ -161,14 +162,14 @@ def test_files_that_stand_for_the_paper_exist():
 @pytest.mark.parametrize('page', [
     'architecture', 'architecture_features', 'decisions', 'machine_life', 'measured', 'security'])
 def test_modules_that_a_page_names_exist(page):
-    text = re.sub('```.*?```', '', (ROOT / f'doc/{page}.md').read_text(), flags=re.DOTALL)
+    text = re.sub('```.*?```', '', (ROOT / f'doc/developers/{page}.md').read_text(), flags=re.DOTALL)
     named = re.findall(r'`([\w/]+(?:/|\.py))`', text)
     assert [name for name in named if not (ROOT / name).exists()
             and not (ROOT / 'fogros2' / name).exists()] == []
 
 
 def test_providers_import_what_their_page_says():
-    page = (ROOT / 'doc' / 'providers.md').read_text()
+    page = (ROOT / 'doc/developers/providers.md').read_text()
     own = ('aws', 'azure', 'container', 'gcp', 'kubernetes', 'ssh', 'vm')
     for path in (ROOT / 'fogros2' / 'provider').rglob('*.py'):
         if path.stem in ('clouds', 'cheapest'):
