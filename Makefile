@@ -75,7 +75,7 @@ bench:
 
 ## docs   the documentation, as pages for a browser
 docs:
-	@tools/setup.sh test
+	@tools/setup.sh docs
 	@tools/run.sh embedded -- python tools/docs.py
 
 ## deb    the Debian package, for Ubuntu 24.04 with ROS 2 Jazzy

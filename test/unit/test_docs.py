@@ -21,9 +21,11 @@ from fogros2.waiting import Timeouts
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'doc').rglob('*.md'))]
-#: Pages without a limit of words: generated ones, and lists that readers search.
-REFERENCES = ('migration.md', 'not_verified.md', 'paper.md', 'security.md',
-              'security_attackers.md', 'troubleshooting.md')
+#: What users read: all but the pages for developers, and what is generated.
+MANUAL = [page for page in PAGES if 'developers' not in page.parts
+          and page.name not in ('README.md', 'command_line.md')]
+#: Pages without a limit of words of their own: lists that readers search.
+REFERENCES = ('not_verified.md', 'paper.md', 'security.md', 'security_attackers.md')
 _BLOCK = re.compile(r'^( *)```(\w+)\n(.*?)^\1```$', re.MULTILINE | re.DOTALL)
 
 
@@ -136,8 +138,17 @@ def test_page_that_explains_is_short(page):
         assert len(page.read_text().split()) <= (800 if name == 'README.md' else 1500)
 
 
+def test_manual_has_at_most_25000_words():
+    assert 15_000 < sum(len(page.read_text().split()) for page in MANUAL) <= 25_000
+
+
+def test_change_log_has_at_most_600_words():
+    assert len((ROOT / 'CHANGELOG.rst').read_text().split()) <= 600
+
+
 @pytest.mark.parametrize('page', [
-    'README.md', 'doc/machines.md', 'doc/developers/security.md', 'doc/developers/machine_life.md',
+    'README.md', 'doc/machines.md', 'doc/safety.md', 'doc/developers/security.md',
+    'doc/developers/machine_life.md',
     'doc/troubleshooting.md', 'fogros2/describe/machines.py'])
 def test_end_of_a_machine_that_was_never_reached_is_stated(page):
     text = ' '.join(re.sub(r'\]\(.*?\)', '', (ROOT / page).read_text()).split())
