@@ -86,7 +86,7 @@ deb:
 ## soak   the long tests and figures that 'make test' and 'make bench' leave out
 soak:
 	@tools/setup.sh bench
-	@tools/run.sh embedded -- pytest -m soak $(if $(ARGS),$(ARGS),test test/integration/kubernetes)
+	@tools/run.sh embedded -- pytest -m soak $(ARGS)
 	@tools/run.sh embedded -- python benchmarks/security.py
 	@tools/run.sh embedded -- python benchmarks/chaos.py
 	@tools/run.sh embedded -- python benchmarks/chaos.py --defaults

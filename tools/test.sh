@@ -24,6 +24,13 @@ part=test
 if [ "${1:-}" = kubernetes ]; then
     part=$1; shift
     set -- test/integration/kubernetes "$@"
+elif [ $# = 0 ]; then
+    # Three at a time: much of what tests with machines take is waiting. Tests named by hand run in
+    # turn, so that their output is seen as it comes.
+    set -- --ignore=test/integration/kubernetes -n 3 --dist loadgroup --no-loadscope-reorder
+else
+    # pytest collects it nevertheless if it is named
+    set -- --ignore=test/integration/kubernetes "$@"
 fi
 rm -f .cache/"$part"-*.xml
 status=0
@@ -39,9 +46,6 @@ suite() {
     say "Tests on $name"
     tools/run.sh "$@" || status=1
 }
-# Three at a time: much of what tests with machines take is waiting. Tests named by hand run in turn,
-# so that their output is seen as it comes.
-[ $# = 0 ] && set -- -n 3 --dist loadgroup --no-loadscope-reorder
 suite "ROS 2's wheels" embedded -- pytest --junit-xml=.cache/"$part"-embedded.xml "$@"
 if [ -n "$ros" ]; then
     # Jazzy's own plugins are written for an older pytest, and nothing here uses them
