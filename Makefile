@@ -34,7 +34,7 @@ cloud-check:
 	@tools/setup.sh cloud
 	@tools/run.sh best -- python tools/cloud_check.py $(PROVIDER) $(if $(OPTIONS),--options '$(OPTIONS)')
 
-## test   the tests, on ROS 2's wheels and, where it is installed, on ROS 2
+## test   all tests but those with a cluster, on ROS 2's wheels and, where it is installed, on ROS 2
 test:
 	@tools/setup.sh test
 	@tools/test.sh $(ARGS)
@@ -54,7 +54,7 @@ fresh:
 test-kubernetes:
 	@tools/setup.sh test
 	@tools/kubernetes.sh >/dev/null
-	@tools/test.sh test/integration/kubernetes $(ARGS)
+	@tools/test.sh kubernetes $(ARGS)
 
 ## test-minimum   the tests without machines, with the oldest versions that are supported
 test-minimum: export FOGROS2_VENV = $(CURDIR)/.venv-minimum
@@ -81,7 +81,7 @@ pictures:
 
 ## docs   the documentation, as pages for a browser
 docs:
-	@tools/setup.sh test
+	@tools/setup.sh docs
 	@tools/run.sh embedded -- python tools/docs.py
 
 ## deb    the Debian package, for Ubuntu 24.04 with ROS 2 Jazzy

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A provider that was written from doc/providers.md keeps the contract."""
+"""A provider that was written from doc/developers/providers.md keeps the contract."""
 
 from __future__ import annotations
 
