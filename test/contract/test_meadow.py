@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A provider that was written from doc/providers.md keeps the contract; its mutants do not."""
+"""A provider that was written from doc/providers_vm.md keeps the contract; its mutants do not."""
 
 from __future__ import annotations
 

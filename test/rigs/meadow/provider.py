@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The provider of Meadow, written from doc/providers.md."""
+"""The provider of Meadow, written from doc/providers_vm.md."""
 
 from __future__ import annotations
 
