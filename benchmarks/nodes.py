@@ -14,7 +14,6 @@ import contextlib
 import json
 import os
 from pathlib import Path
-import resource
 import statistics
 import subprocess
 import sys
@@ -126,24 +125,8 @@ def many() -> None:
             say(resident=resident())
 
 
-class Filled:
-    """
-    Counts buffers as large as an image that were filled for the first time.
-
-    Each page of a new one is a page fault; ``main`` has large buffers mapped anew each time.
-    """
-
-    def __init__(self) -> None:
-        self._before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-
-    def per_image(self, images: int) -> float:
-        """Return how many, for each of so many images."""
-        faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt - self._before
-        return faults * resource.getpagesize() / (WIDTH * HEIGHT * 3 * images)
-
-
 def camera() -> None:
-    """Publish images; tell how many buffers were filled for each."""
+    """Publish images."""
     import array
 
     import rclpy
@@ -156,17 +139,15 @@ def camera() -> None:
     image.data = array.array('B', os.urandom(3 * WIDTH * HEIGHT))
     until(node, lambda: node.count_publishers('viewing'))
     begin = time.monotonic()
-    filled = Filled()
     for index in range(IMAGES):
         time.sleep(max(begin + index / RATE - time.monotonic(), 0.0))
         image.header.stamp = node.get_clock().now().to_msg()
         publisher.publish(image)
-    say(filled=filled.per_image(IMAGES))
     until(node, lambda: not publisher.get_subscription_count())
 
 
 def viewer() -> None:
-    """Receive images; tell how many came, how late, and how many buffers were filled for each."""
+    """Receive images; tell how many came, and how late."""
     import rclpy
     from sensor_msgs.msg import Image
 
@@ -174,7 +155,6 @@ def viewer() -> None:
     node = rclpy.create_node('viewer')
     late: list[float] = []
     last = time.monotonic()
-    filled = Filled()
 
     def take(image: Any) -> None:
         nonlocal last
@@ -186,9 +166,8 @@ def viewer() -> None:
     until(node, subscription.get_publisher_count)
     node.create_publisher(Image, 'viewing', 1)  # says that from now on no image may be lost
     until(node, lambda: late)
-    filled = Filled()
     until(node, lambda: len(late) == IMAGES or time.monotonic() - last > 2.0)
-    say(came=len(late), late=statistics.median(late) * 1e3, filled=filled.per_image(len(late) - 1))
+    say(came=len(late), late=statistics.median(late) * 1e3)
 
 
 def crowd(index: int) -> None:
@@ -262,23 +241,12 @@ class Ros:
 
     def images(self) -> list[Row]:
         """Measure images between two processes."""
-        _, seen = self._stream()
-        # a fixed threshold: each large buffer is mapped anew
-        out, into = self._stream(MALLOC_MMAP_THRESHOLD_='262144')
+        with self.role('viewer') as viewing, self.role('camera'):
+            seen = hear(viewing)
         return [
-            self.row('images lost', IMAGES - seen['came'], 'images', 0, IMAGES),
-            self.row('an image, published to callback', seen['late'], 'ms', None, IMAGES),
-            # a publisher fills the CDR; a subscription what the network brings, and the message
-            # (page faults of other causes are a few hundredths of an image)
-            self.row('copies of an image beyond CDR, publisher', round(out['filled'] - 1, 1),
-                     'copies', 1, IMAGES),
-            self.row('copies of an image beyond CDR, subscription', round(into['filled'] - 2, 1),
-                     'copies', 1, IMAGES)]
-
-    def _stream(self, **environment: str) -> tuple[dict[str, float], dict[str, float]]:
-        with self.role('viewer', **environment) as viewing, \
-                self.role('camera', **environment) as sending:
-            return hear(sending), hear(viewing)
+            self.row(f'{IMAGES} images of {WIDTH}x{HEIGHT}: lost', IMAGES - seen['came'], 'images',
+                     None, IMAGES),
+            self.row('an image, published to callback', seen['late'], 'ms', None, int(seen['came']))]
 
     def discovery(self) -> list[Row]:
         """Measure how long many nodes take to find each other."""

@@ -32,8 +32,8 @@ NAME, PREFIX = 'ros-jazzy-fogros2', '/opt/ros/jazzy'
 SITE = f'{PREFIX}/lib/python3.12/site-packages'
 SUITE = 'trixie'
 #: What the package depends on and is there for real.
-REAL = ('iproute2', 'openssh-client', 'python3', 'python3-cryptography', 'python3-paramiko',
-        'python3-requests', 'python3-yaml', 'rsync', 'wireguard-tools')
+REAL = ('iproute2', 'openssh-client', 'python3', 'python3-cryptography', 'python3-packaging',
+        'python3-paramiko', 'python3-requests', 'python3-yaml', 'rsync', 'wireguard-tools')
 #: Too large for what they would add to this test.
 HEAVY = ('python3-boto3', 'python3-google-auth', 'python3-numpy', 'python3-opencv',
          'python3-catkin-pkg-modules')  # of ROS's own repository

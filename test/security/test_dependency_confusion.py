@@ -78,8 +78,8 @@ def sha256(path: Path) -> str:
 def packed(tmp_path_factory: pytest.TempPathFactory) -> Wheels:
     """Return the robot's wheels."""
     found = wheels.collect(tmp_path_factory.mktemp('wheels'))
-    if not found.embedded:
-        pytest.skip('this interpreter has ROS 2 and no embedded default to send')
+    if not found.ros:
+        pytest.skip('this robot has an installation of ROS 2 and no wheels to send')
     return found
 
 
