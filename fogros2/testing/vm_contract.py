@@ -112,14 +112,19 @@ class VmContract(ProviderContract):
             assert not (self.billed_when_off and set(words) <= _OFF), (
                 f'a machine that is off is billed, and {command} only switches it off')
 
+    def test_offers_are_sorted_by_price(self) -> None:
+        super().test_offers_are_sorted_by_price()
+        provider, spec = self.wanted()
+        if provider.capabilities.prices:
+            region = provider.resolve(spec).options['region']
+            asked = wants(arch='any', min_cpu=1, min_memory_gb=0.1)
+            assert provider.offers(asked, [region]).offers
+
     def test_machine_has_a_price(self) -> None:
         provider, spec = self.wanted()
         if not provider.capabilities.prices:
             return
-        chosen = provider.resolve(spec)
-        asked = wants(arch='any', min_cpu=1, min_memory_gb=0.1)
-        assert provider.offers(asked, [chosen.options['region']]).offers
-        price = provider.cost_per_hour(chosen)
+        price = provider.cost_per_hour(provider.resolve(spec))
         assert price is not None and price > 0
         with self.machine() as (provider, spec, _, machine_id):
             assert self.reached(provider, machine_id).cost_per_hour == price

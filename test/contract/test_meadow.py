@@ -314,6 +314,9 @@ MUTANTS = {
     'there are no prices': Mutant(
         'test_machine_has_a_price', Meadow, 'prices',
         lambda right: lambda self, region, name='': {}),
+    'there are no offers': Mutant(
+        'test_offers_are_sorted_by_price', Meadow, 'zones',
+        lambda right: lambda self, region: {}),
     'the end only switches off': Mutant(
         'test_machine_ends_its_own_billing', Meadow, 'end_command',
         lambda right: lambda self, *words: END_COMMAND),
