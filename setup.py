@@ -100,7 +100,7 @@ setup(
             'websockets',  # with msgpack for openpi-client: see tools/setup.sh
             *AWS, *AZURE, *APPLICATIONS, *DOCS, *GCP, *KUBERNETES, *MONITOR,
             *POINT_CLOUDS],
-        'point_clouds': POINT_CLOUDS,
+        'point-clouds': POINT_CLOUDS,
         'video': VIDEO,
     },
     zip_safe=False,

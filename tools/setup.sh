@@ -350,7 +350,8 @@ if [ -n "$ros" ] && [ "$target" = interfaces ]; then
     say "ROS 2 is installed here, and builds packages of interfaces by itself"
     exit
 fi
-if [ -z "$ros" ] || [ "$target" != demo ]; then
+case $target in demo|cloud) best=yes ;; *) best= ;; esac
+if [ -z "$ros" ] || [ -z "$best" ]; then
     # nothing of a sourced ROS may reach the environment that does without
     (
         unset PYTHONPATH AMENT_PREFIX_PATH ROS_DISTRO PYTHONHOME

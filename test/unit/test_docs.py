@@ -99,16 +99,25 @@ def test_command_of_a_page_is_accepted(line, monkeypatch):
         targets = re.findall(r'^([a-z-]+):', (ROOT / 'Makefile').read_text(), re.MULTILINE)
         assert words[1] in targets
     elif words[:2] == ['pip', 'install']:
-        extras = {name for word in words[2:] for name in re.findall(r'[a-z_]+', word[1:])
+        extras = {name for word in words[2:] for name in re.findall(r'[a-z-]+', word[1:])
                   if word.startswith('.[')}
-        assert extras <= set(re.findall(r"^        '([a-z]+)': ", (ROOT / 'setup.py').read_text(),
+        assert extras <= set(re.findall(r"^        '([a-z-]+)': ", (ROOT / 'setup.py').read_text(),
                                         re.MULTILINE))
     elif words[0] == 'sudo' and words[1].startswith('./'):
         assert os.access(ROOT / words[1], os.X_OK)
     else:
         # other people's programs, which take an account, a network or a workspace
-        assert words[0] in ('.', 'aws', 'colcon', 'echo', 'git', 'kubectl', 'npm', 'rosdep',
-                            'source', 'ssh', 'sudo', 'PIP_BREAK_SYSTEM_PACKAGES=1', 'python'), line
+        assert words[0] in ('.', 'aws', 'colcon', 'docker', 'echo', 'git', 'kubectl', 'npm',
+                            'rosdep', 'source', 'ssh', 'sudo', 'PIP_BREAK_SYSTEM_PACKAGES=1',
+                            'python'), line
+
+
+def test_extras_are_spelt_as_every_pip_takes_them():
+    """Debian 12's pip finds no extra whose name has an underscore."""
+    text = (ROOT / 'setup.py').read_text().partition('extras_require={')[2].partition('    },')[0]
+    names = re.findall(r"^        '(.*?)': ", text, re.MULTILINE)
+    assert 'point-clouds' in names
+    assert all(re.fullmatch('[a-z]+(-[a-z]+)*', name) for name in names)
 
 
 def _refuse(self: argparse.ArgumentParser, message: str) -> None:
