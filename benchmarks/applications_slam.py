@@ -22,7 +22,15 @@ from typing import Any, Optional
 
 import applications
 from applications import (
-    favour, FOLDER, Held, ONE_THREAD, PACKETS, Result, robot_environment, running, words,
+    favour,
+    FOLDER,
+    Held,
+    ONE_THREAD,
+    PACKETS,
+    Result,
+    robot_environment,
+    running,
+    words,
 )
 from figures import paper
 import trajectories

@@ -39,7 +39,7 @@ FOLDER = '/tmp/fogros2-bench'
 VIDEO = f'{FOLDER}/video'
 RATE = 30.0
 LINK = 10e6
-#: Settings of DDS for nodes that are all on this computer. A launch's own are for its domain alone.
+#: Settings of DDS for nodes on this computer alone. A launch's own are for its domain.
 THIS_COMPUTER = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_DOMAIN_ID': '83'}
 #: Frames rendered, and of those that arrive, how many apart are held against the original.
 FRAMES, SAMPLE = 60, 23

@@ -10,7 +10,6 @@ from typing import Any, cast, Optional, TYPE_CHECKING
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal
-from launch.some_substitutions_type import SomeSubstitutionsType
 
 from fogros2 import plan
 from fogros2.errors import ConfigurationError
@@ -23,6 +22,8 @@ from fogros2.runtime.remote_run import RemoteRun
 from fogros2.runtime.republishers import AddedProcess
 
 if TYPE_CHECKING:
+    from launch import SomeSubstitutionsType
+
     from fogros2.describe.machines import SomeMachine
     from fogros2.image_transport.streams import StreamTopic
     from fogros2.runtime.session import Session

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A provider that was written from doc/developers/providers_vm.md keeps the contract; its mutants do not."""
+"""A provider written from doc/developers/providers_vm.md keeps the contract; no mutant does."""
 
 from __future__ import annotations
 

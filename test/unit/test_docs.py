@@ -25,7 +25,8 @@ PAGES = [ROOT / 'README.md', *sorted((ROOT / 'doc').rglob('*.md'))]
 MANUAL = [page for page in PAGES if 'developers' not in page.parts
           and page.name not in ('README.md', 'command_line.md')]
 #: Pages without a limit of words of their own: lists that readers search.
-REFERENCES = ('not_verified.md', 'paper.md', 'paper_tables.md', 'security.md', 'security_attackers.md')
+REFERENCES = ('not_verified.md', 'paper.md', 'paper_tables.md', 'security.md',
+              'security_attackers.md')
 _BLOCK = re.compile(r'^( *)```(\w+)\n(.*?)^\1```$', re.MULTILINE | re.DOTALL)
 
 
