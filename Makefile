@@ -2,7 +2,7 @@
 # Everything below does its own set-up: see tools/setup.sh.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning demo-policy cloud-check test test-fast test-kubernetes test-minimum fresh lint bench soak deb docs interfaces clean
+.PHONY: help setup demo demo-video demo-slam demo-grasp demo-planning demo-policy cloud-check test test-fast test-kubernetes test-minimum fresh lint bench soak pictures deb docs interfaces clean
 
 ## demo   a launch file puts a talker on a container machine and takes it down again
 demo:
@@ -34,7 +34,7 @@ cloud-check:
 	@tools/setup.sh cloud
 	@tools/run.sh best -- python tools/cloud_check.py $(PROVIDER) $(if $(OPTIONS),--options '$(OPTIONS)')
 
-## test   the tests, on ROS 2's wheels and, where it is installed, on ROS 2
+## test   all tests but those with a cluster, on ROS 2's wheels and, where it is installed, on ROS 2
 test:
 	@tools/setup.sh test
 	@tools/test.sh $(ARGS)
@@ -54,7 +54,7 @@ fresh:
 test-kubernetes:
 	@tools/setup.sh test
 	@tools/kubernetes.sh >/dev/null
-	@tools/test.sh test/integration/kubernetes $(ARGS)
+	@tools/test.sh kubernetes $(ARGS)
 
 ## test-minimum   the tests without machines, with the oldest versions that are supported
 test-minimum: export FOGROS2_VENV = $(CURDIR)/.venv-minimum
@@ -73,9 +73,15 @@ bench:
 	@set -e; for script in $(filter-out benchmarks/chaos.py benchmarks/security.py benchmarks/theora.py benchmarks/applications_%,$(wildcard benchmarks/*.py)); do \
 		echo "== $$script"; tools/run.sh best -- python "$$script"; done
 
+## pictures  tables and plots of the stored figures, and the pictures of the pages, anew
+pictures:
+	@tools/setup.sh test
+	@cd benchmarks && ../tools/run.sh embedded -- python -m figures
+	@tools/run.sh embedded -- python -m rigs.pictures
+
 ## docs   the documentation, as pages for a browser
 docs:
-	@tools/setup.sh test
+	@tools/setup.sh docs
 	@tools/run.sh embedded -- python tools/docs.py
 
 ## deb    the Debian package, for Ubuntu 24.04 with ROS 2 Jazzy

@@ -100,7 +100,7 @@ setup(
             'websockets',  # with msgpack for openpi-client: see tools/setup.sh
             *AWS, *AZURE, *APPLICATIONS, *DOCS, *GCP, *KUBERNETES, *MONITOR,
             *POINT_CLOUDS],
-        'point_clouds': POINT_CLOUDS,
+        'point-clouds': POINT_CLOUDS,
         'video': VIDEO,
     },
     zip_safe=False,
@@ -181,6 +181,7 @@ setup(
             'fogros2.verb = ros2fog_cli.verb:VerbExtension',
         ],
         'fogros2.verb': [
+            'bugreport = ros2fog_cli.verb.bugreport:BugreportVerb',
             'connect = ros2fog_cli.verb.connect:ConnectVerb',
             'dashboard = ros2fog_cli.verb.dashboard:DashboardVerb',
             'delete = ros2fog_cli.verb.delete:DeleteVerb',
@@ -195,11 +196,14 @@ setup(
             'list = ros2fog_cli.verb.list:ListVerb',
             'logs = ros2fog_cli.verb.logs:LogsVerb',
             'monitor = ros2fog_cli.verb.monitor:MonitorVerb',
+            'plan = ros2fog_cli.verb.plan:PlanVerb',
             'price = ros2fog_cli.verb.price:PriceVerb',
             'regions = ros2fog_cli.verb.regions:RegionsVerb',
             'revoke = ros2fog_cli.verb.revoke:RevokeVerb',
             'shell = ros2fog_cli.verb.shell:ShellVerb',
+            'ssh-config = ros2fog_cli.verb.ssh_config:SshConfigVerb',
             'status = ros2fog_cli.verb.status:StatusVerb',
+            'wait = ros2fog_cli.verb.wait:WaitVerb',
         ],
     },
 )

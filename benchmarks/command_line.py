@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import statistics
 import subprocess
 import sys
 
@@ -50,16 +49,15 @@ def main() -> None:
          ' if m in sys.modules])'], check=True, capture_output=True, text=True).stdout.strip()
     if sdk != '[]':
         raise SystemExit(f'import fogros2 imports {sdk}')
-    help_time, list_time = statistics.median(bare), statistics.median(listed)
     write('command_line', 'Command line and imports', [
-        Row('ros2 -h', help_time, 's', runs=RUNS),
-        Row('ros2 fog list', list_time, 's', runs=RUNS,
-            published='not published; its code: 0.46 s for one empty local region'),
-        Row('ros2 fog list, more than ros2 -h', list_time - help_time, 's', 0.15, runs=RUNS),
-        Row('import fogros2', statistics.median(package), 's', 0.03, runs=RUNS,
-            published='not published; its code: 0.36 s'),
-        Row('from fogros2 import CloudNode, after launch_ros', statistics.median(node), 's', 0.05,
-            runs=RUNS),
+        Row.of('ros2 -h', bare, 's'),
+        Row.of('ros2 fog list', listed, 's',
+               published='not published; its code: 0.46 s for one empty local region'),
+        Row.of('ros2 fog list, more than ros2 -h',
+               [one - other for one, other in zip(listed, bare)], 's', 0.15),
+        Row.of('import fogros2', package, 's', 0.03,
+               published='not published; its code: 0.36 s'),
+        Row.of('from fogros2 import CloudNode, after launch_ros', node, 's', 0.05),
     ])
 
 

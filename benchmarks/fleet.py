@@ -110,12 +110,11 @@ def join() -> list[Row]:
                 alone.append(only)
                 reference.append(there)
     return [
-        Row('ros2 fog join to the first message', statistics.median(joined), 's', 1.0, runs=RUNS),
-        Row('ros2 fog join alone', statistics.median(alone), 's', runs=RUNS),
-        Row('the same node on the first robot, whose VPN is up', statistics.median(reference),
-            's', runs=RUNS),
-        Row('joining, more than that node', statistics.median(
-            one - other for one, other in zip(joined, reference)), 's', runs=RUNS)]
+        Row.of('ros2 fog join to the first message', joined, 's', 1.0),
+        Row.of('ros2 fog join alone', alone, 's'),
+        Row.of('the same node on the first robot, whose VPN is up', reference, 's'),
+        Row.of('joining, more than that node',
+               [one - other for one, other in zip(joined, reference)], 's')]
 
 
 def host() -> list[Row]:
@@ -236,13 +235,12 @@ def relay() -> list[Row]:
                     with taken() as first_domain, taken() as second_domain:
                         times[bare].append(latency(
                             sockets, [first_domain, second_domain], size, bare))
-            ours, theirs = (statistics.median(times[bare]) for bare in (False, True))
+            ours, theirs = ([1e3 * time for time in times[bare]] for bare in (False, True))
             rows += [
-                Row(f'shared message of {label}, node to node', ours * 1e3, 'ms', runs=TURNS),
-                Row(f'the same by a bare relay of rclpy, {label}', theirs * 1e3, 'ms', runs=TURNS),
-                Row(f'shared messages of {label}, of the bare relay', statistics.median(
-                    one / other for one, other in zip(times[False], times[True])), 'times', 1.3,
-                    runs=TURNS)]
+                Row.of(f'shared message of {label}, node to node', ours, 'ms'),
+                Row.of(f'the same by a bare relay of rclpy, {label}', theirs, 'ms'),
+                Row.of(f'shared messages of {label}, of the bare relay',
+                       [one / other for one, other in zip(ours, theirs)], 'times', 1.3)]
     return rows
 
 

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import statistics
-
 from figures import Row, write
 
 from fogros2.deploy import Launch
@@ -34,9 +32,9 @@ def resident() -> float:
 
 def main() -> None:
     """Take the median."""
-    value = statistics.median(resident() for _ in range(RUNS))
     write('footprint', "The agent's memory", [
-        Row('agent, resident, one node running', value, 'MB', 30.0, runs=RUNS)])
+        Row.of('agent, resident, one node running', [resident() for _ in range(RUNS)], 'MB',
+               30.0)])
 
 
 if __name__ == '__main__':

@@ -11,7 +11,6 @@ taken with the argument ``starts``, on a computer that has nothing else to do.
 from __future__ import annotations
 
 from collections.abc import Iterator
-import statistics
 import sys
 import time
 
@@ -101,8 +100,7 @@ def starts(here: Place) -> Iterator[Row]:
                     run.kill()
             ros2('fog', 'delete', 'starts', '--yes', environment=its.environment,
                  prefix=here.prefix, timeout=120.0)
-        yield Row(f'EC2 in a box, a {what} machine: to the first line', statistics.median(taken),
-                  's', runs=STARTS)
+        yield Row.of(f'EC2 in a box, a {what} machine: to the first line', taken, 's')
 
 
 def main() -> None:

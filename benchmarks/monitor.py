@@ -299,10 +299,9 @@ def by_rosbridge(what: str, seconds: float) -> tuple[list[Seen], float]:
         return asyncio.run(watch(rosbridge, f'ws://127.0.0.1:{port}', what, 1, seconds, [served]))
 
 
-def median(crowd: list[Seen], share: float = 0.5) -> float:
-    """Return the latency (ms) that so many of all messages stay below."""
-    times = sorted(1e3 * each for seen in crowd for each in seen.latencies)
-    return times[int(share * (len(times) - 1))]
+def delays(crowd: list[Seen]) -> list[float]:
+    """Return the latencies of all messages in ms, sorted."""
+    return sorted(1e3 * each for seen in crowd for each in seen.latencies)
 
 
 def dashboard(seconds: float) -> list[Row]:
@@ -335,8 +334,7 @@ def dashboard(seconds: float) -> list[Row]:
             started.send_signal(signal.SIGINT)
             started.wait(TIMEOUT)
     return [
-        Row("dashboard: the page's first content is seen after", statistics.median(paints), 'ms',
-            1000.0, runs=len(paints)),
+        Row.of("dashboard: the page's first content is seen after", paints, 'ms', 1000.0),
         Row('dashboard: its process, idle, with the page open', share, '% CPU', 2.0)]
 
 
@@ -344,25 +342,19 @@ def main(seconds: float, with_dashboard: bool, results: Path) -> None:
     """Measure one after the other."""
     os.environ.setdefault('ROS_DOMAIN_ID', '84')
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    rows: list[Row] = []
-
-    def taken(crowd: list[Seen]) -> int:
-        return sum(len(seen.sizes) for seen in crowd)
-
-    text, _ = by_bridge(TEXT, 1, seconds)
-    texts, _ = by_rosbridge(TEXT, seconds)
-    rows += [
-        Row('bridge: a text, publish to viewer, median', median(text), 'ms', 5.0,
-            runs=taken(text)),
-        Row('bridge: a text, 99 of 100 come within', median(text, 0.99), 'ms', runs=taken(text)),
-        Row(f'{JSON_SERVER}: a text, publish to viewer, median', median(texts), 'ms',
-            runs=taken(texts))]
+    text = delays(by_bridge(TEXT, 1, seconds)[0])
+    texts = delays(by_rosbridge(TEXT, seconds)[0])
+    rows = [
+        Row.of('bridge: a text, publish to viewer, median', text, 'ms', 5.0),
+        Row('bridge: a text, 99 of 100 come within', text[int(0.99 * (len(text) - 1))], 'ms',
+            runs=len(text)),
+        Row.of(f'{JSON_SERVER}: a text, publish to viewer, median', texts, 'ms')]
     image, image_cpu = by_bridge(VGA, 1, seconds)
     json_image, json_cpu = by_rosbridge(VGA, seconds)
     for name, crowd, share in (('bridge', image, image_cpu), (JSON_SERVER, json_image, json_cpu)):
         rows += [
-            Row(f'{name}: raw VGA at {RATES[VGA]:g} Hz, publish to viewer, median', median(crowd),
-                'ms', runs=taken(crowd)),
+            Row.of(f'{name}: raw VGA at {RATES[VGA]:g} Hz, publish to viewer, median',
+                   delays(crowd), 'ms'),
             Row(f'{name}: raw VGA, one viewer', share, '% CPU'),
             Row(f'{name}: raw VGA, an image on the wire',
                 statistics.median(crowd[0].sizes) / 1e3, 'kB'),
@@ -374,8 +366,7 @@ def main(seconds: float, with_dashboard: bool, results: Path) -> None:
     rows += [
         Row(f'bridge: 1080p H.264 to {VIEWERS} viewers, images that come to each',
             min(seen.rate for seen in video), 'Hz', 0.98 * RATE, 'more'),
-        Row('bridge: 1080p H.264, publish to viewer, median', median(video), 'ms',
-            runs=taken(video)),
+        Row.of('bridge: 1080p H.264, publish to viewer, median', delays(video), 'ms'),
         Row(f'bridge: 1080p H.264 to {VIEWERS} viewers', video_cpu, '% CPU'),
         Row('bridge: the same packets as a topic that is no video', opaque_cpu, '% CPU'),
         Row('decoding them once would take', decode * RATE / 10, '% CPU'),

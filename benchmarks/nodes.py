@@ -246,7 +246,8 @@ class Ros:
         return [
             self.row(f'{IMAGES} images of {WIDTH}x{HEIGHT}: lost', IMAGES - seen['came'], 'images',
                      None, IMAGES),
-            self.row('an image, published to callback', seen['late'], 'ms', None, int(seen['came']))]
+            self.row('an image, published to callback', seen['late'], 'ms', None,
+                     int(seen['came']))]
 
     def discovery(self) -> list[Row]:
         """Measure how long many nodes take to find each other."""

@@ -406,7 +406,7 @@ def main() -> None:
             Row('cut: the same, sum of its parts', control.limit + 2 * tick, 'ms')]
     for outcome in (first, *outcomes[:2]):
         rows += [Row(f'{outcome.name}: bytes per observation', outcome.size / 1e3, 'kB'),
-                 Row(f'{outcome.name}: median', outcome.median, 'ms'),
+                 Row(f'{outcome.name}: median', outcome.median, 'ms', high=outcome.p95),
                  Row(f'{outcome.name}: median over limit', outcome.median / outcome.limit, '')]
     write('policy', 'Policies on another machine', rows)
     (RESULTS / 'policy-table.md').write_text(text)

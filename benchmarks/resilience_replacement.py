@@ -19,7 +19,6 @@ from pathlib import Path
 import random
 import re
 import signal
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -111,7 +110,7 @@ def lost(moments: int) -> Iterator[Row]:
         found = [*pool.map(lambda n: kill(Path(top, str(n)), dice.uniform(0.0, 2 * INTERVAL)),
                            range(moments))]
     ages = [age for age, _ in found]
-    yield Row('state lost, median', statistics.median(ages), 's', runs=moments)
+    yield Row.of('state lost, median', ages, 's')
     yield Row('state lost at the most', max(ages), 's', INTERVAL, runs=moments)
     yield Row('corrupt snapshots', sum(not whole for _, whole in found), 'of all', 0,
               runs=moments)
@@ -141,11 +140,10 @@ def replaced(runs: int) -> Iterator[Row]:
             print(*(line for line in run.said if re.search('machine|seconds| s$', line)))
             run.interrupt()
             run.ended(120.0)
-    yield Row('spot notice to the first message of the robot', statistics.median(robots), 's',
-              runs=runs)
-    yield Row('boot of the replacement', statistics.median(boots), 's', runs=runs)
-    yield Row('spot notice to the first message of the replacement, beyond the boot',
-              statistics.median(beyond), 's', 10.0, runs=runs)
+    yield Row.of('spot notice to the first message of the robot', robots, 's')
+    yield Row.of('boot of the replacement', boots, 's')
+    yield Row.of('spot notice to the first message of the replacement, beyond the boot', beyond,
+                 's', 10.0)
 
 
 def main() -> None:

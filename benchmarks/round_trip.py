@@ -134,12 +134,12 @@ def main() -> None:
                 echoing.wait()
     finally:
         launch.down()
-    vpn, bare, loop = map(statistics.median, (through, beside, here))
     write('round_trip', 'DDS round trip, robot to machine and back', [
-        Row('between two processes here', loop, 'ms', runs=RUNS),
-        Row('to a container, without the VPN', bare, 'ms', runs=RUNS),
-        Row('to a container, through the VPN', vpn, 'ms', runs=RUNS),
-        Row('what the VPN adds', vpn - bare, 'ms', 0.4, runs=RUNS),
+        Row.of('between two processes here', here, 'ms'),
+        Row.of('to a container, without the VPN', beside, 'ms'),
+        Row.of('to a container, through the VPN', through, 'ms'),
+        Row.of('what the VPN adds', [one - other for one, other in zip(through, beside)], 'ms',
+               0.4),
     ])
 
 

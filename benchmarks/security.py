@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-How the promises of ``doc/security.md`` hold against inputs that nobody sent on purpose.
+How the promises of ``doc/developers/security.md`` hold against inputs that nobody sent on purpose.
 
 ``fuzz`` feeds mutated inputs to each reader of others' inputs for ``--minutes``, guided by
 coverage where the reader is Python code in one process. ``secrets`` launches a machine of each

@@ -142,18 +142,15 @@ def start(provider: str, runs: int) -> Iterator[Row]:
                 here.box.set_boot_delay(delay)
                 taken = [here.talker() for _ in range(runs)]
                 calls += [asked for *_, asked in taken]
-                total = statistics.median(t for t, *_ in taken)
-                installed = statistics.median(i for _, _, i, _, _ in taken)
+                installed = [i for _, _, i, _, _ in taken]
                 how = taken[-1][3]
-                share = statistics.median(t - b - i for t, b, i, _, _ in taken)
                 what = f'simulated {BOXES[provider]}, {image} image, boot delay {delay:g} s'
-                yield Row(f'{what}: to the first message', total, 's', runs=runs,
-                          published=PUBLISHED[image] if provider == 'aws' else '')
-                if installed:
-                    yield Row(f'{what}: of it ROS 2 installed from {how}', installed, 's',
-                              runs=runs)
-                yield Row(f'{what}: our share', share, 's', 6.0 if image == 'default' else 4.0,
-                          runs=runs)
+                yield Row.of(f'{what}: to the first message', [t for t, *_ in taken], 's',
+                             published=PUBLISHED[image] if provider == 'aws' else '')
+                if any(installed):
+                    yield Row.of(f'{what}: of it ROS 2 installed from {how}', installed, 's')
+                yield Row.of(f'{what}: our share', [t - b - i for t, b, i, _, _ in taken], 's',
+                             6.0 if image == 'default' else 4.0)
             if image == 'default':
                 here.box.set_boot_delay(0.0)
                 here.talker('name:=baked', 'on_exit:=keep')
@@ -175,8 +172,7 @@ def listing(here: Robot, runs: int) -> Iterator[Row]:
     # AWS is asked in each region, and the others once for all
     regions = Counter(call.region for call in calls) if here.cloud.listing > 2 \
         else Counter(dict.fromkeys(load('fogros2.provider', here.cloud.name).region_names(), 0))
-    yield Row(f'ros2 fog list, {len(regions)} regions', statistics.median(taken), 's', 2.0,
-              runs=runs)
+    yield Row.of(f'ros2 fog list, {len(regions)} regions', taken, 's', 2.0)
     yield Row('ros2 fog list, a region', max(*regions.values(), 0) or len(calls), 'requests', 2.0,
               runs=runs)
 
@@ -187,17 +183,17 @@ def several(provider: str, runs: int) -> Iterator[Row]:
         here.machines(1)
         for delay in DELAYS:
             here.box.set_boot_delay(delay)
-            one, spent = map(statistics.median, zip(*(here.machines(1) for _ in range(runs))))
-            many, spent_by_many = map(
-                statistics.median, zip(*(here.machines(MANY) for _ in range(runs))))
+            one, spent = zip(*(here.machines(1) for _ in range(runs)))
+            many, spent_by_many = zip(*(here.machines(MANY) for _ in range(runs)))
             box = f'simulated {BOXES[provider]}'
             what = f'{box}, {MANY} instances, boot delay {delay:g} s'
-            yield Row(f'{box}, 1 instance, boot delay {delay:g} s', one, 's', runs=runs)
-            yield Row(what, many, 's', runs=runs)
-            yield Row(what, many / one, 'times one', 1.5, runs=runs,
-                      published='not published; its code: one after another')
-            yield Row(f"{what}: the robot's CPU", spent_by_many, 's', runs=runs)
-            yield Row(f"{what}: the robot's CPU", spent_by_many / spent, 'times one', runs=runs)
+            yield Row.of(f'{box}, 1 instance, boot delay {delay:g} s', one, 's')
+            yield Row.of(what, many, 's')
+            yield Row(what, statistics.median(many) / statistics.median(one), 'times one', 1.5,
+                      runs=runs, published='not published; its code: one after another')
+            yield Row.of(f"{what}: the robot's CPU", spent_by_many, 's')
+            yield Row(f"{what}: the robot's CPU", statistics.median(spent_by_many)
+                      / statistics.median(spent), 'times one', runs=runs)
 
 
 def list_all(runs: int) -> Iterator[Row]:
@@ -221,8 +217,8 @@ def list_all(runs: int) -> Iterator[Row]:
                 raise SystemExit(f'ros2 fog list failed:\n{done.stdout}{done.stderr}')
         requests = sum(sum(bool(call.service) for call in box.calls()) for box in boxes)
     regions = sum(len(load('fogros2.provider', name).region_names()) for name in CLOUDS)
-    yield Row(f'ros2 fog list, {regions} regions of {len(CLOUDS)} clouds',
-              statistics.median(taken[1:]), 's', 2.0, runs=runs)
+    yield Row.of(f'ros2 fog list, {regions} regions of {len(CLOUDS)} clouds', taken[1:], 's',
+                 2.0)
     yield Row('requests', requests, 'requests', 2.0 * regions, runs=1)
 
 

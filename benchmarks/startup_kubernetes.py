@@ -18,7 +18,6 @@ from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import os
 from pathlib import Path
-import statistics
 import subprocess
 import tempfile
 import time
@@ -157,31 +156,31 @@ def rows(here: Robot, runs: int) -> Iterator[Row]:
     """Yield the figures."""
     here.talker()  # the first one of a cluster reads files that nobody has read
     fresh = [here.talker() for _ in range(runs)]
-    yield Row("a new pod on this computer's cluster, image there: to the first message",
-              statistics.median(t for t, _ in fresh), 's', 5.0, runs=runs,
-              published=f"{paper.STARTUP['local']} s (a local cluster that ran), "
-                        f"{paper.STARTUP['GCP']} s (GCP)")
+    yield Row.of("a new pod on this computer's cluster, image there: to the first message",
+                 [t for t, _ in fresh], 's', 5.0,
+                 published=f"{paper.STARTUP['local']} s (a local cluster that ran), "
+                           f"{paper.STARTUP['GCP']} s (GCP)")
     here.talker('name:=kept', 'on_exit:=keep')
     kept = [here.talker('name:=kept', 'on_exit:=keep') for _ in range(runs)]
     here.delete('kept')
-    yield Row('a kept pod: to the first message', statistics.median(t for t, _ in kept), 's', 2.0,
-              runs=runs)
+    yield Row.of('a kept pod: to the first message', [t for t, _ in kept], 's', 2.0)
     calls = max((asked for _, asked in fresh), key=lambda asked: sum(asked.values()))
     print('requests of a launch:', ', '.join(f'{n} {what}' for what, n in sorted(calls.items())))
     yield Row('requests to the API server in a launch, at most', sum(calls.values()), 'requests',
               15.0, runs=runs)
-    one = statistics.median(here.machines(1) for _ in range(runs))
-    many = statistics.median(here.machines(MANY) for _ in range(runs))
-    yield Row('1 pod: until it is heard', one, 's', runs=runs)
-    yield Row(f'{MANY} pods: until all are heard', many, 's', runs=runs)
-    yield Row(f'{MANY} pods', many / one, 'times one', 4.0, runs=runs)
-    bare = statistics.median(here.bare(1) for _ in range(runs))
-    floor = statistics.median(here.bare(MANY) for _ in range(runs))
-    yield Row('1 bare pod, with nothing of FogROS2: until it runs', bare, 's', runs=runs)
-    yield Row(f'{MANY} bare pods: until they run', floor, 's', runs=runs)
-    yield Row(f'{MANY} bare pods', floor / bare, 'times one', runs=runs)
-    yield Row(f'{MANY} pods, without what the cluster takes for bare ones', (many - floor) / MANY,
-              's each', runs=runs)
+    one = Row.of('1 pod: until it is heard', [here.machines(1) for _ in range(runs)], 's')
+    many = Row.of(f'{MANY} pods: until all are heard',
+                  [here.machines(MANY) for _ in range(runs)], 's')
+    yield from (one, many)
+    yield Row(f'{MANY} pods', many.value / one.value, 'times one', 4.0, runs=runs)
+    bare = Row.of('1 bare pod, with nothing of FogROS2: until it runs',
+                  [here.bare(1) for _ in range(runs)], 's')
+    floor = Row.of(f'{MANY} bare pods: until they run',
+                   [here.bare(MANY) for _ in range(runs)], 's')
+    yield from (bare, floor)
+    yield Row(f'{MANY} bare pods', floor.value / bare.value, 'times one', runs=runs)
+    yield Row(f'{MANY} pods, without what the cluster takes for bare ones',
+              (many.value - floor.value) / MANY, 's each', runs=runs)
 
 
 @contextlib.contextmanager

@@ -39,7 +39,7 @@ FOLDER = '/tmp/fogros2-bench'
 VIDEO = f'{FOLDER}/video'
 RATE = 30.0
 LINK = 10e6
-#: Settings of DDS for nodes that are all on this computer. A launch's are for its own domain.
+#: Settings of DDS for nodes on this computer alone. A launch's own are for its domain.
 THIS_COMPUTER = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_DOMAIN_ID': '83'}
 #: Frames rendered, and of those that arrive, how many apart are held against the original.
 FRAMES, SAMPLE = 60, 23
@@ -607,7 +607,7 @@ def rows(outcomes: list[Outcome], limits: dict[str, float], video: bool) -> Iter
             yield Row(f'{o.case.name}: {what}', value, unit, target,
                       'more' if unit in ('1/s', 'dB') else 'less',
                       published=o.case.published if field in ('fps', 'median') else '',
-                      runs=1)
+                      runs=1, high=o.p95 if field == 'median' else None)
         if o.case.name in limits:
             yield Row(f'{o.case.name}: median over limit', o.median / limits[o.case.name], '',
                       1.3)

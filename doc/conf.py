@@ -12,7 +12,8 @@ sys.path.insert(0, str(ROOT))
 
 project = 'FogROS2'
 author = 'FogROS2 maintainers'
-release = ElementTree.parse(ROOT / 'package.xml').getroot().findtext('version') or ''
+manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
+release = manifest.findtext('version') or ''
 extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.intersphinx',
               'sphinx.ext.viewcode']
 # nothing is fetched: references to others' documentation stay plain text
@@ -24,7 +25,11 @@ html_theme = 'furo'
 html_title = f'FogROS2 {release}'
 html_copy_source = False
 html_show_sphinx = False
-templates_path: list[str] = []
+html_show_copyright = False
+templates_path = ['_templates']
+# for the footer
+html_context = {'licence': manifest.findtext('license'),
+                'issues': manifest.findtext('url[@type="bugtracker"]')}
 exclude_patterns = ['_build']
 autodoc_member_order = 'bysource'
 autodoc_typehints = 'signature'

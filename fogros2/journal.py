@@ -169,7 +169,16 @@ def clocks(lines: list[str]) -> dict[str, ClockOffset]:
 
 def read_clocks(folder: Path) -> dict[str, ClockOffset]:
     """Return the offsets in the journal of a launch's folder, empty without a journal."""
+    return clocks(_lines(folder))
+
+
+def read_steps(folder: Path) -> list[Step]:
+    """Return the steps in the journal of a launch's folder, empty without a journal."""
+    return steps(_lines(folder))
+
+
+def _lines(folder: Path) -> list[str]:
     try:
-        return clocks((folder / FILE).read_text(errors='replace').splitlines())
+        return (folder / FILE).read_text(errors='replace').splitlines()
     except OSError:
-        return {}
+        return []

@@ -9,7 +9,7 @@ import sys
 from setuptools import Distribution, find_packages, setup
 
 NAME = 'ros2-embedded'
-VERSION = '0.1.0'
+VERSION = '0.4.0'
 HERE = Path(__file__).resolve().parent
 
 

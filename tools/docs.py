@@ -11,6 +11,8 @@ import sys
 ROOT = Path(__file__).resolve().parents[1]
 #: Help texts are as wide as the page.
 COLUMNS = '88'
+#: As ``ros2``: argparse begins a usage with the program's name.
+_ROS2 = "import sys; sys.argv[0] = 'ros2'; from ros2cli.cli import main; sys.exit(main())"
 _PAGE = """\
 # Command line
 
@@ -21,8 +23,7 @@ The output of `ros2 fog -h` and of `-h` of each verb.
 def help_of(*words: str) -> str:
     """Return what a command says of itself."""
     return subprocess.run(
-        [sys.executable, '-c', 'import sys; from ros2cli.cli import main; sys.exit(main())',
-         *words, '-h'], check=True, capture_output=True, text=True,
+        [sys.executable, '-c', _ROS2, *words, '-h'], check=True, capture_output=True, text=True,
         env={**os.environ, 'COLUMNS': COLUMNS}).stdout.replace('\t', '    ')
 
 

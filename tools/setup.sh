@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # Makes this computer ready for `make demo`, `make test` or `make lint`, and says what it does.
 #
-#   tools/setup.sh demo|cloud|test|lint|bench|interfaces
+#   tools/setup.sh demo|cloud|test|lint|docs|bench|interfaces
 #
 # 'interfaces' adds what builds a package of messages, services or actions without ROS 2.
 # Touches two things: system packages, through apt and only those that are missing, and a virtual
@@ -12,7 +12,7 @@ set -eu
 cd "$(dirname "$0")/.."
 . tools/common.sh
 target=${1:-demo}
-case $target in lint|interfaces) machines= ;; *) machines=yes ;; esac
+case $target in lint|docs|interfaces) machines= ;; *) machines=yes ;; esac
 
 # --- who is asking ------------------------------------------------------------------------------
 if [ "$(id -u)" = 0 ] && [ -n "${SUDO_UID:-}" ] && [ "$SUDO_UID" != 0 ] \
@@ -283,13 +283,14 @@ install_cyclone() {
 case $target in
     demo|interfaces) extras=none ;;
     cloud) extras=aws,azure,gcp,kubernetes ;;
+    docs) extras=docs ;;
     bench) extras=test,bench ;;
     *) extras=test ;;
 esac
 # Whether an environment that has the extras $1 has those that are wanted.
 enough() {
     case "$1 $extras" in
-        'none none'|'test none'|'test,bench '*|'test test') return 0 ;;
+        'none none'|'test,bench '*|'test none'|'test test'|'test docs'|'docs none'|'docs docs') return 0 ;;
         'aws,azure,gcp,kubernetes none'|'aws,azure,gcp,kubernetes aws,azure,gcp,kubernetes'|'test aws,azure,gcp,kubernetes')
             return 0 ;;
         *) return 1 ;;
@@ -349,7 +350,8 @@ if [ -n "$ros" ] && [ "$target" = interfaces ]; then
     say "ROS 2 is installed here, and builds packages of interfaces by itself"
     exit
 fi
-if [ -z "$ros" ] || [ "$target" != demo ]; then
+case $target in demo|cloud) best=yes ;; *) best= ;; esac
+if [ -z "$ros" ] || [ -z "$best" ]; then
     # nothing of a sourced ROS may reach the environment that does without
     (
         unset PYTHONPATH AMENT_PREFIX_PATH ROS_DISTRO PYTHONHOME
@@ -359,7 +361,7 @@ if [ -z "$ros" ] || [ "$target" != demo ]; then
         [ "$target" != test ] || install_cyclone "$VENV"
     )
 fi
-if [ -n "$ros" ] && [ "$target" != lint ]; then
+if [ -n "$ros" ] && [ "$target" != lint ] && [ "$target" != docs ]; then
     (
         set +eu; . "$ros"; set -eu
         interpreter=/usr/bin/python3

@@ -1,7 +1,10 @@
 #!/bin/sh
 # SPDX-License-Identifier: Apache-2.0
-# Runs all tests on the wheels of ROS 2, then on ROS 2 Jazzy where it is installed, and closes
-# with one line of counts over all. Words are passed on to pytest.
+# Runs the tests on the wheels of ROS 2, then on ROS 2 Jazzy where it is installed, and closes
+# with one line of counts over both.
+#
+#   tools/test.sh [WORDS]             all tests without a cluster; words are passed on to pytest
+#   tools/test.sh kubernetes [WORDS]  the tests with one
 set -u
 cd "$(dirname "$0")/.."
 . tools/common.sh
@@ -16,25 +19,24 @@ export TMPDIR
 trap 'rm -rf "$TMPDIR"' EXIT
 trap 'exit 130' INT
 trap 'exit 143' TERM
-# building Kubernetes can take longer than sudo remembers the password
 keep_ticket
-rm -f .cache/test-*.xml
+part=test
+if [ "${1:-}" = kubernetes ]; then
+    part=$1; shift
+    set -- test/integration/kubernetes "$@"
+elif [ $# = 0 ]; then
+    # Three at a time: much of what tests with machines take is waiting. Tests named by hand run in
+    # turn, so that their output is seen as it comes.
+    set -- --ignore=test/integration/kubernetes -n 3 --dist loadgroup --no-loadscope-reorder
+else
+    # pytest collects it nevertheless if it is named
+    set -- --ignore=test/integration/kubernetes "$@"
+fi
+rm -f .cache/"$part"-*.xml
 status=0
 # what the user has set for nodes of their own must not decide what a test sees
 unset RMW_IMPLEMENTATION CYCLONEDDS_URI ROS_DOMAIN_ID ROS_AUTOMATIC_DISCOVERY_RANGE \
     ROS_STATIC_PEERS ROS_LOCALHOST_ONLY FOGROS2_STATE_HOME
-
-# The cluster of the Kubernetes tests: minutes the first time. Those who name their tests don't wait
-# for it, and where it can't be built those tests are skipped.
-if [ $# = 0 ]; then
-    FOGROS2_NO_KUBERNETES=$(tools/kubernetes.sh --why-not)
-    if [ -n "$FOGROS2_NO_KUBERNETES" ]; then
-        say "No Kubernetes for the tests: $FOGROS2_NO_KUBERNETES"
-        export FOGROS2_NO_KUBERNETES
-    elif ! tools/kubernetes.sh >/dev/null; then
-        status=1
-    fi
-fi
 
 ros=$(ros_setup)
 [ -z "$ros" ] || export ROS2_SETUP="$ros"
@@ -44,16 +46,13 @@ suite() {
     say "Tests on $name"
     tools/run.sh "$@" || status=1
 }
-# Three at a time: much of what tests with machines take is waiting. Tests named by hand run in turn,
-# so that their output is seen as it comes.
-[ $# = 0 ] && set -- -n 3 --dist loadgroup --no-loadscope-reorder
-suite "ROS 2's wheels" embedded -- pytest --junit-xml=.cache/test-embedded.xml "$@"
+suite "ROS 2's wheels" embedded -- pytest --junit-xml=.cache/"$part"-embedded.xml "$@"
 if [ -n "$ros" ]; then
     # Jazzy's own plugins are written for an older pytest, and nothing here uses them
     suite 'ROS 2 Jazzy' ros -- pytest -p no:launch_testing -p no:launch_ros -p no:launch_pytest \
-        --junit-xml=.cache/test-ros.xml "$@"
+        --junit-xml=.cache/"$part"-ros.xml "$@"
 else
     say "ROS 2 Jazzy isn't installed here: tested on its wheels alone"
 fi
-tools/run.sh embedded -- python tools/closing_line.py .cache/test-*.xml || status=1
+tools/run.sh embedded -- python tools/closing_line.py .cache/"$part"-*.xml || status=1
 exit $status

@@ -2,8 +2,10 @@
 """
 What all benchmarks share: rows of figures, and how they are written down.
 
-Each benchmark writes ``results/<name>.json``, a Markdown table and a plot. Absolute times hold for
-the computer they were taken on; targets are held against differences and ratios within one run.
+Each benchmark writes ``results/<name>.json``, a Markdown table and, where ``plots.PANELS`` has the
+name, a picture. ``python -m figures`` writes tables and pictures again from the stored figures.
+Absolute times hold for the computer they were taken on; targets are held against differences and
+ratios within one run.
 """
 
 from __future__ import annotations
@@ -20,6 +22,9 @@ import statistics
 import time
 from typing import Literal, Optional
 
+from figures import plots
+from figures.plots import number
+
 RESULTS = Path(__file__).parents[1] / 'results'
 
 
@@ -32,6 +37,7 @@ class Row:
         others are compared with.
     :param published: what FogROS2's authors published for it, as text.
     :param runs: how many runs ``value`` is the median of.
+    :param low: ``low`` to ``high``, in ``unit``, has 90 % of the runs; None if that is unknown.
     """
 
     what: str
@@ -41,6 +47,19 @@ class Row:
     better: Literal['less', 'more'] = 'less'
     published: str = ''
     runs: int = 1
+    low: Optional[float] = None
+    high: Optional[float] = None
+
+    @classmethod
+    def of(
+        cls, what: str, values: Sequence[float], unit: str, target: Optional[float] = None,
+        better: Literal['less', 'more'] = 'less', published: str = '',
+    ) -> Row:
+        """Return the median of runs with their spread: of fewer than 20 runs, all."""
+        ordered = sorted(values)
+        cut = len(ordered) // 20
+        return cls(what, statistics.median(ordered), unit, target, better, published,
+                   len(ordered), ordered[cut], ordered[-1 - cut])
 
     @property
     def reached(self) -> Optional[bool]:
@@ -113,7 +132,7 @@ def write(
     date: str = '',
 ) -> None:
     """
-    Write the figures as JSON, Markdown and a plot, and print the table.
+    Write the figures as JSON, as a table and as a picture, and print the table.
 
     :param computer: that the rows were measured on, '' for this one.
     :param date: of the measurement, '' for today.
@@ -123,50 +142,54 @@ def write(
     computer = computer or machine()
     data = {'machine': computer, 'date': date, 'rows': [dataclasses.asdict(r) for r in rows]}
     (results / f'{name}.json').write_text(json.dumps(data, indent=1) + '\n')
-    text = markdown(title, rows, f'{computer}; {date}')
+    print(show(name, title, results))
+
+
+def names(results: Path = RESULTS) -> list[str]:
+    """Return the names of all benchmarks that have stored figures."""
+    stored = {path.stem: json.loads(path.read_text()) for path in sorted(results.glob('*.json'))}
+    return [name for name, data in stored.items() if isinstance(data, dict) and 'machine' in data]
+
+
+def heading(name: str, results: Path = RESULTS) -> str:
+    """Return the title of stored figures, which their table has."""
+    return (results / f'{name}.md').read_text().partition('\n')[0].removeprefix('# ')
+
+
+def table(name: str, title: str, results: Path = RESULTS) -> str:
+    """Return the table of stored figures, with their picture if they have one."""
+    note, rows = stored(name, results)
+    return markdown(title, rows, note, f'{name}.png' if name in plots.PANELS else '')
+
+
+def stored(name: str, results: Path = RESULTS) -> tuple[str, list[Row]]:
+    """Return where and when stored figures were measured, and the figures."""
+    data = json.loads((results / f'{name}.json').read_text())
+    return f"{data['machine']}; {data['date']}", [Row(**row) for row in data['rows']]
+
+
+def show(name: str, title: str, results: Path = RESULTS) -> str:
+    """Write the table and the picture of stored figures, and return the table."""
+    text = table(name, title, results)
     (results / f'{name}.md').write_text(text)
-    print(text)
-    plot(results / f'{name}.png', title, rows)
+    if name in plots.PANELS:
+        plots.draw(results / f'{name}.png', title, *stored(name, results))
+    return text
 
 
-def markdown(title: str, rows: Sequence[Row], note: str) -> str:
-    """Return the table as Markdown."""
+def markdown(title: str, rows: Sequence[Row], note: str, picture: str = '') -> str:
+    """Return the table as Markdown, the picture below it."""
     words = {True: 'yes', False: '**no**', None: ''}
     lines = [f'# {title}', '', note, '',
              '| What | Value | Target | Reached | Runs | Published for FogROS2 |',
              '|---|---|---|---|---|---|']
     for row in rows:
         sign = '≤' if row.better == 'less' else '≥'
-        target = '' if row.target is None else f'{sign} {row.target:g} {row.unit}'
-        lines.append(f'| {row.what} | {row.value:.4g} {row.unit} | {target} | '
+        target = '' if row.target is None else f'{sign} {number(row.target)} {row.unit}'
+        spread = ('' if row.low is None or row.high is None else
+                  f' ({number(row.low)} to {number(row.high)})')
+        lines.append(f'| {row.what} | {number(row.value)} {row.unit}{spread} | {target} | '
                      f'{words[row.reached]} | {row.runs} | {row.published} |')
+    if picture:
+        lines += ['', f'![{title}]({picture})']
     return '\n'.join([*lines, ''])
-
-
-def plot(path: Path, title: str, rows: Sequence[Row]) -> None:
-    """Draw each figure as a bar, one panel per unit, its target as a line across."""
-    import matplotlib
-    matplotlib.use('Agg')
-    from matplotlib import pyplot
-
-    units = list(dict.fromkeys(row.unit for row in rows))
-    heights = [sum(row.unit == unit for row in rows) for unit in units]
-    figure, axes = pyplot.subplots(
-        len(units), figsize=(9, 0.7 + 0.55 * len(rows) + 0.7 * len(units)), squeeze=False,
-        height_ratios=heights, layout='constrained')
-    figure.suptitle(title)
-    for unit, axis in zip(units, axes[:, 0]):
-        shown = [row for row in rows if row.unit == unit]
-        for at, row in enumerate(shown):
-            colour = {True: '#2a7f62', False: '#b3412e', None: '#7a8794'}[row.reached]
-            axis.barh(at, row.value, color=colour, height=0.6)
-            axis.text(row.value, at, f' {row.value:.3g}', va='center')
-            if row.target is not None:
-                axis.plot([row.target] * 2, [at - 0.4, at + 0.4], color='black', linewidth=2)
-        axis.set_yticks(range(len(shown)), [row.what for row in shown])
-        axis.invert_yaxis()
-        axis.margins(x=0.15)
-        axis.set_xlabel(f'{unit} (black: target)')
-        axis.spines[['top', 'right']].set_visible(False)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)

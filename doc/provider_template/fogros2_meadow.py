@@ -2,7 +2,7 @@
 """
 A provider of virtual machines at Meadow, a made-up cloud, without the requests to its API.
 
-Copy this file and write the methods of ``Meadow``. doc/providers.md, section 6, has the rest.
+Copy this file and write the methods of ``Meadow``. doc/developers/providers_vm.md has the rest.
 """
 
 from __future__ import annotations

@@ -44,6 +44,13 @@ class FogMachine(Action):
 
     def execute(self, context: LaunchContext) -> None:
         """Create the machine's description, and register its name with the launch."""
+        machine = self.described(context)
+        # resolves the name, so that nodes can refer to it
+        machine.spec(context)
+        Coordinator.of(context).know(machine)
+
+    def described(self, context: LaunchContext) -> CloudInstance:
+        """Return the machine's description."""
         if self.machine is None:
             provider = values.resolve(context, self._provider)
             known = keywords.keywords(keywords.machine_class(provider))
@@ -53,9 +60,7 @@ class FogMachine(Action):
         for container in self._containers:
             self.machine.add_docker_container(**{
                 name: values.resolve(context, value) for name, value in container.items()})
-        # resolves the name, so that nodes can refer to it
-        self.machine.spec(context)
-        Coordinator.of(context).know(self.machine)
+        return self.machine
 
     @staticmethod
     def _is_empty(context: LaunchContext, value: Any) -> bool:

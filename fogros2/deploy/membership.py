@@ -12,7 +12,7 @@ from typing import Optional
 from fogros2 import plugin_system, process
 from fogros2.dds import addresses_of, DdsVendor
 from fogros2.deploy.robot import check_robot, clear, run
-from fogros2.errors import ConfigurationError, DdsError, VpnError
+from fogros2.errors import ConfigurationError, DdsError, did_you_mean, VpnError
 from fogros2.invitation import Invitation, JOINED, joined, own_key, read, SECRET, unseal
 from fogros2.model import Peer, to_json, VpnInterface
 from fogros2.store import boot_id, process_start, Store, write_private
@@ -144,8 +144,9 @@ def leave(name: str, store: Store) -> None:
 
     :raises ConfigurationError: this computer has not joined the machine.
     """
-    folder = joined(store).get(name)
-    if folder is None:
-        raise ConfigurationError(f"this computer has not joined a machine '{name}'",
-                                 'ros2 fog join INVITATION joins one')
-    clear(folder)
+    folders = joined(store)
+    if name not in folders:
+        raise ConfigurationError(
+            f"this computer has not joined a machine '{name}'",
+            did_you_mean(name, [*folders], 'ros2 fog join INVITATION joins one'))
+    clear(folders[name])

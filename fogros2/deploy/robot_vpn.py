@@ -237,7 +237,7 @@ def report_unfiltered(report: Reporter, machine: str, output: str) -> None:
         report(StepFailed(
             machine, 'DDS filter', 0.0, f'{output.strip()}: its DDS is not filtered '
             '(ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST keeps its nodes from the LAN, control '
-            'groups of version 2 give it the filter: doc/dds_network.md)', fatal=False))
+            'groups of version 2 give it the filter: doc/dds.md)', fatal=False))
 
 
 class VpnMember:

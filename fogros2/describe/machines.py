@@ -19,10 +19,6 @@ from fogros2.host.workspace import find_workspaces, underlays
 from fogros2.image_transport import topics
 from fogros2.model import (
     Bootstrap,
-    DEFAULT_CHECKPOINT_INTERVAL,
-    DEFAULT_LIFETIME,
-    DEFAULT_REPLACEMENTS,
-    DEFAULT_ROBOT_TIMEOUT,
     MachineSpec,
     OnExit,
     OnInterrupt,
@@ -61,13 +57,13 @@ class CloudInstance:
         a name, each launch invents one.
     :param on_exit: what happens to the machine when the launch ends: 'delete', 'stop' or 'keep'.
         With 'stop' and 'keep' a name is required, so that a later launch finds the machine.
-    :param lifetime: time until the machine ends by itself, in seconds or as '8h', '1d12h'.
+    :param lifetime: time until the machine ends by itself, in seconds or as '1d12h'; 8 hours.
     :param robot_timeout: time without contact to the launch until the machine stops its nodes;
-        seconds or as above. A machine that the launch has not reached yet ends 6 minutes after
-        its boot (a pod: 10 minutes, or this time if it is longer).
+        seconds or as above; 2 minutes. A machine that the launch has not reached yet ends
+        6 minutes after its boot (a pod: 10 minutes, or this time if it is longer).
     :param idle_timeout: time without use after which the machine ends as ``on_exit`` says, while
         the launch goes on; seconds or as above. See doc/howto/idle_machines.md.
-    :param bootstrap: how to install ROS 2 there: 'auto', 'apt', 'pip', 'none'.
+    :param bootstrap: how to install ROS 2 there: 'auto' (the default), 'apt', 'pip', 'none'.
     :param environment: variables for every node on the machine; PYTHONPATH, PATH and other lists
         of folders are prepended to the machine's own.
     :param apt: Debian packages that the machine needs, such as 'libzbar0'.
@@ -75,13 +71,14 @@ class CloudInstance:
         system has the same package, the system's version is used.
     :param on_interrupt: what to do when the provider reclaims the machine while its nodes run, or
         when neither the machine nor its provider has answered for 37 s.
-        'shutdown' ends the launch with a nonzero exit status. 'robot' restarts the nodes on the
-        robot, where their programs must be installed. They keep names and parameters, and lose
-        their memory: lifecycle states and loaded components. 'replace' creates a new machine;
-        until it is up, nodes whose programs are installed on the robot run there.
+        'shutdown', the default, ends the launch with a nonzero exit status. 'robot' restarts the
+        nodes on the robot, where their programs must be installed. They keep names and
+        parameters, and lose their memory: lifecycle states and loaded components. 'replace'
+        creates a new machine; until it is up, nodes whose programs are installed on the robot run
+        there.
     :param on_loss_after: silence after which on_interrupt='replace' replaces the machine, in
         seconds or as above; at least ``robot_timeout``, which is the default.
-    :param max_replacements: how often on_interrupt='replace' replaces the machine in a launch.
+    :param max_replacements: how often on_interrupt='replace' replaces the machine in a launch; 3.
     :param checkpoint: folder of its nodes, such as '$HOME/map', that a replacement takes over.
     :param checkpoint_interval: time between two copies of the folder to the robot.
     :param bandwidth: what its streams may use of the link in each direction, such as '10Mbit/s';
@@ -103,16 +100,16 @@ class CloudInstance:
         launch_foxglove: Bool = False, *,
         name: Optional[SomeSubstitutionsType] = None,
         on_exit: SomeSubstitutionsType = 'delete',
-        lifetime: Value = DEFAULT_LIFETIME,
-        robot_timeout: Value = DEFAULT_ROBOT_TIMEOUT,
+        lifetime: Optional[Value] = None,
+        robot_timeout: Optional[Value] = None,
         idle_timeout: Optional[Value] = None,
-        bootstrap: SomeSubstitutionsType = 'auto',
+        bootstrap: Optional[SomeSubstitutionsType] = None,
         environment: Optional[Mapping[str, SomeSubstitutionsType]] = None,
-        on_interrupt: SomeSubstitutionsType = 'shutdown',
+        on_interrupt: Optional[SomeSubstitutionsType] = None,
         on_loss_after: Optional[Value] = None,
-        max_replacements: Value = DEFAULT_REPLACEMENTS,
+        max_replacements: Optional[Value] = None,
         checkpoint: Optional[SomeSubstitutionsType] = None,
-        checkpoint_interval: Value = DEFAULT_CHECKPOINT_INTERVAL,
+        checkpoint_interval: Optional[Value] = None,
         bandwidth: Optional[Value] = None,
         monitor_allow: Optional[Sequence[SomeSubstitutionsType]] = None,
         apt: Optional[Sequence[SomeSubstitutionsType]] = None,
@@ -174,6 +171,11 @@ class CloudInstance:
         if self._spec is not None:
             return self._spec.name
         return values.describe(self._name)
+
+    @property
+    def settings(self) -> list[str]:
+        """The keywords of every machine that the launch file gives, of those in ``SETTINGS``."""
+        return list(self._values)
 
     @property
     def own_name(self) -> SomeSubstitutionsType:
@@ -305,7 +307,7 @@ class CloudInstance:
                 apt=self._wanted(context, 'apt'), pip=self._wanted(context, 'pip'),
                 share=self._wanted(context, 'share'), **settings)
             self._check_findable(spec.on_exit)
-            _check_loss(spec)
+            check_loss(spec)
             self._spec = spec
         return self._spec
 
@@ -478,7 +480,7 @@ def parse_bandwidth(what: str, value: Union[str, int, float]) -> float:
     return bits
 
 
-def _check_loss(spec: MachineSpec) -> None:
+def check_loss(spec: MachineSpec) -> None:
     """
     Check that a lost machine has stopped its nodes before they start elsewhere.
 
@@ -537,3 +539,14 @@ _CHECKS: dict[str, Any] = {
     'checkpoint_interval': parse_duration,
     'bandwidth': parse_bandwidth,
 }
+#: Keywords of every machine that a file of defaults may have.
+SETTINGS = tuple(name for name in _CHECKS if name not in ('on_exit', 'checkpoint'))
+
+
+def check_setting(name: str, value: Any) -> Any:
+    """
+    Return the value of a keyword in ``SETTINGS`` as a MachineSpec has it.
+
+    :raises ConfigurationError: a wrong value.
+    """
+    return _CHECKS[name](name, value)

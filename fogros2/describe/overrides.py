@@ -84,11 +84,6 @@ class Overrides:
         return next((override for override in reversed(self._overrides)
                      if fnmatch.fnmatchcase(name, override.pattern)), None)
 
-    def apply(self, spec: MachineSpec, context: LaunchContext) -> MachineSpec:
-        """Return the spec to use for a machine."""
-        override = self.of(spec.name)
-        return spec if override is None else override.instead(spec, context)
-
     def check(self, names: Iterable[str]) -> None:
         """
         Check that each override matches a machine of the launch.

@@ -228,7 +228,8 @@ def _closure() -> Iterator[metadata.Distribution]:
 
     A robot with an installation of ROS 2 sends only this package, to machines that have one too.
     """
-    todo, seen = [OWN, EMBEDDED, PIP, *locked.ros()], set(_ROBOT_ONLY)
+    ros = locked.ros()
+    todo, seen = [OWN, EMBEDDED, PIP, *ros], set(_ROBOT_ONLY)
     try:
         metadata.distribution(EMBEDDED)
     except metadata.PackageNotFoundError:
@@ -236,7 +237,8 @@ def _closure() -> Iterator[metadata.Distribution]:
         return
     while todo:
         name = todo.pop(0)
-        if name in seen:
+        # ROS 2's distributions ask for others that only builds need
+        if name in seen or name.startswith(locked.ROS) and name not in ros:
             continue
         seen.add(name)
         try:

@@ -15,7 +15,7 @@ from fogros2.provider.offers import Offer, Wants, wants
 
 #: Options that are requirements; see :func:`fogros2.provider.offers.wants`.
 WANTS = ('arch', 'min_cpu', 'min_memory_gb', 'cpu_type', 'gpu', 'gpu_memory_gb', 'max_price',
-         'spot')
+         'spot', 'disk_size')
 #: Number of offers to try; the cheapest of each other cloud comes in addition.
 TRIES = 6
 

@@ -50,6 +50,7 @@ class MachineType:
     :param gpus: number of GPUs, with ``gpu_memory_gb`` GiB each.
     :param gpu: manufacturer and name, such as 'NVIDIA T4'.
     :param spot: whether it exists as a spot machine.
+    :param disk_gb: size of the disk that belongs to it; 0 if a machine's disk has any size.
     """
 
     name: str
@@ -62,6 +63,7 @@ class MachineType:
     gpu: str = ''
     gpu_memory_gb: float = 0.0
     spot: bool = False
+    disk_gb: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +82,7 @@ class Wants:
     :param spot: compare spot prices.
     :param cores: exact number of physical cores, as FogROS2 asks; None for any.
     :param threads_per_core: exact number, as FogROS2 asks; None for any.
+    :param disk_gb: minimum size of the disk in GB, 0 if nobody asks for one.
     """
 
     arch: str = ''
@@ -93,6 +96,7 @@ class Wants:
     spot: bool = False
     cores: Optional[int] = None
     threads_per_core: Optional[int] = None
+    disk_gb: int = 0
 
     def __str__(self) -> str:
         words = [f'{self.min_cpu} CPUs', f'{self.min_memory_gb:g} GB']
@@ -106,6 +110,8 @@ class Wants:
         if self.threads_per_core is not None:
             words.append(f"{self.threads_per_core} thread{'s' * (self.threads_per_core > 1)}"
                          ' a core')
+        if self.disk_gb:
+            words.append(f'a disk of {self.disk_gb} GB')
         if self.spot:
             words.append('spot')
         return ', '.join(words)
@@ -165,6 +171,7 @@ def wants(
     gpu: Union[bool, int, str, None] = None, gpu_memory_gb: Optional[float] = None,
     max_price: Union[Decimal, str, float, None] = None, spot: bool = False,
     cores: Optional[int] = None, threads_per_core: Optional[int] = None,
+    disk_size: Optional[float] = None,
 ) -> Wants:
     """
     Check the requirements of a launch file or a command line; see :class:`Wants`.
@@ -183,6 +190,7 @@ def wants(
                                  'there are x86_64, arm64 and any')
     for name, value in (('min_cpu', min_cpu), ('min_memory_gb', min_memory_gb), ('gpu', number),
                         ('gpu_memory_gb', gpu_memory_gb), ('cores', cores),
+                        ('disk_size', disk_size),
                         ('threads_per_core', threads_per_core)):
         if value is not None and not 0 <= value < 1_000_000:
             raise ConfigurationError(f'{name} can not be {value:g}',
@@ -190,7 +198,8 @@ def wants(
     return Wants(
         _ARCHITECTURES[given.lower()], MIN_CPU if min_cpu is None else int(min_cpu),
         MIN_MEMORY_GB if min_memory_gb is None else float(min_memory_gb), cpu_type or '', number,
-        named, float(gpu_memory_gb or 0), dollars(max_price), spot, cores, threads_per_core)
+        named, float(gpu_memory_gb or 0), dollars(max_price), spot, cores, threads_per_core,
+        int(disk_size or 0))
 
 
 def dollars(value: Union[Decimal, str, float, None]) -> Optional[Decimal]:
@@ -217,6 +226,7 @@ def fits(kind: MachineType, asked: Wants) -> bool:
             and kind.memory_gb >= asked.min_memory_gb
             and asked.cpu_type.lower() in kind.cpu.lower()
             and (not asked.spot or kind.spot)
+            and (not kind.disk_gb or kind.disk_gb >= asked.disk_gb)
             and (not asked.gpus or kind.gpus >= asked.gpus and _is_gpu(kind, asked))
             and (asked.cores is None or kind.cores == asked.cores)
             and (asked.threads_per_core is None

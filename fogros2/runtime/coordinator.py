@@ -31,7 +31,7 @@ from launch.event_handlers import OnShutdown
 import launch.logging
 from launch.substitutions import SubstitutionFailure
 
-from fogros2.describe import values
+from fogros2.describe import defaults, values
 from fogros2.describe.keywords import ROBOT
 from fogros2.describe.machines import CloudInstance
 from fogros2.errors import Cancelled, ConfigurationError, did_you_mean, FogError
@@ -158,6 +158,7 @@ class Coordinator:
             return
         self._check_overrides(early=True)
         context = self._context
+        defaults.check(context.environment)
         self.base_environment = _environment_at_start(context)
         self._console = Console()
         self._pool = ThreadPoolExecutor(_THREADS, 'fogros2')
@@ -287,8 +288,7 @@ class Coordinator:
         return resolved
 
     def _spec(self, machine: CloudInstance) -> MachineSpec:
-        spec = machine.spec(self._context)
-        return spec if self._overrides is None else self._overrides.apply(spec, self._context)
+        return defaults.resolved(machine, self._overrides, self._context)
 
     def session(self, machine: SomeMachine) -> Session:
         """

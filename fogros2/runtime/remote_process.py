@@ -22,6 +22,8 @@ from fogros2.runtime.remote_run import RemoteRun
 from fogros2.runtime.republishers import AddedProcess
 
 if TYPE_CHECKING:
+    from launch import SomeSubstitutionsType
+
     from fogros2.describe.machines import SomeMachine
     from fogros2.image_transport.streams import StreamTopic
     from fogros2.runtime.session import Session
@@ -38,6 +40,7 @@ class RemoteProcess(private.RemoteStart):
 
     _fogros2_machine: SomeMachine
     _fogros2_streams: Sequence[StreamTopic] = ()
+    _image: Optional[SomeSubstitutionsType] = None
     #: Container image that the process runs in, and more options for its ``docker run``.
     _fogros2_image = ''
     _fogros2_image_options: Sequence[str] = ()
@@ -60,7 +63,7 @@ class RemoteProcess(private.RemoteStart):
     def planned(self) -> Planned:
         """The machine, and the program if nothing can change it."""
         # only its machine knows what is in an image
-        return self.machine, None if self._fogros2_image else node_spec.program_of(self)
+        return self.machine, None if self._image is not None else node_spec.program_of(self)
 
     def prepare(self, context: LaunchContext) -> None:
         """Resolve the action, as ExecuteLocal does, and create its NodeSpec."""

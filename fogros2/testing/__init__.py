@@ -3,15 +3,17 @@
 Fakes and contracts for the tests of plugin authors, and for our own tests.
 
 A provider's author subclasses :class:`ProviderContract` and writes its method ``make``; pytest
-then runs the contract against the provider. :class:`ShellContract` works the same way.
+then runs the contract against the provider. :class:`VmContract` has more tests, for a cloud of
+virtual machines whose service a test can disturb. :class:`ShellContract` works the same way.
 ``FakeProvider`` passes the same contract; ``FakeShell`` runs no command.
 """
 
 from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream, FakeVpn
 from fogros2.testing.provider_contract import ProviderContract, request_for
 from fogros2.testing.shell_contract import ShellContract
+from fogros2.testing.vm_contract import VmContract
 
 __all__ = [
     'FakeProvider', 'FakeShell', 'FakeStream', 'FakeVpn', 'ProviderContract',
-    'ShellContract', 'request_for',
+    'ShellContract', 'VmContract', 'request_for',
 ]

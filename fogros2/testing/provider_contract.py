@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 import contextlib
 import dataclasses
 import ipaddress
 import secrets
 import threading
 import time
+from types import MappingProxyType
 from typing import Any, ClassVar, Optional
 import uuid
 
@@ -25,7 +26,7 @@ from fogros2.errors import (
     Unsupported,
 )
 from fogros2.model import CreateRequest, Machine, MachineSpec, MachineState
-from fogros2.provider import Capabilities, Provider, TAG_EXPIRES, TAG_NAME
+from fogros2.provider import Capabilities, Provider, TAG_EXPIRES, TAG_NAME, TAG_ON_EXIT
 from fogros2.provider.offers import MachineType, Offer, wants
 from fogros2.testing.shell_contract import raised
 from fogros2.waiting import wait_until
@@ -58,13 +59,22 @@ class ProviderContract:
         raise LookupError(f'{type(self).__name__} has to say what it tests: write make()')
 
     @contextlib.contextmanager
-    def machine(self, **tags: str) -> Iterator[tuple[Provider, MachineSpec, CreateRequest, str]]:
-        """Yield a new machine, and delete it afterwards."""
-        provider, options = self.make()
-        spec = MachineSpec(f't{secrets.token_hex(3)}', provider.name, options)
-        if provider.capabilities.stop:
+    def machine(
+        self, tags: Mapping[str, str] = MappingProxyType({}), *,
+        options: Mapping[str, Any] = MappingProxyType({}),
+        agent: Mapping[str, Any] = MappingProxyType({}),
+    ) -> Iterator[tuple[Provider, MachineSpec, CreateRequest, str]]:
+        """
+        Yield a new machine, and delete it afterwards.
+
+        :param options: in addition to those of ``make``.
+        :param agent: configuration of the agent that ``create`` starts.
+        """
+        provider, usual = self.make()
+        spec = MachineSpec(f't{secrets.token_hex(3)}', provider.name, {**usual, **options})
+        if provider.capabilities.stop and tags.get(TAG_ON_EXIT, 'stop') == 'stop':
             spec = dataclasses.replace(spec, on_exit='stop')
-        request = request_for(spec, **tags)
+        request = dataclasses.replace(request_for(spec, **tags), agent_config=dict(agent))
         machine_id = provider.create(spec, request)
         try:
             yield provider, spec, request, machine_id
@@ -163,7 +173,7 @@ class ProviderContract:
         if not provider.capabilities.owned:
             raised(Unsupported, lambda: list(provider.find({})))
             return
-        with self.machine(**{'fogros2-test': mark}) as (provider, spec, _, machine_id):
+        with self.machine({'fogros2-test': mark}) as (provider, spec, _, machine_id):
             for tags in ({TAG_NAME: spec.name}, {'fogros2-test': mark},
                          {'fogros2-test': mark, TAG_NAME: spec.name}):
                 assert [m.id for m in provider.find(tags)] == [machine_id]
@@ -213,11 +223,11 @@ class ProviderContract:
             assert time.monotonic() - begin < self.timeout / 2
 
     def test_adopted_machine_has_the_tags_of_its_launch(self) -> None:
-        with self.machine(**{TAG_EXPIRES: '1'}) as (provider, spec, _, machine_id):
-            self.reached(provider, machine_id)
+        with self.machine({TAG_EXPIRES: '1'}) as (provider, spec, _, machine_id):
+            before = self.reached(provider, machine_id).tags
             provider.adopt(machine_id, spec, {TAG_EXPIRES: '2'})
-            if provider.capabilities.adopt:
-                assert provider.describe(machine_id).tags[TAG_EXPIRES] == '2'
+            changed = {TAG_EXPIRES: '2'} if provider.capabilities.adopt else {}
+            assert {**before, **changed}.items() <= provider.describe(machine_id).tags.items()
 
     def test_stopped_machine_starts_again(self) -> None:
         with self.machine() as (provider, _, _, machine_id):
@@ -260,7 +270,7 @@ class ProviderContract:
                 provider.open_port(machine, 8766, [])
 
     def test_pinned_host_key_is_reported_everywhere(self) -> None:
-        with self.machine() as (provider, _, _, machine_id):
+        with self.machine() as (provider, _, request, machine_id):
             key = ' '.join(PUBLIC_KEY.split()[:2])
             if not provider.capabilities.one_time_host_key:
                 raised(Unsupported, lambda: provider.pin(machine_id, key))
@@ -268,8 +278,9 @@ class ProviderContract:
             self.reached(provider, machine_id)
             provider.pin(machine_id, key)
             another, _ = self.make()
-            shell = another.describe(machine_id).shell
-            assert shell is not None and shell.host_key == key
+            found = another.describe(machine_id)
+            assert found.shell is not None and found.shell.host_key == key
+            assert request.tags.items() <= found.tags.items()
 
     # -- images, regions, prices ----------------------------------------------------------------
 

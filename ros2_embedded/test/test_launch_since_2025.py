@@ -40,7 +40,7 @@ from launch_ros.substitutions import FindPackageShare
 import pytest
 import yaml
 
-PAGE = Path(__file__).parents[2] / 'doc/ros2_embedded.md'
+PAGE = Path(__file__).parents[2] / 'doc/developers/ros2_embedded.md'
 
 
 def matched(package):

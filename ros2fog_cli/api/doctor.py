@@ -18,6 +18,7 @@ from typing import Literal, Optional
 
 from fogros2 import deploy, plan, plugin_system, process
 from fogros2.dds import cyclonedds
+from fogros2.describe import defaults
 from fogros2.errors import Cancelled, FogError, Unsupported
 from fogros2.host.inspection import DISTRO
 from fogros2.model import Command
@@ -63,8 +64,8 @@ def examine(*, lan_seconds: float = 1.5, providers: Sequence[str] = ()) -> list[
     """
     checks: list[Callable[[], Check]] = [
         python, packages, programs, root, tun, wireguard, engine, overlay, firewall_program, ros,
-        rmw, cyclone_uri, receive_buffer, udp_port, ssh_keys, firewall, state, clocks,
-        lambda: lan_peers(lan_seconds)]
+        rmw, cyclone_uri, machine_defaults, receive_buffer, udp_port, ssh_keys, firewall, state,
+        clocks, lambda: lan_peers(lan_seconds)]
     known = [name for name in plugin_system.names('fogros2.provider') if name not in _LOOKED_AT]
     for name in dict.fromkeys([*known, *providers]):
         checks.append(functools.partial(provider, name, needed=name in providers))
@@ -246,6 +247,19 @@ def cyclone_uri() -> Check:
     if missing := cyclonedds.closed(uri)[len(uri):]:
         return Check(name, 'failed', f'its XML has no {missing}', f'add {missing} at its end')
     return Check(name, 'ok', 'readable; ours is appended' if uri else 'not set')
+
+
+def machine_defaults() -> Check:
+    """Check the files with defaults of machines, and show what they set."""
+    name, paths = 'defaults of machines', defaults.files(os.environ)
+    try:
+        shown = [f'{path}: ' + ', '.join(
+            f"{f'{provider}.' * bool(provider)}{keyword}={value!r}"
+            for provider, table in tables.items() for keyword, value in table.items())
+            for path in paths if (tables := defaults.read(path))]
+    except FogError as error:
+        return _failed(name, error)
+    return Check(name, 'ok', '; '.join(shown) or f'none in {paths[0]}')
 
 
 def receive_buffer() -> Check:

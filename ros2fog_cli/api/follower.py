@@ -18,7 +18,7 @@ from fogros2.model import Command
 from fogros2.shell import Shell
 from fogros2.store import Record
 from ros2fog_cli.api import reach
-from ros2fog_cli.api.log import describe
+from ros2fog_cli.api.log import Lines
 from ros2fog_cli.api.machines import Entry
 
 #: Number of log lines to keep, and longest line in characters.
@@ -51,6 +51,7 @@ class Follower:
         self._lock = threading.Lock()
         self._lines: deque[dict[str, Any]] = deque(maxlen=LINES)
         self._number = self._seq = 0
+        self._log = Lines()
         self._vpn_at = -1e9
         self._pids: tuple[int, ...] = ()
         self.vpn: Optional[dict[str, Any]] = None
@@ -144,12 +145,9 @@ class Follower:
     def _take(self, event: Event) -> None:
         seq, at = event.get('seq'), event.get('time')
         self._seq = seq if isinstance(seq, int) else self._seq
-        text = describe(event)
-        if text is None:
-            return
         error = event['event'] == 'output' and event['stream'] == 'stderr'
         with self._lock:
-            for line in text.splitlines():
+            for line in self._log.of(event):
                 self._number += 1
                 self._lines.append({
                     'number': self._number, 'node': str(event.get('name', '')), 'error': error,

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Describe an agent's events in words."""
+"""Describe an agent's events in lines of text."""
 
 from __future__ import annotations
-
-from typing import Optional
 
 from fogros2.events import Event
 
@@ -17,9 +15,33 @@ _TEXTS = {
     'notice': 'the provider takes the machine away: {reason}',
     'gap': '{count} older events are not kept any more',
 }
+#: Characters of output without a line's end that are kept for its rest.
+_KEPT = 65_536
 
 
-def describe(event: Event) -> Optional[str]:
-    """Return an event as text, None for an event that is not for users."""
-    text = _TEXTS.get(event['event'])
-    return None if text is None else text.format_map(event)
+class Lines:
+    """The lines of a log: a node's output comes in pieces, which may end within a line."""
+
+    def __init__(self) -> None:
+        #: The begin of a line, by name of the node and stream.
+        self.begun: dict[tuple[str, str], str] = {}
+
+    def of(self, event: Event) -> list[str]:
+        """Return the lines that an event completes, none for an event that is not for users."""
+        form = _TEXTS.get(event['event'])
+        if form is None:
+            return []
+        text = form.format_map(event)
+        if event['event'] == 'exited':
+            last = [source for source in self.begun if source[0] == event['name']]
+            return [*map(self.begun.pop, last), text]
+        if event['event'] != 'output':
+            return text.splitlines()
+        source = event['name'], event['stream']
+        # the last line is the one that has no end yet
+        *lines, rest = f'{self.begun.pop(source, "")}{text}|'.splitlines()
+        if len(rest) > _KEPT:
+            return [*lines, rest[:-1]]
+        if rest != '|':
+            self.begun[source] = rest[:-1]
+        return lines

@@ -160,7 +160,7 @@ class Entry:
         return self.record.machine_id if self.record is not None else None
 
     def to_json(self, now: Optional[float] = None) -> dict[str, Any]:
-        """Return the entry as JSON values: times in seconds, money in US dollars as a string."""
+        """Return the entry as JSON values: times in seconds, money in US dollars."""
         now = time.time() if now is None else now
         return {
             'name': self.name, 'provider': self.provider, 'state': self.state,
@@ -178,9 +178,8 @@ class Entry:
             'monitor': self.monitor or None,
             'monitor_open': self.record.monitor_open or None
             if self.record is not None and self.monitor else None,
-            'cost_per_hour': None if self.cost is None else str(self.cost),
-            'cost': None if (spent := self.spent(now)) is None
-            else str(spent.quantize(Decimal('0.000001'))),
+            'cost_per_hour': None if self.cost is None else float(self.cost),
+            'cost': None if (spent := self.spent(now)) is None else round(float(spent), 6),
         }
 
 

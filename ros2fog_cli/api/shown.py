@@ -96,7 +96,7 @@ def machine_json(key: str, shown: Shown) -> dict[str, Any]:
         'launch_alive': record is not None and record.launch_alive and not shown.ended,
         'created': entry.created, 'expires': entry.expires, 'ended': shown.ended or None,
         'address': entry.address, 'place': entry.known.region, 'kind': entry.known.kind,
-        'cost_per_hour': None if entry.cost is None else str(entry.cost),
+        'cost_per_hour': None if entry.cost is None else float(entry.cost),
         'on_exit': record.spec.on_exit if record is not None else '',
         'bridge': record.monitor if record is not None else 0,
         'steps': steps,

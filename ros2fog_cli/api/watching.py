@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import select
 import shutil
@@ -15,7 +14,7 @@ from typing import Any, Optional
 from fogros2.errors import DeadlineExceeded
 from fogros2.store import check_name
 from fogros2.waiting import wait_until
-from ros2fog_cli.api import reach, screen
+from ros2fog_cli.api import output, reach, screen
 from ros2fog_cli.api.live import Live, PRESENT
 
 #: Time-out of the measurement of stream rates, in seconds.
@@ -96,7 +95,7 @@ def _lines(live: Live, name: str, interval: float, as_json: bool) -> None:
         version = state['version']
         machine = _machine(state, name)
         if as_json:
-            text = json.dumps(machine)
+            text = output.as_json({'machine': machine}, indent=None)
         else:
             text = screen.summary(machine) if machine is not None else f'{name}: {_WAITING}'
         if text != said and version > 0:

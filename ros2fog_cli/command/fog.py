@@ -22,13 +22,18 @@ class FogCommand(CommandExtension):
         """Add the verbs; only the chosen one is imported."""
         self._subparser = parser
         parser.error = functools.partial(_error, parser)  # type: ignore[method-assign]
+        parser.add_argument('--version', action='store_true', help='show the version and exit')
         add_subparsers_on_demand(
             parser, cli_name, '_verb', 'fogros2.verb', required=False, argv=argv)
 
     def main(
         self, *, parser: argparse.ArgumentParser, args: argparse.Namespace,
     ) -> Union[int, str, None]:
-        """Run the verb, or print the help when there is none; return the exit status."""
+        """Run the verb, or print version or help; return the exit status."""
+        if args.version:
+            from importlib import metadata
+            print(f"fogros2 {metadata.version('fogros2')}")
+            return 0
         if not hasattr(args, '_verb'):
             self._subparser.print_help()
             return 0

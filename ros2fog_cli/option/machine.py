@@ -6,6 +6,8 @@ from __future__ import annotations
 import argparse
 from typing import Any, Optional, TYPE_CHECKING
 
+from ros2fog_cli.verb import add_overrides
+
 if TYPE_CHECKING:
     from launch import LaunchDescription
 
@@ -28,12 +30,26 @@ class MachineOption:
         self, parser: argparse.ArgumentParser, cli_name: str, *, argv: Any = None,
     ) -> None:
         """Add ``--machine``."""
-        argument = parser.add_argument(
-            '--machine', action='append', default=[], metavar='NAME=PROVIDER[,KEYWORD=VALUE...]',
-            help="Run a cloud machine of the launch elsewhere, such as planner=container, "
-                 "planner=aws,region=eu-west-1, planner=ssh:user@host, or '*=robot': all of them "
-                 'on this computer, without the cloud')
-        argument.completer = complete  # type: ignore[attr-defined]
+        add_overrides(parser)
+
+    def preview(
+        self, launch_description: LaunchDescription, args: argparse.Namespace,
+        arguments: dict[str, str],
+    ) -> str:
+        """
+        Return what ``-s`` and ``-p`` show of the machines; ROS 2's own ros2launch does not ask.
+
+        :param arguments: launch arguments.
+        :raises ConfigurationError: a value of ``--machine`` is invalid.
+        """
+        from fogros2.describe.overrides import Overrides
+        from ros2fog_cli.api.preview import Preview
+        overrides = Overrides(args.machine) if args.machine else None
+        found = Preview(launch_description, arguments, overrides)
+        if all(machine.spec is None and not machine.note for machine in found.machines):
+            return ''
+        return '\n'.join(['', 'Machines (ros2 fog plan asks for their prices):',
+                          *(f'    {line}' for line in found.lines()), ''])
 
     def prestart(self, args: argparse.Namespace) -> None:
         """
@@ -63,25 +79,3 @@ class MachineOption:
 
     def postlaunch(self, launch_return_code: int, args: argparse.Namespace) -> None:
         """Do nothing."""
-
-
-def complete(prefix: str, **_: object) -> list[str]:
-    """
-    Return the completions of an argument that begins with ``prefix``.
-
-    First come the names of machines that this computer knows, then providers, then the keywords
-    of the provider. The completion reads no launch file.
-    """
-    name, equals, rest = prefix.partition('=')
-    if not equals:
-        from ros2fog_cli.verb import machine_names
-        return [f'{one}=' for one in [*machine_names(), '*'] if one.startswith(name)]
-    from fogros2.describe import keywords
-    before, comma, last = rest.rpartition(',')
-    if not comma:
-        return [f'{name}={one}' for one in keywords.providers() if one.startswith(last)]
-    provider = before.partition(',')[0].partition(':')[0]
-    if '=' in last or provider not in keywords.providers():
-        return []
-    return [f'{name}={before},{one}=' for one in keywords.keywords(
-        keywords.machine_class(provider)) if one.startswith(last) and one != 'name']

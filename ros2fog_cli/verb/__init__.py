@@ -92,6 +92,51 @@ def port(text: str) -> int:
     return int(text)
 
 
+def seconds(text: str) -> float:
+    """
+    Parse a number of seconds, 0 or more.
+
+    :raises argparse.ArgumentTypeError: it is none.
+    """
+    try:
+        if 0 <= float(text) < float('inf'):
+            return float(text)
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"'{text}' is no number of seconds")
+
+
+def add_overrides(parser: argparse.ArgumentParser) -> None:
+    """Add ``--machine``."""
+    argument = parser.add_argument(
+        '--machine', action='append', default=[], metavar='NAME=PROVIDER[,KEYWORD=VALUE...]',
+        help="Run a cloud machine of the launch elsewhere, such as planner=container, "
+             "planner=aws,region=eu-west-1, planner=ssh:user@host, or '*=robot': all of them "
+             'on this computer, without the cloud')
+    argument.completer = overrides  # type: ignore[attr-defined]
+
+
+def overrides(prefix: str, **_: object) -> list[str]:
+    """
+    Return the completions of an argument of ``--machine`` that begins with ``prefix``.
+
+    First come the names of machines that this computer knows, then providers, then the keywords
+    of the provider. The completion reads no launch file.
+    """
+    name, equals, rest = prefix.partition('=')
+    if not equals:
+        return [f'{one}=' for one in [*machine_names(), '*'] if one.startswith(name)]
+    from fogros2.describe import keywords
+    before, comma, last = rest.rpartition(',')
+    if not comma:
+        return [f'{name}={one}' for one in keywords.providers() if one.startswith(last)]
+    provider = before.partition(',')[0].partition(':')[0]
+    if '=' in last or provider not in keywords.providers():
+        return []
+    return [f'{name}={before},{one}=' for one in keywords.keywords(
+        keywords.machine_class(provider)) if one.startswith(last) and one != 'name']
+
+
 def region_names() -> list[str]:
     """Return 'all' and the regions of all providers, without any request."""
     from fogros2 import plugin_system
@@ -122,6 +167,12 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON, for programs')
 
 
+def print_json(**fields: object) -> None:
+    """Print what ``--json`` of a verb shows."""
+    from ros2fog_cli.api import output
+    say(output.as_json(fields))
+
+
 def add_page(parser: argparse.ArgumentParser) -> None:
     """Add the options of verbs that serve a page."""
     parser.add_argument('--port', type=port, default=0,
@@ -137,6 +188,7 @@ def say(text: str, *, error: bool = False) -> None:
     :param error: print it to standard error.
     """
     import os
+
     from ros2fog_cli.api import progress
     stream = sys.stderr if error else sys.stdout
     with progress.aside():

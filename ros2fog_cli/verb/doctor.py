@@ -5,10 +5,16 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import sys
 
-from ros2fog_cli.verb import add_json, complete, provider_names, VerbExtension
+from ros2fog_cli.verb import (
+    add_json,
+    complete,
+    print_json,
+    provider_names,
+    seconds,
+    VerbExtension,
+)
 
 _MARKS = {'ok': ' ok ', 'warning': 'warn', 'failed': 'FAIL'}
 _STYLES = {'ok': 'good', 'warning': 'warning', 'failed': 'bad'}
@@ -24,7 +30,7 @@ class DoctorVerb(VerbExtension):
             '--provider', nargs='+', default=[], metavar='NAME',
             help='provider that must work; others are checked if they are configured'),
                  provider_names)
-        parser.add_argument('--lan-seconds', type=float, default=1.5, metavar='SECONDS',
+        parser.add_argument('--lan-seconds', type=seconds, default=1.5, metavar='SECONDS',
                             help='how long to search the LAN for ROS 2 (0: not at all)')
 
     def main(self, *, args: argparse.Namespace) -> int:
@@ -32,7 +38,7 @@ class DoctorVerb(VerbExtension):
         from ros2fog_cli.api import doctor, screen
         checks = doctor.examine(lan_seconds=args.lan_seconds, providers=args.provider)
         if args.json:
-            print(json.dumps([dataclasses.asdict(check) for check in checks], indent=2))
+            print_json(checks=[dataclasses.asdict(check) for check in checks])
         else:
             paint = screen.painter(sys.stdout)
             for check in checks:

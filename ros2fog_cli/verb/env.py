@@ -4,10 +4,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 
-from ros2fog_cli.verb import add_json, add_name, VerbExtension
+from ros2fog_cli.verb import add_json, add_name, print_json, VerbExtension
 
 
 class EnvVerb(VerbExtension):
@@ -24,7 +23,7 @@ class EnvVerb(VerbExtension):
         from ros2fog_cli.api import joining, output
         folder, variables = joining.launch_of(args.name, Store())
         if args.json:
-            print(json.dumps(variables, indent=2))
+            print_json(variables=variables)
         else:
             print(*joining.shell_lines(folder, variables), sep='\n',
                   file=output.uncleaned(sys.stdout))

@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import argparse
-import json
 
-from ros2fog_cli.verb import add_json, add_region, say, VerbExtension, warn
+from ros2fog_cli.verb import add_json, add_region, print_json, say, VerbExtension, warn
 
 
 class GcVerb(VerbExtension):
@@ -51,7 +50,7 @@ class GcVerb(VerbExtension):
                 for what in endings.tidy(warn, regions=args.region):
                     note('leftover', what, 'its machine ended by itself')
         if args.json:
-            say(json.dumps(done, indent=2))
+            print_json(cleared=done)
         elif not done:
             say('nothing to clear')
         return int(any(one['error'] for one in done))

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 
@@ -14,6 +13,7 @@ from ros2fog_cli.verb import (
     agreed,
     complete,
     machine_names,
+    print_json,
     say,
     VerbExtension,
     warn,
@@ -119,7 +119,7 @@ def _list(args: argparse.Namespace) -> int:
     from ros2fog_cli.api import images, table
     found = images.survey(warn, regions=args.region)
     if args.json:
-        print(json.dumps([images.to_json(image) for image in found], indent=2))
+        print_json(images=[images.to_json(image) for image in found])
     elif not found:
         print('no images')
     else:
@@ -156,13 +156,13 @@ def _make(args: argparse.Namespace, name: str) -> int:
                     f'{baking.name}: {state}, {seconds:.0f} s'))
     except KeyboardInterrupt:
         warn(f'the image goes on being made: {baking.id} (ros2 fog image list shows it)')
-        return 130
+        raise
     except FogError as error:
         warn(f'{baking.name}: {error}')
         return 1
     if args.json:
-        print(json.dumps({'id': baking.id, 'name': baking.name, 'provider': baking.provider,
-                          'dependencies': baking.dependencies}, indent=2))
+        print_json(id=baking.id, name=baking.name, provider=baking.provider,
+                   dependencies=baking.dependencies)
     else:
         print(f"{'making' if args.no_wait else 'made'} {baking.name} ({baking.id})")
     return 0

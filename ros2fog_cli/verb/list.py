@@ -4,10 +4,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
 
-from ros2fog_cli.verb import add_json, add_region, VerbExtension, warn
+from ros2fog_cli.verb import add_json, add_region, print_json, VerbExtension, warn
 
 
 class ListVerb(VerbExtension):
@@ -24,7 +23,7 @@ class ListVerb(VerbExtension):
         entries = machines.survey(warn, regions=args.region)
         now = time.time()
         if args.json:
-            print(json.dumps([entry.to_json(now) for entry in entries], indent=2))
+            print_json(machines=[entry.to_json(now) for entry in entries])
             return 0
         if not entries:
             print('no machines')

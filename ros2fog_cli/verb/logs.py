@@ -27,17 +27,22 @@ class LogsVerb(VerbExtension):
         """Print the log."""
         from fogros2.errors import ConfigurationError, did_you_mean
         from ros2fog_cli.api import reach
+        from ros2fog_cli.api.log import Lines
         entry = reach.find(args.name, warn, regions=args.region)
         names: set[str] = set()
+        log = Lines()
 
         def take(event: Event) -> None:
-            names.add(str(event.get('name', '')))
-            show(event, args.node)
+            name = str(event.get('name', ''))
+            names.add(name)
+            show(name, str(event.get('stream', '')), log.of(event), args.node)
 
         with reach.session(entry) as shell:
             client = reach.agent(entry, shell)
             try:
                 there = reach.follow(client, take, forever=args.follow)
+                for (name, stream), line in log.begun.items():
+                    show(name, stream, [line], args.node)
             except KeyboardInterrupt:
                 return 0
             except BrokenPipeError:
@@ -53,13 +58,10 @@ class LogsVerb(VerbExtension):
         return 0 if there else 1
 
 
-def show(event: Event, node: Optional[str]) -> None:
-    """Print one event of the agent's log."""
-    from ros2fog_cli.api.log import describe
-    text = describe(event)
-    if text is None or (node and event.get('name', node) != node):
+def show(name: str, stream: str, lines: list[str], node: Optional[str]) -> None:
+    """Print lines of a node's log, or of the machine's if ``name`` is ''."""
+    if node and name not in ('', node):
         return
-    name = f"[{event.get('name')}] " if event.get('name') else ''
-    stream = sys.stderr if event.get('stream') == 'stderr' else sys.stdout
-    for line in text.splitlines() or ['']:
-        print(f'{name}{line}', file=stream, flush=True)
+    prefix = f'[{name}] ' if name else ''
+    for line in lines:
+        print(f'{prefix}{line}', file=sys.stderr if stream == 'stderr' else sys.stdout, flush=True)

@@ -4,16 +4,20 @@
 from __future__ import annotations
 
 import argparse
-import json
+from typing import Any, TYPE_CHECKING
 
 from ros2fog_cli.verb import (
     add_json,
     cloud_names,
     complete,
+    print_json,
     region_names,
     VerbExtension,
     warn,
 )
+
+if TYPE_CHECKING:
+    from fogros2.provider.offers import Offer
 
 
 class PriceVerb(VerbExtension):
@@ -67,15 +71,7 @@ class PriceVerb(VerbExtension):
         regions = choice.regions
         shown = choice.offers[:args.limit or None]
         if args.json:
-            print(json.dumps([{
-                'provider': one.provider, 'region': one.region, 'type': one.type.name,
-                'vcpus': one.type.vcpus, 'memory_gb': one.type.memory_gb,
-                'arch': one.type.arch, 'cpu': one.type.cpu, 'gpus': one.type.gpus,
-                'gpu': one.type.gpu, 'gpu_memory_gb': one.type.gpu_memory_gb, 'zones': one.zones,
-                'price': None if one.price is None else str(one.price),
-                'spot_price': None if one.spot_price is None else str(one.spot_price),
-                'round_trip_ms': one.round_trip_ms,
-            } for one in shown], indent=2))
+            print_json(offers=list(map(to_json, shown)))
         else:
             where = ', '.join(regions) if len(regions) < 4 else f'{len(regions)} regions'
             print(f'{asked}, in {where}')
@@ -101,6 +97,20 @@ class PriceVerb(VerbExtension):
         if every and others:
             warn(f"not set up here: {', '.join(others)}")
         return 0
+
+
+def to_json(offer: Offer) -> dict[str, Any]:
+    """Return an offer as JSON values: prices in US dollars an hour."""
+    kind = offer.type
+    return {
+        'provider': offer.provider, 'region': offer.region, 'type': kind.name,
+        'vcpus': kind.vcpus, 'memory_gb': kind.memory_gb, 'arch': kind.arch, 'cpu': kind.cpu,
+        'gpus': kind.gpus, 'gpu': kind.gpu, 'gpu_memory_gb': kind.gpu_memory_gb,
+        'zones': offer.zones,
+        'price': None if offer.price is None else float(offer.price),
+        'spot_price': None if offer.spot_price is None else float(offer.spot_price),
+        'round_trip_ms': offer.round_trip_ms,
+    }
 
 
 def _gpus(number: int, name: str, memory: float) -> str:

@@ -4,9 +4,15 @@
 from __future__ import annotations
 
 import argparse
-import json
 
-from ros2fog_cli.verb import add_json, complete, provider_names, region_names, VerbExtension
+from ros2fog_cli.verb import (
+    add_json,
+    complete,
+    print_json,
+    provider_names,
+    region_names,
+    VerbExtension,
+)
 
 
 class RegionsVerb(VerbExtension):
@@ -28,9 +34,9 @@ class RegionsVerb(VerbExtension):
         provider = machines.load(args.provider or machines.able('regions'))
         found = provider.regions(args.region, every=args.all)
         if args.json:
-            print(json.dumps([{'region': one.region, 'place': one.place,
-                               'median_ms': one.milliseconds, 'distance_km': one.distance_km}
-                              for one in found], indent=2))
+            print_json(regions=[{
+                'region': one.region, 'place': one.place, 'median_ms': one.milliseconds,
+                'distance_km': one.distance_km} for one in found])
             return 0
         measured = any(one.milliseconds is not None for one in found)
         print(table.table(

@@ -5,11 +5,10 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import time
 from typing import Any, TYPE_CHECKING
 
-from ros2fog_cli.verb import add_json, add_name, add_region, VerbExtension, warn
+from ros2fog_cli.verb import add_json, add_name, add_region, print_json, VerbExtension, warn
 
 if TYPE_CHECKING:
     from ros2fog_cli.api.reach import Link
@@ -90,7 +89,7 @@ class StatusVerb(VerbExtension):
             from ros2fog_cli.api.watching import streams
             status['streams'] = streams(entry.name, regions=args.region)
         if args.json:
-            print(json.dumps({**status, 'problems': problems}, indent=2))
+            print_json(**status, problems=problems)
         else:
             show(status, idle=idle)
         for problem in problems:
@@ -173,7 +172,7 @@ def show_joined(link: Link, *, as_json: bool) -> int:
     """Print a guest's link to a machine; return 0 if the machine answers."""
     from ros2fog_cli.api.table import duration
     if as_json:
-        print(json.dumps(dataclasses.asdict(link), indent=2))
+        print_json(**dataclasses.asdict(link))
     else:
         answer = 'no answer' if link.latency is None else f'{link.latency:.2f} ms'
         handshake = 'none' if link.handshake_age is None \

@@ -7,17 +7,16 @@ from concurrent.futures import ThreadPoolExecutor
 import logging
 import subprocess
 import sys
-import threading
 import time
 
 import pytest
 
-from fogros2.errors import Cancelled, FogError, ProviderError, Unsupported
+from fogros2.errors import FogError, ProviderError, Unsupported
 from fogros2.model import MachineSpec
 from fogros2.plugin_system import load
 from fogros2.provider import TAG_ON_EXIT, TAG_ROBOT
 from fogros2.provider.vm import cloud
-from fogros2.testing import ProviderContract, request_for
+from fogros2.testing import request_for, VmContract
 from fogros2.testing.provider_contract import PUBLIC_KEY
 from fogros2.waiting import wait_until
 from rigs.clouds_in_memory import DAMAGED, MEMORIES
@@ -34,15 +33,26 @@ def memory(request, monkeypatch):
     return served(request.param, request, monkeypatch)
 
 
-class TestClouds(ProviderContract):
+class TestClouds(VmContract):
     timeout = 10.0
 
     @pytest.fixture(autouse=True)
     def _memory(self, memory):
         self.memory = memory
+        memory.open_catalogue()
+        self.billed_when_off, self.elsewhere = memory.billed_when_off, {'regions': [memory.away]}
 
     def make(self):
         return self.memory.provider(), dict(self.memory.options)
+
+    def left(self):
+        return self.memory.left()
+
+    def user_data(self, machine_id):
+        return self.memory.user_data(machine_id)
+
+    def fault(self, how, times):
+        return self.memory.fault(how, times)
 
 
 def create(memory, name='planner', **options):
@@ -63,14 +73,6 @@ def test_fault_at_each_step_leaves_nothing(request, monkeypatch, name, step, how
         create(memory)
     assert caught.value.undo_failures == ()
     assert caught.value.refused or how == 'lost'
-    gone(memory)
-
-
-def test_throttled_requests_are_made_again(memory):
-    memory.throttle()
-    machine, _ = create(memory)
-    assert [found.id for found in memory.provider().find({})] == [machine]
-    memory.provider().destroy(machine)
     gone(memory)
 
 
@@ -97,15 +99,6 @@ def test_full_region_leads_to_the_next(memory):
     assert memory.provider().describe(machine).region == memory.away
     memory.provider().destroy(machine)
     gone(memory)
-
-
-def test_launch_that_has_ended_creates_nothing(memory):
-    provider, spec = memory.provider(), MachineSpec('planner', memory.name, memory.options)
-    provider.cancel = threading.Event()
-    provider.cancel.set()
-    with pytest.raises(Cancelled):
-        provider.create(spec, request_for(spec))
-    assert not memory.left()
 
 
 def test_eight_machines_at_once_are_eight(memory):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The template of doc/providers.md keeps the contract, and its tests run."""
+"""The template of doc/developers/providers.md keeps the contract, and its tests run."""
 
 from __future__ import annotations
 

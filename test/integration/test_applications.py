@@ -308,12 +308,11 @@ def test_starting_node_can_be_interrupted(package, executable, tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
 
 
-def test_impossible_request_deletes_the_machine(launch, engine):
-    """Of the machine it says the rest: what was asked for wrongly is the robot's."""
+def test_impossible_request_creates_no_machine(launch, engine):
     run = launch('fogros2_examples', 'planning.launch.py', 'time:=soon')
     assert run.ended() == 1, run.text
     assert "could not convert string to float: 'soon'" in run.text
-    assert 'planner: delete' in run.text
+    assert 'planner: machine' not in run.text
 
 
 def test_wait_for_a_plan_lasts_for_its_time_out():

@@ -211,7 +211,7 @@ needs_namespaces = pytest.mark.skipif(
 def test_missing_tun_device_is_reported(refused, cloud_network):
     error, text = refused(container(cloud_network), wrap=without(
         '/dev/net', 'mount -t tmpfs none "$hidden"'))
-    assert '/dev/net/tun is missing on this computer' in error and 'modprobe tun' in error
+    assert 'there is no /dev/net/tun on this computer' in error and 'modprobe tun' in error
     assert nothing_was_made(text)
 
 

@@ -67,10 +67,11 @@ def launched(
 
 
 def test_verbs_work_beside_a_running_launch(
-    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]],
+    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]], tmp_path: Path,
 ) -> None:
     name, child, said = launched
-    (entry,) = [e for e in json.loads(fog('list', '--json').stdout) if e['name'] == name]
+    (entry,) = [e for e in json.loads(fog('list', '--json').stdout)['machines']
+                if e['name'] == name]
     assert entry['state'] == 'running' and entry['launch_alive'] and entry['address']
     assert 28000 < entry['time_left'] <= 28800
 
@@ -94,6 +95,14 @@ def test_verbs_work_beside_a_running_launch(
     assert unwatched.returncode == 1
     assert f"'{name}' has no Foxglove bridge (launch_foxglove=True" in unwatched.stderr
 
+    assert fog('wait', name, '--timeout', '30').returncode == 0
+    written = fog('ssh-config', name).stdout
+    assert str(Store().machine(name) / 'ssh_config') in written
+    config = tmp_path / 'config'
+    config.write_text(written.splitlines()[-1] + '\n')
+    assert subprocess.run(['ssh', '-F', config, '-o', 'BatchMode=yes', name, 'hostname'],
+                          capture_output=True, text=True, timeout=30).stdout.strip() == name
+
     assert fog('connect', name, '--', 'hostname').stdout.strip() == name
     assert fog('connect', name, '--', 'sh', '-c', 'exit 7', check=False).returncode == 7
     assert fog('connect', name, '--user', 'root', '--', 'true', check=False).returncode != 0
@@ -104,6 +113,7 @@ def test_verbs_work_beside_a_running_launch(
     assert child.poll() is None
 
     child.send_signal(signal.SIGINT)
+    assert fog('wait', name, '--gone', '--timeout', '60').returncode == 0
     assert child.wait(60) == 0, said()
     assert name not in fog('list').stdout
 
@@ -149,9 +159,10 @@ def test_verbs_clean_up_after_a_killed_launch(
     name, child, _ = launched
     os.killpg(child.pid, signal.SIGKILL)
     child.wait(10)
-    (entry,) = [e for e in json.loads(fog('list', '--json').stdout) if e['name'] == name]
+    (entry,) = [e for e in json.loads(fog('list', '--json').stdout)['machines']
+                if e['name'] == name]
     assert entry['launch_alive'] is False and 'launch gone' in entry['state']
-    would = json.loads(fog('gc', '--dry-run', '--json').stdout)
+    would = json.loads(fog('gc', '--dry-run', '--json').stdout)['cleared']
     assert [w['reason'] for w in would if w['name'] == name] == ['its launch is gone']
     assert f'deleted {name}' in fog('delete', name, '--yes').stdout
     assert not Store().machine(name).exists()

@@ -21,7 +21,9 @@ pytest.importorskip('cv2', reason='the extra "video" is not installed')
 from fogros2.store import Store
 from fogros2.waiting import wait_until
 from rigs.browser import Browser, program
+from rigs.dashboard import Dashboard
 from rigs.launched import launching, ros2
+from rigs.terminal import screen
 
 pytestmark = [
     pytest.mark.timeout(180),
@@ -48,34 +50,6 @@ def generate_launch_description():
         Node(package='fogros2_examples', executable='listener'),
     ])
 """
-
-
-class Dashboard:
-    """``ros2 fog dashboard`` as a process of a test's own."""
-
-    def __init__(self) -> None:
-        # in our session: sudo's ticket belongs to the terminal
-        self.child = subprocess.Popen(
-            ['ros2', 'fog', 'dashboard', '--no-browser'], stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE, text=True, preexec_fn=os.setpgrp)
-        assert self.child.stdout is not None
-        self.url = self.child.stdout.readline().split()[4]
-
-    def seconds(self) -> float:
-        """Return how much of a processor it has had, with what it started and what has ended."""
-        times = Path(f'/proc/{self.child.pid}/stat').read_text().rpartition(')')[2].split()[11:15]
-        return sum(map(int, times)) / os.sysconf('SC_CLK_TCK')
-
-    def close(self) -> int:
-        """Press Ctrl-C, and return its exit status."""
-        self.child.send_signal(signal.SIGINT)
-        try:
-            code = self.child.wait(20)
-        finally:
-            self.child.kill()
-        assert self.child.stdout is not None
-        self.child.stdout.close()
-        return code
 
 
 @pytest.fixture
@@ -175,9 +149,10 @@ def test_dashboard_shows_a_launch_until_its_end(
                       + ' → robot\\s+[0-9.]+\\s+[0-9]+ B\\/s/'
                       '.test(document.getElementById("topics").innerText)', timeout=30)
         pictures_move(browser)
-        screen = in_a_terminal('ros2', 'fog', 'status', name, '--watch')
-        assert screen.startswith('\x1b[?1049h') and screen.rstrip().endswith('\x1b[?1049l')
-        assert 'handshake' in screen and 'round trip' in screen and '\x1b[32m' in screen
+        drawn = screen('ros2', 'fog', 'status', name, '--watch',
+                       until=lambda text: 'talker' in text and 'handshake' in text)
+        assert drawn.startswith('\x1b[?1049h') and drawn.rstrip().endswith('\x1b[?1049l')
+        assert 'handshake' in drawn and 'round trip' in drawn and '\x1b[32m' in drawn
 
         # what a node prints is text
         browser.until(f'{article(name)}.querySelector(".log")?.textContent.includes('
@@ -206,8 +181,8 @@ def test_dashboard_shows_a_launch_until_its_end(
     assert dashboard.close() == 0
 
     def told() -> list[Any]:
-        return [json.loads(line) for line in watching.read_text().splitlines(keepends=True)
-                if line.endswith('\n')]
+        return [json.loads(line)['machine']
+                for line in watching.read_text().splitlines(keepends=True) if line.endswith('\n')]
 
     wait_until(lambda: told()[-1]['phase'] == 'gone', timeout=20.0, what='its end')
     first, *others = told()
@@ -275,41 +250,3 @@ def watched(tmp_path: Path, nothing_left: None) -> Iterator[Callable[[str], Path
             assert child.wait(20) == 0
         finally:
             child.kill()
-
-
-def in_a_terminal(*words: str) -> str:
-    """
-    Return what a command draws until it tells of nodes and the VPN, and is interrupted.
-
-    It draws on a terminal of its own, and stays in our session, whose ticket sudo has.
-    """
-    import fcntl
-    import pty
-    import select
-    import struct
-    import termios
-    terminal, theirs = pty.openpty()
-    child = subprocess.Popen(words, stdin=theirs, stdout=theirs, stderr=theirs,
-                             preexec_fn=os.setpgrp, env={**os.environ, 'TERM': 'xterm'})
-    os.close(theirs)
-    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack('HHHH', 40, 100, 0, 0))
-    said, pressed = b'', False
-    deadline = time.monotonic() + 40.0
-    while time.monotonic() < deadline:
-        if select.select([terminal], [], [], 0.2)[0]:
-            try:
-                more = os.read(terminal, 65536)
-            except OSError:
-                break  # it has ended
-            if not more:
-                break
-            said += more
-        if b'talker' in said and b'handshake' in said and not pressed:
-            os.killpg(child.pid, signal.SIGINT)
-            pressed = True
-    os.close(terminal)
-    try:
-        assert child.wait(20) == 0
-    finally:
-        child.kill()
-    return said.decode()

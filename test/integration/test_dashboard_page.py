@@ -34,7 +34,7 @@ def machine(name: str, **changes: Any) -> dict[str, Any]:
         'key': name, 'name': name, 'provider': 'aws', 'id': 'i-0123456789', 'state': 'running',
         'phase': 'running', 'launch': 'abc123', 'launch_pid': 4711, 'launch_alive': True,
         'created': NOW - 3600, 'expires': NOW + 7200, 'ended': None, 'address': '198.51.100.7',
-        'place': 'eu-central-1', 'kind': 'g4dn.xlarge', 'cost_per_hour': '0.658',
+        'place': 'eu-central-1', 'kind': 'g4dn.xlarge', 'cost_per_hour': 0.658,
         'on_exit': 'delete', 'bridge': 0, 'deleting': False, 'trouble': '', 'problems': [],
         'replicas': [],
         'agent': {'since': NOW - 3500, 'rss': 16_000_000, 'heartbeat_age': 1.0},
@@ -235,7 +235,7 @@ def test_selection_survives_an_update(story: Story, page: Browser) -> None:
     page.ask('document.querySelector("article details").open = false')
     page.ask('document.querySelector("article select").value = "slam-1"')
     page.ask('document.querySelectorAll("button.delete")[1].focus()')
-    story.tell(machines=[machine('alpha'), machine('planner', cost_per_hour='2'),
+    story.tell(machines=[machine('alpha'), machine('planner', cost_per_hour=2),
                          machine('mapper')])
     page.until('document.querySelectorAll("article").length === 3')
     # the second on the page is the one that was first

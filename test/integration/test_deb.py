@@ -32,8 +32,8 @@ NAME, PREFIX = 'ros-jazzy-fogros2', '/opt/ros/jazzy'
 SITE = f'{PREFIX}/lib/python3.12/site-packages'
 SUITE = 'trixie'
 #: What the package depends on and is there for real.
-REAL = ('iproute2', 'openssh-client', 'python3', 'python3-cryptography', 'python3-paramiko',
-        'python3-requests', 'python3-yaml', 'rsync', 'wireguard-tools')
+REAL = ('iproute2', 'openssh-client', 'python3', 'python3-cryptography', 'python3-packaging',
+        'python3-paramiko', 'python3-requests', 'python3-yaml', 'rsync', 'wireguard-tools')
 #: Too large for what they would add to this test.
 HEAVY = ('python3-boto3', 'python3-google-auth', 'python3-numpy', 'python3-opencv',
          'python3-catkin-pkg-modules')  # of ROS's own repository
@@ -323,7 +323,7 @@ def test_what_goes_to_a_machine_has_the_nodes_in_it(installed: System) -> None:
 def test_group_member_may_create_vpn_interfaces(installed: System) -> None:
     helper = '/usr/libexec/fogros2/vpn'
     assert 'fogros2:' in installed.run('getent', 'group', 'fogros2').stdout
-    assert installed.run('sh', '-c', f'echo "{{}}" | {helper} check').stdout == '3\n'
+    assert installed.run('sh', '-c', f'echo "{{}}" | {helper} check').stdout == '4\n'
     assert 'by sudo' in installed.run(helper, 'check', user='nobody', check=False).stderr
     assert installed.run('stat', '-c', '%a %u', '/etc/sudoers.d/fogros2-vpn').stdout == '440 0\n'
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 import re
 import subprocess
@@ -20,6 +21,14 @@ def test_site_is_built_without_a_warning():
     built = subprocess.run(
         [sys.executable, str(ROOT / 'tools/docs.py')], capture_output=True, text=True)
     assert built.returncode == 0, built.stdout + built.stderr
-    page = re.sub('<[^>]*>', '', (ROOT / '.cache/docs/reference/command_line.html').read_text())
+    site = ROOT / '.cache/docs'
+    page = re.sub('<[^>]*>', '', (site / 'reference/command_line.html').read_text())
     for verb in plugin_system.names('fogros2.verb'):
-        assert f'ros2 fog {verb}' in page
+        assert f'usage: ros2 fog {verb}' in page
+    footer = (site / 'howto/machines.html').read_text().rpartition('class="left-details"')[2]
+    assert 'Apache-2.0' in footer and 'issues"' in footer
+    assert 'href="../install.html#get-a-version"' in footer
+    # the index of the search
+    index = json.loads(re.search(r'{.*}', (site / 'searchindex.js').read_text(), re.DOTALL)[0])
+    found = {index['docnames'][number] for number in index['terms']['timeout']}
+    assert {'reference/glossary', 'troubleshooting'} <= found

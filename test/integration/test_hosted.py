@@ -192,7 +192,7 @@ def test_robots_hear_shared_topics_of_each_other_alone(
 
     # both are in both lists, each its own robot's
     for robot in ('one', 'two'):
-        rows = [row for row in json.loads(fog(host, robot, 'list', '--json'))
+        rows = [row for row in json.loads(fog(host, robot, 'list', '--json'))['machines']
                 if row['provider'] == 'hosted']
         assert sorted('(robot ' in row['state'] for row in rows) == [False, True], rows
         assert {row['name'] for row in rows} == {'planner'}
@@ -219,7 +219,7 @@ def test_robots_hear_shared_topics_of_each_other_alone(
 
 
 def robot_of(host: Fleet, robot: str) -> str:
-    rows = json.loads(fog(host, robot, 'list', '--json'))
+    rows = json.loads(fog(host, robot, 'list', '--json'))['machines']
     return next(str(row['robot']) for row in rows if '(robot ' not in row['state'])
 
 
@@ -243,7 +243,7 @@ def test_delete_from_the_robot_and_not_from_another_computer(
     assert len(host.containers()) == 1
     # a computer that has no record of a machine there knows no host to ask
     assert 'hosted' not in {row['provider'] for row in json.loads(
-        fog(host, 'stranger', 'list', '--json'))}
+        fog(host, 'stranger', 'list', '--json'))['machines']}
     again = launch(str(path), 'robot:=one', environment=host.environment('one'))
     again.wait_for('heard count of one', timeout=150.0)
     assert 'kept from before' in again.text

@@ -238,7 +238,7 @@ def test_guest_of_an_ssh_host_gets_what_its_nodes_need(
     second: SecondRobot, join: Callable[..., Launched], tmp_path: Path, cloud_network: str,
     engine: str, nothing_left: None,
 ) -> None:
-    if not wheels.collect(tmp_path / 'wheels').embedded:
+    if not wheels.collect(tmp_path / 'wheels').ros:
         pytest.skip('this robot has an installation of ROS 2 and no wheels to send')
     name = f'ssh-{uuid.uuid4().hex[:6]}'
     path = tmp_path / 'ssh.launch.py'

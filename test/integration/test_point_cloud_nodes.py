@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip('zstandard', reason='the extra "point_clouds" is not installed')
+pytest.importorskip('zstandard', reason='the extra "point-clouds" is not installed')
 pytest.importorskip('rclpy', reason='rclpy is not installed')
 import numpy
 from sensor_msgs.msg import CompressedImage, PointCloud2

@@ -12,7 +12,7 @@ import uuid
 
 import pytest
 
-pytest.importorskip('zstandard', reason='the extra "point_clouds" is not installed')
+pytest.importorskip('zstandard', reason='the extra "point-clouds" is not installed')
 from fogros2 import process
 from point_cloud_stream.control import COARSEST
 from rigs.launched import launching

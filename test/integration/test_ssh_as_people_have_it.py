@@ -19,9 +19,12 @@ from fogros2.errors import AuthenticationError, ConnectError, FogError, HostKeyE
 from fogros2.model import Command, Endpoint, MachineSpec
 from fogros2.provider.ssh import SSHProvider
 from fogros2.shell.ssh import SSHShell
+from fogros2.store import Record, Store
 from fogros2.testing import request_for
 from fogros2.waiting import wait_until
 from rigs.sshd import private_sshd, PrivateSshd
+from ros2fog_cli.api import ssh_settings
+from ros2fog_cli.api.machines import Entry
 
 pytestmark = pytest.mark.skipif(
     not all(map(process.which, ('ssh', 'sshd', 'ssh-agent'))), reason='OpenSSH is not installed')
@@ -317,3 +320,29 @@ def test_talk_without_end_ends_by_the_time_out(tmp_path, home):
             contextlib.closing(SSHShell(server.endpoint, name='planner')) as shell, \
             pytest.raises(FogError, match='took too long'):
         shell.run(Command(('true',)), timeout=2.0)
+
+
+def test_other_programs_reach_a_machine_by_its_name(
+    server: PrivateSshd, home: Path, tmp_path: Path,
+) -> None:
+    """As ``ros2 fog ssh-config`` writes it, for ssh and what uses it."""
+    store = Store()
+    record = Record('planner', 'ssh', MachineSpec('planner', 'ssh'), shell=server.endpoint)
+    store.save(record)
+    ssh_settings.write(Entry('planner', 'ssh', None, record), store)
+    config = home / '.ssh/config'
+    config.write_text(f'{ssh_settings.include(store)}\n')
+
+    def ssh(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(['ssh', '-F', config, '-o', 'BatchMode=yes', *words],
+                              capture_output=True, text=True, timeout=30)
+
+    assert ssh('planner', 'echo hello').stdout == 'hello\n'
+    copied = subprocess.run(['rsync', '-e', f'ssh -F {config}', 'planner:' + str(
+        server.folder / 'host_key.pub'), tmp_path / 'copy'], timeout=30)
+    assert copied.returncode == 0 and (tmp_path / 'copy').read_text().startswith('ssh-ed25519')
+    # another computer at its address is refused
+    keygen(tmp_path / 'other')
+    (store.machine('planner') / 'known_hosts').write_text(
+        f'fogros2-planner {(tmp_path / "other.pub").read_text()}')
+    assert 'Host key verification failed' in ssh('planner', 'echo hello').stderr

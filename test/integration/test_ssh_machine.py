@@ -163,7 +163,8 @@ rclpy.shutdown()
 
 
 def listed():
-    return [entry['name'] for entry in json.loads(ros2('fog', 'list', '--json').stdout)]
+    return [entry['name']
+            for entry in json.loads(ros2('fog', 'list', '--json').stdout)['machines']]
 
 
 def test_kept_computer_gets_only_changed_workspace_files(

@@ -143,7 +143,7 @@ class FakeLaunch:
 
     def robot_environment(self):
         self.note('robot environment')
-        return {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp', 'CYCLONEDDS_URI': '<CycloneDDS/>'}
+        return {'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp', 'CYCLONEDDS_URI': '<CycloneDDS/>'}
 
     def prepare(self, specs, programs, images):
         self.note('prepare', [spec.name for spec in specs], programs, images)

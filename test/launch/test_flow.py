@@ -570,6 +570,16 @@ def test_cheap_checks_come_before_the_vpn(run, fake, planner, capfd, description
     assert 'there is no podman' in capfd.readouterr().out
 
 
+def test_wrong_defaults_end_a_launch_first(run, fake, planner, capfd, tmp_path, monkeypatch):
+    pytest.importorskip('tomllib')
+    monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path))
+    (tmp_path / 'fogros2').mkdir()
+    (tmp_path / 'fogros2/fogros2.toml').write_text("lifetime = 'soon'")
+    assert run(LaunchDescription([talker(planner)])) == 1
+    assert fake.notes == []
+    assert f'{tmp_path}/fogros2/fogros2.toml: ' in capfd.readouterr().out
+
+
 @pytest.mark.parametrize('later', [False, True])
 def test_early_checks_take_only_values_that_stay(run, fake, later):
     """A configuration that is set after the first node may belong to a machine's values."""
@@ -614,6 +624,14 @@ def test_a_program_may_be_in_the_image_alone(run, fake):
     planner = ContainerInstance(name='planner', ros_workspace='', image='mine')
     assert run(LaunchDescription([
         CloudNode(machine=planner, package='theirs', executable='program')])) == 0
+    assert fake.machines['planner'].nodes['program'].package == 'theirs'
+
+
+def test_a_program_may_be_in_the_node_s_image_alone(run, fake):
+    fake.on_start = ends
+    planner = ContainerInstance(name='planner', ros_workspace='')
+    assert run(LaunchDescription([CloudNode(
+        machine=planner, package='theirs', executable='program', image='mine')])) == 0
     assert fake.machines['planner'].nodes['program'].package == 'theirs'
 
 

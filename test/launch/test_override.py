@@ -35,7 +35,8 @@ from fogros2.describe.overrides import Overrides, parse
 from fogros2.errors import ConfigurationError
 from fogros2.image_transport.nodes import H264
 from fogros2.testing.plugins import instead
-from ros2fog_cli.option.machine import complete, MachineOption
+from ros2fog_cli.option.machine import MachineOption
+from ros2fog_cli.verb import overrides as complete
 
 AWS = {'name': 'planner', 'region': 'eu-west-3', 'ec2_instance_type': 't3.large', 'spot': True,
        'ros_workspace': '', 'on_exit': 'stop', 'environment': {'A': 'b'}}
@@ -43,7 +44,7 @@ AWS = {'name': 'planner', 'region': 'eu-west-3', 'ec2_instance_type': 't3.large'
 
 def spec(text, machine):
     context = LaunchContext()
-    return Overrides([text]).apply(machine.spec(context), context)
+    return Overrides([text]).of(machine.name).instead(machine.spec(context), context)
 
 
 def talker(machine, **kwargs):

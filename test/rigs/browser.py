@@ -2,15 +2,11 @@
 """
 A headless Chromium, driven by a test over the DevTools protocol.
 
-https://chromedevtools.github.io/devtools-protocol/; needs ``websocket-client``. By hand it takes a
-picture of a page::
-
-    .venv/bin/python -m rigs.browser URL FILE.png --until EXPRESSION
+https://chromedevtools.github.io/devtools-protocol/; needs ``websocket-client``.
 """
 
 from __future__ import annotations
 
-import argparse
 import base64
 import itertools
 import json
@@ -180,27 +176,3 @@ class Browser:
         deadline = time.monotonic() + 5.0
         while Path(self._folder).exists() and time.monotonic() < deadline:
             shutil.rmtree(self._folder, ignore_errors=True)  # its children still end
-
-
-def main() -> int:
-    """Take a picture of a page."""
-    parser = argparse.ArgumentParser(description='Take a picture of a page')
-    parser.add_argument('url')
-    parser.add_argument('file', type=Path, help='to write, as PNG')
-    parser.add_argument('--until', default='true', metavar='EXPRESSION',
-                        help='of JavaScript, that is waited for')
-    parser.add_argument('--size', type=int, nargs=2, default=(1400, 1180), metavar=('W', 'H'))
-    parser.add_argument('--dark', action='store_true')
-    words = parser.parse_args()
-    browser = Browser(width=words.size[0], height=words.size[1], dark=words.dark)
-    try:
-        browser.open(words.url)
-        browser.until(words.until, timeout=120.0)
-        browser.screenshot(words.file)
-    finally:
-        browser.close()
-    return 0
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

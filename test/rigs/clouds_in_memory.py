@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping, Sequence
+import base64
+from collections.abc import Iterator, Mapping, Sequence
+import contextlib
 import json
 import re
+import threading
 from typing import Any, ClassVar
 
 import pytest
@@ -38,9 +41,52 @@ class Memory(abc.ABC):
     steps: ClassVar[Sequence[tuple[str, str]]]
     #: The most requests that list the machines of all regions.
     listing: ClassVar[int]
+    #: Whether a machine that has switched itself off is billed.
+    billed_when_off: ClassVar[bool] = True
 
     def __init__(self, served: Any, patch: pytest.MonkeyPatch) -> None:
         self.served, self.patch = served, patch
+
+    @contextlib.contextmanager
+    def fault(self, how: str, times: int) -> Iterator[threading.Event]:
+        """Disturb requests for a machine in the block; see ``fogros2.testing.VmContract``."""
+        met, over = threading.Event(), threading.Event()
+        with self.patch.context() as patch:
+            if how == 'silent':
+                self.hold(patch, met, over)
+            else:
+                self.order(patch, how, times, met)
+            try:
+                yield met
+            finally:
+                over.set()
+                self.heal()
+
+    def hold(self, patch: pytest.MonkeyPatch, met: threading.Event, over: threading.Event) -> None:
+        """Hold every request until ``over``."""
+        import requests
+        send = requests.Session.request
+
+        def held(*words: Any, **options: Any) -> Any:
+            met.set()
+            over.wait(30.0)
+            return send(*words, **options)
+
+        patch.setattr(requests.Session, 'request', held)
+
+    @abc.abstractmethod
+    def order(
+        self, patch: pytest.MonkeyPatch, how: str, times: int, met: threading.Event,
+    ) -> None:
+        """Let the next requests for a machine fail; set ``met`` when one does."""
+
+    @abc.abstractmethod
+    def heal(self) -> None:
+        """Forget the faults."""
+
+    @abc.abstractmethod
+    def user_data(self, machine_id: str) -> bytes:
+        """Return the user data of a machine."""
 
     @abc.abstractmethod
     def provider(self) -> VmProvider:
@@ -53,6 +99,9 @@ class Memory(abc.ABC):
     @abc.abstractmethod
     def calls(self) -> int:
         """Return the number of requests so far."""
+
+    def open_catalogue(self) -> None:
+        """Let the provider know prices."""
 
     def hurry(self) -> None:
         """Let operations take no time: each look at one is a request."""
@@ -71,10 +120,6 @@ class Memory(abc.ABC):
         """Let the next ``times`` machines find no room in their region; 0 for all."""
 
     @abc.abstractmethod
-    def throttle(self) -> None:
-        """Refuse the next two requests because of their number."""
-
-    @abc.abstractmethod
     def vanish(self) -> None:
         """Let all machines end, and nothing else."""
 
@@ -83,8 +128,21 @@ class Memory(abc.ABC):
         """Change tags of what is beside machines."""
 
 
+def _counted(fault: Any, met: threading.Event) -> Any:
+    """Return a fault that sets ``met`` when its service counts it down."""
+    class Counted(type(fault)):  # type: ignore[misc]
+        def __setattr__(self, name: str, value: Any) -> None:
+            super().__setattr__(name, value)
+            met.set()
+
+    fault.__class__ = Counted
+    return fault
+
+
 class Aws(Memory):
     """Moto's EC2."""
+
+    billed_when_off = False
 
     fixture, name = 'moto_aws', 'aws'
     options = {'ec2_instance_type': 't3.medium', 'disk_size': 10}
@@ -96,8 +154,60 @@ class Aws(Memory):
 
     def __init__(self, served: Any, patch: pytest.MonkeyPatch) -> None:
         super().__init__(served, patch)
+        from fogros2.provider.aws.clients import Account
         from rigs.ec2 import watched
         self._rig, self._watched = watched, watched.Watched()
+        call, orders = Account.call, dict[str, Any]()
+
+        def once(own: Any, service: str, region: str, asked: str, what: str, **words: Any) -> Any:
+            # Moto ignores the token
+            token = words.get('ClientToken')
+            if token is None:
+                return call(own, service, region, asked, what, **words)
+            if token not in orders:
+                orders[token] = call(own, service, region, asked, what, **words)
+            return orders[token]
+
+        patch.setattr(Account, 'call', once)
+
+    def hold(self, patch: pytest.MonkeyPatch, met: threading.Event, over: threading.Event) -> None:
+        """Hold every request of botocore."""
+        from botocore.httpsession import URLLib3Session
+        send = URLLib3Session.send
+
+        def held(*words: Any) -> Any:
+            met.set()
+            over.wait(30.0)
+            return send(*words)
+
+        patch.setattr(URLLib3Session, 'send', held)
+
+    def order(
+        self, patch: pytest.MonkeyPatch, how: str, times: int, met: threading.Event,
+    ) -> None:
+        """Refuse RunInstances, or lose its answers."""
+        class Sent(list[str]):
+            def append(self, code: str) -> None:
+                met.set()
+
+        if how == 'lost':
+            self._lose(patch, 'run_instances', times, met)
+            return
+        patch.setattr(self._watched, 'sent', Sent())
+        code = {'throttled': 'RequestLimitExceeded', 'unavailable': 'ServiceUnavailable',
+                'full': 'InsufficientInstanceCapacity'}[how]
+        self._watched.refuse('RunInstances', *[code] * times,
+                             status=503 if how == 'unavailable' else 400)
+
+    def heal(self) -> None:
+        """Refuse nothing."""
+        self._watched.refusals.clear()
+
+    def user_data(self, machine_id: str) -> bytes:
+        """Return an attribute of the instance."""
+        instance = machine_id.split('/')[1]
+        return base64.b64decode(self._rig.ec2().describe_instance_attribute(
+            InstanceId=instance, Attribute='userData')['UserData']['Value'])
 
     def provider(self) -> VmProvider:
         """Return the watched provider."""
@@ -116,25 +226,29 @@ class Aws(Memory):
         if how == 'refused':
             self._watched.refuse(step, *['UnauthorizedOperation'] * 9)
             return
+        operation = re.sub('(?<!^)([A-Z])', r'_\1', step).lower()
+        self._lose(self.patch, operation, 1000, threading.Event())
+
+    def _lose(
+        self, patch: pytest.MonkeyPatch, operation: str, times: int, met: threading.Event,
+    ) -> None:
+        """Raise an error after the next calls of an operation."""
         from fogros2.provider.aws.clients import Account
         from fogros2.provider.aws.failures import AwsError
-        call, operation = Account.call, re.sub('(?<!^)([A-Z])', r'_\1', step).lower()
+        call, losses = Account.call, iter(range(times))
 
         def lost(own: Any, service: str, region: str, asked: str, what: str, **words: Any) -> Any:
             answer = call(own, service, region, asked, what, **words)
-            if asked == operation:
+            if asked == operation and next(losses, None) is not None:
+                met.set()
                 raise AwsError(f'{what} failed', code='InternalError', status=500)
             return answer
 
-        self.patch.setattr(Account, 'call', lost)
+        patch.setattr(Account, 'call', lost)
 
     def fill(self, times: int) -> None:
         """Report a quota, which holds for the region."""
         self._watched.refuse('RunInstances', *['VcpuLimitExceeded'] * (times or 20))
-
-    def throttle(self) -> None:
-        """Refuse two calls."""
-        self._watched.refuse('RunInstances', *['RequestLimitExceeded'] * 2)
 
     def vanish(self) -> None:
         """Terminate the instances."""
@@ -162,6 +276,27 @@ class Azure(Memory):
         for how in ('refused', 'late', 'lost') if how == 'refused' or step != 'schedules'
         and (how == 'lost' or step != 'resourcegroups'))
     listing = 2
+
+    def order(
+        self, patch: pytest.MonkeyPatch, how: str, times: int, met: threading.Event,
+    ) -> None:
+        """Order errors of a machine's PUT."""
+        from rigs.azure.service import Fault
+        code, status = {
+            'throttled': ('TooManyRequests', 429), 'unavailable': ('ServiceUnavailable', 503),
+            'lost': ('InternalServerError', 500), 'full': ('AllocationFailed', 409)}[how]
+        self.served.faults.append(_counted(Fault(
+            code, status, 'PUT', 'virtualMachines', times=times, after=how == 'lost'), met))
+
+    def heal(self) -> None:
+        """Forget the faults."""
+        self.served.faults.clear()
+
+    def user_data(self, machine_id: str) -> bytes:
+        """Return the machine's custom data."""
+        name = machine_id.split('/')[1]
+        (vm,) = [vm for vm in self.served.vms() if vm['name'] == name]
+        return base64.b64decode(vm['properties']['osProfile']['customData'])
 
     def provider(self) -> VmProvider:
         """Return the provider."""
@@ -195,11 +330,6 @@ class Azure(Memory):
         self.served.faults.append(Fault('QuotaExceeded', 409, 'PUT', 'virtualMachines',
                                         times=times))
 
-    def throttle(self) -> None:
-        """Refuse two requests."""
-        from rigs.azure.service import Fault
-        self.served.faults.append(Fault('TooManyRequests', 429, times=2))
-
     def vanish(self) -> None:
         """Evict the machines."""
         for vm in self.served.vms():
@@ -220,6 +350,34 @@ class Gcp(Memory):
     steps = tuple((step, how) for step in ('firewalls.insert', 'instances.insert')
                   for how in ('refused', 'late', 'lost'))
     listing = 1
+
+    def open_catalogue(self) -> None:
+        """Name the key that Google's catalogue takes."""
+        from fogros2.provider.gcp import prices
+        from rigs.gce.catalogue import API_KEY
+        self.patch.setenv(prices.KEY_VARIABLE, API_KEY)
+        self.patch.setenv(prices.ENDPOINT_VARIABLE, f'{self.served.url}/')
+
+    def order(
+        self, patch: pytest.MonkeyPatch, how: str, times: int, met: threading.Event,
+    ) -> None:
+        """Order errors of an insert; a code in capitals is that of its operation."""
+        from rigs.gce.api import Fault
+        code = {'throttled': 'rateLimitExceeded', 'unavailable': 'backendError',
+                'lost': 'internalError', 'full': 'ZONE_RESOURCE_POOL_EXHAUSTED'}[how]
+        self.served.api.faults.append(_counted(Fault(
+            code, 'instances.insert', times=times, after=how == 'lost'), met))
+
+    def heal(self) -> None:
+        """Forget the faults."""
+        self.served.api.faults.clear()
+
+    def user_data(self, machine_id: str) -> bytes:
+        """Return the metadata of the instance."""
+        name = machine_id.split('/')[-2]
+        (found,) = [one for one in self.served.instances if one['name'] == name]
+        items = {item['key']: item['value'] for item in found['metadata']['items']}
+        return base64.b64decode(items['user-data'])
 
     def provider(self) -> VmProvider:
         """Return the provider."""
@@ -247,10 +405,6 @@ class Gcp(Memory):
     def fill(self, times: int) -> None:
         """Report a quota."""
         self._order('QUOTA_EXCEEDED', 'instances.insert', times)
-
-    def throttle(self) -> None:
-        """Refuse two requests."""
-        self._order('rateLimitExceeded', '', 2)
 
     def vanish(self) -> None:
         """End the instances."""

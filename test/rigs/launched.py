@@ -45,7 +45,7 @@ class Launched:
         #: When each line came, on ``time.monotonic``'s clock.
         self.times: list[float] = []
         self.child = subprocess.Popen(
-            [*_WITH_SIGINT, *prefix, ROS2, 'launch', *words], stdin=subprocess.DEVNULL,
+            [*WITH_SIGINT, *prefix, ROS2, 'launch', *words], stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors='replace',
             env=None if environment is None else dict(environment))
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -162,7 +162,7 @@ def ros2(
 
 #: A shell that starts something in the background has SIGINT ignored, and all that it starts.
 #: A group of its own, not a session: sudo's ticket is the terminal's, and goes for its session.
-_WITH_SIGINT: Sequence[str] = (
+WITH_SIGINT: Sequence[str] = (
     sys.executable, '-c', 'import os, signal, sys; '
     'os.setpgrp(); signal.signal(signal.SIGINT, signal.default_int_handler); '
     'os.execvp(sys.argv[1], sys.argv[1:])')

@@ -11,7 +11,7 @@ import sys
 import numpy
 import pytest
 
-pytest.importorskip('zstandard', reason='the extra "point_clouds" is not installed')
+pytest.importorskip('zstandard', reason='the extra "point-clouds" is not installed')
 from point_cloud_stream import codec
 from point_cloud_stream.cloud import Field, Layout, MAX_BYTES
 from point_cloud_stream.numbers import Writer

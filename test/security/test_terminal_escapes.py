@@ -179,7 +179,7 @@ def test_no_verb_lets_a_name_control_the_terminal(
 ) -> None:
     parser = argparse.ArgumentParser()
     assert FogCommand().main(
-        parser=parser, args=argparse.Namespace(_verb=Names(attack))) == 0
+        parser=parser, args=argparse.Namespace(version=False, _verb=Names(attack))) == 0
     out, err = capsys.readouterr()
     assert harmless(out + err), ascii(out + err)
     assert RED in out and 'VPN failed' in err

@@ -96,8 +96,6 @@ def test_a_type_is_chosen_where_none_is_named(options, chooses):
     ({'fleet': ['/home/me/.ssh/id_ed25519.pub'], 'ssh_from': '198.51.100.0/24'},
      'no public SSH key'),
     ({'fleet': [f'{KEY}\n{KEY}'], 'ssh_from': '198.51.100.0/24'}, 'no public SSH key'),
-    ({'fleet': [KEY]}, 'the networks (IPv4) of its robots'),
-    ({'fleet': [KEY], 'ssh_from': '2001:db8::/64'}, 'the networks (IPv4) of its robots'),
     ({'tags': {'fogros2-name': 'x'}}, "can't be a tag"),
     ({'ami_image': 'ami-1', 'regions': ['us-east-1']}, 'belongs to one region'),
     ({'subnet': 'subnet-1', 'region': 'nearest'}, 'belongs to one region'),

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 from pathlib import Path
 import sys
 from typing import Any
@@ -22,25 +21,10 @@ def benchmark_modules(monkeypatch: pytest.MonkeyPatch) -> Any:
     return importlib.import_module
 
 
-def stored() -> list[Path]:
-    """Return the files of results that ``figures.write`` made."""
-    return [path for path in sorted(RESULTS.glob('*.json'))
-            if isinstance(data := json.loads(path.read_text()), dict) and 'machine' in data]
-
-
-@pytest.mark.parametrize('path', stored(), ids=lambda path: path.stem)
-def test_page_of_results_shows_stored_figures(path: Path, benchmark_modules: Any) -> None:
-    figures = benchmark_modules('figures')
-    data, page = json.loads(path.read_text()), path.with_suffix('.md').read_text()
-    title = page.partition('\n')[0].removeprefix('# ')
-    assert page == figures.markdown(title, [figures.Row(**row) for row in data['rows']],
-                                    f"{data['machine']}; {data['date']}")
-
-
 def test_tables_show_stored_figures(benchmark_modules: Any, tmp_path: Path,
                                     monkeypatch: pytest.MonkeyPatch) -> None:
     figures = benchmark_modules('figures')
-    monkeypatch.setattr(figures, 'plot', lambda *words: None)
+    monkeypatch.setattr(figures.plots, 'draw', lambda *words: None)
     applications, streaming = map(benchmark_modules, ('applications', 'streaming'))
     results = list(applications.before())
     outcomes = {name: streaming.stored(RESULTS / f'{name}-table.json')

@@ -185,13 +185,13 @@ def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     record('a', **alive())
     record('b')
     assert run('list', '--json') == 0
-    entry, unknown = json.loads(capsys.readouterr().out)
+    entry, unknown = json.loads(capsys.readouterr().out)['machines']
     assert (entry['image'], entry['key'], entry['disk_gb']) == ('ami-1', 'fogros2-a', 40)
     assert (unknown['image'], unknown['key'], unknown['disk_gb']) == (None, None, None)
     assert (entry['host_key'], unknown['host_key']) == ('ssh-ed25519 AAAA', None)
     assert entry['name'] == 'a' and entry['provider'] == 'memory' and entry['id'] == 'id-a'
-    assert entry['launch_alive'] is True and entry['cost_per_hour'] == '0.5'
-    assert float(entry['cost']) == pytest.approx(0.5 / 6, rel=0.01)
+    assert entry['launch_alive'] is True and entry['cost_per_hour'] == 0.5
+    assert entry['cost'] == pytest.approx(0.5 / 6, rel=0.01)
     assert 595 < entry['age'] < 700 and 3500 < entry['time_left'] < 3600
 
 
@@ -410,7 +410,8 @@ def test_gc_clears_and_reports_leftovers(capsys: pytest.CaptureFixture[str]) -> 
     machine('busy')
     record('busy', **alive())
     assert run('gc', '--dry-run', '--json') == 0
-    would = {entry['name']: entry['reason'] for entry in json.loads(capsys.readouterr().out)}
+    would = {entry['name']: entry['reason']
+             for entry in json.loads(capsys.readouterr().out)['cleared']}
     assert would == {'old': 'past its lifetime', 'gone': 'gone at its provider',
                      'kept': 'its launch is gone'}
     assert len(Memory.machines) == 3
@@ -553,7 +554,8 @@ def test_env_lets_a_terminal_join(capsys: pytest.CaptureFixture[str],
                            capture_output=True, text=True, check=True).stdout.splitlines()
     assert shown == ['rmw_cyclonedds_cpp', f'<a b="c\'d"/>,file://{path}', '42']
     assert run('env', 'a', '--json') == 0
-    assert json.loads(capsys.readouterr().out)['RMW_IMPLEMENTATION'] == 'rmw_cyclonedds_cpp'
+    assert json.loads(capsys.readouterr().out)['variables'][
+        'RMW_IMPLEMENTATION'] == 'rmw_cyclonedds_cpp'
     # ROS 2's own ros2 has a daemon, which gets a port of this launch
     found = importlib.util.find_spec('os')
     monkeypatch.setattr(joining.importlib.util, 'find_spec', lambda name: found)
@@ -690,8 +692,9 @@ def test_no_verb_prints_the_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize('words', [
-    [], ['connect'], ['dashboard'], ['delete'], ['doctor'], ['env'], ['gc'], ['image'], ['list'],
-    ['logs'], ['price'], ['regions'], ['shell'], ['status']], ids=' '.join)
+    [], ['bugreport'], ['connect'], ['dashboard'], ['delete'], ['doctor'], ['env'], ['gc'],
+    ['image'], ['list'], ['logs'], ['plan'], ['price'], ['regions'], ['shell'], ['ssh-config'],
+    ['status'], ['wait']], ids=' '.join)
 def test_help_imports_no_core(words: list[str], tmp_path: Path) -> None:
     # beside what ros2cli loads for a command of its own
     code = ('import sys\nfrom ros2cli.cli import main\n'

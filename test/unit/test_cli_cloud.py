@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 import contextlib
 import dataclasses
 from decimal import Decimal
+import io
 import json
 import os
 from pathlib import Path
 import socket
+import sys
 import threading
 import time
 from typing import Any, Optional
@@ -48,7 +50,17 @@ from fogros2.provider.offers import MachineType, Offer, Offers, ranked, Region, 
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.testing.fakes import FakeProvider, FakeShell
 from fogros2.testing.plugins import instead
-from ros2fog_cli.api import doctor, endings, images, monitor, pod_image, reach, table
+from fogros2.waiting import wait_until
+from ros2fog_cli.api import (
+    doctor,
+    endings,
+    images,
+    monitor,
+    pod_image,
+    progress,
+    reach,
+    table,
+)
 from ros2fog_cli.api.machines import Entry
 
 NOW = 1_800_000_000.0
@@ -514,7 +526,8 @@ def test_images_are_listed_and_deleted(capsys: pytest.CaptureFixture[str]) -> No
     assert lines[1].split() == ['one', 'img-0', 'cloud', 'eu-west-1', 'available', '2', 'h', '00',
                                 'min', '30', 'GB', 'abcd']
     assert run('image', 'list', '--json') == 0
-    assert [i['id'] for i in json.loads(capsys.readouterr().out)] == ['img-0', 'img-1', 'img-2']
+    assert [i['id'] for i in json.loads(capsys.readouterr().out)['images']] == [
+        'img-0', 'img-1', 'img-2']
     assert run('image', 'delete', 'two', '--dry-run') == 0
     assert capsys.readouterr().out.count('would delete two') == 2
     assert run('image', 'delete', 'two') == 1
@@ -604,8 +617,8 @@ def test_prices_are_listed_cheapest_first(
         'm6i.2xlarge  cloud     eu-west-1  8     32 GB   -                      x86_64  Intel  '
         '$10.9600  $0.1000']
     assert run('price', '--spot', '--arch', 'x86_64', '--json') == 0
-    (only,) = json.loads(capsys.readouterr().out)
-    assert only['type'] == 'm6i.2xlarge' and only['spot_price'] == '0.1'
+    (only,) = json.loads(capsys.readouterr().out)['offers']
+    assert only['type'] == 'm6i.2xlarge' and only['spot_price'] == 0.1
 
 
 def test_prices_of_all_regions_are_compared(
@@ -639,7 +652,7 @@ def test_regions(
         'REGION     PLACE          DISTANCE', 'us-west-1  San Francisco  9 km',
         'no region answers: these are distances from where this computer seems to be'])
     assert run('regions', 'us-west-1', '--all', '--json') == 0
-    assert json.loads(capsys.readouterr().out)[0]['place'] == 'San Francisco'
+    assert json.loads(capsys.readouterr().out)['regions'][0]['place'] == 'San Francisco'
     assert asked == [([], False), (['us-west-1'], True)]
 
 
@@ -733,7 +746,7 @@ def test_slow_deletion_is_told_without_a_terminal(
 
 def test_running_time_of_a_deletion_makes_room_for_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ('one', 'two'):
-        machine(name, f'id-{name}')
+        machine(name)
     shown = Terminal()
     slow_cloud(monkeypatch, lambda: 'deleting' in shown.getvalue())
     monkeypatch.setattr(sys, 'stderr', shown)

@@ -59,6 +59,8 @@ def complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Complete:
     ('ros2 fog revoke ', ['mapper', 'planner']),
     ('ros2 fog leave ', ['slam']),
     ('ros2 fog status ', ['mapper', 'planner']),
+    ('ros2 fog wait p', ['planner']),
+    ('ros2 fog ssh-config ', ['mapper', 'planner']),
     ('ros2 fog status pl', ['planner']),
     ('ros2 fog delete ', ['all', 'mapper', 'planner']),
     ('ros2 fog list --region eu-west-', ['eu-west-1', 'eu-west-2', 'eu-west-3']),

@@ -22,7 +22,7 @@ from ros2fog_cli.api import doctor, lan
 
 def test_doctor_passes_on_this_computer(capsys: pytest.CaptureFixture[str]) -> None:
     status = main(argv=['fog', 'doctor', '--json', '--lan-seconds', '0'])
-    checks = json.loads(capsys.readouterr().out)
+    checks = json.loads(capsys.readouterr().out)['checks']
     assert len(checks) >= 15
     assert {check['verdict'] for check in checks} <= {'ok', 'warning', 'failed'}
     failed = [check for check in checks if check['verdict'] == 'failed']
@@ -51,7 +51,7 @@ def test_missing_python_package_is_named() -> None:
          "from ros2cli.cli import main\n"
          "main(argv=['fog', 'doctor', '--json', '--lan-seconds', '0'])"],
         capture_output=True, text=True, timeout=60)
-    (check,) = [check for check in json.loads(found.stdout)
+    (check,) = [check for check in json.loads(found.stdout)['checks']
                 if check['name'] == 'Python packages']
     assert check['verdict'] == 'failed' and check['detail'].startswith('paramiko not found')
     assert 'python3-paramiko,' in check['remedy'] and 'Traceback' not in found.stderr

@@ -25,6 +25,7 @@ from fogros2.model import (
     MachineSpec,
     MachineState,
     Result,
+    to_json,
     VpnInterface,
 )
 from fogros2.provider import Capabilities
@@ -217,3 +218,11 @@ def test_published_port_is_part_of_the_machines_filter() -> None:
     assert 'fib daddr type local udp dport 50000 dnat ip to 198.51.100.2' in text
     assert 'table inet fogros2-abc' in text
     assert 'delete table %s fogros2-abc' in packet_filter.unset('fogros2-abc')
+
+
+def test_leave_names_the_nearest_machine() -> None:
+    write_private(Store().launch('a1b2c3') / 'joined.json', to_json(invitation.Invitation(
+        'slam', '', '198.18.7.2', '', '198.18.7.224', '198.18.7.0/24', '', 0, 0.0)).encode())
+    assert main(argv=['fog', 'leave', 'slan']) == (
+        "this computer has not joined a machine 'slan' (did you mean 'slam'?)")
+    assert 'ros2 fog join' in main(argv=['fog', 'leave', 'planner'])

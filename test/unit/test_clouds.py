@@ -162,10 +162,10 @@ def test_spot_price_and_round_trip_are_in_json(
     two_clouds: Any, capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert run('--arch', 'x86_64', '--spot', '--limit', '2', '--json') == 0
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(capsys.readouterr().out)['offers']
     assert [(one['provider'], one['type'], one['spot_price'], round(one['round_trip_ms'], 1))
-            for one in found] == [('gcp', 'e2-medium', '0.0086319', 12.3),
-                                  ('azure', 'Standard_B2als_v2', '0.0094', 45.6)]
+            for one in found] == [('gcp', 'e2-medium', 0.0086319, 12.3),
+                                  ('azure', 'Standard_B2als_v2', 0.0094, 45.6)]
 
 
 def test_google_without_a_key_has_an_unknown_price(

@@ -92,7 +92,7 @@ def test_machine_is_shown_from_its_steps_to_its_end(live: Live) -> None:
     shown = when(live, 'a', lambda one: one['steps'][0]['state'] == 'done')
     assert shown['steps'][0]['detail'] == 'there'
     shown = when(live, 'a', lambda one: one['cost_per_hour'] is not None)
-    assert shown['cost_per_hour'] == '0.6' and shown['address'] == '198.51.100.7'
+    assert shown['cost_per_hour'] == 0.6 and shown['address'] == '198.51.100.7'
     (launch,) = live.state()['launches']
     assert launch['alive'] and [step['step'] for step in launch['steps']] == ['VPN interface']
     json.dumps(live.state())

@@ -158,7 +158,7 @@ def machine(**changes: Any) -> dict[str, Any]:
         'name': 'planner', 'provider': 'aws', 'id': 'i-1', 'state': 'running',
         'phase': 'running', 'launch': 'abc123', 'launch_pid': 7, 'launch_alive': True,
         'created': 1000.0, 'expires': 4600.0, 'ended': None, 'address': '198.51.100.7',
-        'place': 'eu-central-1', 'kind': 'g4dn.xlarge', 'cost_per_hour': '3.6',
+        'place': 'eu-central-1', 'kind': 'g4dn.xlarge', 'cost_per_hour': 3.6,
         'on_exit': 'delete', 'bridge': 0, 'deleting': False, 'trouble': '', 'problems': [],
         'replicas': [],
         'log': 0, 'agent': {'since': 1010.0, 'rss': 14_000_000, 'heartbeat_age': 1.0},
@@ -249,4 +249,4 @@ def test_watch_ends_with_the_reader_of_its_lines(tmp_path: Path) -> None:
     words = f'{sys.executable} {program} fog status a --watch --json --interval 0.1'
     done = subprocess.run(['sh', '-c', f'{words} | head -n 1'], capture_output=True, text=True,
                           timeout=30)
-    assert done.stdout == 'null\n' and done.stderr == ''
+    assert json.loads(done.stdout) == {'version': 1, 'machine': None} and done.stderr == ''

@@ -111,7 +111,7 @@ def test_sudo_ticket_is_kept_while_a_script_runs(tmp_path):
     for name, text in (('id', 'echo 1000'), ('sudo', f'echo "$*" >>{said}')):
         (tmp_path / name).write_text(f'#!/bin/sh\n{text}\n')
         (tmp_path / name).chmod(0o755)
-    # test.sh waits for Kubernetes's build with it
+    # a build of Kubernetes takes longer than sudo remembers the password
     script = subprocess.Popen(
         ['sh', '-c', '. tools/common.sh; keep_ticket; read -r line'], cwd=ROOT,
         stdin=subprocess.PIPE, env={**os.environ, 'PATH': f'{tmp_path}:{os.environ["PATH"]}'})
@@ -138,7 +138,7 @@ def test_page_shows_failures_and_leftovers(tools, tmp_path):
             'system': system, 'password': True, 'command': 'make test', 'commit': 'a' * 40,
             'date': '2026-01-01', 'status': 0, 'packages': 5, 'downloaded': 7_000_000,
             'minutes': 1.5, 'tests': (9, 0, 0), 'failed': [], 'skipped': {}, 'left': [],
-            'notes': [], **more})
+            **more})
 
     fresh.record([outcome('Debian 12', status=2), outcome('Debian 13')], tmp_path)
     fresh.record([outcome('Debian 12', status=1, tests=(8, 1, 0), failed=['test_a::test_bad'],

@@ -11,7 +11,7 @@ from typing import Any
 import numpy
 import pytest
 
-pytest.importorskip('zstandard', reason='the extra "point_clouds" is not installed')
+pytest.importorskip('zstandard', reason='the extra "point-clouds" is not installed')
 import zstandard
 
 from fogros2_examples.city import City

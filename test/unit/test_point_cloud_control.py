@@ -8,7 +8,7 @@ import math
 
 import pytest
 
-pytest.importorskip('zstandard', reason='the extra "point_clouds" is not installed')
+pytest.importorskip('zstandard', reason='the extra "point-clouds" is not installed')
 from point_cloud_stream.codec import Coded
 from point_cloud_stream.control import COARSEST, Control
 from point_cloud_stream.parts import split

@@ -18,6 +18,7 @@ from fogros2.provider.aws.prices import Ec2Prices
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import Order, Place, Vm, VmId
 from fogros2.provider.vm.failures import unless_gone
+from fogros2.provider.vm.market import CACHE_AGE
 from fogros2.provider.vm.regions import read_table, Regions
 
 
@@ -40,6 +41,7 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network):
     regions = Regions('AWS', read_table(__file__), api_host)
     id_form = 'i-[0-9a-f]+'
     base_region = 'us-east-1'
+    types_age = CACHE_AGE
     configured = staticmethod(login.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:

@@ -37,6 +37,7 @@ from fogros2.provider.vm.cloud import (
     VmId,
 )
 from fogros2.provider.vm.failures import unless_gone
+from fogros2.provider.vm.market import CACHE_AGE
 from fogros2.provider.vm.options import ipv4, SSH
 from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import wait_until
@@ -65,6 +66,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
                       lambda region: f'{region}.handler.control.monitor.azure.com')
     id_form = 'fogros2-[0-9a-f]{16}-[0-9a-f]{8}'
     base_region = 'westeurope'
+    types_age = CACHE_AGE
     configured = staticmethod(login.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
@@ -375,7 +377,7 @@ class Azure(prices.AzurePrices, images.AzureImages):
         self._account.call('POST', self._vm(machine.vm, '/start'), f'starting {machine.vm}',
                            wait=True)
 
-    def end_command(self, tags: Mapping[str, str]) -> tuple[str, ...]:
+    def end_command(self, machine: VmId, tags: Mapping[str, str]) -> tuple[str, ...]:
         return (*ending.END, endpoint())
 
     # -- images ---------------------------------------------------------------------------------

@@ -29,6 +29,7 @@ from fogros2.provider.vm.cloud import (
     VmId,
 )
 from fogros2.provider.vm.failures import unless_gone
+from fogros2.provider.vm.market import CACHE_AGE
 from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import cancellable, wait_until
 
@@ -51,6 +52,7 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
     #: Project, zone and name.
     id_form = r'[a-z0-9.:-]+/[a-z0-9-]+/fogros2-[0-9a-f]{16}'
     base_region = DEFAULT_REGION
+    types_age = CACHE_AGE
     configured = staticmethod(login.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:
@@ -211,8 +213,8 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
         return next((str(url) for url in found.get('subnetworks', ())
                      if f'/regions/{place.region}/' in url), '')
 
-    def end_command(self, tags: Mapping[str, str]) -> tuple[str, ...]:
-        return super().end_command(tags) if tags.get(TAG_ON_EXIT) == 'stop' \
+    def end_command(self, machine: VmId, tags: Mapping[str, str]) -> tuple[str, ...]:
+        return super().end_command(machine, tags) if tags.get(TAG_ON_EXIT) == 'stop' \
             else (*guest.DELETE, self._account.endpoint)
 
     def delete(self, machine: VmId) -> None:

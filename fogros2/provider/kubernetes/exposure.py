@@ -3,7 +3,7 @@
 Find how WireGuard's UDP gets from the robot to a pod.
 
 By a load balancer, by a port of the nodes, or, if neither lets UDP through, the pod connects to
-the robot. WireGuard does not answer unknown peers, so until its agent starts, the pod answers
+the robot. WireGuard admits known peers only, so until its agent starts, the pod answers
 probes on that port: an address that answers is known to work.
 """
 

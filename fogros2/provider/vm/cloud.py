@@ -46,12 +46,14 @@ Adapter = TypeVar('Adapter', bound='VmCloud')
 
 class CloudError(ProviderError):
     """
-    A cloud refused a request.
+    A cloud refused a request; set ``refused`` to False if it may have had an effect.
 
     :param full: no capacity in this zone, or the quota of this region is used up.
     :param gone: the resource does not exist (any more).
     :param denied: these credentials must not do that.
     """
+
+    refused = True
 
     def __init__(
         self, message: str, hint: str = '', *, full: Literal['', 'zone', 'region'] = '',
@@ -118,7 +120,8 @@ class Order:
 
     :param options: of the cloud's class, with the values for the region.
     :param tags: for the machine and every resource beside it.
-    :param sources: networks (CIDR) that may reach the SSH port.
+    :param sources: networks (CIDR) that may reach the SSH port; empty without the capability
+        ``firewall``.
     """
 
     spec: MachineSpec
@@ -192,6 +195,11 @@ class VmCloud(abc.ABC):
     id_form: ClassVar[str]
     #: Region for requests that belong to no region.
     base_region: ClassVar[str]
+    #: The most characters of user data that has to be text; 0 where a cloud takes any bytes.
+    text_limit: ClassVar[int] = 0
+    #: Seconds for which ``types`` and ``zones`` are used again. They are few, because a type that
+    #: has no capacity now may be left out; a cloud that lists all types may set a day.
+    types_age: ClassVar[float] = 300.0
     #: Notes for people about machines that this process has created, by the cloud's id.
     notes: ClassVar[dict[str, list[str]]] = collections.defaultdict(list)
     #: Set when the launch ends; calls then raise Cancelled.
@@ -334,8 +342,13 @@ class VmCloud(abc.ABC):
         :raises CloudError: with ``full`` if there is no capacity.
         """
 
-    def end_command(self, tags: Mapping[str, str]) -> tuple[str, ...]:
-        """Return the command by which a machine with these tags ends itself, as root."""
+    def end_command(self, machine: VmId, tags: Mapping[str, str]) -> tuple[str, ...]:
+        """
+        Return the command by which a machine with these tags ends itself and its billing, as root.
+
+        :param machine: ``vm`` is '' in the command of the user data, which is written before the
+            cloud names the machine; the launch replaces that command at its first connection.
+        """
         return END_COMMAND
 
     @abc.abstractmethod
@@ -350,9 +363,9 @@ class VmCloud(abc.ABC):
         :returns: whether there was one.
         """
 
-    @abc.abstractmethod
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
         """Let only ``sources`` (CIDR) reach a TCP port of a machine; none closes it."""
+        raise Unsupported(f'{self.title} has no firewall')
 
     @abc.abstractmethod
     def set_tags(self, machine: VmId, tags: Mapping[str, str]) -> None:

@@ -96,7 +96,7 @@ class Creation:
             # all look-ups come before the first creation, at the same time
             there = pool.submit(self._existing, region, tags[TAG_ATTEMPT])
             sources = pool.submit(lambda: list(options.ssh_from) or self.sources())
-            data = pool.submit(self._user_data, options, tags)
+            data = pool.submit(self._user_data, region, options, tags)
             order = Order(self.spec, self.request, options, tags, b'', ())
             prepared = pool.submit(self.cloud.prepare, region, order, options.types)
             found = there.result()
@@ -121,14 +121,15 @@ class Creation:
                 f'give the machine another name=, or: ros2 fog delete {self.spec.name}')
         return None
 
-    def _user_data(self, options: VmOptions, tags: Mapping[str, str]) -> bytes:
+    def _user_data(self, region: str, options: VmOptions, tags: Mapping[str, str]) -> bytes:
         agent = self.request.agent_config
         if agent:
-            agent = {**agent, 'end_command': list(self.cloud.end_command(tags))}
+            machine = VmId(region, '', tags[TAG_ATTEMPT])
+            agent = {**agent, 'end_command': list(self.cloud.end_command(machine, tags))}
         return user_data(cloud_config(
             name=self.spec.name, user=options.user,
             authorized_keys=[self.request.authorized_key, *options.fleet],
-            host_key=one_time(self.request.token), agent_config=agent))
+            host_key=one_time(self.request.token), agent_config=agent), self.cloud.text_limit)
 
     def _make(self, region: str, order: Order, prepared: Mapping[str, Any]) -> VmId:
         created: list[str] = []
@@ -187,10 +188,11 @@ class Creation:
                 if error.full == 'region':
                     full.add(place.kind)
                 refused = error
+        limit = self.options.max_price
         raise refused or CloudError(
-            f"no machine for '{self.spec.name}' in {region} is known to cost at most "
-            f'max_price={self.options.max_price}', 'ros2 fog price shows what there is',
-            full='zone')
+            f"{self.cloud.title} has no {' or '.join(order.options.types)} in {region}"
+            + ('' if limit is None else f' that is known to cost at most max_price={limit}'),
+            'ros2 fog price --region shows what it has', full='zone')
 
     def _too_dear(self, price: Optional[Decimal]) -> bool:
         """Return whether a price may be above the limit; the cloud checks a spot price itself."""

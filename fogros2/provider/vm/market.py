@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Types and prices of a cloud's regions, cached on disk for a day; choose the cheapest."""
+"""Types and prices of a cloud's regions, cached on disk; choose the cheapest."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from fogros2.provider.offers import fits, MachineType, Offer, Offers, ranked, Wa
 from fogros2.provider.vm.cloud import VmCloud
 from fogros2.store import state_home, write_private
 
-#: Seconds for which an answer is used again.
+#: Seconds for which prices are used again; for types and zones: ``VmCloud.types_age``.
 CACHE_AGE = 86400.0
 #: Maximum number of types in one request for spot prices.
 _NAMED_TYPES = 100
@@ -189,15 +189,19 @@ class Market:
             return found
 
     def _fresh(self, key: str) -> Any:
-        """Return an answer of less than a day ago, None if there is none."""
+        """Return an answer that is not too old, None if there is none."""
+        kind = key.partition('-')[0]
         if key not in self._known and not self._refresh:
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError,
                                      ArithmeticError):  # missing or damaged
                 data = json.loads(self._path(key).read_text())
                 if data['source'] == self._source.account_key() \
-                        and 0 <= self._clock() - float(data['time']) < CACHE_AGE:
-                    self._known[key] = _READ[key.partition('-')[0]](data['value'])
+                        and 0 <= self._clock() - float(data['time']) < self._age(kind):
+                    self._known[key] = _READ[kind](data['value'])
         return self._known.get(key)
+
+    def _age(self, kind: str) -> float:
+        return self._source.types_age if kind in ('types', 'zones') else CACHE_AGE
 
     def _path(self, key: str) -> Path:
         return (self._cache or state_home() / 'cache' / self._source.name) / f'{key}.json'

@@ -42,7 +42,7 @@ from fogros2.provider.vm.cloud import (
 )
 from fogros2.provider.vm.creation import Creation
 from fogros2.provider.vm.market import Market
-from fogros2.provider.vm.options import CHEAPEST, NEAREST, VmOptions
+from fogros2.provider.vm.options import CHEAPEST, ipv4, NEAREST, VmOptions
 from fogros2.provider.vm.user_data import AGENT_DIRECTORY, AGENT_PROGRAM
 from fogros2.waiting import cancellable, wait_until
 
@@ -99,6 +99,13 @@ class VmProvider(Provider):
 
     def check(self, spec: MachineSpec) -> None:
         options = self._cloud.options.of(spec)
+        if options.ssh_from and not self.capabilities.firewall:
+            raise ConfigurationError(
+                f'{self._cloud.title} has no firewall that could keep others out',
+                'leave ssh_from= out')
+        if options.fleet and self.capabilities.firewall and not ipv4(options.ssh_from):
+            raise ConfigurationError('fleet= needs the networks (IPv4) of its robots',
+                                     "ssh_from=['198.51.100.0/24'] names one")
         self._cloud.account(options).check_credentials()
         region = self._region(options)
         for one in (*((region,) if region != NEAREST else ()), *options.regions):
@@ -115,14 +122,17 @@ class VmProvider(Provider):
                 chosen['regions'] = [one for one in self._cloud.regions.neighbours(region)
                                      if among is None or one in among]
         options = options.in_region(region)
-        kind = options.named_type
+        kind, disk = options.named_type, spec.options.get('disk_size') and options.disk_size or 0
         market = Market(self._cloud.account(options).until(self.cancel))
         if options.chooses_type:
-            choice = market.choose([region], options.wants())
+            choice = market.choose(
+                [region], dataclasses.replace(options.wants(), disk_gb=disk))
             kind = choice.chosen.type.name
             # if there is no capacity for the cheapest, the next cheapest are tried
             chosen[options.TYPES] = list(options.further_types) or [
                 offer.type.name for offer in choice.offers[1:3]]
+        elif disk:
+            self._check_disk(region, options)
         kind = kind or options.DEFAULT_TYPE
         if options.max_price is not None and not options.chooses_type:
             price = market.price_of(region, kind, spot=options.spot)
@@ -134,6 +144,15 @@ class VmProvider(Provider):
         if not isinstance(spec.options.get(options.TYPE), Mapping):
             chosen[options.TYPE] = kind
         return dataclasses.replace(spec, options={**spec.options, **chosen, 'region': region})
+
+    def _check_disk(self, region: str, options: VmOptions) -> None:
+        """Check that no type has a fixed disk that is smaller than ``disk_size``."""
+        for kind in self._cloud.account(options).until(self.cancel).named_types(
+                region, options.types):
+            if 0 < kind.disk_gb < options.disk_size:
+                raise ConfigurationError(
+                    f'{kind.name} in {region} has a disk of {kind.disk_gb} GB, and disk_size= '
+                    f'asks for {options.disk_size}', 'ask for less, or name another type')
 
     def choices(self, asked: MachineSpec, chosen: MachineSpec) -> list[str]:
         """Describe type and region, and what is tried if there is no capacity."""
@@ -179,17 +198,24 @@ class VmProvider(Provider):
         if options.chooses_type or self._region(options) == NEAREST:
             spec = self.resolve(spec)
             options = self._cloud.options.of(spec)
-        cloud = self._cloud.account(options)
+        cloud, firewall = self._cloud.account(options), self.capabilities.firewall
         creation = Creation(
             cloud.until(cancel), cloud, spec, request, options,
-            sources=lambda: _ROBOT_ADDRESS.with_ipv6([self._address(cancel)]),
+            sources=lambda: _ROBOT_ADDRESS.with_ipv6(
+                [self._address(cancel)]) if firewall else [],
             price=functools.cache(
                 lambda region, kind: self._price(region, kind, options, cancel)))
         machine = creation.run(list(dict.fromkeys([self._region(options), *options.regions])))
         cloud.notes[machine.vm] += map(str, creation.undo_failures)
+        if not firewall:
+            cloud.notes[machine.vm].append(
+                f'warning: its SSH port is open to the world, because {cloud.title} has no '
+                'firewall')
         return self._text(machine)
 
     def adopt(self, machine_id: str, spec: MachineSpec, tags: Mapping[str, str]) -> None:
+        if not self.capabilities.adopt:
+            return
         machine, cloud = self._id(machine_id), self._until()
         cloud.set_tags(machine, tags)
         cloud.set_ending(machine, spec)
@@ -209,14 +235,14 @@ class VmProvider(Provider):
         shell = Endpoint('ssh', vm.address, user=user, host_key=key) if running and vm.address \
             and untrusted.NAME.fullmatch(user) and untrusted.HOST_KEY.fullmatch(key) else None
         disk = tags.get(TAG_DISK, '')
+        machine = VmId(vm.region, vm.id, tags.get(TAG_ATTEMPT, '0' * 16))
         return Machine(
-            self._text(VmId(vm.region, vm.id, tags.get(TAG_ATTEMPT, '0' * 16))),
-            tags.get(TAG_NAME, ''), self.name, vm.state, created=vm.created, shell=shell,
-            vpn_host=vm.address if running else '', private_network=vm.private_network,
-            private_ip=vm.private_ip, region=vm.region,
+            self._text(machine), tags.get(TAG_NAME, ''), self.name, vm.state, created=vm.created,
+            shell=shell, vpn_host=vm.address if running else '',
+            private_network=vm.private_network, private_ip=vm.private_ip, region=vm.region,
             kind=f'{vm.kind}{_SPOT}' if vm.spot else vm.kind, image=vm.image, key=vm.key,
             disk_gb=int(disk) if disk.isdecimal() else None, tags=tags,
-            end_command=self._cloud.end_command(tags),
+            end_command=self._cloud.end_command(machine, tags),
             cost_per_hour=_dollars(tags.get(TAG_PRICE, '')), stopped=vm.stopped,
             billed=vm.billed)
 
@@ -297,13 +323,16 @@ class VmProvider(Provider):
     # -- its network ----------------------------------------------------------------------------
 
     def robot_address(self) -> str:
-        return self._address(self._cancel())
+        return self._address(self._cancel()) if self.capabilities.firewall \
+            else super().robot_address()
 
     def _address(self, cancel: Optional[threading.Event]) -> str:
         return cancellable(_ROBOT_ADDRESS, cancel, what="asking for the robot's address",
                            grace=lambda: 0.0)
 
     def allow(self, machine_id: str, port: int, sources: Sequence[str]) -> None:
+        if not self.capabilities.firewall:
+            super().allow(machine_id, port, sources)
         # a port is closed even if the launch ends
         cloud = self._until() if sources else self._cloud
         cloud.set_firewall(self._id(machine_id), port, _ROBOT_ADDRESS.with_ipv6(sources))

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Write the user data of a machine: a #cloud-config, gzipped.
+Write the user data of a machine: a #cloud-config, gzipped unless the cloud takes only text.
 
 It contains, in this order: the one-time SSH host key and the login key (before sshd starts), the
 agent (before anything slow), and, in the background, programs that an Ubuntu image lacks. It is
@@ -96,17 +96,18 @@ apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends \\
 """
 
 
-def user_data(config: Mapping[str, Any]) -> bytes:
+def user_data(config: Mapping[str, Any], text_limit: int = 0) -> bytes:
     """
     Return a #cloud-config as user data; the same bytes for the same one.
 
+    :param text_limit: the most bytes of a text (ASCII); 0 for compressed user data.
     :raises ProviderError: longer than the limit of the clouds.
     """
-    text = '#cloud-config\n' + json.dumps(config, ensure_ascii=False)
-    data = gzip.compress(text.encode(), 9, mtime=0)
-    if len(data) > LIMIT:
+    text = f'#cloud-config\n{json.dumps(config)}'.encode()
+    data, limit = (text, text_limit) if text_limit else (gzip.compress(text, 9, mtime=0), LIMIT)
+    if len(data) > limit:
         raise ProviderError(f"the user data of '{config['hostname']}' has {len(data)} bytes, and "
-                            f'a cloud takes {LIMIT}', 'name fewer keys in fleet=')
+                            f'the cloud takes {limit}', 'name fewer keys in fleet=')
     return data
 
 

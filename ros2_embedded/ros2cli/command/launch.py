@@ -97,12 +97,15 @@ class LaunchCommand(CommandExtension):
         import launch
         from launch.actions import IncludeLaunchDescription
         from launch.launch_description_sources import get_launch_description_from_any_launch_file
-        if args.print:
-            print(launch.LaunchIntrospector().format_launch_description(
-                get_launch_description_from_any_launch_file(path)))
-            return None
-        if args.show_args:
-            _print_arguments(get_launch_description_from_any_launch_file(path))
+        if args.print or args.show_args:
+            description = get_launch_description_from_any_launch_file(path)
+            if args.print:
+                print(launch.LaunchIntrospector().format_launch_description(description))
+            else:
+                _print_arguments(description)
+            for option in self._options:
+                preview = getattr(option, 'preview', lambda *_: '')
+                print(preview(description, args, _parse(words)), end='')
             return None
         for option in self._options:
             option.prestart(args)

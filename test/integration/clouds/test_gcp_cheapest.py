@@ -73,7 +73,7 @@ def test_launch_continues_in_the_next_cloud(
     assert shown.returncode == 0 and box.calls() == [], shown.stdout + shown.stderr
     table = robot.ros2('fog', 'price', '--arch', 'x86_64', '--json',
                        '--region', 'westeurope', 'europe-west3')
-    assert [(one['provider'], one['type']) for one in json.loads(table.stdout)[:2]] == [
+    assert [(one['provider'], one['type']) for one in json.loads(table.stdout)['offers'][:2]] == [
         ('azure', 'Standard_B2als_v2'), ('gcp', 'e2-medium')]
     run = robot.launch(path)
     run.wait_for(f'I heard: [Hello World from {name} ', timeout=120)
@@ -81,9 +81,9 @@ def test_launch_continues_in_the_next_cloud(
     (instance,) = box.alive()
     assert (instance.type, instance.region) == ('e2-medium', 'europe-west3')
     # containers of tests beside this one are listed too
-    (machine,) = [one for one in json.loads(robot.ros2('fog', 'list', '--json').stdout)
-                  if one['name'] == name]
-    assert (machine['provider'], machine['cost_per_hour']) == ('gcp', '0.04316778')
+    (machine,) = [one for one in json.loads(
+        robot.ros2('fog', 'list', '--json').stdout)['machines'] if one['name'] == name]
+    assert (machine['provider'], machine['cost_per_hour']) == ('gcp', 0.04316778)
     run.interrupt()
     assert run.ended() == 0, run.text
     # each attempt had a name of its own, and Azure has nothing of them

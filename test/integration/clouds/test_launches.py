@@ -164,12 +164,12 @@ def test_kept_machine_is_baked_listed_and_deleted_elsewhere(cloud, robot, box, n
     box.run(kept.id, 'echo baked >/root/baked; sync')
     shown = robot.ros2('fog', 'image', name, '--dry-run')
     assert shown.returncode == 0 and f'would make an image of {name}' in shown.stderr
-    assert robot.fog('image', 'list', '--json').strip() == '[]'
+    assert json.loads(robot.fog('image', 'list', '--json'))['images'] == []
     robot.fog('image', name)
     # a computer that knows nothing of this robot's machines finds this one, and ends it
     elsewhere = {'FOGROS2_STATE_HOME': str(robot.home / 'elsewhere')}
     before = len(cloud.asked(box))
-    (found,) = [one for one in json.loads(robot.fog('list', '--json', **elsewhere))
+    (found,) = [one for one in json.loads(robot.fog('list', '--json', **elsewhere))['machines']
                 if one['name'] == name]
     assert (found['provider'], found['disk_gb']) == (cloud.name, 30)
     assert len(cloud.asked(box)) - before <= cloud.listing
@@ -183,7 +183,7 @@ def test_kept_machine_is_baked_listed_and_deleted_elsewhere(cloud, robot, box, n
     assert again.clean, again.text
     assert box.run(box.alive()[0].id, 'cat /root/baked').strip() == 'baked'
     robot.fog('delete', '--yes', f'{name}-b')
-    (image,) = json.loads(robot.fog('image', 'list', '--json'))
+    (image,) = json.loads(robot.fog('image', 'list', '--json'))['images']
     robot.fog('image', 'delete', image['id'], '--yes')
     assert not robot.things()
 
@@ -203,7 +203,7 @@ def test_kept_machine_is_a_host_for_the_robots_of_its_fleet(cloud, robot, box, n
     box.run(instance.id, f'cat >/root/ports.py <<END\n{PORTS}\nEND\n'
                          'setsid python3 /root/ports.py >/dev/null 2>&1 &')
 
-    (told,) = json.loads(robot.fog('list', '--json'))
+    (told,) = json.loads(robot.fog('list', '--json'))['machines']
     known = tmp_path / 'known'
     known.write_text(f"{told['address']} {told['host_key']}\n")
 

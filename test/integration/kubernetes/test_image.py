@@ -154,7 +154,7 @@ def test_image_has_the_requested_packages(builder):
              for line in layer.read_text().splitlines()]
     assert 'update' in asked
     installs = next(line for line in asked if line.startswith('install -y'))
-    assert {'ros-jazzy-ros-base', 'ros-jazzy-rmw-cyclonedds-cpp', 'rsync', 'wireguard-tools',
+    assert {'ros-jazzy-ros-base', 'ros-jazzy-rmw-fastrtps-cpp', 'rsync', 'wireguard-tools',
             'wireguard-go'} <= set(installs.split())
 
 

@@ -184,7 +184,7 @@ def _make(
     with contextlib.ExitStack() as undo:
         undo.callback(debian_root.remove, upper)
         upper.mkdir()
-        _tar(layers[0], root)
+        pack(layers[0], root)
         if not system.is_dir():
             sandbox_layer(layers[2], static_busybox())
             write_archive(archive, [
@@ -196,7 +196,7 @@ def _make(
         shell.run(Command(('useradd', '-m', '-s', '/bin/bash', '-u', str(UID), USER), sudo=True,
                           what='add the login user'), timeout=30.0)
         why_not = _add_ros(shell, its, root, upper / 'files')
-        _tar(layers[1], upper / 'files')
+        pack(layers[1], upper / 'files')
         # the lower layer is there already
         write_archive(archive, [
             Image(name, tuple(layers[:2]), _CONFIG) for name in (READY, DEFAULT)],
@@ -360,7 +360,7 @@ def _digest(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _tar(target: Path, folder: Path) -> None:
+def pack(target: Path, folder: Path) -> None:
     """Pack a folder; much of it is root's alone. The same files give the same archive."""
     process.run(Command(
         ('sh', '-ec', 'tar --numeric-owner --one-file-system --sort=name -C "$1" -cf "$2" .; '

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The provider of Meadow, written from doc/providers.md."""
+"""The provider of Meadow, written from doc/developers/providers_vm.md."""
 
 from __future__ import annotations
 
@@ -7,23 +7,21 @@ import base64
 from collections.abc import Iterator, Mapping, Sequence
 import dataclasses
 from decimal import Decimal
-import json
 import os
 from typing import Any, ClassVar, Optional
-import urllib.error
-from urllib.parse import urlencode
-import urllib.request
 
-from fogros2.errors import MachineNotFound, PrerequisiteError
+from fogros2.errors import FogError, MachineNotFound, PrerequisiteError
 from fogros2.model import MachineState
-from fogros2.provider import Capabilities
+from fogros2.provider import Capabilities, TAG_ON_EXIT
 from fogros2.provider.offers import MachineType
-from fogros2.provider.vm.cloud import CloudError, Order, Place, Vm, VmCloud, VmId
+from fogros2.provider.vm.cloud import Order, Place, Vm, VmCloud, VmId
+from fogros2.provider.vm.failures import CodedError, Failure, unless_gone
 from fogros2.provider.vm.labels import LabelRules
 from fogros2.provider.vm.options import VmOptions
 from fogros2.provider.vm.provider import VmProvider
 from fogros2.provider.vm.regions import Regions
-from fogros2.waiting import cancellable, ON_ITS_WAY, wait_until
+from fogros2.provider.vm.rest import RestAccount
+from fogros2.waiting import wait_until
 
 RULES = LabelRules(plain='a-z0-9-', longest=63)
 STATES = {'pending': MachineState.PENDING, 'running': MachineState.RUNNING,
@@ -44,6 +42,37 @@ class MeadowOptions(VmOptions):
         'region': ('nearest|[a-z]+', "'north'"), 'machine_type': ('[a-z]+', "'small'")}
 
 
+class MeadowError(CodedError):
+    """Meadow refused."""
+
+    TITLE = 'Meadow'
+    FAILURES: ClassVar[Mapping[str, Failure]] = {
+        'bad_token': Failure('Meadow does not accept the token', 'check MEADOW_TOKEN',
+                             PrerequisiteError),
+        'exhausted': Failure('Meadow has no free machine of this type here',
+                             'name another region=', full='zone'),
+        'no_such_machine': Failure(gone=True)}
+
+
+class Account(RestAccount):
+    """The account of MEADOW_TOKEN."""
+
+    TITLE, ENDPOINT_VARIABLE = 'Meadow', 'MEADOW_URL'
+
+    def token(self, what: str) -> str:
+        """Return the token."""
+        return os.environ.get('MEADOW_TOKEN', '')
+
+    def refusal(self, status: int, body: Any, what: str) -> FogError:
+        """Return the error for Meadow's code."""
+        code = str(body.get('code', '')) if isinstance(body, dict) else ''
+        return MeadowError.of(code, '', what, status)
+
+    def call(self, what: str, method: str, path: str, body: Any = None, **query: str) -> Any:
+        """Make a request, and return the JSON of its answer."""
+        return self.ask(method, os.environ['MEADOW_URL'] + path, what, body, query=query).body
+
+
 class Meadow(VmCloud):
     """The API of Meadow."""
 
@@ -54,33 +83,11 @@ class Meadow(VmCloud):
     id_form = 'm-[0-9a-f]+'
     base_region = 'north'
 
+    def __init__(self) -> None:
+        self._account = Account()
+
     def _call(self, what: str, method: str, path: str, body: Any = None, **query: str) -> Any:
-        """Make a request that ends when ``cancel`` is set."""
-        url = os.environ['MEADOW_URL'] + path + (f'?{urlencode(query)}' if query else '')
-        request = urllib.request.Request(
-            url, None if body is None else json.dumps(body).encode(), method=method,
-            headers={'Authorization': f'Bearer {os.environ["MEADOW_TOKEN"]}'})
-
-        def ask() -> Any:
-            with urllib.request.urlopen(request, timeout=10.0) as answer:
-                return json.load(answer)
-
-        try:
-            # nobody waits for an answer that changes nothing
-            return cancellable(ask, self.cancel, what=what,
-                               grace=lambda: 0.0 if method == 'GET' else ON_ITS_WAY)
-        except urllib.error.HTTPError as error:
-            code = json.load(error)['code']
-            if code == 'bad_token':
-                raise PrerequisiteError('Meadow does not accept the token',
-                                        'check MEADOW_TOKEN') from error
-            raise CloudError(f'{what} failed: {code}', gone=code == 'no_such_machine',
-                             full='zone' if code == 'exhausted' else '') from error
-        except OSError as error:
-            silent = PrerequisiteError(f'{what} failed: Meadow does not answer: {error}',
-                                       'check MEADOW_URL')
-            silent.refused = method == 'GET'
-            raise silent from error
+        return self._account.call(what, method, path, body, **query)
 
     def _path(self, region: str, vm: str = '', action: str = '') -> str:
         return '/'.join(filter(None, ['/regions', region, 'machines', vm, action]))
@@ -100,7 +107,7 @@ class Meadow(VmCloud):
 
     def _types(self, region: str) -> list[dict[str, Any]]:
         found: list[dict[str, Any]] = self._call(
-            'asking for the types', 'GET', f'/regions/{region}/types')
+            'asking for the types', 'GET', f'/regions/{region}/types')['types']
         return found
 
     def types(self, region: str) -> list[MachineType]:
@@ -125,22 +132,18 @@ class Meadow(VmCloud):
     def find(self, region: str, tags: Mapping[str, str]) -> list[Vm]:
         """Return the machines with all of the tags."""
         found = self._call('looking for machines', 'GET', self._path(region),
-                           **RULES.encode(tags))
+                           **RULES.encode(tags))['machines']
         machines = [self._vm(machine) for machine in found]
         return [vm for vm in machines if 'fogros2-attempt' in vm.tags
                 and vm.state is not MachineState.DELETED]
 
     def get(self, region: str, vm: str) -> Optional[Vm]:
         """Return a machine."""
-        try:
+        with unless_gone():
             found = self._vm(self._call(f'looking for {vm}', 'GET', self._path(region, vm)))
-        except CloudError as error:
-            if error.gone:
-                raise MachineNotFound(f'there is no {vm} in {region}') from error
-            raise
-        if found.state is MachineState.DELETED:
-            raise MachineNotFound(f'{vm} in {region} is deleted')
-        return found
+            if found.state is not MachineState.DELETED:
+                return found
+        raise MachineNotFound(f'there is no {vm} in {region} any more')
 
     def insert(
         self, place: Place, order: Order, prepared: Any, created: Sequence[str],
@@ -160,24 +163,28 @@ class Meadow(VmCloud):
         """Delete a machine, and wait until it is gone."""
         path = self._path(machine.region, machine.vm)
 
-        def gone(method: str) -> bool:
-            try:
-                self._call(f'deleting {machine.vm}', method, path)
-            except CloudError as error:
-                if not error.gone:
-                    raise
-                return True
-            return False
+        def gone() -> bool:
+            with unless_gone():
+                self._call(f'looking for {machine.vm}', 'GET', path)
+                return False
+            return True
 
-        if not gone('DELETE'):
-            wait_until(lambda: gone('GET'), timeout=60.0, what=f'{machine.vm} to be deleted')
+        with unless_gone():
+            self._call(f'deleting {machine.vm}', 'DELETE', path)
+            wait_until(gone, timeout=60.0, what=f'{machine.vm} to be deleted')
 
     def end_attempt(self, region: str, attempt: str) -> bool:
         """Delete the machines of an attempt."""
         found = self.find(region, {'fogros2-attempt': attempt})
         for vm in found:
-            self._call(f'deleting {vm.id}', 'DELETE', self._path(region, vm.id))
+            with unless_gone():
+                self._call(f'deleting {vm.id}', 'DELETE', self._path(region, vm.id))
         return bool(found)
+
+    def end_command(self, machine: VmId, tags: Mapping[str, str]) -> tuple[str, ...]:
+        """Ask Meadow's metadata service, which obeys the machine: one that is off is billed."""
+        action = ('POST', 'stop') if tags.get(TAG_ON_EXIT) == 'stop' else ('DELETE', '')
+        return ('curl', '-fsX', action[0], f'http://169.254.169.254/machine/{action[1]}')
 
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
         """Change the firewall."""
@@ -187,7 +194,7 @@ class Meadow(VmCloud):
 
     def set_tags(self, machine: VmId, tags: Mapping[str, str]) -> None:
         """Change labels."""
-        self._call(f'writing labels of {machine.vm}', 'PUT',
+        self._call(f'writing labels of {machine.vm}', 'PATCH',
                    self._path(machine.region, machine.vm, 'labels'), RULES.encode(tags))
 
     def stop(self, machine: VmId) -> None:

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Defaults of machines in TOML files, of the user and of each sourced workspace."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+import dataclasses
+import importlib
+import inspect
+from pathlib import Path
+from typing import Any, Optional, TYPE_CHECKING
+
+from fogros2.describe import keywords, values
+from fogros2.describe.kinds import Kind
+from fogros2.describe.machines import check_loss, check_setting, CloudInstance, SETTINGS
+from fogros2.errors import ConfigurationError, PrerequisiteError
+from fogros2.host.workspace import find_workspaces
+from fogros2.model import MachineSpec
+
+if TYPE_CHECKING:
+    from launch import LaunchContext
+
+    from fogros2.describe.overrides import Overrides
+
+#: The file's name, in the user's folder of configurations and in a workspace.
+FILE = 'fogros2.toml'
+_TYPES: Mapping[Kind, tuple[type, ...]] = {
+    'text': (str,), 'number': (int, float, str), 'bool': (bool,), 'list': (list,),
+    'table': (list,), 'mapping': (dict,), 'scalar': (str, int, float),
+    'text or mapping': (str, dict)}
+
+
+def files(environment: Mapping[str, str]) -> list[Path]:
+    """Return the paths, whether or not they exist; a later one wins."""
+    home = Path(environment.get('XDG_CONFIG_HOME') or '~/.config').expanduser()
+    return [home / 'fogros2' / FILE,
+            *(Path(folder) / FILE for folder in reversed(find_workspaces(environment)))]
+
+
+def read(path: Path) -> dict[str, dict[str, Any]]:
+    """
+    Return the keywords in a file by provider, with '' for all providers.
+
+    :raises ConfigurationError: the file cannot be read, or has a keyword that no machine has.
+    :raises PrerequisiteError: this Python cannot read TOML.
+    """
+    if not path.is_file():
+        return {}
+    tables: dict[str, dict[str, Any]] = {'': {}}
+    for name, value in _parsed(path).items():
+        if name in keywords.providers() and isinstance(value, dict):
+            tables[name] = value
+        else:
+            tables[''][name] = value
+    for provider, table in tables.items():
+        known = {name: kind for each in ([provider] if provider else keywords.providers())
+                 for name, kind in _allowed(keywords.machine_class(each)).items()}
+        for name, value in table.items():
+            if name not in known:
+                raise keywords.unknown(f"{path}: [{provider or 'machines'}]", name, known)
+            if not isinstance(value, _TYPES[known[name]]) or (
+                    isinstance(value, bool) and known[name] not in ('bool', 'scalar')):
+                raise ConfigurationError(f'{path}: {name} = {value!r} has the wrong type',
+                                         f'it takes a {known[name]}')
+            if name in SETTINGS:
+                with values.named(str(path)):
+                    check_setting(name, value)
+    return tables
+
+
+def check(environment: Mapping[str, str]) -> None:
+    """
+    Check all files.
+
+    :raises FogError: one is wrong, or cannot be read.
+    """
+    for path in files(environment):
+        read(path)
+
+
+def _parsed(path: Path) -> dict[str, Any]:
+    for name in ('tomllib', 'tomli'):
+        try:
+            toml = importlib.import_module(name)
+        except ModuleNotFoundError:
+            continue
+        try:
+            parsed: dict[str, Any] = toml.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise ConfigurationError(f"{path} can't be read: {error}",
+                                     'it is TOML, such as: lifetime = "4h"') from error
+        return parsed
+    raise PrerequisiteError(f"Python 3.10 can't read {path}", 'pip install tomli')
+
+
+def _allowed(cls: type[CloudInstance]) -> dict[str, Kind]:
+    """Return the keywords that a file may set, with their kinds: no machine has them by itself."""
+    optional = {name for base in cls.__mro__ if '__init__' in vars(base)
+                for name, parameter in inspect.signature(vars(base)['__init__']).parameters.items()
+                if parameter.default is None}
+    common = keywords.keywords(CloudInstance)
+    return {name: keyword.kind for name, keyword in keywords.keywords(cls).items()
+            if name in optional and (name in SETTINGS if name in common else True)}
+
+
+def apply(
+    spec: MachineSpec, given: Collection[str], environment: Mapping[str, str],
+) -> MachineSpec:
+    """
+    Return a spec with defaults for what neither launch file nor command line says.
+
+    :param given: the keywords of every machine that they say.
+    :raises FogError: a file is wrong, or cannot be read.
+    """
+    wanted: dict[str, Any] = {}
+    for path in files(environment):
+        tables = read(path)
+        known = _allowed(keywords.machine_class(spec.provider)) if tables else {}
+        wanted.update({name: value for part in ('', spec.provider)
+                       for name, value in tables.get(part, {}).items() if name in known})
+    settings = {name: check_setting(name, value) for name, value in wanted.items()
+                if name in SETTINGS and name not in given}
+    # an empty text is what an argument of a launch file has without a value
+    options = {name: value for name, value in wanted.items()
+               if name not in SETTINGS and spec.options.get(name, '') == ''}
+    found = dataclasses.replace(spec, options={**spec.options, **options}, **settings)
+    check_loss(found)
+    return found
+
+
+def resolved(
+    machine: CloudInstance, overrides: Optional[Overrides], context: LaunchContext,
+) -> MachineSpec:
+    """
+    Return the spec of a machine by the launch file, the command line and the files of defaults.
+
+    :raises FogError: a value is wrong, or a file cannot be read.
+    """
+    spec, given = machine.spec(context), set(machine.settings)
+    override = overrides.of(spec.name) if overrides is not None else None
+    if override is not None:
+        spec = override.instead(spec, context)
+        given.update(override.given)
+    return apply(spec, given, context.environment)

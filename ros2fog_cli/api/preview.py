@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Show the machines of a launch description, and which node goes where; nothing is executed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+import contextlib
+import dataclasses
+from decimal import Decimal
+from typing import Any, Optional
+
+from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity, Substitution
+from launch.actions import (
+    DeclareLaunchArgument,
+    ExecuteLocal,
+    GroupAction,
+    IncludeLaunchDescription,
+    OpaqueFunction,
+    SetLaunchConfiguration,
+)
+from launch.substitutions import Command, SubstitutionFailure
+
+from fogros2.actions.cloud_group import CloudGroup
+from fogros2.actions.fog_machine import FogMachine
+from fogros2.deploy.choosing import Choices
+from fogros2.describe import defaults, values
+from fogros2.describe.keywords import ROBOT
+from fogros2.describe.machines import CloudInstance
+from fogros2.describe.overrides import Overrides
+from fogros2.errors import ConfigurationError
+from fogros2.launch_internals.wrapping import below
+from fogros2.model import MachineSpec
+from fogros2.runtime.remote_process import RemoteProcess
+
+#: Raised by substitutions and conditions that only a launch can evaluate, by wrong values, and by
+#: the code of included files, which can raise anything.
+_UNKNOWN = Exception
+#: Characters of a value; a longer one is cut.
+_LONGEST = 60
+
+
+@dataclasses.dataclass
+class Planned:
+    """
+    A machine of a launch.
+
+    :param spec: None for the robot, and for a machine whose values are known at launch only.
+    :param note: why there is no spec.
+    :param nodes: programs, or command lines.
+    """
+
+    name: str
+    spec: Optional[MachineSpec] = None
+    note: str = ''
+    nodes: list[str] = dataclasses.field(default_factory=list)
+
+    def lines(self, price: Optional[Decimal] = None) -> Iterator[str]:
+        """
+        Yield a line for the machine, and one for each node.
+
+        :param price: US dollars per hour, if it is known.
+        """
+        what = self.note
+        if self.spec is not None:
+            options = ', '.join(f'{name}={_short(value)}' for name, value
+                                in sorted(self.spec.options.items())
+                                if value not in ('', None, [], ()))
+            what = self.spec.provider + f' ({options})' * bool(options)
+        if price is not None:
+            what += f', ${price.normalize():f} an hour'
+        yield f'{self.name}: {what}' if what else self.name
+        yield from (f'    {node}' for node in self.nodes)
+
+
+class _Context(LaunchContext):
+    """A context in which no substitution runs a command."""
+
+    def perform_substitution(self, substitution: Substitution) -> str:
+        """Return the value of a substitution."""
+        if isinstance(substitution, Command):
+            raise SubstitutionFailure(f'{substitution.describe()} runs at launch')
+        return str(super().perform_substitution(substitution))
+
+
+class Preview:
+    """
+    What a launch description would do.
+
+    :param arguments: launch arguments.
+    :param overrides: of ``--machine``.
+    """
+
+    def __init__(
+        self, description: LaunchDescription, arguments: Mapping[str, str],
+        overrides: Optional[Overrides] = None,
+    ) -> None:
+        self._context = _Context()
+        self._context.launch_configurations.update(arguments)
+        self._overrides = overrides
+        self._machines: dict[str, Planned] = {}
+        self._on_robot: set[str] = set()
+        #: Whether a function or an unread file may add something.
+        self.open = False
+        self._look(description.entities)
+
+    @property
+    def machines(self) -> list[Planned]:
+        """The machines, then the robot if it has nodes."""
+        robot = [self._machines[ROBOT]] if ROBOT in self._machines else []
+        return [one for one in self._machines.values() if one.name != ROBOT] + robot
+
+    def lines(self, prices: Mapping[str, Decimal] = {}) -> Iterator[str]:
+        """
+        Yield the lines to show.
+
+        :param prices: US dollars per hour, by the names of machines.
+        """
+        for one in self.machines:
+            yield from one.lines(prices.get(one.name))
+        if self.open:
+            yield 'Not shown: what functions, and files that cannot be read now, may add.'
+
+    def _look(
+        self, entities: Iterable[LaunchDescriptionEntity], where: str = ROBOT, note: str = '',
+    ) -> None:
+        for entity in entities:
+            own = note
+            try:
+                condition = getattr(entity, 'condition', None)
+                if condition is not None and not condition.evaluate(self._context):
+                    continue
+            except _UNKNOWN:
+                own = ' (under a condition)'
+            if isinstance(entity, DeclareLaunchArgument):
+                if entity.default_value is not None:
+                    self._context.launch_configurations.setdefault(
+                        entity.name, self._text(entity.default_value))
+            elif isinstance(entity, SetLaunchConfiguration):
+                with contextlib.suppress(_UNKNOWN):
+                    entity.execute(self._context)
+            elif isinstance(entity, FogMachine):
+                with contextlib.suppress(_UNKNOWN):
+                    self._name(entity.described(self._context))
+            elif isinstance(entity, ExecuteLocal):
+                at = self._name(entity.machine) if isinstance(entity, RemoteProcess) else where
+                self._planned(at).nodes.append(self._program(entity) + own)
+            else:
+                self.open = self.open or isinstance(entity, OpaqueFunction)
+                self._inside(entity, where, own)
+
+    def _inside(self, entity: LaunchDescriptionEntity, where: str, note: str) -> None:
+        configurations = dict(self._context.launch_configurations)
+        if isinstance(entity, IncludeLaunchDescription):
+            try:
+                entity.launch_description_source.get_launch_description(self._context)
+                for name, value in entity.launch_arguments:
+                    self._context.launch_configurations[
+                        values.resolve(self._context, name)] = values.resolve(
+                            self._context, value)
+            except _UNKNOWN:
+                self.open = True
+        if isinstance(entity, CloudGroup):
+            where = self._name(entity.machine)
+        for some in below(entity):
+            self._look(some, where, note)
+        if isinstance(entity, (GroupAction, IncludeLaunchDescription)):
+            self._context.launch_configurations.clear()
+            self._context.launch_configurations.update(configurations)
+
+    def _program(self, action: ExecuteLocal) -> str:
+        program = [part for name in ('node_package', 'node_executable')
+                   if (part := getattr(action, name, None))]
+        words: Sequence[Any] = program or getattr(action, 'cmd', [])
+        return _short(' '.join(map(self._text, words)) or type(action).__name__)
+
+    def _text(self, value: Any) -> str:
+        try:
+            return str(values.resolve(self._context, value))
+        except _UNKNOWN:
+            return values.describe(value)
+
+    def _planned(self, name: str) -> Planned:
+        return self._machines.setdefault(name, Planned(name))
+
+    def _name(self, machine: Any) -> str:
+        """Return the name under which a machine is planned, the robot's for one that runs here."""
+        if not isinstance(machine, CloudInstance):
+            name = self._text(machine)
+            return ROBOT if name in self._on_robot else name
+        try:
+            spec = defaults.resolved(machine, self._overrides, self._context)
+            if spec.provider == ROBOT:
+                self._on_robot.add(spec.name)
+                return ROBOT
+            self._planned(spec.name).spec = spec
+            return spec.name
+        except _UNKNOWN as error:
+            self._planned(machine.name).note = f'{machine.provider}: {error}'
+            return machine.name
+
+
+def arguments(words: Sequence[str]) -> dict[str, str]:
+    """
+    Parse launch arguments.
+
+    :raises ConfigurationError: one is not of the form ``NAME:=VALUE``.
+    """
+    found = {}
+    for word in words:
+        name, assigned, value = word.partition(':=')
+        if not name or not assigned:
+            raise ConfigurationError(f"'{word}' is no argument of a launch file",
+                                     'write NAME:=VALUE')
+        found[name] = value
+    return found
+
+
+def priced(spec: MachineSpec, choices: Choices) -> tuple[MachineSpec, Optional[Decimal]]:
+    """
+    Make the open choices of a machine as a launch would; return its price, if it is known.
+
+    :raises FogError: nothing fits, or a cloud does not answer.
+    """
+    spec = dataclasses.replace(spec, options=values.await_all(spec.options))
+    chosen = choices.resolved(choices.places(spec)[0])
+    return chosen, choices.price(chosen)
+
+
+def _short(value: Any) -> str:
+    if callable(value):
+        return '(chosen at launch)'
+    text = str(value)
+    return text if len(text) <= _LONGEST else f'{text[:_LONGEST]}...'

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Write settings of OpenSSH for machines, so that other programs reach them by name.
+
+Each file is in the folder of a machine's record, so it ends with the machine. One ``Include``
+with a pattern in the user's configuration reads those that exist.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+import shlex
+
+from fogros2.errors import ShellError, Unsupported
+from fogros2.model import Endpoint
+from fogros2.shell import ssh_config
+from fogros2.store import Store, write_private
+from ros2fog_cli.api import machines, reach
+from ros2fog_cli.api.machines import Entry
+
+#: Names of the files in a machine's folder.
+FILE, KNOWN_HOSTS = 'ssh_config', 'known_hosts'
+
+
+def write(entry: Entry, store: Store) -> Path:
+    """
+    Write the settings of a machine as it can be reached now; return the file.
+
+    :raises FogError: the machine does not run, or its shell is not SSH.
+    """
+    to = reach.endpoint(entry)
+    if to.kind != 'ssh':
+        raise Unsupported(f"'{entry.name}' has no SSH server that this computer reaches",
+                          f'ros2 fog connect {entry.name}')
+    if not store.exists(entry.name):
+        raise Unsupported(f"this robot has no key of '{entry.name}'",
+                          'only the robot that launched the machine has one')
+    if machines.load(entry.provider).capabilities.firewall:
+        to = reach.through_vpn(entry, to) or to
+    folder = store.machine(entry.name)
+    text = settings(entry.name, to, folder)
+    if to.host_key:
+        write_private(folder / KNOWN_HOSTS, f'{label(entry.name)} {to.host_key}\n'.encode())
+    write_private(folder / FILE, text.encode())
+    return folder / FILE
+
+
+def label(name: str) -> str:
+    """Return the name of a machine in its file of known hosts."""
+    return f'fogros2-{name}'
+
+
+def settings(name: str, to: Endpoint, folder: Path) -> str:
+    """
+    Return the settings of a machine, in the form of ssh_config(5).
+
+    :param folder: where the file with its host key is.
+    :raises ShellError: a value would be several settings.
+    """
+    found = ssh_config.of(to)
+    host = to.host if to.host_key else found.host
+    pairs = [('HostName', host.replace('%', '%%')), ('Port', str(found.port)),
+             ('User', found.user)]
+    if found.proxy:
+        pairs.append(('ProxyCommand', shlex.join(found.proxy).replace('%', '%%')))
+    if found.only_keys:
+        pairs += [('IdentityFile', _path(key, '%')) for key in found.keys]
+        pairs.append(('IdentitiesOnly', 'yes'))
+    if to.host_key:
+        found = dataclasses.replace(
+            found, known_hosts=(str(folder / KNOWN_HOSTS),), label=label(name))
+        pairs += [('UserKnownHostsFile', _path(found.known_hosts[0], '%')),
+                  ('GlobalKnownHostsFile', '/dev/null'), ('StrictHostKeyChecking', 'yes')]
+    elif to.alias:
+        pairs.append(('UserKnownHostsFile', ' '.join(
+            _path(one, '%') for one in found.known_hosts)))
+    pairs.append(('HostKeyAlias', found.label))
+    for key, value in (*pairs, ('host key', to.host_key or '')):
+        if value and (not value.isprintable() or ' ' in value and key in ('HostName', 'User')):
+            raise ShellError(f"'{name}' has a {key} that ssh would misread: {value!r}",
+                             'its host or its provider may be hijacked')
+    return f'Host {name}\n' + ''.join(f'    {key} {value}\n' for key, value in pairs if value)
+
+
+def include(store: Store) -> str:
+    """Return the line for the user's configuration."""
+    return f"Include {_path(str(store.root.absolute() / 'machines' / '*' / FILE))}"
+
+
+def included(line: str, path: Path = Path('~/.ssh/config')) -> bool:
+    """Return whether the user's configuration has the line."""
+    try:
+        return line in map(str.strip, path.expanduser().read_text().splitlines())
+    except (OSError, ValueError):
+        return False
+
+
+def _path(path: str, doubled: str = '') -> str:
+    """
+    Quote a path.
+
+    :param doubled: a character that has to be written twice.
+    """
+    text = path.replace(doubled, 2 * doubled) if doubled else path
+    return f'"{text}"' if ' ' in text else text

@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ``ros2 launch -s``, ``-p`` and ``ros2 fog plan`` show of machines, without any of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from decimal import Decimal
+from importlib.util import find_spec
+import os
+from pathlib import Path
+
+from launch import LaunchDescription
+from launch.actions import (
+    DeclareLaunchArgument,
+    ExecuteProcess,
+    GroupAction,
+    IncludeLaunchDescription,
+    OpaqueFunction,
+    TimerAction,
+)
+from launch.conditions import IfCondition
+from launch.launch_description_sources import AnyLaunchDescriptionSource
+from launch.substitutions import Command, LaunchConfiguration
+from launch_ros.actions import Node
+import pytest
+from ros2cli.cli import main
+
+from fogros2 import (
+    AWSCloudInstance,
+    CloudGroup,
+    CloudNode,
+    ContainerInstance,
+    FogROSLaunchDescription,
+)
+from fogros2.describe.overrides import Overrides
+from fogros2.errors import ConfigurationError, ProviderError
+from fogros2.model import CreateRequest, MachineSpec
+from fogros2.provider import Capabilities
+from fogros2.store import Store
+from fogros2.testing.fakes import FakeProvider
+from fogros2.testing.plugins import instead
+from ros2fog_cli.api.preview import arguments, Preview
+
+XML = """\
+<launch>
+  <arg name="where" default="aws"/>
+  <arg name="region" default="eu-west-1"/>
+  <fog_machine name="planner" provider="$(var where)" region="$(var region)"/>
+  <cloud_node machine="planner" pkg="fogros2_examples" exec="talker"/>
+  <node pkg="fogros2_examples" exec="listener"/>
+</launch>
+"""
+
+
+class Cloud(FakeProvider):
+    """A cloud that notes what it is asked."""
+
+    name = 'aws'
+    capabilities = Capabilities(choices=True)
+    asked: list[str] = []
+
+    def resolve(self, spec: MachineSpec) -> MachineSpec:
+        self.asked.append(f'resolve {spec.name}')
+        if spec.name == 'c':
+            raise ProviderError('no credentials', 'log in')
+        return dataclasses.replace(spec, options={**spec.options, 'ec2_instance_type': 't3.large'})
+
+    def cost_per_hour(self, spec: MachineSpec) -> Decimal:
+        return Decimal('0.0416')
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        raise AssertionError
+
+
+@pytest.fixture(autouse=True)
+def cloud(monkeypatch: pytest.MonkeyPatch) -> type[Cloud]:
+    Cloud.asked = []
+    instead(monkeypatch, 'fogros2.provider', {'aws': Cloud, 'container': FakeProvider})
+    return Cloud
+
+
+def node(machine, executable='talker', **more):
+    return CloudNode(machine=machine, package='demo', executable=executable, **more)
+
+
+def lines(entities, overrides=None, **given):
+    kind = entities if isinstance(entities, LaunchDescription) else LaunchDescription(entities)
+    return list(Preview(kind, given, Overrides(overrides) if overrides else None).lines())
+
+
+def test_machines_are_shown_with_their_nodes():
+    planner = AWSCloudInstance(name='planner', region='eu-west-1', ec2_instance_type='t3.large')
+    assert lines(FogROSLaunchDescription([
+        node(planner), TimerAction(period=1.0, actions=[node(planner, 'late')]),
+        CloudGroup(machine=ContainerInstance(name='mapper', memory='2g'), actions=[
+            Node(package='demo', executable='mapper'),
+            ExecuteProcess(cmd=['echo', LaunchConfiguration('x')])]),
+        Node(package=['de', 'mo'], executable=LaunchConfiguration('x', default='listener'))])) == [
+        'planner: aws (ec2_instance_type=t3.large, region=eu-west-1)',
+        '    demo talker', '    demo late',
+        'mapper: container (memory=2g)', '    demo mapper',
+        "    echo <LaunchConfig('x')>",
+        'robot', '    demo listener']
+
+
+def test_values_are_those_of_the_arguments():
+    def described():
+        return [
+            DeclareLaunchArgument('region', default_value='eu-west-1'),
+            DeclareLaunchArgument('big', default_value='false'),
+            node(AWSCloudInstance(name='a', region=LaunchConfiguration('region'))),
+            node(ContainerInstance(name='b'), condition=IfCondition(LaunchConfiguration('big')))]
+
+    assert lines(described()) == ['a: aws (region=eu-west-1)', '    demo talker']
+    assert lines(described(), region='us-east-1', big='true') == [
+        'a: aws (region=us-east-1)', '    demo talker', 'b: container', '    demo talker']
+
+
+def test_what_only_a_launch_knows_is_said():
+    found = lines([
+        node(AWSCloudInstance(name='a', region=LaunchConfiguration('nowhere'))),
+        node(ContainerInstance(name='b'), condition=IfCondition(LaunchConfiguration('x'))),
+        OpaqueFunction(function=lambda context: None)])
+    assert found[0].startswith('a: aws: ') and 'nowhere' in found[0]
+    assert found[1:] == ['    demo talker', 'b: container', '    demo talker (under a condition)',
+                         'Not shown: what functions, and files that cannot be read now, may add.']
+
+
+def test_preview_runs_no_command(tmp_path: Path):
+    made = tmp_path / 'made'
+    command = Command(['touch ', str(made)])
+    found = lines([node(AWSCloudInstance(name='a', region=command)),
+                   ExecuteProcess(cmd=['echo', command])])
+    assert found[0].startswith('a: aws: ') and found[1:3] == ['    demo talker', 'robot']
+    assert found[3].startswith('    echo <Command(') and not made.exists()
+
+
+def test_machines_run_where_the_command_line_says():
+    described = [node(AWSCloudInstance(name='a')), node(AWSCloudInstance(name='b'))]
+    assert lines(described, ['a=container,memory=1g', 'b=robot']) == [
+        'a: container (memory=1g)', '    demo talker', 'robot', '    demo talker']
+
+
+def test_included_file_has_its_own_arguments(tmp_path: Path):
+    path = tmp_path / 'x.launch.xml'
+    path.write_text(XML)
+    included = IncludeLaunchDescription(
+        AnyLaunchDescriptionSource(str(path)), launch_arguments={'region': 'us-east-1'}.items())
+    assert lines([GroupAction([included]), included]) == [
+        'planner: aws (region=us-east-1)', *['    fogros2_examples talker'] * 2,
+        'robot', *['    fogros2_examples listener'] * 2]
+
+
+def test_broken_include_spoils_nothing_else(tmp_path: Path):
+    path = tmp_path / 'x.launch.py'
+    path.write_text('raise KeyboardError')
+    included = IncludeLaunchDescription(AnyLaunchDescriptionSource(str(path)))
+    assert lines([included, node(ContainerInstance(name='a'))]) == [
+        'a: container', '    demo talker',
+        'Not shown: what functions, and files that cannot be read now, may add.']
+
+
+def test_word_that_is_no_argument_is_refused():
+    assert arguments(['a:=b:=c', 'd:=']) == {'a': 'b:=c', 'd': ''}
+    with pytest.raises(ConfigurationError, match='NAME:=VALUE'):
+        arguments(['a=b'])
+
+
+@pytest.mark.skipif(find_spec('ros2launch') is not None,
+                    reason="ROS 2's own ros2launch does not show machines")
+@pytest.mark.parametrize('option', ['-s', '-p'])
+def test_launch_shows_machines_and_asks_nothing(option, tmp_path, capsys, cloud):
+    path = tmp_path / 'x.launch.xml'
+    path.write_text(XML)
+    before = sorted(os.walk(Store().root))
+    assert not main(argv=['launch', str(path), 'region:=us-east-1', option])
+    said = capsys.readouterr().out
+    assert said.endswith("""
+Machines (ros2 fog plan asks for their prices):
+    planner: aws (region=us-east-1)
+        fogros2_examples talker
+    robot
+        fogros2_examples listener
+""")
+    assert cloud.asked == [] and sorted(os.walk(Store().root)) == before
+    path.write_text('<launch><node pkg="demo" exec="talker"/></launch>')
+    assert not main(argv=['launch', str(path), option])
+    assert 'Machines' not in capsys.readouterr().out
+
+
+def test_plan_asks_for_prices_and_creates_nothing(tmp_path, capsys, cloud):
+    path = tmp_path / 'x.launch.xml'
+    path.write_text("""\
+<launch>
+  <fog_machine name="a" provider="aws" region="eu-west-1"/>
+  <fog_machine name="b" provider="aws"/>
+  <fog_machine name="c" provider="aws"/>
+  <fog_machine name="d" provider="container"/>
+  <cloud_node machine="a" pkg="demo" exec="talker"/>
+</launch>
+""")
+    assert main(argv=['fog', 'plan', str(path)]) == 1
+    said = capsys.readouterr()
+    assert said.out == """a: aws (ec2_instance_type=t3.large, region=eu-west-1), $0.0416 an hour
+    demo talker
+b: aws (ec2_instance_type=t3.large), $0.0416 an hour
+c: aws
+d: container
+All machines: $0.0832 an hour
+"""
+    assert said.err == 'c: no credentials (log in)\n'
+    assert cloud.asked == ['resolve a', 'resolve b', 'resolve c']
+    assert main(argv=['fog', 'plan', str(path), '--machine', 'c=robot']) == 0
+    assert 'c: aws' not in capsys.readouterr().out
+
+
+def test_plan_of_a_missing_file_is_an_error(tmp_path):
+    assert "can't be read" in main(argv=['fog', 'plan', str(tmp_path / 'no.launch.py')])
