@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import importlib.util
 import logging
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import launch.logging
 import pytest
 
 from fogros2.store import Store
-from ros2fog_cli.api import bugreport
+from ros2fog_cli.api import bugreport, doctor
 
 
 @pytest.fixture
@@ -58,6 +59,24 @@ def test_value_of_secret_variable_is_hidden_anywhere(name: str) -> None:
     said = bugreport.report([], Store(), {name: 'hunter2-of-me', 'ROS_B': 'a hunter2-of-me'},
                             Path('/nonexistent'))
     assert 'hunter2' not in said
+
+
+@pytest.mark.skipif(not any(map(importlib.util.find_spec, ('tomllib', 'tomli'))),
+                    reason='needs Python 3.11 or tomli')
+def test_values_of_env_in_defaults_are_not_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path))
+    for name in ('COLCON_PREFIX_PATH', 'AMENT_PREFIX_PATH'):
+        monkeypatch.setenv(name, '')
+    (tmp_path / 'fogros2').mkdir()
+    (tmp_path / 'fogros2/fogros2.toml').write_text(
+        "[kubernetes]\nmb = 512\nenv = {WANDB_LOGIN = 'hunter2'}\n")
+    check = doctor.machine_defaults()
+    assert check.verdict == 'ok', check
+    said = bugreport.report([check], Store(), {}, Path('/nonexistent'))
+    assert 'hunter2' not in said
+    assert "kubernetes.mb=512, kubernetes.env=['WANDB_LOGIN']" in said
 
 
 def test_what_a_report_needs_is_shown() -> None:
