@@ -36,12 +36,44 @@ _NAME = re.compile(r'[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?')
 
 
 def state_home() -> Path:
-    """Return FogROS2's state folder; ``FOGROS2_STATE_HOME`` overrides the XDG default."""
+    """
+    Return FogROS2's state folder; ``FOGROS2_STATE_HOME`` overrides the XDG default.
+
+    :raises StoreError: it belongs to another account.
+    """
     own = os.environ.get('FOGROS2_STATE_HOME')
-    if own:
-        return Path(own)
     base = os.environ.get('XDG_STATE_HOME') or os.path.expanduser('~/.local/state')
-    return Path(base) / 'fogros2'
+    return check_owner(Path(own or f'{base}/fogros2'))
+
+
+def cache_home() -> Path:
+    """
+    Return FogROS2's cache, below XDG_CACHE_HOME.
+
+    :raises StoreError: it belongs to another account.
+    """
+    base = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
+    return check_owner(Path(base) / 'fogros2')
+
+
+def check_owner(path: Path) -> Path:
+    """
+    Check that a path, if it exists, belongs to root, this account, or its folder's owner.
+
+    In a folder such as /tmp, another account could have made it first.
+
+    :returns: the path.
+    :raises StoreError: it belongs to another account.
+    """
+    try:
+        owners = {path.stat().st_uid, path.lstat().st_uid}
+        trusted = {0, os.geteuid(), path.parent.stat().st_uid}
+    except OSError:
+        return path
+    if not owners <= trusted:
+        raise StoreError(f'{path} belongs to another account',
+                         'use a folder in which no other account may write')
+    return path
 
 
 def check_name(name: str) -> str:

@@ -16,6 +16,7 @@ from fogros2.describe.machines import check_loss, check_setting, CloudInstance, 
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.host.workspace import find_workspaces
 from fogros2.model import MachineSpec
+from fogros2.store import check_owner
 
 if TYPE_CHECKING:
     from launch import LaunchContext
@@ -42,12 +43,13 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
     Return the keywords in a file by provider, with '' for all providers.
 
     :raises ConfigurationError: the file cannot be read, or has a keyword that no machine has.
+    :raises StoreError: the file belongs to another account.
     :raises PrerequisiteError: this Python cannot read TOML.
     """
     if not path.is_file():
         return {}
     tables: dict[str, dict[str, Any]] = {'': {}}
-    for name, value in _parsed(path).items():
+    for name, value in _parsed(check_owner(path)).items():
         if name in keywords.providers() and isinstance(value, dict):
             tables[name] = value
         else:

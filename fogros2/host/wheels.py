@@ -28,7 +28,7 @@ from typing import Optional
 import urllib.parse
 import zipfile
 
-from fogros2 import process
+from fogros2 import process, store
 from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError
 from fogros2.host import locked
 from fogros2.model import Command
@@ -71,8 +71,7 @@ class Wheels:
 
 def cache_folder() -> Path:
     """Return the folder of the cached wheels, below XDG_CACHE_HOME."""
-    base = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
-    return Path(base) / 'fogros2' / 'wheels'
+    return store.cache_home() / 'wheels'
 
 
 def collect(folder: Optional[Path] = None) -> Wheels:

@@ -28,20 +28,26 @@ _PACKAGES = ('ros-rclpy', 'cryptography', 'paramiko', 'PyYAML', 'boto3', 'google
              'azure-identity', 'kubernetes', 'av', 'foxglove-sdk')
 #: Variables whose values are shown, by how they begin, and names of secrets.
 _SHOWN = ('ROS_', 'RMW_', 'FOGROS2_', 'CYCLONEDDS_', 'FASTDDS_', 'FASTRTPS_', 'ZENOH_')
-_WORD = 'secret|token|passw|credential|authorization|signature'
-_SECRET_NAME = re.compile(f'key|{_WORD}', re.IGNORECASE)
+_WORD = 'secret|token|passw|passphr|credential|authorization|signature'
+_SHORT = '(?:pass|pwd|psk|sig)(?![a-z])'
+#: PWD itself is the current folder.
+_SECRET_NAME = re.compile(f'key|{_WORD}|_{_SHORT}|sshpass', re.IGNORECASE)
 _SECRETS = (
     re.compile(r'-----BEGIN [A-Z ]+-----(?:\s*\n\s*[A-Za-z0-9+/=]+$)*'
                r'(?:\s*-----END [A-Z ]+-----)?', re.MULTILINE),
-    re.compile(r'(?<=://)[^/\s@]+(?=@)'),
-    re.compile(rf'(?i)(?P<kept>(?:\w[_-]key|{_WORD})[\w-]*["\']?\s*[:=]\s*["\']?(?:bearer\s+)?)'
-               r'[^\s&"\',;)]+'),
+    # a password may have '@' and '/', although it should not
+    re.compile(r'(?<=://)(?:[^/\s:]*:\S+|[^/\s]+)(?=@)'),
+    re.compile(rf'(?i)(?P<kept>(?:\w[_-]key|{_WORD}|(?<![a-z]){_SHORT})[\w-]*'
+               r'["\']?\s*[:=>]\s*["\']?(?:bearer\s+)?)[^\s&"\',;)]+'),
+    re.compile(rf'(?i)(?P<kept>--[\w-]*(?:key|{_WORD}|{_SHORT})[\w-]*\s+["\']?)[^\s"\']+'),
+    re.compile(r'\b(?:gh[pousr]_|github_pat_|glpat-|hf_|xox[a-z]-|sk-|AIza|pypi-)[\w-]{16,}'),
     re.compile(r'\b(?:AKIA|ASIA)[A-Z0-9]{16}\b'),
     re.compile(r'\beyJ[\w-]+\.[\w-]+\.?[\w-]*'),
     re.compile(r'\b[0-9a-fA-F]{32,}\b'),
     re.compile(r'(?<![\w+/])(?=\S*[0-9])(?=\S*[A-Z])(?:[A-Za-z0-9+/]{40}|[A-Za-z0-9+/]{42,}={0,2})'
                r'(?![\w+/=])'))
-_LINE = re.compile(r'[0-9]+\.[0-9]+ \[[A-Z]+\] \[(.*?)\]: ')
+#: Begin of an entry in launch's log; what nodes print has no level and logger there.
+_LINE = re.compile(r'[0-9]+\.[0-9]+ (?:\[[A-Z]+\] \[(.*?)\]: )?')
 
 
 def report(

@@ -250,11 +250,13 @@ def cyclone_uri() -> Check:
 
 
 def machine_defaults() -> Check:
-    """Check the files with defaults of machines, and show what they set."""
+    """Check the files with defaults of machines, and show what they set; of mappings, the names."""
     name, paths = 'defaults of machines', defaults.files(os.environ)
     try:
         shown = [f'{path}: ' + ', '.join(
-            f"{f'{provider}.' * bool(provider)}{keyword}={value!r}"
+            # a variable of env= may be a secret
+            f"{f'{provider}.' * bool(provider)}{keyword}="
+            f'{sorted(value) if isinstance(value, dict) else value!r}'
             for provider, table in tables.items() for keyword, value in table.items())
             for path in paths if (tables := defaults.read(path))]
     except FogError as error:

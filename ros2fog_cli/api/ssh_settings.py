@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+import re
 import shlex
 
 from fogros2.errors import ShellError, Unsupported
@@ -21,6 +22,8 @@ from ros2fog_cli.api.machines import Entry
 
 #: Names of the files in a machine's folder.
 FILE, KNOWN_HOSTS = 'ssh_config', 'known_hosts'
+#: Characters that end a value. An unpaired quote in a file ends ssh, for all hosts.
+_MISREAD = re.compile('[ "\'#=]')
 
 
 def write(entry: Entry, store: Store) -> Path:
@@ -77,7 +80,7 @@ def settings(name: str, to: Endpoint, folder: Path) -> str:
             _path(one, '%') for one in found.known_hosts)))
     pairs.append(('HostKeyAlias', found.label))
     for key, value in (*pairs, ('host key', to.host_key or '')):
-        if value and (not value.isprintable() or ' ' in value and key in ('HostName', 'User')):
+        if not value.isprintable() or key in ('HostName', 'User') and _MISREAD.search(value):
             raise ShellError(f"'{name}' has a {key} that ssh would misread: {value!r}",
                              'its host or its provider may be hijacked')
     return f'Host {name}\n' + ''.join(f'    {key} {value}\n' for key, value in pairs if value)
@@ -101,6 +104,9 @@ def _path(path: str, doubled: str = '') -> str:
     Quote a path.
 
     :param doubled: a character that has to be written twice.
+    :raises ShellError: it cannot be quoted.
     """
     text = path.replace(doubled, 2 * doubled) if doubled else path
-    return f'"{text}"' if ' ' in text else text
+    if '"' in text:
+        raise ShellError(f'ssh would misread the path {text!r}', 'rename the file or folder')
+    return f'"{text}"' if _MISREAD.search(text) else text

@@ -12,7 +12,6 @@ import contextlib
 import dataclasses
 import fcntl
 import hashlib
-import os
 from pathlib import Path
 import platform
 import re
@@ -20,7 +19,7 @@ import tempfile
 import threading
 from typing import IO, Optional
 
-from fogros2 import process
+from fogros2 import process, store
 from fogros2.errors import PrerequisiteError
 from fogros2.model import Command
 from fogros2.waiting import wait_until
@@ -117,8 +116,7 @@ def connection() -> str:
 
 def cache_folder() -> Path:
     """Return the folder of the cached roots, below XDG_CACHE_HOME."""
-    base = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
-    return Path(base) / 'fogros2' / 'roots'
+    return store.cache_home() / 'roots'
 
 
 def path(folder: Path, own: Release, packages: Sequence[str] = PACKAGES) -> Path:

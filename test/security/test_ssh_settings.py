@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+No answer of a host or provider ends ``ssh`` to other hosts, or chooses more than its own words.
+
+The user's configuration includes the files that ``ros2 fog ssh-config`` writes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+import subprocess
+
+import pytest
+
+from fogros2 import process
+from fogros2.errors import ShellError
+from fogros2.model import Endpoint
+from ros2fog_cli.api import ssh_settings
+
+pytestmark = pytest.mark.skipif(process.which('ssh') is None, reason='OpenSSH is not installed')
+
+ODD = ['198.51.100.7"', "'x", '#', '=', '=x', 'a b', 'a"b c"', '-oProxyCommand=id', '%h', '${HOME}',
+       '$(id)', '\\', 'a\tb', 'a\rb', '\u2028', 'é']
+
+
+def settings(file: Path, name: str) -> dict[str, str]:
+    said = subprocess.run(['ssh', '-F', file, '-G', '--', name], capture_output=True, text=True)
+    assert said.returncode == 0, said.stderr
+    return dict(line.partition(' ')[::2] for line in said.stdout.splitlines())
+
+
+@pytest.mark.parametrize('field', ['host', 'user'])
+@pytest.mark.parametrize('value', ODD)
+def test_odd_name_is_refused_or_stays_one_word(tmp_path: Path, field: str, value: str) -> None:
+    plain = Endpoint('ssh', '198.51.100.7', 2200, 'fog', 'ssh-ed25519 AAAA', '/k')
+    file = tmp_path / 'config'
+    try:
+        file.write_text(ssh_settings.settings(
+            'a', dataclasses.replace(plain, **{field: value}), tmp_path))
+    except ShellError as refused:
+        assert 'ssh would misread' in str(refused)
+        return
+    assert settings(file, 'b')['hostname'] == 'b'
+    found = settings(file, 'a')
+    name = {'host': 'hostname', 'user': 'user'}[field]
+    assert found[name].lower() == value.lower()
+    assert found['port'] == '2200' and 'proxycommand' not in found
+    assert found['stricthostkeychecking'] in ('yes', 'true')
+
+
+@pytest.mark.parametrize('name', ["it's", '#1', 'a=b', 'a b', 'a"b'])
+def test_odd_path_of_a_key_is_refused_or_read(tmp_path: Path, name: str) -> None:
+    file, key = tmp_path / 'config', f'/keys/{name}'
+    endpoint = Endpoint('ssh', '198.51.100.7', 22, 'fog', 'ssh-ed25519 AAAA', key)
+    try:
+        file.write_text(ssh_settings.settings('a', endpoint, tmp_path / name))
+    except ShellError as refused:
+        assert '"' in name and 'ssh would misread' in str(refused)
+        return
+    found = settings(file, 'a')
+    assert found['identityfile'] == key
+    assert found['userknownhostsfile'] == str(tmp_path / name / ssh_settings.KNOWN_HOSTS)
