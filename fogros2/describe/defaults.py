@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping
 import dataclasses
 import importlib
 import inspect
+import os
 from pathlib import Path
 from typing import Any, Optional, TYPE_CHECKING
 
@@ -46,7 +47,8 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
     :raises StoreError: the file belongs to another account.
     :raises PrerequisiteError: this Python cannot read TOML.
     """
-    if not path.is_file():
+    # not by Path: another account's folder may be closed to this one
+    if not os.path.isfile(path):
         return {}
     tables: dict[str, dict[str, Any]] = {'': {}}
     for name, value in _parsed(check_owner(path)).items():

@@ -250,7 +250,7 @@ def cyclone_uri() -> Check:
 
 
 def machine_defaults() -> Check:
-    """Check the files with defaults of machines, and show what they set; of mappings, the names."""
+    """Check the files with defaults of machines; show what they set, of mappings the names."""
     name, paths = 'defaults of machines', defaults.files(os.environ)
     try:
         shown = [f'{path}: ' + ', '.join(

@@ -400,7 +400,7 @@ def test_container_machine_runs_containers_and_images(
     with launching() as start:
         launched = start(str(path))
         launched.wait_for(f'I heard: [Hello World from {name} ')
-        launched.wait_for('it has demo librmw_cyclonedds_cpp.so for rmw_cyclonedds_cpp and was '
+        launched.wait_for('it has demo librmw_fastrtps_cpp.so for rmw_fastrtps_cpp and was '
                           'told --ros-args')
         status = ros2('fog', 'status', name).stdout
         assert re.search(r'talker-\d +running', status) and re.search(r'box-\d +running', status)

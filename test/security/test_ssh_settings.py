@@ -20,8 +20,8 @@ from ros2fog_cli.api import ssh_settings
 
 pytestmark = pytest.mark.skipif(process.which('ssh') is None, reason='OpenSSH is not installed')
 
-ODD = ['198.51.100.7"', "'x", '#', '=', '=x', 'a b', 'a"b c"', '-oProxyCommand=id', '%h', '${HOME}',
-       '$(id)', '\\', 'a\tb', 'a\rb', '\u2028', 'é']
+ODD = ['198.51.100.7"', "'x", '#', '=', '=x', 'a b', 'a"b c"', '-oProxyCommand=id', '%h',
+       '${HOME}', '$(id)', '\\', 'a\tb', 'a\rb', '\u2028', 'é']
 
 
 def settings(file: Path, name: str) -> dict[str, str]:

@@ -26,6 +26,7 @@ from fogros2.shell import command_line, sync
 from fogros2.testing import FakeShell
 from fogros2.waiting import wait_until
 from ros2fog_cli.api import output, progress, table
+from ros2fog_cli.api.log import Lines
 from ros2fog_cli.command.fog import FogCommand
 from ros2fog_cli.verb import logs, VerbExtension, warn
 
@@ -91,8 +92,9 @@ def test_no_text_of_an_event_controls_the_terminal(
         {**node, 'event': 'started', 'pid': 1, 'cmd': ['x', attack], 'seq': 3},
         {'event': 'watchdog', 'reason': attack, 'action': attack, 'seq': 4},
         {'event': 'launch_exited', 'returncode': 1, 'said': attack, 'seq': 5}])
+    lines = Lines()
     for event in found:
-        logs.show(event, None)
+        logs.show(str(event.get('name', '')), str(event.get('stream', '')), lines.of(event), None)
     out, err = capsys.readouterr()
     assert harmless(out + err), ascii(out + err)
     # what launch logs, and hands to handlers of the process's output
@@ -107,7 +109,7 @@ def test_a_machine_cannot_overwrite_the_name_of_its_node(
 ) -> None:
     (event,) = received([{'event': 'output', 'node': '1', 'name': 'talker', 'stream': 'stdout',
                           'text': '10 %\r20 %\r\n', 'seq': 1}])
-    logs.show(event, None)
+    logs.show(event['name'], event['stream'], Lines().of(event), None)
     assert capsys.readouterr().out == '[talker] 10 %\n[talker] 20 %\n'
 
 

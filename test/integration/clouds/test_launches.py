@@ -203,7 +203,8 @@ def test_kept_machine_is_a_host_for_the_robots_of_its_fleet(cloud, robot, box, n
     box.run(instance.id, f'cat >/root/ports.py <<END\n{PORTS}\nEND\n'
                          'setsid python3 /root/ports.py >/dev/null 2>&1 &')
 
-    (told,) = json.loads(robot.fog('list', '--json'))['machines']
+    (told,) = [one for one in json.loads(robot.fog('list', '--json'))['machines']
+               if one['name'] == name]
     known = tmp_path / 'known'
     known.write_text(f"{told['address']} {told['host_key']}\n")
 
