@@ -159,6 +159,7 @@ class Preview:
                             self._context, value)
             except _UNKNOWN:
                 self.open = True
+                return  # its sub-entities would evaluate the file's name anew, with its commands
         if isinstance(entity, CloudGroup):
             where = self._name(entity.machine)
         for some in below(entity):
