@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Show the machines of a launch description, and which node goes where; nothing is executed."""
+"""Show the machines of a launch description, and which node goes where; no action is executed."""
 
 from __future__ import annotations
 
