@@ -659,7 +659,8 @@ def supervise(directory: str, answer: int) -> None:
     """
     Return in a child process that is to be the agent; start another child when one dies.
 
-    This process exits when an agent ends in order, or when its directory was removed.
+    This process exits when an agent ends in order or by SIGTERM, which finds no handler while
+    Python ends; and when its directory was removed, even if another launch made it again.
 
     :param answer: descriptor of the line about the start; only the first child writes it.
     """
@@ -669,10 +670,14 @@ def supervise(directory: str, answer: int) -> None:
         begin = time.monotonic()
         status = os.waitpid(child, 0)[1]
         ran = time.monotonic() - begin
-        pause = FIRST_RESTART if ran > LAST_RESTART else min(2 * pause, LAST_RESTART)
-        time.sleep(pause if status else 0)
-        if status == 0 or not os.path.isdir(directory):
+        if status in (0, signal.SIGTERM) or not os.path.isdir(directory):
             os._exit(0)
+        folder = os.open(directory, os.O_RDONLY | os.O_CLOEXEC)
+        pause = FIRST_RESTART if ran > LAST_RESTART else min(2 * pause, LAST_RESTART)
+        time.sleep(pause)
+        if os.fstat(folder).st_nlink == 0:
+            os._exit(0)
+        os.close(folder)
 
 
 def read(path: str) -> Json:

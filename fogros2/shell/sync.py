@@ -38,6 +38,8 @@ from fogros2.shell.lines import KEPT
 BULK = 64 << 20
 #: Bytes that a file takes at least.
 BLOCK = 4096
+#: Makes rsync compare times to the nanosecond: a file written twice in one second has changed.
+_EXACT_TIMES = '--modify-window=-1'
 #: Exit status of rsync for vanished source files, which is normal with editors and compilers.
 VANISHED = 24
 #: Exit statuses of rsync for errors in socket or protocol, and of the remote shell.
@@ -106,7 +108,8 @@ class RsyncShell(Shell):
         room = Room(target, limit, cancel, f'{self.where} has sent more than '
                     f'{limit / 1e9:.1f} GB in place of {source}')
         process.require(['rsync'])
-        words = ['rsync', '-rltp', '-s', '--delete', '--safe-links', '--chmod=u-s,g-s']
+        words = ['rsync', '-rltp', _EXACT_TIMES, '-s', '--delete', '--safe-links']
+        words += ['--chmod=u-s,g-s']
         words += [f'--link-dest={known.resolve()}'] if known is not None else []
         with self._remote_shell() as (rsh, files, failures):
             words += ['-e', relay.RSH] if rsh else []
@@ -207,7 +210,7 @@ def rsync(
     :param progress: print the progress as lines.
     """
     # -s protects arguments: the remote shell does not expand a folder's name.
-    words = ['rsync', '-a', '-s', '--delete', '--stats', '--no-human-readable']
+    words = ['rsync', '-a', _EXACT_TIMES, '-s', '--delete', '--stats', '--no-human-readable']
     words += [f'--include={pattern}' for pattern in includes]
     words += [f'--exclude={pattern}' for pattern in excludes]
     if compress:

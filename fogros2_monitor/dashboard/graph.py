@@ -28,7 +28,7 @@ import time
 from typing import Any, Optional, TYPE_CHECKING
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -210,9 +210,11 @@ def main() -> None:
     os.nice(5)  # the nodes of the launch have priority
     rclpy.init(args=[])
     node = GraphNode()
+    executor = SingleThreadedExecutor()  # before standard input can end: none can be made after
+    executor.add_node(node)
     threading.Thread(target=_take_lines, args=(node,), daemon=True).start()
     try:
-        rclpy.spin(node)
+        executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:

@@ -615,6 +615,28 @@ def test_detached_agent_reports_when_it_is_ready(rig):
     assert not rig.directory.exists()
 
 
+@pytest.mark.parametrize('number, change, starts', [
+    (signal.SIGKILL, '', 2), (signal.SIGTERM, '', 1),
+    (signal.SIGKILL, 'os.rmdir(folder)', 1),
+    (signal.SIGKILL, 'os.rmdir(folder); os.mkdir(folder)', 1)])
+def test_agent_starts_again_unless_it_was_ended(tmp_path, number, change, starts):
+    """Python has no handler of SIGTERM while it ends; another launch may have the directory."""
+    program = (
+        'import os, sys\n'
+        'from fogros2.agent import server\n'
+        'folder = sys.argv[1]\n'
+        f'server.time.sleep = lambda seconds: exec({change!r})\n'
+        'server.supervise(folder, os.open(os.devnull, os.O_WRONLY))\n'
+        'with open(sys.argv[2], "a") as stream:\n'
+        '    stream.write("start\\n")\n'
+        'if os.path.getsize(sys.argv[2]) == 6:\n'
+        f'    os.kill(os.getpid(), {int(number)})\n')
+    (tmp_path / 'agent').mkdir()
+    subprocess.run([sys.executable, '-c', program, str(tmp_path / 'agent'),
+                    str(tmp_path / 'starts')], timeout=20, check=True)
+    assert (tmp_path / 'starts').read_text().count('start') == starts
+
+
 def test_killed_launch_process_ends_its_nodes_and_restarts(rig):
     rig.serve()
     client = rig.client()

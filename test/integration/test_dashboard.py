@@ -111,7 +111,7 @@ def test_quiet_dashboard_shows_no_machines(dashboard: Dashboard, browser: Browse
     browser.open(dashboard.url.partition('#')[0] + '#wrong')
     browser.reload()
     browser.until('document.getElementById("link").textContent === "no access"')
-    assert 'token is missing or wrong' in browser.text()
+    browser.until('document.body.innerText.includes("token is missing or wrong")')
     assert dashboard.close() == 0
     assert all(url.startswith(('http://127.0.0.1:', 'data:')) for url in browser.requested)
 

@@ -80,6 +80,19 @@ def test_both_ways_make_the_folder_equal(shell, source, tmp_path, monkeypatch, b
     assert not compare(source, target)
 
 
+def test_file_written_twice_in_a_second_is_sent_twice(shell, source, tmp_path):
+    """Its size is the same: only the nanoseconds of its time tell."""
+    target, copy = tmp_path / 'sync-target', tmp_path / 'copy'
+    for text in ('rate: 10', 'rate: 20'):
+        (source / 'rate').write_text(text)
+        os.utime(source / 'rate', ns=(10 ** 18, 10 ** 18 + int(text[-2:])))
+        shell.sync(source, str(target), excludes=(), timeout=30)
+        assert (target / 'rate').read_text() == text
+        known, copy = copy if copy.exists() else None, tmp_path / text
+        shell.fetch(str(source), copy, known=known, limit=1 << 30, timeout=30)
+        assert (copy / 'rate').read_text() == text
+
+
 def test_the_second_time_goes_over_the_open_connection(shell, source, tmp_path, monkeypatch):
     monkeypatch.setattr(sync, 'BULK', 1000)
     target = tmp_path / 'sync-target'
