@@ -90,13 +90,13 @@ if _next is not None:
 _CONSTRAINTS = """\
 import re
 from importlib import metadata
-found = {}
+versions = {}
 for one in metadata.distributions():
     # Debian appends '+', which no index has
     version = str(one.metadata['Version']).partition('+')[0]
     if one.metadata['Name'] and re.fullmatch('[0-9][0-9A-Za-z.]*', version):
-        found.setdefault(re.sub('[-_.]+', '-', one.metadata['Name']).lower(), version)
-for item in sorted(found.items()):
+        versions.setdefault(re.sub('[-_.]+', '-', one.metadata['Name']).lower(), version)
+for item in sorted(versions.items()):
     print('=='.join(item))
 """
 #: Runs pip, at first without sources: if nothing fits, it would build one version after another.

@@ -62,8 +62,8 @@ def invite(
     folder = store.root / 'launches' / record.launch
     rmw = (folder / 'rmw').read_text()
     membership.check_rmw(rmw)
-    dial_host, port = machines.load(entry.provider).dialled_at(entry.machine, record.vpn.port, host)
-    dial_host = dial_host or addresses.own_address()
+    server, port = machines.load(entry.provider).dialled_at(entry.machine, record.vpn.port, host)
+    server = server or addresses.own_address()
     secret = secrets.token_hex(32)
     (store.machine(name) / GUESTS).touch()
     with reach.session(entry) as shell:
@@ -77,7 +77,7 @@ def invite(
     address = next((guest['address'] for guest in guests if guest['key'] == public), '')
     return invitation.seal(invitation.Invitation(
         machine=name, key=record.public_key, address=record.vpn.address,
-        endpoint=host_port(dial_host, port), joiner=address, network=record.vpn.network,
+        endpoint=host_port(server, port), joiner=address, network=record.vpn.network,
         rmw=rmw, domain=int((folder / 'domain').read_text()), expires=time.time() + seconds,
         interface=record.vpn.name, secret=secret), public)
 
