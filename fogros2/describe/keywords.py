@@ -108,24 +108,24 @@ def row_of(keyword: Keyword, row: Mapping[str, Any]) -> dict[str, Any]:
             if isinstance(value, str) else value for name, value in row.items()}
 
 
-def make(provider: str, given: Mapping[str, Any]) -> CloudInstance:
+def make(provider: str, arguments: Mapping[str, Any]) -> CloudInstance:
     """
     Create a machine's description.
 
-    :param given: keywords of its constructor.
+    :param arguments: keywords of its constructor.
     :raises ConfigurationError: an unknown provider or keyword, a wrong value, or a missing one.
     """
     cls = machine_class(provider)
     parameters = keywords(cls)
-    for name in given:
+    for name in arguments:
         if name not in parameters:
             raise unknown(f"a machine of the provider '{provider}'", name, parameters)
     for keyword in parameters.values():
-        if keyword.needed and keyword.name not in given:
+        if keyword.needed and keyword.name not in arguments:
             raise ConfigurationError(
                 f"a machine of the provider '{provider}' needs {keyword.name}",
                 f'{keyword.name}= says it')
-    return cls(**given)
+    return cls(**arguments)
 
 
 @contextlib.contextmanager
