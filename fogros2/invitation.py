@@ -93,9 +93,9 @@ class Invitation:
 
 def joined(store: Store) -> dict[str, Path]:
     """Return the folders of the machines that this computer has joined, by machine."""
-    return {found.machine: path.parent
+    return {invitation.machine: path.parent
             for path in sorted((store.root / 'launches').glob(f'*/{JOINED}'))
-            if (found := read(path.parent)) is not None}
+            if (invitation := read(path.parent)) is not None}
 
 
 def read(folder: Path) -> Optional[Invitation]:

@@ -125,46 +125,46 @@ def steps(lines: list[str]) -> list[Step]:
 
     Damaged lines are ignored.
     """
-    found: list[Step] = []
+    entries: list[Step] = []
     for line in lines:
         try:
             event = json.loads(line)
             machine, name = str(event['machine']), str(event['step'])
             kind, at = event['event'], float(event['time'])
             if kind == 'started':
-                found.append(Step(machine, name, at))
+                entries.append(Step(machine, name, at))
                 continue
-            index = next((i for i in reversed(range(len(found))) if found[i].state == 'running'
-                          and (found[i].machine, found[i].step) == (machine, name)), None)
+            index = next((i for i in reversed(range(len(entries))) if entries[i].state == 'running'
+                          and (entries[i].machine, entries[i].step) == (machine, name)), None)
             if kind == 'progress':
                 if index is not None:
-                    found[index] = dataclasses.replace(
-                        found[index], done=int(event['done']), total=int(event['total']))
+                    entries[index] = dataclasses.replace(
+                        entries[index], done=int(event['done']), total=int(event['total']))
             elif kind in ('done', 'failed'):
                 seconds = float(event['seconds'])
                 if index is None:
                     # a failed undo step is reported only at its end
-                    found.append(Step(machine, name, at - seconds))
-                    index = len(found) - 1
-                found[index] = dataclasses.replace(
-                    found[index], state=kind, seconds=seconds, detail=str(event['detail']))
+                    entries.append(Step(machine, name, at - seconds))
+                    index = len(entries) - 1
+                entries[index] = dataclasses.replace(
+                    entries[index], state=kind, seconds=seconds, detail=str(event['detail']))
         except (ValueError, TypeError, KeyError, RecursionError):
             continue
-    return found
+    return entries
 
 
 def clocks(lines: list[str]) -> dict[str, ClockOffset]:
     """Return the last offset of each machine's clock in a journal."""
-    found: dict[str, ClockOffset] = {}
+    offsets: dict[str, ClockOffset] = {}
     for line in lines:
         try:
             event = json.loads(line)
             if event['event'] == 'clock':
-                found[str(event['machine'])] = ClockOffset(
+                offsets[str(event['machine'])] = ClockOffset(
                     float(event['seconds']), float(event['uncertainty']))
         except (ValueError, TypeError, KeyError, RecursionError):
             continue
-    return found
+    return offsets
 
 
 def read_clocks(folder: Path) -> dict[str, ClockOffset]:

@@ -36,15 +36,15 @@ PLAIN_VARIABLES = (
     'RCUTILS_CONSOLE_OUTPUT_FORMAT')
 
 
-def extended(base: Mapping[str, str], given: Mapping[str, str]) -> dict[str, str]:
+def extended(base: Mapping[str, str], variables: Mapping[str, str]) -> dict[str, str]:
     """
     Add a user's variables; lists of folders are prepended to existing lists.
 
-    :param base: variables that nodes need; ``given`` are those of the launch file.
+    :param base: variables that nodes need; ``variables`` are those of the launch file.
     """
-    longer = {name: os.pathsep.join(filter(None, [given[name], base[name]]))
-              for name in PATH_LISTS if name in given and name in base}
-    return {**base, **given, **longer}
+    longer = {name: os.pathsep.join(filter(None, [variables[name], base[name]]))
+              for name in PATH_LISTS if name in variables and name in base}
+    return {**base, **variables, **longer}
 
 
 def choose_rmw(environment: Mapping[str, str], known: Sequence[str]) -> str:

@@ -92,19 +92,19 @@ def sudo_trouble(*, timeout: float = 10.0) -> tuple[str, str] | None:
     """
     if os.geteuid() == 0:
         return None
-    asked = run(Command(('true',), sudo=True), timeout=timeout, check=False)
-    if asked.returncode == 0:
+    result = run(Command(('true',), sudo=True), timeout=timeout, check=False)
+    if result.returncode == 0:
         return None
-    said = asked.stderr
-    if 'password is required' in said:
+    text = result.stderr
+    if 'password is required' in text:
         # sudo gives this reason to users without rights, too; ``sudo -v`` distinguishes them
-        said = run(Command(('sudo', '-n', '-v')), timeout=timeout, check=False).stderr or said
-    if 'password is required' in said or 'terminal is required' in said:
+        text = run(Command(('sudo', '-n', '-v')), timeout=timeout, check=False).stderr or text
+    if 'password is required' in text or 'terminal is required' in text:
         return PASSWORD
-    if 'may not run sudo' in said or 'not in the sudoers' in said or 'not allowed' in said:
+    if 'may not run sudo' in text or 'not in the sudoers' in text or 'not allowed' in text:
         return ('this user may not use sudo',
                 "ask the computer's administrator, or let a user who may launch it")
-    reason = (said.strip().splitlines() or ['it says nothing'])[-1].removeprefix('sudo: ')
+    reason = (text.strip().splitlines() or ['it says nothing'])[-1].removeprefix('sudo: ')
     return f"sudo doesn't work here: {reason}", 'run it as root'
 
 
@@ -184,14 +184,14 @@ def run(
     try:
         with noted(what):
             while True:
-                left = deadline - time.monotonic()
+                remaining = deadline - time.monotonic()
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     # without a cancel event, no polling is needed
-                    child.wait(max(0.0, left if cancel is None else min(left, 0.05)))
+                    child.wait(max(0.0, remaining if cancel is None else min(remaining, 0.05)))
                     break
                 if cancel is not None and cancel.is_set():
                     raise Cancelled(what)
-                if left <= 0:
+                if remaining <= 0:
                     raise DeadlineExceeded(f'{what} took longer than {timeout:g} s')
     except BaseException:  # Ctrl-C too: the command must not outlive this call
         end(child, sudo=_through_sudo(command))

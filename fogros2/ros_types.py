@@ -63,8 +63,8 @@ def _imported(name: str, kind: str, attribute: str) -> Any:
         folder = os.path.dirname(os.path.dirname(os.path.realpath(spec.origin)))
         if folder == os.path.realpath(os.getcwd()):
             raise LookupError(f'{package} of the current folder is not imported')
-        found = getattr(importlib.import_module(f'{package}.{parts[2] or kind}'), parts[3])
-        getattr(found, attribute)
+        cls = getattr(importlib.import_module(f'{package}.{parts[2] or kind}'), parts[3])
+        getattr(cls, attribute)
     except (ImportError, AttributeError, LookupError, OSError, ValueError) as error:
         raise LookupError(f"'{name}' isn't installed here: {error}") from error
-    return found
+    return cls

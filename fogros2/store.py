@@ -255,14 +255,14 @@ class Store:
 
     def requests(self) -> list[tuple[Record, float]]:
         """Return the records of requests without an answer, and the seconds since each."""
-        found = []
+        requests = []
         for path in sorted((self.root / 'requests').glob('[!.]*.json')):
             try:
                 age = time.time() - path.stat().st_mtime
-                found.append((record_from_json(json.loads(path.read_text())), age))
+                requests.append((record_from_json(json.loads(path.read_text())), age))
             except (OSError, ValueError, TypeError, KeyError, AttributeError):
                 continue  # another program has just removed it, or it is damaged
-        return found
+        return requests
 
     def answered(self, record: Record) -> None:
         """Forget a request: no machine of it can appear any more."""
@@ -383,8 +383,8 @@ def _digits(folder: Path, *, new: bool) -> str:
         fcntl.flock(file, fcntl.LOCK_EX if new else fcntl.LOCK_SH)
         file.seek(0)
         try:
-            known = json.load(file)
-            digits, bound = str(known['digits']), (known['machine_id'], known['mac'])
+            identity = json.load(file)
+            digits, bound = str(identity['digits']), (identity['machine_id'], identity['mac'])
         except (ValueError, LookupError, TypeError):
             digits, bound = '', ('', '')
         if digits and bound[0] == machine_id and bound[1] in (addresses or ['']):
@@ -400,15 +400,15 @@ def _digits(folder: Path, *, new: bool) -> str:
 
 def mac_addresses(folder: Path = Path('/sys/class/net')) -> list[str]:
     """Return the MAC addresses of this computer, those that belong to hardware first."""
-    found = []
+    candidates = []
     for path in folder.iterdir() if folder.is_dir() else []:
         with contextlib.suppress(OSError):
             address = (path / 'address').read_text().strip()
             # 0: the address is the device's own, not a random one
             own = (path / 'addr_assign_type').read_text().strip() == '0'
             if len(address) == 17 and address.strip('0:'):
-                found.append((not (path / 'device').exists(), not own, path.name, address))
-    return [address for *_, address in sorted(found)]
+                candidates.append((not (path / 'device').exists(), not own, path.name, address))
+    return [address for *_, address in sorted(candidates)]
 
 
 def write_private(path: Path, data: bytes) -> None:
@@ -483,8 +483,8 @@ def _not_written(path: Path, error: OSError) -> StoreError:
 
 def record_from_json(data: Mapping[str, Any]) -> Record:
     """Read a Record that ``model.to_json`` wrote; ignore unknown keys of later versions."""
-    known = {f.name for f in dataclasses.fields(Record)}
-    values = {key: value for key, value in data.items() if key in known}
+    names = {f.name for f in dataclasses.fields(Record)}
+    values = {key: value for key, value in data.items() if key in names}
     fields = {f.name for f in dataclasses.fields(MachineSpec)}
     spec: dict[str, Any] = {k: v for k, v in values['spec'].items() if k in fields}
     for key in ('underlays', 'containers', 'monitor_allow', 'apt', 'pip', 'share'):

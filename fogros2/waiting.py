@@ -89,10 +89,10 @@ def wait_until(
             value = probe()
             if value is not None and value is not False:
                 return value
-            left = deadline - time.monotonic()
-            if left <= 0:
+            remaining = deadline - time.monotonic()
+            if remaining <= 0:
                 raise DeadlineExceeded(f'timed out after {timeout:g} s waiting for {what}', hint)
-            cancel.wait(min(interval, left))
+            cancel.wait(min(interval, remaining))
             interval = min(interval * 1.5, longest)
 
 

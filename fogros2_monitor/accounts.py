@@ -46,9 +46,9 @@ def is_foreign(connection: socket.socket) -> bool:
 
 def plain_address(address: str) -> str:
     """Return a peer's address; map an IPv4 address of a dual-stack socket back to IPv4."""
-    found = ipaddress.ip_address(address.partition('%')[0])
-    mapped = getattr(found, 'ipv4_mapped', None)
-    return str(mapped or found)
+    peer = ipaddress.ip_address(address.partition('%')[0])
+    mapped = getattr(peer, 'ipv4_mapped', None)
+    return str(mapped or peer)
 
 
 def _account(peer: tuple[Any, ...], own: tuple[Any, ...]) -> Optional[int]:

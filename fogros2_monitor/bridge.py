@@ -222,20 +222,20 @@ class BridgeNode(Node, ServerListener):
 
     def _look(self) -> None:
         """Add new topics and remove topics that are gone."""
-        found = {name: kind for name, kind in ros_types.topics(self).items()
+        kinds = {name: kind for name, kind in ros_types.topics(self).items()
                  if '/_' not in name  # hidden by ROS 2's naming convention
                  and any(fnmatch.fnmatchcase(name, pattern) for pattern in self._patterns)}
-        for name in self._topics.keys() - found.keys():
+        for name in self._topics.keys() - kinds.keys():
             self._topics.pop(name).close()
-        for name, kind in found.items():
-            known = self._topics.get(name)
-            video = kind == _COMPRESSED and f'{name}{_KEYFRAME}' in found
-            if known is not None and (known.kind, known.video) == (kind, video):
-                known.refit()
+        for name, kind in kinds.items():
+            topic = self._topics.get(name)
+            video = kind == _COMPRESSED and f'{name}{_KEYFRAME}' in kinds
+            if topic is not None and (topic.kind, topic.video) == (kind, video):
+                topic.refit()
                 continue
             if kind in self._unknown:
                 continue
-            if known is not None:
+            if topic is not None:
                 self._topics.pop(name).close()
             try:
                 self._topics[name] = _Topic(self, name, kind, video)

@@ -39,8 +39,8 @@ def make_token(folder: Path) -> Credentials:
         the folder and its parents with mode 0700.
     :raises OSError: the folder is not writable.
     """
-    found = Credentials(folder)
-    if not found.token.exists():
+    credentials = Credentials(folder)
+    if not credentials.token.exists():
         if folder.parent.name.startswith(CREDENTIALS):
             shutil.rmtree(folder.parent, ignore_errors=True)
         for each in (*reversed(folder.parents), folder):
@@ -48,8 +48,8 @@ def make_token(folder: Path) -> Credentials:
         unfinished = folder / 'token.new'
         unfinished.touch(mode=0o600)
         unfinished.write_text(secrets.token_urlsafe(24) + '\n')
-        unfinished.rename(found.token)
-    return found
+        unfinished.rename(credentials.token)
+    return credentials
 
 
 def make(folder: Path, name: str) -> Credentials:
@@ -60,19 +60,19 @@ def make(folder: Path, name: str) -> Credentials:
     :param name: name of the machine.
     :raises FogError: ``openssl`` is not installed, or it fails.
     """
-    found = make_token(folder)
-    if found.certificate.exists():
-        return found
+    credentials = make_token(folder)
+    if credentials.certificate.exists():
+        return credentials
     unfinished = folder / 'certificate.new'
     process.run(Command((
         'openssl', 'req', '-x509', '-newkey', 'ec', '-pkeyopt', 'ec_paramgen_curve:prime256v1',
-        '-nodes', '-sha256', '-days', str(DAYS), '-keyout', str(found.key),
+        '-nodes', '-sha256', '-days', str(DAYS), '-keyout', str(credentials.key),
         '-out', str(unfinished), '-subj', f'/CN={name}',
         '-addext', f'subjectAltName=DNS:{name}'), what='make a certificate'), timeout=_SECONDS)
-    found.key.chmod(0o600)
+    credentials.key.chmod(0o600)
     # The rename is the last step: if the certificate exists, so does the key.
-    unfinished.rename(found.certificate)
-    return found
+    unfinished.rename(credentials.certificate)
+    return credentials
 
 
 def fingerprint(certificate: str) -> str:

@@ -60,10 +60,10 @@ def _short(name: str) -> str:
 def _written(kind: str) -> tuple[str, str]:
     """Return a field's type as message files write it, and its item type."""
     for pattern, brackets in ((_SEQUENCE, '[<={bound}]'), (_ARRAY, '[{size}]')):
-        found = pattern.match(kind)
-        if found:
-            item, inner = _written(found['item'])
-            bounds = found.groupdict()
+        match = pattern.match(kind)
+        if match:
+            item, inner = _written(match['item'])
+            bounds = match.groupdict()
             unbounded = pattern is _SEQUENCE and bounds['bound'] is None
             return item + ('[]' if unbounded else brackets.format(**bounds)), inner
     bounded = _BOUNDED.match(kind)

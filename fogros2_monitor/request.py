@@ -55,11 +55,11 @@ class Request:
             tells the application's page in the browser the bridge's address and token.
         """
         target = self.target.partition('?')[0] if closing else self.target
-        left = [line for line in self.lines if not line.lower().startswith('cookie:')]
+        lines = [line for line in self.lines if not line.lower().startswith('cookie:')]
         if closing:
-            left = [line for line in left if not line.lower().startswith('connection:')]
-            left.append('Connection: close')
-        head = [f'GET {target} {self.version}', *left, '', '']
+            lines = [line for line in lines if not line.lower().startswith('connection:')]
+            lines.append('Connection: close')
+        head = [f'GET {target} {self.version}', *lines, '', '']
         return '\r\n'.join(head).encode('latin-1')
 
 
@@ -82,13 +82,13 @@ def parse(head: bytes) -> Request:
     hosts = _values(lines, 'host')
     if len(hosts) > 1:
         raise Refused('400 Bad Request', 'what came is for several hosts')
-    given = tuple(value for name, value in query if name == 'token')
+    tokens = tuple(value for name, value in query if name == 'token')
     path = url.path if url.path.startswith('/') else '/'
-    left = urllib.parse.urlencode([item for item in query if item[0] != 'token']) \
-        if given else url.query
+    rest = urllib.parse.urlencode([item for item in query if item[0] != 'token']) \
+        if tokens else url.query
     # Only one slash: a redirect to '//x' would lead to the host x.
     return Request(
-        '/' + path.lstrip('/\\') + (f'?{left}' if left else ''), given,
+        '/' + path.lstrip('/\\') + (f'?{rest}' if rest else ''), tokens,
         ''.join(hosts), tuple(_values(lines, 'origin')),
         'websocket' in ','.join(_values(lines, 'upgrade')).lower(), words[2], tuple(lines))
 
@@ -155,19 +155,19 @@ def check(request: Request, token: str) -> None:
     :raises Refused: the token is missing or wrong.
     """
     name, value = cookie(token)
-    given = _cookie(_values(request.lines, 'cookie'), name)
+    secret = _cookie(_values(request.lines, 'cookie'), name)
     if request.given:
         right = len(request.given) == 1 and _same(request.given[0], token)
-    elif given and not request.websocket:
-        right = _same(given, value)
+    elif secret and not request.websocket:
+        right = _same(secret, value)
     else:
         raise Refused('401 Unauthorized', 'no token')
     if not right:
         raise Refused('401 Unauthorized', 'a wrong token')
 
 
-def _same(given: str, token: str) -> bool:
-    return hmac.compare_digest(given.encode('utf-8', 'replace'), token.encode())
+def _same(secret: str, token: str) -> bool:
+    return hmac.compare_digest(secret.encode('utf-8', 'replace'), token.encode())
 
 
 def _values(lines: Sequence[str], name: str) -> list[str]:
@@ -176,10 +176,10 @@ def _values(lines: Sequence[str], name: str) -> list[str]:
 
 
 def _cookie(values: Sequence[str], name: str) -> str:
-    found: Optional[http.cookies.Morsel[str]] = None
+    morsel: Optional[http.cookies.Morsel[str]] = None
     for value in values:
         try:
-            found = http.cookies.SimpleCookie(value).get(name, found)
+            morsel = http.cookies.SimpleCookie(value).get(name, morsel)
         except http.cookies.CookieError:
             continue  # another site's cookie
-    return found.value if found is not None else ''
+    return morsel.value if morsel is not None else ''

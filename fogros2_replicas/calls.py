@@ -125,13 +125,13 @@ class Calls:
     def ready(self, now: float, names: Iterable[str]) -> list[Action]:
         """Record which replicas the ROS graph shows; send what waits for one."""
         names = set(names)
-        gone = [name for name, one in self.replicas.items() if one.there and name not in names]
+        removals = [name for name, one in self.replicas.items() if one.there and name not in names]
         if any(not self.replicas[name].there for name in names):
             for call in self._calls.values():
                 call.due = now if call.pause else call.due
         for name, replica in self.replicas.items():
             replica.there = name in names
-        return [action for name in gone for action in self._lost(now, name)] + self.due(now)
+        return [action for name in removals for action in self._lost(now, name)] + self.due(now)
 
     def next_due(self) -> float:
         """Return when to call :meth:`due` next; infinity for never."""
@@ -139,18 +139,18 @@ class Calls:
 
     def due(self, now: float) -> list[Action]:
         """Return which requests go to another replica, because none has answered in time."""
-        found: list[Action] = []
+        actions: list[Action] = []
         for call, one in list(self._calls.items()):
             if one.due > now:
                 continue
             one.due = math.inf
             if one.pause:
-                found += self._send_to_any(now, call, one)
+                actions += self._send_to_any(now, call, one)
                 continue
             for name in one.asked - one.failed:
                 self.replicas[name].late = self._hedge_after is not None
-            found += self._send(now, call, self._next(one))
-        return found
+            actions += self._send(now, call, self._next(one))
+        return actions
 
     # -- the rules ------------------------------------------------------------------------------
 
@@ -175,23 +175,23 @@ class Calls:
 
     def _send(self, now: float, call: int, replicas: Iterable[Figures]) -> list[Action]:
         one = self._calls[call]
-        found: list[Action] = []
+        actions: list[Action] = []
         for replica in replicas:
             replica.last = replica.sent[call] = now
             one.asked.add(replica.name)
             one.failed.discard(replica.name)
             one.due = min(one.due, now + (self._delay(replica) or PROBE))
-            found.append(Send(call, replica.name))
-        return found
+            actions.append(Send(call, replica.name))
+        return actions
 
     def _send_to_any(self, now: float, call: int, one: _Call) -> list[Action]:
         """Send a request to all replicas if none is live; again later if all have died."""
-        there = [replica for replica in self.replicas.values() if replica.there]
-        alive = [replica for replica in there if not replica.died]
-        found = self._send(now, call, alive or there)
+        candidates = [replica for replica in self.replicas.values() if replica.there]
+        alive = [replica for replica in candidates if not replica.died]
+        actions = self._send(now, call, alive or candidates)
         if one.pause or not alive:
             self._hold(now, one)
-        return found
+        return actions
 
     def _hold(self, now: float, one: _Call) -> None:
         one.pause = 2 * one.pause or PAUSE
@@ -205,9 +205,9 @@ class Calls:
     def _failed(self, now: float, call: int, name: str) -> list[Action]:
         one = self._calls[call]
         one.failed.add(name)
-        found = self._send(now, call, self._next(one))
-        if found or one.asked - one.failed:
-            return found
+        actions = self._send(now, call, self._next(one))
+        if actions or one.asked - one.failed:
+            return actions
         if one.error is not None:
             return self._settle(call, one.error)
         self._hold(now, one)

@@ -99,12 +99,12 @@ class _Served:
             if isinstance(action, Answer):
                 self._waiting.pop(action.call)[1].set_result(action.response)
                 continue
-            client, asked = self._clients[action.replica], self._asked[action.replica]
-            future = asked[action.call] = client.call_async(self._waiting[action.call][0])
+            client, futures = self._clients[action.replica], self._asked[action.replica]
+            future = futures[action.call] = client.call_async(self._waiting[action.call][0])
             future.add_done_callback(
                 functools.partial(self._answered, action.call, action.replica))
-            if len(asked) > MOST:
-                client.remove_pending_request(asked.pop(next(iter(asked))))
+            if len(futures) > MOST:
+                client.remove_pending_request(futures.pop(next(iter(futures))))
         self.node.wake()
 
     def _answered(self, call: int, replica: str, future: Future) -> None:
@@ -136,17 +136,17 @@ class _Forwarded:
 
     def look(self) -> None:
         """Subscribe to what the graph has now."""
-        found = {name: self.node.published(prefix + self.name)
-                 for name, prefix in self.node.replicas.items()}
+        outputs = {name: self.node.published(prefix + self.name)
+                   for name, prefix in self.node.replicas.items()}
         self._kind, fit = self.node.agreed(
-            self.name, self._kind, {name: kind for name, (kind, _) in found.items() if kind})
+            self.name, self._kind, {name: kind for name, (kind, _) in outputs.items() if kind})
         message = self.node.imported(self.name, self._kind, ros_types.message)
         for name, replica in self.figures.replicas.items():
             replica.there = name in fit
             if message is None or not replica.there or name in self._heard:
                 continue
             self._heard.add(name)
-            qos = found[name][1]
+            qos = outputs[name][1]
             self._output = self._output or self.node.create_publisher(message, self.name, qos)
             self.node.create_subscription(
                 message, self.node.replicas[name] + self.name, functools.partial(
@@ -218,14 +218,14 @@ class FirstAnswer(Node):
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
         return infos[0].topic_type if infos else '', qos
 
-    def agreed(self, name: str, kind: str, found: Mapping[str, str]) -> tuple[str, list[str]]:
+    def agreed(self, name: str, kind: str, kinds: Mapping[str, str]) -> tuple[str, list[str]]:
         """Return the first type found, empty for none, and who has it; complain of others."""
-        kind = kind or next(iter(found.values()), '')
-        if set(found.values()) - {kind}:
+        kind = kind or next(iter(kinds.values()), '')
+        if set(kinds.values()) - {kind}:
             self.complain(f'{name}: replicas have different types, and the first one is used: '
-                          + ', '.join(f'{other} on {one}' for one, other in found.items())
+                          + ', '.join(f'{other} on {one}' for one, other in kinds.items())
                           + '; give all machines the same packages')
-        return kind, [one for one, other in found.items() if other == kind]
+        return kind, [one for one, other in kinds.items() if other == kind]
 
     def imported(self, name: str, kind: str, get: Callable[[str], Any]) -> Any:
         """Return the class of a type, None for none; complain if it is not installed."""
@@ -250,10 +250,10 @@ class FirstAnswer(Node):
         if not missing:
             self._report_shared()
         elif time.monotonic() - self._begin > MISSING:
-            known = [name for name, _ in (
+            names = [name for name, _ in (
                 *self.get_service_names_and_types(), *self.get_topic_names_and_types())]
             for name in missing:
-                near = difflib.get_close_matches(name, known, 3, 0.5) or ['nothing like it']
+                near = difflib.get_close_matches(name, names, 3, 0.5) or ['nothing like it']
                 self.complain(f"no replica has {name}; the ROS graph has {', '.join(near)}")
 
     def _report_shared(self) -> None:

@@ -207,9 +207,9 @@ class Relay(Node):
 
     def _look(self, name: str, shared: Shared) -> None:
         """Subscribe with the type and QoS of the publishers, and again when these change."""
-        publishers, subscriptions = ([one for one in found if one.node_name != self.get_name()]
-                                     for found in (self.get_publishers_info_by_topic(name),
-                                                   self.get_subscriptions_info_by_topic(name)))
+        publishers, subscriptions = ([one for one in endpoints if one.node_name != self.get_name()]
+                                     for endpoints in (self.get_publishers_info_by_topic(name),
+                                                       self.get_subscriptions_info_by_topic(name)))
         shared.kind = next((one.topic_type for one in (*publishers, *subscriptions)), '')
         profiles = [one.qos_profile for one in publishers]
         kept = sum(one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in profiles)
@@ -262,14 +262,14 @@ class Relay(Node):
     def _admit(self, link: socket.socket) -> bool:
         """Add a reader that proves of which machine it is, in place of an earlier one of it."""
         try:
-            said, files, _, _ = socket.recv_fds(link, 256, 1)
+            data, files, _, _ = socket.recv_fds(link, 256, 1)
         except OSError:
             return False
         with contextlib.ExitStack() as undo:
             for file in files:
                 undo.callback(os.close, file)
             try:
-                name = said.decode()
+                name = data.decode()
                 folder = self._others / name
                 if not files or folder.parent != self._others or not proven(
                         files[0], folder / OWN / PROOF.format(self._machine)):
@@ -301,8 +301,8 @@ class Relay(Node):
                     data = stream.read(size)
                     if len(data) < size:
                         break
-                    known, since, _ = publishers.get(name, (form, 0.0, None))
-                    if known != form:  # not dropped: a map is sent only once
+                    old_form, since, _ = publishers.get(name, (form, 0.0, None))
+                    if old_form != form:  # not dropped: a map is sent only once
                         time.sleep(max(0.0, since + CHANGE - time.monotonic()))
                     with self._lock:
                         self._take(folder, publishers, name, form, data)
@@ -350,8 +350,8 @@ class Relay(Node):
         if shared.kind not in ('', form.kind):
             return self._complain(
                 f'{name} is {form.kind} on another robot, so it is not shared here')
-        known, _, publisher = publishers.get(name, (None, now, None))
-        if publisher is None or known != form:
+        old_form, _, publisher = publishers.get(name, (None, now, None))
+        if publisher is None or old_form != form:
             message = self._imported(form.kind)
             if message is None:
                 return

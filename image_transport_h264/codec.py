@@ -588,9 +588,9 @@ def _converted(frame: VideoFrame, layout: Layout, width: int, height: int) -> Pi
 
 def _colorspace(frame: VideoFrame) -> int:
     # The default of streams that state none: BT.601 for standard definition, BT.709 for high.
-    told = int(frame.colorspace)
-    if told in (1, 4, 5, 6, 7, 9):
-        return told
+    value = int(frame.colorspace)
+    if value in (1, 4, 5, 6, 7, 9):
+        return value
     return int(Colorspace.ITU601 if frame.height < 720 else Colorspace.ITU709)
 
 

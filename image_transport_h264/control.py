@@ -88,9 +88,9 @@ class Control:
         # After a stall, images arrive in a burst, whose intervals are not their rate.
         since = max(now - self._last_sent, 0.9 * self._interval)
         fits = since * self.share >= 0.8 * LEAST_BITS * pixels or since > 1.0
-        said = [governor.may_send(now, pixels, since)
-                for governor in self._governors.values()]
-        return fits and (all(said) or not self.adapt)
+        answers = [governor.may_send(now, pixels, since)
+                   for governor in self._governors.values()]
+        return fits and (all(answers) or not self.adapt)
 
     def settings(self, current: Settings, now: float) -> Settings:
         """

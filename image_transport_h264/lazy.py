@@ -178,8 +178,8 @@ class LazyNode(Node):
 
     def fitting(self, topic: str, qos: QoSProfile) -> QoSProfile:
         """Return the profile, with best effort unless all publishers of the topic are reliable."""
-        told = [info.qos_profile.reliability for info in self.get_publishers_info_by_topic(topic)]
-        if told and all(kind == ReliabilityPolicy.RELIABLE for kind in told):
+        kinds = [info.qos_profile.reliability for info in self.get_publishers_info_by_topic(topic)]
+        if kinds and all(kind == ReliabilityPolicy.RELIABLE for kind in kinds):
             return qos
         return best_effort(qos)
 

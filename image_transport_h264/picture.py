@@ -113,8 +113,8 @@ class Picture:
         try:
             return LAYOUTS[self.encoding]
         except KeyError:
-            known = ', '.join(LAYOUTS)
-            raise BadPicture(f"encoding '{self.encoding}' isn't one of {known}: use the transport "
+            names = ', '.join(LAYOUTS)
+            raise BadPicture(f"encoding '{self.encoding}' isn't one of {names}: use the transport "
                              "'raw', which carries every encoding, or convert the images",
                              f'encoding {self.encoding!r}') from None
 

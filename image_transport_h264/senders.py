@@ -202,12 +202,12 @@ class VideoSender(Sender):
     # --- in the executor's thread
 
     def _matched(self) -> None:
-        known = self.listeners()
-        if known > self._known:
+        listeners = self.listeners()
+        if listeners > self._known:
             # A new reader needs a keyframe to start.
             with self._lock:
                 self._key_wanted = True
-        self._known = known
+        self._known = listeners
         self._changed()
 
     def _key_requested(self, _: Empty) -> None:
@@ -273,12 +273,12 @@ class VideoSender(Sender):
         if protects:
             again = pieces(packet.tag.stream, packet.tag.sequence,
                            message.with_header(header, packet.data))
-        left = time.monotonic()
+        time_sent = time.monotonic()
         size = len(packet.data) + sum(map(len, again))
         with self._lock:
             if packet.tag.key:
-                self._last_key = left
-            self._control.sent(packet.tag.sequence, size, left)
+                self._last_key = time_sent
+            self._control.sent(packet.tag.sequence, size, time_sent)
             floor = LEAST_BITS * picture.width * picture.height * self._encoder.settings.rate
             self._budget.sent(size, floor, self._control.latency, self._control.asked.bitrate)
         # Pieces first: after a loss, the packet is then complete one datagram later.

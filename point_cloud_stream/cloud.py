@@ -93,11 +93,11 @@ class Layout:
 
         :raises CloudError: one of the three is no single float32.
         """
-        found = {field.name: field.offset for field in self.fields
-                 if (field.datatype, field.count) == (FLOAT32, 1)}
-        if not found.keys() >= {*COORDINATES}:
+        offsets = {field.name: field.offset for field in self.fields
+                   if (field.datatype, field.count) == (FLOAT32, 1)}
+        if not offsets.keys() >= {*COORDINATES}:
             raise CloudError('x, y and z are not float32')
-        return [found[name] for name in COORDINATES]
+        return [offsets[name] for name in COORDINATES]
 
     def columns(self) -> list[tuple[int, int]]:
         """
@@ -106,15 +106,15 @@ class Layout:
         Bytes that belong to no field are numbers of one byte. Of overlapping fields, the first
         one decides.
         """
-        taken = {at + i for at in self.places() for i in range(4)}
-        found: list[tuple[int, int]] = []
+        bytes_used = {at + i for at in self.places() for i in range(4)}
+        columns: list[tuple[int, int]] = []
         for field in self.fields:
             size = SIZES[field.datatype]
             for at in range(field.offset, field.offset + field.size, size):
-                if taken.isdisjoint(range(at, at + size)):
-                    taken.update(range(at, at + size))
-                    found.append((at, size))
-        return found + [(at, 1) for at in range(self.point_step) if at not in taken]
+                if bytes_used.isdisjoint(range(at, at + size)):
+                    bytes_used.update(range(at, at + size))
+                    columns.append((at, size))
+        return columns + [(at, 1) for at in range(self.point_step) if at not in bytes_used]
 
     def pack(self) -> bytes:
         """Return the layout as bytes."""

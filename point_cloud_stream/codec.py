@@ -66,13 +66,13 @@ def encode(
     """
     layout.check()
     points = cloud.rows(layout, data)
-    gone = [each for each in layout.fields if each.name in drop - {*COORDINATES}]
-    if gone:
+    dropped_fields = [each for each in layout.fields if each.name in drop - {*COORDINATES}]
+    if dropped_fields:
         points = points.copy()
-        for each in gone:
+        for each in dropped_fields:
             points[:, each.offset:each.offset + each.size] = 0
         layout = dataclasses.replace(layout, fields=tuple(
-            each for each in layout.fields if each not in gone))
+            each for each in layout.fields if each not in dropped_fields))
     out = Writer()
     bits = [_strided(layout, points, at, 4).astype('<u4') for at in layout.places()]
     model, step = LOSSLESS, SLACK * resolution

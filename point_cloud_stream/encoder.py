@@ -61,14 +61,14 @@ class EncoderNode(LazyNode):
     # --- in the executor's thread
 
     def _matched(self) -> None:
-        known = self.subscribers(self._publisher)
-        if known < self._known:
+        subscribers = self.subscribers(self._publisher)
+        if subscribers < self._known:
             # the receiver that has gone would acknowledge no more
             with self._news:
                 self._control.forget()
                 self._news.notify_all()
-        self._known = known
-        self._clouds.want(known > 0)
+        self._known = subscribers
+        self._clouds.want(subscribers > 0)
 
     def _take(self, cloud: bytes) -> None:
         with self._news:

@@ -72,14 +72,14 @@ class Assembler:
             self._clouds[stream] = _Open(identity)
             while len(self._clouds) > OPEN:
                 del self._clouds[next(iter(self._clouds))]
-        found = self._clouds[stream]
-        if index not in found.parts:
-            found.parts[index] = part[_HEAD.size:]
-            found.size += len(part) - _HEAD.size
+        entry = self._clouds[stream]
+        if index not in entry.parts:
+            entry.parts[index] = part[_HEAD.size:]
+            entry.size += len(part) - _HEAD.size
         if sum(each.size for each in self._clouds.values()) > self._max_bytes:
             self._clouds.clear()
-        if len(found.parts) < count:
+        if len(entry.parts) < count:
             return (stream, number), None
-        whole = b''.join(found.parts[at] for at in range(count))
+        whole = b''.join(entry.parts[at] for at in range(count))
         self._clouds[stream] = _Open(identity)
         return (stream, number), whole if zlib.crc32(whole) == checksum else None

@@ -40,12 +40,12 @@ class FogCheck(DoctorCheck):
     def check(self) -> Result:
         """Report failures and warnings, each with its remedy."""
         result = Result()
-        for found in findings():
-            if found.verdict == 'failed':
-                doctor_error(f'FogROS2, {found.name}: {_text(found)}')
+        for check in findings():
+            if check.verdict == 'failed':
+                doctor_error(f'FogROS2, {check.name}: {_text(check)}')
                 result.add_error()
-            elif found.verdict == 'warning':
-                doctor_warn(f'FogROS2, {found.name}: {_text(found)}')
+            elif check.verdict == 'warning':
+                doctor_warn(f'FogROS2, {check.name}: {_text(check)}')
                 result.add_warning()
         return result
 
@@ -60,7 +60,7 @@ class FogReport(DoctorReport):
     def report(self) -> Report:
         """Return the result of each check."""
         report = Report('FOGROS2')
-        for found in findings():
+        for check in findings():
             report.add_to_report(
-                found.name, f'{found.verdict}: {_text(found)}')
+                check.name, f'{check.verdict}: {_text(check)}')
         return report

@@ -53,10 +53,10 @@ class FogMachine(Action):
         """Return the machine's description."""
         if self.machine is None:
             provider = values.resolve(context, self._provider)
-            known = keywords.keywords(keywords.machine_class(provider))
+            parameters = keywords.keywords(keywords.machine_class(provider))
             self.machine = keywords.make(provider, {
                 name: value for name, value in self._given.items()
-                if name in known or not self._is_empty(context, value)})
+                if name in parameters or not self._is_empty(context, value)})
         for container in self._containers:
             self.machine.add_docker_container(**{
                 name: values.resolve(context, value) for name, value in container.items()})

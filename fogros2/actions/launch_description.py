@@ -69,8 +69,8 @@ class FogROSLaunchDescription(LaunchDescription):
         **unknown: object,
     ) -> None:
         for name in unknown:
-            known = set(inspect.signature(FogROSLaunchDescription).parameters) - {'unknown'}
-            raise keywords.unknown('a FogROSLaunchDescription', name, known)
+            parameters = set(inspect.signature(FogROSLaunchDescription).parameters) - {'unknown'}
+            raise keywords.unknown('a FogROSLaunchDescription', name, parameters)
         entities = list(initial_entities or ())
         for machine in entities:
             if isinstance(machine, CloudInstance):

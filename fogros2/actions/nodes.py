@@ -60,12 +60,12 @@ class Node(launch_ros.actions.Node):
                 f'image_options={image_options!r} is no list of options for an image',
                 "such as image='ros:jazzy-perception', image_options=['--gpus=all']")
         if machine is None:
-            given = ('image' if image is not None else 'checkpoint' if checkpoint is not None
-                     else 'stream_topics')
+            keyword = ('image' if image is not None else 'checkpoint' if checkpoint is not None
+                       else 'stream_topics')
             if image is not None or checkpoint is not None or stream_topics:
                 raise ConfigurationError(
-                    f'{given}= of a node is for a machine, and this node has none',
-                    f'add machine=, or leave {given}= out')
+                    f'{keyword}= of a node is for a machine, and this node has none',
+                    f'add machine=, or leave {keyword}= out')
             return
         self.stream_topics = list(stream_topics)
         self._image = image

@@ -79,5 +79,5 @@ def _look_through(
 
 def _mention(entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
     """Remember the machines of an entity, also those that a timer or an event adds."""
-    for found, _ in cloud_entities([entity]):
-        Coordinator.of(context).mention(found.machine)
+    for member, _ in cloud_entities([entity]):
+        Coordinator.of(context).mention(member.machine)

@@ -128,12 +128,12 @@ class _Replica(CloudGroup):
         super()._send(entity, context)
 
 
-def _pair(given: Any, context: LaunchContext, namespace: str) -> tuple[str, str]:
+def _pair(pair: Any, context: LaunchContext, namespace: str) -> tuple[str, str]:
     """Return the full names of an input and an output; XML and YAML write ``/in:/out``."""
-    parts = values.resolve(context, given).split(':') if values.is_text(given) and not (
-        isinstance(given, tuple)) else [values.resolve(context, part) for part in given]
+    parts = values.resolve(context, pair).split(':') if values.is_text(pair) and not (
+        isinstance(pair, tuple)) else [values.resolve(context, part) for part in pair]
     if len(parts) != 2 or not all(parts):
         raise ConfigurationError(
-            f'{given!r} is no pair of topics', "write ('/image', '/detections') in Python, "
+            f'{pair!r} is no pair of topics', "write ('/image', '/detections') in Python, "
             "'/image:/detections' in XML and YAML")
     return absolute(parts[0], namespace), absolute(parts[1], namespace)

@@ -151,11 +151,12 @@ def static_peers(user: Mapping[str, str]) -> list[str]:
 
 def addresses_of(hosts: Sequence[str]) -> list[str]:
     """Return the IPv4 addresses of hosts, without those that are unknown."""
-    found: set[str] = set()
+    addresses: set[str] = set()
     for host in hosts:
         with contextlib.suppress(OSError, UnicodeError):
-            found |= {str(info[4][0]) for info in socket.getaddrinfo(host, None, socket.AF_INET)}
-    return sorted(found)
+            addresses |= {str(info[4][0])
+                          for info in socket.getaddrinfo(host, None, socket.AF_INET)}
+    return sorted(addresses)
 
 
 def is_address(text: str) -> bool:

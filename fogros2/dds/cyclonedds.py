@@ -144,14 +144,14 @@ class CycloneDds(DdsVendor):
 
     def _find(self, tag: str, user: Mapping[str, str]) -> list[Element]:
         """Return the user's settings with a tag, in lower case, that are for our domain."""
-        found: list[Element] = []
+        elements: list[Element] = []
         for _, root in fragments(user.get('CYCLONEDDS_URI', ''), user):
             # Cyclone accepts <Domain> and its settings without what is around them
             for part in root if root.tag.lower() == 'cyclonedds' else [root]:
                 if part.tag.lower() != 'domain' or _attribute(part, 'id').lower() in (
                         '', 'any', str(self.domain)):
-                    found += [one for one in part.iter() if one.tag.lower() == tag]
-        return found
+                    elements += [one for one in part.iter() if one.tag.lower() == tag]
+        return elements
 
     def machine_interfaces(self, vpn: str) -> list[DdsInterface]:
         """Return the interfaces of a machine's nodes; their peers are the other machines."""
@@ -174,9 +174,9 @@ class CycloneDds(DdsVendor):
         ordered = sorted(interfaces, key=lambda interface: -interface.priority)
         multicast = any(interface.multicast for interface in interfaces)
         networks = [interface for interface in interfaces if not _is_loopback(interface)]
-        asked = [] if _is_loopback(ordered[0]) and networks else list(dict.fromkeys(peers))
+        hosts = [] if _is_loopback(ordered[0]) and networks else list(dict.fromkeys(peers))
         if not multicast:
-            asked.insert(0, LOOPBACK)
+            hosts.insert(0, LOOPBACK)
         return '\n'.join([
             '<?xml version="1.0" encoding="UTF-8"?>',
             '<CycloneDDS xmlns="https://cdds.io/config">',
@@ -204,10 +204,10 @@ class CycloneDds(DdsVendor):
             f'      <MaxAutoParticipantIndex>{MAX_PARTICIPANTS}</MaxAutoParticipantIndex>',
             f'      <SPDPInterval>{SPDP_INTERVAL} s</SPDPInterval>',
             f'      <LeaseDuration>{LEASE_DURATION} s</LeaseDuration>',
-            *_if(bool(asked), '      <Peers>'),
+            *_if(bool(hosts), '      <Peers>'),
             *(f'        <Peer address={quoteattr(address)}/>'
-              for host in asked for address in self._addresses(host)),
-            *_if(bool(asked), '      </Peers>'),
+              for host in hosts for address in self._addresses(host)),
+            *_if(bool(hosts), '      </Peers>'),
             '    </Discovery>',
             '    <Internal>',
             f'      <SocketReceiveBufferSize max="{RECEIVE_BUFFER} B"/>',
@@ -297,22 +297,22 @@ def _element(text: str) -> tuple[str, str, str]:
 
     There, Cyclone takes ``</>`` for the end of any element, and the end of the text for all ends.
     """
-    found, names, at = '', list[str](), 0
+    xml, names, at = '', list[str](), 0
     for tag in _MARKUP.finditer(text):
-        found += text[at:tag.start()]
+        xml += text[at:tag.start()]
         at = tag.end()
         if tag['name'] is None:
             continue  # a comment, or the declaration
         if tag['end']:
-            found += f"</{tag['name'] or ''.join(names[-1:])}>"
+            xml += f"</{tag['name'] or ''.join(names[-1:])}>"
             names = names[:-1]
         else:
-            found += _NAMESPACE.sub('', tag[0])
+            xml += _NAMESPACE.sub('', tag[0])
             names += [] if tag['empty'] else [tag['name']]
         if not names:
-            return found, '', text[at:]
+            return xml, '', text[at:]
     missing = ''.join(f'</{name}>' for name in reversed(names))
-    return found + text[at:] + missing, missing, ''
+    return xml + text[at:] + missing, missing, ''
 
 
 def closed(uri: str) -> str:

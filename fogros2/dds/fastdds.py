@@ -156,7 +156,7 @@ class FastDds(DdsVendor):
         group, common = [multicast_group(names[-1])], [DISCOVERY_GROUP]
         # the robot's nodes also hear the common group, and so find each other by it
         heard, found_by = (group, group) if len(names) == 1 else (group + common, [])
-        asked = dict.fromkeys([*common, *found_by, *map(multicast_group, peers)])
+        groups = dict.fromkeys([*common, *found_by, *map(multicast_group, peers)])
         if not guest:
             # the first group is announced, see max_multicast_locators
             _child(builtin, 'avoid_builtin_multicast').text = 'false'
@@ -164,7 +164,7 @@ class FastDds(DdsVendor):
             _child(_child(builtin, 'metatrafficUnicastLocatorList'), 'locator')
         # any initial peer replaces the default one
         _child(builtin, 'initialPeersList').extend([
-            *map(self._group, asked),
+            *map(self._group, groups),
             *(one for host in [*static_peers(user), *({LOOPBACK} & {*names})]
               for one in self._ports(host))])
         _own_transport(profiles, rtps, names)
@@ -287,8 +287,8 @@ def _text(parent: Element, **values: str) -> None:
 
 
 def _child(parent: Element, name: str) -> Element:
-    found = parent.find(name)
-    return ElementTree.SubElement(parent, name) if found is None else found
+    child = parent.find(name)
+    return ElementTree.SubElement(parent, name) if child is None else child
 
 
 def _sort(rtps: Element) -> None:

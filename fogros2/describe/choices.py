@@ -143,7 +143,7 @@ def find_cheapest_ec2_instance_type(
     if not ours and isinstance(gpu, (bool, type(None))):
         ask = functools.partial(_type_of_fogros2, **theirs, **_said(gpu=gpu))
     else:
-        ask = functools.partial(_type, asked={**ours, **_said(gpu=gpu)})
+        ask = functools.partial(_type, wanted={**ours, **_said(gpu=gpu)})
     return Choice('the cheapest type there', ask,
                   {'region': region_name})
 
@@ -171,13 +171,13 @@ def find_cheapest(
                 f"it takes regions, provider, max_round_trip_ms, {', '.join(WANTS)}")
     ask = functools.partial(
         _cheapest, providers=() if provider == clouds.ALL else (provider,),
-        max_round_trip_ms=max_round_trip_ms, asked=wanted)
+        max_round_trip_ms=max_round_trip_ms, wanted=wanted)
     # one request answers all
     offer = Choice('the cheapest offer', ask, {'regions': values.items(regions)})
-    found = tuple(
+    parts = tuple(
         Choice(f'the {part} of the cheapest offer', functools.partial(_part, number),
                {'offer': offer}) for number, part in enumerate(('provider', 'region', 'type')))
-    return found if provider == clouds.ALL else found[1:]
+    return parts if provider == clouds.ALL else parts[1:]
 
 
 def _said(**values: Any) -> dict[str, Any]:
@@ -195,8 +195,8 @@ def _nearest(regions: Optional[Sequence[str]]) -> str:
     return _aws().nearest(regions or ())
 
 
-def _type(region: str, asked: Mapping[str, Any]) -> str:
-    return _aws().offers(offers.wants(**asked), [region]).chosen.type.name
+def _type(region: str, wanted: Mapping[str, Any]) -> str:
+    return _aws().offers(offers.wants(**wanted), [region]).chosen.type.name
 
 
 def _type_of_fogros2(
@@ -211,9 +211,9 @@ def _type_of_fogros2(
 
 def _cheapest(
     regions: Optional[Sequence[str]], providers: Sequence[str],
-    max_round_trip_ms: Optional[float], asked: Mapping[str, Any],
+    max_round_trip_ms: Optional[float], wanted: Mapping[str, Any],
 ) -> str:
-    offer = clouds.compare(offers.wants(**asked), providers, regions or [clouds.ALL],
+    offer = clouds.compare(offers.wants(**wanted), providers, regions or [clouds.ALL],
                            max_round_trip_ms=max_round_trip_ms).chosen
     return f'{offer.provider} {offer.region} {offer.type.name}'
 

@@ -57,15 +57,15 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
         else:
             tables[''][name] = value
     for provider, table in tables.items():
-        known = {name: kind for each in ([provider] if provider else keywords.providers())
-                 for name, kind in _allowed(keywords.machine_class(each)).items()}
+        kinds_of = {name: kind for each in ([provider] if provider else keywords.providers())
+                    for name, kind in _allowed(keywords.machine_class(each)).items()}
         for name, value in table.items():
-            if name not in known:
-                raise keywords.unknown(f"{path}: [{provider or 'machines'}]", name, known)
-            if not isinstance(value, _TYPES[known[name]]) or (
-                    isinstance(value, bool) and known[name] not in ('bool', 'scalar')):
+            if name not in kinds_of:
+                raise keywords.unknown(f"{path}: [{provider or 'machines'}]", name, kinds_of)
+            if not isinstance(value, _TYPES[kinds_of[name]]) or (
+                    isinstance(value, bool) and kinds_of[name] not in ('bool', 'scalar')):
                 raise ConfigurationError(f'{path}: {name} = {value!r} has the wrong type',
-                                         f'it takes a {known[name]}')
+                                         f'it takes a {kinds_of[name]}')
             if name in SETTINGS:
                 with values.named(str(path)):
                     check_setting(name, value)
@@ -119,17 +119,17 @@ def apply(
     wanted: dict[str, Any] = {}
     for path in files(environment):
         tables = read(path)
-        known = _allowed(keywords.machine_class(spec.provider)) if tables else {}
+        kinds_of = _allowed(keywords.machine_class(spec.provider)) if tables else {}
         wanted.update({name: value for part in ('', spec.provider)
-                       for name, value in tables.get(part, {}).items() if name in known})
+                       for name, value in tables.get(part, {}).items() if name in kinds_of})
     settings = {name: check_setting(name, value) for name, value in wanted.items()
                 if name in SETTINGS and name not in given}
     # an empty text is what an argument of a launch file has without a value
     options = {name: value for name, value in wanted.items()
                if name not in SETTINGS and spec.options.get(name, '') == ''}
-    found = dataclasses.replace(spec, options={**spec.options, **options}, **settings)
-    check_loss(found)
-    return found
+    result = dataclasses.replace(spec, options={**spec.options, **options}, **settings)
+    check_loss(result)
+    return result
 
 
 def resolved(
@@ -140,9 +140,9 @@ def resolved(
 
     :raises FogError: a value is wrong, or a file cannot be read.
     """
-    spec, given = machine.spec(context), set(machine.settings)
+    spec, settings = machine.spec(context), set(machine.settings)
     override = overrides.of(spec.name) if overrides is not None else None
     if override is not None:
         spec = override.instead(spec, context)
-        given.update(override.given)
-    return apply(spec, given, context.environment)
+        settings.update(override.given)
+    return apply(spec, settings, context.environment)

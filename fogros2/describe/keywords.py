@@ -47,20 +47,20 @@ def machine_class(provider: str) -> type[CloudInstance]:
     if provider not in plugin_system.names(GROUP):
         raise ConfigurationError(f"there is no provider '{provider}'",
                                  did_you_mean(provider, providers(), all_too=True))
-    found: type[CloudInstance] = plugin_system.load(GROUP, provider)
-    return found
+    cls: type[CloudInstance] = plugin_system.load(GROUP, provider)
+    return cls
 
 
 def keywords(cls: type[CloudInstance]) -> Mapping[str, Keyword]:
     """Return the keywords of a machine class by name; its own come before inherited ones."""
-    found: dict[str, Keyword] = {}
+    by_name: dict[str, Keyword] = {}
     for base in cls.__mro__:
         if '__init__' not in vars(base) or not issubclass(base, CloudInstance):
             continue
         constructor = vars(base)['__init__']
         for name, keyword in parameters_of(constructor).items():
-            found.setdefault(name, keyword)
-    return found
+            by_name.setdefault(name, keyword)
+    return by_name
 
 
 def read(keyword: Keyword, text: str) -> Any:
@@ -85,14 +85,14 @@ def read(keyword: Keyword, text: str) -> Any:
 
 def _nested(keyword: Keyword, text: str) -> Any:
     """Parse a YAML mapping, or the rows of a table: ``{a: b}``, ``[{key: gpu}]``."""
-    found = values.read_yaml(text)
+    content = values.read_yaml(text)
     if keyword.kind != 'table':
-        if isinstance(found, dict) and all(isinstance(one, str) for one in found.values()):
-            return found
+        if isinstance(content, dict) and all(isinstance(one, str) for one in content.values()):
+            return content
         raise ConfigurationError(f'{text!r} has no names and texts', 'write {name: value}')
-    if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
+    if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise ConfigurationError(f'{text!r} is no list of mappings', 'write [{name: value}]')
-    return [row_of(keyword, row) for row in found]
+    return [row_of(keyword, row) for row in content]
 
 
 def row_of(keyword: Keyword, row: Mapping[str, Any]) -> dict[str, Any]:
@@ -108,24 +108,24 @@ def row_of(keyword: Keyword, row: Mapping[str, Any]) -> dict[str, Any]:
             if isinstance(value, str) else value for name, value in row.items()}
 
 
-def make(provider: str, given: Mapping[str, Any]) -> CloudInstance:
+def make(provider: str, arguments: Mapping[str, Any]) -> CloudInstance:
     """
     Create a machine's description.
 
-    :param given: keywords of its constructor.
+    :param arguments: keywords of its constructor.
     :raises ConfigurationError: an unknown provider or keyword, a wrong value, or a missing one.
     """
     cls = machine_class(provider)
-    known = keywords(cls)
-    for name in given:
-        if name not in known:
-            raise unknown(f"a machine of the provider '{provider}'", name, known)
-    for keyword in known.values():
-        if keyword.needed and keyword.name not in given:
+    parameters = keywords(cls)
+    for name in arguments:
+        if name not in parameters:
+            raise unknown(f"a machine of the provider '{provider}'", name, parameters)
+    for keyword in parameters.values():
+        if keyword.needed and keyword.name not in arguments:
             raise ConfigurationError(
                 f"a machine of the provider '{provider}' needs {keyword.name}",
                 f'{keyword.name}= says it')
-    return cls(**given)
+    return cls(**arguments)
 
 
 @contextlib.contextmanager
@@ -141,11 +141,11 @@ def refused(cls: type[Any]) -> Iterator[None]:
         match = re.search(r"got an unexpected keyword argument '(\w+)'", str(error))
         if match is None:
             raise
-        known = {name for each in cls.__mro__ if '__init__' in vars(each)
+        names = {name for each in cls.__mro__ if '__init__' in vars(each)
                  for name in inspect.signature(vars(each)['__init__']).parameters}
-        raise unknown(f'a {cls.__name__}', match[1], known - {'self', 'args', 'kwargs'}) from None
+        raise unknown(f'a {cls.__name__}', match[1], names - {'self', 'args', 'kwargs'}) from None
 
 
-def unknown(what: str, name: str, known: Iterable[str]) -> ConfigurationError:
+def unknown(what: str, name: str, names: Iterable[str]) -> ConfigurationError:
     """Return the error for an unknown name, with the nearest known one in its hint."""
-    return ConfigurationError(f"{what} has no '{name}'", did_you_mean(name, sorted(known)))
+    return ConfigurationError(f"{what} has no '{name}'", did_you_mean(name, sorted(names)))

@@ -93,14 +93,14 @@ def _options(hint: Any) -> Iterable[Any]:
         yield hint
 
 
-def options_of(constructor: Callable[..., Any], given: Mapping[str, Any]) -> dict[str, Any]:
+def options_of(constructor: Callable[..., Any], arguments: Mapping[str, Any]) -> dict[str, Any]:
     """
     Return the arguments of a machine's constructor as options, marked by their kinds.
 
-    :param given: the arguments by name, and other names, which are ignored.
+    :param arguments: the arguments by name, and other names, which are ignored.
     """
-    return {name: _MARKS[keyword.kind](given[name]) if keyword.kind in _MARKS else given[name]
-            for name, keyword in parameters_of(constructor).items()}
+    return {name: _MARKS[keyword.kind](arguments[name]) if keyword.kind in _MARKS
+            else arguments[name] for name, keyword in parameters_of(constructor).items()}
 
 
 _MARKS: Mapping[Kind, Callable[[Any], Any]] = {

@@ -118,7 +118,7 @@ class CloudInstance:
         options: Optional[Mapping[str, Any]] = None,
         **unknown: object,
     ) -> None:
-        given = locals()
+        parameters = locals()
         if unknown:
             raise self._unknown(next(iter(unknown)))
         if not self.provider:
@@ -129,13 +129,13 @@ class CloudInstance:
         self._name = names.two_words() if name is None else name
         self._workspace = ros_workspace
         self._working_dir_base = working_dir_base
-        self._values = {name: given[name] for name in _CHECKS if given[name] is not None}
+        self._values = {name: parameters[name] for name in _CHECKS if parameters[name] is not None}
         self._environment = dict(environment or {})
         self._options = {k: v for k, v in (options or {}).items() if v is not None}
         self._foxglove = launch_foxglove
         self._monitor_allow = networks.items(monitor_allow)
         self._containers: list[SomeSubstitutionsType] = []
-        self._lists = {name: _listed(name, given) for name, given in (
+        self._lists = {name: _listed(name, parameters) for name, parameters in (
             ('apt', apt), ('pip', pip), ('share', share))}
         self._spec: Optional[MachineSpec] = None
         self._running: Optional[RunningMachine] = None
@@ -158,12 +158,12 @@ class CloudInstance:
                 'give it a name=, so that the next launch finds it')
 
     def _unknown(self, name: str) -> ConfigurationError:
-        known = sorted({
+        parameters = sorted({
             parameter for cls in type(self).__mro__[:-1]
             for parameter in inspect.signature(cls).parameters
         } - {'self', 'options', 'unknown', 'common'})
         return ConfigurationError(
-            f"{type(self).__name__} has no attribute '{name}'", did_you_mean(name, known))
+            f"{type(self).__name__} has no attribute '{name}'", did_you_mean(name, parameters))
 
     @property
     def name(self) -> str:
@@ -516,14 +516,14 @@ _LIST_CHECKS = {'apt': dependencies.check_apt, 'pip': dependencies.check_pip,
                 'share': topics.check_name}
 
 
-def _listed(program: str, given: Any) -> list[Union[values.Items, values.List]]:
+def _listed(program: str, content: Any) -> list[Union[values.Items, values.List]]:
     """
     Read a value of ``apt=``, ``pip=`` or ``share=``; check the items that are known already.
 
     :raises ConfigurationError: not a list, or a wrong item.
     """
-    found = values.checked_items(program, given, _LIST_CHECKS[program])
-    return [] if found is None else [found]
+    items = values.checked_items(program, content, _LIST_CHECKS[program])
+    return [] if items is None else [items]
 
 
 _CHECKS: dict[str, Any] = {

@@ -321,16 +321,16 @@ class AzureCloudInstance(VmInstance):
         vm_sizes: Optional[Sequence[SomeSubstitutionsType]] = None,
         **common: Any,
     ) -> None:
-        given = options_of(AzureCloudInstance.__init__, locals())
+        options = options_of(AzureCloudInstance.__init__, locals())
         for other, name in (('location', 'region'), ('zone', 'region'),
                             ('machine_type', 'vm_size'), ('ami_image', 'image')):
-            value = given.pop(other, None)
+            value = options.pop(other, None)
             if value is not None:
-                if given.get(name) is not None:
+                if options.get(name) is not None:
                     raise ConfigurationError(f'{other}= and {name}= are the same option',
                                              f'leave {other}= out')
-                given[name] = value
-        super().__init__(options=given, **common)
+                options[name] = value
+        super().__init__(options=options, **common)
 
     def info(self, flush_to_disk: bool = False) -> dict[str, Any]:
         """Return what is known about the machine, with the keys of pull request 109."""

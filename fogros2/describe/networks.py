@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 _SUCH = "write networks such as '198.51.100.0/28', or addresses"
 
 
-def items(given: Any) -> Any:
+def items(content: Any) -> Any:
     """Read a value of ``monitor_allow``; see :func:`values.checked_items`."""
-    return values.checked_items('monitor_allow', given, normal)
+    return values.checked_items('monitor_allow', content, normal)
 
 
 def resolve(context: LaunchContext, networks: Any) -> tuple[str, ...]:

@@ -114,20 +114,20 @@ def parse(text: str) -> Override:
             f"--machine '{text}' lacks the name or the provider of a machine",
             f"write planner=container; there are: {', '.join(keywords.providers())}")
     provider, *settings = (part.strip() for part in _parts(rest))
-    given: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     if provider.startswith(_SSH):
-        given.update(_computer(provider[len(_SSH):]))
+        options.update(_computer(provider[len(_SSH):]))
         provider = 'ssh'
-    known = keywords.keywords(keywords.machine_class(provider))
+    parameters = keywords.keywords(keywords.machine_class(provider))
     for setting in settings:
         name, equals, value = (part.strip() for part in setting.partition('='))
         if not equals:
             raise ConfigurationError(f"--machine '{text}': '{setting}' is no keyword=value",
                                      'such as region=eu-west-1')
-        if name not in known or name == 'name':
-            raise keywords.unknown(f"a machine of the provider '{provider}'", name, known)
-        given[name] = keywords.read(known[name], value)
-    override = Override(pattern.strip(), provider, given)
+        if name not in parameters or name == 'name':
+            raise keywords.unknown(f"a machine of the provider '{provider}'", name, parameters)
+        options[name] = keywords.read(parameters[name], value)
+    override = Override(pattern.strip(), provider, options)
     # report wrong values before the launch begins; the name does not matter
     override.machine('machine')
     return override
@@ -150,6 +150,6 @@ def _computer(text: str) -> dict[str, Any]:
     name, colon, port = host.rpartition(':')
     if not colon or host.endswith(']'):
         name, port = host, ''
-    given = {'host': name.strip('[]'), 'user': user if at else None,
-             'port': values.number(port) if port else None}
-    return {key: value for key, value in given.items() if value is not None}
+    options = {'host': name.strip('[]'), 'user': user if at else None,
+               'port': values.number(port) if port else None}
+    return {key: value for key, value in options.items() if value is not None}

@@ -55,20 +55,20 @@ def items(
     return List(values) if hasattr(values, 'perform') else Items(values)
 
 
-def checked_items(name: str, given: Any, check: Callable[[str], object]) -> Any:
+def checked_items(name: str, sequence: Any, check: Callable[[str], object]) -> Any:
     """
     Return the values of a list as separate items, None for none; check those that are known.
 
     :param name: the keyword, for messages.
     :raises ConfigurationError: a single text, or an invalid value.
     """
-    if isinstance(given, str):
-        raise ConfigurationError(f'{name}={given!r} is no list', f'{name}=[{given!r}]')
-    found = items(given)
-    for value in found if isinstance(found, Items) else ():
+    if isinstance(sequence, str):
+        raise ConfigurationError(f'{name}={sequence!r} is no list', f'{name}=[{sequence!r}]')
+    parts = items(sequence)
+    for value in parts if isinstance(parts, Items) else ():
         if isinstance(value, str):
             check(value)
-    return found
+    return parts
 
 
 @contextlib.contextmanager
@@ -88,10 +88,10 @@ def split(text: str) -> list[str]:
     """
     if not text.lstrip().startswith('['):
         return [part.strip() for part in text.split(',') if part.strip()]
-    found = read_yaml(text)
-    if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
+    parts = read_yaml(text)
+    if not isinstance(parts, list) or not all(isinstance(item, str) for item in parts):
         raise ConfigurationError(f'{text!r} is no list of texts', "write 'a, b' or '[a, b]'")
-    return found
+    return parts
 
 
 def read_yaml(text: str) -> Any:
@@ -176,10 +176,10 @@ def read_number(value: Any) -> Union[int, float]:
 
     :raises ConfigurationError: it is none.
     """
-    found = number(value) if isinstance(value, str) else value
-    if isinstance(found, str):
+    result = number(value) if isinstance(value, str) else value
+    if isinstance(result, str):
         raise ConfigurationError(f'{value!r} is no number', 'such as 2 or 1.5')
-    return found if isinstance(found, (int, float)) else float(found)
+    return result if isinstance(result, (int, float)) else float(result)
 
 
 def number(text: str) -> Union[int, float, str]:

@@ -16,7 +16,7 @@ COPY = 0.8
 _reported: set[str] = set()
 
 
-def to_send(given: Mapping[str, str], robot: Mapping[str, str]) -> dict[str, str]:
+def to_send(variables: Mapping[str, str], robot: Mapping[str, str]) -> dict[str, str]:
     """
     Return the variables that a machine gets; of a copy of the robot's, only what differs.
 
@@ -25,12 +25,12 @@ def to_send(given: Mapping[str, str], robot: Mapping[str, str]) -> dict[str, str
 
     :param robot: the robot's variables.
     """
-    same = [name for name, value in robot.items() if given.get(name) == value]
+    same = [name for name, value in robot.items() if variables.get(name) == value]
     if not same or len(same) < COPY * len(robot):
-        return dict(given)
-    sent = {name: value for name, value in given.items()
+        return dict(variables)
+    sent = {name: value for name, value in variables.items()
             if robot.get(name) != value and name not in LOCAL_VARIABLES}
-    new = sorted(given.keys() - sent.keys() - _reported)
+    new = sorted(variables.keys() - sent.keys() - _reported)
     if new:
         import launch.logging
         _reported.update(new)

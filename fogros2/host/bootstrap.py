@@ -183,10 +183,10 @@ def ensure(
     question = host.probe(under.prefixes)
     with ThreadPoolExecutor(1, 'fog-probe') as pool:
         here = pool.submit(_robot_facts, under.prefixes, timeout)
-        there = shell.run(question, timeout=timeout, cancel=cancel)
+        reply = shell.run(question, timeout=timeout, cancel=cancel)
         robot = here.result()
     try:
-        facts = host.parse_facts(there.stdout)
+        facts = host.parse_facts(reply.stdout)
     except untrusted.InvalidMessage as error:
         raise PrerequisiteError(
             f"'{spec.name}' describes itself wrongly: {error}",
@@ -267,24 +267,24 @@ def _complete(
     named = {name.partition('=')[0] for name in apt}
     keys = [key for key in keys if key not in named]
     able = spec.bootstrap != 'none' and facts.root and 'apt-get' in facts.programs
-    left = run(needs.unknown(keys, environment, install.setup)).stdout.split() if keys else []
-    if left:
-        asked = run(needs.resolve(left, environment, install.setup), check=False)
-        if asked.returncode == needs.NO_ROSDEP and able:
+    rest = run(needs.unknown(keys, environment, install.setup)).stdout.split() if keys else []
+    if rest:
+        reply = run(needs.resolve(rest, environment, install.setup), check=False)
+        if reply.returncode == needs.NO_ROSDEP and able:
             rosdep = 'python3-rosdep2' if facts.system == 'debian' else 'python3-rosdep'
             run(apt_install([rosdep], 'install rosdep'), check=False)
-            asked = run(needs.resolve(left, environment, install.setup), check=False)
-        if asked.returncode == 0:
-            more_apt, more_pip = needs.resolved(asked.stdout)
+            reply = run(needs.resolve(rest, environment, install.setup), check=False)
+        if reply.returncode == 0:
+            more_apt, more_pip = needs.resolved(reply.stdout)
             apt, pip = (*apt, *more_apt), (*pip, *more_pip)
-            left = re.findall(r"no rosdep rule for '([^']+)'", asked.stderr)
+            rest = re.findall(r"no rosdep rule for '([^']+)'", reply.stderr)
         elif able:
             complete = False
-            why = ' / '.join(asked.stderr.strip().splitlines()[-3:]) or 'it is not installed'
-            warn(f"machine '{spec.name}' may lack {', '.join(left)}, as rosdep gave no answer: "
+            why = ' / '.join(reply.stderr.strip().splitlines()[-3:]) or 'it is not installed'
+            warn(f"machine '{spec.name}' may lack {', '.join(rest)}, as rosdep gave no answer: "
                  f'{why}', "apt=['...'] or pip=['...'] of the machine installs what it lacks")
-        if left and complete:
-            notes.append(f"the machine may lack {', '.join(left)}")
+        if rest and complete:
+            notes.append(f"the machine may lack {', '.join(rest)}")
     if pip and run(needs.able(environment, install.setup), check=False).returncode != 0:
         if not able:
             raise PrerequisiteError(
@@ -626,18 +626,18 @@ def _install_wheels(
     # pip runs from its wheel, so that the machine needs no ensurepip (package python3-venv).
     words = [f'{target}/{wheels.pip}/pip', 'install', '--quiet', '--no-compile',
              '--disable-pip-version-check', '--no-warn-script-location', *locked.OPTIONS]
-    asked = _asked(facts, wheels)
-    if fetched is None and asked:
+    names = _asked(facts, wheels)
+    if fetched is None and names:
         words += ['--retries', '1', '--timeout', '8']
     else:
         words.append('--no-index')
     sent = {file: digest for file, digest in wheels.hashes.items()
-            if _distribution(file) not in asked}
+            if _distribution(file) not in names}
     lines = [locked.from_file(f'{target}{suffix}/{file}', digest, _distribution(file))
              for suffix, files in (('', sent), ('-fetched', fetched or {}))
              for file, digest in files.items()]
     if fetched is None:
-        lines += locked.requirements(asked)
+        lines += locked.requirements(names)
     module = f'venv/lib/python{python.version[0]}.{python.version[1]}/site-packages/fogros2/host'
     script = (
         f'cd {shlex.quote(folder)}\n'
@@ -647,7 +647,7 @@ def _install_wheels(
         f"printf '%s\\n' {shlex.join(lines)} >requirements.txt\n"
         f'venv/bin/python {shlex.join(words)} --requirement requirements.txt\n'
         # the robot's own are relocated already
-        + (f'venv/bin/python -I {module}/relocation.py\n' if asked else '')
+        + (f'venv/bin/python -I {module}/relocation.py\n' if names else '')
         + ': >complete\n')
     return Command.script(script, what='install ROS 2 by pip')
 

@@ -122,7 +122,7 @@ class Checkpoint:
         if words[:1] == ['missing']:
             return ''
         try:
-            size, found = untrusted.number(words[0]), untrusted.matched(_HASH, words[1])
+            size, digest = untrusted.number(words[0]), untrusted.matched(_HASH, words[1])
         except (untrusted.InvalidMessage, IndexError) as error:
             raise ShellError(f'the size of {self.folder} is not known: {error}',
                              'the machine may be hijacked: delete it') from error
@@ -130,7 +130,7 @@ class Checkpoint:
             raise ShellError(
                 f'{self.folder} has {size / 1e9:.1f} GB, and a checkpoint at most '
                 f'{LIMIT / 1e9:.1f} GB', 'write what a restart needs to a folder of its own')
-        return found
+        return digest
 
     def _commit(self, partial: Path) -> None:
         before = self.newest

@@ -137,7 +137,7 @@ def parse(line: str) -> Container:
     if words[:1] != ['run']:
         raise wrong('runs nothing')
     options: list[str] = []
-    found = {'--gpus': '', '--name': '', '--restart': ''}
+    settings = {'--gpus': '', '--name': '', '--restart': ''}
     at = 1
     while at < len(words) and words[at].startswith('-') and words[at] != '-':
         word = words[at]
@@ -166,18 +166,18 @@ def parse(line: str) -> Container:
                 raise wrong(f'has nothing after {word}')
             value = words[at]
             at += 1
-        if name in found:
-            found[name] = value
+        if name in settings:
+            settings[name] = value
         else:
             options += [name, value]
     if at >= len(words):
         raise wrong('names no image')
-    for text in (words[at], *found.values()):
+    for text in (words[at], *settings.values()):
         if docker_lines.MARK in text:
             raise wrong(f"has {text.replace(docker_lines.MARK, '')} as image, name, gpus or "
                         'restart', 'write it out: the launch has to know it')
-    return Container(words[at], tuple(options), tuple(words[at + 1:]), found['--gpus'],
-                     found['--name'], found['--restart'])
+    return Container(words[at], tuple(options), tuple(words[at + 1:]), settings['--gpus'],
+                     settings['--name'], settings['--restart'])
 
 
 def on_machine_network(container: Container) -> bool:
@@ -349,8 +349,8 @@ def inside(
     :param variables: names of the launch file's variables for the machine's nodes.
     """
     container = node_container(node.image, node.image_options)
-    known = {*_DDS_VARIABLES, *_NODE_VARIABLES, *variables, *node.environment}
-    names = sorted(name for name in known if _VARIABLE.fullmatch(name))
+    candidates = {*_DDS_VARIABLES, *_NODE_VARIABLES, *variables, *node.environment}
+    names = sorted(name for name in candidates if _VARIABLE.fullmatch(name))
     options: list[Text] = [
         '--label', f'{LABEL}={launch}', *dds_options(container, configuration)]
     for key in node.files:

@@ -90,13 +90,13 @@ if _next is not None:
 _CONSTRAINTS = """\
 import re
 from importlib import metadata
-found = {}
+versions = {}
 for one in metadata.distributions():
     # Debian appends '+', which no index has
     version = str(one.metadata['Version']).partition('+')[0]
     if one.metadata['Name'] and re.fullmatch('[0-9][0-9A-Za-z.]*', version):
-        found.setdefault(re.sub('[-_.]+', '-', one.metadata['Name']).lower(), version)
-for item in sorted(found.items()):
+        versions.setdefault(re.sub('[-_.]+', '-', one.metadata['Name']).lower(), version)
+for item in sorted(versions.items()):
     print('=='.join(item))
 """
 #: Runs pip, at first without sources: if nothing fits, it would build one version after another.
@@ -160,12 +160,12 @@ def check_pip(requirement: str) -> str:
 
     :raises ConfigurationError: it names no package, or a package of this project.
     """
-    found = _PIP.match(requirement)
-    if found is None:
+    match = _PIP.match(requirement)
+    if match is None:
         raise ConfigurationError(f'pip: {requirement!r} names no Python package',
                                  "such as 'pyzbar>=0.1.9' or 'pyzbar @ https://...'")
-    if locked.name_of(found[1]) in OURS:
-        raise ConfigurationError(f"pip: '{found[1]}' is part of FogROS2, which brings it itself",
+    if locked.name_of(match[1]) in OURS:
+        raise ConfigurationError(f"pip: '{match[1]}' is part of FogROS2, which brings it itself",
                                  'leave it out')
     return requirement
 
@@ -179,13 +179,13 @@ def keys(workspaces: Iterable[Workspace], packages: Iterable[str]) -> tuple[str,
     :param packages: packages of the launch's nodes.
     """
     own: set[str] = set()
-    found = set(packages)
+    names = set(packages)
     for workspace in workspaces:
         own |= set(workspace.packages)
         for name, prefix in workspace.installed.items():
             if name not in OWN_PACKAGES:
-                found |= run_dependencies(prefix / 'share' / name / 'package.xml')
-    return tuple(sorted(found - own - {''}))
+                names |= run_dependencies(prefix / 'share' / name / 'package.xml')
+    return tuple(sorted(names - own - {''}))
 
 
 def outside(names: Iterable[str], prefixes: Iterable[str]) -> tuple[str, ...]:
@@ -219,14 +219,14 @@ def resolved(output: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     >>> resolved('#ROSDEP[a]\n#apt\nliba libb\n#ROSDEP[c]\n#pip\nc')
     (('liba', 'libb'), ('c',))
     """
-    found: dict[str, list[str]] = {'apt': [], 'pip': []}
+    packages: dict[str, list[str]] = {'apt': [], 'pip': []}
     installer = ''
     for line in output.splitlines():
         if line.startswith('#'):
             installer = line[1:].strip()
-        elif installer in found:
-            found[installer] += line.split()
-    return tuple(dict.fromkeys(found['apt'])), tuple(dict.fromkeys(found['pip']))
+        elif installer in packages:
+            packages[installer] += line.split()
+    return tuple(dict.fromkeys(packages['apt'])), tuple(dict.fromkeys(packages['pip']))
 
 
 def missing(names: Iterable[str]) -> Command:
@@ -262,12 +262,12 @@ def able(environment: Mapping[str, str], setup: Sequence[str]) -> Command:
 
 def fill(
     folder: str, requirements: Sequence[str], environment: Mapping[str, str],
-    given: Mapping[str, str], setup: Sequence[str], *, complete: bool = True,
+    variables: Mapping[str, str], setup: Sequence[str], *, complete: bool = True,
 ) -> Command:
     """
     Return the command that installs packages into a folder by one call of pip.
 
-    :param environment: variables of nodes there; ``given`` has those of the launch file.
+    :param environment: variables of nodes there; ``variables`` has those of the launch file.
     :param complete: whether a later launch has nothing to add.
     """
     names = ' '.join(name.replace('-', '_') for name in OURS)
@@ -287,4 +287,4 @@ def fill(
         f'python3 -c {shlex.join([_IMPORT, *requirements])} || {{ rm -rf site; exit 1; }}\n'
         f"{': >complete' if complete else ':'}\n")
     return modules.among_nodes(
-        plan.extended(environment, given), setup, script, 'install Python packages')
+        plan.extended(environment, variables), setup, script, 'install Python packages')

@@ -75,18 +75,18 @@ def words(line: str) -> list[str]:
     """
     if MARK in line:
         raise ValueError('has a NUL character')
-    found: list[str] = []
+    result: list[str] = []
     word: list[str] = []
     for kind, text in _pieces(_PIECE, line.replace('\r\n', '\n').strip()):
         if kind in ('space', 'comment'):
-            found += [''.join(word)] if word else []
+            result += [''.join(word)] if word else []
             word = []
         elif kind == 'double':
             # '' keeps a word without content
             word += ['', *(part for _, part in _pieces(_QUOTED, text))]
         else:
             word += [text]
-    return found + ([''.join(word)] if word else [])
+    return result + ([''.join(word)] if word else [])
 
 
 def _pieces(pattern: re.Pattern[str], text: str) -> Iterator[tuple[str, str]]:

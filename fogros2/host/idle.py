@@ -94,12 +94,12 @@ def _processes() -> list[str]:
 
 def marked(mark: str) -> list[str]:
     """Return the nodes' processes: those with a mark in their environment."""
-    found = []
+    pids = []
     for pid in _processes():
         with contextlib.suppress(OSError):
             if f'{MARK}={mark}'.encode() in Path(f'/proc/{pid}/environ').read_bytes().split(b'\0'):
-                found.append(pid)
-    return found
+                pids.append(pid)
+    return pids
 
 
 def computed(processes: Iterable[str]) -> float:
@@ -123,13 +123,13 @@ def acting_as(user: int) -> Iterator[None]:
 
 def ready(processes: Iterable[str]) -> dict[str, float]:
     """Return by thread the seconds that it has run, or has waited for a processor, so far."""
-    found = {}
+    seconds = {}
     for pid in processes:
         with contextlib.suppress(OSError, ValueError):  # it has ended
             for task in os.listdir(f'/proc/{pid}/task'):
                 ran, waited, _ = Path(f'/proc/{pid}/task/{task}/schedstat').read_text().split()
-                found[task] = (int(ran) + int(waited)) / 1e9
-    return found
+                seconds[task] = (int(ran) + int(waited)) / 1e9
+    return seconds
 
 
 def carried(interface: str) -> Optional[float]:
@@ -166,9 +166,9 @@ def main(interface: str, folder: str, timeout: float, token: str, run: str = '/r
     """Take one sample; return whether the machine is idle."""
     path, idle = Path(run, f'{interface}.idle.json'), Idle(timeout)
     with contextlib.suppress(FileNotFoundError):
-        before, since, last, known = json.loads(path.read_text())
+        before, since, last, old_threads = json.loads(path.read_text())
         if before == token:
-            idle.since, idle.last, idle.threads = since, last, known
+            idle.since, idle.last, idle.threads = since, last, old_threads
     user = os.stat(folder).st_uid
     try:
         with acting_as(user):
@@ -179,12 +179,12 @@ def main(interface: str, folder: str, timeout: float, token: str, run: str = '/r
     traffic = carried(interface)
     if traffic is None:
         return False  # the VPN is being repaired, or the launch has ended
-    found = idle.sample(time.monotonic(), cpu, traffic, threads, connected=connected,
-                        discovery=DISCOVERY * len(nodes) * machines(interface))
+    is_idle = idle.sample(time.monotonic(), cpu, traffic, threads, connected=connected,
+                          discovery=DISCOVERY * len(nodes) * machines(interface))
     aside = path.with_suffix('.new')
     aside.write_text(json.dumps([token, idle.since, idle.last, idle.threads]))
     aside.replace(path)
-    return found
+    return is_idle
 
 
 if __name__ == '__main__':

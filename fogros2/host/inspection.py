@@ -173,16 +173,16 @@ def parse_facts(output: str) -> HostFacts:
 
     :raises InvalidMessage: a value is not a number, or the home is no path.
     """
-    found: dict[str, list[str]] = {}
+    values: dict[str, list[str]] = {}
     for line in output.splitlines():
         key, _, value = line.partition(' ')
-        found.setdefault(key, []).append(value)
+        values.setdefault(key, []).append(value)
 
     def one(key: str, default: str = '') -> str:
-        return found.get(key, [default])[-1]
+        return values.get(key, [default])[-1]
 
     def split(key: str, number: int) -> list[list[str]]:
-        words = [value.split(' ', number - 1) for value in found.get(key, ())]
+        words = [value.split(' ', number - 1) for value in values.get(key, ())]
         return [each for each in words if len(each) == number]
 
     pythons = {path: Python(path, (number(major), number(minor)), venv == '1')
@@ -196,12 +196,12 @@ def parse_facts(output: str) -> HostFacts:
     return HostFacts(
         system=system, release=release, architecture=one('arch'), uid=number(uid), user=user,
         home=matched(PATH, one('home', '/root')),
-        libc=one('libc'), root='root' in found, pythons=tuple(pythons.values()),
-        programs=frozenset(found.get('program', ())), ros=dict(split('ros', 2)), rmw=rmw,
-        kernel_wireguard='kernel-wireguard' in found,
+        libc=one('libc'), root='root' in values, pythons=tuple(pythons.values()),
+        programs=frozenset(values.get('program', ())), ros=dict(split('ros', 2)), rmw=rmw,
+        kernel_wireguard='kernel-wireguard' in values,
         free_bytes=number(disk) * 1024 if disk.isdecimal() else None,
-        routes=tuple(filter(_is_network, found.get('route', ()))),
-        network=one('network'), installed=frozenset(found.get('installed', ())),
+        routes=tuple(filter(_is_network, values.get('route', ()))),
+        network=one('network'), installed=frozenset(values.get('installed', ())),
         environments={path: signature for signature, path in split('environment', 2)},
         cloud_launch=one('cloud_launch'))
 

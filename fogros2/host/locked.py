@@ -34,11 +34,11 @@ def parse(text: str) -> dict[str, list[str]]:
 
     A distribution has several entries if the version depends on the Python.
     """
-    found: dict[str, list[str]] = {}
+    entries: dict[str, list[str]] = {}
     for entry in re.sub(r'\s*\\\n\s*', ' ', text).splitlines():
         if entry.strip() and not entry.startswith('#'):
-            found.setdefault(name_of(entry), []).append(entry.strip())
-    return found
+            entries.setdefault(name_of(entry), []).append(entry.strip())
+    return entries
 
 
 def requirements(
@@ -57,9 +57,9 @@ def requirements(
             raise PrerequisiteError(
                 f'{name} is compiled for this robot, and no other build of it is pinned',
                 'choose a machine with the same Python, processor and C library as the robot')
-        found = entries[name_of(name)]
-        lines += found if python is None else filter(
-            None, (_for_python(line, python) for line in found))
+        matches = entries[name_of(name)]
+        lines += matches if python is None else filter(
+            None, (_for_python(line, python) for line in matches))
     return lines
 
 

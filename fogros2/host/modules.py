@@ -180,10 +180,10 @@ def lacking_here(names: Iterable[str]) -> list[Module]:
 
 
 def _too_old(module: Module) -> bool:
-    found = next(filter(None, map(_installed, module.distributions)), None)
-    if found is None:
+    distribution = next(filter(None, map(_installed, module.distributions)), None)
+    if distribution is None:
         return False  # installed without a version
-    numbers = map(int, re.findall('[0-9]+', found.version)[:len(module.oldest)])
+    numbers = map(int, re.findall('[0-9]+', distribution.version)[:len(module.oldest)])
     return tuple(numbers) < module.oldest
 
 
@@ -227,20 +227,20 @@ def answer(output: str) -> Answer:
             'is python3 there at least 3.10, and does a login there print nothing?') from error
 
 
-def copy(there: Answer) -> Optional[Copy]:
+def copy(facts: Answer) -> Optional[Copy]:
     """Return the missing modules from this Python, None if they would not run there."""
-    if there.architecture != platform.machine():
+    if facts.architecture != platform.machine():
         return None
     entries: dict[str, set[str]] = {}
     versions = []
-    for name in there.missing:
-        found = next(filter(None, map(_installed, MODULES[name].distributions)), None)
-        if found is None or not _runs(found, there):
+    for name in facts.missing:
+        distribution = next(filter(None, map(_installed, MODULES[name].distributions)), None)
+        if distribution is None or not _runs(distribution, facts):
             return None
         # The other files are programs in a bin folder.
-        entries.setdefault(str(found.locate_file('')), set()).update(
-            file.parts[0] for file in found.files or () if file.parts[0] != '..')
-        versions.append(f'{found.name} {found.version}')
+        entries.setdefault(str(distribution.locate_file('')), set()).update(
+            file.parts[0] for file in distribution.files or () if file.parts[0] != '..')
+        versions.append(f'{distribution.name} {distribution.version}')
     return Copy({folder: tuple(sorted(names)) for folder, names in entries.items()},
                 tuple(versions))
 
@@ -252,30 +252,30 @@ def _installed(name: str) -> Optional[metadata.Distribution]:
         return None
 
 
-def _runs(found: metadata.Distribution, there: Answer) -> bool:
+def _runs(distribution: metadata.Distribution, facts: Answer) -> bool:
     """Return whether an installed distribution runs on a machine with this processor."""
     tags = [tag.split('-') for tag in re.findall(
-        r'^Tag: (\S+)$', found.read_text('WHEEL') or '', re.MULTILINE)]
+        r'^Tag: (\S+)$', distribution.read_text('WHEEL') or '', re.MULTILINE)]
     if not tags:
         return False  # not from a wheel: it may need libraries of this computer
     # It is for this version of Python, for the tag's version and later ones, or for any version.
     least = re.fullmatch(r'(?:cp|py)(\d)(\d*)', tags[0][0])
-    stable = tags[0][1] in ('abi3', 'none') and least is not None and there.python >= (
+    stable = tags[0][1] in ('abi3', 'none') and least is not None and facts.python >= (
         int(least[1]), int(least[2] or 0))
-    if not stable and there.python != sys.version_info[:2]:
+    if not stable and facts.python != sys.version_info[:2]:
         return False
     wheel = f"x-{'.'.join(tag[2] for tag in tags)}.whl"
-    return runs_on(libc_for([wheel]), there.libc)
+    return runs_on(libc_for([wheel]), facts.libc)
 
 
-def folder(home: str, there: Answer, versions: Sequence[str]) -> str:
+def folder(home: str, facts: Answer, versions: Sequence[str]) -> str:
     """
     Return the folder of modules on a machine; equal for equal modules.
 
     :param home: home of the login user.
     :param versions: names and versions of the modules.
     """
-    need = json.dumps([there.python, there.missing, list(versions)])
+    need = json.dumps([facts.python, facts.missing, list(versions)])
     return (f'{home}/.local/share/fogros2/'
             f'modules-{hashlib.sha256(need.encode()).hexdigest()[:16]}')
 

@@ -37,13 +37,13 @@ def check_program(
     if source is not None:
         raise WorkspaceError(f"package '{package}' in {source} is not built",
                              f'run colcon build in {travelling}')
-    known = {
+    packages = {
         path.name for prefix in prefixes if Path(prefix, index).is_dir()
         for path in Path(prefix, index).iterdir()}
     raise WorkspaceError(
         f"there is no package '{package}'",
-        _nearest(package, sorted(known)) or 'source the setup.bash of its workspace, or name that '
-        'workspace with ros_workspace=')
+        _nearest(package, sorted(packages)) or 'source the setup.bash of its workspace, or name '
+        'that workspace with ros_workspace=')
 
 
 def _nearest(name: str, names: Sequence[str]) -> str:

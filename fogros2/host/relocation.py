@@ -45,11 +45,11 @@ class RelocationError(Exception):
 
 def libraries(site: Path) -> list[Path]:
     """Return the libraries of the ROS distributions in a site-packages folder, sorted."""
-    found = set()
+    paths = set()
     for record in site.glob('ros_*.dist-info/RECORD'):
         with record.open(newline='') as lines:
-            found |= {Path(os.path.normpath(site / row[0])) for row in csv.reader(lines) if row}
-    return sorted(path for path in found if _LIBRARY.fullmatch(path.name) and path.is_file()
+            paths |= {Path(os.path.normpath(site / row[0])) for row in csv.reader(lines) if row}
+    return sorted(path for path in paths if _LIBRARY.fullmatch(path.name) and path.is_file()
                   and not path.is_symlink())
 
 

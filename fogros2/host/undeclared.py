@@ -46,18 +46,18 @@ def warning(
     """
     if not chain:
         return None
-    there = {*map(locked.name_of, spec.pip), *dependencies.OURS, *wheels.names()}
+    names = {*map(locked.name_of, spec.pip), *dependencies.OURS, *wheels.names()}
     pip = {module: name for module, name in from_pip(
-        (*shown, *(str(space.root) for space in chain))).items() if name not in there}
+        (*shown, *(str(space.root) for space in chain))).items() if name not in names}
     imported = imports(chain, packages, frozenset(pip))
-    found = undeclared(imported, pip, declared(
+    needs = undeclared(imported, pip, declared(
         (*dependencies.keys(chain, packages), *spec.apt), prefixes)) if any(
             imported.values()) else {}
-    if not found:
+    if not needs:
         return None
-    modules = sorted(set().union(*found.values()))
+    modules = sorted(set().union(*needs.values()))
     return Warned(
-        spec.name, f"node packages {str([*found])[1:-1]} import {str(modules)[1:-1]}, which this "
+        spec.name, f"node packages {str([*needs])[1:-1]} import {str(modules)[1:-1]}, which this "
         f"robot has from pip and no package.xml declares: machine '{spec.name}' may lack them",
         f'add pip={[*spec.pip, *sorted({pip[module] for module in modules})]} to machine '
         f"'{spec.name}'")
@@ -95,17 +95,17 @@ def imports(
     :param packages: packages of the nodes; with the packages that they import; none for all.
     :param modules: the modules to look for.
     """
-    found: dict[str, set[str]] = {}
+    by_package: dict[str, set[str]] = {}
     for space in chain:
         for name, path in _code(space):
-            found.setdefault(name, set()).update(*(
+            by_package.setdefault(name, set()).update(*(
                 _imported(file, modules) for file in (path, *path.rglob('*'))
                 if file.is_file() and _SKIPPED.isdisjoint(file.relative_to(path.parent).parts)))
-    reached, todo = set[str](), {*(packages or found)} & {*found}
+    reached, todo = set[str](), {*(packages or by_package)} & {*by_package}
     while todo:
         reached |= todo
-        todo = set().union(*(found[name] for name in todo)) & {*found} - reached
-    return {name: found[name] & modules - {*found} for name in reached}
+        todo = set().union(*(by_package[name] for name in todo)) & {*by_package} - reached
+    return {name: by_package[name] & modules - {*by_package} for name in reached}
 
 
 def _code(space: Workspace) -> Iterator[tuple[str, Path]]:
@@ -159,20 +159,20 @@ def _statements(body: Iterable[ast.AST]) -> Iterator[str]:
 @functools.lru_cache(maxsize=8)
 def from_pip(but: tuple[str, ...]) -> Mapping[str, str]:
     """Return the distributions of modules that pip or uv installed, ``but`` in some folders."""
-    found: dict[str, str] = {}
+    distributions: dict[str, str] = {}
     for one in metadata.distributions():
         if (one.read_text('INSTALLER') or '').strip() in ('pip', 'uv') and not any(
                 Path(str(one.locate_file(''))).is_relative_to(folder) for folder in but):
             modules = {*_MODULE.findall(one.read_text('RECORD') or '')} - sys.stdlib_module_names
-            found = {**dict.fromkeys(modules, locked.name_of(one.name)), **found}
-    return found
+            distributions = {**dict.fromkeys(modules, locked.name_of(one.name)), **distributions}
+    return distributions
 
 
 def declared(keys: Iterable[str], prefixes: Iterable[str]) -> set[str]:
     """Return keys, and what the ROS packages among them declare in turn."""
-    found, todo = set[str](), {*keys}
+    names, todo = set[str](), {*keys}
     while todo:
-        found |= todo
+        names |= todo
         todo = set().union(*(run_dependencies(Path(prefix, 'share', key, 'package.xml'))
-                             for key in todo for prefix in prefixes)) - found
-    return found
+                             for key in todo for prefix in prefixes)) - names
+    return names

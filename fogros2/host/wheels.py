@@ -87,12 +87,12 @@ def collect(folder: Optional[Path] = None) -> Wheels:
     """
     folder = folder or cache_folder()
     with _collecting:
-        when, known = _collected.get(folder, (-FRESH, None))
-        if known is None or time.monotonic() - when > FRESH \
-                or not Path(known.folder, 'wheels.json').exists():
-            known = _collect(folder)
-            _collected[folder] = time.monotonic(), known
-    return known
+        when, wheels = _collected.get(folder, (-FRESH, None))
+        if wheels is None or time.monotonic() - when > FRESH \
+                or not Path(wheels.folder, 'wheels.json').exists():
+            wheels = _collect(folder)
+            _collected[folder] = time.monotonic(), wheels
+    return wheels
 
 
 _collecting = threading.Lock()
@@ -100,15 +100,15 @@ _collected: dict[Path, tuple[float, Wheels]] = {}
 
 
 def _collect(folder: Path) -> Wheels:
-    found = list(_closure())
-    names = [locked.name_of(d.name) for d in found]
-    key = _key(found)
+    distributions = list(_closure())
+    names = [locked.name_of(d.name) for d in distributions]
+    key = _key(distributions)
     target = folder / key
     if not (target / 'wheels.json').exists():
         # Two launches may pack at the same time, so move the complete folder.
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix='.new-') as aside:
-            packed = {name: _wheel(d, Path(aside)) for name, d in zip(names, found)}
+            packed = {name: _wheel(d, Path(aside)) for name, d in zip(names, distributions)}
             Path(aside, 'wheels.json').write_text(json.dumps({
                 name: [file, hashlib.sha256(Path(aside, file).read_bytes()).hexdigest()]
                 for name, file in packed.items()}))
@@ -273,10 +273,10 @@ def _sources(distribution: metadata.Distribution) -> Optional[Path]:
     return Path(urllib.parse.unquote(urllib.parse.urlsplit(url['url']).path))
 
 
-def _key(found: list[metadata.Distribution]) -> str:
+def _key(distributions: list[metadata.Distribution]) -> str:
     """Return a hash over the contents of all distributions and over the interpreter."""
     digest = hashlib.sha256(repr(sys.version_info[:2]).encode() + platform.machine().encode())
-    for distribution in found:
+    for distribution in distributions:
         digest.update(f'{distribution.name} {distribution.version}\n'.encode())
         sources = _sources(distribution)
         if sources is None:
@@ -293,12 +293,12 @@ def _key(found: list[metadata.Distribution]) -> str:
 
 def _programs(sources: Path) -> list[Path]:
     """Return the Python files of a source folder that are sent, sorted."""
-    found = []
+    paths = []
     for folder, folders, names in os.walk(sources):
         # A virtual environment may have a hundred times as many files.
         folders[:] = set(folders) - {'.venv', '.venv-ros', '.git', 'build', '.cache', 'test'}
-        found += [Path(folder, name) for name in names if name.endswith('.py')]
-    return sorted(found)
+        paths += [Path(folder, name) for name in names if name.endswith('.py')]
+    return sorted(paths)
 
 
 def _wheel(distribution: metadata.Distribution, target: Path) -> str:

@@ -155,8 +155,8 @@ def sourced(path: Optional[str], environment: Mapping[str, str]) -> Mapping[str,
 
     :raises CommandError: the workspace's setup script fails.
     """
-    found = set(environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
-    missing = [prefix for prefix in prefixes(path) if prefix not in found]
+    entries = set(environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
+    missing = [prefix for prefix in prefixes(path) if prefix not in entries]
     script = _absolute(path or '') / 'install' / 'local_setup.sh'
     if not missing or not script.is_file():
         return environment
@@ -541,15 +541,15 @@ def find_workspaces(environment: Mapping[str, str]) -> list[str]:
     An install space is a folder with colcon's marker beside a ``src`` folder. An installed
     distribution has no ``src``. ROS 2 that was built from source is not a workspace of the user.
     """
-    found: dict[str, None] = {}
+    roots: dict[str, None] = {}
     for variable in ('COLCON_PREFIX_PATH', 'AMENT_PREFIX_PATH'):
         for entry in environment.get(variable, '').split(os.pathsep):
             # An isolated install space has a prefix for each package.
             for folder in (Path(entry), Path(entry).parent) if entry else ():
                 marked = (folder / '.colcon_install_layout').is_file()
                 if marked and (folder.parent / 'src').is_dir() and not _is_ros(folder):
-                    found[str(folder.parent)] = None
-    return list(found)
+                    roots[str(folder.parent)] = None
+    return list(roots)
 
 
 def underlays(workspace: Optional[str], chain: Sequence[str]) -> tuple[str, ...]:
@@ -565,18 +565,18 @@ def underlays(workspace: Optional[str], chain: Sequence[str]) -> tuple[str, ...]
 
 def left_behind(environment: Mapping[str, str], travelling: Sequence[str]) -> list[str]:
     """Explain for each sourced prefix of the user that is not sent why it stays here."""
-    found: dict[str, str] = {}
+    reasons: dict[str, str] = {}
     chain = find_workspaces(environment)
     for entry in environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
         above = next((root for root in chain if Path(entry).is_relative_to(root)), None)
         if above in travelling or not entry:
             continue
         if above is not None:
-            found[above] = 'it is above the workspace that the launch names'
+            reasons[above] = 'it is above the workspace that the launch names'
         elif not any(_is_ros(Path(top)) for top in (entry, os.path.dirname(entry))) \
                 and not entry.startswith(('/opt/ros/', '/usr')) and entry != sys.prefix:
-            found[entry] = 'it is no workspace with src and install'
-    return [f'{path} stays here: {why}' for path, why in found.items()]
+            reasons[entry] = 'it is no workspace with src and install'
+    return [f'{path} stays here: {why}' for path, why in reasons.items()]
 
 
 def _is_ros(install: Path) -> bool:

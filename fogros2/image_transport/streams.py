@@ -85,20 +85,20 @@ def stream(entry: Entry, machine: str) -> Stream:
     :raises PrerequisiteError: the robot lacks what its end of the stream needs.
     """
     entry = topic_of(entry)
-    known = plugin_system.names(GROUP)
-    if entry.transport not in known:
+    transports = plugin_system.names(GROUP)
+    if entry.transport not in transports:
         raise ConfigurationError(
             f"{entry.topic}: there is no image transport '{entry.transport}'",
-            did_you_mean(entry.transport, known, all_too=True))
+            did_you_mean(entry.transport, transports, all_too=True))
     if entry.direction not in ('to_cloud', 'to_robot'):
         raise ConfigurationError(f"{entry.topic}: direction '{entry.direction}' is unknown",
                                  "there are 'to_cloud' and 'to_robot'")
-    there = entry.direction == 'to_cloud'
-    if entry.source is not None and not there:
+    to_cloud = entry.direction == 'to_cloud'
+    if entry.source is not None and not to_cloud:
         raise ConfigurationError(f"{entry.topic}: a stream 'to_robot' has its source already",
                                  'leave source= out: the machine it stands at publishes')
-    made = Stream(entry.topic, entry.transport, source=entry.source if there else machine,
-                  target=machine if there else None, options=dict(entry.parameters))
+    made = Stream(entry.topic, entry.transport, source=entry.source if to_cloud else machine,
+                  target=machine if to_cloud else None, options=dict(entry.parameters))
     check(made)
     options = _transport(made).options
     for name in entry.parameters:
@@ -120,7 +120,7 @@ def nodes(streams: Iterable[Stream]) -> dict[Optional[str], list[NodeSpec]]:
     :raises ConfigurationError: two streams encode a topic in different ways.
     :raises PrerequisiteError: a dependency of a transport is not installed.
     """
-    found: dict[Optional[str], dict[str, NodeSpec]] = {}
+    by_machine: dict[Optional[str], dict[str, NodeSpec]] = {}
     topics_of: dict[tuple[Optional[str], str], str] = {}
     informed: dict[tuple[Optional[str], Optional[str], str], str] = {}
     for one in streams:
@@ -133,17 +133,17 @@ def nodes(streams: Iterable[Stream]) -> dict[Optional[str], list[NodeSpec]]:
                 decoded = dataclasses.replace(one, options={**one.options, 'camera_info': False})
         for machine, spec in ((one.source, transport.encoder(one)),
                               (one.target, transport.decoder(decoded))):
-            there = found.setdefault(machine, {})
+            own = by_machine.setdefault(machine, {})
             other = topics_of.setdefault((machine, spec.id), one.topic)
             if other != one.topic:
                 raise ConfigurationError(
                     f"the streams {other} and {one.topic} can't have nodes of different names",
                     'remap one of the topics to another name')
-            if there.setdefault(spec.id, spec) != spec:
+            if own.setdefault(spec.id, spec) != spec:
                 raise ConfigurationError(
                     f'{one.topic} is streamed twice with different parameters',
                     'give both streams the same ones')
-    return {machine: list(specs.values()) for machine, specs in found.items()}
+    return {machine: list(specs.values()) for machine, specs in by_machine.items()}
 
 
 def remappings(streams: Iterable[Stream], machine: Optional[str]) -> dict[str, str]:

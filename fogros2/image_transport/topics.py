@@ -155,8 +155,8 @@ def rewrite(
         return names.get(full) or names.get(full.removesuffix(_CLOUD), name)
 
     changed = [(old, renamed(new)) for old, new in pairs]
-    taken = {absolute(old, namespace) for old, _ in pairs}
-    return [*changed, *((old, new) for old, new in names.items() if old not in taken)]
+    old_names = {absolute(old, namespace) for old, _ in pairs}
+    return [*changed, *((old, new) for old, new in names.items() if old not in old_names)]
 
 
 def absolute(name: str, namespace: str) -> str:

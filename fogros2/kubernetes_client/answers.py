@@ -42,10 +42,10 @@ def http_errors() -> tuple[type[BaseException], ...]:
 def parsed(data: bytes) -> dict[str, Any]:
     """Parse a response's JSON object; return an empty one if it is invalid."""
     try:
-        found = json.loads(data)
+        body = json.loads(data)
     except ValueError:
         return {}
-    return found if isinstance(found, dict) else {}
+    return body if isinstance(body, dict) else {}
 
 
 def refusal(status: int, answer: Mapping[str, Any], data: bytes) -> ApiError:
@@ -76,6 +76,6 @@ def path(kind: str, namespace: str = '', name: str = '', *rest: str) -> str:
     return '/'.join(parts)
 
 
-def items(found: Mapping[str, Any]) -> Sequence[dict[str, Any]]:
+def items(answer: Mapping[str, Any]) -> Sequence[dict[str, Any]]:
     """Return the objects of a list."""
-    return found.get('items') or []
+    return answer.get('items') or []

@@ -70,11 +70,11 @@ class Api:
 
     def headers(self) -> dict[str, str]:
         """Return the headers that authenticate a request; renew expired credentials."""
-        found: dict[str, str] = {}
+        headers: dict[str, str] = {}
         for each in self._client.configuration.auth_settings().values():
             if each['in'] == 'header' and each['value']:
-                found[each['key']] = each['value']
-        return found
+                headers[each['key']] = each['value']
+        return headers
 
     # -- requests -------------------------------------------------------------------------------
 
@@ -136,10 +136,10 @@ class Api:
             raise self._unreachable(error) from error
         finally:
             response.release_conn()
-        found = parsed(data)
+        reply = parsed(data)
         if response.status >= 400:
-            raise refusal(response.status, found, data)
-        return found
+            raise refusal(response.status, reply, data)
+        return reply
 
     def send(
         self, method: str, path: str, body: Optional[Mapping[str, Any]], query: Query,
@@ -203,8 +203,8 @@ class Api:
             def probe() -> Optional[tuple[T]]:
                 nonlocal watch, lost, query
                 if watch is None:
-                    if lost and again is not None and (found := again()) is not None:
-                        return (found,)
+                    if lost and again is not None and (result := again()) is not None:
+                        return (result,)
                     watch = undo.enter_context(Watch(self, path, {'watch': 'true', **query}))
                 event = watch.get(0.1)
                 if event is not None and event[0] in ('CLOSED', 'ERROR'):
@@ -212,10 +212,10 @@ class Api:
                     watch, lost = None, True
                     query = {k: v for k, v in query.items() if k != 'resourceVersion'}
                 elif event is not None and event[0] != 'BOOKMARK':
-                    found = look(*event)
-                    return None if found is None else (found,)
-                found = tick() if tick is not None else None
-                return None if found is None else (found,)
+                    result = look(*event)
+                    return None if result is None else (result,)
+                result = tick() if tick is not None else None
+                return None if result is None else (result,)
 
             return wait_until(probe, timeout=timeout, what=what, cancel=cancel,
                               interval=0.0)[0]
@@ -236,11 +236,11 @@ class Api:
         configuration = self._client.configuration
         if proxy := configuration.proxy:
             from urllib.parse import urlsplit
-            found = urlsplit(proxy)
-            options.update(http_proxy_host=found.hostname, http_proxy_port=found.port,
+            parts = urlsplit(proxy)
+            options.update(http_proxy_host=parts.hostname, http_proxy_port=parts.port,
                            proxy_type='http')
-            if found.username:
-                options['http_proxy_auth'] = (found.username, found.password or '')
+            if parts.username:
+                options['http_proxy_auth'] = (parts.username, parts.password or '')
         url = self._url(path, query).replace('http', 'ws', 1)
         try:
             return websocket.create_connection(
@@ -314,9 +314,9 @@ class Watch:
             return None
         except http_errors():
             return None
-        said = refusal(response.status, parsed(data), data)
-        if said.status != 410 and not api.passing(said):
-            self._refusal = said
+        error = refusal(response.status, parsed(data), data)
+        if error.status != 410 and not api.passing(error):
+            self._refusal = error
         return None
 
     def _read(self, api: Api, response: Any) -> None:
@@ -402,13 +402,13 @@ def connect(context: str = '') -> Api:
     """
     kubeconfig = os.environ.get('KUBECONFIG', '')
     with _apis_lock:
-        found = _apis.get((context, kubeconfig))
-        if found is None:
-            found = Api(context)
+        api = _apis.get((context, kubeconfig))
+        if api is None:
+            api = Api(context)
             # Also store the current context by its name, so that both share one object.
-            found = _apis.setdefault((found.context, kubeconfig), found)
-            _apis[context, kubeconfig] = found
-        return found
+            api = _apis.setdefault((api.context, kubeconfig), api)
+            _apis[context, kubeconfig] = api
+        return api
 
 
 def _tls(configuration: Any) -> dict[str, Any]:

@@ -90,8 +90,8 @@ def _check_plugin(user: str, settings: Any) -> None:
         return
     import yaml
     texts = (yaml.safe_load(path.read_text()) or {} for path in kubeconfig_files())
-    known = [each for text in texts for each in text.get('users') or ()]
-    for each in known:
+    users = [each for text in texts for each in text.get('users') or ()]
+    for each in users:
         plugin = (each.get('user') or {}).get('exec') if each.get('name') == user else None
         if plugin:
             raise PrerequisiteError(

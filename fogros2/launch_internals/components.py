@@ -18,8 +18,8 @@ _REMAPS, _NAMESPACE = 'ros_remaps', 'ros_namespace'
 
 def of(action: Any) -> list[Any]:
     """Return the descriptions of the nodes that a LoadComposableNodes loads."""
-    found: list[Any] = list(vars(action)['_LoadComposableNodes__composable_node_descriptions'])
-    return found
+    nodes: list[Any] = list(vars(action)['_LoadComposableNodes__composable_node_descriptions'])
+    return nodes
 
 
 def set_remappings(component: Any, rules: Any) -> None:

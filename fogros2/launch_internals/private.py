@@ -189,12 +189,12 @@ def kept_environments(context: LaunchContext) -> list[dict[str, str]]:
     A scoped group restores one at its end, ResetEnvironment another. Variables of the whole
     launch have to be in all of them.
     """
-    found: list[dict[str, str]] = []
+    environments: list[dict[str, str]] = []
     for name, value in vars(context).items():
         if 'environment' in name:
-            found += [kept for kept in (value if isinstance(value, list) else [value])
-                      if isinstance(kept, dict)]
-    return found
+            environments += [kept for kept in (value if isinstance(value, list) else [value])
+                             if isinstance(kept, dict)]
+    return environments
 
 
 def waiting_events(context: LaunchContext) -> int:
@@ -268,9 +268,9 @@ def signal_manager() -> Optional[AsyncSafeSignalManager]:
 class _Census(ShutdownProcess):
     """Collect every process action; shut down none."""
 
-    def __init__(self, found: list[ExecuteLocal]) -> None:
+    def __init__(self, actions: list[ExecuteLocal]) -> None:
         def note(action: ExecuteLocal) -> bool:
-            found.append(action)
+            actions.append(action)
             return False  # this process is not to be shut down
 
         super().__init__(process_matcher=note)
@@ -284,8 +284,8 @@ def processes(context: LaunchContext) -> list[ExecuteLocal]:
     of this event notes the action and does not match. The function calls the handlers itself,
     because the event queue would deliver the answer later.
     """
-    found: list[ExecuteLocal] = []
-    census = _Census(found)
+    actions: list[ExecuteLocal] = []
+    census = _Census(actions)
     for handler in tuple(context._event_handlers):
         if handler.matches(census):
             context._push_locals()
@@ -294,4 +294,4 @@ def processes(context: LaunchContext) -> list[ExecuteLocal]:
                 if entity is not None:
                     entity.visit(context)
             context._pop_locals()
-    return found
+    return actions

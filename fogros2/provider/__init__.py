@@ -167,12 +167,12 @@ class Provider(abc.ABC):
         """Return the text of the invitation by which a launch joins a machine; '' for none."""
         return ''
 
-    def choices(self, asked: MachineSpec, chosen: MachineSpec) -> list[str]:
+    def choices(self, spec: MachineSpec, chosen: MachineSpec) -> list[str]:
         """Describe for people what ``resolve`` has changed."""
         return [f'{key} ' + (' or '.join(map(str, value)) if isinstance(value, (list, tuple))
                              else str(value))
                 for key, value in sorted(chosen.options.items())
-                if asked.options.get(key) != value]
+                if spec.options.get(key) != value]
 
     def architecture(self, spec: MachineSpec) -> str:
         """

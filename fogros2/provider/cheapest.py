@@ -41,13 +41,13 @@ class Cheapest(Provider):
 
         :raises FogError: nothing fits, or no cloud answers.
         """
-        found = compare(
+        offers = compare(
             _wants(spec), spec.options.get('providers') or (),
             spec.options.get('regions') or [ALL], cancel=self.cancel,
             max_round_trip_ms=spec.options.get('max_round_trip_ms')).offers
-        first = {offer.provider: offer for offer in reversed(found)}
+        first = {offer.provider: offer for offer in reversed(offers)}
         places = []
-        for number, offer in enumerate(found):
+        for number, offer in enumerate(offers):
             if number < TRIES or first[offer.provider] is offer:
                 provider: Provider = plugin_system.load(GROUP, offer.provider)()
                 place = provider.taking(spec, offer)

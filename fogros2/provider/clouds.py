@@ -57,25 +57,25 @@ def compare(
         raise ConfigurationError('no cloud with prices is set up here',
                                  f"one of {', '.join(others)} needs credentials" if others else
                                  'pip list shows whether the plugin of one is installed')
-    asked = {name: _own(name, regions) if len(names) > 1 else list(regions) for name in names}
-    if regions and not any(asked.values()):
+    regions_of = {name: _own(name, regions) if len(names) > 1 else list(regions) for name in names}
+    if regions and not any(regions_of.values()):
         raise ConfigurationError(f"none of {', '.join(names)} has a region {', '.join(regions)}",
                                  'ros2 fog regions --provider shows them')
-    asked = {name: own for name, own in asked.items() if own or not regions}
+    regions_of = {name: own for name, own in regions_of.items() if own or not regions}
     everywhere = ALL in regions or '*' in regions or max_round_trip_ms is not None
     deadline = DEADLINE_ALL if everywhere else DEADLINE
     late = threading.Event()
-    with ThreadPoolExecutor(len(asked), 'fog-clouds') as pool:
+    with ThreadPoolExecutor(len(regions_of), 'fog-clouds') as pool:
         answers = {name: pool.submit(cancellable, functools.partial(
             _ask, name, wanted, own, refresh, measure, max_round_trip_ms, late), late,
-            what=f'asking {name}', grace=lambda: 0.0) for name, own in asked.items()}
+            what=f'asking {name}', grace=lambda: 0.0) for name, own in regions_of.items()}
         try:
             with contextlib.suppress(DeadlineExceeded):
                 wait_until(lambda: all(one.done() for one in answers.values()), timeout=deadline,
                            what='prices', cancel=cancel, longest=0.1)
         finally:
             late.set()
-    found: list[Offer] = []
+    candidates: list[Offer] = []
     where: list[str] = []
     left_out: list[tuple[str, str]] = []
     failed: list[FogError] = []
@@ -87,10 +87,10 @@ def compare(
                           if isinstance(error, Cancelled) else error)
             left_out.append((name, str(failed[-1]).removeprefix(f'{name} ')))
         else:
-            found += offers.offers
+            candidates += offers.offers
             where += offers.regions
             left_out += [(f'{name} {region}', why) for region, why in offers.left_out]
-    priced = ranked(found, wanted.spot)
+    priced = ranked(candidates, wanted.spot)
     if not priced and len(failed) == 1:
         raise failed[0]
     if not priced:
@@ -120,11 +120,11 @@ def _ask(
             near = next((f'{region} takes {ms:.0f} ms' for region, ms in times.items() if ms),
                         'no region answers')
             raise ConfigurationError(f'{name} has no region within {limit:g} ms', near)
-    found = provider.offers(wanted, regions, refresh=refresh)
+    result = provider.offers(wanted, regions, refresh=refresh)
     if measure and not times:
-        times = _round_trips(provider, found.regions)
-    return dataclasses.replace(found, offers=tuple(dataclasses.replace(
-        offer, provider=name, round_trip_ms=times.get(offer.region)) for offer in found.offers))
+        times = _round_trips(provider, result.regions)
+    return dataclasses.replace(result, offers=tuple(dataclasses.replace(
+        offer, provider=name, round_trip_ms=times.get(offer.region)) for offer in result.offers))
 
 
 def _round_trips(provider: Provider, regions: Sequence[str]) -> dict[str, Optional[float]]:

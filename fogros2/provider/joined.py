@@ -61,13 +61,15 @@ class JoinedProvider(Provider):
         """Return the machine while this computer has joined it."""
         number, _, name = machine_id.removeprefix(_SCHEME).partition(':')
         folder = Store().root / 'launches' / number
-        found = read(folder) if number.isalnum() else None
-        if found is None:
+        invitation = read(folder) if number.isalnum() else None
+        if invitation is None:
             raise MachineNotFound(f"this computer has left the machine '{name}'")
         return Machine(
-            machine_id, name, self.name, MachineState.RUNNING, owned=False, region=found.machine,
-            shell=Endpoint('guest', found.address, addresses.GUEST_PORT, guests.account(
-                found.interface, found.joiner), key_file=str(folder / SECRET)))
+            machine_id, name, self.name, MachineState.RUNNING, owned=False,
+            region=invitation.machine, shell=Endpoint(
+                'guest', invitation.address, addresses.GUEST_PORT,
+                guests.account(invitation.interface, invitation.joiner),
+                key_file=str(folder / SECRET)))
 
     def capabilities_of(self, machine: Machine) -> Capabilities:
         """Return the capabilities with the place of the agent, which each guest has."""

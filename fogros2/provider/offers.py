@@ -184,9 +184,9 @@ def wants(
     number = 1 if named or gpu is True else int(gpu or 0)
     if gpu_memory_gb and not number:
         number = 1
-    given = platform.machine() if arch is None else arch
-    if given.lower() not in _ARCHITECTURES:
-        raise ConfigurationError(f"no machine has the architecture '{given}'",
+    architecture = platform.machine() if arch is None else arch
+    if architecture.lower() not in _ARCHITECTURES:
+        raise ConfigurationError(f"no machine has the architecture '{architecture}'",
                                  'there are x86_64, arm64 and any')
     for name, value in (('min_cpu', min_cpu), ('min_memory_gb', min_memory_gb), ('gpu', number),
                         ('gpu_memory_gb', gpu_memory_gb), ('cores', cores),
@@ -196,7 +196,7 @@ def wants(
             raise ConfigurationError(f'{name} can not be {value:g}',
                                      'it takes a number from 0 to a million')
     return Wants(
-        _ARCHITECTURES[given.lower()], MIN_CPU if min_cpu is None else int(min_cpu),
+        _ARCHITECTURES[architecture.lower()], MIN_CPU if min_cpu is None else int(min_cpu),
         MIN_MEMORY_GB if min_memory_gb is None else float(min_memory_gb), cpu_type or '', number,
         named, float(gpu_memory_gb or 0), dollars(max_price), spot, cores, threads_per_core,
         int(disk_size or 0))
@@ -219,30 +219,30 @@ def dollars(value: Union[Decimal, str, float, None]) -> Optional[Decimal]:
     return price
 
 
-def fits(kind: MachineType, asked: Wants) -> bool:
+def fits(kind: MachineType, wanted: Wants) -> bool:
     """Return whether a type meets the requirements, except for its price."""
-    return ((not asked.arch or kind.arch == asked.arch)
-            and kind.vcpus >= asked.min_cpu
-            and kind.memory_gb >= asked.min_memory_gb
-            and asked.cpu_type.lower() in kind.cpu.lower()
-            and (not asked.spot or kind.spot)
-            and (not kind.disk_gb or kind.disk_gb >= asked.disk_gb)
-            and (not asked.gpus or kind.gpus >= asked.gpus and _is_gpu(kind, asked))
-            and (asked.cores is None or kind.cores == asked.cores)
-            and (asked.threads_per_core is None
-                 or kind.vcpus == asked.threads_per_core * kind.cores))
+    return ((not wanted.arch or kind.arch == wanted.arch)
+            and kind.vcpus >= wanted.min_cpu
+            and kind.memory_gb >= wanted.min_memory_gb
+            and wanted.cpu_type.lower() in kind.cpu.lower()
+            and (not wanted.spot or kind.spot)
+            and (not kind.disk_gb or kind.disk_gb >= wanted.disk_gb)
+            and (not wanted.gpus or kind.gpus >= wanted.gpus and _is_gpu(kind, wanted))
+            and (wanted.cores is None or kind.cores == wanted.cores)
+            and (wanted.threads_per_core is None
+                 or kind.vcpus == wanted.threads_per_core * kind.cores))
 
 
-def _is_gpu(kind: MachineType, asked: Wants) -> bool:
+def _is_gpu(kind: MachineType, wanted: Wants) -> bool:
     # clouds report GiB, people ask for GB: a card of '24 GB' has 22.4 GiB
     gigabytes = kind.gpu_memory_gb * 1.024 ** 3 + 0.1
-    named = re.search(rf'\b{re.escape(asked.gpu or _CUDA)}\b', kind.gpu, re.IGNORECASE)
-    return named is not None and gigabytes >= asked.gpu_memory_gb
+    named = re.search(rf'\b{re.escape(wanted.gpu or _CUDA)}\b', kind.gpu, re.IGNORECASE)
+    return named is not None and gigabytes >= wanted.gpu_memory_gb
 
 
-def ranked(found: Iterable[Offer], spot: bool) -> list[Offer]:
+def ranked(offers: Iterable[Offer], spot: bool) -> list[Offer]:
     """Return the offers that have a price, the lowest first; of two equal ones the larger."""
-    priced = [(cost, offer) for offer in found if (cost := offer.cost(spot)) is not None]
+    priced = [(cost, offer) for offer in offers if (cost := offer.cost(spot)) is not None]
     return [offer for _, offer in sorted(priced, key=lambda pair: (
         pair[0], -pair[1].type.vcpus, -pair[1].type.memory_gb, pair[1].type.name,
         pair[1].region))]

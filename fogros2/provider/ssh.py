@@ -90,25 +90,25 @@ class SSHProvider(Provider):
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Return the id of the computer if it answers."""
         options = Options.parse(spec.options)
-        found = ssh_config.read(options.host, options.user, int(options.port))
+        settings = ssh_config.read(options.host, options.user, int(options.port))
         try:
-            reach(found)
+            reach(settings)
         except socket.gaierror as error:
-            raise ProviderError(f"there is no host called '{found.host}'",
+            raise ProviderError(f"there is no host called '{settings.host}'",
                                 'it is reached through another computer, and the VPN needs its '
-                                'address: write that as HostName' if found.proxy else
+                                'address: write that as HostName' if settings.proxy else
                                 f"check host= of '{spec.name}'") from error
         except ConnectionRefusedError as error:
             raise ProviderError(
-                f'{found.host} refuses connections to port {found.port}',
+                f'{settings.host} refuses connections to port {settings.port}',
                 'does its SSH server run, and at that port?') from error
         except OSError as error:
             raise ProviderError(
-                f'{found.host} port {found.port} does not answer: {error}',
+                f'{settings.host} port {settings.port} does not answer: {error}',
                 'is it on, and reachable from this robot?') from error
         return _SCHEME + urlencode({
             'name': spec.name, **dataclasses.asdict(options),
-            'user': found.user or getpass.getuser(), 'port': found.port,
+            'user': settings.user or getpass.getuser(), 'port': settings.port,
             'key': str(Path(options.key).expanduser().absolute()) if options.key else ''})
 
     def describe(self, machine_id: str) -> Machine:
@@ -122,10 +122,10 @@ class SSHProvider(Provider):
             host_key, key_file = words['host_key'] or None, words['key'] or None
         except (KeyError, ValueError) as error:
             raise MachineNotFound(f"'{machine_id}' is no SSH machine") from error
-        found = ssh_config.read(alias, user, number)
-        shell = Endpoint('ssh', found.host, found.port, user, host_key, key_file, alias)
+        settings = ssh_config.read(alias, user, number)
+        shell = Endpoint('ssh', settings.host, settings.port, user, host_key, key_file, alias)
         try:
-            address = reach(found)
+            address = reach(settings)
         except OSError:
             return Machine(machine_id, name, self.name, MachineState.STOPPED, owned=False)
         return Machine(
@@ -140,13 +140,13 @@ class SSHProvider(Provider):
         """Do nothing: the launch did not create the computer."""
 
 
-def reach(found: ssh_config.Settings) -> str:
+def reach(settings: ssh_config.Settings) -> str:
     """
     Return the address at which a computer answers; behind a proxy, the login will tell.
 
     :raises OSError: no answer, or no address.
     """
-    if found.proxy:
-        return str(socket.getaddrinfo(found.host, found.port)[0][4][0])
-    with socket.create_connection((found.host, found.port), timeout=_TIMEOUT) as connection:
+    if settings.proxy:
+        return str(socket.getaddrinfo(settings.host, settings.port)[0][4][0])
+    with socket.create_connection((settings.host, settings.port), timeout=_TIMEOUT) as connection:
         return str(connection.getpeername()[0])

@@ -48,14 +48,14 @@ def instead(
     """
     names, load = plugin_system.names, plugin_system.load
 
-    def loaded(asked: str, name: str) -> Any:
-        if asked != group:
-            return load(asked, name)
+    def loaded(wanted: str, name: str) -> Any:
+        if wanted != group:
+            return load(wanted, name)
         plugin = known[name]
         if isinstance(plugin, FogError):
             raise plugin
         return plugin
 
-    patch.setattr(plugin_system, 'names', lambda asked: (
-        list(known) if asked == group else names(asked)))
+    patch.setattr(plugin_system, 'names', lambda wanted: (
+        list(known) if wanted == group else names(wanted)))
     patch.setattr(plugin_system, 'load', loaded)

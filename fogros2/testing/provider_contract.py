@@ -179,9 +179,9 @@ class ProviderContract:
                 assert [m.id for m in provider.find(tags)] == [machine_id]
             assert machine_id in [m.id for m in provider.find({})]
             assert not list(provider.find({'fogros2-test': mark, TAG_NAME: 'another'}))
-            found, = provider.find({'fogros2-test': mark})
-            assert found.name == spec.name
-            assert found.tags['fogros2-test'] == mark
+            machine, = provider.find({'fogros2-test': mark})
+            assert machine.name == spec.name
+            assert machine.tags['fogros2-test'] == mark
 
     def test_destroy_is_idempotent(self) -> None:
         with self.machine() as (provider, spec, _, machine_id):
@@ -278,9 +278,9 @@ class ProviderContract:
             self.reached(provider, machine_id)
             provider.pin(machine_id, key)
             another, _ = self.make()
-            found = another.describe(machine_id)
-            assert found.shell is not None and found.shell.host_key == key
-            assert request.tags.items() <= found.tags.items()
+            machine = another.describe(machine_id)
+            assert machine.shell is not None and machine.shell.host_key == key
+            assert request.tags.items() <= machine.tags.items()
 
     # -- images, regions, prices ----------------------------------------------------------------
 
@@ -313,17 +313,17 @@ class ProviderContract:
 
     def test_offers_are_sorted_by_price(self) -> None:
         provider, _ = self.make()
-        asked = wants(arch='any', min_cpu=1, min_memory_gb=0.1)
+        requirements = wants(arch='any', min_cpu=1, min_memory_gb=0.1)
         spec = MachineSpec('any', 'cheapest', {'min_cpu': 1, 'disk_size': 40})
         offer = Offer('region-1', MachineType('type-1', 2, 1, 4.0, 'x86_64'))
         if not provider.capabilities.prices:
-            raised(Unsupported, lambda: provider.offers(asked))
+            raised(Unsupported, lambda: provider.offers(requirements))
             raised(Unsupported, lambda: provider.taking(spec, offer))
             return
-        taken = provider.taking(spec, offer)
-        assert (taken.provider, taken.wanted) == (provider.name, spec.options)
-        assert {'region-1', 'type-1', 40} == {*taken.options.values()}
+        chosen = provider.taking(spec, offer)
+        assert (chosen.provider, chosen.wanted) == (provider.name, spec.options)
+        assert {'region-1', 'type-1', 40} == {*chosen.options.values()}
         with contextlib.suppress(FogError):  # a simulated service may have no price list
-            found = provider.offers(asked)
-            prices = [offer.price for offer in found.offers if offer.price is not None]
-            assert prices == sorted(prices) and found.regions
+            offers = provider.offers(requirements)
+            prices = [offer.price for offer in offers.offers if offer.price is not None]
+            assert prices == sorted(prices) and offers.regions

@@ -38,9 +38,9 @@ class ShellContract:
     @contextlib.contextmanager
     def connected(self, folder: Path) -> Iterator[tuple[Shell, str]]:
         """Yield what ``make`` returns, and close the shell afterwards."""
-        shell, there = self.make(folder)
+        shell, remote = self.make(folder)
         try:
-            yield shell, there
+            yield shell, remote
         finally:
             shell.close()
 
@@ -124,24 +124,24 @@ class ShellContract:
         assert time.monotonic() - begin < 10.0
 
     def test_many_threads_use_one_shell(self, shell: Shell) -> None:
-        found: dict[int, str] = {}
+        outputs: dict[int, str] = {}
         def ask(number: int) -> None:
-            found[number] = shell.run(Command(('echo', str(number))), timeout=30.0).stdout
+            outputs[number] = shell.run(Command(('echo', str(number))), timeout=30.0).stdout
 
         threads = [threading.Thread(target=ask, args=(n,)) for n in range(24)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join(60.0)
-        assert found == {n: f'{n}\n' for n in range(24)}
+        assert outputs == {n: f'{n}\n' for n in range(24)}
 
     def test_put_makes_folders_and_sets_the_mode(self, shell: Shell, there: str) -> None:
         path = f'{there}/new folder/é'
         for data, mode in ((b'secret', 0o600), (b'', 0o644), (b'x' * 3_000_000, 0o700)):
             shell.put(data, path, mode=mode)
             assert self.read(shell, path) == data.decode()
-            told = shell.run(Command(('stat', '-c', '%a', path)), timeout=30.0).stdout
-            assert told == f'{mode:o}\n'
+            mode_text = shell.run(Command(('stat', '-c', '%a', path)), timeout=30.0).stdout
+            assert mode_text == f'{mode:o}\n'
 
     def test_sync_makes_a_folder_equal(self, shell: Shell, there: str, tmp_path: Path) -> None:
         source = tmp_path / 'the source'

@@ -88,12 +88,12 @@ class VmContract(ProviderContract):
             text = data.decode() if data.startswith(b'#') else gzip.decompress(data).decode()
             first, _, config = text.partition('\n')
             assert first == '#cloud-config'
-            told = json.loads(config)
-            assert PUBLIC_KEY in told['ssh_authorized_keys']
-            assert 'of-the-contract' in json.dumps(told['bootcmd'])
+            settings = json.loads(config)
+            assert PUBLIC_KEY in settings['ssh_authorized_keys']
+            assert 'of-the-contract' in json.dumps(settings['bootcmd'])
             shell = self.reached(provider, machine_id).shell
             assert shell is not None and shell.host_key is not None
-            assert told['ssh_keys']['ed25519_public'].split()[:2] == shell.host_key.split()[:2]
+            assert settings['ssh_keys']['ed25519_public'].split()[:2] == shell.host_key.split()[:2]
 
     def test_machine_has_the_tags_of_its_user(self) -> None:
         with self.machine(options={'tags': {'team': 'Lab 3'}}) as (provider, spec, _, machine_id):
@@ -117,8 +117,8 @@ class VmContract(ProviderContract):
         provider, spec = self.wanted()
         if provider.capabilities.prices:
             region = provider.resolve(spec).options['region']
-            asked = wants(arch='any', min_cpu=1, min_memory_gb=0.1)
-            assert provider.offers(asked, [region]).offers
+            requirements = wants(arch='any', min_cpu=1, min_memory_gb=0.1)
+            assert provider.offers(requirements, [region]).offers
 
     def test_machine_has_a_price(self) -> None:
         provider, spec = self.wanted()

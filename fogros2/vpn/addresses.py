@@ -59,10 +59,10 @@ def choose_subnet(used: Iterable[str], *, launch_id: str, pool: str = POOL) -> s
     :raises ConfigurationError: the pool is not an IPv4 network with room for a /24.
     """
     candidates = list(_pool(pool).subnets(new_prefix=NETWORK_PREFIX))
-    taken = [network for network in map(_network, used) if network is not None]
+    networks = [network for network in map(_network, used) if network is not None]
     begin = int(launch_id, 16) % len(candidates)
     for candidate in candidates[begin:] + candidates[:begin]:
-        if not any(candidate.overlaps(network) for network in taken):
+        if not any(candidate.overlaps(network) for network in networks):
             return str(candidate)
     raise VpnError(
         f'no /{NETWORK_PREFIX} of {pool} is free for the VPN',
@@ -114,17 +114,17 @@ def parse_used(output: str) -> list[str]:
 
     :raises VpnError: the output is not that of ``ip``.
     """
-    found: set[str] = set()
+    networks: set[str] = set()
     try:
         for line in output.splitlines():
             for entry in untrusted.parsed(line):
                 # an interface that is down has addresses but no routes
                 for address in entry.get('addr_info', ()):
-                    found.add(f"{address['local']}/{address['prefixlen']}")
+                    networks.add(f"{address['local']}/{address['prefixlen']}")
                 if 'dst' in entry and entry['dst'] != 'default':
-                    found.add(entry['dst'])
+                    networks.add(entry['dst'])
         return sorted(
-            str(ipaddress.ip_interface(text).network) for text in found)
+            str(ipaddress.ip_interface(text).network) for text in networks)
     except (ValueError, KeyError, AttributeError, TypeError) as error:
         raise VpnError(f"can't read the networks in use: {error}") from error
 

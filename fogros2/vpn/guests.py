@@ -124,13 +124,13 @@ def admitted(guests: list[Guest], request: dict[str, Any], now: float) -> list[G
     :raises SystemExit: there is no free address.
     """
     others = [guest for guest in guests if guest['key'] != request['key']]
-    known = [guest for guest in guests if guest['key'] == request['key']]
-    taken = {guest['address'] for guest in others}
-    free = [address for address in request['addresses'] if address not in taken]
+    matches = [guest for guest in guests if guest['key'] == request['key']]
+    addresses = {guest['address'] for guest in others}
+    free = [address for address in request['addresses'] if address not in addresses]
     if not free:
-        sys.exit(f'{len(taken)} guests are as many as a machine can have')
+        sys.exit(f'{len(addresses)} guests are as many as a machine can have')
     return [*others, {
-        **(known[0] if known else {'address': free[0], 'handshake': 0, 'heard': None}),
+        **(matches[0] if matches else {'address': free[0], 'handshake': 0, 'heard': None}),
         'key': request['key'], 'label': request['label'], 'until': now + request['seconds'],
         'patience': request['patience'], 'secret': request.get('secret', ''),
         'end': now + request['left'] if 'left' in request else None}]
@@ -220,12 +220,12 @@ def uptime() -> float:
 def evict(user: str) -> None:
     """End a guest's processes, and delete its account and its files; idempotent."""
     try:
-        found = pwd.getpwnam(user)
+        entry = pwd.getpwnam(user)
     except KeyError:
         return
     until = time.monotonic() + 5.0
     while time.monotonic() < until and subprocess.run(
-            (sys.executable, '-ISc', KILL), user=found.pw_uid, group=found.pw_gid,
+            (sys.executable, '-ISc', KILL), user=entry.pw_uid, group=entry.pw_gid,
             extra_groups=(), stderr=subprocess.DEVNULL).returncode:
         time.sleep(0.02)
     for words in (('userdel', user), ('groupdel', user)):  # mostly, the group goes with the user
@@ -233,7 +233,7 @@ def evict(user: str) -> None:
     with contextlib.suppress(FileNotFoundError):
         subprocess.run(('nft', 'delete', 'table', 'inet', user), stderr=subprocess.DEVNULL)
     shutil.rmtree(HOMES / user, ignore_errors=True)
-    subprocess.run(('sh', '-c', CLEAN, 'sh', str(found.pw_uid)), start_new_session=True)
+    subprocess.run(('sh', '-c', CLEAN, 'sh', str(entry.pw_uid)), start_new_session=True)
     with contextlib.suppress(OSError):
         HOMES.rmdir()  # of the last guest
 
@@ -291,10 +291,10 @@ class Door(socketserver.ThreadingTCPServer):
             if time.monotonic() < look:
                 continue
             look = time.monotonic() + INTERVAL
-            with self.guests.locked() as left:
+            with self.guests.locked() as guests:
                 with contextlib.suppress(OSError, subprocess.CalledProcessError):
-                    left = left and self.guests.change(left, 'look', {})
-                if not left:
+                    guests = guests and self.guests.change(guests, 'look', {})
+                if not guests:
                     self.server_close()
                     own.close()  # a guest that is admitted from now on gets another door
                     return
@@ -359,7 +359,7 @@ class Door(socketserver.ThreadingTCPServer):
         """
         home = HOMES / user
         try:
-            found = pwd.getpwnam(user)
+            entry = pwd.getpwnam(user)
         except KeyError:
             HOMES.mkdir(mode=0o755, exist_ok=True)
             number = str(new_id())
@@ -369,18 +369,18 @@ class Door(socketserver.ThreadingTCPServer):
                     ('useradd', '--system', '--no-log-init', '--uid', number, '--gid', number,
                      '--no-create-home', '--home-dir', home, '--shell', '/bin/sh', user)):
                 subprocess.run(words, check=True, stderr=subprocess.PIPE, text=True)
-            found = pwd.getpwnam(user)
+            entry = pwd.getpwnam(user)
             home.mkdir(mode=0o700)
             (home / 'agent.py').write_text(self.agent)
             (home / 'agent.json').write_text(json.dumps({
                 'machine': self.request['machine'], 'directory': f'{home}/agent', 'user': user,
                 'boot_timeout': 120.0}))
-            os.chown(home, found.pw_uid, found.pw_gid)
-        confine(user, found.pw_uid)
+            os.chown(home, entry.pw_uid, entry.pw_gid)
+        confine(user, entry.pw_uid)
         link.settimeout(None)
         return subprocess.Popen(
             ('sh', '-c', ENTRY, self.request['shell']), stdin=link.fileno(), stdout=link.fileno(),
-            stderr=subprocess.DEVNULL, cwd=home, user=found.pw_uid, group=found.pw_gid,
+            stderr=subprocess.DEVNULL, cwd=home, user=entry.pw_uid, group=entry.pw_gid,
             extra_groups=(), umask=0o022, start_new_session=True, env={
                 'HOME': str(home), 'USER': user, 'LOGNAME': user, 'SHELL': '/bin/sh',
                 'LANG': 'C.UTF-8', 'PATH': '/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin'})

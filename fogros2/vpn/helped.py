@@ -36,10 +36,10 @@ def permitted() -> bool:
     if os.geteuid() == 0 or not Path(HELPER).exists() or process.which('sudo') is None:
         return False
     try:
-        said = process.run(_ask('check', {}), timeout=10.0, check=False)
+        reply = process.run(_ask('check', {}), timeout=10.0, check=False)
     except FogError:
         return False
-    return said.returncode == 0 and said.stdout.strip() == PROTOCOL
+    return reply.returncode == 0 and reply.stdout.strip() == PROTOCOL
 
 
 def key_file(name: str) -> str:

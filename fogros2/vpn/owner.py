@@ -42,6 +42,6 @@ def alive(name: str) -> Optional[bool]:
 
 def abandoned() -> list[str]:
     """Return the ids of dead launches, of any state folder, whose interfaces still exist."""
-    found = [match[1] for path in sorted(INTERFACES.glob('fog*'))
-             if (match := _NAME.fullmatch(path.name))]
-    return [launch for launch in found if alive(f'fog{launch}') is False]
+    launches = [match[1] for path in sorted(INTERFACES.glob('fog*'))
+                if (match := _NAME.fullmatch(path.name))]
+    return [launch for launch in launches if alive(f'fog{launch}') is False]

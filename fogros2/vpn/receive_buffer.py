@@ -48,12 +48,12 @@ def sockets(process: int) -> Iterator[int]:
 
     :raises OSError: this user, or this kernel, does not allow it.
     """
-    there = os.pidfd_open(process)
+    descriptor = os.pidfd_open(process)
     try:
         for name in os.listdir(f'/proc/{process}/fd'):
             if not os.readlink(f'/proc/{process}/fd/{name}').startswith('socket:'):
                 continue
-            copy = _checked(_libc.syscall(_PIDFD_GETFD, there, int(name), 0))
+            copy = _checked(_libc.syscall(_PIDFD_GETFD, descriptor, int(name), 0))
             try:
                 if (_option(copy, _SO_TYPE) == _SOCK_DGRAM
                         and _option(copy, _SO_DOMAIN) in (_AF_INET, _AF_INET6)):
@@ -61,7 +61,7 @@ def sockets(process: int) -> Iterator[int]:
             finally:
                 os.close(copy)
     finally:
-        os.close(there)
+        os.close(descriptor)
 
 
 def _option(number: int, option: int) -> int:

@@ -170,21 +170,21 @@ class WireGuard(Vpn):
 
         :raises VpnError: the text is not the output of :meth:`status`.
         """
-        found: dict[str, dict[str, float]] = {}
+        counters: dict[str, dict[str, float]] = {}
         for line in output.splitlines():
             key, *values = line.split()
             try:
                 numbers = [float(value) for value in values]
             except ValueError as error:
                 raise VpnError(f"can't read WireGuard's counters: {line!r}") from error
-            peer = found.setdefault(key, {'handshake': 0.0, 'received': 0.0, 'sent': 0.0})
+            peer = counters.setdefault(key, {'handshake': 0.0, 'received': 0.0, 'sent': 0.0})
             if len(numbers) == 1:
                 peer['handshake'] = numbers[0]
             elif len(numbers) == 2:
                 peer['received'], peer['sent'] = numbers
             else:
                 raise VpnError(f"can't read WireGuard's counters: {line!r}")
-        return found
+        return counters
 
     def down(self, interface: VpnInterface) -> Iterator[Command]:
         """Yield one script that undoes ``up`` in reverse order, and continues after errors."""
@@ -327,7 +327,7 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
 
 
 def _confine(
-    interface: VpnInterface, ports: Sequence[tuple[int, int]], asked: Sequence[str],
+    interface: VpnInterface, ports: Sequence[tuple[int, int]], addressees: Sequence[str],
 ) -> _Step:
     """
     Return the step that filters the DDS of one process and its children, in a control group.
@@ -354,7 +354,7 @@ def _confine(
             'chain confined {',
             f'udp dport != {_set(ports)} drop',
             'oifname "lo" accept',
-            f'ip daddr {{ {", ".join([DISCOVERY_GROUP, group, *asked])} }} accept',
+            f'ip daddr {{ {", ".join([DISCOVERY_GROUP, group, *addressees])} }} accept',
             'ip daddr @lan accept',
             'drop',
             '}',

@@ -109,7 +109,7 @@ class GraphNode(Node):
             sys.stdout.flush()
 
     def _look(self) -> None:
-        topics = [self._topic(*found) for found in ros_types.topics(self).items()]
+        topics = [self._topic(*item) for item in ros_types.topics(self).items()]
         streamed = streams(topics, self.get_node_names(), self._hosts)
         others = crossing(topics, self._hosts, streamed)
         ways = {one.between: one for one in streamed}
@@ -200,8 +200,8 @@ class GraphNode(Node):
 def _take_lines(node: GraphNode) -> None:
     for line in sys.stdin:
         with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError):
-            told = json.loads(line)
-            node.know(told['machines'], pictures=bool(told['pictures']))
+            message = json.loads(line)
+            node.know(message['machines'], pictures=bool(message['pictures']))
     rclpy.try_shutdown()
 
 

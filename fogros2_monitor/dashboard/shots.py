@@ -50,10 +50,10 @@ def _values(picture: Picture) -> Pixels:
 
 def _coloured(values: Pixels) -> Pixels:
     """Map values to colours from near to far; pixels without a value are black."""
-    known = numpy.isfinite(values)
-    near, far = numpy.percentile(values[known], (2, 98)) if known.any() else (0.0, 1.0)
+    mask = numpy.isfinite(values)
+    near, far = numpy.percentile(values[mask], (2, 98)) if mask.any() else (0.0, 1.0)
     scaled = numpy.clip((values - near) / max(far - near, 1e-6), 0, 1)
     colours: Pixels = cv2.applyColorMap(
         (255 * (1 - numpy.nan_to_num(scaled, nan=1.0))).astype(numpy.uint8), cv2.COLORMAP_TURBO)
-    colours[~known] = 0
+    colours[~mask] = 0
     return colours

@@ -98,7 +98,7 @@ def streams(topics: Iterable[Topic], nodes: Iterable[str], hosts: Hosts) -> list
     by_name = {topic.name: topic for topic in topics}
     nodes = sorted(set(nodes))
     decoders = [match for node in nodes if (match := _DECODER.fullmatch(node))]
-    found = []
+    results = []
     for node in nodes:
         encoder = _ENCODER.fullmatch(node)
         if encoder is None:
@@ -113,11 +113,11 @@ def streams(topics: Iterable[Topic], nodes: Iterable[str], hosts: Hosts) -> list
             targets = [decoder['host'] for decoder in decoders if (
                 decoder['topic'], decoder['transport'], decoder['source']) == (
                 encoder['topic'], encoder['transport'], encoder['host'])]
-            found += [Stream(
+            results += [Stream(
                 name, last, topic.name, topic.kind, hosts.machine(encoder['host']),
                 hosts.machine(target), bool(topic.subscribers - {OWN}))
                 for target in targets]
-    return sorted(found, key=lambda one: (one.source, one.topic, one.target))
+    return sorted(results, key=lambda one: (one.source, one.topic, one.target))
 
 
 def crossing(
@@ -129,7 +129,7 @@ def crossing(
     # The local replacements of a streamed topic stay on their machine.
     local = tuple(f'/fogros2/{identifier(host)}/' for one in streamed
                   for host in (one.source, one.target) if host)
-    found = []
+    results = []
     for topic in topics:
         if topic.name.startswith(local) or _HIDDEN.fullmatch(topic.name) or topic.name in between \
                 or topic.name.rpartition('/')[0] in between \
@@ -138,9 +138,9 @@ def crossing(
         sources = {hosts.of(node) for node in topic.publishers - {OWN}}
         targets = {hosts.of(node) for node in topic.subscribers - {OWN}}
         if any(source != target for source in sources for target in targets):
-            found.append(Crossing(
+            results.append(Crossing(
                 topic.name, topic.kind, tuple(sorted(sources)), tuple(sorted(targets))))
-    return sorted(found, key=lambda one: one.topic)
+    return sorted(results, key=lambda one: one.topic)
 
 
 def decoded(topic: Topic) -> bool:

@@ -58,8 +58,8 @@ def gone(
     def probe() -> bool:
         if store.exists(name):
             return False
-        found = machines.survey(once, name=name, regions=regions, store=store)
-        return not any(entry.own and not entry.gone for entry in found)
+        entries = machines.survey(once, name=name, regions=regions, store=store)
+        return not any(entry.own and not entry.gone for entry in entries)
 
     wait_until(probe, timeout=timeout, interval=0.2, longest=10.0, what=f"the end of '{name}'",
                hint=f'ros2 fog delete {name} ends it')

@@ -108,39 +108,39 @@ def steps(store: Store) -> Iterator[str]:
 
 def last_lines(path: Path) -> Sequence[str]:
     """Return the last lines that FogROS2 and launch wrote to a log, without those of nodes."""
-    found, own = [], False
+    lines, own = [], False
     with contextlib.suppress(OSError), open(path, errors='replace') as file:
         for line in file:
             begin = _LINE.match(line)
             if begin:
                 own = begin[1] in ('fogros2', 'launch')
             if own:
-                found.append(line.rstrip('\n'))
-    return found[-LAST:]
+                lines.append(line.rstrip('\n'))
+    return lines[-LAST:]
 
 
 def known_secrets(environment: Mapping[str, str], store: Store) -> set[str]:
     """Return the values of variables that name secrets, and the lines of files with keys."""
-    found = {value for name, value in environment.items() if _SECRET_NAME.search(name)}
+    texts = {value for name, value in environment.items() if _SECRET_NAME.search(name)}
     for path in store.root.rglob('*'):
         with contextlib.suppress(OSError):
             if path.is_file() and path.suffix != '.json' and path.stat().st_size < 1 << 16 and (
                     path.suffix == '.key' or path.name.startswith('id_')):
-                found.update(path.read_text(errors='replace').splitlines())
-    return {text.strip() for text in found if len(text.strip()) >= 8}
+                texts.update(path.read_text(errors='replace').splitlines())
+    return {text.strip() for text in texts if len(text.strip()) >= 8}
 
 
-def without_secrets(text: str, known: Iterable[str], home: str = '') -> str:
+def without_secrets(text: str, secrets: Iterable[str], home: str = '') -> str:
     """
     Return a text without secrets.
 
-    :param known: texts that must not be in it.
+    :param secrets: texts that must not be in it.
     :param home: the user's home, which becomes ``~``.
     """
     if len(home) > 1:
         text = text.replace(home, '~')
     for pattern in _SECRETS:
-        text = pattern.sub(lambda found: found.groupdict().get('kept', '') + HIDDEN, text)
-    for secret in sorted(known, key=len, reverse=True):
+        text = pattern.sub(lambda match: match.groupdict().get('kept', '') + HIDDEN, text)
+    for secret in sorted(secrets, key=len, reverse=True):
         text = text.replace(secret, HIDDEN)
     return text

@@ -66,8 +66,8 @@ def examine(*, lan_seconds: float = 1.5, providers: Sequence[str] = ()) -> list[
         python, packages, programs, root, tun, wireguard, engine, overlay, firewall_program, ros,
         rmw, cyclone_uri, machine_defaults, receive_buffer, udp_port, ssh_keys, firewall, state,
         clocks, lambda: lan_peers(lan_seconds)]
-    known = [name for name in plugin_system.names('fogros2.provider') if name not in _LOOKED_AT]
-    for name in dict.fromkeys([*known, *providers]):
+    others = [name for name in plugin_system.names('fogros2.provider') if name not in _LOOKED_AT]
+    for name in dict.fromkeys([*others, *providers]):
         checks.append(functools.partial(provider, name, needed=name in providers))
     with ThreadPoolExecutor(6, 'fog-doctor') as pool:
         return list(pool.map(lambda check: check(), checks))
@@ -81,15 +81,15 @@ def provider(name: str, *, needed: bool = False, timeout: float = TIMEOUT) -> Ch
         kind: type[Provider] = plugin_system.load('fogros2.provider', name)
         if not needed and not kind.configured():
             return Check(title, 'ok', 'not set up here')
-        said = _in_time(lambda: kind().answers(), timeout)
+        answer = _in_time(lambda: kind().answers(), timeout)
     except Unsupported:
         return Check(title, 'ok', 'is there')
     except FogError as error:
         return Check(title, wrong, str(error.args[0]), error.hint)
-    if said is None:
+    if answer is None:
         return Check(title, wrong, f'no answer within {timeout:g} s',
                      'is there a way to the internet, and through a proxy?')
-    return Check(title, 'ok', said)
+    return Check(title, 'ok', answer)
 
 
 def _in_time(ask: Callable[[], str], timeout: float) -> Optional[str]:
@@ -174,12 +174,12 @@ def engine() -> Check:
     try:
         chosen = container_engine.select('auto', None)
         # The flags may name a runtime or a cgroup manager that does not work: call with flags.
-        said = chosen.call('ps', '--format', '{{.ID}}', what='asking the container engine',
-                           timeout=20.0)
+        result = chosen.call('ps', '--format', '{{.ID}}', what='asking the container engine',
+                             timeout=20.0)
     except FogError as error:
         return Check(name, 'warning', str(error.args[0]),
                      f'{error.hint} (needed for ContainerInstance alone)')
-    return Check(name, 'ok', f'{chosen.name}, {len(said.stdout.split())} containers run')
+    return Check(name, 'ok', f'{chosen.name}, {len(result.stdout.split())} containers run')
 
 
 def overlay() -> Check:
@@ -303,17 +303,17 @@ def ssh_keys() -> Check:
 def firewall() -> Check:
     """Check whether a firewall of the user may block the VPN."""
     try:
-        said = process.run(Command(('nft', 'list', 'ruleset'), sudo=True), timeout=10.0,
-                           check=False)
+        result = process.run(Command(('nft', 'list', 'ruleset'), sudo=True), timeout=10.0,
+                             check=False)
     except FogError as error:
         return Check('firewall', 'warning', f'can not be looked at: {error.args[0]}', error.hint)
-    if said.returncode != 0:
+    if result.returncode != 0:
         return Check('firewall', 'warning', 'can be looked at by root alone')
     chains = re.findall(
-        r'chain (\S+) \{\s*type filter hook input[^;]*; policy drop;', said.stdout)
+        r'chain (\S+) \{\s*type filter hook input[^;]*; policy drop;', result.stdout)
     if not chains:
         return Check('firewall', 'ok', 'lets in by default')
-    if re.search(r'iifname "fog\*" (counter [^\n]*)?accept', said.stdout):
+    if re.search(r'iifname "fog\*" (counter [^\n]*)?accept', result.stdout):
         return Check('firewall', 'ok', 'lets in what comes through the VPN')
     return Check(
         'firewall', 'warning', f"the chain {', '.join(chains)} drops by default: it has to let in "
@@ -324,16 +324,16 @@ def firewall() -> Check:
 def state() -> Check:
     """Check that the state folder can be written, and by this user alone."""
     folder = state_home()
-    there = next(p for p in (folder, *folder.parents) if p.exists())
-    disk = os.statvfs(there)
+    ancestor = next(p for p in (folder, *folder.parents) if p.exists())
+    disk = os.statvfs(ancestor)
     why = 'is on a read-only file system' if disk.f_flag & os.ST_RDONLY else \
         'is on a full disk' if disk.f_blocks and not disk.f_bavail \
         or disk.f_files and not disk.f_ffree else \
-        'is not writable' if there != folder and not os.access(there, os.W_OK) else ''
+        'is not writable' if ancestor != folder and not os.access(ancestor, os.W_OK) else ''
     if why:
-        return Check('state folder', 'failed', f'{there} {why}',
+        return Check('state folder', 'failed', f'{ancestor} {why}',
                      'FOGROS2_STATE_HOME names another folder')
-    if there != folder:
+    if ancestor != folder:
         return Check('state folder', 'ok', f'{folder} will be made')
     status = folder.stat()
     if status.st_uid != os.geteuid() or not os.access(folder, os.W_OK):
@@ -348,12 +348,12 @@ def state() -> Check:
 def clocks() -> Check:
     """Compare the clocks of machines under a launch with this computer's clock."""
     name, store = 'clocks of machines', Store()
-    found = {record.name: offset for record in store.machines()
-             if (offset := reach.clock(record, store)) is not None}
-    said = '; '.join(f'{machine}: {offset}' for machine, offset in found.items())
-    if any(offset.exceeds for offset in found.values()):
-        return Check(name, 'warning', said, 'sudo apt-get install chrony, here and there')
-    return Check(name, 'ok', said or 'measured while a machine runs')
+    offsets = {record.name: offset for record in store.machines()
+               if (offset := reach.clock(record, store)) is not None}
+    detail = '; '.join(f'{machine}: {offset}' for machine, offset in offsets.items())
+    if any(offset.exceeds for offset in offsets.values()):
+        return Check(name, 'warning', detail, 'sudo apt-get install chrony, here and there')
+    return Check(name, 'ok', detail or 'measured while a machine runs')
 
 
 def lan_peers(seconds: float) -> Check:
@@ -363,12 +363,12 @@ def lan_peers(seconds: float) -> Check:
         return Check(name, 'ok', 'not looked for')
     try:
         domain = int(os.environ.get('ROS_DOMAIN_ID') or 0)
-        found = lan.participants(domain, seconds)
+        counts = lan.participants(domain, seconds)
     except (ValueError, OSError) as error:
         return Check(name, 'warning', f'can not be looked for: {error}')
-    if not found:
+    if not counts:
         return Check(name, 'ok', f'no other computer answers in domain {domain}')
-    hosts = ', '.join(f'{host} ({count})' for host, count in sorted(found.items()))
+    hosts = ', '.join(f'{host} ({count})' for host, count in sorted(counts.items()))
     if os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() in ('LOCALHOST', 'OFF'):
         return Check(
             name, 'warning', f"participants at {hosts}: a launch's nodes don't talk to them, as "

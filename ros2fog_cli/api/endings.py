@@ -266,9 +266,9 @@ def due(
         yield Due('machine', record.name, 'its provider had not answered the request for it',
                   functools.partial(end_request, record, age, store))
     folders = leftovers(store, now)
-    known = {record.launch for record in store.machines()}
+    launches = {record.launch for record in store.machines()}
     folders += [store.root / 'launches' / launch for launch in owner.abandoned()
-                if launch not in known and store.root / 'launches' / launch not in folders]
+                if launch not in launches and store.root / 'launches' / launch not in folders]
     for folder in folders:
         yield Due('leftovers of launch', folder.name, 'the launch is gone',
                   functools.partial(clear, folder))
@@ -339,9 +339,9 @@ def tidy(warn: machines.Warn, *, regions: Optional[Sequence[str]] = None) -> Ite
 
     Yield a line of text for each deleted resource; warn about a provider that does not answer.
     """
-    for said in machines.ask_all(warn, machines.configured(regions),
-                                 lambda name: machines.load(name, regions).tidy()):
-        yield from said or ()
+    for lines in machines.ask_all(warn, machines.configured(regions),
+                                  lambda name: machines.load(name, regions).tidy()):
+        yield from lines or ()
 
 
 def let_go(record: Record, store: Store) -> None:

@@ -167,11 +167,11 @@ def rates(before: Optional[dict[str, Any]], link: reach.Link, now: float) -> dic
     seconds = now - before['at']
     if seconds < 0.5:
         return {key: before[key] for key in ('at', 'receiving', 'sending')}
-    found: dict[str, Any] = {'at': now}
+    figures: dict[str, Any] = {'at': now}
     for rate, count in (('receiving', 'received'), ('sending', 'sent')):
         more = getattr(link, count) - before[count]
-        found[rate] = more / seconds if more >= 0 else None
-    return found
+        figures[rate] = more / seconds if more >= 0 else None
+    return figures
 
 
 def graph_names(shell: Shell, pids: tuple[int, ...]) -> tuple[str, ...]:
@@ -193,8 +193,8 @@ def graph_names(shell: Shell, pids: tuple[int, ...]) -> tuple[str, ...]:
 
 def node_name(words: list[str]) -> str:
     """Return the name of the node that a command line starts, '' if unknown."""
-    told = [word.partition('__node:=')[2] for word in words if word.startswith('__node:=')]
-    if told:
-        return told[0]
+    names = [word.partition('__node:=')[2] for word in words if word.startswith('__node:=')]
+    if names:
+        return names[0]
     programs = [word for word in words[:3] if word.startswith('/')]
     return programs[-1].rpartition('/')[2].removesuffix('.py') if programs else ''

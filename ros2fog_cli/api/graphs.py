@@ -93,16 +93,16 @@ class Graph:
         assert self._process.stdout is not None
         for line in self._process.stdout:
             with contextlib.suppress(ValueError, KeyError, TypeError):
-                told = json.loads(line)
-                if not isinstance(told, dict):
+                message = json.loads(line)
+                if not isinstance(message, dict):
                     continue  # a library printed this line
-                if 'streams' in told:
-                    self.streams, self.topics = told['streams'], told['topics']
-                elif 'data' in told:
-                    self.pictures[told['picture']] = (
-                        int(told['number']), base64.b64decode(told['data']))
+                if 'streams' in message:
+                    self.streams, self.topics = message['streams'], message['topics']
+                elif 'data' in message:
+                    self.pictures[message['picture']] = (
+                        int(message['number']), base64.b64decode(message['data']))
                 else:
-                    self._notes[told['picture']] = str(told['note'])
+                    self._notes[message['picture']] = str(message['note'])
 
     def _read_errors(self) -> None:
         assert self._process.stderr is not None

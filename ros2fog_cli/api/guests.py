@@ -62,8 +62,8 @@ def invite(
     folder = store.root / 'launches' / record.launch
     rmw = (folder / 'rmw').read_text()
     membership.check_rmw(rmw)
-    found, port = machines.load(entry.provider).dialled_at(entry.machine, record.vpn.port, host)
-    found = found or addresses.own_address()
+    server, port = machines.load(entry.provider).dialled_at(entry.machine, record.vpn.port, host)
+    server = server or addresses.own_address()
     secret = secrets.token_hex(32)
     (store.machine(name) / GUESTS).touch()
     with reach.session(entry) as shell:
@@ -77,7 +77,7 @@ def invite(
     address = next((guest['address'] for guest in guests if guest['key'] == public), '')
     return invitation.seal(invitation.Invitation(
         machine=name, key=record.public_key, address=record.vpn.address,
-        endpoint=host_port(found, port), joiner=address, network=record.vpn.network,
+        endpoint=host_port(server, port), joiner=address, network=record.vpn.network,
         rmw=rmw, domain=int((folder / 'domain').read_text()), expires=time.time() + seconds,
         interface=record.vpn.name, secret=secret), public)
 
@@ -154,11 +154,11 @@ def revoke(name: str, who: Optional[str], warn: Callable[[str], None]) -> list[s
                 raise
             guests = []  # the VPN ended with its launch
         key = invitation.parse_key(who)[1] if who and who.endswith('=') else who
-        gone = [guest for guest in guests
-                if who is None or key in (guest['label'], guest['address'], guest['key'])]
-        if who is not None and not gone:
+        matches = [guest for guest in guests
+                   if who is None or key in (guest['label'], guest['address'], guest['key'])]
+        if who is not None and not matches:
             raise ConfigurationError(f"'{name}' has no guest {who}",
                                      f'ros2 fog status {name} shows its guests')
-        if gone:
-            ask(shell, record, 'remove', {'keys': [guest['key'] for guest in gone]})
-    return [guest['label'] or guest['key'] for guest in gone]
+        if matches:
+            ask(shell, record, 'remove', {'keys': [guest['key'] for guest in matches]})
+    return [guest['label'] or guest['key'] for guest in matches]

@@ -103,13 +103,13 @@ def named(images: Sequence[Image], words: Sequence[str]) -> list[Image]:
 
     :raises ConfigurationError: a word matches no image.
     """
-    found = [image for image in images if image.id in words or image.name in words]
+    matches = [image for image in images if image.id in words or image.name in words]
     missing = [word for word in words
-               if not any(word in (image.id, image.name) for image in found)]
+               if not any(word in (image.id, image.name) for image in matches)]
     if missing:
         raise ConfigurationError(f"there is no image {', '.join(missing)}",
                                  'ros2 fog image list shows those there are')
-    return found
+    return matches
 
 
 def delete(image: Image) -> None:

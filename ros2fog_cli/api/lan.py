@@ -35,7 +35,7 @@ def participants(domain: int, seconds: float) -> dict[str, int]:
     :raises OSError: no socket can be opened.
     """
     own = addresses()
-    found: dict[str, set[bytes]] = {}
+    prefixes_of: dict[str, set[bytes]] = {}
     prefix = _VENDOR + secrets.token_bytes(10)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind(('', 0))
@@ -54,21 +54,21 @@ def participants(domain: int, seconds: float) -> dict[str, int]:
                 continue
             # The header is RTPS, version, vendor, then the sender's GUID prefix.
             if data[:4] == b'RTPS' and len(data) >= 20 and host not in own:
-                found.setdefault(host, set()).add(data[8:20])
-    return {host: len(prefixes) for host, prefixes in found.items()}
+                prefixes_of.setdefault(host, set()).add(data[8:20])
+    return {host: len(prefixes) for host, prefixes in prefixes_of.items()}
 
 
 def addresses() -> list[str]:
     """Return this computer's IPv4 addresses on networks with possible other computers."""
-    said = process.run(Command(('ip', '-4', '-o', 'addr', 'show', 'up')), timeout=5.0,
-                       check=False).stdout
-    found = []
-    for line in said.splitlines():
+    output = process.run(Command(('ip', '-4', '-o', 'addr', 'show', 'up')), timeout=5.0,
+                         check=False).stdout
+    ipv4 = []
+    for line in output.splitlines():
         match = re.search(r'^\d+: (\S+)\s+inet ([0-9.]+)', line)
         # Point-to-point links and our own VPNs carry no multicast.
         if match and match[1] != 'lo' and not re.match(r'fog[0-9a-f]{6}|wg|tun', match[1]):
-            found.append(match[2])
-    return found
+            ipv4.append(match[2])
+    return ipv4
 
 
 def _announce(

@@ -193,14 +193,14 @@ class Live:
         now = time.time()
         with self._lock:
             self._look_at_launches(now)
-            there = set()
+            keys = set()
             for entry in self._found():
                 key = self._key(entry)
                 shown = self._shown.setdefault(key, Shown(entry))
                 shown.entry, shown.ended = entry, 0.0
-                there.add(key)
+                keys.add(key)
             for key, shown in list(self._shown.items()):
-                self._update(shown, now, there=key in there)
+                self._update(shown, now, is_present=key in keys)
                 if shown.ended and now - shown.ended > KEPT:
                     del self._shown[key]
             state = self._make()
@@ -219,10 +219,10 @@ class Live:
     def _found(self) -> list[Entry]:
         """Return this robot's machines by the last answers; those with a record come first."""
         records = machines.recorded(self.store, self._name)
-        known = {(record.name, record.machine_id) for record in records.values()}
-        if known != self._known:
-            self._known, self._asked = known, -1e9
-        found = []
+        ids = {(record.name, record.machine_id) for record in records.values()}
+        if ids != self._known:
+            self._known, self._asked = ids, -1e9
+        entries = []
         for entry in machines.combined(records, self._answers):
             record = records.get(entry.name)
             # A machine that the provider did not know yet has to be asked for again.
@@ -230,8 +230,8 @@ class Live:
                 entry = dataclasses.replace(entry, asked=False)
             # A record without an id may be that of a machine that the provider knows already.
             if entry.own and (entry.record or record is None or record.machine_id):
-                found.append(entry)
-        return sorted(found, key=lambda entry: entry.record is None)
+                entries.append(entry)
+        return sorted(entries, key=lambda entry: entry.record is None)
 
     def _key(self, entry: Entry) -> str:
         """
@@ -249,13 +249,13 @@ class Live:
 
     def _look_at_launches(self, now: float) -> None:
         folder = self.store.root / 'launches'
-        there = {path.name: path for path in folder.iterdir()} if folder.is_dir() else {}
-        for name, path in there.items():
+        folders = {path.name: path for path in folder.iterdir()} if folder.is_dir() else {}
+        for name, path in folders.items():
             launch = self._launches.setdefault(name, ShownLaunch())
             launch.pid, launch.alive = process_of(path)
             launch.read(path)
         for name, launch in list(self._launches.items()):
-            if name not in there:
+            if name not in folders:
                 if launch.file is not None:
                     launch.read(folder / name)
                     launch.close()
@@ -264,9 +264,9 @@ class Live:
                 if now - launch.ended > KEPT:
                     del self._launches[name]
 
-    def _update(self, shown: Shown, now: float, *, there: bool) -> None:
+    def _update(self, shown: Shown, now: float, *, is_present: bool) -> None:
         record = shown.entry.record
-        if there and record is not None and record.launch:
+        if is_present and record is not None and record.launch:
             shown.launch = record.launch
         launch = self._launches.get(shown.launch)
         if launch is not None:
@@ -275,9 +275,9 @@ class Live:
             shown.clock = launch.clocks.get(shown.entry.name)
             shown.replicas = tuple(replicas.figures(
                 self.store.root / 'launches' / shown.launch, shown.entry.name))
-        if not there:
+        if not is_present:
             shown.ended = shown.ended or now
-        if not (self.watched and there and record is not None and record.launch_alive):
+        if not (self.watched and is_present and record is not None and record.launch_alive):
             if shown.follower is not None:
                 shown.follower.stop()
                 shown.follower = None

@@ -102,16 +102,16 @@ class Entry:
         if self.known.state is MachineState.STOPPED:
             return None
         tag = self.known.tags.get(TAG_EXPIRES, '')
-        known = [float(tag)] if tag.isdecimal() and len(tag) < 13 else []
+        ends = [float(tag)] if tag.isdecimal() and len(tag) < 13 else []
         record = self.record
         if record is not None and record.armed:
             # If a launch reused the machine, this is later than the tag of the creation.
-            known.append(record.armed + record.spec.lifetime)
-        elif record is not None and record.created and not known:
-            known.append(record.created + record.spec.lifetime)
+            ends.append(record.armed + record.spec.lifetime)
+        elif record is not None and record.created and not ends:
+            ends.append(record.created + record.spec.lifetime)
         # a robot whose clock is wrong may note an end that is long before the beginning
         begin = (self.known.created or 0.0) - CLOCK_TOLERANCE
-        return max((at for at in known if at > begin), default=None)
+        return max((at for at in ends if at > begin), default=None)
 
     @property
     def address(self) -> str:
@@ -246,9 +246,9 @@ def combined(
                                  machine.provider, machine, record))
     for record in records.values():
         if record.name not in matched:
-            asked = answers.get(record.provider)
-            known = asked is not None and record.name not in asked.silent or bool(record.damage)
-            entries.append(Entry(record.name, record.provider or '?', None, record, known))
+            reply = answers.get(record.provider)
+            is_known = reply is not None and record.name not in reply.silent or bool(record.damage)
+            entries.append(Entry(record.name, record.provider or '?', None, record, is_known))
     return sorted(entries, key=lambda entry: (entry.name, entry.provider))
 
 
@@ -313,25 +313,25 @@ def _ask(
         return Answer([])
     provider = load(name, regions)
     provider.cancel = cancel
-    found: list[Machine] = []
+    matches: list[Machine] = []
     silent = []
     failure: Optional[FogError] = None
     try:
         for machine in provider.find(tags):
-            found.append(machine)
+            matches.append(machine)
     except Unsupported:
         pass
     except FogError as error:
-        if not found:
+        if not matches:
             raise
         failure = error  # such as one of several hosts
     # it may have no tags, or not be able to search where the machine is
-    ids = {machine.id for machine in found}
+    ids = {machine.id for machine in matches}
     for record in records:
         if record.provider == name and record.machine_id not in ids:
             try:
                 if record.machine_id:
-                    found.append(provider.describe(record.machine_id))
+                    matches.append(provider.describe(record.machine_id))
                 elif failure is not None:
                     raise failure  # the machine may be where nobody answered
             except MachineNotFound:
@@ -339,7 +339,7 @@ def _ask(
             except FogError as error:
                 warn(f'{name}: {error}')
                 silent.append(record.name)
-    return Answer(found, silent)
+    return Answer(matches, silent)
 
 
 def load(name: str, regions: Optional[Sequence[str]] = None) -> Provider:
@@ -362,16 +362,16 @@ def able(capability: str) -> str:
     :param capability: a field of :class:`~fogros2.provider.Capabilities`.
     :raises ConfigurationError: no provider has it.
     """
-    found: list[tuple[bool, str]] = []
+    candidates: list[tuple[bool, str]] = []
     for name in plugin_system.names('fogros2.provider'):
         with contextlib.suppress(FogError):
             kind: type[Provider] = plugin_system.load('fogros2.provider', name)
             if getattr(kind.capabilities, capability):
-                found.append((not kind.configured(), name))
-    if not found:
+                candidates.append((not kind.configured(), name))
+    if not candidates:
         raise ConfigurationError(f'no provider here has {capability}',
                                  'pip list shows whether the plugin of one is installed')
-    return min(found)[1]
+    return min(candidates)[1]
 
 
 def total(entries: Sequence[Entry], now: float) -> Optional[tuple[Decimal, Decimal]]:

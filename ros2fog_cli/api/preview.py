@@ -206,14 +206,14 @@ def arguments(words: Sequence[str]) -> dict[str, str]:
 
     :raises ConfigurationError: one is not of the form ``NAME:=VALUE``.
     """
-    found = {}
+    mapping = {}
     for word in words:
         name, assigned, value = word.partition(':=')
         if not name or not assigned:
             raise ConfigurationError(f"'{word}' is no argument of a launch file",
                                      'write NAME:=VALUE')
-        found[name] = value
-    return found
+        mapping[name] = value
+    return mapping
 
 
 def priced(spec: MachineSpec, choices: Choices) -> tuple[MachineSpec, Optional[Decimal]]:

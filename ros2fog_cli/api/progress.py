@@ -44,19 +44,19 @@ def _redraw(text: str = '') -> None:
 @contextlib.contextmanager
 def line() -> Iterator[Callable[[str], None]]:
     """Yield a function that shows a text on one terminal line and replaces the previous text."""
-    shown_now, told = '', time.monotonic()
+    shown_now, printed_at = '', time.monotonic()
 
     def show(text: str) -> None:
-        nonlocal shown_now, told
+        nonlocal shown_now, printed_at
         if sys.stderr.isatty():
             _redraw(text)
             shown_now = text
         elif text.split(',')[0] != shown_now:
             # Not a terminal: print each state once, not every second.
-            shown_now, told = text.split(',')[0], time.monotonic()
+            shown_now, printed_at = text.split(',')[0], time.monotonic()
             _write(f'{shown_now}\n')
-        elif time.monotonic() - told >= STILL:
-            told = time.monotonic()
+        elif time.monotonic() - printed_at >= STILL:
+            printed_at = time.monotonic()
             _write(f'{text}\n')
 
     try:

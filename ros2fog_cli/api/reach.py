@@ -57,18 +57,18 @@ def endpoint(entry: Entry, user: Optional[str] = None) -> Endpoint:
 
     :raises ConnectError: the machine has no shell, because it does not run.
     """
-    found = entry.machine.shell if entry.machine is not None else None
+    result = entry.machine.shell if entry.machine is not None else None
     if entry.record is not None and entry.record.shell is not None:
-        known = entry.record.shell
+        stored = entry.record.shell
         # The provider knows the current address, the record knows the key.
-        found = dataclasses.replace(
-            found, key_file=known.key_file, user=known.user,
-            host_key=known.host_key or found.host_key) if found is not None else known
+        result = dataclasses.replace(
+            result, key_file=stored.key_file, user=stored.user,
+            host_key=stored.host_key or result.host_key) if result is not None else stored
     stopped = entry.machine is not None and entry.machine.state is MachineState.STOPPED
-    if found is None or stopped:
+    if result is None or stopped:
         raise ConnectError(f"the machine '{entry.name}' can't be reached: {entry.state}",
                            'a launch that names it starts it again' if stopped else '')
-    return dataclasses.replace(found, user=user) if user else found
+    return dataclasses.replace(result, user=user) if user else result
 
 
 @contextlib.contextmanager
@@ -95,9 +95,9 @@ def session(
                 raise ConnectError(f"'{entry.name}' can't be reached through the VPN")
             elif entry.own and entry.machine is not None:
                 _open(entry, to.port, undo)
-        found = shells.connect(to, name=entry.name, timeout=timeout)
-        undo.callback(found.close)
-        yield found
+        shell = shells.connect(to, name=entry.name, timeout=timeout)
+        undo.callback(shell.close)
+        yield shell
 
 
 def through_vpn(
@@ -205,8 +205,8 @@ def measure(
     :raises FogError: the status of the interface cannot be read.
     """
     vpn: Vpn = plugin_system.load('fogros2.vpn', kind)()
-    asked = process.run(vpn.status(interface), timeout=10.0)
-    peer = vpn.parse_status(asked.stdout).get(key, {})
+    status = process.run(vpn.status(interface), timeout=10.0)
+    peer = vpn.parse_status(status.stdout).get(key, {})
     handshake = peer.get('handshake', 0.0)
     return Link(address, interface.name, time.time() - handshake if handshake else None,
                 peer.get('received', 0.0), peer.get('sent', 0.0), ping(address, pings))

@@ -24,11 +24,11 @@ def figures(folder: Path, machine: str) -> list[dict[str, Any]]:
 
     :param folder: the launch's folder, whether or not it exists.
     """
-    found: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
     for path in sorted(folder.glob('first_answer_*.json')):
         with contextlib.suppress(OSError, ValueError):
-            found += [one for one in json.loads(path.read_text()) if one['machine'] == machine]
-    return found
+            rows += [one for one in json.loads(path.read_text()) if one['machine'] == machine]
+    return rows
 
 
 def row(one: dict[str, Any]) -> tuple[str, ...]:

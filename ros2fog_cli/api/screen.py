@@ -90,14 +90,14 @@ def frame(
 
 
 def _more(machine: dict[str, Any], now: float) -> str:
-    found = ''
+    text = ''
     if machine['created'] is not None:
-        found += f"  {duration(max(0.0, (machine['ended'] or now) - machine['created']))}"
+        text += f"  {duration(max(0.0, (machine['ended'] or now) - machine['created']))}"
     if machine['cost_per_hour'] is not None and machine['created'] is not None:
         rate = Decimal(machine['cost_per_hour'])
         spent = rate * Decimal(max(0.0, now - machine['created'])) / 3600
-        found += f'  {cost(spent, 4)} so far'
-    return found
+        text += f'  {cost(spent, 4)} so far'
+    return text
 
 
 def _about(machine: dict[str, Any], now: float) -> Iterator[tuple[str, str]]:
@@ -106,9 +106,9 @@ def _about(machine: dict[str, Any], now: float) -> Iterator[tuple[str, str]]:
         yield 'address', where
     launch = f"{machine['launch']}, process {machine['launch_pid']}" \
         if machine['launch_alive'] else f"{machine['launch'] or '-'} (over)"
-    left = '' if machine['expires'] is None \
+    remaining = '' if machine['expires'] is None \
         else f", {duration(machine['expires'] - now)} left"
-    yield 'launch', launch + left
+    yield 'launch', launch + remaining
     vpn, agent = machine['vpn'], machine['agent']
     if vpn is not None:
         shaken = 'none yet' if vpn['handshake'] is None \
@@ -130,14 +130,14 @@ def _about(machine: dict[str, Any], now: float) -> Iterator[tuple[str, str]]:
 
 def _crossing(machine: dict[str, Any]) -> list[tuple[str, ...]]:
     """Return a row for each topic that crosses the VPN to or from a machine."""
-    found = [(f"{one['topic']} ({one['transport']})", [one['source']], [one['target']], one)
-             for one in machine.get('streams', [])]
-    found += [(one['topic'], one['from'], one['to'], one) for one in machine.get('topics', [])]
+    rows = [(f"{one['topic']} ({one['transport']})", [one['source']], [one['target']], one)
+            for one in machine.get('streams', [])]
+    rows += [(one['topic'], one['from'], one['to'], one) for one in machine.get('topics', [])]
     return [
         (name, _hosts(sources), _hosts(targets),
          '-' if one['rate'] is None else f"{one['rate']:.1f}",
          '-' if one['bandwidth'] is None else f"{size(one['bandwidth'])}/s", *shares(one))
-        for name, sources, targets, one in found
+        for name, sources, targets, one in rows
         if machine['name'] in (*sources, *targets)]
 
 

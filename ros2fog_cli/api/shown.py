@@ -139,15 +139,15 @@ def as_json(step: journal.Step, *, ended: bool = False) -> dict[str, Any]:
 
 def phase(steps: tuple[journal.Step, ...]) -> str:
     """Return the phase of a machine by its steps: 'coming', 'running' or 'ending'."""
-    found = 'coming'
+    result = 'coming'
     for step in steps:
         if step.step in DOWN:
             return 'ending'
         if step.step == UP and step.state == 'done':
-            found = 'running'
-        elif step.state == 'failed' and found == 'coming':
+            result = 'running'
+        elif step.state == 'failed' and result == 'coming':
             return 'ending'
-    return found
+    return result
 
 
 def _phase(shown: Shown) -> str:

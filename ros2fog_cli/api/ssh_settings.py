@@ -61,24 +61,24 @@ def settings(name: str, to: Endpoint, folder: Path) -> str:
     :param folder: where the file with its host key is.
     :raises ShellError: a value would be several settings.
     """
-    found = ssh_config.of(to)
-    host = to.host if to.host_key else found.host
-    pairs = [('HostName', host.replace('%', '%%')), ('Port', str(found.port)),
-             ('User', found.user)]
-    if found.proxy:
-        pairs.append(('ProxyCommand', shlex.join(found.proxy).replace('%', '%%')))
-    if found.only_keys:
-        pairs += [('IdentityFile', _path(key, '%')) for key in found.keys]
+    config = ssh_config.of(to)
+    host = to.host if to.host_key else config.host
+    pairs = [('HostName', host.replace('%', '%%')), ('Port', str(config.port)),
+             ('User', config.user)]
+    if config.proxy:
+        pairs.append(('ProxyCommand', shlex.join(config.proxy).replace('%', '%%')))
+    if config.only_keys:
+        pairs += [('IdentityFile', _path(key, '%')) for key in config.keys]
         pairs.append(('IdentitiesOnly', 'yes'))
     if to.host_key:
-        found = dataclasses.replace(
-            found, known_hosts=(str(folder / KNOWN_HOSTS),), label=label(name))
-        pairs += [('UserKnownHostsFile', _path(found.known_hosts[0], '%')),
+        config = dataclasses.replace(
+            config, known_hosts=(str(folder / KNOWN_HOSTS),), label=label(name))
+        pairs += [('UserKnownHostsFile', _path(config.known_hosts[0], '%')),
                   ('GlobalKnownHostsFile', '/dev/null'), ('StrictHostKeyChecking', 'yes')]
     elif to.alias:
         pairs.append(('UserKnownHostsFile', ' '.join(
-            _path(one, '%') for one in found.known_hosts)))
-    pairs.append(('HostKeyAlias', found.label))
+            _path(one, '%') for one in config.known_hosts)))
+    pairs.append(('HostKeyAlias', config.label))
     for key, value in (*pairs, ('host key', to.host_key or '')):
         if not value.isprintable() or key in ('HostName', 'User') and _MISREAD.search(value):
             raise ShellError(f"'{name}' has a {key} that ssh would misread: {value!r}",

@@ -24,11 +24,11 @@ def shares(stream: Mapping[str, Any]) -> tuple[str, str]:
             '-' if latency is None else f'{1e3 * latency:.0f} ms')
 
 
-def nodes(found: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+def nodes(status: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
     """Return the rows of nodes in an agent's status, for the columns ``NODES``."""
     return [(node['name'], node['state'], str(node['pid'] or NONE),
              NONE if node['returncode'] is None else str(node['returncode']),
-             str(node['restarts'])) for node in found]
+             str(node['restarts'])) for node in status]
 
 
 def table(
@@ -44,13 +44,13 @@ def table(
     """
     empty = {name for column, name in enumerate(header) if name in optional
              and all(row[column] in ('', NONE) for row in rows)}
-    left = [name for name in optional if name not in empty]
+    omissible = [name for name in optional if name not in empty]
     while True:
         keep = [column for column, name in enumerate(header) if name not in empty]
         text = _columns([[one_line(row[column]) for column in keep] for row in [header, *rows]])
-        if not width or not left or max(map(len, text)) <= width:
+        if not width or not omissible or max(map(len, text)) <= width:
             return '\n'.join(text)
-        empty.add(left.pop(0))
+        empty.add(omissible.pop(0))
 
 
 def terminal_width() -> int:

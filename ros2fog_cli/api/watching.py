@@ -57,16 +57,16 @@ def streams(name: str, *, regions: Optional[list[str]] = None) -> list[dict[str,
     A node joins the launch for a few seconds to measure the rates.
     """
     live = Live(name=name, regions=regions, interval=0.5, topics=True)
-    found: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
     begin = time.monotonic()
 
     def measured() -> bool:
-        found[:] = [one for one in live.state().get('streams', [])
-                    if name in (one['source'], one['target'])]
+        rows[:] = [one for one in live.state().get('streams', [])
+                   if name in (one['source'], one['target'])]
         # Discovery takes time: a stream without subscribers may have one that is not known yet.
         settled = time.monotonic() - begin > TIMEOUT / 2
-        return bool(found) and all(
-            one['rate'] is not None or settled and one['note'] for one in found)
+        return bool(rows) and all(
+            one['rate'] is not None or settled and one['note'] for one in rows)
 
     live.start()
     try:
@@ -74,20 +74,20 @@ def streams(name: str, *, regions: Optional[list[str]] = None) -> list[dict[str,
             wait_until(measured, timeout=TIMEOUT, what='the rates of streams')
     finally:
         live.close()
-    return found
+    return rows
 
 
 def _machine(state: dict[str, Any], name: str) -> Optional[dict[str, Any]]:
     # Of several machines of one name, prefer the one that a launch uses.
-    found = max((one for one in state.get('machines', []) if one['name'] == name),
-                key=lambda one: bool(one['launch_alive']), default=None)
-    return None if found is None else {
-        **found, **{key: state[key] for key in ('streams', 'topics') if key in state},
-        'problems': [*found['problems'], *state.get('graph_trouble', [])]}
+    machine = max((one for one in state.get('machines', []) if one['name'] == name),
+                  key=lambda one: bool(one['launch_alive']), default=None)
+    return None if machine is None else {
+        **machine, **{key: state[key] for key in ('streams', 'topics') if key in state},
+        'problems': [*machine['problems'], *state.get('graph_trouble', [])]}
 
 
 def _lines(live: Live, name: str, interval: float, as_json: bool) -> None:
-    said: Optional[str] = None
+    last: Optional[str] = None
     version = -1
     while True:
         # Often enough to count as present.
@@ -98,8 +98,8 @@ def _lines(live: Live, name: str, interval: float, as_json: bool) -> None:
             text = output.as_json({'machine': machine}, indent=None)
         else:
             text = screen.summary(machine) if machine is not None else f'{name}: {_WAITING}'
-        if text != said and version > 0:
-            said = text
+        if text != last and version > 0:
+            last = text
             print(text if as_json else f'{time.strftime("%H:%M:%S")} {text}', flush=True)
         if _unheard():
             raise BrokenPipeError

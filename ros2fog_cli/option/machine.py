@@ -45,11 +45,11 @@ class MachineOption:
         from fogros2.describe.overrides import Overrides
         from ros2fog_cli.api.preview import Preview
         overrides = Overrides(args.machine) if args.machine else None
-        found = Preview(launch_description, arguments, overrides)
-        if all(machine.spec is None and not machine.note for machine in found.machines):
+        preview = Preview(launch_description, arguments, overrides)
+        if all(machine.spec is None and not machine.note for machine in preview.machines):
             return ''
         return '\n'.join(['', 'Machines (ros2 fog plan asks for their prices):',
-                          *(f'    {line}' for line in found.lines()), ''])
+                          *(f'    {line}' for line in preview.lines()), ''])
 
     def prestart(self, args: argparse.Namespace) -> None:
         """

@@ -43,17 +43,17 @@ class DeleteVerb(VerbExtension):
                                 regions=args.region, store=store)
         entries, failed = [], 0
         for name in names:
-            found = [entry for entry in every if name in (None, entry.name)]
-            own = [entry for entry in found if entry.own]
+            matches = [entry for entry in every if name in (None, entry.name)]
+            own = [entry for entry in matches if entry.own]
             # Another robot's machine can be deleted by name, unless this robot has one of that
             # name.
             if not args.any_robot and (name is None or own):
-                if len(own) < len(found):
-                    warn(f'{len(found) - len(own)} of other robots left out (--any-robot takes '
+                if len(own) < len(matches):
+                    warn(f'{len(matches) - len(own)} of other robots left out (--any-robot takes '
                          'them)')
-                found = own
-            entries += found
-            if name is not None and not found:
+                matches = own
+            entries += matches
+            if name is not None and not matches:
                 warn(str(machines.unknown(name, store)))
                 failed = 1
         if not entries:

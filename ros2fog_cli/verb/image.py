@@ -117,10 +117,10 @@ def _create(args: argparse.Namespace) -> int:
 
 def _list(args: argparse.Namespace) -> int:
     from ros2fog_cli.api import images, table
-    found = images.survey(warn, regions=args.region)
+    listing = images.survey(warn, regions=args.region)
     if args.json:
-        print_json(images=[images.to_json(image) for image in found])
-    elif not found:
+        print_json(images=[images.to_json(image) for image in listing])
+    elif not listing:
         print('no images')
     else:
         now = time.time()
@@ -130,7 +130,7 @@ def _list(args: argparse.Namespace) -> int:
               image.state or table.NONE,
               table.duration(None if image.created is None else max(0.0, now - image.created)),
               table.NONE if image.size_gb is None else f'{image.size_gb} GB',
-              image.dependencies or table.NONE) for image in found],
+              image.dependencies or table.NONE) for image in listing],
             width=table.terminal_width(),
             optional=('DEPENDENCIES', 'PROVIDER', 'SIZE', 'PLACE', 'AGE')))
     return 0
@@ -171,17 +171,17 @@ def _make(args: argparse.Namespace, name: str) -> int:
 def _delete(args: argparse.Namespace, words: list[str]) -> int:
     from fogros2.errors import FogError
     from ros2fog_cli.api import images, progress
-    found = images.named(images.survey(warn, regions=args.region), words)
-    for image in found:
+    matches = images.named(images.survey(warn, regions=args.region), words)
+    for image in matches:
         say(f"{'would delete' if args.dry_run else 'delete'} {image.name}: "
             f'{image.provider} {image.id}, {image.state}')
     if args.dry_run:
         return 0
-    if not args.yes and not agreed('this image', 'images', len(found)):
+    if not args.yes and not agreed('this image', 'images', len(matches)):
         return 1
     failed = 0
     with progress.working('deleting'):
-        for image in found:
+        for image in matches:
             try:
                 images.delete(image)
                 say(f'deleted {image.name}')

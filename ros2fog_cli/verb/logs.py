@@ -40,7 +40,7 @@ class LogsVerb(VerbExtension):
         with reach.session(entry) as shell:
             client = reach.agent(entry, shell)
             try:
-                there = reach.follow(client, take, forever=args.follow)
+                alive = reach.follow(client, take, forever=args.follow)
                 for (name, stream), line in log.begun.items():
                     show(name, stream, [line], args.node)
             except KeyboardInterrupt:
@@ -50,12 +50,12 @@ class LogsVerb(VerbExtension):
                 return 0
             finally:
                 client.close()
-        if not there:
+        if not alive:
             warn(f"the agent of '{args.name}' is gone")
         elif args.node and args.node not in names:
             raise ConfigurationError(f"'{args.name}' has no node '{args.node}'",
                                      did_you_mean(args.node, sorted(names - {''})))
-        return 0 if there else 1
+        return 0 if alive else 1
 
 
 def show(name: str, stream: str, lines: list[str], node: Optional[str]) -> None:

@@ -49,11 +49,11 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
         raise ConfigurationError(
             f"'{entry.name}' has no Foxglove bridge",
             'launch_foxglove=True of the machine, or a Foxglove action, starts one')
-    there = (entry.record.monitor if entry.record is not None else 0) or addresses.PORT
+    remote_port = (entry.record.monitor if entry.record is not None else 0) or addresses.PORT
     with reach.session(entry) as shell:
-        token = monitor.token_of(entry, shell, there)
+        token = monitor.token_of(entry, shell, remote_port)
         try:
-            tunnel = Tunnel(shell, ('127.0.0.1', there), port=port, say=warn)
+            tunnel = Tunnel(shell, ('127.0.0.1', remote_port), port=port, say=warn)
         except OSError as error:
             raise ConfigurationError(
                 f'port {port} of this computer: {error.strerror}',

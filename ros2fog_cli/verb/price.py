@@ -59,14 +59,14 @@ class PriceVerb(VerbExtension):
         from fogros2.provider import clouds, offers
         from ros2fog_cli.api import replicas, table
         from ros2fog_cli.api.interrupts import interruptible
-        asked = offers.wants(
+        wanted = offers.wants(
             arch=args.arch, min_cpu=args.min_cpu, min_memory_gb=args.min_memory,
             cpu_type=args.cpu_type, gpu=args.gpu, gpu_memory_gb=args.gpu_memory,
             max_price=args.max_price, spot=args.spot)
         every = args.provider == clouds.ALL
         with interruptible() as cancel:
             choice = clouds.compare(
-                asked, () if every else (args.provider,), args.region or (), measure=True,
+                wanted, () if every else (args.provider,), args.region or (), measure=True,
                 max_round_trip_ms=args.max_round_trip, refresh=args.refresh, cancel=cancel)
         regions = choice.regions
         shown = choice.offers[:args.limit or None]
@@ -74,7 +74,7 @@ class PriceVerb(VerbExtension):
             print_json(offers=list(map(to_json, shown)))
         else:
             where = ', '.join(regions) if len(regions) < 4 else f'{len(regions)} regions'
-            print(f'{asked}, in {where}')
+            print(f'{wanted}, in {where}')
             print(table.table(
                 ('TYPE', 'PROVIDER', 'REGION', 'CPUS', 'MEMORY', 'GPU', 'ARCH', 'CPU', 'PRICE/H',
                  'SPOT/H', 'ROUND TRIP'),
@@ -86,9 +86,9 @@ class PriceVerb(VerbExtension):
                 width=table.terminal_width(), optional=(
                     'CPU', 'ARCH', *(('REGION',) if len(regions) == 1 else ()), 'GPU',
                     'ROUND TRIP')))
-            left = len(choice.offers) - len(shown)
-            if left:
-                print(f"{left} more {'cost' if left > 1 else 'costs'} as much or more (--limit 0)")
+            rest = len(choice.offers) - len(shown)
+            if rest:
+                print(f"{rest} more {'cost' if rest > 1 else 'costs'} as much or more (--limit 0)")
         if args.replicas and not args.json:
             print(replicas.price(choice.offers, args.replicas, spot=args.spot))
         for who, reason in choice.left_out:

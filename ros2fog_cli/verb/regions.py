@@ -32,16 +32,16 @@ class RegionsVerb(VerbExtension):
         """Print the table."""
         from ros2fog_cli.api import machines, table
         provider = machines.load(args.provider or machines.able('regions'))
-        found = provider.regions(args.region, every=args.all)
+        regions = provider.regions(args.region, every=args.all)
         if args.json:
             print_json(regions=[{
                 'region': one.region, 'place': one.place, 'median_ms': one.milliseconds,
-                'distance_km': one.distance_km} for one in found])
+                'distance_km': one.distance_km} for one in regions])
             return 0
-        measured = any(one.milliseconds is not None for one in found)
+        measured = any(one.milliseconds is not None for one in regions)
         print(table.table(
             ('REGION', 'PLACE', 'MEDIAN' if measured else 'DISTANCE'),
-            [(one.region, one.place, _far(one.milliseconds, one.distance_km)) for one in found]))
+            [(one.region, one.place, _far(one.milliseconds, one.distance_km)) for one in regions]))
         if not measured:
             print('no region answers: these are distances from where this computer seems to be')
         return 0

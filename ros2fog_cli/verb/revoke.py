@@ -20,9 +20,9 @@ class RevokeVerb(VerbExtension):
     def main(self, *, args: argparse.Namespace) -> int:
         """Print who was removed."""
         from ros2fog_cli.api import guests
-        gone = guests.revoke(args.name, args.who, warn)
-        for each in gone:
+        names = guests.revoke(args.name, args.who, warn)
+        for each in names:
             print(f'revoked {each}')
-        if not gone:
+        if not names:
             print(f"'{args.name}' has no guests")
         return 0

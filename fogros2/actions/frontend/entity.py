@@ -43,8 +43,8 @@ def attribute(entity: Entity, parser: Parser, name: str) -> Optional[ParsedText]
 
     :raises ConfigurationError: the attribute is not a text.
     """
-    found: Optional[ParsedText] = value(entity, parser, kinds.Keyword(name, 'text'))
-    return found
+    content: Optional[ParsedText] = value(entity, parser, kinds.Keyword(name, 'text'))
+    return content
 
 
 def value(
@@ -93,9 +93,9 @@ def _raw(entity: Entity, name: str) -> Union[str, int, float, bool, list[Any], N
     # compare the type object itself, so it has to be typing's List
     for kind in (str, List[str], None):
         try:
-            found: Union[str, int, float, bool, list[Any], None] = entity.get_attr(
+            content: Union[str, int, float, bool, list[Any], None] = entity.get_attr(
                 name, data_type=kind, optional=True)
-            return found
+            return content
         except TypeError:
             continue
     raise ConfigurationError(
@@ -121,13 +121,13 @@ def children(entity: Entity, name: str) -> list[Entity]:
     :raises ConfigurationError: YAML has another value there.
     """
     try:
-        found: Optional[list[Entity]] = entity.get_attr(
+        elements: Optional[list[Entity]] = entity.get_attr(
             name, data_type=_list_of_entities(), optional=True)
     except TypeError as error:
         raise ConfigurationError(
             f"{entity.type_name}: '{name}' is no list of elements",
             'write - {name: ..., value: ...} for each') from error
-    return found or []
+    return elements or []
 
 
 def _list_of_entities() -> Any:
@@ -136,7 +136,7 @@ def _list_of_entities() -> Any:
 
 
 def _mapping(entity: Entity, parser: Parser, keyword: kinds.Keyword) -> Any:
-    found: dict[str, ParsedText] = {}
+    entries: dict[str, ParsedText] = {}
     for child in children(entity, keyword.name):
         name, content = attribute(child, parser, 'name'), attribute(child, parser, 'value')
         complete(child, ('name', 'value'))
@@ -144,8 +144,8 @@ def _mapping(entity: Entity, parser: Parser, keyword: kinds.Keyword) -> Any:
             raise ConfigurationError(f'{entity.type_name}: {keyword.name} takes a name, written '
                                      'out, and a value', '<{0} name="..." value="..."/>'.format(
                                          keyword.name))
-        found[name] = content
-    return found or None
+        entries[name] = content
+    return entries or None
 
 
 def _table(entity: Entity, parser: Parser, keyword: kinds.Keyword) -> Any:
@@ -169,8 +169,8 @@ def complete(entity: Entity, known: Iterable[str], what: str = '') -> None:
     try:
         entity.assert_entity_completely_parsed()
     except ValueError as error:
-        left = _UNREAD.search(str(error))
-        names = sorted(ast.literal_eval(left[1])) if left is not None else []
+        match = _UNREAD.search(str(error))
+        names = sorted(ast.literal_eval(match[1])) if match is not None else []
         if not names:
             raise ConfigurationError(str(error), 'take it out') from error
         raise keywords.unknown(what or entity.type_name, names[0], known) from error

@@ -51,37 +51,37 @@ def fog_machine(entity: Entity, parser: Parser) -> Parsed:
         raise ConfigurationError('a fog_machine needs a provider',
                                  did_you_mean('', keywords.providers()))
     if isinstance(provider, str):
-        known = dict(keywords.keywords(keywords.machine_class(provider)))
+        parameters = dict(keywords.keywords(keywords.machine_class(provider)))
     else:
         # the provider is resolved when the action is executed: accept the keywords of all
-        known = {name: keyword for each in keywords.providers() if _loads(each)
-                 for name, keyword in keywords.keywords(keywords.machine_class(each)).items()}
-    given = {name: value(entity, parser, keyword) for name, keyword in known.items()}
+        parameters = {name: keyword for each in keywords.providers() if _loads(each)
+                      for name, keyword in keywords.keywords(keywords.machine_class(each)).items()}
+    contents = {name: value(entity, parser, keyword) for name, keyword in parameters.items()}
     containers = [_container(child, parser) for child in children(entity, 'docker_container')]
     what = f"a fog_machine of the provider '{provider}'" if isinstance(provider, str) else ''
-    complete(entity, (*known, 'provider', 'docker_container', *CONDITIONS), what)
-    if given['name'] is None:
+    complete(entity, (*parameters, 'provider', 'docker_container', *CONDITIONS), what)
+    if contents['name'] is None:
         raise ConfigurationError('a fog_machine needs a name', 'its nodes say machine="that name"')
     kwargs.update(provider=provider, containers=containers, given={
-        name: content for name, content in given.items() if content is not None})
+        name: content for name, content in contents.items() if content is not None})
     return FogMachine, kwargs
 
 
 def _container(entity: Entity, parser: Parser) -> dict[str, Any]:
     """Read ``<docker_container cmd="docker run redis"/>``, or ``image=`` and its keywords."""
-    known = {'cmd': kinds.Keyword('cmd', 'text'), **kinds.parameters_of(described)}
-    given = {name: value(entity, parser, keyword, docker_lines.joined if name == 'cmd' else str)
-             for name, keyword in known.items()}
-    complete(entity, known)
-    found = {name: values.items(content) if known[name].kind == 'list' else content
-             for name, content in given.items() if content is not None}
-    if ('cmd' in found) == ('image' in found) or ('cmd' in found and len(found) > 1):
+    parameters = {'cmd': kinds.Keyword('cmd', 'text'), **kinds.parameters_of(described)}
+    contents = {name: value(entity, parser, keyword, docker_lines.joined if name == 'cmd' else str)
+                for name, keyword in parameters.items()}
+    complete(entity, parameters)
+    arguments = {name: values.items(content) if parameters[name].kind == 'list' else content
+                 for name, content in contents.items() if content is not None}
+    line = arguments.get('cmd')
+    if (line is None) == ('image' not in arguments) or (line is not None and len(arguments) > 1):
         raise ConfigurationError('a docker_container takes a cmd, or an image and what it needs',
                                  'cmd="docker run --net=host IMAGE", or image="IMAGE"')
-    line = found.get('cmd')
     if isinstance(line, str):
         parse(line)
-    return found
+    return arguments
 
 
 def _loads(provider: str) -> bool:
@@ -102,15 +102,15 @@ def node(entity: Entity, parser: Parser, cls: type[Node]) -> Parsed:
     """Read an element of ``cls`` as launch_ros does, with the keywords of a machine."""
     _, kwargs = cls.parse(entity, parser)
     kwargs['machine'] = _machine(entity, parser)
-    known = {'image': kinds.Keyword('image', 'text'),
-             'image_options': kinds.Keyword('image_options', 'list'),
-             'checkpoint': kinds.Keyword('checkpoint', 'text')}
-    given = {name: value(entity, parser, keyword) for name, keyword in known.items()}
+    parameters = {'image': kinds.Keyword('image', 'text'),
+                  'image_options': kinds.Keyword('image_options', 'list'),
+                  'checkpoint': kinds.Keyword('checkpoint', 'text')}
+    contents = {name: value(entity, parser, keyword) for name, keyword in parameters.items()}
     kwargs.update({name: values.items(content) if name == 'image_options' else content
-                   for name, content in given.items() if content is not None})
+                   for name, content in contents.items() if content is not None})
     streams = [stream_topic(child, parser)[1] for child in children(entity, 'stream_topic')]
     _, kwargs['stream_topics'] = instead_of(StreamTopicEverywhere(**each) for each in streams)
-    complete(entity, ('machine', 'stream_topic', *known, *_NODE, *CONDITIONS))
+    complete(entity, ('machine', 'stream_topic', *parameters, *_NODE, *CONDITIONS))
     return cls, kwargs
 
 
@@ -139,16 +139,16 @@ def cloud_group(entity: Entity, parser: Parser) -> Parsed:
 def replicated(entity: Entity, parser: Parser) -> Parsed:
     """Read ``<replicated machines="a, b" services="/plan" topics="/in:/out">``."""
     _, kwargs = Action.parse(entity, parser)
-    known: dict[str, kinds.Kind] = {
+    parameters: dict[str, kinds.Kind] = {
         'machines': 'list', 'services': 'list', 'topics': 'list', 'hedge_after': 'scalar'}
-    for name, kind in known.items():
+    for name, kind in parameters.items():
         content = value(entity, parser, kinds.Keyword(name, kind))
         if content is not None:
             kwargs[name] = content
     kwargs.setdefault('machines', [])
     kwargs['actions'], kwargs['stream_topics'] = instead_of(
         parser.parse_action(child) for child in entity.children)
-    complete(entity, (*known, 'stream_topic', *CONDITIONS))
+    complete(entity, (*parameters, 'stream_topic', *CONDITIONS))
     return Replicated, kwargs
 
 

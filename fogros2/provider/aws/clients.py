@@ -74,8 +74,8 @@ class Account(vm.Account):
         session = self.session()
         with translated('looking for AWS credentials'):
             with self._lock:
-                found = session.get_credentials()
-        if found is None:
+                credentials = session.get_credentials()
+        if credentials is None:
             raise PrerequisiteError(
                 'there are no AWS credentials on this computer',
                 'aws configure, or set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY')
@@ -110,10 +110,10 @@ class Account(vm.Account):
         :param operation: as boto3's method is called.
         :raises FogError: see :func:`~fogros2.provider.aws.failures.translated`.
         """
-        found: Mapping[str, Any] = self._ask(
+        answer: Mapping[str, Any] = self._ask(
             lambda client: getattr(client, operation)(**parameters), service, region, operation,
             what)
-        return found
+        return answer
 
     def remove(self, region: str, operation: str, what: str, **parameters: Any) -> None:
         """Make a call of EC2 that deletes something; it may be deleted already."""

@@ -54,9 +54,9 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network):
 
     def whoami(self, region: str) -> str:
         """Return the account; no policy can refuse this request."""
-        told = self._account.having(self.cancel, hasty=True).call(
+        identity = self._account.having(self.cancel, hasty=True).call(
             'sts', region, 'get_caller_identity', 'asking AWS who we are')
-        return f'account {told["Account"]}, {str(told["Arn"]).split(":")[-1]}, {region}'
+        return f'account {identity["Account"]}, {str(identity["Arn"]).split(":")[-1]}, {region}'
 
     def default_region(self) -> str:
         return str(os.environ.get('AWS_REGION') or self._account.session().region_name or '')
@@ -77,39 +77,39 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network):
             region, tags, 'looking for machines', instances.in_states(instances.ALIVE))]
 
     def get(self, region: str, vm: str) -> Optional[Vm]:
-        found: list[Mapping[str, Any]] = []
+        matches: list[Mapping[str, Any]] = []
         with unless_gone():
-            found = instances.instances_in(self._account.call(
+            matches = instances.instances_in(self._account.call(
                 'ec2', region, 'describe_instances', f'looking for {vm}',
                 InstanceIds=[vm])['Reservations'])
-        if not found:
+        if not matches:
             if self._account.just_made(vm):
                 return None
             raise MachineNotFound(f'there is no {vm} in {region} any more')
-        if found[0]['State']['Name'] == 'terminated' and not self._account.just_made(vm):
+        if matches[0]['State']['Name'] == 'terminated' and not self._account.just_made(vm):
             raise MachineNotFound(f'{vm} in {region} was terminated')
-        self._account.disks[vm] = instances.own_disks(found[0])
-        return instances.vm_of(region, found[0])
+        self._account.disks[vm] = instances.own_disks(matches[0])
+        return instances.vm_of(region, matches[0])
 
     def is_marked(self, machine: VmId) -> bool:
         """Ask the spot request, which EC2 marks two minutes before the instance's end."""
-        found = self._account.call(
+        requests = self._account.call(
             'ec2', machine.region, 'describe_spot_instance_requests',
             f'asking whether {machine.vm} is reclaimed',
             Filters=[{'Name': 'instance-id', 'Values': [machine.vm]}])['SpotInstanceRequests']
         return any(str(one.get('Status', {}).get('Code', '')).startswith('marked-for-')
-                   for one in found)
+                   for one in requests)
 
     def prepare(self, region: str, order: Order, types: Sequence[str]) -> dict[str, Any]:
         """Return the image of each type, looked up once for all types that use the same."""
-        found: dict[tuple[str, bool], Mapping[str, Any]] = {}
+        cache: dict[tuple[str, bool], Mapping[str, Any]] = {}
         chosen: dict[str, Any] = {}
         for kind in images.kinds(self._account, region, list(types)):
             key = (kind.arch, images.has_nvidia(kind))
-            if key not in found:
-                found[key] = images.choose(self._account, region, kind, order.options,
+            if key not in cache:
+                cache[key] = images.choose(self._account, region, kind, order.options,
                                            order.request.dependencies)
-            chosen[kind.name] = found[key]
+            chosen[kind.name] = cache[key]
         return chosen
 
     def insert(

@@ -165,15 +165,15 @@ def refused(
 ) -> FogError:
     """Return the error for a refusal; ``response`` as botocore has it."""
     details = response.get('Error') or {}
-    code, said = str(details.get('Code', '')), _plain(str(details.get('Message', '')))
+    code, message = str(details.get('Code', '')), _plain(str(details.get('Message', '')))
     status = (response.get('ResponseMetadata') or {}).get('HTTPStatusCode', 400)
     if AwsError.known(code).denied:
-        action = denied_action(said, operation, decode)
+        action = denied_action(message, operation, decode)
         return AwsError(f'{where} failed: the policy of these credentials does not allow {action}',
                         f'add {action} to it: doc/aws.md has the whole policy', code=code)
-    error = AwsError.of(code, said, where, status)
-    if code.startswith('Invalid') and said and AwsError.known(code).reason:
-        error.args = (f'{error.args[0]} ({said[:160].rstrip(".")})',)
+    error = AwsError.of(code, message, where, status)
+    if code.startswith('Invalid') and message and AwsError.known(code).reason:
+        error.args = (f'{error.args[0]} ({message[:160].rstrip(".")})',)
     return error
 
 
@@ -187,7 +187,7 @@ def _plain(text: str) -> str:
 
 
 def denied_action(
-    said: str, operation: str, decode: Optional[Callable[[str], str]] = None,
+    message: str, operation: str, decode: Optional[Callable[[str], str]] = None,
 ) -> str:
     """
     Return the action that a policy lacks, such as 'ec2:RunInstances'.
@@ -195,11 +195,11 @@ def denied_action(
     A call may need other actions too (tags at creation, a role). AWS names the action in plain
     text, or encoded for users who may ``sts:DecodeAuthorizationMessage``.
     """
-    encoded = _ENCODED.search(said)
+    encoded = _ENCODED.search(message)
     if encoded and decode:
         with contextlib.suppress(ValueError, KeyError, TypeError):
             return str(json.loads(decode(encoded[1]))['context']['action'])
-    named = _ACTION.search(said)
+    named = _ACTION.search(message)
     if named:
         return named[1]
     service = {'GetCallerIdentity': 'sts', 'GetParameter': 'ssm',
@@ -211,14 +211,14 @@ def _unsent(error: BaseException, where: str) -> FogError:
     """Return the error for a request without an answer."""
     from botocore import exceptions as known
 
-    said = ' '.join(str(error).split())
+    message = ' '.join(str(error).split())
     for kind in type(error).__mro__:
         if kind.__name__ in _UNSENT:
             reason, hint = _UNSENT[kind.__name__]
-            return PrerequisiteError(f'{where} failed: {reason.format(said)}', hint)
+            return PrerequisiteError(f'{where} failed: {reason.format(message)}', hint)
     if isinstance(error, (known.HTTPClientError, known.ConnectionError)):
         return Silent(
-            f'{where} failed: AWS does not answer: {said}',
+            f'{where} failed: AWS does not answer: {message}',
             'does region= exist, and is there a way to the Internet (a proxy, AWS_ENDPOINT_URL)?',
             unsent=not isinstance(error, (known.ReadTimeoutError, known.ConnectionClosedError)))
-    return ProviderError(f'{where} failed: {said}')
+    return ProviderError(f'{where} failed: {message}')

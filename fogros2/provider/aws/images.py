@@ -39,16 +39,16 @@ def kinds(account: Account, region: str, names: list[str]) -> list[MachineType]:
 
     :raises ConfigurationError: it has none of them.
     """
-    found = {entry['InstanceType']: instance_type(entry) for entry in account.call(
+    types = {entry['InstanceType']: instance_type(entry) for entry in account.call(
         'ec2', region, 'describe_instance_types',
         f'looking for the instance type {" or ".join(names)}',
         # a filter, because one unknown name among InstanceTypes is an error for all
         Filters=[{'Name': 'instance-type', 'Values': names}])['InstanceTypes']}
-    if not found:
+    if not types:
         raise ConfigurationError(
             f'looking for the instance type {" or ".join(names)} in {region} failed: the region '
             'has no such instance type', 'ros2 fog price shows what it has')
-    fitting = [kind for name in names if (kind := found.get(name)) is not None]
+    fitting = [kind for name in names if (kind := types.get(name)) is not None]
     if not fitting:
         raise ConfigurationError(f'machines of the type {" or ".join(names)} run no Ubuntu',
                                  'take one with an x86_64 or arm64 processor')
@@ -87,16 +87,17 @@ def choose(
 
 def _named(account: Account, region: str, kind: MachineType, identity: str) -> Mapping[str, Any]:
     try:
-        found = account.call('ec2', region, 'describe_images', f'looking for the image {identity}',
-                             ImageIds=[identity])['Images']
+        images = account.call(
+            'ec2', region, 'describe_images', f'looking for the image {identity}',
+            ImageIds=[identity])['Images']
     except AwsError as error:
         if not error.gone:
             raise
         raise ConfigurationError(str(error.args[0]), error.hint) from error
-    if not found:
+    if not images:
         raise ConfigurationError(f'there is no image {identity} in {region}',
                                  'an AMI belongs to one region; leave ami_image= out')
-    image: Mapping[str, Any] = found[0]
+    image: Mapping[str, Any] = images[0]
     if image.get('State', 'available') != 'available':
         raise ConfigurationError(f'the image {identity} in {region} is {image["State"]}',
                                  'ros2 fog image list shows when it is available')
@@ -111,13 +112,13 @@ def _baked(
     account: Account, region: str, kind: MachineType, options: Options, dependencies: str,
 ) -> Optional[Mapping[str, Any]]:
     """Return the newest image of FogROS2 with the same dependencies, or None."""
-    found = account.call(
+    images = account.call(
         'ec2', region, 'describe_images', 'looking for images baked before', Owners=['self'],
         Filters=[{'Name': f'tag:{TAG_DEPENDENCIES}', 'Values': [dependencies]},
                  {'Name': 'tag-key', 'Values': [TAG_BAKED]},
                  {'Name': 'architecture', 'Values': [kind.arch]},
                  {'Name': 'state', 'Values': ['available']}])['Images']
-    fitting = [image for image in found
+    fitting = [image for image in images
                if tags_of(image).get(TAG_USER, options.user) == options.user]
     return max(fitting, key=lambda image: str(image.get('CreationDate', '')), default=None)
 
@@ -163,19 +164,19 @@ class Ec2Images(VmCloud):
         account = self._account
         region, identity = image_parts(image_id, 'aws:([a-z0-9-]+)/(ami-[0-9a-f]+)')
         what = f'deleting the image {identity}'
-        found = account.call('ec2', region, 'describe_images', what, Owners=['self'],
-                             Filters=[{'Name': 'image-id', 'Values': [identity]}])['Images']
+        images = account.call('ec2', region, 'describe_images', what, Owners=['self'],
+                              Filters=[{'Name': 'image-id', 'Values': [identity]}])['Images']
         snapshots = {str(mapping['Ebs']['SnapshotId'])
-                     for image in found for mapping in image.get('BlockDeviceMappings') or ()
+                     for image in images for mapping in image.get('BlockDeviceMappings') or ()
                      if mapping.get('Ebs', {}).get('SnapshotId')}
-        if found:
-            check_baked(tags_of(found[0]), f'{identity} in {region}')
+        if images:
+            check_baked(tags_of(images[0]), f'{identity} in {region}')
         # EC2 writes the image's id into the description of its snapshots
         snapshots |= {str(entry['SnapshotId']) for entry in account.pages(
             'ec2', region, 'describe_snapshots', 'Snapshots', what, OwnerIds=['self'],
             Filters=[{'Name': 'description', 'Values': [f'*for {identity}*']},
                      {'Name': 'tag-key', 'Values': [TAG_BAKED]}])}
-        if found:
+        if images:
             account.remove(region, 'deregister_image', what, ImageId=identity)
         for snapshot in sorted(snapshots):
             account.remove(region, 'delete_snapshot', what, SnapshotId=snapshot)

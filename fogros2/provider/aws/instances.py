@@ -181,5 +181,5 @@ def instances_in(reservations: Iterable[Mapping[str, Any]]) -> list[Mapping[str,
 
 
 def _stopped(instance: Mapping[str, Any]) -> Optional[float]:
-    found = _STOPPED.search(str(instance.get('StateTransitionReason') or ''))
-    return when(f'{found[1]}Z') if found else None
+    match = _STOPPED.search(str(instance.get('StateTransitionReason') or ''))
+    return when(f'{match[1]}Z') if match else None

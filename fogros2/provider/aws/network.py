@@ -31,10 +31,10 @@ ANYONE = {'IpRanges': [{'CidrIp': '0.0.0.0/0'}], 'Ipv6Ranges': [{'CidrIpv6': '::
 def rule(protocol: str, port: int, sources: Iterable[str], last: int = 0) -> dict[str, Any]:
     """Return a rule of a security group in EC2's form, for a port or those up to ``last``."""
     networks = sorted({cidr(source) for source in sources})
-    found: dict[str, Any] = {'IpProtocol': protocol, 'FromPort': port, 'ToPort': last or port}
+    permission: dict[str, Any] = {'IpProtocol': protocol, 'FromPort': port, 'ToPort': last or port}
     four = [{'CidrIp': network} for network in networks if ':' not in network]
     six = [{'CidrIpv6': network} for network in networks if ':' in network]
-    return {**found, **({'IpRanges': four} if four else {}),
+    return {**permission, **({'IpRanges': four} if four else {}),
             **({'Ipv6Ranges': six} if six else {})}
 
 
@@ -117,16 +117,16 @@ class Ec2Network(VmCloud):
             Filters=[{'Name': 'group-name', 'Values': [own_name(attempt)]}])['SecurityGroups'])
 
     def _drop_groups(
-        self, region: str, attempt: str, known: Sequence[str], *, timeout: float,
+        self, region: str, attempt: str, ids: Sequence[str], *, timeout: float,
     ) -> None:
         """
         Delete the groups of an attempt; wait until no instance uses them.
 
-        :param known: their ids, which EC2 may not report yet if they are new; () to look.
+        :param ids: their ids, which EC2 may not report yet if they are new; () to look.
         :raises DeadlineExceeded: an instance still uses a group.
         """
-        for group in known or [
-                str(found['GroupId']) for found in self._groups(region, attempt)]:
+        for group in ids or [
+                str(entry['GroupId']) for entry in self._groups(region, attempt)]:
             def deleted(group: str = group) -> bool:
                 with tolerated('DependencyViolation', 'InvalidGroup.InUse'):
                     self._account.remove(region, 'delete_security_group',
@@ -176,7 +176,7 @@ class Ec2Network(VmCloud):
         :raises ConfigurationError: there is no such subnet in the region.
         """
         try:
-            found = self._account.call(
+            subnets = self._account.call(
                 'ec2', region, 'describe_subnets', 'looking for the subnet',
                 SubnetIds=[subnet])['Subnets']
         except AwsError as error:
@@ -184,17 +184,17 @@ class Ec2Network(VmCloud):
                 raise ConfigurationError(f"there is no subnet '{subnet}' in {region}",
                                          'check subnet= and region=') from error
             raise
-        return str(found[0]['VpcId'])
+        return str(subnets[0]['VpcId'])
 
     def places(self, region: str, order: Order) -> Iterator[str]:
         """Yield the subnet that is named; else EC2's choice, then the default VPC's subnets."""
         yield order.options.subnet
         if not order.options.subnet:
-            found = self._account.call(
+            subnets = self._account.call(
                 'ec2', region, 'describe_subnets', 'looking for zones',
                 Filters=[{'Name': 'default-for-az', 'Values': ['true']}])['Subnets']
             yield from (str(subnet['SubnetId']) for subnet in sorted(
-                found, key=lambda entry: str(entry['AvailabilityZone'])))
+                subnets, key=lambda entry: str(entry['AvailabilityZone'])))
 
     # -- its end --------------------------------------------------------------------------------
 
@@ -209,8 +209,8 @@ class Ec2Network(VmCloud):
         self._account.made.pop(machine.vm, None)
         self._account.doors.pop(machine.attempt, None)
         # EC2 reports these for a while, although they are being deleted
-        gone = self._account.disks.pop(machine.vm, set())
-        self.sweep(machine.region, machine.attempt, gone=gone)
+        disks = self._account.disks.pop(machine.vm, set())
+        self.sweep(machine.region, machine.attempt, gone=disks)
 
     def _terminate(self, machine: VmId) -> bool:
         """Terminate an instance; return whether its end has to be awaited."""
@@ -225,19 +225,19 @@ class Ec2Network(VmCloud):
                 # EC2 may not report a new instance yet, which would continue to run
                 return None if self._account.just_made(machine.vm) else []
 
-        told = wait_until(ask, timeout=TIMEOUT, interval=1.0, longest=5.0,
-                          what=f'{machine.vm} in {machine.region} to be known')
-        return any(entry['CurrentState']['Name'] != 'terminated' for entry in told)
+        changes = wait_until(ask, timeout=TIMEOUT, interval=1.0, longest=5.0,
+                             what=f'{machine.vm} in {machine.region} to be known')
+        return any(entry['CurrentState']['Name'] != 'terminated' for entry in changes)
 
     def _there(self, machine: VmId) -> bool:
         # filters: an id that EC2 does not know would be an error
-        found = self._instances(
+        matches = self._instances(
             machine.region, {TAG_ATTEMPT: machine.attempt}, f'watching {machine.vm} end',
             {'Name': 'instance-id', 'Values': [machine.vm]})
-        for instance in found:
+        for instance in matches:
             self._account.disks.setdefault(machine.vm, set()).update(
                 instances.own_disks(instance))
-        return any(instance['State']['Name'] != 'terminated' for instance in found)
+        return any(instance['State']['Name'] != 'terminated' for instance in matches)
 
     def _instances(
         self, region: str, tags: Mapping[str, str], what: str, *filters: Mapping[str, Any],
@@ -250,32 +250,32 @@ class Ec2Network(VmCloud):
     def sweep(self, region: str, attempt: str, *, gone: Collection[str] = ()) -> None:
         account = self._account
         self._drop_key(region, attempt)
-        left = [str(entry['ResourceId']) for entry in account.pages(
+        ids = [str(entry['ResourceId']) for entry in account.pages(
             'ec2', region, 'describe_tags', 'Tags', 'looking for what is left',
             Filters=[{'Name': 'key', 'Values': [TAG_ATTEMPT]},
                      {'Name': 'value', 'Values': [attempt]}])]
         # EC2 reports tags a little late; the group's name is reliable
-        self._drop_groups(region, attempt, [each for each in left if each.startswith('sg-')],
+        self._drop_groups(region, attempt, [each for each in ids if each.startswith('sg-')],
                           timeout=TIMEOUT)
-        for address in left:
+        for address in ids:
             if address.startswith('eipalloc-'):
                 account.remove(region, 'release_address', 'releasing an address',
                                AllocationId=address)
-        found: Iterable[Mapping[str, Any]] = account.call(
+        volumes: Iterable[Mapping[str, Any]] = account.call(
             'ec2', region, 'describe_volumes', 'looking for disks',
             Filters=[{'Name': f'tag:{TAG_ATTEMPT}', 'Values': [attempt]},
                      {'Name': 'status', 'Values': ['available', 'error']}],
-        )['Volumes'] if any(each.startswith('vol-') and each not in gone for each in left) else ()
-        for disk in found:
+        )['Volumes'] if any(name.startswith('vol-') and name not in gone for name in ids) else ()
+        for disk in volumes:
             account.remove(region, 'delete_volume', 'deleting a disk', VolumeId=disk['VolumeId'])
 
     def end_attempt(self, region: str, attempt: str) -> bool:
-        found = self._instances(region, {TAG_ATTEMPT: attempt}, 'looking for what was made',
-                                instances.in_states(instances.ALIVE))
-        if found:
+        matches = self._instances(region, {TAG_ATTEMPT: attempt}, 'looking for what was made',
+                                  instances.in_states(instances.ALIVE))
+        if matches:
             self._account.remove(region, 'terminate_instances', 'ending what was made',
-                                 InstanceIds=[instance['InstanceId'] for instance in found])
-        return bool(found)
+                                 InstanceIds=[instance['InstanceId'] for instance in matches])
+        return bool(matches)
 
     def remains(self, region: str) -> list[dict[str, str]]:
         # the end of a machine deletes its disk and address, but not its group and key
@@ -287,6 +287,6 @@ class Ec2Network(VmCloud):
         return [instances.tags_of(entry) for entry in entries]
 
     def attempts(self, region: str) -> list[str]:
-        return [instances.tags_of(found)[TAG_ATTEMPT] for found in self._instances(
+        return [instances.tags_of(instance)[TAG_ATTEMPT] for instance in self._instances(
             region, {}, 'looking for machines',
             instances.in_states([*instances.ALIVE, 'shutting-down']))]

@@ -45,16 +45,16 @@ class Ec2Prices(VmCloud):
                 yield kind
 
     def zones(self, region: str) -> dict[str, list[str]]:
-        found: dict[str, list[str]] = {}
+        zones: dict[str, list[str]] = {}
         for entry in self._account.pages(
                 'ec2', region, 'describe_instance_type_offerings', 'InstanceTypeOfferings',
                 'asking for the zones of the instance types', LocationType='availability-zone'):
-            found.setdefault(entry['InstanceType'], []).append(entry['Location'])
-        return {name: sorted(places) for name, places in found.items()}
+            zones.setdefault(entry['InstanceType'], []).append(entry['Location'])
+        return {name: sorted(places) for name, places in zones.items()}
 
     def prices(self, region: str, name: str = '') -> dict[str, Decimal]:
         wanted = {**ON_DEMAND, 'regionCode': region, **({'instanceType': name} if name else {})}
-        found: dict[str, Decimal] = {}
+        prices: dict[str, Decimal] = {}
         place = self.regions.table.get(region)
         near = self.regions.by_distance(PRICING_REGIONS, place[:2])[0].region if place \
             else PRICING_REGIONS[0]
@@ -64,13 +64,13 @@ class Ec2Prices(VmCloud):
                 Filters=[{'Type': 'TERM_MATCH', 'Field': field, 'Value': value}
                          for field, value in wanted.items()]):
             for kind, price in on_demand_price(str(text)):
-                found[kind] = min(price, found.get(kind, price))
-        return found
+                prices[kind] = min(price, prices.get(kind, price))
+        return prices
 
     def spot_prices(
         self, region: str, names: Optional[Sequence[str]],
     ) -> dict[str, dict[str, Decimal]]:
-        found: dict[str, dict[str, Decimal]] = {}
+        prices: dict[str, dict[str, Decimal]] = {}
         # a history from now on has only the current prices
         arguments: dict[str, Any] = {
             'StartTime': time.time(), 'ProductDescriptions': [SPOT_PRODUCT]}
@@ -80,9 +80,9 @@ class Ec2Prices(VmCloud):
                 'ec2', region, 'describe_spot_price_history', 'SpotPriceHistory',
                 'asking for the spot prices', **arguments):
             # should there be more, the newest comes first
-            found.setdefault(entry['InstanceType'], {}).setdefault(
+            prices.setdefault(entry['InstanceType'], {}).setdefault(
                 entry['AvailabilityZone'], Decimal(entry['SpotPrice']))
-        return found
+        return prices
 
 
 def instance_type(entry: Mapping[str, Any]) -> Optional[MachineType]:

@@ -44,8 +44,8 @@ def subscription() -> str:
     named = os.environ.get('AZURE_SUBSCRIPTION_ID', '')
     if not named:
         try:
-            known = json.loads(login.file('azureProfile.json').read_text(encoding='utf-8-sig'))
-            named = next((str(entry['id']) for entry in known['subscriptions']
+            profile = json.loads(login.file('azureProfile.json').read_text(encoding='utf-8-sig'))
+            named = next((str(entry['id']) for entry in profile['subscriptions']
                           if entry.get('isDefault')), '')
         except (OSError, ValueError, KeyError, TypeError):
             named = ''
@@ -101,17 +101,18 @@ class Account(RestAccount):
         version = next(word for key, word in VERSIONS.items() if key.lower() in path.lower())
         _, headers, answer = self._below(
             method, endpoint() + path, what, body, {'api-version': version, **(query or {})})
-        there = headers.get('Azure-AsyncOperation') or headers.get('Location')
+        operation = headers.get('Azure-AsyncOperation') or headers.get('Location')
         # a change of a resource is answered with 200 and takes an operation, too
-        if not wait or not there or _state(answer) == 'Succeeded':
+        if not wait or not operation or _state(answer) == 'Succeeded':
             return answer
 
         def look() -> Any:
             # the resource of a PUT has its state: no other request is needed for the operation
-            found = self.call('GET', path, what) if method == 'PUT' else True
-            if found is not True and _state(found) not in ('Succeeded', 'Failed', 'Canceled'):
+            resource = self.call('GET', path, what) if method == 'PUT' else True
+            state = _state(resource)
+            if resource is not True and state not in ('Succeeded', 'Failed', 'Canceled'):
                 return None
-            return found if _state(found) == 'Succeeded' or self._over(there, what) else None
+            return resource if state == 'Succeeded' or self._over(operation, what) else None
 
         # a group takes longer than what is in it
         first = 0.3 if '/providers/' in path else 1.5
@@ -135,9 +136,9 @@ class Account(RestAccount):
             try:
                 answer = requests.get(url, params=query, timeout=5.0 if self.hasty else 30.0)
                 answer.raise_for_status()
-                found = answer.json()
-                yield from found['Items']
-                url, query = found.get('NextPageLink') or '', {}
+                page = answer.json()
+                yield from page['Items']
+                url, query = page.get('NextPageLink') or '', {}
             except (requests.RequestException, ValueError, KeyError, TypeError) as error:
                 raise ProviderError(f'{what} failed: {error}') from error
 
@@ -149,9 +150,9 @@ class Account(RestAccount):
         with unless_gone():
             self.call('DELETE', path, what, wait=wait, query=query)
 
-    def _over(self, there: str, what: str) -> bool:
+    def _over(self, operation: str, what: str) -> bool:
         """Return whether an operation has succeeded; raise its error."""
-        status, _, answer = self._below('GET', there, what)
+        status, _, answer = self._below('GET', operation, what)
         state = str((answer or {}).get('status', '')).lower()
         if state in ('failed', 'canceled'):
             raise refusal(400, answer, what)

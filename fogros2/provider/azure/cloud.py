@@ -79,9 +79,9 @@ class Azure(prices.AzurePrices, images.AzureImages):
         self._account.credential()
 
     def whoami(self, region: str) -> str:
-        found = self._account.having(None, hasty=True).call(
+        answer = self._account.having(None, hasty=True).call(
             'GET', self._account.path(), 'asking Azure for the subscription')
-        return f'subscription {found["displayName"]}, {region}'
+        return f'subscription {answer["displayName"]}, {region}'
 
     def default_region(self) -> str:
         """Return the region that the user's environment names for the az command."""
@@ -102,15 +102,15 @@ class Azure(prices.AzurePrices, images.AzureImages):
 
     def find(self, region: str, tags: Mapping[str, str]) -> list[Vm]:
         """Return the machines with all of ``tags``; a second request for their states."""
-        found = [entry for entry in self._all(region) if tags.items() <= entry['tags'].items()]
-        if not found:
+        entries = [entry for entry in self._all(region) if tags.items() <= entry['tags'].items()]
+        if not entries:
             return []
         states = {str(entry['id']).lower(): entry['properties'].get('instanceView', {}).get(
                       'statuses') or () for entry in self._account.pages(
                           self._account.path(rest=_VMS), 'looking for the states of machines',
                           statusOnly='true')}
         return [machines.vm_of(entry, states.get(str(entry['id']).lower(), ()))
-                for entry in found]
+                for entry in entries]
 
     def get(self, region: str, vm: str) -> Optional[Vm]:
         # what insert has just seen is reported once
@@ -119,15 +119,15 @@ class Azure(prices.AzurePrices, images.AzureImages):
             entry = entry or self._entry(vm)
         if not entry:
             raise MachineNotFound(f'there is no {vm} in {region} any more')
-        found = machines.vm_of(entry)
-        if found.state is MachineState.DELETED:
+        machine = machines.vm_of(entry)
+        if machine.state is MachineState.DELETED:
             raise MachineNotFound(f'{vm} in {region} is being deleted')
-        return found
+        return machine
 
     def _entry(self, vm: str) -> Mapping[str, Any]:
-        found: Mapping[str, Any] = self._account.call(
+        entry: Mapping[str, Any] = self._account.call(
             'GET', self._vm(vm), f'looking for {vm}', query={'$expand': 'instanceView'})
-        return found
+        return entry
 
     def _vm(self, vm: str, rest: str = '') -> str:
         return self._account.path(vm, f'{_VMS}/{vm}{rest}')
@@ -136,35 +136,35 @@ class Azure(prices.AzurePrices, images.AzureImages):
         """Return image, disk and network of each size that the region has."""
         options: Options = order.options
         with ThreadPoolExecutor(3, 'fog-azure') as pool:
-            asked = pool.submit(self.sizes, region)
+            listing = pool.submit(self.sizes, region)
             guarded = pool.submit(ending.may_assign, self._account)
             subnet = pool.submit(self._subnet, options.resource_group, region)
             baked = pool.submit(images.baked, self._account, region, options,
                                 order.request.dependencies)
-            sizes = {name: asked.result()[name] for name in types if name in asked.result()}
+            sizes = {name: listing.result()[name] for name in types if name in listing.result()}
             if not sizes:
                 raise ConfigurationError(
                     f'Azure has no {" or ".join(types)} in {region} for this subscription',
                     'ros2 fog price --region shows what it has')
-            found = {}
+            prepared = {}
             for name, entry in sizes.items():
                 kind, version = prices.machine_type(entry), prices.generation(entry)
                 made = baked.result().get((kind.arch, version), '')
-                found[name] = Prepared(
+                prepared[name] = Prepared(
                     machines.image_of(options.image or made, kind.arch, version),
                     kind.gpu.startswith('NVIDIA'),
                     prices.capabilities(entry).get('PremiumIO') == 'True',
                     subnet.result(), guarded.result())
-            return found
+            return prepared
 
     def _subnet(self, group: str, region: str) -> str:
         """Return a subnet of the user's own group in a region, '' if there is none."""
-        found: list[Mapping[str, Any]] = []
+        networks: list[Mapping[str, Any]] = []
         with unless_gone():  # pull request 109 creates the group
-            found += self._account.pages(
+            networks += self._account.pages(
                 self._account.path(group, f'{_NET}/virtualNetworks'),
                 f'looking for a network in {group}') if group else ()
-        return next((str(subnet['id']) for network in found if prices.is_in(network, region)
+        return next((str(subnet['id']) for network in networks if prices.is_in(network, region)
                      for subnet in network['properties'].get('subnets') or ()
                      if not subnet['properties'].get('delegations')), '')
 
@@ -195,27 +195,27 @@ class Azure(prices.AzurePrices, images.AzureImages):
         return name
 
     def _insert(
-        self, name: str, place: Place, order: Order, known: Prepared, tags: Mapping[str, str],
+        self, name: str, place: Place, order: Order, prepared: Prepared, tags: Mapping[str, str],
     ) -> None:
         common = {'location': place.region, 'tags': dict(order.tags)}
 
         def put(kind: str, properties: Mapping[str, Any], **more: Any) -> Mapping[str, Any]:
-            found: Mapping[str, Any] = self._account.call(
+            resource: Mapping[str, Any] = self._account.call(
                 'PUT', self._account.path(name, f'{_NET}/{kind}/{name}'),
                 f"making the {kind} of '{order.spec.name}'",
                 {**common, **more, 'properties': properties}, wait=True)
-            return found
+            return resource
 
         with ThreadPoolExecutor(3, 'fog-azure') as pool:
             firewall = pool.submit(put, 'networkSecurityGroups', machines.firewall(order))
             address = pool.submit(put, 'publicIPAddresses', {
                 'publicIPAllocationMethod': 'Static', 'publicIPAddressVersion': 'IPv4'},
                 sku={'name': 'Standard'})
-            network = None if known.subnet else pool.submit(put, 'virtualNetworks', {
+            network = None if prepared.subnet else pool.submit(put, 'virtualNetworks', {
                 'addressSpace': {'addressPrefixes': ['10.0.0.0/28']},
                 'subnets': [{'name': 'machine', 'properties': {
                     'addressPrefix': '10.0.0.0/28', 'defaultOutboundAccess': False}}]})
-            subnet = known.subnet if network is None else str(
+            subnet = prepared.subnet if network is None else str(
                 network.result()['properties']['subnets'][0]['id'])
             public = address.result()
             self._account.admitted[order.attempt] = ipv4(order.sources)
@@ -225,16 +225,16 @@ class Azure(prices.AzurePrices, images.AzureImages):
                     'primary': True, 'privateIPAllocationMethod': 'Dynamic',
                     'subnet': {'id': subnet}, 'publicIPAddress': {'id': public['id']}}}]})
         tags = {**tags, machines.TAG_ADDRESS: str(public['properties']['ipAddress'])}
-        if known.subnet:
+        if prepared.subnet:
             private = nic['properties']['ipConfigurations'][0]['properties']['privateIPAddress']
             # machines of one network reach each other; its name is long
             tags[machines.TAG_PRIVATE] = f'{private} {"/".join(subnet.split("/")[4:9:2])}'
         what = f"creating '{order.spec.name}' ({place.kind})"
         self._account.call('PUT', self._vm(name), what,
-                           machines.request(place, order, known, str(nic['id']), tags))
+                           machines.request(place, order, prepared, str(nic['id']), tags))
         entry = self._account.seen[name] = self._allocated(name, what)
-        self._guard(name, place.region, order, known, entry)
-        if known.nvidia:
+        self._guard(name, place.region, order, prepared, entry)
+        if prepared.nvidia:
             self._install_driver(name, place.region)
 
     def _allocated(self, name: str, what: str) -> Mapping[str, Any]:
@@ -252,11 +252,11 @@ class Azure(prices.AzurePrices, images.AzureImages):
                           longest=4.0, what=what)
 
     def _guard(
-        self, name: str, region: str, order: Order, known: Prepared, entry: Mapping[str, Any],
+        self, name: str, region: str, order: Order, prepared: Prepared, entry: Mapping[str, Any],
     ) -> None:
         """Let the machine end its own billing, or let Azure do it at a time of day."""
         principal = str(entry.get('identity', {}).get('principalId', ''))
-        if known.guarded and principal and ending.assign(self._account, name, principal):
+        if prepared.guarded and principal and ending.assign(self._account, name, principal):
             return
         end = float(order.tags.get(TAG_EXPIRES, 0)) or time.time() + order.spec.lifetime
         first = ending.schedule(self._account, name, region, end)
@@ -287,8 +287,8 @@ class Azure(prices.AzurePrices, images.AzureImages):
         return [group for group in self._account.pages(
                     self._account.path(rest='resourceGroups'), 'looking for groups of machines',
                     **{'$filter': query})
-                if (found := (group.get('tags') or {}).get(TAG_ATTEMPT, ''))
-                and attempt in ('', found) and str(group['name']).startswith(own_name(found))]
+                if (tag := (group.get('tags') or {}).get(TAG_ATTEMPT, ''))
+                and attempt in ('', tag) and str(group['name']).startswith(own_name(tag))]
 
     def _drop(
         self, attempt: str, names: Iterable[str] = (), *, wait: bool = False,
@@ -332,9 +332,9 @@ class Azure(prices.AzurePrices, images.AzureImages):
         return [group['tags'] for group in self._empty(region)]
 
     def _empty(self, region: str) -> list[Mapping[str, Any]]:
-        there = {str(entry['id']).split('/')[4].lower() for entry in self._all('')}
+        groups = {str(entry['id']).split('/')[4].lower() for entry in self._all('')}
         return [group for group in self._groups() if prices.is_in(group, region)
-                and str(group['name']).lower() not in there]
+                and str(group['name']).lower() not in groups]
 
     def sweep(self, region: str, attempt: str) -> None:
         """Delete the groups of an attempt that have no machine."""

@@ -66,11 +66,11 @@ try:
         'http://169.254.169.254/metadata/scheduledevents?api-version=2020-07-01',
         headers={'Metadata': 'true'})
     with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(call, timeout=3) as a:
-        found = [e for e in json.load(a)['Events'] if e['EventType'] in ('Preempt', 'Terminate')]
+        events = [e for e in json.load(a)['Events'] if e['EventType'] in ('Preempt', 'Terminate')]
 except (OSError, ValueError, KeyError):
     sys.exit(1)
-print(found and found[0]['EventType'] + ' ' + found[0].get('NotBefore', ''))
-sys.exit(not found)
+print(events and events[0]['EventType'] + ' ' + events[0].get('NotBefore', ''))
+sys.exit(not events)
 """
 #: Its success is the notice of a spot machine's eviction, and its output has the time.
 NOTICE = ('python3', '-ISc', _NOTICE)

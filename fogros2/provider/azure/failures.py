@@ -73,17 +73,17 @@ def refusal(status: int, body: Any, what: str) -> FogError:
     :param body: the answer's JSON, with the error of ARM or of a long-running operation.
     """
     error = body.get('error', body) if isinstance(body, Mapping) else {}
-    code, said = str(error.get('code', '')), one_line(error.get('message', ''))
+    code, message = str(error.get('code', '')), one_line(error.get('message', ''))
     for part in error.get('details') or ():
         # the outer code of a failed operation says only that it failed
         if part.get('code') in _FAILURES and code not in _FAILURES:
-            code, said = part['code'], one_line(part.get('message', ''))
-    if code == 'OperationNotAllowed' and 'quota' in said.lower():
+            code, message = part['code'], one_line(part.get('message', ''))
+    if code == 'OperationNotAllowed' and 'quota' in message.lower():
         code = 'QuotaExceeded'
     if AzureError.known(code).denied and code != 'RequestDisallowedByPolicy':
-        action = re.search(r"perform action '([\w./]+)'", said)
+        action = re.search(r"perform action '([\w./]+)'", message)
         missing = action[1] if action else 'this'
         return AzureError(f'{what} failed: these credentials have no role that allows {missing}',
                           'doc/azure.md has the roles that FogROS2 needs', code=code)
     code = code or ('NotFound' if status == 404 else '')
-    return AzureError.of(code, said or f'Azure answered with status {status}', what, status)
+    return AzureError.of(code, message or f'Azure answered with status {status}', what, status)

@@ -82,8 +82,8 @@ def _groups(account: Account, region: str, query: str) -> list[Mapping[str, Any]
 
 def _state(account: Account, group: str) -> str:
     with unless_gone():
-        found = account.call('GET', _version(account, group), f'looking for the image {group}')
-        return _STATES.get(found['properties']['provisioningState'], 'pending')
+        version = account.call('GET', _version(account, group), f'looking for the image {group}')
+        return _STATES.get(version['properties']['provisioningState'], 'pending')
     return 'failed'
 
 
@@ -91,9 +91,9 @@ def baked(
     account: Account, region: str, options: Options, dependencies: str,
 ) -> dict[tuple[str, str], str]:
     """Return the newest images with the same dependencies, by architecture and generation."""
-    found: dict[tuple[str, str], str] = {}
+    versions: dict[tuple[str, str], str] = {}
     if options.image or not dependencies:
-        return found
+        return versions
     groups = _groups(account, region,
                      f"tagName eq '{TAG_DEPENDENCIES}' and tagValue eq '{dependencies}'")
     for group in sorted(groups, key=lambda one: str(one['tags'].get(TAG_MADE, ''))):
@@ -101,8 +101,8 @@ def baked(
         if group['tags'].get(TAG_DEPENDENCIES) == dependencies \
                 and group['tags'].get(TAG_USER, options.user) == options.user \
                 and _state(account, str(group['name'])) == 'available':
-            found[arch, generation] = _version(account, str(group['name']))
-    return found
+            versions[arch, generation] = _version(account, str(group['name']))
+    return versions
 
 
 class AzureImages(VmCloud):

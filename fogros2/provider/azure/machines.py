@@ -80,7 +80,7 @@ def firewall(order: Order) -> dict[str, Any]:
 
 
 def request(
-    place: Place, order: Order, known: Prepared, nic: str, tags: Mapping[str, str],
+    place: Place, order: Order, prepared: Prepared, nic: str, tags: Mapping[str, str],
 ) -> dict[str, Any]:
     """
     Return the body that creates a machine.
@@ -93,13 +93,13 @@ def request(
         'maxPrice': -1 if options.max_price is None else float(options.max_price)}}
     return {
         'location': place.region, 'tags': {**tags, TAG_DISK: str(disk)},
-        **({'identity': {'type': 'SystemAssigned'}} if known.guarded else {}),
+        **({'identity': {'type': 'SystemAssigned'}} if prepared.guarded else {}),
         'properties': {
             'hardwareProfile': {'vmSize': place.kind},
-            'storageProfile': {'imageReference': dict(known.image), 'osDisk': {
+            'storageProfile': {'imageReference': dict(prepared.image), 'osDisk': {
                 'createOption': 'FromImage', 'deleteOption': 'Delete', 'diskSizeGB': disk,
                 'managedDisk': {'storageAccountType':
-                                'Premium_LRS' if known.premium else 'StandardSSD_LRS'}}},
+                                'Premium_LRS' if prepared.premium else 'StandardSSD_LRS'}}},
             'osProfile': {
                 'computerName': order.spec.name, 'adminUsername': options.user,
                 'customData': base64.b64encode(order.user_data).decode(),

@@ -244,13 +244,13 @@ class ContainerProvider(Provider):
         self, engine: Engine, name: str, request: CreateRequest, error: ProviderError,
     ) -> str:
         """Return the container that an earlier attempt with this token created, or raise."""
-        found = engine.inspect([container_machine.container_name(name, request.tags)])
-        if not found:
+        reports = engine.inspect([container_machine.container_name(name, request.tags)])
+        if not reports:
             raise error
-        if container_machine.labels_of(found[0]).get(container_machine.ATTEMPT) != request.token:
+        if container_machine.labels_of(reports[0]).get(container_machine.ATTEMPT) != request.token:
             raise NameTaken(f"there is a container machine '{name}' already",
                             f'ros2 fog delete {name}') from error
-        return str(found[0]['Id'])
+        return str(reports[0]['Id'])
 
     def _create_from_root(
         self, engine: Engine, spec: MachineSpec, request: CreateRequest, options: Options,
@@ -317,17 +317,17 @@ class ContainerProvider(Provider):
 
     def describe(self, machine_id: str) -> Machine:
         """Return the state of a container, from the engine."""
-        engine, identity, found = _inspected(machine_id)
-        state = container_machine.state_of(found)
+        engine, identity, report = _inspected(machine_id)
+        state = container_machine.state_of(report)
         if state is MachineState.STOPPED:
-            self._check_exit(engine, found)
+            self._check_exit(engine, report)
         key = None
         if state is MachineState.RUNNING:
             # The first boot creates the key in 20 ms; another call of the engine takes longer.
             with contextlib.suppress(DeadlineExceeded):
-                key = wait_until(lambda: self._host_key(engine, found), timeout=0.15,
+                key = wait_until(lambda: self._host_key(engine, report), timeout=0.15,
                                  interval=0.004, longest=0.02, what='the host key')
-        return container_machine.machine_of(engine, found, key)
+        return container_machine.machine_of(engine, report, key)
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
         """Yield the containers of both engines that have all of ``tags`` as labels."""
@@ -380,16 +380,16 @@ class ContainerProvider(Provider):
 
     def stop(self, machine_id: str) -> None:
         """Stop a container that was created with ``on_exit='stop'``; its disk stays."""
-        engine, identity, found = _inspected(machine_id)
-        if container_machine.ENDS_STOPPED not in container_machine.labels_of(found):
+        engine, identity, report = _inspected(machine_id)
+        if container_machine.ENDS_STOPPED not in container_machine.labels_of(report):
             raise Unsupported('a container made to be deleted at its end can not be stopped',
                               "create it with on_exit='stop'")
         engine.call('stop', '-t', '3', identity, what=f'stopping container {identity}')
 
     def start(self, machine_id: str) -> None:
         """Start a stopped container again."""
-        engine, identity, found = _inspected(machine_id)
-        token = container_machine.labels_of(found)[container_machine.ATTEMPT]
+        engine, identity, report = _inspected(machine_id)
+        token = container_machine.labels_of(report)[container_machine.ATTEMPT]
         _start(engine, identity, token, kept=True, what=f'starting container {identity}')
 
     def dialled_at(
@@ -467,10 +467,10 @@ def _inspected(machine_id: str) -> tuple[Engine, str, dict[str, Any]]:
     :raises MachineNotFound: there is no such container.
     """
     engine, identity, _ = container_machine.parse_id(machine_id)
-    found = engine.inspect([identity])
-    if not found:
+    reports = engine.inspect([identity])
+    if not reports:
         raise MachineNotFound(f'container {identity} does not exist any more')
-    return engine, identity, found[0]
+    return engine, identity, reports[0]
 
 
 def _start(engine: Engine, identity: str, token: str, *, kept: bool, what: str) -> None:
@@ -521,8 +521,8 @@ def read_plain(path: Path) -> str:
 
 
 def _after(log: str, mark: str) -> str:
-    found = [line[len(mark):] for line in log.splitlines() if line.startswith(mark)]
-    return found[-1] if found else ''
+    lines = [line[len(mark):] for line in log.splitlines() if line.startswith(mark)]
+    return lines[-1] if lines else ''
 
 
 def filter_name(top: Path) -> str:

@@ -70,14 +70,14 @@ def release() -> Release:
     :raises PrerequisiteError: apt has no sources of the release, or there is no apt.
     """
     try:
-        known = platform.freedesktop_os_release()
+        fields = platform.freedesktop_os_release()
         targets = process.run(Command(
             ('apt-get', 'indextargets', '--format',
              '$(ORIGIN) $(RELEASE) $(COMPONENT) $(REPO_URI)', 'Created-By: Packages')),
             timeout=30.0, check=False).stdout
     except (OSError, PrerequisiteError):
-        known, targets = {}, ''
-    return parse_release(known.get('ID', ''), known.get('VERSION_CODENAME', ''), targets)
+        fields, targets = {}, ''
+    return parse_release(fields.get('ID', ''), fields.get('VERSION_CODENAME', ''), targets)
 
 
 def parse_release(system: str, codename: str, targets: str) -> Release:
@@ -174,8 +174,8 @@ def root(
                    what='another launch to make the root')
         if target.is_dir():
             return target
-        for left in folder.glob('new-*'):  # of a launch that was killed
-            remove(left)
+        for leftover in folder.glob('new-*'):  # of a launch that was killed
+            remove(leftover)
         aside = Path(tempfile.mkdtemp(dir=folder, prefix='new-'))
         with contextlib.ExitStack() as undo:
             undo.callback(remove, aside)

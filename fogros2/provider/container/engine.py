@@ -80,11 +80,11 @@ class Engine:
     def inspect(self, names: Sequence[str]) -> list[dict[str, Any]]:
         """Return the engine's reports of containers; omit containers that do not exist."""
         result = self.call('container', 'inspect', *names, what='look at containers', check=False)
-        found = json.loads(result.stdout) if result.stdout.strip() else []
+        reports = json.loads(result.stdout) if result.stdout.strip() else []
         if result.returncode != 0 and not gone(result.stderr):
             raise ProviderError(f'{self.name} failed: {last_line(result.stderr)}',
                                 sudo_hint(result.stderr))
-        return [dict(entry) for entry in found or ()]
+        return [dict(entry) for entry in reports or ()]
 
 
 def gone(text: str) -> bool:
@@ -112,9 +112,9 @@ def architecture(engine: Engine, image: str) -> str:
 
     :returns: '' for an image that is not on this computer yet, and for other architectures.
     """
-    found = engine.call('image', 'inspect', '--format', '{{.Architecture}}', image,
-                        what='looking at the image', check=False)
-    return {'amd64': 'x86_64', 'arm64': 'aarch64'}.get(found.stdout.strip(), '')
+    result = engine.call('image', 'inspect', '--format', '{{.Architecture}}', image,
+                         what='looking at the image', check=False)
+    return {'amd64': 'x86_64', 'arm64': 'aarch64'}.get(result.stdout.strip(), '')
 
 
 def check_architecture(engine: Engine, image: str) -> None:
@@ -191,13 +191,13 @@ def candidates(engine: Engine) -> Iterator[Engine]:
     Yield ways to call an engine: the one that worked before, the one for the control groups, and
     then other ones, because some computers do not show their control groups.
     """
-    found = [_WORKED.get(engine.name, engine), engine]
+    engines = [_WORKED.get(engine.name, engine), engine]
     if engine.name == 'podman':
         for runtime in ((), ('--runtime', 'crun'), ('--runtime', 'runc')):
             if not runtime or process.which(runtime[1]):
-                found += [dataclasses.replace(engine, flags=(*runtime, *manager))
-                          for manager in ((), ('--cgroup-manager', 'cgroupfs'))]
-    return iter(dict.fromkeys(found))
+                engines += [dataclasses.replace(engine, flags=(*runtime, *manager))
+                            for manager in ((), ('--cgroup-manager', 'cgroupfs'))]
+    return iter(dict.fromkeys(engines))
 
 
 def remember(engine: Engine) -> None:

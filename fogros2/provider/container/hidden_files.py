@@ -61,7 +61,7 @@ def search(top: str, local: str = LOCAL) -> tuple[list[str], dict[str, int]]:
 
     :param local: the files below this folder are among the latter.
     """
-    found: list[str] = []
+    paths: list[str] = []
     changed: dict[str, int] = {}
     todo, device = [top], os.stat(top).st_dev
     while todo:
@@ -72,7 +72,7 @@ def search(top: str, local: str = LOCAL) -> tuple[list[str], dict[str, int]]:
                 continue  # another file system, which the machine does not show
             changed[folder] = status.st_ctime_ns
             if not status.st_mode & 0o001:
-                found.append(folder)
+                paths.append(folder)
                 continue
             entries = list(os.scandir(folder))
         except FileNotFoundError:
@@ -86,10 +86,10 @@ def search(top: str, local: str = LOCAL) -> tuple[list[str], dict[str, int]]:
                 except FileNotFoundError:
                     continue
                 if not status.st_mode & 0o005 and status.st_size:
-                    found.append(entry.path)
+                    paths.append(entry.path)
                 if folder.startswith(local):
                     changed[entry.path] = status.st_ctime_ns
-    return found, changed
+    return paths, changed
 
 
 def unchanged(changed: dict[str, int]) -> bool:
@@ -112,9 +112,9 @@ def read(path: str) -> dict[str, tuple[list[str], dict[str, int]]]:
         for part in parts:
             kind, rest = part[0], part[1:]
             if kind == 'f':
-                found, changed = results[rest] = [], {}
+                paths, changed = results[rest] = [], {}
             elif kind == 'h':
-                found.append(rest)
+                paths.append(rest)
             else:
                 at, _, name = rest.partition(' ')
                 changed[name] = int(at)
@@ -145,10 +145,10 @@ def main(top: str, cache: str = CACHE) -> None:
     if fresh:
         parts = []
         for folder in folders:
-            found, changed = results[folder]
+            paths, changed = results[folder]
             # a change that was a moment ago may hide another one
             if max(changed.values()) < begin - TICK:
-                parts += [f'f{folder}', *(f'h{path}' for path in found),
+                parts += [f'f{folder}', *(f'h{path}' for path in paths),
                           *(f'c{at} {path}' for path, at in changed.items())]
         os.makedirs(os.path.dirname(cache), 0o700, exist_ok=True)
         write(cache, os.fsencode('\0'.join([*parts, 'end'])))

@@ -169,15 +169,15 @@ def check_network(engine: Engine, options: Options) -> None:
 
 def network_subnets(output: str) -> list[ipaddress.IPv4Network]:
     """Return the IPv4 subnets in the report of podman or docker about a network."""
-    found = []
+    subnets = []
     for network in json.loads(output):
         parts = [*(network.get('subnets') or ()), *(
             (network.get('IPAM') or {}).get('Config') or ())]
         for part in parts:
             text = str(part.get('subnet') or part.get('Subnet') or '')
             if '.' in text:
-                found.append(ipaddress.IPv4Network(text, strict=False))
-    return found
+                subnets.append(ipaddress.IPv4Network(text, strict=False))
+    return subnets
 
 
 def common_flags(

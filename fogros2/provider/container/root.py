@@ -123,14 +123,14 @@ def system_mounts(base: str = '') -> tuple[str, ...]:
 
     :param base: folder with a system; '' for this computer's.
     """
-    found = [f'/{name}' for name in SYSTEM if _is_folder(Path(f'{base}/{name}'))]
+    mounts = [f'/{name}' for name in SYSTEM if _is_folder(Path(f'{base}/{name}'))]
     if base:
-        found.append('/var/lib')  # it has no data of this computer's services
+        mounts.append('/var/lib')  # it has no data of this computer's services
     else:
-        found += [PACKAGES] if os.path.isdir(PACKAGES) else []
+        mounts += [PACKAGES] if os.path.isdir(PACKAGES) else []
         # An overlay does not show other file systems that are mounted in it.
-        found += [point for point in mount_points() if point.startswith('/usr/')]
-    return (*found, *(path[len(base):] for path in many_settings(f'{base}/etc')))
+        mounts += [point for point in mount_points() if point.startswith('/usr/')]
+    return (*mounts, *(path[len(base):] for path in many_settings(f'{base}/etc')))
 
 
 def _is_folder(path: Path) -> bool:
@@ -140,15 +140,15 @@ def _is_folder(path: Path) -> bool:
 @functools.lru_cache(maxsize=4)
 def allowed_settings(etc: str = '/etc') -> Mapping[str, tuple[str, ...]]:
     """Return the paths of the allow-list in ``etc``, with all paths below each."""
-    found = {}
+    allowed = {}
     for pattern in ETC:
         for path in sorted(glob.glob(f'{etc}/{pattern}')):
             below: list[str] = []
             if not os.path.islink(path):
                 for top, folders, files in os.walk(path):
                     below += [f'{top}/{name}' for name in (*folders, *files)]
-            found[path] = tuple(sorted(below))
-    return found
+            allowed[path] = tuple(sorted(below))
+    return allowed
 
 
 @functools.lru_cache(maxsize=4)
@@ -303,20 +303,20 @@ def environment_mounts(*workspaces: str | None) -> list[str]:
     A custom image would contain them: the environment of this process, its editable installs, and
     the folders in AMENT_PREFIX_PATH without ``workspaces``, which are sent.
     """
-    found = [sys.prefix, sys.base_prefix]
+    folders = [sys.prefix, sys.base_prefix]
     for prefix in {sys.prefix, sys.base_prefix}:
         for site in Path(prefix).glob('lib/python3*/site-packages'):
-            found += editable(site)
+            folders += editable(site)
     for entry in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
         if entry and os.path.isdir(entry) and not any(
                 _inside(entry, workspace) for workspace in workspaces):
-            found.append(entry)
-    return outermost(found)
+            folders.append(entry)
+    return outermost(folders)
 
 
 def editable(site: Path) -> list[str]:
     """Return the packages that ``site`` refers to in other folders (editable installs)."""
-    found: list[str] = []
+    paths: list[str] = []
     for path in site.glob('*.pth'):
         for line in path.read_text(errors='replace').splitlines():
             if line.startswith('/') and os.path.isdir(line):
@@ -324,12 +324,12 @@ def editable(site: Path) -> list[str]:
                             if (child / '__init__.py').is_file()
                             or child.suffix == '.py' and child.name != 'setup.py']
                 # One mount for each, unless the folder contains little else.
-                found += packages if len(packages) <= 8 else [line]
+                paths += packages if len(packages) <= 8 else [line]
     for path in site.glob('__editable__*_finder.py'):
         match = re.search(r'^MAPPING[^=]*= *(\{.*\})', path.read_text(), re.MULTILINE)
         if match:
-            found += [str(target) for target in ast.literal_eval(match[1]).values()]
-    return [path for path in found if os.path.exists(path)]
+            paths += [str(target) for target in ast.literal_eval(match[1]).values()]
+    return [path for path in paths if os.path.exists(path)]
 
 
 def outermost(paths: Iterable[str]) -> list[str]:

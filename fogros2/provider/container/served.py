@@ -20,19 +20,19 @@ from fogros2.model import CreateRequest, MachineSpec
 from fogros2.provider.container import ContainerProvider
 
 
-def answer(provider: ContainerProvider, call: str, given: Mapping[str, Any]) -> Any:
+def answer(provider: ContainerProvider, call: str, arguments: Mapping[str, Any]) -> Any:
     """
     Call a method of the provider with arguments that were JSON; return its result.
 
     :raises FogError: the method's error.
     """
     if call == 'create':
-        spec = MachineSpec(**given['spec'])
+        spec = MachineSpec(**arguments['spec'])
         provider.check(spec)
-        return provider.create(spec, CreateRequest(**given['request']))
+        return provider.create(spec, CreateRequest(**arguments['request']))
     if call == 'find':
-        return list(provider.find(given['tags']))
-    return getattr(provider, call)(given['id'])
+        return list(provider.find(arguments['tags']))
+    return getattr(provider, call)(arguments['id'])
 
 
 def main() -> None:
@@ -41,10 +41,10 @@ def main() -> None:
     provider.cancel = cancel = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: cancel.set())
     try:
-        said = {'result': answer(provider, ask['call'], ask['given'])}
+        reply = {'result': answer(provider, ask['call'], ask['given'])}
     except FogError as error:
-        said = {'error': type(error).__name__, 'message': error.args[0], 'hint': error.hint}
-    print(model.to_json(said))
+        reply = {'error': type(error).__name__, 'message': error.args[0], 'hint': error.hint}
+    print(model.to_json(reply))
 
 
 if __name__ == '__main__':

@@ -144,10 +144,10 @@ class Account(RestAccount):
         if method != 'GET' and not waits:
             # Google carries out a repeated request with the same id once
             query.setdefault('requestId', str(uuid.uuid4()))
-        found: dict[str, Any] = self.ask(
+        answer: dict[str, Any] = self.ask(
             method, f'{self.endpoint}projects/{path}', what, body, query=query, grace=not waits,
             timeout=WAIT_TIMEOUT if waits else 30.0).body or {}
-        return found
+        return answer
 
     def run(
         self, method: str, path: str, what: str, *, body: Any = None, **query: str,

@@ -101,19 +101,19 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
                 maxResults='500', filter=f'({kinds}) AND ({zones})' if names else f'({zones})')))
 
     def types(self, region: str) -> list[MachineType]:
-        found = {entry['name']: entry for entry in self._types(region, ())}
-        return [instances.machine_type(entry) for entry in found.values()]
+        entries = {entry['name']: entry for entry in self._types(region, ())}
+        return [instances.machine_type(entry) for entry in entries.values()]
 
     def zones(self, region: str) -> dict[str, list[str]]:
-        found: dict[str, list[str]] = {}
+        zones: dict[str, list[str]] = {}
         for entry in self._types(region, ()):
-            found.setdefault(entry['name'], []).append(entry['zone'])
-        return found
+            zones.setdefault(entry['name'], []).append(entry['zone'])
+        return zones
 
     def _priced(self, region: str, names: Sequence[str], spot: bool) -> dict[str, Decimal]:
-        known = cancellable(prices.rates, self.cancel, what="asking for Google's prices",
+        rates = cancellable(prices.rates, self.cancel, what="asking for Google's prices",
                             grace=lambda: 0.0)
-        costs = {entry['name']: prices.price(known, region, entry, self._gpus, spot)
+        costs = {entry['name']: prices.price(rates, region, entry, self._gpus, spot)
                  for entry in self._types(region, names)}
         return {name: cost for name, cost in costs.items() if cost is not None}
 
@@ -148,16 +148,16 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
 
     def get(self, region: str, vm: str) -> Optional[Vm]:
         project = vm.partition('/')[0]
-        found: Mapping[str, Any] = {}
+        entry: Mapping[str, Any] = {}
         with unless_gone():
-            found = self._account.call('GET', _path(vm), f'looking for {vm}')
-        if not found:
+            entry = self._account.call('GET', _path(vm), f'looking for {vm}')
+        if not entry:
             raise MachineNotFound(f'there is no {vm} any more')
-        self._account.labels[vm] = found['labelFingerprint'], found.get('labels', {})
-        known = instances.vm_of(project, found)
-        if known.state is MachineState.DELETED:
+        self._account.labels[vm] = entry['labelFingerprint'], entry.get('labels', {})
+        machine = instances.vm_of(project, entry)
+        if machine.state is MachineState.DELETED:
             raise MachineNotFound(f'{vm} has ended')
-        return known
+        return machine
 
     def prepare(self, region: str, order: Order, types: Sequence[str]) -> dict[str, Any]:
         """Return the zones and the image of each type."""
@@ -173,13 +173,13 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
             raise ConfigurationError(
                 f'{options.zone or region} has no machine type {" or ".join(types)}',
                 'gcloud compute machine-types list shows what it has')
-        found: dict[Any, tuple[str, int]] = {}
+        chosen_images: dict[Any, tuple[str, int]] = {}
         for entry in chosen.values():
             key = entry['arch'], entry['gpus']
-            if key not in found:
-                found[key] = images.choose(
+            if key not in chosen_images:
+                chosen_images[key] = images.choose(
                     self._account, options, *key, order.request.dependencies)
-            entry['path'], entry['size'] = found[key]
+            entry['path'], entry['size'] = chosen_images[key]
         return {kind: chosen[kind] for kind in types if kind in chosen}
 
     def places(self, region: str, order: Order) -> Iterator[str]:
@@ -207,10 +207,10 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
         name = order.options.network
         if name == 'default':
             return ''
-        found = self._account.call(
+        network = self._account.call(
             'GET', f'{self._account.project}/global/networks/{name}',
             f"looking for the network '{name}'")
-        return next((str(url) for url in found.get('subnetworks', ())
+        return next((str(url) for url in network.get('subnetworks', ())
                      if f'/regions/{place.region}/' in url), '')
 
     def end_command(self, machine: VmId, tags: Mapping[str, str]) -> tuple[str, ...]:
@@ -224,10 +224,10 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
         self._drop_rules(machine.vm.partition('/')[0], machine.attempt)
 
     def end_attempt(self, region: str, attempt: str) -> bool:
-        found = self._instances({TAG_ATTEMPT: attempt})
-        for vm in found:
+        vms = self._instances({TAG_ATTEMPT: attempt})
+        for vm in vms:
             self._account.remove(_path(vm.id), f'deleting {vm.id}')
-        return bool(found)
+        return bool(vms)
 
     def sweep(self, region: str, attempt: str) -> None:
         """Delete an instance that ended itself, and the firewall rules."""
@@ -260,13 +260,13 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
     def set_ending(self, machine: VmId, spec: MachineSpec) -> None:
         """Change when Google ends an instance, which it takes for stopped instances only."""
         path, what = _path(machine.vm), f'writing how {machine.vm} ends'
-        found = wait_until(
+        instance = wait_until(
             lambda: state if (state := self._account.call('GET', path, what))['status']
             not in ('PENDING_STOP', 'STOPPING') else None,
             timeout=END_TIMEOUT, interval=1.0, longest=5.0, what=f'{machine.vm} to be stopped')
-        words = {key: value for key, value in found['scheduling'].items()
+        words = {key: value for key, value in instance['scheduling'].items()
                  if key not in ('maxRunDuration', 'instanceTerminationAction')}
-        if found['status'] == 'TERMINATED':
+        if instance['status'] == 'TERMINATED':
             # stopped, with the action of a machine that is deleted, would mean that it has ended
             words.update(instances.limit(spec, spot=False, action='STOP'))
             self._account.run('POST', f'{path}/setScheduling', what, body=words)

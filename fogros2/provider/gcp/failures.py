@@ -57,17 +57,18 @@ def refused(status: int, answer: Any, what: str) -> FogError:
     try:
         error = answer['error']
         details: Mapping[str, Any] = (error.get('errors') or [{}])[0]
-        said = str(error.get('message') or '')
+        message = str(error.get('message') or '')
         code = re.sub('([a-z])([A-Z])', r'\1_\2', str(details.get('reason') or '')).upper()
     except (TypeError, KeyError, AttributeError, IndexError):
         return not_the_cloud('Google', what, status)
     if status == 401:
         code = 'AUTH_ERROR'
-    elif status == 404 and re.search(r"resource 'projects/[^/']+'", said):
+    elif status == 404 and re.search(r"resource 'projects/[^/']+'", message):
         code = 'PROJECT_NOT_FOUND'
     elif status in (404, 429):
         code = 'NOT_FOUND' if status == 404 else 'RATE_LIMIT_EXCEEDED'
-    return GoogleError.of(code or str(error.get('status') or status), one_line(said), what, status)
+    return GoogleError.of(
+        code or str(error.get('status') or status), one_line(message), what, status)
 
 
 def failed(operation: Mapping[str, Any], what: str) -> FogError:

@@ -43,10 +43,10 @@ def rule(
         'sourceRanges': list(sources), **action}
 
 
-def tags_of(found: Mapping[str, Any]) -> dict[str, str]:
+def tags_of(body: Mapping[str, Any]) -> dict[str, str]:
     """Return the tags in the description of a rule; {} if it is not ours."""
     try:
-        return untrusted.parsed(found['description'], dict[str, str])  # type: ignore[no-any-return]
+        return untrusted.parsed(body['description'], dict[str, str])  # type: ignore[no-any-return]
     except (untrusted.InvalidMessage, KeyError):
         return {}
 
@@ -87,16 +87,16 @@ class GoogleFirewall(VmCloud):
 
     def _drop_rules(self, project: str, attempt: str) -> None:
         base, what = f'{project}/global/firewalls', 'deleting the firewall rules'
-        names = [str(found['name']) for found in self._account.pages(
+        names = [str(entry['name']) for entry in self._account.pages(
             base, what, filter=f'name eq {own_name(attempt)}-.*')]
         with ThreadPoolExecutor(max(1, len(names)), 'fog-firewall') as pool:
             list(pool.map(lambda name: self._account.remove(f'{base}/{name}', what), names))
 
     def remains(self, region: str) -> list[dict[str, str]]:
-        tags = [tags_of(found) for found in self._account.pages(
+        tags = [tags_of(entry) for entry in self._account.pages(
             f'{self._account.project}/global/firewalls', 'looking for what is left',
             filter='name eq fogros2-.*')]
-        return [found for found in tags if region in ('', found.get('region'))]
+        return [own for own in tags if region in ('', own.get('region'))]
 
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
         """Let only ``sources`` reach a TCP port, beside the networks of ``ssh_from=``."""
@@ -107,19 +107,19 @@ class GoogleFirewall(VmCloud):
         if not ipv4(sources):
             self._account.remove(f'{base}/{name}', what)
             return
-        found: Mapping[str, Any] = {}
+        existing: Mapping[str, Any] = {}
         for one in (name, f'{own}-deny'):
             with unless_gone():
-                found = found or self._account.call('GET', f'{base}/{one}', what)
-        if not found:
+                existing = existing or self._account.call('GET', f'{base}/{one}', what)
+        if not existing:
             raise ProviderError('the machine has no firewall rules any more',
                                 'ros2 fog list shows whether it is there')
-        tags = tags_of(found)
+        tags = tags_of(existing)
         more = tags.get(TAG_SSH_FROM, '').split() if port == SSH else []
-        body = rule(machine.attempt, f'tcp-{port}', found['network'], tags,
+        body = rule(machine.attempt, f'tcp-{port}', existing['network'], tags,
                     ipv4([*sources, *more]), 'tcp', str(port))
-        if found['name'] != name:
+        if existing['name'] != name:
             self._account.create(base, what, body)
-        elif sorted(found['sourceRanges']) != body['sourceRanges']:
+        elif sorted(existing['sourceRanges']) != body['sourceRanges']:
             self._account.run('PATCH', f'{base}/{name}', what,
                               body={'name': name, 'sourceRanges': body['sourceRanges']})

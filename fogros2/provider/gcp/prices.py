@@ -58,7 +58,7 @@ _ASKING = threading.Lock()
 def _asked(key: str, endpoint: str) -> Rates:
     import requests
 
-    found: dict[tuple[str, str, str, bool], Decimal] = {}
+    table: dict[tuple[str, str, str, bool], Decimal] = {}
     query = {'key': key, 'pageSize': '5000', 'fields': _FIELDS}
     try:
         while True:
@@ -66,14 +66,14 @@ def _asked(key: str, endpoint: str) -> Rates:
             reply.raise_for_status()
             answer = reply.json()
             for sku in answer.get('skus', ()):
-                found.update(parts(sku))
+                table.update(parts(sku))
             if not answer.get('nextPageToken'):
-                return found
+                return table
             query['pageToken'] = answer['nextPageToken']
     except (requests.RequestException, ValueError, KeyError, IndexError, TypeError) as error:
         # the key is a part of the address
-        said = str(error).replace(key, '...')
-        raise ProviderError(f"Google's catalogue of prices can't be read: {said[:200]}",
+        message = str(error).replace(key, '...')
+        raise ProviderError(f"Google's catalogue of prices can't be read: {message[:200]}",
                             f'is {KEY_VARIABLE} a key for the Cloud Billing API?') from None
 
 
@@ -90,7 +90,7 @@ def parts(sku: Mapping[str, Any]) -> Rates:
 
 
 def price(
-    known: Rates, region: str, entry: Mapping[str, Any], gpus: Mapping[str, int], spot: bool,
+    table: Rates, region: str, entry: Mapping[str, Any], gpus: Mapping[str, int], spot: bool,
 ) -> Optional[Decimal]:
     """
     Return the price of a type in US dollars per hour, None if a part has none.
@@ -104,7 +104,7 @@ def price(
     wanted = [(family, 'Core', _SHARED.get(entry['name'], Decimal(entry['guestCpus']))),
               (family, 'Ram', Decimal(entry['memoryMb']) / 1024),
               *((gpu, 'GPU', Decimal(count)) for gpu, count in {**own, **gpus}.items())]
-    costs = [(known.get((region, name, part, spot)), count) for name, part, count in wanted]
+    costs = [(table.get((region, name, part, spot)), count) for name, part, count in wanted]
     if any(cost is None for cost, _ in costs):
         return None
     return sum((cost * count for cost, count in costs if cost is not None), Decimal(0)).normalize()

@@ -119,16 +119,16 @@ class KubernetesProvider(Provider):
         """Return the architecture in ``node_selector``, or of all nodes with its labels."""
         options = Options.parse(spec.options)
         api, _ = self._place(options)
-        found = {options.node_selector.get(_ARCHITECTURE, '')}
-        if found == {''}:
+        architectures = {options.node_selector.get(_ARCHITECTURE, '')}
+        if architectures == {''}:
             # Most users may not list nodes.
             with contextlib.suppress(ApiError):
                 nodes = items(api.request(
                     'GET', path('nodes'), labelSelector=selector(options.node_selector),
                     timeout=_FIRST, cancel=self.cancel))
-                found = {str((node['metadata'].get('labels') or {}).get(_ARCHITECTURE, ''))
-                         for node in nodes}
-        (arch,) = found if len(found) == 1 else ('',)
+                architectures = {str((node['metadata'].get('labels') or {}).get(_ARCHITECTURE, ''))
+                                 for node in nodes}
+        (arch,) = architectures if len(architectures) == 1 else ('',)
         return {'amd64': 'x86_64', 'arm64': 'aarch64'}.get(arch, '')
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
@@ -177,9 +177,9 @@ class KubernetesProvider(Provider):
             raise
         except ApiError as error:
             if error.reason != 'AlreadyExists':
-                told = refused(error, f"the Job of '{spec.name}'", namespace)
-                told.refused = error.status < 500
-                raise told from error
+                failure = refused(error, f"the Job of '{spec.name}'", namespace)
+                failure.refused = error.status < 500
+                raise failure from error
             existing = self._existing(api, namespace, spec, request)
             if existing is None:
                 raise NameTaken(
@@ -192,10 +192,10 @@ class KubernetesProvider(Provider):
     ) -> Optional[dict[str, Any]]:
         """Return the Job that an earlier attempt with this token created."""
         with contextlib.suppress(ApiError):
-            found = api.request('GET', path('jobs', namespace, names.job_name(spec.name)),
-                                cancel=self.cancel)
-            if names.annotation(found, names.ATTEMPT) == request.token:
-                return found
+            job = api.request('GET', path('jobs', namespace, names.job_name(spec.name)),
+                              cancel=self.cancel)
+            if names.annotation(job, names.ATTEMPT) == request.token:
+                return job
         return None
 
     def reachable(self, machine_id: str, *, name: str, timeout: float) -> Machine:
@@ -236,8 +236,8 @@ class KubernetesProvider(Provider):
         api = kubernetes_client.connect(where.context)
         job = self._job(api, where)
         pod = pods.pod_of(job, self._pods_of(api, where))
-        known = self._pods.get(machine_id)
-        if known and (pod is None or pod['metadata']['uid'] != known):
+        uid = self._pods.get(machine_id)
+        if uid and (pod is None or pod['metadata']['uid'] != uid):
             raise MachineNotFound(f"the pod of '{where.job}' is gone")
         return self._machine(api, where, job, pod)
 
@@ -252,12 +252,12 @@ class KubernetesProvider(Provider):
             labels = selector(names.wanted(tags))
             for namespace, jobs in self._jobs(api, labels):
                 wanted = [job for job in jobs if tags.items() <= names.tags_of(job).items()]
-                found = items(self._ask(api, 'pods', namespace, labels)) if wanted else ()
+                pod_list = items(self._ask(api, 'pods', namespace, labels)) if wanted else ()
                 for job in wanted:
                     where = MachineId.of(job, api.context)
                     if where.uid not in seen:
                         seen.add(where.uid)
-                        yield self._machine(api, where, job, pods.pod_of(job, found))
+                        yield self._machine(api, where, job, pods.pod_of(job, pod_list))
 
     def _jobs(self, api: Api, labels: str) -> Iterator[tuple[str, list[dict[str, Any]]]]:
         try:
@@ -279,8 +279,8 @@ class KubernetesProvider(Provider):
         """Delete the Job; return when Job, pod and Service are deleted."""
         where = MachineId.parse(machine_id)
         api = kubernetes_client.connect(where.context)
-        for known in (self._made, self._services, self._pods):
-            known.pop(machine_id, None)
+        for cache in (self._made, self._services, self._pods):
+            cache.pop(machine_id, None)
         with explained(f"deleting '{where.job}'", where.namespace):
             ending.end(api, where)
 

@@ -75,26 +75,26 @@ def _end_pods(api: Api, where: MachineId) -> None:
             'kind': 'DeleteOptions', 'apiVersion': 'v1', 'gracePeriodSeconds': grace},
             labelSelector=labels)))
 
-    found = delete(GRACE)
-    left = {str(pod['metadata']['uid']) for pod in found if not pods.has_ended(pod)}
+    pod_list = delete(GRACE)
+    uids = {str(pod['metadata']['uid']) for pod in pod_list if not pods.has_ended(pod)}
 
     def look(event: str, pod: dict[str, Any]) -> Optional[bool]:
         if event == 'DELETED' or pods.has_ended(pod):
-            left.discard(str(pod['metadata']['uid']))
-        return None if left else True
+            uids.discard(str(pod['metadata']['uid']))
+        return None if uids else True
 
     def again() -> Optional[bool]:
         now = items(api.request('GET', target, labelSelector=labels))
-        left.intersection_update(
+        uids.intersection_update(
             str(pod['metadata']['uid']) for pod in now if not pods.has_ended(pod))
-        return None if left else True
+        return None if uids else True
 
-    if left:
-        for pod in found:
+    if uids:
+        for pod in pod_list:
             _tell(api, pod)
         api.follow(target, look, again=again, timeout=GONE, labelSelector=labels,
                    what=f"the pod of '{where.job}' to end")
-    if found:
+    if pod_list:
         # Nothing runs in the pods; the node would need seconds to clean up.
         delete(0)
 

@@ -102,8 +102,8 @@ def timeout(maker: str) -> float:
 
 def ingress(service: Mapping[str, Any]) -> list[str]:
     """Return the addresses and host names of a load balancer; none before it is ready."""
-    found = ((service.get('status') or {}).get('loadBalancer') or {}).get('ingress') or ()
-    return [str(each.get('ip') or each.get('hostname')) for each in found
+    entries = ((service.get('status') or {}).get('loadBalancer') or {}).get('ingress') or ()
+    return [str(each.get('ip') or each.get('hostname')) for each in entries
             if each.get('ip') or each.get('hostname')]
 
 
@@ -114,9 +114,9 @@ def node_port(service: Mapping[str, Any]) -> int:
 
 def node_addresses(node: Mapping[str, Any]) -> list[str]:
     """Return a node's addresses, external ones first."""
-    found = (node.get('status') or {}).get('addresses') or ()
+    entries = (node.get('status') or {}).get('addresses') or ()
     order = ('ExternalIP', 'InternalIP')
-    return [str(each['address']) for kind in order for each in found if each['type'] == kind]
+    return [str(each['address']) for kind in order for each in entries if each['type'] == kind]
 
 
 def first_to_answer(
@@ -131,15 +131,15 @@ def first_to_answer(
     """
     question = word.encode() + b' ' + secrets.token_hex(8).encode()
     deadline = time.monotonic() + timeout
-    known = _resolved(places)
+    endpoints = _resolved(places)
     links: dict[socket.socket, tuple[str, int]] = {}
     try:
-        while known and time.monotonic() < deadline:
+        while endpoints and time.monotonic() < deadline:
             if cancel is not None and cancel.is_set():
                 raise Cancelled('looking for a way into the cluster')
             # Each probe has a new source port: a node forwards all datagrams of a connection as
             # the first one, which it may have received before it knew the pod.
-            for place in known:
+            for place in endpoints:
                 with contextlib.suppress(OSError):
                     link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
                     links[link] = place
@@ -147,8 +147,8 @@ def first_to_answer(
                     link.connect(place)  # receive datagrams only from this address
                     link.send(question)
             begin = time.monotonic()
-            while (left := begin + INTERVAL - time.monotonic()) > 0:
-                ready, _, _ = select.select(list(links), [], [], left)
+            while (remaining := begin + INTERVAL - time.monotonic()) > 0:
+                ready, _, _ = select.select(list(links), [], [], remaining)
                 for link in ready:
                     place = links[link]
                     with contextlib.suppress(OSError):
@@ -157,7 +157,7 @@ def first_to_answer(
                     # A node that is not ready refused the datagram.
                     del links[link]
                     link.close()
-            for link in list(links)[:-ROUNDS * len(known)]:
+            for link in list(links)[:-ROUNDS * len(endpoints)]:
                 del links[link]
                 link.close()
     finally:
@@ -168,12 +168,12 @@ def first_to_answer(
 
 def _resolved(places: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
     """Return places by address, without unknown host names."""
-    found = []
+    endpoints = []
     for host, port in places:
         with contextlib.suppress(OSError):
             address = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
-            found.append((str(address[0]), port))
-    return found
+            endpoints.append((str(address[0]), port))
+    return endpoints
 
 
 def own_address(server: str) -> str:

@@ -177,10 +177,10 @@ def build(
             process.run(dataclasses.replace(command, environment=_login()), timeout=STEP_TIMEOUT,
                         on_output=on_output)
         except CommandError as error:
-            said = error.result.stderr
+            output = error.result.stderr
             image = what.reference if command.argv[1] == 'push' else what.base
-            raise ProviderError(f'{command.what} failed: {_reason(said)}',
-                                _hint(said, image, program, command.argv[1])) from error
+            raise ProviderError(f'{command.what} failed: {_reason(output)}',
+                                _hint(output, image, program, command.argv[1])) from error
     return what.reference
 
 
@@ -190,14 +190,14 @@ def _login() -> dict[str, str]:
             if os.environ.get(name)}
 
 
-def _reason(said: str) -> str:
+def _reason(output: str) -> str:
     """Return the last error of a program's output; earlier ones belong to its retries."""
-    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    lines = [line.strip() for line in output.splitlines() if line.strip()]
     errors = [line for line in lines if re.match(r'error\b', line, re.I)]
     return (errors or lines or ['it says nothing'])[-1]
 
 
-def _hint(said: str, image: str, program: str, step: str) -> str:
+def _hint(output: str, image: str, program: str, step: str) -> str:
     """
     Return the remedy for a failure.
 
@@ -206,7 +206,7 @@ def _hint(said: str, image: str, program: str, step: str) -> str:
     """
     registry = image.partition('/')[0] if re.match(r'[^/]*[.:][^/]*/|localhost/', image) \
         else 'docker.io'
-    text = _reason(said).lower()
+    text = _reason(output).lower()
     pushes = step == 'push'
     if re.search(r'unauthorized|denied|authentication required|no basic auth|forbidden', text) \
             and 'permission denied' not in text:

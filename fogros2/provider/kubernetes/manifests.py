@@ -84,25 +84,25 @@ def pod_spec(spec: MachineSpec, request: CreateRequest, options: Options) -> dic
             {'name': 'vpn', 'containerPort': request.vpn_port, 'protocol': 'UDP'}]
     if resources := _resources(options):
         container['resources'] = {'limits': resources, 'requests': resources}
-    found: dict[str, Any] = {
+    manifest: dict[str, Any] = {
         'restartPolicy': 'Never', 'automountServiceAccountToken': False,
         'enableServiceLinks': False, 'hostname': names.job_name(spec.name)[len('fogros2-'):],
         'terminationGracePeriodSeconds': boot.GRACE, 'containers': [container]}
     if request.application:
-        found['containers'].append(_application(request.application, resources))
+        manifest['containers'].append(_application(request.application, resources))
     if options.node_selector:
-        found['nodeSelector'] = dict(options.node_selector)
+        manifest['nodeSelector'] = dict(options.node_selector)
     if options.tolerations:
-        found['tolerations'] = [dict(each) for each in options.tolerations]
+        manifest['tolerations'] = [dict(each) for each in options.tolerations]
     if options.runtime_class:
-        found['runtimeClassName'] = options.runtime_class
+        manifest['runtimeClassName'] = options.runtime_class
     if options.image_pull_secrets:
-        found['imagePullSecrets'] = [{'name': name} for name in options.image_pull_secrets]
+        manifest['imagePullSecrets'] = [{'name': name} for name in options.image_pull_secrets]
     if options.service_account:
-        found['serviceAccountName'] = options.service_account
+        manifest['serviceAccountName'] = options.service_account
     if options.zone:
-        found['affinity'] = _preferring(options.zone)
-    return found
+        manifest['affinity'] = _preferring(options.zone)
+    return manifest
 
 
 def _application(image: str, beside: Mapping[str, str]) -> dict[str, Any]:
@@ -113,7 +113,7 @@ def _application(image: str, beside: Mapping[str, str]) -> dict[str, Any]:
 
     :param beside: limits of the machine's container.
     """
-    found: dict[str, Any] = {
+    container: dict[str, Any] = {
         'name': names.APPLICATION, 'image': image, 'imagePullPolicy': 'IfNotPresent',
         'ports': [{'name': 'application', 'containerPort': APPLICATION_PORT}],
         'securityContext': {
@@ -123,8 +123,8 @@ def _application(image: str, beside: Mapping[str, str]) -> dict[str, Any]:
         'livenessProbe': {'tcpSocket': {'port': boot.ALIVE_PORT}, 'periodSeconds': 5}}
     limits = {kind: value for kind, value in _APPLICATION_LIMITS.items() if kind in beside}
     if limits:
-        found['resources'] = {'limits': limits, 'requests': limits}
-    return found
+        container['resources'] = {'limits': limits, 'requests': limits}
+    return container
 
 
 def image_for(options: Options, dependencies: str) -> str:
@@ -133,14 +133,14 @@ def image_for(options: Options, dependencies: str) -> str:
 
 
 def _resources(options: Options) -> dict[str, str]:
-    found = {}
+    limits = {}
     if options.mcpu:
-        found['cpu'] = f'{options.mcpu}m'
+        limits['cpu'] = f'{options.mcpu}m'
     if options.mb:
-        found['memory'] = f'{options.mb}Mi'
+        limits['memory'] = f'{options.mb}Mi'
     if options.gpus:
-        found[options.gpu_resource] = str(options.gpus)
-    return found
+        limits[options.gpu_resource] = str(options.gpus)
+    return limits
 
 
 def _preferring(zone: str) -> dict[str, Any]:
@@ -176,13 +176,13 @@ def port_service(
 
     :param kind: 'LoadBalancer' or 'NodePort'.
     """
-    found = owned_service(
+    manifest = owned_service(
         names.port_service(where, port), kind, where.job, where.uid, 'TCP', port,
         labels={**names.MANAGED, names.MACHINE: where.job}, annotations={})
-    found['spec']['externalTrafficPolicy'] = 'Local'
+    manifest['spec']['externalTrafficPolicy'] = 'Local'
     if kind == 'LoadBalancer':
-        found['spec']['loadBalancerSourceRanges'] = list(sources)
-    return found
+        manifest['spec']['loadBalancerSourceRanges'] = list(sources)
+    return manifest
 
 
 def owned_service(

@@ -96,10 +96,10 @@ def wanted(tags: Mapping[str, str]) -> dict[str, str]:
 def tags_of(job: Mapping[str, Any]) -> dict[str, str]:
     """Return the tags of a Job."""
     try:
-        found: dict[str, str] = untrusted.parsed(annotation(job, TAGS) or '{}', dict[str, str])
+        tags: dict[str, str] = untrusted.parsed(annotation(job, TAGS) or '{}', dict[str, str])
     except untrusted.InvalidMessage:
         return {}
-    return found
+    return tags
 
 
 def annotation(thing: Mapping[str, Any], name: str) -> str:

@@ -108,9 +108,9 @@ def end_of(job: Mapping[str, Any], pod: Optional[Mapping[str, Any]]) -> str:
     for each in _machine(pod):
         ended = (each.get('state') or {}).get('terminated')
         if ended:
-            said = f", {ended['message'].strip()}" if ended.get('message') else ''
+            message = f", {ended['message'].strip()}" if ended.get('message') else ''
             return f"its container ended: {ended.get('reason') or 'exit'} " \
-                   f"(exit status {ended.get('exitCode')}{said})"
+                   f"(exit status {ended.get('exitCode')}{message})"
     return 'its pod is being deleted' if pod['metadata'].get('deletionTimestamp') \
         else 'its pod has ended'
 

@@ -109,10 +109,10 @@ class Start:
         if self._pod is None:
             self._again()
         meta = (self._pod or self._job)['metadata']
-        found = items(self._api.request(
+        events = items(self._api.request(
             'GET', path('events', self._where.namespace),
             fieldSelector=f"involvedObject.uid={meta['uid']}", cancel=self._cancel))
-        self._scales_up = pods.scales_up(found)
-        told = pods.trouble_in(found)
-        if told is not None and (told.final or self._trouble is None):
-            self._note(told)
+        self._scales_up = pods.scales_up(events)
+        trouble = pods.trouble_in(events)
+        if trouble is not None and (trouble.final or self._trouble is None):
+            self._note(trouble)

@@ -46,10 +46,10 @@ def make(
         except ApiError as error:
             if error.reason != 'AlreadyExists':
                 raise
-        there = existing(api, f"{target}/{body['metadata']['name']}", cancel)
+        service = existing(api, f"{target}/{body['metadata']['name']}", cancel)
         # It belongs to an earlier attempt, or to an earlier Job with the name, with which the
         # cluster will delete it soon.
-        return there if there is not None and owned(there, uid) else None
+        return service if service is not None and owned(service, uid) else None
 
     try:
         return wait_until(attempt, timeout=TAKEN, cancel=cancel, interval=0.2,
@@ -86,14 +86,14 @@ _makers: dict[str, str] = {}
 
 def maker(api: Api, cancel: Optional[threading.Event] = None) -> str:
     """Return what makes load balancers in a cluster, see ``exposure.load_balancers``."""
-    if (known := _makers.get(api.server)) is not None:
-        return known
-    found = exposure.load_balancers(api.server)
-    if not found:
+    if (name := _makers.get(api.server)) is not None:
+        return name
+    name = exposure.load_balancers(api.server)
+    if not name:
         groups = api.request('GET', '/apis', cancel=cancel).get('groups') or ()
-        found = exposure.load_balancers(api.server, [str(each['name']) for each in groups])
-    _makers[api.server] = found
-    return found
+        name = exposure.load_balancers(api.server, [str(each['name']) for each in groups])
+    _makers[api.server] = name
+    return name
 
 
 def load_balancer(
@@ -105,7 +105,7 @@ def load_balancer(
     :raises DeadlineExceeded: it was not ready after ``timeout`` seconds.
     """
     return api.follow(
-        path('services', namespace), lambda event, found: exposure.ingress(found) or None,
+        path('services', namespace), lambda event, body: exposure.ingress(body) or None,
         timeout=timeout, cancel=cancel, what='a load balancer',
         fieldSelector=f'metadata.name={service}')
 
@@ -114,13 +114,13 @@ def node_hosts(
     api: Api, pod: Mapping[str, Any], cancel: Optional[threading.Event],
 ) -> list[str]:
     """Return the addresses of a pod's node, external ones first."""
-    found: list[str] = []
+    hosts: list[str] = []
     name = str(pod['spec'].get('nodeName') or '')
     # Most robots may not read nodes; then the address in the pod's status remains.
     with contextlib.suppress(ApiError, Unreachable):
-        found = exposure.node_addresses(api.request(
+        hosts = exposure.node_addresses(api.request(
             'GET', path('nodes', '', name), timeout=2.0, cancel=cancel))
-    return list(dict.fromkeys([*found, str(pod['status'].get('hostIP') or '')]))
+    return list(dict.fromkeys([*hosts, str(pod['status'].get('hostIP') or '')]))
 
 
 def known(job: Mapping[str, Any]) -> Optional[Exposure]:
@@ -143,14 +143,14 @@ def find(
     :param service: result of ``make``, None if it is unknown.
     :raises ProviderError: the requested exposure does not work.
     """
-    asked = names.annotation(job, names.EXPOSE)
-    if asked == 'pod_ip':
+    expose = names.annotation(job, names.EXPOSE)
+    if expose == 'pod_ip':
         return Exposure('pod_ip', str(pod['status']['podIP']), 0, 'as asked')
-    if asked == 'pod_dials_robot':
+    if expose == 'pod_dials_robot':
         return Exposure('pod_dials_robot', '', 0, 'as asked')
     search = _Search(api, where, job, pod, cancel)
     with hints.explained(f"reading the Service of '{where.job}'", where.namespace):
-        return search.run(asked, service or search.service(), timeout)
+        return search.run(expose, service or search.service(), timeout)
 
 
 class _Search:
@@ -170,34 +170,34 @@ class _Search:
         self._failed: list[str] = []
 
     def run(
-        self, asked: str, service: Optional[Mapping[str, Any]], timeout: float,
+        self, expose: str, service: Optional[Mapping[str, Any]], timeout: float,
     ) -> Exposure:
         """Return the first exposure that works."""
         deadline = time.monotonic() + timeout
         if service is not None and service['spec']['type'] == 'LoadBalancer':
             limit = min(exposure.timeout(maker(self._api, self._cancel)), timeout * 0.8)
-            if (found := self._load_balancer(limit)) is not None:
-                return found
-        if service is not None and asked in ('auto', 'node_port'):
-            left = max(1.0, min(exposure.NODE_PORT, deadline - time.monotonic()))
-            if (found := self._node_port(service, left)) is not None:
-                return found
+            if (result := self._load_balancer(limit)) is not None:
+                return result
+        if service is not None and expose in ('auto', 'node_port'):
+            remaining = max(1.0, min(exposure.NODE_PORT, deadline - time.monotonic()))
+            if (result := self._node_port(service, remaining)) is not None:
+                return result
         reason = '; '.join(self._failed)
-        if asked == 'auto':
+        if expose == 'auto':
             return Exposure('pod_dials_robot', '', 0, reason)
         raise ProviderError(
-            f"no UDP gets to the pod of '{self._where.job}' by expose='{asked}': {reason}",
+            f"no UDP gets to the pod of '{self._where.job}' by expose='{expose}': {reason}",
             "let UDP through on the way there, or take expose='pod_dials_robot'")
 
     def service(self) -> Optional[dict[str, Any]]:
         """Return the Service, None if there is none."""
-        found = existing(self._api, self._path, self._cancel)
-        if found is None:
+        service = existing(self._api, self._path, self._cancel)
+        if service is None:
             self._failed.append('the cluster allows no Service')
-        elif not owned(found, self._where.uid):
+        elif not owned(service, self._where.uid):
             self._failed.append("the Service of that name is not the machine's")
             return None
-        return found
+        return service
 
     def _load_balancer(self, timeout: float) -> Optional[Exposure]:
         begin = time.monotonic()
@@ -207,10 +207,10 @@ class _Search:
         except DeadlineExceeded:
             self._failed.append(f'no load balancer came in {timeout:.0f} s')
             return None
-        while (left := timeout - (time.monotonic() - begin)) > 0:
+        while (remaining := timeout - (time.monotonic() - begin)) > 0:
             # A host name may be unknown for minutes, so resolve it each time.
             answer = exposure.first_to_answer(
-                [(host, self._port) for host in hosts], self._word, timeout=min(5.0, left),
+                [(host, self._port) for host in hosts], self._word, timeout=min(5.0, remaining),
                 cancel=self._cancel)
             if answer is not None:
                 return Exposure('load_balancer', answer[0], self._port, f'{hosts[0]} answers')

@@ -44,8 +44,8 @@ class Account:
         """Return the answer to a question that is asked once in this process."""
         if key not in self._known:
             self._known[key] = ask()
-        found: T = self._known[key]
-        return found
+        answer: T = self._known[key]
+        return answer
 
     def admits(self, attempt: str, networks: Sequence[str]) -> bool:
         """

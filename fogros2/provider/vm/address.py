@@ -38,13 +38,13 @@ class RobotAddress:
         :raises ConfigurationError: the variable that names it has no address.
         :raises ProviderError: the service does not answer.
         """
-        told = os.environ.get(ADDRESS_VARIABLE, '')
-        if told:
-            return cidr(told)
+        configured = os.environ.get(ADDRESS_VARIABLE, '')
+        if configured:
+            return cidr(configured)
         url = os.environ.get(CHECKIP_VARIABLE, CHECKIP)
         with self._lock:
-            address, asked, when = self._known
-            if asked != url or time.monotonic() - when > ADDRESS_AGE:
+            address, last_url, when = self._known
+            if last_url != url or time.monotonic() - when > ADDRESS_AGE:
                 address = self._ask(url)
                 self._known = (address, url, time.monotonic())
             return address
@@ -60,8 +60,8 @@ class RobotAddress:
         hint = f'{ADDRESS_VARIABLE}=... names it'
         try:
             with urllib.request.urlopen(url, timeout=5.0) as answer:
-                said = answer.read(100).decode('ascii', 'replace').strip()
-            return cidr(str(ipaddress.ip_address(said)))
+                text = answer.read(100).decode('ascii', 'replace').strip()
+            return cidr(str(ipaddress.ip_address(text)))
         except OSError as error:
             own = own_ipv6()
             if own:
@@ -69,7 +69,7 @@ class RobotAddress:
             raise ProviderError(
                 f"{url} did not return this robot's public address: {error}", hint) from error
         except ValueError as error:
-            raise ProviderError(f"{url} returned '{said[:40]}', not an address", hint) from error
+            raise ProviderError(f"{url} returned '{text[:40]}', not an address", hint) from error
 
 
 def own_ipv6() -> str:

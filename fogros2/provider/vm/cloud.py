@@ -399,7 +399,7 @@ class VmCloud(abc.ABC):
         :param now: seconds since the epoch; a new attempt may still get its machine.
         :param dead: attempts that get none, because their launches have died.
         """
-        left: dict[str, str] = {}
+        names: dict[str, str] = {}
         # one entry for each attempt, which may have a firewall and a key
         for attempt, tags in {tags.get(TAG_ATTEMPT, ''): tags
                               for tags in self.remains(region)}.items():
@@ -412,10 +412,10 @@ class VmCloud(abc.ABC):
                     "%s: '%s' has the damaged tag %s=%.40r, and stays: %s", self.title,
                     tags.get(TAG_NAME, '?'), TAG_MADE, tags[TAG_MADE], own_name(attempt))
             elif attempt in dead or now - (made or 0.0) > SETTLED:
-                left[attempt] = tags.get(TAG_NAME, '?')
-        for attempt in self.attempts(region) if left else ():
-            left.pop(attempt, None)
-        return left
+                names[attempt] = tags.get(TAG_NAME, '?')
+        for attempt in self.attempts(region) if names else ():
+            names.pop(attempt, None)
+        return names
 
     def sweep(self, region: str, attempt: str) -> None:
         """Delete what an attempt created besides its machine."""

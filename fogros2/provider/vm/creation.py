@@ -94,14 +94,14 @@ class Creation:
         tags = own_tags(self.spec, self.request, options)
         with ThreadPoolExecutor(4, 'fog-vm') as pool:
             # all look-ups come before the first creation, at the same time
-            there = pool.submit(self._existing, region, tags[TAG_ATTEMPT])
+            lookup = pool.submit(self._existing, region, tags[TAG_ATTEMPT])
             sources = pool.submit(lambda: list(options.ssh_from) or self.sources())
             data = pool.submit(self._user_data, region, options, tags)
             order = Order(self.spec, self.request, options, tags, b'', ())
             prepared = pool.submit(self.cloud.prepare, region, order, options.types)
-            found = there.result()
-            if found is not None:
-                return found
+            existing = lookup.result()
+            if existing is not None:
+                return existing
             ready = prepared.result()
             order = dataclasses.replace(
                 order, sources=sources.result(), user_data=data.result())
@@ -109,11 +109,11 @@ class Creation:
 
     def _existing(self, region: str, attempt: str) -> Optional[VmId]:
         """Return the machine that an earlier call with this token created, or None."""
-        found = [*self.cloud.find(region, {TAG_NAME: self.spec.name})]
-        for vm in found:
+        vms = [*self.cloud.find(region, {TAG_NAME: self.spec.name})]
+        for vm in vms:
             if vm.tags[TAG_ATTEMPT] == attempt:
                 return VmId(region, vm.id, attempt)
-        for vm in found:
+        for vm in vms:
             owner = vm.tags.get(TAG_ROBOT, '')
             whose = f" of the robot '{owner}'" if owner else ''
             raise NameTaken(

@@ -46,11 +46,11 @@ class CodedError(CloudError):
     def __init__(
         self, message: str, hint: str = '', *, code: str = '', status: int = 400,
     ) -> None:
-        known = self.known(code)
-        super().__init__(message, hint, full=known.full, gone=known.gone, denied=known.denied)
+        entry = self.known(code)
+        super().__init__(message, hint, full=entry.full, gone=entry.gone, denied=entry.denied)
         self.code = code
-        fault = status >= 500 and not self.full and not known.temporary
-        self.temporary = fault or status == 429 or known.temporary
+        fault = status >= 500 and not self.full and not entry.temporary
+        self.temporary = fault or status == 429 or entry.temporary
         # after a fault of the cloud, the request may have had its effect
         self.refused = not fault
         self.pause: Optional[float] = None
@@ -61,21 +61,21 @@ class CodedError(CloudError):
         return cls.FAILURES.get(code, Failure())
 
     @classmethod
-    def of(cls, code: str, said: str, what: str, status: int = 400) -> FogError:
+    def of(cls, code: str, words: str, what: str, status: int = 400) -> FogError:
         """
         Return the error for a code.
 
-        :param said: the cloud's own words, in one line.
+        :param words: the cloud's message, in one line.
         :param what: see :meth:`~fogros2.provider.vm.account.Account.repeated`.
         """
-        known = cls.known(code)
-        reason = known.reason or said or code or f'{cls.TITLE} gave no reason'
+        entry = cls.known(code)
+        reason = entry.reason or words or code or f'{cls.TITLE} gave no reason'
         message = f'{what} failed: {reason}' + f' [{code}]' * bool(code and code not in reason)
-        if known.kind is ProviderError:
-            return cls(message, known.hint, code=code, status=status)
-        found = known.kind(message, known.hint)
-        found.refused = status < 500
-        return found
+        if entry.kind is ProviderError:
+            return cls(message, entry.hint, code=code, status=status)
+        error = entry.kind(message, entry.hint)
+        error.refused = status < 500
+        return error
 
 
 @contextlib.contextmanager
@@ -119,6 +119,6 @@ def one_line(text: object) -> str:
 
 def not_the_cloud(title: str, what: str, status: object = '') -> FogError:
     """Return the error for an answer that only another server can have given."""
-    known = f' (HTTP {status})' if status else ''
-    return PrerequisiteError(f'{what} failed: what answered is not {title}{known}',
+    detail = f' (HTTP {status})' if status else ''
+    return PrerequisiteError(f'{what} failed: what answered is not {title}{detail}',
                              'is there a proxy, or a page to log in to this network?')

@@ -28,7 +28,7 @@ class LabelRules:
         """Return tags as labels."""
         labels: dict[str, str] = {}
         for key, value in tags.items():
-            coded = re.sub(f'[^{self.plain}]', lambda found: f'_{ord(found[0]):x}_', value)
+            coded = re.sub(f'[^{self.plain}]', lambda match: f'_{ord(match[0]):x}_', value)
             parts = [coded[start:start + self.longest]
                      for start in range(0, len(coded), self.longest)] or ['']
             labels.update((f'{key}_{index}' if index else key, part)
@@ -47,5 +47,5 @@ class LabelRules:
                 index += 1
             # no other number is a character's
             tags[key] = re.sub('_([0-9a-f]{1,5}|10[0-9a-f]{4})_',
-                               lambda found: chr(int(found[1], 16)), coded)
+                               lambda match: chr(int(match[1], 16)), coded)
         return tags

@@ -87,8 +87,8 @@ class Market:
         key = f'spot-{region}'
         if named is not None and self._fresh(key) is None:
             key += '-' + hashlib.sha256(' '.join(named).encode()).hexdigest()[:12]
-        found = self._kept(key, lambda: self._source.spot_prices(region, named))
-        return {name: zones for name, zones in found.items() if names is None or name in names}
+        prices = self._kept(key, lambda: self._source.spot_prices(region, named))
+        return {name: zones for name, zones in prices.items() if names is None or name in names}
 
     def price_of(self, region: str, name: str, *, spot: bool = False) -> Decimal:
         """
@@ -106,7 +106,7 @@ class Market:
 
     # -- choosing -------------------------------------------------------------------------
 
-    def offers(self, region: str, asked: Wants, *, spot_too: bool = False) -> list[Offer]:
+    def offers(self, region: str, wanted: Wants, *, spot_too: bool = False) -> list[Offer]:
         """
         Return the types of one region that meet the requirements, the cheapest first.
 
@@ -117,16 +117,16 @@ class Market:
             asking = (pool.submit(self.zones, region), pool.submit(self.types, region),
                       pool.submit(self.prices, region))
             zones, types, prices = (asking[0].result(), asking[1].result(), asking[2].result())
-        kinds = [kind for kind in types if fits(kind, asked) and kind.name in zones]
+        kinds = [kind for kind in types if fits(kind, wanted) and kind.name in zones]
         if not kinds:
             return []
-        spot = self.spot(region, [kind.name for kind in kinds]) if asked.spot or spot_too else {}
+        spot = self.spot(region, [kind.name for kind in kinds]) if wanted.spot or spot_too else {}
         return ranked([
             Offer(region, kind, prices.get(kind.name),
                   cheapest_zone(spot.get(kind.name, {}), zones[kind.name]),
-                  tuple(zones[kind.name])) for kind in kinds], asked.spot)
+                  tuple(zones[kind.name])) for kind in kinds], wanted.spot)
 
-    def choose(self, regions: Sequence[str], asked: Wants, *, spot_too: bool = False) -> Offers:
+    def choose(self, regions: Sequence[str], wanted: Wants, *, spot_too: bool = False) -> Offers:
         """
         Return the types of several regions that meet the requirements, the cheapest first.
 
@@ -135,12 +135,12 @@ class Market:
         :raises ConfigurationError: nothing fits, or everything costs more than ``max_price``.
         :raises FogError: no region could be asked.
         """
-        found: list[Offer] = []
+        offers: list[Offer] = []
         failed: list[tuple[str, FogError]] = []
 
         def ask(region: str) -> Union[list[Offer], FogError]:
             try:
-                return self.offers(region, asked, spot_too=spot_too)
+                return self.offers(region, wanted, spot_too=spot_too)
             except FogError as error:
                 return error
 
@@ -149,27 +149,27 @@ class Market:
                 if isinstance(answer, FogError):
                     failed.append((region, answer))
                 else:
-                    found += answer
+                    offers += answer
         if failed and len(failed) == len(regions):
             raise failed[0][1]
         where = regions[0] if len(regions) == 1 else f'{len(regions)} regions'
-        if not found:
+        if not offers:
             gpus = {kind.gpu for region in regions
                     for kind in self._fresh(f'types-{region}') or ()}
             raise ConfigurationError(
-                f'no {self._source.title} type in {where} has {asked}',
-                f"GPUs there: {', '.join(sorted(filter(None, gpus))) or 'none'}" if asked.gpu else
+                f'no {self._source.title} type in {where} has {wanted}',
+                f"GPUs there: {', '.join(sorted(filter(None, gpus))) or 'none'}" if wanted.gpu else
                 'ask for less, or in another region')
-        found = ranked(found, asked.spot)
-        cheapest = found[0]
-        if asked.max_price is not None:
-            found = [o for o in found if (o.cost(asked.spot) or Decimal(0)) <= asked.max_price]
-        if not found:
+        offers = ranked(offers, wanted.spot)
+        cheapest = offers[0]
+        if wanted.max_price is not None:
+            offers = [o for o in offers if (o.cost(wanted.spot) or Decimal(0)) <= wanted.max_price]
+        if not offers:
             raise ConfigurationError(
-                f'nothing in {where} with {asked} costs at most ${asked.max_price} an hour',
+                f'nothing in {where} with {wanted} costs at most ${wanted.max_price} an hour',
                 f'the cheapest is {cheapest.type.name} in {cheapest.region} for '
-                f'${cheapest.cost(asked.spot)}')
-        return Offers(asked, tuple(found), tuple(regions),
+                f'${cheapest.cost(wanted.spot)}')
+        return Offers(wanted, tuple(offers), tuple(regions),
                       tuple((region, str(error)) for region, error in failed))
 
     # -- cache ----------------------------------------------------------------------------
@@ -179,14 +179,14 @@ class Market:
         with self._lock:
             lock = self._locks.setdefault(key, threading.Lock())
         with lock:
-            found = self._fresh(key)
-            if found is None:
-                found = self._known[key] = ask()
+            answer = self._fresh(key)
+            if answer is None:
+                answer = self._known[key] = ask()
                 with contextlib.suppress(StoreError):  # the next launch takes longer
                     write_private(self._path(key), to_json({
                         'source': self._source.account_key(), 'time': self._clock(),
-                        'value': found}).encode())
-            return found
+                        'value': answer}).encode())
+            return answer
 
     def _fresh(self, key: str) -> Any:
         """Return an answer that is not too old, None if there is none."""

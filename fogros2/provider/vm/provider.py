@@ -154,7 +154,7 @@ class VmProvider(Provider):
                     f'{kind.name} in {region} has a disk of {kind.disk_gb} GB, and disk_size= '
                     f'asks for {options.disk_size}', 'ask for less, or name another type')
 
-    def choices(self, asked: MachineSpec, chosen: MachineSpec) -> list[str]:
+    def choices(self, spec: MachineSpec, chosen: MachineSpec) -> list[str]:
         """Describe type and region, and what is tried if there is no capacity."""
         options = self._cloud.options.parse(chosen.options)
         options = options.in_region(options.region)
@@ -222,10 +222,10 @@ class VmProvider(Provider):
 
     def describe(self, machine_id: str) -> Machine:
         machine = self._id(machine_id)
-        found = self._until().get(machine.region, machine.vm)
-        if found is None:
+        vm = self._until().get(machine.region, machine.vm)
+        if vm is None:
             return Machine(machine_id, '', self.name, MachineState.PENDING, region=machine.region)
-        return dataclasses.replace(self.machine_of(found), id=machine_id)
+        return dataclasses.replace(self.machine_of(vm), id=machine_id)
 
     def machine_of(self, vm: Vm) -> Machine:
         """Convert the cloud's report of a machine."""
@@ -266,9 +266,9 @@ class VmProvider(Provider):
                     f"'{name}' ({machine.vm}) ended while it was coming up: "
                     f'{vm.reason or f"{cloud.title} gives no reason"}',
                     f'the console of {cloud.title} has its system log')
-            found = self.machine_of(vm)
-            return dataclasses.replace(found, id=machine_id, note='; '.join(
-                cloud.notes[machine.vm])) if found.shell is not None else None
+            report = self.machine_of(vm)
+            return dataclasses.replace(report, id=machine_id, note='; '.join(
+                cloud.notes[machine.vm])) if report.shell is not None else None
 
         # a cloud needs some ten seconds: few requests, but a fast machine is noticed soon
         return wait_until(
@@ -280,8 +280,8 @@ class VmProvider(Provider):
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
         cloud = self._until()
-        for found in self._everywhere(cloud, lambda region: list(cloud.find(region, tags))):
-            yield from map(self.machine_of, found)
+        for vms in self._everywhere(cloud, lambda region: list(cloud.find(region, tags))):
+            yield from map(self.machine_of, vms)
 
     def destroy(self, machine_id: str) -> None:
         try:
@@ -292,8 +292,8 @@ class VmProvider(Provider):
 
     def stop(self, machine_id: str) -> None:
         machine = self._id(machine_id)
-        found = self._cloud.get(machine.region, machine.vm)
-        if found is not None and found.spot:
+        vm = self._cloud.get(machine.region, machine.vm)
+        if vm is not None and vm.spot:
             raise Unsupported("a spot instance can't be stopped and started again",
                               "use on_exit='delete' or 'keep', or spot=False")
         self._cloud.stop(machine)
@@ -302,8 +302,8 @@ class VmProvider(Provider):
         machine = self._id(machine_id)
 
         def stopped() -> bool:
-            found = self._cloud.get(machine.region, machine.vm)
-            return found is None or found.state is not MachineState.STOPPING
+            vm = self._cloud.get(machine.region, machine.vm)
+            return vm is None or vm.state is not MachineState.STOPPING
 
         wait_until(stopped, timeout=END_TIMEOUT, interval=1.0, longest=5.0,
                    what=f'{machine.vm} in {machine.region} to be stopped')
@@ -313,12 +313,12 @@ class VmProvider(Provider):
         attempts = {attempt_of(token) for token in dead}
 
         def ask(region: str) -> list[str]:
-            found = self._cloud.leftovers(region, time.time(), attempts)
-            for attempt in found:
+            names = self._cloud.leftovers(region, time.time(), attempts)
+            for attempt in names:
                 self._cloud.sweep(region, attempt)
             where = f' in {region}' if region else ''
-            return [f"firewall and key of '{name}'{where}" for name in found.values()]
-        return [words for found in self._everywhere(self._cloud, ask) for words in found]
+            return [f"firewall and key of '{name}'{where}" for name in names.values()]
+        return [words for notes in self._everywhere(self._cloud, ask) for words in notes]
 
     # -- its network ----------------------------------------------------------------------------
 
@@ -348,8 +348,8 @@ class VmProvider(Provider):
 
     def images(self) -> Iterable[Image]:
         cloud = self._until()
-        found = self._everywhere(cloud, lambda region: list(cloud.images(region)))
-        return [image for images in found for image in images]
+        by_region = self._everywhere(cloud, lambda region: list(cloud.images(region)))
+        return [image for images in by_region for image in images]
 
     def delete_image(self, image_id: str) -> None:
         self._cloud.delete_image(image_id)
@@ -416,12 +416,12 @@ class VmProvider(Provider):
 
         with ThreadPoolExecutor(min(PARALLEL, len(regions)), 'fog-regions') as pool:
             answers = list(pool.map(attempt, regions))
-        found = [answer for answer, error in answers if answer is not None]
+        results = [answer for answer, error in answers if answer is not None]
         for _, error in answers:
             denied = isinstance(error, CloudError) and error.denied
-            if error is not None and (named or not found or not denied):
+            if error is not None and (named or not results or not denied):
                 raise error
-        return found
+        return results
 
     def _region(self, options: VmOptions) -> str:
         """
@@ -448,10 +448,10 @@ class VmProvider(Provider):
         :raises MachineNotFound: not an id of this provider.
         """
         form = rf'{self.name}:([a-z0-9-]+)/({self._cloud.id_form})/([0-9a-f]{{16}})'
-        found = re.fullmatch(form, text)
-        if found is None:
+        match = re.fullmatch(form, text)
+        if match is None:
             raise MachineNotFound(f"'{text}' is no machine at {self._cloud.title}")
-        return VmId(*found.groups())
+        return VmId(*match.groups())
 
 
 def _dollars(text: str) -> Optional[Decimal]:

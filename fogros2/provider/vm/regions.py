@@ -127,7 +127,7 @@ class Regions:
         """
         names, connect = list(dict.fromkeys(regions)), connect_time
         times: dict[str, list[float]] = {name: [] for name in names}
-        left = threading.Semaphore(0)
+        answers = threading.Semaphore(0)
 
         def ask(region: str) -> None:
             try:
@@ -136,14 +136,14 @@ class Regions:
             except OSError:
                 pass  # earlier measurements count
             finally:
-                left.release()
+                answers.release()
 
         for name in names:
             # no pool: the interpreter's exit would wait for its threads
             threading.Thread(target=ask, args=(name,), name=f'fog-{name}', daemon=True).start()
         end = time.monotonic() + DEADLINE
         for _ in names:
-            if not left.acquire(timeout=max(0.0, end - time.monotonic())):
+            if not answers.acquire(timeout=max(0.0, end - time.monotonic())):
                 break
             if grace is not None and any(len(list(times[name])) == ATTEMPTS for name in names):
                 end = min(end, time.monotonic() + grace)
@@ -159,17 +159,17 @@ class Regions:
 
     def by_distance(self, regions: Iterable[str], here: tuple[float, float]) -> list[Region]:
         """Return known regions by their distance from a place."""
-        found = [
+        distances = [
             Region(name, self.place(name), distance_km=distance_km(here, self.table[name][:2]))
             for name in regions if name in self.table]
-        return sorted(found, key=lambda one: (one.distance_km or 0.0, one.region))
+        return sorted(distances, key=lambda one: (one.distance_km or 0.0, one.region))
 
     def neighbours(self, region: str) -> list[str]:
         """Return a few regions beside one, the nearest on the globe first."""
         if region not in self.table:
             return []
         others = [name for name in self.enabled if name != region]
-        return [found.region for found in self.by_distance(
+        return [near.region for near in self.by_distance(
             others, self.table[region][:2])][:NEIGHBOURS]
 
     def ranked(

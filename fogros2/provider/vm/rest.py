@@ -78,18 +78,18 @@ class RestAccount(Account, abc.ABC):
         except requests.RequestException as error:
             raise self.silent(error, what, isinstance(error, requests.ConnectTimeout)) from error
         try:
-            found = answer.json() if answer.content else None
+            content = answer.json() if answer.content else None
         except ValueError:
-            found = answer.text
+            content = answer.text
         if answer.status_code >= 300:
-            refused = self.refusal(answer.status_code, found, what)
+            refused = self.refusal(answer.status_code, content, what)
             pause = answer.headers.get('Retry-After', '')
             if isinstance(refused, CodedError) and pause.isdigit():
                 refused.pause = float(pause)
             raise refused
-        if found is not None and not isinstance(found, dict):
+        if content is not None and not isinstance(content, dict):
             raise not_the_cloud(self.TITLE, what, answer.status_code)
-        return Answer(answer.status_code, answer.headers, found)
+        return Answer(answer.status_code, answer.headers, content)
 
     def silent(self, error: BaseException, what: str, unsent: bool = True) -> Silent:
         """Return the error for a request without an answer; it is made again if it was sent."""
