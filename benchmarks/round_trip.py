@@ -68,8 +68,8 @@ def run_measure(environment: dict[str, str]) -> float:
     """Return the median round trip in ms, from a process with this environment."""
     said = subprocess.run(
         [sys.executable, __file__, '--measure'], check=True, capture_output=True, text=True,
-        env={**os.environ, **environment}).stdout.split()
-    return float(said[0])
+        env={**os.environ, **environment}).stdout.splitlines()
+    return float(said[-1].split()[0])  # Fast DDS warns on standard output
 
 
 def main() -> None:
