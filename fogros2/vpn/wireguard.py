@@ -114,8 +114,7 @@ class WireGuard(Vpn):
     def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """Yield the commands that set the peers, and keep the sessions of remaining ones."""
         yield Command.script(
-            '\n'.join([_configure(interface, peers), *_routes(interface, peers),
-                       _buffer(interface)]), sudo=True,
+            '\n'.join([_configure(interface, peers), *_routes(interface, peers)]), sudo=True,
             what=_what('tell', interface, 'its peers'))
 
     def health_check(self, interface: VpnInterface) -> Command:
@@ -220,8 +219,7 @@ class WireGuard(Vpn):
         confined = [_confine(interface, self.ports, self.asked)] if interface.process else []
         return [
             _filter(interface, self.ports), *confined, _link(interface),
-            _Step(_configure(interface, peers, recall=recall)), _address(interface, peers),
-            _Step(_buffer(interface))]
+            _Step(_configure(interface, peers, recall=recall)), _address(interface, peers)]
 
 
 def dds_ports(domain: int) -> tuple[int, int]:
@@ -561,19 +559,6 @@ def _address(interface: VpnInterface, peers: Sequence[Peer]) -> _Step:
     do = f'{_print(lines)} | ip -batch -'
     own = [_free(interface, interface.address)] if interface.host_routes else []
     return _Step('\n'.join([*own, do, *_routes(interface, peers)]))
-
-
-def _buffer(interface: VpnInterface) -> str:
-    """
-    Return the text that enlarges the receive buffers of a ``wireguard-go``.
-
-    It opens new sockets for each configuration. If the buffers cannot be set, the VPN works, but
-    loses more packets of large images.
-    """
-    name = _name(interface)
-    source = Path(__file__).with_name('receive_buffer.py').read_text()
-    return (f'[ ! -S /var/run/wireguard/{name}.sock ] || '
-            f'python3 -IS -c {shlex.quote(source)} {name} || :')
 
 
 def _routes(interface: VpnInterface, peers: Sequence[Peer]) -> list[str]:

@@ -13,7 +13,7 @@ from ._base import (
     perform_substitutions,
     SomeSubstitutionsType,
 )
-from .launch_context import LaunchContext
+from .launch_context import LaunchContext, NoLaunch
 
 
 class LaunchDescription(LaunchDescriptionEntity):
@@ -96,7 +96,7 @@ class LaunchDescriptionSource:
             return self.__launch_description
         try:
             return self._get_launch_description(
-                perform_substitutions(LaunchContext(), self.__location))
+                perform_substitutions(NoLaunch(), self.__location))
         except Exception as exc:
             self.__logger.debug(
                 f'Failed to load the launch file without a context: {exc}', exc_info=True)
