@@ -137,12 +137,3 @@ class LaunchContext:
     def perform_substitution(self, substitution: Any) -> str:
         text: str = substitution.perform(self)
         return text
-
-
-class NoLaunch(LaunchContext):
-    """A context outside of a launch, for descriptions: no substitution runs a command."""
-
-    def perform_substitution(self, substitution: Any) -> str:
-        if substitution._runs_command:
-            raise RuntimeError(f'{substitution.describe()} runs at launch')
-        return super().perform_substitution(substitution)

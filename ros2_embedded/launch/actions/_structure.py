@@ -13,7 +13,7 @@ from .. import _base
 from ..event_handlers import OnShutdown
 from ..events import TimerEvent
 from ..frontend.expose import expose_action
-from ..launch_context import LaunchContext, NoLaunch
+from ..launch_context import LaunchContext
 from ..launch_description import LaunchDescriptionSource
 from ..launch_description_sources import AnyLaunchDescriptionSource
 from ..utilities import ensure_argument_type, perform_substitutions
@@ -117,7 +117,7 @@ class IncludeLaunchDescription(_base.Action):
 
     def _argument_names_without_context(self) -> list[str]:
         try:
-            return self.__argument_names(NoLaunch())
+            return self.__argument_names(LaunchContext())
         except Exception as exc:  # noqa: BLE001 - A substitution may raise anything.
             self.__logger.debug(f'No names of launch arguments without a context: {exc}')
         return []
