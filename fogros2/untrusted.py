@@ -119,7 +119,7 @@ def _cleaned(value: Any, depth: int, field: str = '') -> Any:
             value[:] = [_cleaned(item, depth - 1, field) for item in value]
         else:
             return {clean(name): _cleaned(item, depth - 1, clean(name))
-                for name, item in value.items()}
+                    for name, item in value.items()}
     return value
 
 
