@@ -249,10 +249,10 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
     """
     Return the step that creates the host's filter.
 
-    No host accepts packets for its VPN address from another interface, as Linux does. On the
-    robot, the filter admits only DDS and ping from a machine, which may be hijacked. A machine of
-    a launch accepts DDS from the VPN and from itself only; guests reach its DDS, ping and door
-    (``guests``) alone.
+    No host accepts packets for its VPN address from another interface, as Linux does, nor for its
+    group, as Linux does if any process has joined the group there. On the robot, the filter admits
+    only DDS and ping from a machine, which may be hijacked. A machine of a launch accepts DDS from
+    the VPN and from itself only; guests reach its DDS, ping and door (``guests``) alone.
 
     It uses one table, so that one delete is its undo. One transaction replaces the whole table,
     so there is no moment without it. An accept in another table does not override a drop here,
@@ -270,7 +270,7 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
         if interface.firewall else '',
         '  chain input {',
         '    type filter hook input priority filter; policy accept;',
-        f'    {outside} ip daddr {interface.address} drop']
+        f'    {outside} ip daddr {{ {interface.address}, {group} }} drop']
     if interface.firewall:
         rules += [
             # an address of the LAN is known if it sends DDS from where an answer would go

@@ -91,7 +91,7 @@ def test_large_images_have_room_on_both_hosts(interface: VpnInterface) -> None:
 
 def test_machine_of_a_launch_takes_dds_from_the_vpn_only() -> None:
     text = script(*WireGuard().up(MACHINE, [TO_ROBOT]))
-    assert 'iifname != { "lo", "foga1b2c3m0" } ip daddr 198.18.7.2 drop' in text
+    assert 'iifname != { "lo", "foga1b2c3m0" } ip daddr { 198.18.7.2, 239.18.7.2 } drop' in text
     assert f'iifname != {{ "lo", "foga1b2c3m0" }} {RTPS} drop' in text
     assert 'confine' not in text
 
