@@ -10,7 +10,6 @@ import logging
 import os
 from pathlib import Path
 import socket
-import sys
 import threading
 from typing import TYPE_CHECKING
 import warnings

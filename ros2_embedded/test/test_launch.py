@@ -55,7 +55,6 @@ import launch.utilities
 from launch.utilities import perform_substitutions
 import pytest
 
-
 pytestmark = pytest.mark.usefixtures('own_log')
 
 

@@ -39,7 +39,7 @@ from rigs.stranger import stranger
 from ros2fog_cli.api.browser import Ticket
 
 ROOT = Path(__file__).resolve().parents[2]
-#: The helper's folder is opened by another account and locked; then root makes a name a user's own.
+#: Another account opens the helper's folder and locks it; then root makes a name a user's own.
 HELPER = """\
 import importlib.util, os, shutil, signal, sys, tempfile
 from pathlib import Path
