@@ -137,9 +137,9 @@ class Record:
     :param armed: when its lifetime last restarted; a launch that reuses the machine restarts it.
     :param launch: id of the launch that uses the machine, '' for none.
     :param last: id of the launch that used it last; the agent may not know that launch's end.
-    :param robot: see :func:`robot_id`; '' in older records. It differs in a copied state folder.
+    :param robot: see :func:`robot_id`. It differs in a copied state folder.
     :param asked: the provider's options as requested; in ``spec`` all open choices ('cheapest',
-        'nearest') are made. None in older records, where they are the same.
+        'nearest') are made.
     :param pid: process of that launch; ``pid_start`` (clock ticks) and ``boot`` (id of the boot)
         detect a reused process id.
     :param shell: how to reach the machine from outside the VPN.
@@ -167,7 +167,7 @@ class Record:
     pid: int = 0
     pid_start: int = 0
     boot: str = ''
-    asked: Optional[Mapping[str, Any]] = None
+    asked: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     shell: Optional[Endpoint] = None
     host_key: str = ''
     vpn: Optional[VpnInterface] = None
@@ -183,11 +183,6 @@ class Record:
     def launch_alive(self) -> bool:
         """Whether the launch that uses the machine still runs."""
         return process_alive(self.pid, self.pid_start, self.boot)
-
-    @property
-    def asked_options(self) -> Mapping[str, Any]:
-        """The provider's options as the launch file requested them."""
-        return self.spec.options if self.asked is None else self.asked
 
 
 class Store:
@@ -363,8 +358,8 @@ def robot_id(*, new: bool = True) -> str:
 
 
 def is_another_robot(noted: str) -> bool:
-    """Return whether a tag has the id of another robot; older versions noted only a name."""
-    return bool(re.fullmatch('.*-[0-9]+-[0-9a-f]{8}', noted)) and noted != robot_id(new=False)
+    """Return whether a tag has the id of another robot."""
+    return noted not in ('', robot_id(new=False))
 
 
 def _digits(folder: Path, *, new: bool) -> str:
@@ -488,12 +483,9 @@ def record_from_json(data: Mapping[str, Any]) -> Record:
     fields = {f.name for f in dataclasses.fields(MachineSpec)}
     spec: dict[str, Any] = {k: v for k, v in values['spec'].items() if k in fields}
     for key in ('underlays', 'containers', 'monitor_allow', 'apt', 'pip', 'share'):
-        spec[key] = tuple(spec.get(key, ()))
+        spec[key] = tuple(spec[key])
     values['spec'] = MachineSpec(**spec)
     for key, kind in (('shell', Endpoint), ('vpn', VpnInterface), ('robot_vpn', VpnInterface)):
         if values.get(key) is not None:
-            # older versions stored the firewall as 'guarded'
-            values[key] = kind(**{
-                'firewall' if name == 'guarded' else name: value
-                for name, value in values[key].items()})
+            values[key] = kind(**values[key])
     return Record(**values)

@@ -64,6 +64,21 @@ def port(value: int) -> int:
     raise InvalidMessage(f'{value} is no port')
 
 
+def address(text: str) -> str:
+    """
+    Return an IP address in its usual form, '' for none.
+
+    :raises InvalidMessage: it is something else, or has a zone, which may be any text.
+    """
+    import ipaddress  # the import takes longer than all other checks
+    try:
+        if '%' in text:
+            raise ValueError
+        return str(ipaddress.ip_address(text)) if text else ''
+    except ValueError:
+        raise InvalidMessage(f'{text[:80]!r} is no IP address') from None
+
+
 # -- JSON -------------------------------------------------------------------------------------
 
 # without a limit, Python 3.10 takes minutes for a number of a million digits
@@ -103,7 +118,8 @@ def _cleaned(value: Any, depth: int, field: str = '') -> Any:
         if isinstance(value, list):
             value[:] = [_cleaned(item, depth - 1, field) for item in value]
         else:
-            value.update({name: _cleaned(item, depth - 1, name) for name, item in value.items()})
+            return {clean(name): _cleaned(item, depth - 1, clean(name))
+                    for name, item in value.items()}
     return value
 
 

@@ -13,8 +13,9 @@ Discovery uses multicast. WireGuard sends a packet to the one peer that its dest
 so each host has a group of its own (``vpn.addresses``), to which the others send announcements and
 descriptions of topics. One packet is for all processes of the host. By unicast each process would
 send each of them to each process: the traffic of 100 processes would be ten times as much. Only
-the robot also listens to the common group, for its LAN. A guest announces no group: it may have
-several VPNs, and addresses of each. Processes that use the default announce none either.
+the robot also listens to the common group, for its LAN, unless it is limited to itself. A guest
+announces no group: it may have several VPNs, and addresses of each. Processes that use the default
+announce none either.
 
 Nodes use UDP only. Shared memory, which Fast DDS uses by default, carries nothing between two
 accounts, or between containers with a common network, and reports no error: the segments of one
@@ -154,8 +155,9 @@ class FastDds(DdsVendor):
                 _child(_child(discovery, name), 'sec').text = str(seconds)
         names = [one.name for one in interfaces]
         group, common = [multicast_group(names[-1])], [DISCOVERY_GROUP]
-        # the robot's nodes also hear the common group, and so find each other by it
-        heard, found_by = (group, group) if len(names) == 1 else (group + common, [])
+        # nodes that use a LAN also hear the common group, and so find each other by it. On Linux,
+        # a socket hears its groups on each interface on which any process has joined them.
+        heard, found_by = (group + common, []) if ANY in names else (group, group)
         groups = dict.fromkeys([*common, *found_by, *map(multicast_group, peers)])
         if not guest:
             # the first group is announced, see max_multicast_locators

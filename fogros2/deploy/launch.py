@@ -141,7 +141,7 @@ class Launch:
         if before is not None and before.spec.wanted is not None and (
                 model.to_json(before.spec.wanted) == model.to_json(spec.options)):
             return [dataclasses.replace(
-                spec, provider=before.provider, options=before.asked_options,
+                spec, provider=before.provider, options=before.asked,
                 wanted=spec.options)]
         return self._choices.places(spec)
 

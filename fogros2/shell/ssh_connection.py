@@ -10,7 +10,6 @@ import logging
 import os
 from pathlib import Path
 import socket
-import sys
 import threading
 from typing import TYPE_CHECKING
 import warnings
@@ -77,14 +76,6 @@ def _import() -> None:
     with _IMPORT, warnings.catch_warnings():
         # the paramiko of Ubuntu 24.04 names a cipher of which a newer cryptography warns the user
         warnings.simplefilter('ignore')
-        if 'paramiko' not in sys.modules and 'invoke' not in sys.modules:
-            # paramiko imports 'invoke' only for a keyword of ssh_config files, which OpenSSH reads
-            # for this project, and works without it. The import takes a third of its time.
-            sys.modules['invoke'] = None  # type: ignore[assignment]
-            try:
-                import paramiko
-            finally:
-                del sys.modules['invoke']
         import paramiko
     # paramiko's threads log errors that we raise; without a handler, Python would print them.
     logger = logging.getLogger(paramiko.__name__)

@@ -2,9 +2,9 @@
 """
 The plugin interface of VPNs: pure functions from interfaces and peers to commands.
 
-``addresses`` chooses the subnet of a launch. ``receive_buffer`` and ``guests`` are programs that
-the commands of ``wireguard`` run; the latter admits computers to a machine's interface. ``owner``
-tells whose an interface is. ``helped`` is the plugin: on the robot it may use the root helper.
+``addresses`` chooses the subnet of a launch. ``guests`` is a program that the commands of
+``wireguard`` run; it admits computers to a machine's interface. ``owner`` tells whose an interface
+is. ``helped`` is the plugin: on the robot it may use the root helper.
 """
 
 from __future__ import annotations

@@ -33,9 +33,7 @@ def alive(name: str) -> Optional[bool]:
     """Return whether the owner of an interface runs, None if that is not known here."""
     try:
         *marks, pid, start = (INTERFACES / name / 'ifalias').read_text().split()
-        # older versions noted the state folder between the two
-        return process_alive(int(pid), int(start)) if [*marks[:1], *marks[-1:]] == _marks() \
-            else None
+        return process_alive(int(pid), int(start)) if marks == _marks() else None
     except (OSError, ValueError):
         return None
 

@@ -114,8 +114,7 @@ class WireGuard(Vpn):
     def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """Yield the commands that set the peers, and keep the sessions of remaining ones."""
         yield Command.script(
-            '\n'.join([_configure(interface, peers), *_routes(interface, peers),
-                       _buffer(interface)]), sudo=True,
+            '\n'.join([_configure(interface, peers), *_routes(interface, peers)]), sudo=True,
             what=_what('tell', interface, 'its peers'))
 
     def health_check(self, interface: VpnInterface) -> Command:
@@ -220,8 +219,7 @@ class WireGuard(Vpn):
         confined = [_confine(interface, self.ports, self.asked)] if interface.process else []
         return [
             _filter(interface, self.ports), *confined, _link(interface),
-            _Step(_configure(interface, peers, recall=recall)), _address(interface, peers),
-            _Step(_buffer(interface))]
+            _Step(_configure(interface, peers, recall=recall)), _address(interface, peers)]
 
 
 def dds_ports(domain: int) -> tuple[int, int]:
@@ -251,10 +249,10 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
     """
     Return the step that creates the host's filter.
 
-    No host accepts packets for its VPN address from another interface, as Linux does. On the
-    robot, the filter admits only DDS and ping from a machine, which may be hijacked. A machine of
-    a launch accepts DDS from the VPN and from itself only; guests reach its DDS, ping and door
-    (``guests``) alone.
+    No host accepts packets for its VPN address from another interface, as Linux does, nor for its
+    group, as Linux does if any process has joined the group there. On the robot, the filter admits
+    only DDS and ping from a machine, which may be hijacked. A machine of a launch accepts DDS from
+    the VPN and from itself only; guests reach its DDS, ping and door (``guests``) alone.
 
     It uses one table, so that one delete is its undo. One transaction replaces the whole table,
     so there is no moment without it. An accept in another table does not override a drop here,
@@ -272,7 +270,7 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
         if interface.firewall else '',
         '  chain input {',
         '    type filter hook input priority filter; policy accept;',
-        f'    {outside} ip daddr {interface.address} drop']
+        f'    {outside} ip daddr {{ {interface.address}, {group} }} drop']
     if interface.firewall:
         rules += [
             # an address of the LAN is known if it sends DDS from where an answer would go
@@ -561,19 +559,6 @@ def _address(interface: VpnInterface, peers: Sequence[Peer]) -> _Step:
     do = f'{_print(lines)} | ip -batch -'
     own = [_free(interface, interface.address)] if interface.host_routes else []
     return _Step('\n'.join([*own, do, *_routes(interface, peers)]))
-
-
-def _buffer(interface: VpnInterface) -> str:
-    """
-    Return the text that enlarges the receive buffers of a ``wireguard-go``.
-
-    It opens new sockets for each configuration. If the buffers cannot be set, the VPN works, but
-    loses more packets of large images.
-    """
-    name = _name(interface)
-    source = Path(__file__).with_name('receive_buffer.py').read_text()
-    return (f'[ ! -S /var/run/wireguard/{name}.sock ] || '
-            f'python3 -IS -c {shlex.quote(source)} {name} || :')
 
 
 def _routes(interface: VpnInterface, peers: Sequence[Peer]) -> list[str]:

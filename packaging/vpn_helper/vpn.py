@@ -278,7 +278,7 @@ def prepare() -> None:
     status = RECORDS.lstat()
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != 0 or status.st_mode & 0o022:
         raise Refused(f"{RECORDS} isn't root's alone")
-    RECORDS.chmod(0o711)  # an older version made it with 0755
+    RECORDS.chmod(0o711)  # whatever the umask
 
 
 @contextlib.contextmanager

@@ -29,6 +29,8 @@ class Event:
 class Substitution:
     """A text that is only known when the launch runs."""
 
+    _runs_command = False
+
     def describe(self) -> str:
         return repr(self)
 

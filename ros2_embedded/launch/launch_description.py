@@ -76,6 +76,15 @@ class LaunchDescription(LaunchDescriptionEntity):
     add_action = add_entity
 
 
+class _NoLaunch(LaunchContext):
+    """A context for descriptions, in which no substitution runs a command."""
+
+    def perform_substitution(self, substitution: Any) -> str:
+        if substitution._runs_command:
+            raise RuntimeError(f'{substitution.describe()} runs at launch')
+        return super().perform_substitution(substitution)
+
+
 class LaunchDescriptionSource:
     """A launch description, or the location to load it from by the method described."""
 
@@ -96,7 +105,7 @@ class LaunchDescriptionSource:
             return self.__launch_description
         try:
             return self._get_launch_description(
-                perform_substitutions(LaunchContext(), self.__location))
+                perform_substitutions(_NoLaunch(), self.__location))
         except Exception as exc:
             self.__logger.debug(
                 f'Failed to load the launch file without a context: {exc}', exc_info=True)

@@ -26,3 +26,14 @@ def ros_of_this_computer() -> Iterator[None]:
             patch.delenv(name, raising=False)
         patch.setenv('RCUTILS_COLORIZED_OUTPUT', '0')
         yield
+
+
+@pytest.fixture
+def own_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Let launch log into the test's folder, and leave its parameter files there."""
+    import launch.logging
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
+    launch.logging.reset()
+    yield
+    launch.logging.reset()

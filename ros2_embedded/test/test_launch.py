@@ -55,13 +55,7 @@ import launch.utilities
 from launch.utilities import perform_substitutions
 import pytest
 
-
-@pytest.fixture(autouse=True)
-def _log_into(tmp_path, monkeypatch):
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-    launch.logging.reset()
-    yield
-    launch.logging.reset()
+pytestmark = pytest.mark.usefixtures('own_log')
 
 
 def run(*entities, service=None):

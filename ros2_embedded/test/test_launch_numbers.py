@@ -12,7 +12,6 @@ from launch.actions import (
     IncludeLaunchDescription,
     TimerAction,
 )
-import launch.logging
 from launch.substitutions import LaunchConfiguration
 from launch.utilities.type_utils import coerce_to_type
 from launch_ros.actions import Node, SetParameter
@@ -37,13 +36,7 @@ TYPES = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def _log_into(tmp_path, monkeypatch):
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-    monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
-    launch.logging.reset()
-    yield
-    launch.logging.reset()
+pytestmark = pytest.mark.usefixtures('own_log')
 
 
 @pytest.mark.parametrize('text, value', TYPES)

@@ -48,12 +48,7 @@ while time.monotonic() < deadline:
 '''
 
 
-@pytest.fixture(autouse=True)
-def _log_into(tmp_path, monkeypatch):
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-    launch.logging.reset()
-    yield
-    launch.logging.reset()
+pytestmark = pytest.mark.usefixtures('own_log')
 
 
 def python(code, *arguments, **kwargs):

@@ -7,7 +7,6 @@ import sys
 from launch import LaunchDescription, LaunchService
 from launch.actions import EmitEvent, OpaqueFunction, RegisterEventHandler, Shutdown, TimerAction
 from launch.event_handlers import OnProcessIO
-import launch.logging
 from launch.substitutions import TextSubstitution
 from launch_ros.actions import LifecycleNode
 from launch_ros.event_handlers import OnStateTransition
@@ -54,12 +53,7 @@ except (KeyboardInterrupt, ExternalShutdownException):
 '''
 
 
-@pytest.fixture(autouse=True)
-def _log_into(tmp_path, monkeypatch):
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-    launch.logging.reset()
-    yield
-    launch.logging.reset()
+pytestmark = pytest.mark.usefixtures('own_log')
 
 
 @pytest.fixture

@@ -70,13 +70,7 @@ PathSubstitution = launch.substitutions.PathSubstitution
 A = LaunchConfiguration('a')
 
 
-@pytest.fixture(autouse=True)
-def _log_into(tmp_path, monkeypatch):
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-    monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
-    launch.logging.reset()
-    yield
-    launch.logging.reset()
+pytestmark = pytest.mark.usefixtures('own_log')
 
 
 @pytest.fixture

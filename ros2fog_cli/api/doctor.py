@@ -51,6 +51,8 @@ class Check:
 
 #: Providers that have checks of their own, or nothing to ask.
 _LOOKED_AT = ('container', 'hosted', 'joined', 'ssh')
+#: Receive buffer in bytes that releases of wireguard-go since 2023 request: several raw images.
+WIREGUARD_BUFFER = 7 << 20
 #: Time-out of a provider's answer, in seconds.
 TIMEOUT = 8.0
 
@@ -160,12 +162,17 @@ def tun() -> Check:
 
 def wireguard() -> Check:
     """Check for WireGuard in the kernel, or as a program."""
-    if Path('/sys/module/wireguard').exists() or _succeeds('modprobe', '-nq', 'wireguard'):
+    if _kernel_wireguard():
         return Check('WireGuard', 'ok', 'in the kernel')
     if process.which('wireguard-go'):
         return Check('WireGuard', 'ok', 'wireguard-go (the kernel has no module)')
     return Check('WireGuard', 'failed', 'neither in the kernel nor as wireguard-go',
                  'sudo apt-get install wireguard-go')
+
+
+def _kernel_wireguard() -> bool:
+    """Return whether the kernel has WireGuard's module."""
+    return Path('/sys/module/wireguard').exists() or _succeeds('modprobe', '-nq', 'wireguard')
 
 
 def engine() -> Check:
@@ -264,18 +271,22 @@ def machine_defaults() -> Check:
     return Check(name, 'ok', '; '.join(shown) or f'none in {paths[0]}')
 
 
-def receive_buffer() -> Check:
-    """Check the kernel's limit of receive buffers; raw images need a large one."""
-    name = 'receive buffer'
+def receive_buffer(settings: Path = Path('/proc/sys/net/core')) -> Check:
+    """Check the kernel's settings of receive buffers; raw images need large ones."""
+    name, wanted = 'receive buffer', {'rmem_max': cyclonedds.RECEIVE_BUFFER}
+    if not _kernel_wireguard():
+        # releases of wireguard-go before 2023 request no size, and get the default
+        wanted = dict.fromkeys(('rmem_default', 'rmem_max'), WIREGUARD_BUFFER)
     try:
-        most = int(Path('/proc/sys/net/core/rmem_max').read_text())
+        sizes = {key: int((settings / key).read_text()) for key in wanted}
     except (OSError, ValueError):
-        return Check(name, 'warning', 'net.core.rmem_max can not be read here')
-    if most < cyclonedds.RECEIVE_BUFFER:
-        return Check(
-            name, 'warning', f'net.core.rmem_max is {most}: large images get lost on their way',
-            f'sudo sysctl -w net.core.rmem_max={cyclonedds.RECEIVE_BUFFER}')
-    return Check(name, 'ok', f'net.core.rmem_max is {most}')
+        return Check(name, 'warning', f"net.core.{' and '.join(wanted)} can not be read here")
+    shown = ', '.join(f'net.core.{key} is {size}' for key, size in sizes.items())
+    small = [f'net.core.{key}={wanted[key]}' for key in wanted if sizes[key] < wanted[key]]
+    if small:
+        return Check(name, 'warning', f'{shown}: large images get lost on their way',
+                     f"sudo sysctl -w {' '.join(small)}")
+    return Check(name, 'ok', shown)
 
 
 def udp_port() -> Check:

@@ -156,8 +156,8 @@ def _sure(record: Record) -> bool:
     """
     Return whether a record tells if the machine's launch lives.
 
-    A record of an older version, or in a copied state folder, may be another computer's: then
-    the machine's agent has to be asked.
+    A record in a copied state folder may be another computer's: then the machine's agent has to
+    be asked.
     """
     return record.robot == robot_id(new=False)
 

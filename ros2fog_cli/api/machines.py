@@ -23,7 +23,7 @@ from fogros2.errors import (
 )
 from fogros2.model import Machine, MachineState
 from fogros2.provider import Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
-from fogros2.store import Record, robot_id, robot_name, Store
+from fogros2.store import Record, robot_id, Store
 from ros2fog_cli.api.interrupts import interruptible
 
 Warn = Callable[[str], None]
@@ -82,13 +82,13 @@ class Entry:
     @property
     def robot(self) -> str:
         """The robot that created the machine, '' if unknown."""
-        noted = '' if self.record is None else self.record.robot or robot_name()
+        noted = '' if self.record is None else self.record.robot
         return self.known.tags.get(TAG_ROBOT, noted)
 
     @property
     def own(self) -> bool:
-        """Whether the machine belongs to this robot; older versions used its name in tags."""
-        return self.robot in ('', robot_name(), robot_id(new=False))
+        """Whether the machine belongs to this robot."""
+        return self.robot in ('', robot_id(new=False))
 
     @property
     def created(self) -> Optional[float]:

@@ -1160,40 +1160,6 @@ def test_restarted_agent_keeps_watchdog_and_journal(rig, free_udp_port):
 
 
 @pytest.fixture
-def first_agent(tmp_path: Path) -> Path:
-    """Return the agent of commit 326363e, which still runs on a machine that it kept."""
-    done = subprocess.run(['git', 'show', '326363e:fogros2/agent.py'], capture_output=True,
-                          cwd=Path(__file__).parents[2])
-    if done.returncode != 0:
-        pytest.skip('needs the history of the repository')
-    path = tmp_path / 'first-agent.py'
-    path.write_bytes(done.stdout)
-    return path
-
-
-def test_agent_of_the_first_commit_serves_a_new_robot(rig, first_agent, free_udp_port):
-    rig.program = first_agent
-    agent = rig.serve(on_exit='keep')
-    client = rig.client()
-    assert client.request('configure', launch='next', force='abc123')['machine'] == 'planner'
-    client.request('launch')
-    client.request('configure', environment={
-        'LATE': 'yes', 'ROS_LOG_DIR': str(rig.folder),
-        **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ}})
-    client.request('start', nodes=[rig.node('n', 'import os\nprint(os.environ["LATE"])\n')])
-    assert rig.wait('exited', node='n')['returncode'] == 0
-    assert rig.text('n') == 'yes\n'
-    status = client.status()
-    assert (status['launch'], status['nodes'][0]['state']) == ('next', 'exited')
-    assert 'signed' not in client.request('configure', heartbeat={
-        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1', 'key': KEY})
-    with contextlib.closing(Heartbeat('127.0.0.1', free_udp_port, 'next')) as heartbeat:
-        wait_until(lambda: heartbeat.round_trip is not None, timeout=10, what='an answer')
-    client.request('release', exit=True)
-    assert rig.ended(agent) == 0 and not rig.directory.exists()
-
-
-@pytest.fixture
 def login(root: None) -> Iterator[Path]:
     """Give a folder that the user nobody can reach, and skip where we can't become that user."""
     if os.geteuid() != 0:

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from fogros2 import events
+from fogros2 import ContainerInstance, events
 from fogros2.errors import Cancelled
 from fogros2.report import step
 from fogros2.store import Store
@@ -195,6 +195,12 @@ def package(tmp_path, monkeypatch):
     before = os.environ.get('AMENT_PREFIX_PATH')
     monkeypatch.setenv('AMENT_PREFIX_PATH', f'{prefix}:{before}' if before else str(prefix))
     return prefix
+
+
+@pytest.fixture
+def planner():
+    """Return a machine without a workspace."""
+    return ContainerInstance(name='planner', ros_workspace='')
 
 
 @pytest.fixture

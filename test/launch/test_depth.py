@@ -22,16 +22,7 @@ from launch_ros.actions import Node, PushROSNamespace, SetParameter
 import pytest
 
 from fogros2 import CloudGroup, CloudNode, ContainerInstance, FogROSLaunchDescription
-
-
-def ends(machine, node):
-    """Have each node exit as soon as it started, so that the launch ends."""
-    machine.say('exited', node, returncode=0, respawns=False)
-
-
-@pytest.fixture
-def planner():
-    return ContainerInstance(name='planner', ros_workspace='')
+from rigs.launching import ends
 
 
 def cloud_node(planner, **kwargs):

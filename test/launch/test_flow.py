@@ -34,19 +34,11 @@ from fogros2.errors import (
     VpnError,
 )
 from fogros2.runtime import remote_run, session
-
-
-@pytest.fixture
-def planner():
-    return ContainerInstance(name='planner', ros_workspace='')
+from rigs.launching import ends
 
 
 def talker(machine, **kwargs):
     return CloudNode(machine=machine, package='demo', executable='talker', **kwargs)
-
-
-def ends(machine, node):
-    machine.say('exited', node, returncode=0, respawns=False)
 
 
 def robot(fake, *cmd, **kwargs):

@@ -26,9 +26,9 @@ from fogros2 import (
 )
 from fogros2.describe import keywords, values
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport.nodes import H264
 from fogros2.runtime.coordinator import Coordinator
 from fogros2.testing.plugins import instead
+from rigs.launching import ends, Harmless
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
@@ -37,18 +37,6 @@ if TYPE_CHECKING:
 
 CLASSES = {'aws': AWSCloudInstance, 'container': ContainerInstance, 'joined': JoinedMachine,
            'kubernetes': KubeInstance, 'ssh': SSHInstance}
-
-
-class Harmless(H264):
-    """H.264's decisions, carried out by a program that only sleeps."""
-
-    def encoder(self, stream):
-        return dataclasses.replace(
-            super().encoder(stream), package='demo', executable='talker')
-
-    def decoder(self, stream):
-        return dataclasses.replace(
-            super().decoder(stream), package='demo', executable='talker')
 
 
 class Other(Harmless):
@@ -375,10 +363,7 @@ def test_nodes_groups_and_streams_run_on_the_machine(
         text, run, fake, monkeypatch):
     instead(monkeypatch, 'fogros2.image_transport', {'h264': Harmless, 'other': Other})
 
-    def on_start(machine, node):
-        machine.say('exited', node, returncode=0, respawns=False)
-
-    fake.on_start = on_start
+    fake.on_start = ends
     assert run(load(text)) == 0
     there = {spec.name.rpartition('-')[0] or spec.name: spec
              for spec in fake.machines['planner'].all}

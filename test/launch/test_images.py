@@ -11,15 +11,7 @@ import pytest
 from fogros2 import CloudNode, ContainerInstance, FogMachine, FogROSLaunchDescription
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
-
-
-def ends(machine, node):
-    machine.say('exited', node, returncode=0, respawns=False)
-
-
-@pytest.fixture
-def planner():
-    return ContainerInstance(name='planner', ros_workspace='')
+from rigs.launching import ends
 
 
 def test_executable_of_an_image_is_not_checked_on_the_robot(run, fake, planner):

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from decimal import Decimal
 import functools
 import re
@@ -35,9 +34,9 @@ from fogros2 import (
     StreamTopic,
 )
 from fogros2.errors import AgentError, ProviderError
-from fogros2.image_transport.nodes import H264
 from fogros2.runtime import session
 from fogros2.testing.plugins import instead
+from rigs.launching import Harmless
 
 REASON = 'spot instance, at 12:00'
 #: Says where it runs, and ends when told to.
@@ -369,16 +368,6 @@ def test_a_shutdown_does_not_wait_for_the_news(run, fake, planner, talker, watch
 
 
 # -- streams --------------------------------------------------------------------------------------
-
-class Harmless(H264):
-    """H.264's decisions, carried out by a program that only sleeps."""
-
-    def encoder(self, stream):
-        return dataclasses.replace(super().encoder(stream), package='demo', executable='talker')
-
-    def decoder(self, stream):
-        return dataclasses.replace(super().decoder(stream), package='demo', executable='talker')
-
 
 @pytest.fixture
 def harmless(monkeypatch):

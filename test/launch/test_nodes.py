@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from argparse import Namespace
 from concurrent.futures import ThreadPoolExecutor
-import dataclasses
 import io
 
 from launch import LaunchContext, LaunchDescription
@@ -41,20 +40,11 @@ from fogros2.actions.launch_description import has_machine
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport.nodes import H264
 from fogros2.testing.plugins import instead
+from rigs.launching import ends, Harmless
 from ros2fog_cli.option.machine import MachineOption
 
 KINDS = [Node, LifecycleNode, ComposableNodeContainer]
-
-
-class Harmless(H264):
-    """H.264's decisions, carried out by a program that only sleeps."""
-
-    def encoder(self, stream):
-        return dataclasses.replace(super().encoder(stream), package='demo', executable='talker')
-
-    decoder = encoder
 
 
 @pytest.fixture
@@ -62,19 +52,10 @@ def streams(monkeypatch):
     instead(monkeypatch, 'fogros2.image_transport', {'h264': Harmless})
 
 
-@pytest.fixture
-def planner():
-    return ContainerInstance(name='planner', ros_workspace='')
-
-
 def node(cls=Node, **kwargs):
     if cls is not Node:
         kwargs = {'name': 'arm', 'namespace': '', **kwargs}
     return cls(package='demo', executable='talker', **kwargs)
-
-
-def ends(machine, node):
-    machine.say('exited', node, returncode=0, respawns=False)
 
 
 def started(fake):

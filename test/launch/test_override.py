@@ -33,8 +33,8 @@ from fogros2 import (
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides, parse
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport.nodes import H264
 from fogros2.testing.plugins import instead
+from rigs.launching import ends, Harmless
 from ros2fog_cli.option.machine import MachineOption
 from ros2fog_cli.verb import overrides as complete
 
@@ -60,10 +60,6 @@ def elsewhere(description, *texts):
     option.prestart(args)
     (found,) = option.prelaunch(description, args)
     return found
-
-
-def ends(machine, node):
-    machine.say('exited', node, returncode=0, respawns=False)
 
 
 # -- what is made instead ------------------------------------------------------------------------
@@ -232,20 +228,14 @@ def test_one_machine_here_and_another_in_the_cloud(run, fake, capfd, program):
     assert said.count('here: ') == 1 and '<CycloneDDS/>' in said
 
 
-class Harmless(H264):
-    """H.264's decisions, carried out by a program that only speaks."""
-
-    def encoder(self, stream):
-        return dataclasses.replace(super().encoder(stream), package='demo', executable='talker')
-
+class Once(Harmless):
     def decoder(self, stream):
-        return dataclasses.replace(
-            super().decoder(stream), package='demo', executable='talker', respawn=False)
+        return dataclasses.replace(super().decoder(stream), respawn=False)
 
 
 def test_streams_between_machines_end_or_begin_here(run, fake, monkeypatch):
     """The robot publishes what the machine that is none would have, and hears what it would."""
-    instead(monkeypatch, 'fogros2.image_transport', {'h264': Harmless})
+    instead(monkeypatch, 'fogros2.image_transport', {'h264': Once})
     started = set()
 
     def on_start(event, context):

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import itertools
 import json
@@ -35,10 +34,10 @@ from fogros2 import (
 )
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
-from fogros2.image_transport.nodes import H264
 from fogros2.model import NodeSpec
 from fogros2.runtime import replicas
 from fogros2.testing.plugins import instead
+from rigs.launching import Harmless
 
 pytestmark = pytest.mark.timeout(60)
 NAMES = ('one', 'two', 'three')
@@ -160,18 +159,6 @@ def test_lost_machine_does_not_end_the_launch(run, fake, caplog):
     assert run(FogROSLaunchDescription([
         Replicated(machines('one', 'two'), [talker()], services=['/plan'])])) == 0
     assert "the machine 'one' is gone: taken away; the other replicas go on" in caplog.text
-
-
-class Harmless(H264):
-    """H.264's decisions, carried out by a program that only sleeps."""
-
-    def encoder(self, stream):
-        return dataclasses.replace(
-            super().encoder(stream), package='demo', executable='talker')
-
-    def decoder(self, stream):
-        return dataclasses.replace(
-            super().decoder(stream), package='demo', executable='talker')
 
 
 def test_streamed_input_is_not_forwarded_again(run, fake, first, monkeypatch):

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import importlib.util
 import re
@@ -41,32 +40,15 @@ from fogros2 import (
 )
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
-from fogros2.image_transport.nodes import H264
 from fogros2.testing.plugins import instead
+from rigs.launching import Harmless
 
 BACK = StreamTopic('/seen', 'h264', 'to_robot', bitrate=500_000)
-
-
-class Harmless(H264):
-    """H.264's decisions, carried out by a program that only sleeps."""
-
-    def encoder(self, stream):
-        return dataclasses.replace(
-            super().encoder(stream), package='demo', executable='talker')
-
-    def decoder(self, stream):
-        return dataclasses.replace(
-            super().decoder(stream), package='demo', executable='talker')
 
 
 @pytest.fixture(autouse=True)
 def transports(monkeypatch):
     instead(monkeypatch, 'fogros2.image_transport', {'h264': Harmless, 'raw': Harmless})
-
-
-@pytest.fixture
-def planner():
-    return ContainerInstance(name='planner', ros_workspace='')
 
 
 @pytest.fixture

@@ -18,10 +18,11 @@ from fogros2.provider.container import ContainerProvider
 from fogros2.provider.container import machine as container_machine
 from fogros2.shell.ssh import SSHShell
 from fogros2.waiting import wait_until
+from rigs.networks import network
 
 #: Of TEST-NET-2: nobody's, and no route leads out of an internal network. Several, as two runs of
 #: the tests may meet on one computer.
-SUBNETS = [f'198.51.100.{host}' for host in range(0, 256, 32)]
+SUBNETS = [f'198.51.100.{host}/27' for host in range(0, 256, 32)]
 
 
 @pytest.fixture(scope='session')
@@ -35,18 +36,10 @@ def engine(tun: None) -> str:
 @pytest.fixture(scope='session')
 def cloud_network(engine: str) -> Iterator[str]:
     """Return a container network without a way out, for the time of the tests."""
-    name = f'fogt{uuid.uuid4().hex[:8]}'
-    for subnet in SUBNETS:
-        # machines get the lower half in turn; tests take addresses for others from the upper one
-        made = run(Command((engine, 'network', 'create', '--internal', '--subnet', f'{subnet}/27',
-                            '--ip-range', f'{subnet}/28', name), sudo=True),
-                   timeout=60, check=False)
-        if made.returncode == 0:
-            break
-    else:
-        pytest.fail(f'no subnet for the tests is free: {made.stderr}')
-    yield name
-    run(Command((engine, 'network', 'rm', '-f', name), sudo=True), timeout=60)
+    # machines get the lower half in turn; tests take addresses for others from the upper one
+    with network(SUBNETS, lambda subnet: (
+            '--internal', '--ip-range', subnet.replace('/27', '/28'))) as (name, _):
+        yield name
 
 
 @pytest.fixture

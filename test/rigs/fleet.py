@@ -15,6 +15,7 @@ from fogros2.model import Command, MachineSpec
 from fogros2.process import run
 from fogros2.provider.container import machine as container_machine
 from fogros2.provider.container.hosted import HostedProvider
+from rigs import networks
 from rigs.launched import embedded, Launched
 from rigs.sshd import private_sshd, PrivateSshd
 from rigs.vpn_lab import PASSED
@@ -145,24 +146,12 @@ def network() -> Iterator[str]:
 
     The engine publishes no ports of an internal network.
     """
-    name = f'fogt{os.urandom(4).hex()}'
-    for subnet in SUBNETS:
-        made = run(Command(('podman', 'network', 'create', '--subnet', subnet, name), sudo=True),
-                   timeout=60.0, check=False)
-        if made.returncode == 0:
-            break
-    else:
-        raise RuntimeError(f'no subnet for the tests is free: {made.stderr}')
-    rules = f'ip saddr {subnet} ip daddr != {subnet} ct state new drop'
-    table = (f'table inet {name} {{ chain out {{ '
-             f'type filter hook forward priority filter - 5; {rules}; }}; }}')
-    try:
+    with networks.network(SUBNETS) as (name, subnet):
+        rules = f'ip saddr {subnet} ip daddr != {subnet} ct state new drop'
+        table = (f'table inet {name} {{ chain out {{ '
+                 f'type filter hook forward priority filter - 5; {rules}; }}; }}')
         run(Command(('nft', '-f', '-'), sudo=True, input=table.encode()), timeout=10.0)
         yield name
-    finally:
-        run(Command(('podman', 'network', 'rm', '-f', name), sudo=True), timeout=60.0)
-        run(Command(('nft', 'delete', 'table', 'inet', name), sudo=True), timeout=10.0,
-            check=False)
 
 
 @contextlib.contextmanager

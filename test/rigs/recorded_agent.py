@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the agent of commit 326363e wrote and answered, recorded from a run of it."""
+"""What an agent wrote and answered, recorded from a run of it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-FOLDER = Path(__file__).parents[1] / 'unit' / 'agent_326363e'
+FOLDER = Path(__file__).with_name('agent_messages')
 
 
 def events() -> list[dict[str, Any]]:

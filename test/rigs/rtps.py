@@ -2,14 +2,15 @@
 """
 Send messages of DDS (RTPS 2.5) that no middleware would send; standard library only.
 
-    rtps.py announce ADDRESS LOCATOR...     for each address:port, a participant that claims it
-    rtps.py inject ADDRESS TOPIC TEXT       a std_msgs/String to participant 0's readers
+    rtps.py announce PLACES LOCATOR...     for each address:port, a participant that claims it
+    rtps.py inject PLACES TOPIC TEXT       a std_msgs/String
 
-Both send to a host's first participant until they are ended, and print a line for each round.
+Both send to PLACES (``address:port,...``) until they are ended, and print a line for each round.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import itertools
 import json
 import os
@@ -24,6 +25,12 @@ WRITER = b'\0\0\1\3'
 ANYBODY = bytes(4)
 #: Version 2.3, and the vendor id of eProsima.
 VERSION, VENDOR = b'\2\3', b'\1\x0f'
+Places = Sequence[tuple[str, int]]
+
+
+def split(word: str) -> tuple[str, int]:
+    host, _, port = word.partition(':')
+    return host, int(port)
 
 
 def locator(address: str, port: int) -> bytes:
@@ -62,8 +69,9 @@ class Participant:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.count = 0
 
-    def send(self, to: tuple[str, int], *parts: bytes) -> None:
-        self.socket.sendto(self.message(*parts), to)
+    def send(self, places: Places, *parts: bytes) -> None:
+        for place in places:
+            self.socket.sendto(self.message(*parts), place)
 
     def message(self, *parts: bytes) -> bytes:
         """Return a message of these submessages."""
@@ -76,31 +84,31 @@ class Participant:
             (2, struct.pack('<iI', 100, 0)), (0x58, struct.pack('<I', 0xc3f)),
             *((kind, one) for one in locators for kind in (0x32, 0x31))))
 
-    def inject(self, address: str, topic: str, message: str) -> None:
+    def inject(self, places: Places, topic: str, message: str) -> None:
         """Announce a writer of a topic, and send it a message, without an answer."""
         self.count += 1
         # an address that participants of the VPN may use, or they would ignore this one
-        self.send((address, 7410), self.announcement([locator('198.18.7.9', 7410)]))
+        self.send(places, self.announcement([locator('198.18.7.9', 7410)]))
         time.sleep(0.2)
-        self.send((address, 7410), heartbeat(SEDP, 1, self.count), data(SEDP, 1, parameters(
+        self.send(places, heartbeat(SEDP, 1, self.count), data(SEDP, 1, parameters(
             (0x15, VERSION), (0x16, VENDOR), (0x5a, self.prefix + WRITER),
             (5, text(f'rt{topic}')), (7, text('std_msgs::msg::dds_::String_')),
             (0x1a, struct.pack('<IiI', 2, 0, 0)), (0x1d, struct.pack('<I', 0)))))
         time.sleep(0.2)
-        self.send((address, 7411), heartbeat(WRITER, self.count, self.count),
+        self.send(places, heartbeat(WRITER, self.count, self.count),
                   data(WRITER, self.count, b'\0\1\0\0' + text(message)))
 
 
 def main() -> None:
-    what, address, *words = sys.argv[1:]
+    what, to, *words = sys.argv[1:]
+    places = [split(word) for word in to.split(',')]
     participants = [Participant() for _ in words]
     for count in itertools.count(1):
         if what == 'inject':
-            participants[0].inject(address, *words)
+            participants[0].inject(places, *words)
         else:
             for one, word in zip(participants, words):
-                host, _, port = word.partition(':')
-                one.send((address, 7410), one.announcement([locator(host, int(port))]))
+                one.send(places, one.announcement([locator(*split(word))]))
             time.sleep(0.3)
         print(json.dumps({'round': count}), flush=True)
 

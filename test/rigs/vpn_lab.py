@@ -151,6 +151,8 @@ class Lab:
                                   str(folder / 'r/vpn.key'), firewall=True),
             'machine': VpnInterface(f'{self.mark}m', MACHINE, NETWORK, PORT,
                                     str(folder / 'm/vpn.key'))}
+        #: Environment variables of the robot's user.
+        self.user: dict[str, str] = {}
         self.children: list[Child] = []
         self.relay: Child | None = None
         self.lan_name: str | None = None
@@ -322,8 +324,8 @@ class Lab:
                     if not other.firewall and name != host]
         if interface.firewall:
             text = self.dds.render(
-                self.dds.robot_interfaces(used, self.lan_name, {}),
-                machines if self.dds.asks_machines else [], guest=host == 'guest')
+                self.dds.robot_interfaces(used, self.lan_name, self.user),
+                machines if self.dds.asks_machines else [], self.user, guest=host == 'guest')
         else:
             text = self.dds.render(self.dds.machine_interfaces(used), machines)
         path = self.folder / f'{host} {self.dds.file_name}'

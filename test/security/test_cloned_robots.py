@@ -22,7 +22,6 @@ from fogros2.agent_client import AgentClient
 from fogros2.deploy.steps.creating import Creation
 from fogros2.errors import NameTaken
 from fogros2.model import MachineSpec, Result
-from fogros2.provider import TAG_ROBOT
 from fogros2.store import robot_name, Store
 from fogros2.testing.fakes import FakeProvider, FakeShell, FakeVpn
 from fogros2.testing.plugins import instead
@@ -102,11 +101,8 @@ def test_machine_in_use_elsewhere_needs_force(
     provider: FakeProvider, boot: Callable[[str], None], monkeypatch: pytest.MonkeyPatch,
     ages: list[Any], left: int, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Its record is of an older version, so nothing tells whose it is."""
-    launched(agent='/run/fogros2/slam', agent_program='/run/fogros2/slam/agent.py', robot='')
-    (found,) = provider.find({})
-    provider.machines[found.id] = dataclasses.replace(
-        found, tags={**found.tags, TAG_ROBOT: robot_name()})
+    """Its record is in a copied state folder, so only its agent knows whether a launch lives."""
+    launched(agent='/run/fogros2/slam', agent_program='/run/fogros2/slam/agent.py')
     monkeypatch.setattr(reach, 'session', lambda *_, **__: contextlib.nullcontext(
         FakeShell(handlers={'test': lambda command: Result(0, '', '')})))
     monkeypatch.setattr(AgentClient, 'status',

@@ -16,7 +16,10 @@ RTPS = str(Path(__file__).parents[1] / 'rigs/rtps.py')
 ROBOT, MACHINE = '198.18.7.1', '198.18.7.2'
 #: The machine's address outside of the VPN, where a stranger is its neighbour.
 OUTSIDE = '203.0.113.2'
-#: Prints what UDP packets say that arrive at its arguments, host:port; joins DDS's group.
+#: The robot's address on its LAN.
+LAN = '192.168.77.1'
+#: Prints what UDP packets say that arrive at its arguments, host:port. Joins all groups of DDS on
+#: each interface, which lets the kernel pass their packets to the nodes of other accounts, too.
 LISTENER = '''
 import json, selectors, socket, struct, sys
 chosen = selectors.DefaultSelector()
@@ -25,9 +28,9 @@ for word in sys.argv[1:]:
     one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     one.bind((host, int(port)))
     for _, name in socket.if_nameindex():
-        if name != 'lo':
+        for group in ('239.255.0.1', '239.18.7.1', '239.18.7.2') if name != 'lo' else ():
             one.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, struct.pack(
-                '4s4si', socket.inet_aton('239.255.0.1'), bytes(4), socket.if_nametoindex(name)))
+                '4s4si', socket.inet_aton(group), bytes(4), socket.if_nametoindex(name)))
     chosen.register(one, selectors.EVENT_READ, word)
 print(json.dumps({'ready': True}), flush=True)
 while True:
@@ -59,11 +62,20 @@ def send(vpn: Lab, host: str, text: str, *to: str) -> None:
     vpn.start(host, [sys.executable, '-c', SENDER, text, *to]).process.wait(10)
 
 
+def route(vpn: Lab, host: str, *words: str) -> None:
+    vpn.ip('-n', vpn.spaces[host], 'route', 'add', *words)
+
+
+def announce(vpn: Lab, host: str, places: list[str], *claimed: str) -> None:
+    """Announce participants that claim some addresses, until the test ends."""
+    vpn.start(host, [sys.executable, RTPS, 'announce', ','.join(places), *claimed])
+
+
 def test_machine_hears_dds_from_its_launch_only(vpn: Lab) -> None:
     machine = listener(vpn, 'machine', '0.0.0.0:7400')
     # Linux takes packets for any of its addresses on any interface
-    vpn.ip('-n', vpn.spaces['net'], 'route', 'add', MACHINE, 'via', OUTSIDE)
-    vpn.ip('-n', vpn.spaces['net'], 'route', 'add', '239.255.0.1', 'dev', 'e1')
+    route(vpn, 'net', MACHINE, 'via', OUTSIDE)
+    route(vpn, 'net', '239.255.0.1', 'dev', 'e1')
     send(vpn, 'net', 'stranger', f'{OUTSIDE}:7400', f'{MACHINE}:7400', '239.255.0.1:7400')
     send(vpn, 'machine', 'itself', '127.0.0.1:7400')
     send(vpn, 'robot', 'robot', f'{MACHINE}:7400')
@@ -76,7 +88,8 @@ def test_stranger_cannot_publish_on_a_machine(vpn: Lab) -> None:
     """Cyclone 0.10 (ROS 2 Jazzy) would take these messages, 11 would not."""
     machine = vpn.node('machine', 'from:/cmd_vel', 'from:/ok')
     vpn.node('robot', 'to:/ok')
-    stranger = vpn.start('net', [sys.executable, RTPS, 'inject', OUTSIDE, '/cmd_vel', '1 0 bad'])
+    stranger = vpn.start('net', [
+        sys.executable, RTPS, 'inject', f'{OUTSIDE}:7410,{OUTSIDE}:7411', '/cmd_vel', '1 0 bad'])
     stranger.wait('round', 5)
     machine.wait('topic', '/ok', count=5)
     assert machine.lines('topic', '/cmd_vel') == []
@@ -102,8 +115,39 @@ def test_robot_sends_no_dds_where_a_machine_points(vpn: Lab) -> None:
     lan = listener(vpn, 'lan', *traps[:2])
     local = listener(vpn, 'robot', *traps[2:])
     machine = listener(vpn, 'machine', f'{MACHINE}:6000')
-    vpn.start('machine', [sys.executable, RTPS, 'announce', ROBOT, *traps, f'{MACHINE}:6000'])
+    announce(vpn, 'machine', [f'{ROBOT}:7410'], *traps, f'{MACHINE}:6000')
     # the robot answers all participants alike, and may answer in the VPN
     machine.wait('said', count=20, timeout=20.0)
     assert lan.lines('said') == [] and local.lines('said') == []
     assert robot.process.poll() is None
+
+
+@by_middleware
+def test_machine_answers_no_participant_outside_the_vpn(vpn: Lab) -> None:
+    """Participants claim addresses in the VPN, to which a node that takes them sends."""
+    vpn.node('machine', 'to:/ok')
+    listener(vpn, 'machine', f'{OUTSIDE}:9000')
+    route(vpn, 'net', MACHINE, 'via', OUTSIDE)
+    route(vpn, 'net', '239.0.0.0/8', 'dev', 'e1')
+    robot = listener(vpn, 'robot', f'{ROBOT}:7498', f'{ROBOT}:7499')
+    announce(vpn, 'net', [f'{OUTSIDE}:7410', f'{MACHINE}:7410', '239.255.0.1:7400',
+                          '239.18.7.2:7402'], f'{ROBOT}:7498')
+    announce(vpn, 'robot', [f'{MACHINE}:7410'], f'{ROBOT}:7499')
+    robot.wait('at', f'{ROBOT}:7499', count=20, timeout=20.0)
+    assert robot.lines('at', f'{ROBOT}:7498') == []
+
+
+@pytest.mark.parametrize('middleware', ['fastdds'])
+def test_robot_limited_to_itself_answers_no_participant_of_its_lan(vpn: Lab) -> None:
+    vpn.user = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    vpn.lan()
+    vpn.node('robot', 'to:/up')
+    listener(vpn, 'robot', f'{LAN}:9000')
+    route(vpn, 'lan', ROBOT, 'via', LAN)
+    route(vpn, 'lan', '239.0.0.0/8', 'dev', 'lan0')
+    machine = listener(vpn, 'machine', f'{MACHINE}:6000', f'{MACHINE}:6001')
+    announce(vpn, 'lan', [f'{LAN}:7410', f'{ROBOT}:7410', '239.255.0.1:7400', '239.18.7.1:7402'],
+             f'{MACHINE}:6000')
+    announce(vpn, 'machine', [f'{ROBOT}:7410'], f'{MACHINE}:6001')
+    machine.wait('at', f'{MACHINE}:6001', count=20, timeout=20.0)
+    assert machine.lines('at', f'{MACHINE}:6000') == []

@@ -61,6 +61,7 @@ def described(host: Host, report: object) -> None:
         '', 'ssh-ed25519', 'ssh-ed25519 AA\n* ssh-ed25519 BB', '@cert-authority AA')),
     *({'shell': {**LOGIN, 'port': port}} for port in (-1, 1 << 16, '22', 1.5, True)),
     {'id': f'{ID}@ssh:host=203.0.113.1'}, {'id': 'x'}, {'vpn_host': '203.0.113.1 -x'},
+    {'vpn_host': 'fe80::1%$(reboot)'}, {'vpn_host': 1}, {'id': ID + 64 * 'x'},
     {'created': float('-inf')}, {'created': '-Infinity'}, {'vpn_port': 1 << 16}, {'state': 'odd'},
     {'tags': {'fogros2-name': 7}}, {'tags': []}, {'image': ['x']}])
 def test_wrong_report_of_a_host_is_one_clear_error(host: Host, wrong: dict[str, Any]) -> None:
@@ -83,7 +84,9 @@ def test_odd_answer_of_a_host_is_one_clear_error(host: Host, line: str) -> None:
         list(host.provider.find({}))
 
 
-@pytest.mark.parametrize('name', [f'{ID}@ssh:host=203.0.113.1&port=22&user=lab', 'x', 7, None])
+@pytest.mark.parametrize('name', [
+    f'{ID}@ssh:host=203.0.113.1&port=22&user=lab', 'x', 7, None, f'{ID}\n', ID + 64 * 'x', [ID],
+    {'id': ID}, ID.replace('podman', 'sh')])
 def test_host_cannot_name_another_host_as_a_machines(host: Host, name: object) -> None:
     host.answers(name)
     with pytest.raises(ProviderError, match="the host '127.0.0.1' reports a machine wrongly"):

@@ -39,8 +39,7 @@ from rigs.stranger import stranger
 from ros2fog_cli.api.browser import Ticket
 
 ROOT = Path(__file__).resolve().parents[2]
-#: The helper's folder, as an older version left it or not there yet, is opened by another account
-#: and locked; then root makes a name a user's own.
+#: Another account opens the helper's folder and locks it; then root makes a name a user's own.
 HELPER = """\
 import importlib.util, os, shutil, signal, sys, tempfile
 from pathlib import Path
@@ -54,8 +53,6 @@ def late(*_):
     raise TimeoutError('it waits for the lock')
 signal.signal(signal.SIGALRM, late)
 vpn.RECORDS = top / 'records'
-if sys.argv[2] == 'older':
-    vpn.RECORDS.mkdir(mode=0o755)
 try:
     vpn.prepare()
     read, write = os.pipe()
@@ -72,7 +69,7 @@ try:
         os._exit(0)
     print(os.read(read, 10).decode(), flush=True)
     signal.alarm(5)
-    if sys.argv[3] == 'stays':
+    if sys.argv[2] == 'stays':
         vpn.QUEUE = 0.2
         with vpn.locked(vpn.RECORDS):
             try:
@@ -193,20 +190,19 @@ class Said:
     def close(self) -> None: ...
 
 
-def helper(*words: str) -> str:
+def helper(lock: str) -> str:
     """Run the attack on the helper's folder as root, and return what it printed."""
     return process.run(Command((
-        sys.executable, '-I', '-c', HELPER, str(ROOT / 'packaging/vpn_helper/vpn.py'), *words),
+        sys.executable, '-I', '-c', HELPER, str(ROOT / 'packaging/vpn_helper/vpn.py'), lock),
         sudo=True), timeout=30.0, check=False).stdout
 
 
 def test_no_account_locks_the_vpn_helper_s_folder(root: None) -> None:
-    for state in ('new', 'older'):
-        assert helper(state, 'goes').split() == ['refused', 'fog0a1b2c'], state
+    assert helper('goes').split() == ['refused', 'fog0a1b2c']
 
 
 def test_the_vpn_helper_waits_for_a_lock_until_a_deadline(root: None) -> None:
-    assert 'another process has held' in helper('new', 'stays')
+    assert 'another process has held' in helper('stays')
 
 
 def test_vpn_helper_knows_a_process_id_that_was_used_again(root: None) -> None:

@@ -75,6 +75,23 @@ def test_missing_programs_are_named_with_their_packages(monkeypatch: pytest.Monk
     assert 'apt-get install rsync wireguard-tools' in check.remedy
 
 
+@pytest.mark.parametrize(('in_kernel', 'sizes', 'remedy'), [
+    (True, (212992, 4 << 20), ''), (True, (212992, 212992), 'net.core.rmem_max=4194304'),
+    (False, (212992, 4 << 20), 'net.core.rmem_default=7340032 net.core.rmem_max=7340032'),
+    (False, (212992, 7 << 20), 'net.core.rmem_default=7340032'), (False, (7 << 20, 8 << 20), '')])
+def test_small_receive_buffers_are_named_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_kernel: bool, sizes: tuple[int, int],
+    remedy: str,
+) -> None:
+    monkeypatch.setattr(doctor, '_kernel_wireguard', lambda: in_kernel)
+    for name, size in zip(('rmem_default', 'rmem_max'), sizes):
+        (tmp_path / name).write_text(f'{size}\n')
+    check = doctor.receive_buffer(tmp_path)
+    assert check.remedy == (f'sudo sysctl -w {remedy}' if remedy else '')
+    assert check.verdict == ('warning' if remedy else 'ok')
+    assert doctor.receive_buffer(tmp_path / 'none').verdict == 'warning'
+
+
 def test_missing_wireguard_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, '_succeeds', lambda *words: False)
     monkeypatch.setattr(Path, 'exists', lambda self: False)

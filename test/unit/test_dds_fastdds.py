@@ -102,8 +102,12 @@ def test_robot_limited_to_itself_has_the_loopback_and_the_vpn(user: dict[str, st
     text = robot(FastDds(), user)
     assert [one.text for one in parsed(text).iterfind('.//interfaceWhiteList/address', NS)] == [
         '127.0.0.1', '198.18.7.1']
+    # not the common group, which another account's node may have joined on the LAN
+    assert locators(text, 'metatrafficMulticastLocatorList') == [('239.18.7.1', '7402')]
+    assert locators(text)[:3] == [
+        (DISCOVERY_GROUP, '7400'), ('239.18.7.1', '7402'), ('239.18.7.2', '7402')]
     # terminals without multicast
-    assert locators(text)[2:] == [('127.0.0.1', str(7410 + 2 * index)) for index in range(ASKED)]
+    assert locators(text)[3:] == [('127.0.0.1', str(7410 + 2 * index)) for index in range(ASKED)]
     # the middleware itself would bring transports that listen everywhere
     environment = FastDds().environment('/x', user)
     assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SYSTEM_DEFAULT'

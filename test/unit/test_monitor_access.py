@@ -30,7 +30,7 @@ from fogros2.provider.kubernetes import manifests, ways
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.runtime import foxglove as runtime_foxglove
 from fogros2.runtime import republishers, streaming
-from fogros2.store import process_start, Record, record_from_json, Store
+from fogros2.store import process_start, Record, Store
 from fogros2.testing.fakes import FakeProvider, FakeShell
 from fogros2_monitor import credentials
 from rigs import deploying
@@ -104,12 +104,6 @@ def test_next_launch_closes_the_port_of_a_killed_one(
     assert provider.allowed == {('fake-1', 8766): []}
     after = context.store.load('planner')
     assert (after.monitor, after.monitor_open) == (0, '')
-
-
-def test_older_record_has_no_networks():
-    spec = {'name': 'a', 'provider': 'fake'}
-    assert record_from_json({'name': 'a', 'provider': 'fake', 'spec': spec}).spec == MachineSpec(
-        'a', 'fake')
 
 
 def entry(**changes):

@@ -35,6 +35,19 @@ def test_other_number_is_refused(text: str) -> None:
         untrusted.number(text)
 
 
+@pytest.mark.parametrize(('text', 'value'), [
+    ('', ''), ('192.0.2.1', '192.0.2.1'), ('2001:DB8::1', '2001:db8::1')])
+def test_address_is_returned(text: str, value: str) -> None:
+    assert untrusted.address(text) == value
+
+
+@pytest.mark.parametrize('text', [
+    'localhost', '192.0.2.1/24', '192.0.2.1 ', '192.0.2.256', '-oProxyCommand=x', 'fe80::1%x y'])
+def test_other_address_is_refused(text: str) -> None:
+    with pytest.raises(InvalidMessage):
+        untrusted.address(text)
+
+
 class Part(TypedDict):
     number: int
 
@@ -47,10 +60,10 @@ class Whole(TypedDict, total=False):
 
 
 def test_json_of_a_type_is_returned_without_control_characters() -> None:
-    text = ('{"parts": [{"number": 1, "new": [[]]}], "names": {"a": "\\u001b[2Jb"}, '
+    text = ('{"parts": [{"number": 1, "new": [[]]}], "names": {"\\u001b[a": "\\u001b[2Jb"}, '
             '"size": null, "kind": "a"}')
     assert untrusted.parsed(text, Whole) == {
-        'parts': [{'number': 1, 'new': [[]]}], 'names': {'a': '\ufffd[2Jb'}, 'size': None,
+        'parts': [{'number': 1, 'new': [[]]}], 'names': {'\ufffd[a': '\ufffd[2Jb'}, 'size': None,
         'kind': 'a'}
     assert untrusted.parsed(text.encode()) == untrusted.parsed(text)
 

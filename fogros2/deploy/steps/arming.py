@@ -179,7 +179,7 @@ class Arming(Step):
         context, job, address = self._context, self._job, self._job.interface.address
         key, (port, peer) = secrets.token_hex(32), job.heartbeats
         try:
-            configured = job.agent.request(
+            job.agent.request(
                 'configure', timeout=context.timeouts.agent, launch=context.launch, again=True,
                 heartbeat={'bind': address, 'port': port, 'peer': peer, 'key': key},
                 environment={
@@ -194,8 +194,7 @@ class Arming(Step):
                 ) from error
             raise
         job.heartbeat = Heartbeat(
-            address, port, context.launch, key if configured.get('signed') else '',
-            interval=interval_for(job.spec.robot_timeout))
+            address, port, context.launch, key, interval=interval_for(job.spec.robot_timeout))
         job.undo.callback(job.heartbeat.close)
         try:
             wait_until(

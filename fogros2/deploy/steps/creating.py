@@ -102,7 +102,7 @@ class Creation(Step):
         if found is None or found.state is MachineState.DELETED:
             context.provider.destroy(before.machine_id)  # what was made for it may still be there
             return None
-        self._check_alike(before.asked_options, found)
+        self._check_alike(before.asked, found)
         # the earlier choices still hold; everything else comes from this launch
         job.spec = dataclasses.replace(job.spec, options=before.spec.options)
         job.record = dataclasses.replace(before, spec=job.spec)

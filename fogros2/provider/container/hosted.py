@@ -15,7 +15,6 @@ import dataclasses
 import functools
 import gzip
 import hashlib
-import ipaddress
 from pathlib import Path
 from typing import Any, ClassVar, Optional, TypedDict
 
@@ -240,7 +239,7 @@ class HostedProvider(Provider):
         with self._reading(host):
             untrusted.checked(report, _Machine)
             found: _Machine = report
-            login, address = found['shell'], found['vpn_host']
+            login = found['shell']
             return Machine(
                 f"{_SCHEME}{untrusted.matched(ID, found['id'])}@{host}",
                 found['tags'].get(TAG_NAME, ''), self.name, MachineState(found['state']),
@@ -251,7 +250,7 @@ class HostedProvider(Provider):
                     alias=outside.shell.alias),
                 # the host's packet filter admits no machine to the host's ports
                 outside.vpn_host, untrusted.port(found['vpn_port']), private_network=host,
-                private_ip=address and str(ipaddress.ip_address(address)), region=outside.name,
+                private_ip=untrusted.address(found['vpn_host']), region=outside.name,
                 image=found['image'], tags=found['tags'], end_command=END_COMMAND)
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:

@@ -33,7 +33,7 @@ ROOTS = Path('/var/lib/fogros2')
 #: Folders by which relays of shared topics meet: of each user of this computer, of each machine.
 SHARED = Path('/var/lib/fogros2-share')
 #: A machine's id: its engine, its container's id, its token.
-ID = re.compile(r'(podman|docker):([0-9a-f]{12}):([A-Za-z0-9_-]+)')
+ID = re.compile(r'(podman|docker):([0-9a-f]{12}):([A-Za-z0-9_-]{1,64})')
 
 _STATES = {
     'created': MachineState.PENDING, 'configured': MachineState.PENDING,

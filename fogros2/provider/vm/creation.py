@@ -111,7 +111,7 @@ class Creation:
         """Return the machine that an earlier call with this token created, or None."""
         vms = [*self.cloud.find(region, {TAG_NAME: self.spec.name})]
         for vm in vms:
-            if vm.tags[TAG_ATTEMPT] == attempt:
+            if vm.tags.get(TAG_ATTEMPT) == attempt:
                 return VmId(region, vm.id, attempt)
         for vm in vms:
             owner = vm.tags.get(TAG_ROBOT, '')

@@ -55,6 +55,8 @@ ALL = 'all'
 EVERYWHERE = ('disk_size', 'spot', 'tags', 'user', 'ssh_from', 'fleet')
 #: Number of regions that are asked at the same time.
 PARALLEL = 20
+#: The name of an attempt, see ``attempt_of``.
+ATTEMPT = re.compile('[0-9a-f]{16}')
 #: After the type of a spot machine, for people.
 _SPOT = ' spot'
 
@@ -228,20 +230,25 @@ class VmProvider(Provider):
         return dataclasses.replace(self.machine_of(vm), id=machine_id)
 
     def machine_of(self, vm: Vm) -> Machine:
-        """Convert the cloud's report of a machine."""
+        """
+        Convert the cloud's report of a machine.
+
+        Everybody with rights in the cloud's account can write tags, from which some clouds know
+        the addresses. So a value without the form of one counts as missing.
+        """
         tags, running = vm.tags, vm.state is MachineState.RUNNING
         user, key = tags.get(TAG_USER, 'ubuntu'), tags.get(TAG_HOST_KEY, '')
-        # everybody with rights in the cloud's account can write tags
-        shell = Endpoint('ssh', vm.address, user=user, host_key=key) if running and vm.address \
+        address, private_ip = _ip(vm.address), _ip(vm.private_ip)
+        shell = Endpoint('ssh', address, user=user, host_key=key) if running and address \
             and untrusted.NAME.fullmatch(user) and untrusted.HOST_KEY.fullmatch(key) else None
-        disk = tags.get(TAG_DISK, '')
-        machine = VmId(vm.region, vm.id, tags.get(TAG_ATTEMPT, '0' * 16))
+        disk, attempt = tags.get(TAG_DISK, ''), tags.get(TAG_ATTEMPT, '')
+        machine = VmId(vm.region, vm.id, attempt if ATTEMPT.fullmatch(attempt) else '0' * 16)
         return Machine(
             self._text(machine), tags.get(TAG_NAME, ''), self.name, vm.state, created=vm.created,
-            shell=shell, vpn_host=vm.address if running else '',
-            private_network=vm.private_network, private_ip=vm.private_ip, region=vm.region,
+            shell=shell, vpn_host=address if running else '',
+            private_network=vm.private_network, private_ip=private_ip, region=vm.region,
             kind=f'{vm.kind}{_SPOT}' if vm.spot else vm.kind, image=vm.image, key=vm.key,
-            disk_gb=int(disk) if disk.isdecimal() else None, tags=tags,
+            disk_gb=int(disk) if disk.isdecimal() and len(disk) < 7 else None, tags=tags,
             end_command=self._cloud.end_command(machine, tags),
             cost_per_hour=_dollars(tags.get(TAG_PRICE, '')), stopped=vm.stopped,
             billed=vm.billed)
@@ -447,11 +454,17 @@ class VmProvider(Provider):
 
         :raises MachineNotFound: not an id of this provider.
         """
-        form = rf'{self.name}:([a-z0-9-]+)/({self._cloud.id_form})/([0-9a-f]{{16}})'
+        form = rf'{self.name}:([a-z0-9-]+)/({self._cloud.id_form})/({ATTEMPT.pattern})'
         match = re.fullmatch(form, text)
         if match is None:
             raise MachineNotFound(f"'{text}' is no machine at {self._cloud.title}")
         return VmId(*match.groups())
+
+
+def _ip(text: str) -> str:
+    with contextlib.suppress(untrusted.InvalidMessage):
+        return untrusted.address(text)
+    return ''
 
 
 def _dollars(text: str) -> Optional[Decimal]:

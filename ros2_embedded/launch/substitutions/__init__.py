@@ -190,6 +190,7 @@ class Command(ParsedSubstitution):
     """
 
     _parameters = ('command', 'on_stderr?')
+    _runs_command = True
 
     def __init__(
         self, command: SomeSubstitutionsType, *, on_stderr: SomeSubstitutionsType = 'fail'
