@@ -138,7 +138,7 @@ def test_machine_answers_no_participant_outside_the_vpn(vpn: Lab) -> None:
 
 
 @pytest.mark.parametrize('middleware', ['fastdds'])
-def test_robot_limited_to_itself_answers_no_participant_of_its_lan(vpn: Lab) -> None:
+def test_robot_limited_to_itself_answers_no_lan_participant(vpn: Lab) -> None:
     vpn.user = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     vpn.lan()
     vpn.node('robot', 'to:/up')
