@@ -185,7 +185,7 @@ class Arming(Step):
                 environment={
                     'FOGROS2_VPN_ADDRESS': address,
                     **plan.extended({**ros.environment, **dds}, job.spec.environment)},
-                setup=list(ros.setup), ros_command=list(ros.command))
+                setup=list(ros.setup))
         except AgentError as error:
             if 'in use' in str(error):
                 raise VpnError(
