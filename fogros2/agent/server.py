@@ -523,7 +523,8 @@ class Agent:
             'heartbeat_age': None if dog.beat_at is None else now - dog.beat_at,
             'ending': self.ending,
             'nodes': [node.status for node in self.nodes.known.values()],
-            'kept': self.checks.status(), 'rss_kb': rss, 'first': self.journal.first, 'next': self.journal.next,
+            'kept': self.checks.status(), 'rss_kb': rss,
+            'first': self.journal.first, 'next': self.journal.next,
         }
 
     def do_ping(self, client: Client, request: Json) -> Empty:

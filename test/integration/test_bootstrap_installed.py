@@ -144,8 +144,8 @@ def test_machine_with_another_python_gets_ros(
     talk = ('import rclpy, std_msgs.msg as m; rclpy.init(); node = rclpy.create_node("n"); '
             'node.create_publisher(m.String, "t", 1).publish(m.String(data="x")); print("done")')
     assert subprocess.run(
-        [Path(install.environment['VIRTUAL_ENV'], 'bin/python'), '-c', talk], check=True, text=True,
-        capture_output=True, env={'HOME': str(tmp_path)}).stdout == 'done\n'
+        [Path(install.environment['VIRTUAL_ENV'], 'bin/python'), '-c', talk], check=True,
+        text=True, capture_output=True, env={'HOME': str(tmp_path)}).stdout == 'done\n'
 
 
 def test_fogros2_is_unpacked_beside_a_ros_that_is_there(packed: Wheels, tmp_path: Path) -> None:

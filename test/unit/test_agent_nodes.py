@@ -53,7 +53,7 @@ def prepared(nodes: Nodes) -> Prepared:
 
 
 def test_markers_become_paths_of_this_machine(prefix: str) -> None:
-    def resolve(text: Any, files: Any = {}) -> str:
+    def resolve(text: Any, files: Any = ()) -> str:
         return programs.resolve(text, files, f'/none:{prefix}')
 
     assert resolve('plain') == 'plain'
@@ -136,7 +136,7 @@ def test_missing_program_is_refused(prepared: Prepared, spec: Any, reason: str) 
 
 
 def test_shell_command_is_not_checked(prepared: Prepared) -> None:
-    assert prepared(shell=True, arguments=['a | b'])[0] == ['a | b']
+    assert prepared(**{'shell': True, 'arguments': ['a | b']})[0] == ['a | b']
 
 
 @pytest.mark.parametrize('spec', [

@@ -42,7 +42,7 @@ mv -f -- "$aside" "$3"
 python3 -IS "$3" serve --detach --config "$4"
 """
 
-# Send the agent to a machine that starts it as soon as it is there; keep an agent that runs.
+# Send the agent to a machine whose boot script waits for it; keep an earlier one.
 # $1 program. Standard input is the agent's source.
 _SEND = """\
 [ -e "$1" ] && exit
