@@ -2,8 +2,8 @@
 """
 The agent's events and answers: the one definition of the messages that a machine sends.
 
-A message is a JSON object. The agent and ``cloud_launch`` build it as one of these types; neither
-imports them when it runs. The robot checks each received message once, in ``agent_client``, with
+A message is a JSON object. The agent builds it as one of these types, but does not import them
+when it runs. The robot checks each received message once, in ``agent_client``, with
 :func:`event` or :func:`answer`, because a hijacked machine may send anything. Keys that are not
 defined here, and events of other names, come from a newer agent: the robot ignores them.
 """
@@ -47,7 +47,7 @@ class NodeOutput(_OfNode):
 
 
 class NodeExited(_OfNode):
-    """A node's process ended; launch starts it again if ``respawns``."""
+    """A node's process ended; the agent starts it again if ``respawns``."""
 
     event: Literal['exited']
     returncode: int
@@ -106,12 +106,10 @@ class AgentEnding(_Numbered):
     reason: str
 
 
-class LaunchExited(_Numbered):
-    """The nodes' launch process ended unexpectedly; ``said`` is the end of its log."""
+class AgentRestarted(_Numbered):
+    """The agent died and was started again; the nodes of the dead agent have ended."""
 
-    event: Literal['launch_exited']
-    returncode: int
-    said: str
+    event: Literal['restarted']
 
 
 class ConnectionChanged(TypedDict, total=False):
@@ -144,7 +142,7 @@ NodeEvent = Union[NodeStarted, NodeOutput, NodeExited, NodeRefused]
 #: Events that an agent sends; the robot makes the others itself.
 AgentEvent = Union[
     NodeEvent, WatchdogFired, VpnRepaired, EndFailed, PreemptionNotice, MachineIdle, AgentEnding,
-    LaunchExited]
+    AgentRestarted]
 Event = Union[AgentEvent, ConnectionChanged, Gap, MachineLost]
 
 
@@ -168,12 +166,6 @@ class Configured(_Configured, total=False):
     """
 
     signed: bool
-
-
-class Launched(TypedDict):
-    """The process that will run the nodes."""
-
-    pid: int
 
 
 class StartedNodes(TypedDict):
@@ -232,7 +224,6 @@ class Status(TypedDict):
     lifetime_left: float
     heartbeat_age: Optional[float]
     ending: bool
-    launch_running: bool
     nodes: list[NodeStatus]
     kept: list[HealthCheck]
     rss_kb: int
@@ -267,8 +258,7 @@ class HeartbeatAnswer(_Heartbeat, total=False):
 _EVENTS: Mapping[str, Any] = {
     get_args(get_type_hints(kind)['event'])[0]: kind for kind in get_args(AgentEvent)}
 _ANSWERS: Mapping[str, Any] = {
-    'configure': Configured, 'launch': Launched, 'start': StartedNodes, 'log': LogRange,
-    'status': Status}
+    'configure': Configured, 'start': StartedNodes, 'log': LogRange, 'status': Status}
 
 
 # -- the check --------------------------------------------------------------------------------

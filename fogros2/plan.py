@@ -220,14 +220,12 @@ class Underlay:
     The ROS 2 environment of the robot's launch, as paths that a machine may have too.
 
     :param prefixes: ament prefixes and the Python environment, outside the workspace.
-    :param ros2: path of the ``ros2`` program.
     :param environment: variables by which nodes find these prefixes and the workspace's install
         space; entries outside them, such as a user's own, are left out.
     :param rmw: the middleware of the launch's nodes.
     """
 
     prefixes: tuple[str, ...]
-    ros2: str
     environment: Mapping[str, str]
     rmw: str = DEFAULT_RMW
 
@@ -258,8 +256,8 @@ def underlay(
             variables[name] = os.pathsep.join(entries)
     variables.update({
         name: environment[name] for name in PLAIN_VARIABLES if environment.get(name)})
-    return Underlay(tuple(prefixes), ros2, variables,
-                    environment.get('RMW_IMPLEMENTATION') or DEFAULT_RMW)
+    return Underlay(
+        tuple(prefixes), variables, environment.get('RMW_IMPLEMENTATION') or DEFAULT_RMW)
 
 
 def below(path: str, roots: Iterable[str]) -> bool:

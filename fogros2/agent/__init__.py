@@ -11,11 +11,13 @@ modules, in this order:
 - ``loop``: one thread that serves sockets and timers, and blocks on none of them;
 - ``watchdog``: when the machine has to end, and heartbeats;
 - ``processes``: commands as root, health checks and watches;
-- ``nodes``: the launch process that runs the nodes;
+- ``programs``: packages, executables and files that a node's spec names;
+- ``nodes``: the nodes' processes, from their start to their end;
 - ``server``: clients, their requests, and the command line.
 
 A module may import the standard library, the modules before it, and types of ``fogros2.events``.
 """
 
 #: The modules in reading order; the joined file has them in this order.
-MODULES = ('protocol', 'journal', 'loop', 'watchdog', 'processes', 'nodes', 'server')
+MODULES = (
+    'protocol', 'journal', 'loop', 'watchdog', 'processes', 'programs', 'nodes', 'server')

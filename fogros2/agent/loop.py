@@ -12,7 +12,7 @@ from fogros2.agent.journal import BLOCK
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from typing import Optional
+    from typing import Any, Optional
 
 
 def boot_clock() -> float:
@@ -46,8 +46,10 @@ class Loop:
         self.timers.append(timer)
         return timer
 
-    def select(self, connection: socket.socket, wanted: int, call: Callable[[int], None]) -> None:
-        """Call a function with the ready events of a socket, of those that are ``wanted``."""
+    def select(
+        self, connection: socket.socket | int, wanted: int, call: Callable[[int], Any],
+    ) -> None:
+        """Call a function with the ready events of a socket or descriptor that are ``wanted``."""
         key = self.selector.get_map().get(connection)
         if not wanted:
             if key is not None:

@@ -1,49 +1,121 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes of a machine, and the process of launch that runs them."""
+"""The nodes of a machine, and their processes."""
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Callable
 import contextlib
-import json
+import functools
 import os
+import re
+import selectors
 import shlex
 import signal
-import socket
 import time
 
-from fogros2.agent.loop import Channel
+from fogros2.agent.loop import Loop, Timer
 from fogros2.agent.processes import MARK, Processes, remove_tree, search_path
-from fogros2.agent.protocol import dump, Refused, say
+from fogros2.agent.programs import check_program, find_executable, interpreter, resolve
+from fogros2.agent.protocol import dump, Refused
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any, Optional
 
     from fogros2.agent.protocol import Json
-    from fogros2.events import LaunchExited, NodeExited, NodeStatus
+    from fogros2.events import AgentRestarted, NodeStatus
 
-LAUNCH_LOG_BYTES = 8 << 20
-#: Bytes at the end of the launch process's log that are reported when it fails.
-LAST_WORDS = 1000
+#: Maximum number of bytes in one output event, and of such pieces in a pipe.
+CHUNK, CHUNKS = 1 << 16, 16
+#: Maximum number of bytes of the variables that setup files set.
+VARIABLES = 1 << 20
+#: Seconds from one signal to the next where all nodes have to end quickly.
+QUICK = (0.4, 0.4)
+#: Linux: the option of prctl for the signal that a process gets when its parent dies.
+PR_SET_PDEATHSIG = 1
 
 
-class CloudLaunch(Channel):
-    """The process that runs the nodes, and the agent's socket to it."""
+class Output:
+    """
+    One stream of a process, read as text.
 
-    pid = 0
-    stopping = False
+    :param report: called with ``text``.
+    """
 
-    def stop(self) -> None:
-        """Make the process stop the nodes as launch does, and end; idempotent."""
-        self.stopping = True
-        with contextlib.suppress(OSError):
-            self.socket.shutdown(socket.SHUT_WR)
+    def __init__(self, loop: Loop, fd: int, report: Callable[..., None]) -> None:
+        os.set_blocking(fd, False)
+        self.loop = loop
+        self.fd = fd
+        self.report = report
+        self.decoder = codecs.getincrementaldecoder('utf-8')('replace')
+        loop.select(fd, selectors.EVENT_READ, self.read)
+
+    def read(self, mask: int = 0) -> bool:
+        """Report text once; return whether there may be more."""
+        if self.fd < 0:
+            return False
+        try:
+            data = os.read(self.fd, CHUNK)
+        except BlockingIOError:
+            return False
+        except OSError:
+            data = b''  # a terminal that no process has open any more
+        text = self.decoder.decode(data, final=not data)
+        if text:
+            self.report(text=text)
+        if not data:
+            self.loop.select(self.fd, 0, self.read)
+            os.close(self.fd)
+            self.fd = -1
+        return bool(data)
+
+    def drain(self) -> None:
+        """Report what a process has written, but not what its children go on to write."""
+        for _ in range(CHUNKS):
+            if not self.read():
+                return
+
+
+class Node:
+    """
+    A NodeSpec, and the process that runs it.
+
+    :raises Refused: the spec is invalid.
+    """
+
+    def __init__(self, spec: Json) -> None:
+        if not all(isinstance(spec.get(key), str) for key in ('id', 'name')):
+            raise Refused("a node has an 'id' and a 'name'")
+        self.spec = spec
+        self.id: str = spec['id']
+        self.retries_left = int(spec.get('respawn_max_retries', -1))
+        self.respawn_delay = float(spec.get('respawn_delay', 0.0))
+        #: Seconds from SIGINT to SIGTERM, and from there to SIGKILL.
+        self.timeouts = (
+            float(spec.get('sigterm_timeout', 5.0)), float(spec.get('sigkill_timeout', 5.0)))
+        if not all(0 <= seconds < 1e6 for seconds in (*self.timeouts, self.respawn_delay)):
+            raise Refused(f"node '{self.id}' can't be given {self.timeouts} s to end")
+        self.stopping = False
+        #: Command line, and options of ``Popen``; empty until they are known.
+        self.command: list[str] = []
+        self.options: Json = {}
+        #: Timers of the signals that stop it, or of its next start.
+        self.timers: list[Timer] = []
+        self.status: NodeStatus = {
+            'id': self.id, 'name': spec['name'], 'state': 'starting', 'pid': None,
+            'returncode': None, 'restarts': 0}
+
+    def cancel(self) -> None:
+        """Cancel its timers."""
+        for timer in self.timers:
+            timer.at = None
+        self.timers.clear()
 
 
 class Nodes:
     """
-    The nodes of a machine, and the launch process that runs them.
+    The nodes of a machine.
 
     :param config: the agent's configuration, see ``CONFIG``.
     :param write: appends events to the journal, see ``Journal.append``.
@@ -59,73 +131,54 @@ class Nodes:
         self.config = config
         self.write = write
         self.mark = f'{os.getpid()}-{time.time_ns()}'
-        self.launch: Optional[CloudLaunch] = None
-        self.states: dict[str, NodeStatus] = {}
-        #: Seconds that each node may take to end.
-        self.graces: dict[str, float] = {}
-        #: The nodes that start again when they end.
-        self.respawn: set[str] = set()
+        #: The nodes of the launch that have been started, by id.
+        self.known: dict[str, Node] = {}
+        #: Variables of the nodes, and the settings that they were read for.
+        self.environment: dict[str, str] = {}
+        self.settings: Any = None
+        #: The standard input of all nodes: as with launch, it has no data and no end.
+        self.stdin, self._no_input = os.pipe()
         self.stopping = False
-        #: Whether processes that the launch process left get little time to end.
+        #: When to stop waiting for the nodes to end; None unless they are ending.
+        self.limit: Optional[Timer] = None
+        #: Whether processes that nodes left behind get little time to end.
         self.quickly = False
         self.stopped: list[Callable[[], None]] = []
 
-    def path(self, name: str) -> str:
-        """Return the path of a file in the agent's directory."""
-        return os.path.join(self.directory, name)
+    # -- the environment ------------------------------------------------------------------------
 
-    @property
-    def running(self) -> list[NodeStatus]:
-        """The nodes that run, or are about to."""
-        return [n for n in self.states.values() if n['state'] in ('starting', 'running')]
-
-    # -- the launch process ---------------------------------------------------------------------
-
-    def start_launch(self) -> CloudLaunch:
-        """
-        Return the running launch process; start it if needed.
-
-        :raises Refused: it cannot be started now.
-        """
-        if self.stopping:
-            raise Refused('the agent is stopping its nodes', kind='ending')
-        if self.launch is not None:
-            return self.launch
-        argv, setup = list(self.config['ros_command']), self.config['setup']
-        if not argv:
-            raise Refused("there is no 'ros_command' to run nodes with", 'configure it first')
+    def source(self, then: Callable[[Optional[Refused]], None]) -> None:
+        """Read the variables that the setup files set, once; then call ``then``."""
+        setup, variables = self.config['setup'], self._variables()
         for path in setup:
             if not os.path.isfile(path):
-                raise Refused(f'{path} to be sourced is not there')
-        if setup:
-            lines = [*(f'. {shlex.quote(path)}' for path in setup), f'exec {shlex.join(argv)}']
-            argv = ['bash', '-c', '\n'.join(lines)]
-        account = self.processes.identity.account
-        options: Json = {}
-        if os.getuid() != account.pw_uid:
-            options = {
-                'user': account.pw_uid, 'group': account.pw_gid,
-                'extra_groups': os.getgrouplist(account.pw_name, account.pw_gid)}
-        ours, theirs = socket.socketpair()
-        log = os.open(
-            self.path('launch.log'), os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW
-            | os.O_CLOEXEC, 0o600)
-        launch = CloudLaunch(self.loop, ours, self._reported)
-        try:
-            launch.pid = self.processes.start(
-                argv, lambda status: self._launch_exited(launch, status), stdout=log, stderr=log,
-                cwd=account.pw_dir if os.path.isdir(account.pw_dir) else '/', umask=0o022,
-                env=self._environment(theirs.fileno()), pass_fds=(theirs.fileno(),), **options)
-        except (OSError, ValueError) as error:
-            launch.close()
-            raise Refused(f"{argv[0]} can't be started: {error}") from error
-        finally:
-            os.close(log)
-            theirs.close()
-        self.launch = launch
-        return launch
+                then(Refused(f'{path} to be sourced is not there'))
+                return
+        if not setup:
+            self.environment = variables
+        if not setup or self.settings == (setup, variables):
+            then(None)
+            return
+        output = os.memfd_create('variables', os.MFD_CLOEXEC)
 
-    def _environment(self, fd: int) -> dict[str, str]:
+        def ran(status: int) -> None:
+            found = os.pread(output, VARIABLES, 0).decode(errors='surrogateescape')
+            os.close(output)
+            if status != 0:
+                then(Refused(f"{', '.join(setup)} can't be sourced: exit status {status}"))
+                return
+            pairs = (line.partition('=') for line in found.split('\0') if line)
+            self.environment = {name: value for name, _, value in pairs}
+            self.settings = (setup, variables)
+            then(None)
+
+        # what the files print is no variable
+        lines = ['{', *(f'. {shlex.quote(path)}' for path in setup), '} >&2', 'exec env -0']
+        self.processes.spawn(
+            ['bash', '-c', '\n'.join(lines)], ran, output=output,
+            **{**self.processes.identity.options, 'env': variables})
+
+    def _variables(self) -> dict[str, str]:
         """Return the variables of a login of the user, and those that the launch configured."""
         user = self.processes.identity.account
         environment = dict(os.environ)
@@ -136,61 +189,29 @@ class Nodes:
             runtime = f'/run/user/{user.pw_uid}'
             if os.path.isdir(runtime):
                 environment['XDG_RUNTIME_DIR'] = runtime
-        environment.pop('OVERRIDE_LAUNCH_PROCESS_OUTPUT', None)
         return {
             **environment, 'HOME': user.pw_dir, 'USER': user.pw_name, 'LOGNAME': user.pw_name,
             'SHELL': user.pw_shell or '/bin/sh',
             # send output when it is written, not when a buffer is full
             'PYTHONUNBUFFERED': '1', 'RCUTILS_LOGGING_BUFFERED_STREAM': '1',
             **self.config['environment'],
-            'FOGROS2_AGENT_FD': str(fd), 'FOGROS2_AGENT_DIRECTORY': self.directory,
-            MARK: self.mark}
-
-    def trim_log(self) -> None:
-        """Empty a large log of the launch process, now and every 10 s."""
-        self.loop.at(10.0, self.trim_log)
-        with contextlib.suppress(OSError):
-            if os.path.getsize(self.path('launch.log')) > LAUNCH_LOG_BYTES:
-                os.truncate(self.path('launch.log'), 0)
-
-    def _last_words(self) -> str:
-        """Return the end of the launch process's log, which shows why it failed."""
-        with contextlib.suppress(OSError), open(self.path('launch.log'), 'rb') as log:
-            log.seek(max(0, os.fstat(log.fileno()).st_size - LAST_WORDS))
-            lines = log.read().decode(errors='replace').split('\n')
-            return '\n'.join(line for line in lines if line.strip()).strip()
-        return ''
+            'FOGROS2_AGENT_DIRECTORY': self.directory, MARK: self.mark}
 
     # -- requests -------------------------------------------------------------------------------
 
-    def start(self, specs: Any) -> list[str]:
+    def start(self, nodes: list[Node]) -> list[str]:
         """
         Start nodes; return the ids of those that were started before.
 
-        :raises Refused: the specs are invalid, or the launch process cannot be started.
+        :raises Refused: nodes are being stopped.
         """
-        if not isinstance(specs, list) or not all(
-                isinstance(spec, dict) and isinstance(spec.get('id'), str)
-                and isinstance(spec.get('name'), str) for spec in specs):
-            raise Refused("'nodes' is a list of objects with id and name")
-        known = [spec['id'] for spec in specs if spec['id'] in self.states]
-        specs = [spec for spec in specs if spec['id'] not in self.states]
-        graces = {}
-        for spec in specs:
-            grace = sum(float(spec.get(key, 5.0)) for key in (
-                'sigterm_timeout', 'sigkill_timeout'))
-            if not 0 <= grace < 1e6:
-                raise Refused(f"node '{spec['id']}' can't be given {grace} s to end")
-            graces[spec['id']] = grace
-        launch = self.start_launch()
-        self.graces.update(graces)
-        self.respawn.update(spec['id'] for spec in specs if spec.get('respawn'))
-        for spec in specs:
-            self.states[spec['id']] = {
-                'id': spec['id'], 'name': spec['name'], 'state': 'starting', 'pid': None,
-                'returncode': None, 'restarts': 0}
-        if specs:
-            launch.send(dump({'command': 'start', 'nodes': specs}))
+        if self.stopping:
+            raise Refused('the agent is stopping its nodes', kind='ending')
+        known = [node.id for node in nodes if node.id in self.known]
+        new = {node.id: node for node in nodes if node.id not in self.known}
+        self.known.update(new)
+        for node in new.values():
+            self._run(node)
         return known
 
     def stop(self, ids: Any) -> None:
@@ -199,12 +220,13 @@ class Nodes:
 
         :raises Refused: there is no such node.
         """
-        ids = list(self.states) if ids is None else [str(number) for number in ids]
+        ids = list(self.known) if ids is None else [str(number) for number in ids]
         for number in ids:
-            if number not in self.states:
+            if number not in self.known:
                 raise Refused(f"there is no node '{number}'", kind='not running')
-        if self.launch is not None and not self.launch.stopping:
-            self.launch.send(dump({'command': 'stop', 'nodes': ids}))
+        for node in map(self.known.__getitem__, ids):
+            if not node.stopping:
+                self._stop(node, node.timeouts)
 
     def signal(self, number: str, name: str) -> None:
         """
@@ -214,109 +236,200 @@ class Nodes:
         """
         if name not in signal.Signals.__members__:
             raise Refused(f"there is no signal '{name}'")
-        node = self.states.get(number)
-        if node is None or node not in self.running or self.launch is None:
+        node = self.known.get(number)
+        if node is None or node.status['pid'] is None:
             raise Refused(f"node '{number}' isn't running", kind='not running')
-        self.launch.send(dump({'command': 'signal', 'node': number, 'signal': name}))
+        self.processes.kill(node.status['pid'], signal.Signals[name])
 
-    # -- events of the launch process -----------------------------------------------------------
+    # -- processes ------------------------------------------------------------------------------
 
-    def _reported(self, lines: list[bytes]) -> None:
-        """Handle events of the launch process: ``{"event":...}`` lines."""
-        events = []
-        for line in lines:
-            # most lines are output, which changes no state: skip parsing it
-            if not line.startswith(b'{"event":"output"'):
-                try:
-                    self._changed(json.loads(line))
-                except (KeyError, TypeError, ValueError):
-                    say(f'the launch process sent {line[:200]!r}')
-                    continue
-            events.append(line[1:] + b'\n')
-        if events:
-            self.write(events)
+    def _report(self, node: Node, event: str, **fields: Any) -> None:
+        self.write([dump({
+            'event': event, 'node': node.id, 'name': node.status['name'], **fields})[1:]])
 
-    def _changed(self, event: Json) -> None:
-        node, kind = self.states[event['node']], event['event']
-        if kind == 'started':
-            node['state'], node['pid'] = 'running', event['pid']
-        elif kind == 'exited':
-            node['state'] = 'starting' if event['respawns'] else 'exited'
-            node['restarts'] += bool(event['respawns'])
-            node['pid'], node['returncode'] = None, event['returncode']
-        elif kind == 'refused':
-            node['state'], node['error'] = 'refused', event['error']
+    def _run(self, node: Node) -> None:
+        """Start a node's process, or report why it cannot start."""
+        ours: list[int] = []
+        theirs: list[int] = []
+        try:
+            if not node.command:
+                self._prepare(node)
+            for _ in ('stdout', 'stderr'):
+                reader, writer = os.openpty() if node.spec.get('emulate_tty') else os.pipe()
+                ours.append(reader)
+                theirs.append(writer)
+            pid = self._spawn(node, ours, theirs)
+        except (AttributeError, OSError, Refused, TypeError, ValueError) as error:
+            for fd in ours:
+                os.close(fd)
+            reason = error if isinstance(error, Refused) else Refused(
+                f"{node.status['name']} could not be executed: {error}")
+            node.status['state'], node.status['error'] = 'refused', reason.answer['error']
+            self._report(node, 'refused', error=reason.answer['error'],
+                         hint=reason.answer['hint'])
+        else:
+            node.status['state'], node.status['pid'] = 'running', pid
+            self._report(node, 'started', pid=pid, cmd=node.command)
+        finally:
+            for fd in theirs:
+                os.close(fd)
+
+    def _spawn(self, node: Node, ours: list[int], theirs: list[int]) -> int:
+        """Start a node's process; return its pid."""
+        import ctypes  # here, because it takes memory of agents without nodes
+        prctl = ctypes.CDLL(None).prctl
+        outputs: list[Output] = []
+        command = node.command
+        if node.spec.get('shell'):
+            command = ['/bin/sh', '-c', ' '.join(command)]
+        pid = self.processes.start(
+            command, lambda status: self._exited(node, outputs, status), stdin=self.stdin,
+            stdout=theirs[0], stderr=theirs[1], **node.options,
+            # the nodes must not outlive an agent that nothing starts again
+            preexec_fn=lambda: prctl(PR_SET_PDEATHSIG, signal.SIGINT))
+        for stream, fd in zip(('stdout', 'stderr'), ours):
+            outputs.append(Output(self.loop, fd, functools.partial(
+                self._report, node, 'output', stream=stream)))
+        return pid
+
+    def _prepare(self, node: Node) -> None:
+        """
+        Find out a node's command line and options, and write its files.
+
+        :raises Refused: this machine lacks something that the spec names.
+        """
+        spec, options = node.spec, self.processes.identity.options
+        path = self.environment.get('AMENT_PREFIX_PATH', '')
+        files = self._write(node, path)
+        environment = {**self.environment, **{
+            name: resolve(value, files, path)
+            for name, value in spec.get('environment', {}).items()}}
+        arguments = [resolve(word, files, path) for word in spec.get('arguments', [])]
+        if spec.get('package'):
+            arguments.insert(0, find_executable(spec['package'], spec.get('executable', ''), path))
+        prefix = list(spec.get('prefix', []))
+        if not prefix + arguments:
+            raise Refused('there is nothing to run: no executable and no arguments')
+        options['env'], cwd = environment, spec.get('cwd')
+        if cwd is not None:
+            if not os.path.isdir(cwd):
+                raise Refused(f"the working directory '{cwd}' isn't there")
+            options['cwd'] = cwd
+        if not spec.get('shell'):
+            check_program((prefix + arguments)[0], environment.get('PATH', os.defpath),
+                          options['cwd'])
+            prefix += interpreter(arguments)
+        node.command, node.options = prefix + arguments, options
+
+    def _write(self, node: Node, path: str) -> dict[str, str]:
+        """
+        Write the files that came with a node; return the path of each.
+
+        :raises Refused: a file cannot be written.
+        """
+        texts: Json = node.spec.get('files', {})
+        files = {}
+        folder = f'{self.directory}/files-{os.urandom(4).hex()}'
+        try:
+            if texts:
+                os.mkdir(folder, 0o700)
+            for number, key in enumerate(texts):
+                name = re.sub(r'[^A-Za-z0-9._-]', '_', os.path.basename(key)) or 'file'
+                files[key] = f'{folder}/{number}-{name[-100:]}'
+            # a file may contain the path of another one
+            for key, text in texts.items():
+                content = resolve(text, files, path)
+                fd = os.open(files[key], os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+                with os.fdopen(fd, 'w', encoding='utf-8') as stream:
+                    stream.write(content)
+        except OSError as error:
+            raise Refused(f"what travelled with {node.status['name']} can not be written there: "
+                          f'{error.strerror or error}') from error
+        return files
+
+    def _exited(self, node: Node, outputs: list[Output], status: int) -> None:
+        """Report the end of a node's process, and schedule its next start."""
+        for output in outputs:
+            output.drain()
+        node.cancel()
+        respawns = (
+            bool(node.spec.get('respawn')) and not node.stopping and node.retries_left != 0)
+        node.retries_left -= respawns and node.retries_left > 0
+        node.status['state'] = 'starting' if respawns else 'exited'
+        node.status['pid'], node.status['returncode'] = None, status
+        node.status['restarts'] += respawns
+        self._report(node, 'exited', returncode=status, respawns=respawns)
+        if respawns:
+            node.timers.append(self.loop.at(node.respawn_delay, lambda: self._run(node)))
+        self._check_ended()
+
+    def _stop(self, node: Node, timeouts: tuple[float, float]) -> None:
+        """Stop a node's process by SIGINT, and by SIGTERM and SIGKILL after time-outs."""
+        node.stopping = True
+        node.cancel()
+        pid = node.status['pid']
+        if pid is None:
+            if node.status['state'] == 'starting':
+                node.status['state'] = 'exited'
+            return
+        kill = functools.partial(self.processes.kill, pid)
+        kill(signal.SIGINT)
+        node.timers += [
+            self.loop.at(timeouts[0], lambda: kill(signal.SIGTERM)),
+            self.loop.at(sum(timeouts), lambda: kill(signal.SIGKILL))]
 
     # -- the end --------------------------------------------------------------------------------
 
     def stop_all(self, then: Callable[[], None], *, quickly: bool = False) -> None:
-        """Stop every node and the launch process; then call ``then``."""
+        """Stop every node and its descendants; then call ``then``."""
         self.stopped.append(then)
         self.quickly = self.quickly or quickly
         if self.stopping and not quickly:
             return
         self.stopping = True
-        launch = self.launch
-        if launch is None:
-            self.processes.sweep(self.mark, self._swept, quickly=self.quickly)
-            return
-        launch.stop()
-        grace = max((self.graces[node['id']] for node in self.running), default=2.0)
-        steps = [(grace + 3.0, signal.SIGKILL)]
-        if quickly:
-            steps = [(0.0, signal.SIGINT), (0.4, signal.SIGTERM), (0.8, signal.SIGKILL)]
-        for delay, number in steps:
-            self.loop.at(delay, self._killer(launch, number))
+        longest = 0.0
+        for node in self.known.values():
+            timeouts = QUICK if quickly else node.timeouts
+            if node.status['pid'] is not None:
+                longest = max(longest, sum(timeouts))
+            if quickly or not node.stopping:
+                self._stop(node, timeouts)
+        if self.limit is not None:
+            self.limit.at = None
+        # a process in the kernel may not end at all
+        self.limit = self.loop.at(longest + 3.0, self._sweep)
+        self._check_ended()
 
-    def _killer(self, launch: CloudLaunch, number: int) -> Callable[[], None]:
-        def kill() -> None:
-            if self.launch is launch:
-                self.processes.kill(launch.pid, number)
-        return kill
+    def _check_ended(self) -> None:
+        """Go on with the end if no node runs any more."""
+        if self.limit is not None and not any(
+                node.status['pid'] for node in self.known.values()):
+            self._sweep()
 
-    def _launch_exited(self, launch: CloudLaunch, status: int) -> None:
-        while launch.receive():
-            pass  # its last lines
-        launch.close()
-        self.launch = None
-        expected, self.stopping = self.stopping, True  # start nothing until its nodes have ended
-        left = self.running
-
-        def swept(number: int) -> None:
-            events: list[NodeExited | LaunchExited] = []
-            for node in left:
-                node['state'], node['pid'], node['returncode'] = 'exited', None, -number
-                events.append({'event': 'exited', 'node': node['id'], 'name': node['name'],
-                               'returncode': -number,
-                               # by the robot, after ``launch_exited``
-                               'respawns': not expected and node['id'] in self.respawn})
-            if not expected:
-                say(f'the launch process ended with status {status}')
-                events.append({'event': 'launch_exited', 'returncode': status,
-                               'said': self._last_words()})
-            if events:
-                self.write([dump(event)[1:] for event in events])
-            self._swept(number)
-
-        self.processes.sweep(self.mark, swept, quickly=self.quickly)
+    def _sweep(self) -> None:
+        """End what nodes left behind."""
+        if self.limit is not None:
+            self.limit.at = None
+            self.limit = None
+        self.processes.sweep(self.mark, self._swept, quickly=self.quickly)
 
     def sweep_former(self) -> None:
-        """End the nodes of an agent that died here; report that their launch process ended."""
-        def swept(number: int) -> None:
-            event: LaunchExited = {
-                'event': 'launch_exited', 'returncode': -int(signal.SIGKILL), 'said': ''}
+        """End the nodes of an agent that died here, and report it."""
+        def swept() -> None:
+            event: AgentRestarted = {'event': 'restarted'}
             self.write([dump(event)[1:]])
-            self._swept(number)
+            self._swept()
 
         self.stopping = True
         self.processes.sweep(self.mark, swept, quickly=False)
 
-    def _swept(self, number: int) -> None:
+    def _swept(self) -> None:
         """Note that no process of the nodes is left, and remove what they received."""
         with contextlib.suppress(OSError):
             for name in os.listdir(self.directory):
                 if name.startswith('files-'):
-                    remove_tree(self.path(name))
+                    remove_tree(os.path.join(self.directory, name))
+        self.settings = None
         self.stopping = False
         calls, self.stopped = self.stopped, []
         for call in calls:

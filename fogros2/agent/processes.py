@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 #: Time-outs in seconds of commands, and of the commands of health checks and watches.
 COMMAND_TIMEOUT, CHECK_TIMEOUT = 30.0, 10.0
-#: (seconds, signal): when processes that the launch process left behind get each signal.
+#: (seconds, signal): when processes that the nodes left behind get each signal.
 SWEEP = ((0.0, signal.SIGINT), (3.0, signal.SIGTERM), (6.0, signal.SIGKILL))
 SWEEP_QUICKLY = ((0.0, signal.SIGINT), (0.4, signal.SIGTERM), (0.8, signal.SIGKILL))
 #: Maximum bytes of a watch's output in its event, and its poll interval in seconds.
 REASON, WATCH_INTERVAL = 2000, 5.0
-#: The variable that marks the descendants of the launch process.
+#: The variable that marks the nodes and their descendants.
 MARK = 'FOGROS2_AGENT_MARK'
 
 
@@ -58,6 +58,16 @@ class Identity:
             os.setegid(self.account.pw_gid)
             os.seteuid(self.account.pw_uid)
 
+    @property
+    def options(self) -> Json:
+        """Options of ``Popen`` for a process of the login user, in the user's home."""
+        user = self.account
+        options: Json = {'cwd': user.pw_dir if os.path.isdir(user.pw_dir) else '/', 'umask': 0o022}
+        if os.getuid() != user.pw_uid:
+            options.update(user=user.pw_uid, group=user.pw_gid,
+                           extra_groups=os.getgrouplist(user.pw_name, user.pw_gid))
+        return options
+
     @contextlib.contextmanager
     def root(self) -> Iterator[None]:
         """Become root during the block, if the agent was started as root."""
@@ -78,7 +88,7 @@ def search_path() -> str:
 
 
 def marked(mark: str) -> list[int]:
-    """Return all descendants of the agent's launch process, found by their environment."""
+    """Return the nodes' processes and their descendants, found by their environment."""
     wanted = f'{MARK}={mark}'.encode()
     found = []
     for name in os.listdir('/proc'):
@@ -126,24 +136,27 @@ class Processes:
         """
         with self.identity.root():
             child = subprocess.Popen(
-                argv, stdin=subprocess.DEVNULL, start_new_session=True, **options)
+                argv, start_new_session=True, **{'stdin': subprocess.DEVNULL, **options})
         child.returncode = 0  # ``reap`` collects the status
         self.children[child.pid] = exited
         return child.pid
 
-    def kill(self, group: int, number: int) -> None:
-        """Send a signal to a process group."""
+    def kill(self, pid: int, number: int) -> None:
+        """Send a signal to a process that ``start`` returned, SIGKILL to its whole group."""
+        send = os.killpg if number == signal.SIGKILL else os.kill
         with self.identity.root(), contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(group, number)
+            send(pid, number)
 
     def spawn(
         self, argv: list[str], then: Callable[[int], None], *, timeout: float = COMMAND_TIMEOUT,
-        output: int = -1,
+        output: int = -1, **options: Any,
     ) -> None:
         """
         Run a command, as root if possible; pass its exit status to ``then`` (127: not found).
 
         Its output goes to the agent's own log, standard output to the descriptor ``output``.
+
+        :param options: as for ``subprocess.Popen``.
         """
         def expire() -> None:
             say(f'{argv[0]} took longer than {timeout:g} s')
@@ -157,7 +170,7 @@ class Processes:
         try:
             pid = self.start(
                 argv, exited, stdout=own_log if output < 0 else output, stderr=own_log,
-                cwd='/', env={**os.environ, 'PATH': search_path()})
+                **{'cwd': '/', 'env': {**os.environ, 'PATH': search_path()}, **options})
         except (OSError, ValueError) as error:
             say(f'{argv[0] if argv else "an empty command"}: {error}')
             self.loop.at(0.0, lambda: then(127))
@@ -173,23 +186,21 @@ class Processes:
             self.spawn(commands[index], lambda status: step(index + 1, good and status == 0))
         step(0, True)
 
-    def sweep(self, mark: str, then: Callable[[int], None], *, quickly: bool) -> None:
-        """End processes that the launch process left; pass the last signal sent to ``then``."""
+    def sweep(self, mark: str, then: Callable[[], None], *, quickly: bool) -> None:
+        """End the processes that nodes left behind, then call ``then``."""
         begin = self.loop.clock()
         steps = list(SWEEP_QUICKLY if quickly else SWEEP)
-        last = signal.SIGKILL
 
         def look() -> None:
-            nonlocal last
             left, age = marked(mark), self.loop.clock() - begin
             if not left or age > SWEEP[-1][0] + 2.0:
-                then(last)
+                then()
                 return
             while steps and age >= steps[0][0]:
-                last = steps.pop(0)[1]
+                number = steps.pop(0)[1]
                 for pid in left:
                     with contextlib.suppress(ProcessLookupError, PermissionError):
-                        os.kill(pid, last)
+                        os.kill(pid, number)
             self.loop.at(0.02, look)
         look()
 

@@ -17,8 +17,8 @@ A request is ``{"id": 1, "command": ..., ...}``. A reply is ``{"id": 1, "ok": tr
 ``watch``      ``what`` (idle), ``argv``, run as root every ``interval`` (s, default 5). When it
                exits with 0, the agent sends one event named ``what``, with the output as
                ``reason``, and ends the watch. The watch ``notice`` is part of the configuration.
-``launch``     start the process that will run the nodes, ahead of time
-``start``      ``nodes``: list of NodeSpec; nodes with a known id are ignored
+``start``      ``nodes``: list of NodeSpec; nodes with a known id are ignored. Replies when the
+               setup files have been sourced and the processes started.
 ``stop``       ``nodes``: ids, or null for all; replies at once, ``exited`` events follow
 ``signal``     ``node``, ``signal``: 'SIGINT'
 ``status``     the agent's state; ``ping`` is cheaper and returns nothing
@@ -73,7 +73,6 @@ CONFIG: dict[str, tuple[tuple[type, ...], Any]] = {
     'heartbeat': ((dict, type(None)), None),
     'environment': ((dict,), {}),
     'setup': ((list,), []),
-    'ros_command': ((list,), []),
     # command of the watch for a preemption notice; fixed for a launch once it is not None
     'notice': ((list, type(None)), None),
     'log_bytes': ((int,), LOG_BYTES),

@@ -23,7 +23,7 @@ import time
 
 from fogros2.agent.journal import BLOCK, Journal
 from fogros2.agent.loop import Channel, Loop
-from fogros2.agent.nodes import Nodes
+from fogros2.agent.nodes import Node, Nodes
 from fogros2.agent.processes import (
     Checks,
     Identity,
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from typing import Any, Optional
 
     from fogros2.agent.protocol import Json
-    from fogros2.events import AgentEvent, Configured, Empty, Launched, StartedNodes, Status
+    from fogros2.events import AgentEvent, Configured, Empty, Status
 
 #: The number of connections; with more, the connection that was idle for longest is closed.
 CLIENTS = 64
@@ -49,8 +49,7 @@ RETRY_END = 30.0
 FIRST_RESTART, LAST_RESTART = 0.1, 30.0
 #: Settings that a restarted agent takes over from its predecessor.
 RESUMED = (
-    'launch', 'on_exit', 'lifetime', 'robot_timeout', 'heartbeat', 'environment', 'setup',
-    'ros_command')
+    'launch', 'on_exit', 'lifetime', 'robot_timeout', 'heartbeat', 'environment', 'setup')
 
 
 class Client(Channel):
@@ -311,7 +310,6 @@ class Agent:
             self.heartbeats.open()
         except Refused as error:
             say(str(error))
-        self.nodes.trim_log()
         self._watch_notice()
         if self.journal.next > 1:
             # the nodes end with the agent that died here, and nothing has reported it
@@ -406,12 +404,8 @@ class Agent:
                 f"this machine belongs to launch '{owner}', whose last sign of life is "
                 f'{self.loop.clock() - heard_at:.0f} s old',
                 'end that launch, or choose another name', 'busy')
-        running = self.nodes.launch is not None
-        outdated = running and not self.nodes.running and any(
-            new.get(key, self.config[key]) != self.config[key]
-            for key in ('setup', 'ros_command', 'environment'))
-        occupied = taken_over and (running or self.checks.kept or self.checks.watched)
-        if not (self.nodes.stopping or outdated or occupied):
+        occupied = taken_over and (self.nodes.known or self.checks.kept or self.checks.watched)
+        if not (self.nodes.stopping or occupied):
             return self._configure(new, taken_over)
         if taken_over:
             self.claimed = new['launch']
@@ -434,7 +428,7 @@ class Agent:
         if taken_over:
             self.claimed = ''
             self.adopted = True
-            self.nodes.states.clear()
+            self.nodes.known.clear()
             new.setdefault('heartbeat', None)
             self.config['notice'] = None
         self.released = self.released and not new.get('launch')
@@ -486,16 +480,25 @@ class Agent:
         self.checks.watch('idle', argv, max(0.05, interval))
         return {}
 
-    def do_launch(self, client: Client, request: Json) -> Launched:
-        """Start the launch process, if it does not run."""
-        self._check_held()
-        return {'pid': self.nodes.start_launch().pid}
-
-    def do_start(self, client: Client, request: Json) -> StartedNodes:
-        """Start nodes."""
+    def do_start(self, client: Client, request: Json) -> None:
+        """Start nodes, as soon as their environment is known."""
         specs = request['nodes']
+        if not isinstance(specs, list) or not all(isinstance(spec, dict) for spec in specs):
+            raise Refused("'nodes' is a list of objects")
+        nodes = [Node(spec) for spec in specs]
         self._check_held()
-        return {'known': self.nodes.start(specs)}
+        reply = client.reply_later(request.get('id'))
+
+        def sourced(failure: Optional[Refused]) -> None:
+            try:
+                if failure is not None:
+                    raise failure
+                self._check_held()
+                reply({'known': self.nodes.start(nodes)})
+            except Refused as error:
+                reply(error.answer)
+
+        self.nodes.source(sourced)
 
     def do_stop(self, client: Client, request: Json) -> Empty:
         """Stop nodes."""
@@ -512,7 +515,6 @@ class Agent:
         with open('/proc/self/statm') as stream:
             rss = int(stream.read().split()[1]) * os.sysconf('SC_PAGE_SIZE') // 1024
         config, now, dog = self.config, self.loop.clock(), self.watchdog
-        launch = self.nodes.launch
         return {
             'machine': config['machine'], 'launch': config['launch'], 'pid': os.getpid(),
             'user': config['user'], 'directory': self.directory, 'since': self.since,
@@ -520,9 +522,9 @@ class Agent:
             'lifetime_left': dog.lifetime_from + config['lifetime'] - now,
             'heartbeat_age': None if dog.beat_at is None else now - dog.beat_at,
             'ending': self.ending,
-            'launch_running': launch is not None and not launch.stopping,
-            'nodes': list(self.nodes.states.values()), 'kept': self.checks.status(),
-            'rss_kb': rss, 'first': self.journal.first, 'next': self.journal.next,
+            'nodes': [node.status for node in self.nodes.known.values()],
+            'kept': self.checks.status(), 'rss_kb': rss,
+            'first': self.journal.first, 'next': self.journal.next,
         }
 
     def do_ping(self, client: Client, request: Json) -> Empty:
@@ -587,7 +589,7 @@ class Agent:
             self.nodes.stop_all(self._end_machine)
 
     def _hurry(self) -> None:
-        """Start nothing more, and give processes that a launch process left little time."""
+        """Start nothing more, and give processes that the nodes left behind little time."""
         self.ending = self.nodes.quickly = True
 
     def _end_machine(self) -> None:

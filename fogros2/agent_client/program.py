@@ -17,8 +17,8 @@ def joined() -> str:
     """
     Return the modules of ``fogros2.agent`` as one program.
 
-    Docstrings, comments and imports that only a type checker needs stay behind, because EC2 limits
-    the size of user data.
+    Docstrings, comments and imports that only a type checker needs stay behind: launches send the
+    program to machines.
     """
     imports, lines = set(), []
     for name in agent.MODULES:

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent import futures
 from concurrent.futures import Future, ThreadPoolExecutor
-import contextlib
 import dataclasses
 from decimal import Decimal
 import functools
@@ -390,7 +389,6 @@ class Launch:
             mine.set_exception(error)
             raise
         mine.set_result(machine)
-        self._warm()
         return machine
 
     def retire(self, name: str) -> None:
@@ -419,20 +417,6 @@ class Launch:
                                    f'the launch tries the next offer, of {following.provider}'))
                 self._check_choices(following)
         return bring_up(self.context(last), last)
-
-    def _warm(self) -> None:
-        """
-        Start the machines' launch processes once all machines are up.
-
-        This shortens the start of nodes. Earlier, it would slow down machines on the same
-        computer that are still coming up.
-        """
-        ups = list(self._ups.values())
-        if self.ending or not all(up.done() for up in ups):
-            return  # a kept machine would keep the process
-        for machine in self.machines():
-            with contextlib.suppress(FogError):  # the first start of a node reports the same error
-                machine.warm()
 
     @property
     def ending(self) -> bool:

@@ -46,19 +46,12 @@ class RunningMachine(Step):
         self.vpn_address = job.interface.address
         self._modules = modules
         self._containers = containers
-        self._warm = False
         self._lock = threading.Lock()
         self._callback: Optional[EventCallback] = None
         self._lost = ''
         self._published: dict[int, tuple[str, int]] = {}
         job.undo.callback(Watch(
             context, job, gone=self._gone, found=found, lost=self._is_lost).close)
-
-    def warm(self) -> None:
-        """Start the machine's launch process ahead of its nodes; once."""
-        if not self._warm:
-            self._warm = True
-            self.agent.request('launch')
 
     def start(self, nodes: Sequence[NodeSpec]) -> None:
         """

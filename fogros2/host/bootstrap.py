@@ -77,7 +77,6 @@ class RosInstall:
     How ROS programs run on a machine.
 
     :param kind: an installation of ROS 2, or its wheels.
-    :param command: command that starts our launch file there.
     :param setup: scripts for sh to source in this order, after ``environment`` is set; with a
         workspace's script if it is needed.
     :param facts: facts of the machine; ``robot`` has those of the robot.
@@ -85,7 +84,6 @@ class RosInstall:
     """
 
     kind: Literal['ros', 'pip']
-    command: tuple[str, ...]
     setup: tuple[str, ...] = ()
     environment: Mapping[str, str] = dataclasses.field(default_factory=dict)
     facts: HostFacts = HostFacts()
@@ -365,12 +363,11 @@ def plan_alike(
     same = facts.architecture == robot.architecture and all(
         facts.environments.get(prefix, '?') == robot.environments.get(prefix)
         for prefix in under.prefixes)
-    ours = _travelling(chain) or ((facts.cloud_launch,) if facts.cloud_launch else ())
-    if not same or not ours or spec.bootstrap == 'apt':
+    if not same or not (facts.fogros2 or _travels(chain)) or spec.bootstrap == 'apt':
         return None
     install = RosInstall(
-        'ros' if robot.has_rmw(under.rmw) else 'pip', (under.ros2, 'launch', *ours),
-        environment=under.environment, facts=facts, robot=robot)
+        'ros' if robot.has_rmw(under.rmw) else 'pip', environment=under.environment, facts=facts,
+        robot=robot)
     return Preparation(
         'none', _with_workspaces(install, chain, spec.name, _builds(facts)),
         _tools(facts, spec.bootstrap, spec.name))
@@ -597,9 +594,7 @@ def _pip_python(facts: HostFacts, wheels: wheel_cache.Wheels) -> Python:
 
 def _pip_install(facts: HostFacts, wheels: wheel_cache.Wheels) -> RosInstall:
     prefix = f'{_folder(facts, wheels)}/venv'
-    version = '{}.{}'.format(*_pip_python(facts, wheels).version)
-    program = f'{prefix}/lib/python{version}/site-packages/fogros2/cloud_launch.py'
-    return RosInstall('pip', (f'{prefix}/bin/ros2', 'launch', program), environment={
+    return RosInstall('pip', environment={
         'PATH': f'{prefix}/bin:{SYSTEM_PATH}', 'AMENT_PREFIX_PATH': prefix,
         'VIRTUAL_ENV': prefix})
 
@@ -658,11 +653,9 @@ def _checked(wheels: wheel_cache.Wheels, file: str) -> str:
     return f'echo {shlex.quote(line)} | sha256sum -c >/dev/null\n'
 
 
-def _travelling(chain: Sequence[workspaces.Workspace]) -> tuple[str, ...]:
-    """Return the arguments of ``ros2 launch`` for our launch file if a workspace contains it."""
-    if any(wheel_cache.OWN in space.packages for space in chain):
-        return (wheel_cache.OWN, 'cloud.launch.py')
-    return ()
+def _travels(chain: Sequence[workspaces.Workspace]) -> bool:
+    """Return whether a workspace brings this package."""
+    return any(wheel_cache.OWN in space.packages for space in chain)
 
 
 def _ros(
@@ -670,14 +663,11 @@ def _ros(
 ) -> Preparation:
     """Return the plan that adds this package to an installed ROS, by unpacking its wheel."""
     prefix = facts.ros.get(DISTRO, f'/opt/ros/{DISTRO}')
-    if _travelling(chain):
-        return Preparation('none', RosInstall(
-            'ros', (f'{prefix}/bin/ros2', 'launch', *_travelling(chain)),
-            (f'{prefix}/setup.sh',)))
+    if _travels(chain):
+        return Preparation('none', RosInstall('ros', (f'{prefix}/setup.sh',)))
     folder = _folder(facts, wheels)
     install = RosInstall(
-        'ros', (f'{prefix}/bin/ros2', 'launch', f'{folder}/site/fogros2/cloud_launch.py'),
-        (f'{prefix}/setup.sh',),
+        'ros', (f'{prefix}/setup.sh',),
         {'PYTHONPATH': f'{folder}/site', 'AMENT_PREFIX_PATH': f'{folder}/site/prefix'})
     if wheels.key in facts.installed:
         return Preparation('none', install)

@@ -76,11 +76,11 @@ for e in "$@"; do
 s = u.find_spec("fogros2")
 print(*s.submodule_search_locations if s else ())' 2>/dev/null) || continue 2
             fi
-            [ -z "$w" ] || [ ! -r "$w/cloud_launch.py" ] || echo "cloud_launch $w/cloud_launch.py"
+            [ -z "$w" ] || [ ! -r "$w/__init__.py" ] || echo fogros2
         done
     else
-        for w in "$e"/lib/python3*/site-packages/fogros2/cloud_launch.py; do
-            [ ! -r "$w" ] || echo "cloud_launch $w"
+        for w in "$e"/lib/python3*/site-packages/fogros2/__init__.py; do
+            [ ! -r "$w" ] || echo fogros2
         done
     fi
     s=$(cat "$e"/lib/python3*/site-packages/*2[-_]*.dist-info/RECORD "$e"/share/*/package.xml \
@@ -120,7 +120,7 @@ class HostFacts:
         kernel and the network namespace.
     :param installed: keys of wheels that earlier launches have installed completely.
     :param environments: by requested prefix that exists and works, a signature of its packages.
-    :param cloud_launch: path of our launch file in one of them, '' for none.
+    :param fogros2: whether one of them has this package.
     """
 
     system: str = 'unknown'
@@ -141,7 +141,7 @@ class HostFacts:
     network: str = ''
     installed: frozenset[str] = frozenset()
     environments: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    cloud_launch: str = ''
+    fogros2: bool = False
 
     @property
     def python(self) -> Optional[Python]:
@@ -203,7 +203,7 @@ def parse_facts(output: str) -> HostFacts:
         routes=tuple(filter(_is_network, values.get('route', ()))),
         network=one('network'), installed=frozenset(values.get('installed', ())),
         environments={path: signature for signature, path in split('environment', 2)},
-        cloud_launch=one('cloud_launch'))
+        fogros2='fogros2' in found)
 
 
 def _is_network(text: str) -> bool:

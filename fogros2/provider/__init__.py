@@ -57,6 +57,8 @@ class Capabilities:
     :param agent_directory: folder on the machine of the agent that ``create`` starts at boot; ''
         if the launch starts the agent over the first connection.
     :param agent_program: path on the machine of that agent's program.
+    :param agent_sent: the launch sends that program over the first connection, and the machine
+        waits for it from its boot on.
     :param share_folders: folders on the machine by which its relay of shared topics meets those of
         other robots: its own, and the folder of all; empty if the provider has none.
     :param application_port: TCP port on the machine's loopback where ``create`` serves the
@@ -78,6 +80,7 @@ class Capabilities:
     prices: bool = False
     agent_directory: str = ''
     agent_program: str = ''
+    agent_sent: bool = False
     share_folders: tuple[str, ...] = ()
     application_port: int = 0
     preemption_notice: tuple[str, ...] = ()

@@ -41,8 +41,7 @@ _NOTICES = {
     'ending': (logging.WARNING, 'the agent was asked to end: {reason}'),
     'end_failed': (logging.ERROR, 'the machine would not end: exit status {returncode}'),
     'vpn_repaired': (logging.WARNING, 'the VPN was down for {seconds:.1f} s and is up again'),
-    'launch_exited': (
-        logging.ERROR, 'the launch on the machine ended with exit status {returncode}'),
+    'restarted': (logging.ERROR, 'its agent died and was started again; the nodes have ended'),
     'gap': (logging.WARNING, '{count} events of the agent came too late for its log'),
     'connection lost': (logging.WARNING, 'the connection to its agent is lost; trying again'),
     'connection back': (logging.INFO, 'the connection is back'),
@@ -56,7 +55,7 @@ _LAST_EVENTS = ('watchdog', 'ending')
 _HOLD = 60.0
 #: Seconds in which the provider may confirm a notice; EC2 gives two minutes' notice.
 _CONFIRM = 150.0
-#: Seconds, at least, before nodes with respawn start again because their launch process ended.
+#: Seconds, at least, before nodes with respawn start again because their agent died.
 _RESPAWN_DELAY = 1.0
 
 
@@ -407,21 +406,18 @@ class Session:
             kind = f"connection {event['state']}"
         if kind in _NOTICES:
             level, text = _NOTICES[kind]
-            text = text.format_map(event)
-            if event['event'] == 'launch_exited' and event['said']:
-                text += f": {event['said']}"
-            self._logger.log(level, f'{self.spec.name}: {text}')
+            self._logger.log(level, f'{self.spec.name}: {text.format_map(event)}')
         if kind in _LAST_EVENTS and self.spec.on_interrupt != 'shutdown' and not self.interrupted:
             self._ending = True
             self._loop.call_later(_HOLD, self._release_exits)
-        elif event['event'] == 'launch_exited' and not self._ending:
+        elif kind == 'restarted' and not self._ending:
             respawning = self._respawning()
-            self._end_unreported(event['returncode'], respawning)
+            self._end_unreported(respawning)
             self._start_again(respawning)
         elif kind == 'connection absent' and not self._ending and not (
                 self.interrupted and self.replacer):
             respawning = self._respawning()
-            self._end_unreported(_UNREPORTED, [])
+            self._end_unreported([])
             if respawning and not self.replicated:
                 self._fail(AgentError(
                     f"{', '.join(run.node.name for run in respawning)} can't respawn: the agent "
@@ -585,7 +581,7 @@ class Session:
                 and run.node.respawn and run.node.respawn_max_retries != 0]
 
     def _start_again(self, runs: list[RemoteRun]) -> None:
-        """Start processes, that the end of their launch process has ended, in another one."""
+        """Start processes, which ended with their agent, in the agent that was started again."""
         for run in runs:
             # an agent starts the same id once
             node = self._runs.pop(run.node.id).node
@@ -597,7 +593,7 @@ class Session:
             delay = max(_RESPAWN_DELAY, *(run.node.respawn_delay for run in runs))
             self._loop.call_later(delay, self.request, self._start_waiting)
 
-    def _end_unreported(self, returncode: int, respawning: list[RemoteRun]) -> None:
+    def _end_unreported(self, respawning: list[RemoteRun]) -> None:
         for run in list(self._runs.values()):
             if run in self._waiting:
                 continue
@@ -606,7 +602,7 @@ class Session:
                 continue  # the agent has reported the exit
             if run.started:
                 run.on_event({'event': 'exited', 'node': node.id, 'name': node.name,
-                              'returncode': returncode, 'respawns': run in respawning})
+                              'returncode': _UNREPORTED, 'respawns': run in respawning})
             else:
                 run.on_event({'event': 'refused', 'node': node.id, 'name': node.name,
-                              'error': 'the launch on the machine ended', 'hint': ''})
+                              'error': 'the agent of the machine died', 'hint': ''})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The agent as a process, its nodes as real processes below launch, the client over a pipe."""
+"""The agent as a process, its nodes as real processes, the client over a pipe."""
 
 from __future__ import annotations
 
@@ -22,20 +22,16 @@ from typing import Any, Optional
 
 import pytest
 
-import fogros2
 from fogros2.agent_client import AgentClient, Heartbeat, joined
 from fogros2.errors import AgentError, ConnectError
 from fogros2.model import Command, NodeSpec
 from fogros2.waiting import wait_until
-
-pytest.importorskip('launch.actions', reason='launch is not installed')
 
 ME = pwd.getpwuid(os.getuid()).pw_name
 #: What a sourced ROS 2 needs; an agent that runs as root gives nodes a login's environment.
 ROS_VARIABLES = ('PATH', 'PYTHONPATH', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH')
 #: Signs the heartbeats.
 KEY = '5a' * 32
-LAUNCH = [sys.executable, str(Path(fogros2.__file__).with_name('cloud_launch.py'))]
 
 
 class PipeStream:
@@ -108,7 +104,9 @@ class Rig:
         self.folder = folder
         self.program = program(folder)
         self.directory = folder / 'agent'
-        self.home = folder
+        self.prefix = folder / 'prefix'
+        (self.prefix / 'share/ament_index/resource_index/packages').mkdir(parents=True)
+        (self.prefix / 'share/ament_index/resource_index/packages/pack').touch()
         self.shell = PipeShell()
         self.events: list[dict[str, Any]] = []
         self.agents: list[subprocess.Popen[bytes]] = []
@@ -117,9 +115,9 @@ class Rig:
     def config(self, **more: Any) -> Path:
         config = {
             'machine': 'planner', 'launch': 'abc123', 'directory': str(self.directory),
-            'user': ME, 'ros_command': LAUNCH, 'environment': {
-                'ROS_LOG_DIR': str(self.folder),
-                **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ}},
+            'user': ME, 'environment': {
+                **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ},
+                'AMENT_PREFIX_PATH': str(self.prefix)},
             **more}
         path = self.folder / 'config.json'
         path.write_text(json.dumps(config))
@@ -207,7 +205,6 @@ SLEEP = 'import time\nprint("up")\ntime.sleep(600)\n'
 def test_output_and_exit_status_of_a_node_arrive(rig):
     rig.serve()
     client = rig.client()
-    client.request('launch')
     client.request('start', nodes=[rig.node('n', (
         'import os, sys\n'
         'print("hello", os.environ["X"], os.getcwd())\n'
@@ -280,7 +277,7 @@ def test_stop_goes_from_sigint_to_sigkill(rig):
     assert rig.wait('exited', node='polite')['returncode'] == -2
 
 
-def test_launch_respawns_a_node(rig):
+def test_node_respawns_as_often_as_it_may(rig):
     rig.serve()
     client = rig.client()
     client.request('start', nodes=[rig.node(
@@ -298,8 +295,8 @@ def test_missing_programs_are_refused_by_name(rig):
     (rig.folder / 'broken').chmod(0o700)
     client.request('start', nodes=[
         NodeSpec('package', 'p-1', package='no_such_package', executable='x'),
-        NodeSpec('executable', 'e-1', package='launch', executable='nothing'),
-        NodeSpec('near', 'n-1', package='launchh', executable='x'),
+        NodeSpec('executable', 'e-1', package='pack', executable='nothing'),
+        NodeSpec('near', 'n-1', package='packk', executable='x'),
         NodeSpec('program', 'f-1', arguments=('/no/such/program',)),
         NodeSpec('word', 'w-1', arguments=('no-such-word',)),
         NodeSpec('plain', 'd-1', arguments=(str(rig.folder / 'plain'),)),
@@ -312,8 +309,8 @@ def test_missing_programs_are_refused_by_name(rig):
     reasons = {name: rig.wait('refused', node=name) for name in (
         'package', 'executable', 'near', 'program', 'word', 'plain', 'broken', 'folder', 'empty')}
     assert "package 'no_such_package' not found" in reasons['package']['error']
-    assert "'nothing' not found in package 'launch'" in reasons['executable']['error']
-    assert "did you mean 'launch'?" in reasons['near']['hint']
+    assert "'nothing' not found in package 'pack'" in reasons['executable']['error']
+    assert "did you mean 'pack'?" in reasons['near']['hint']
     assert "'/no/such/program' not found" in reasons['program']['error']
     assert "'no-such-word' not found" in reasons['word']['error']
     assert "isn't executable" in reasons['plain']['error']
@@ -335,9 +332,9 @@ def test_files_arrive_and_markers_become_paths(rig):
         'print(mode == (0o600, 0o700), open(path).read(), os.environ["SHARE"] == share, path)\n'))
     client.request('start', nodes=[NodeSpec(
         'k', 'k-1', arguments=(*script.arguments, ({'file': 'params.yaml'},),
-                               ({'share': 'launch'}, '/x')),
-        files={'params.yaml': ('rate: ', {'prefix': 'launch'})},
-        environment={'SHARE': ({'share': 'launch'}, '/x')})])
+                               ({'share': 'pack'}, '/x')),
+        files={'params.yaml': ('rate: ', {'prefix': 'pack'})},
+        environment={'SHARE': ({'share': 'pack'}, '/x')})])
     assert rig.wait('exited', node='k')['returncode'] == 0
     same, _, prefix, share, path = rig.text('k').split()
     assert (same, share) == ('True', 'True') and os.path.isabs(prefix)
@@ -380,7 +377,6 @@ def test_binary_output_and_lines_without_an_end(rig):
 def test_much_output_fills_neither_memory_nor_disk(rig):
     agent = rig.serve(log_bytes=2 << 20)
     client = rig.client(follow=False)
-    client.request('launch')
     client.request('start', nodes=[rig.node('n', (
         'import sys\n'
         'block = b"x" * 99 + b"\\n"\n'
@@ -475,7 +471,7 @@ BAD_REQUESTS = [
     (b'[' * 100_000 + b'\n', 'malformed request'),
     (b'{"command": "start"}\n', "'nodes' is missing"),
     (b'{"command": "start", "nodes": 7}\n', "'nodes' is a list"),
-    (b'{"command": "start", "nodes": [{"id": 1}]}\n', "'nodes' is a list"),
+    (b'{"command": "start", "nodes": [{"id": 1}]}\n', "has an 'id' and a 'name'"),
     (b'{"command": "stop", "nodes": ["x"]}\n', "no node 'x'"),
     (b'{"command": "configure", "lifetime": -1}\n', "'lifetime' has to be above 0"),
     (b'{"command": "configure", "lifetime": NaN}\n', "'lifetime' has to be above 0"),
@@ -637,34 +633,54 @@ def test_agent_starts_again_unless_it_was_ended(tmp_path, number, change, starts
     assert (tmp_path / 'starts').read_text().count('start') == starts
 
 
-def test_killed_launch_process_ends_its_nodes_and_restarts(rig):
+def test_killed_node_starts_again_after_its_delay(rig):
     rig.serve()
     client = rig.client()
-    pid = client.request('launch')['pid']
+    client.request('start', nodes=[rig.node('n', SLEEP, respawn=True, respawn_delay=0.2)])
+    first = rig.wait('started', node='n')['pid']
+    os.kill(first, signal.SIGKILL)
+    exited = rig.wait('exited', node='n')
+    assert (exited['returncode'], exited['respawns']) == (-9, True)
+    wait_until(lambda: sum(e['event'] == 'started' for e in list(rig.events)) == 2, timeout=10,
+               what='the second start')
+    second = [e for e in rig.events if e['event'] == 'started'][1]
+    assert second['pid'] != first and second['time'] - exited['time'] >= 0.2
+
+
+def test_node_that_is_stopped_before_it_respawns_stays_away(rig):
+    rig.serve()
+    client = rig.client()
+    client.request('start', nodes=[
+        rig.node('n', 'raise SystemExit(3)\n', respawn=True, respawn_delay=0.3)])
+    assert rig.wait('exited', node='n')['respawns']
+    client.request('stop', nodes=['n'])
+    client.request('start', nodes=[rig.node('later', 'import time\ntime.sleep(0.6)\n')])
+    rig.wait('exited', node='later')
+    (node, _) = client.request('status')['nodes']
+    assert (node['state'], node['pid']) == ('exited', None)
+    assert sum(e['event'] == 'started' and e['node'] == 'n' for e in rig.events) == 1
+
+
+def test_stopped_nodes_leave_no_descendant(rig):
+    rig.serve(on_exit='keep')
+    client = rig.client()
     client.request('start', nodes=[rig.node('n', (
-        'import os, subprocess, sys, time\n'
+        'import subprocess, time\n'
         'child = subprocess.Popen(["sleep", "600"], start_new_session=True)\n'
         'print(child.pid)\n'
-        'time.sleep(600)\n'), respawn=True)])
-    node = rig.wait('started', node='n')['pid']
+        'time.sleep(600)\n'))])
     wait_until(lambda: '\n' in rig.text('n'), timeout=10, what='the child')
-    child = int(rig.text('n'))
-    os.kill(pid, signal.SIGKILL)
-    assert rig.wait('launch_exited')['returncode'] == -9
-    exited = rig.wait('exited', node='n')
-    assert exited['returncode'] == -2 and exited['respawns']
-    assert gone(node)() and gone(child)()
-    client.request('start', nodes=[rig.node('again', 'print("here")\n')])
-    assert rig.wait('exited', node='again')['returncode'] == 0
+    client.request('release', on_exit='keep')
+    assert gone(int(rig.text('n')))()
 
 
-def test_failed_launch_process_reports_its_log(rig):
-    rig.serve(ros_command=['sh', '-c', 'echo before >&2; echo no such library >&2; exit 3'])
+def test_standard_input_of_nodes_has_no_end(rig):
+    rig.serve()
     client = rig.client()
-    client.request('launch')
-    event = rig.wait('launch_exited')
-    assert event['returncode'] == 3
-    assert event['said'] == 'before\nno such library'
+    client.request('start', nodes=[NodeSpec('cat', 'c-1', arguments=('cat',)),
+                                   rig.node('after', 'import time\ntime.sleep(0.3)\n')])
+    rig.wait('exited', node='after')
+    assert client.request('status')['nodes'][0]['state'] == 'running'
 
 
 def test_starting_twice_runs_once(rig):
@@ -680,10 +696,7 @@ def test_starting_twice_runs_once(rig):
 def test_variables_configured_later_reach_the_nodes(rig):
     rig.serve()
     client = rig.client()
-    client.request('launch')
-    client.request('configure', environment={
-        'LATE': 'yes', 'ROS_LOG_DIR': str(rig.folder),
-        **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ}})
+    client.request('configure', environment={'LATE': 'yes', 'PATH': os.environ['PATH']})
     client.request('start', nodes=[rig.node('n', 'import os\nprint(os.environ["LATE"])\n')])
     rig.wait('exited', node='n')
     assert rig.text('n') == 'yes\n'
@@ -691,9 +704,9 @@ def test_variables_configured_later_reach_the_nodes(rig):
 
 def test_variables_of_setup_files_reach_the_nodes(rig):
     setup = rig.folder / 'setup.bash'
-    setup.write_text('export LISTED="sourced:$LISTED"\n')
+    setup.write_text('echo printed\nexport LISTED="sourced:$LISTED"\n')
     rig.serve(setup=[str(setup)], environment={
-        'ROS_LOG_DIR': str(rig.folder), 'LISTED': 'configured',
+        'LISTED': 'configured',
         **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ}})
     client = rig.client()
     client.request('start', nodes=[rig.node('n', 'import os\nprint(os.environ["LISTED"])\n')])
@@ -709,20 +722,14 @@ def test_setup_files_are_sourced(rig):
     client.request('start', nodes=[rig.node('n', 'import os\nprint(os.environ["SOURCED"])\n')])
     rig.wait('exited', node='n')
     assert rig.text('n') == "from it's a setup.bash 0\n"
-    client.request('configure', setup=['/no/such/setup.bash'])  # restarts the launch process
+    client.request('configure', setup=['/no/such/setup.bash'])
     with pytest.raises(AgentError, match='setup.bash to be sourced is not there'):
-        client.request('launch')
-
-
-def test_missing_ros_command_is_refused(rig):
-    rig.serve(ros_command=['/no/such/ros2'])
-    client = rig.client()
-    with pytest.raises(AgentError, match="/no/such/ros2 can't be started"):
-        client.request('launch')
-    client.request('configure', ros_command=[])
-    with pytest.raises(AgentError, match="no 'ros_command'"):
-        client.request('start', nodes=[rig.node('n', SLEEP)])
-    assert client.request('status')['nodes'] == []
+        client.request('start', nodes=[rig.node('later', SLEEP)])
+    setup.write_text('exit 3\n')
+    client.request('configure', setup=[str(setup)], environment={'PATH': os.environ['PATH']})
+    with pytest.raises(AgentError, match="can't be sourced: exit status 3"):
+        client.request('start', nodes=[rig.node('later', SLEEP)])
+    assert [node['id'] for node in client.request('status')['nodes']] == ['n']
 
 
 def ends(rig: Rig) -> list[str]:
@@ -909,8 +916,13 @@ def test_late_request_does_not_claim_a_released_machine(rig):
 def test_release_during_a_takeover_leaves_the_machine_free(rig):
     rig.serve(launch='first', on_exit='keep')
     client = rig.client()
-    client.request('start', nodes=[
-        rig.node('n', STUBBORN, sigterm_timeout=0.2, sigkill_timeout=0.2)])
+    client.request('start', nodes=[rig.node('n', (
+        'import signal, time\n'
+        'signal.signal(signal.SIGINT, lambda *_: print("no"))\n'
+        'signal.signal(signal.SIGTERM, signal.SIG_IGN)\n'
+        'print("up")\n'
+        'while True:\n'
+        '    time.sleep(0.05)\n'), sigterm_timeout=0.2, sigkill_timeout=0.5)])
     rig.wait('output', node='n')
     refused: list[AgentError] = []
 
@@ -922,8 +934,7 @@ def test_release_during_a_takeover_leaves_the_machine_free(rig):
 
     taking = threading.Thread(target=take)
     taking.start()
-    wait_until(lambda: not client.request('status')['launch_running'], timeout=10,
-               what='the first one to be ended')
+    wait_until(lambda: 'no' in rig.text('n'), timeout=10, what='the first one to be ended')
     # the first one's own, which comes too late
     client.request('release', launch='first', on_exit='keep')
     assert client.request('status')['launch'] == 'first'
@@ -1082,9 +1093,9 @@ def test_release_stops_the_nodes_before_it_answers(rig):
     client.request('release', on_exit='keep')
     assert gone(node)()
     status = client.request('status')
-    assert (status['on_exit'], status['launch_running']) == ('keep', False)
-    # what comes too late starts nothing, neither ahead of time nor at all
-    for late in ({'command': 'launch'}, {'command': 'start', 'nodes': [rig.node('late', SLEEP)]},
+    assert status['on_exit'] == 'keep'
+    # what comes too late starts nothing
+    for late in ({'command': 'start', 'nodes': [rig.node('late', SLEEP)]},
                  {'command': 'keep', 'what': 'vpn', 'alive': ['true'], 'repair': [['true']]}):
         with pytest.raises(AgentError, match='no launch has this machine any more'):
             client.request(**late)
@@ -1134,7 +1145,7 @@ def test_restarted_agent_reports_when_no_node_is_left(rig):
     agent.kill()
     agent.wait(10)
     rig.serve()
-    rig.wait('launch_exited')
+    rig.wait('restarted')
     assert all(gone(pid)() for pid in pids)
 
 
@@ -1149,7 +1160,7 @@ def test_restarted_agent_keeps_watchdog_and_journal(rig, free_udp_port):
     first.wait(10)
     # another path than the directory's own: as a machine's boot has it
     second = rig.serve(robot_timeout=3.0, end_command=ends(rig))
-    assert rig.wait('launch_exited')['returncode'] == -9
+    rig.wait('restarted')
     wait_until(gone(node), timeout=10, what='the node to end')
     status = client.request('status')
     assert (status['pid'], status['launch']) == (second.pid, 'def456')
@@ -1182,7 +1193,7 @@ def test_root_agent_runs_nodes_as_the_login_user(login, tmp_path):
               f'echo ${{LC_SECRET:-unset}} >> {record}/id; mv {record}/id {record}/done; cat')
     os.environ['LC_SECRET'] = 'of the agent'
     try:
-        agent = rig.serve(user='nobody', ros_command=['sh', '-c', script], environment={})
+        agent = rig.serve(user='nobody', environment={})
     finally:
         del os.environ['LC_SECRET']
     nobody = pwd.getpwnam('nobody')
@@ -1190,7 +1201,7 @@ def test_root_agent_runs_nodes_as_the_login_user(login, tmp_path):
         assert path.stat().st_uid == nobody.pw_uid
         assert path.stat().st_mode & 0o077 == 0
     client = rig.client()
-    client.request('launch')
+    client.request('start', nodes=[NodeSpec('n', 'n-1', arguments=('sh', '-c', script))])
     wait_until((record / 'done').exists, timeout=10, what='the record')
     lines = (record / 'done').read_text().splitlines()
     assert lines[0] == str(nobody.pw_uid)
@@ -1254,7 +1265,7 @@ def test_agent_as_process_1_reaps_orphans_and_ends(root, tmp_path):
     rig.close()
 
 
-def test_launch_runs_shell_commands_and_terminals(rig):
+def test_shell_commands_terminals_and_prefixes(rig):
     rig.serve()
     client = rig.client()
     client.request('start', nodes=[
@@ -1265,21 +1276,3 @@ def test_launch_runs_shell_commands_and_terminals(rig):
     for node in ('shell', 'tty', 'prefix'):
         assert rig.wait('exited', node=node)['returncode'] == 0
     assert (rig.text('shell'), rig.text('prefix')) == ('ONE TWO\n', 'hi\n')
-
-
-def test_installed_launch_file_runs_under_ros2_launch(rig):
-    share = Path(__file__).parents[2] / 'launch' / 'cloud.launch.py'
-    ros2 = shutil.which('ros2', path=f'{Path(sys.executable).parent}:{os.environ["PATH"]}')
-    if ros2 is None:
-        pytest.skip('needs ros2')
-    path = f'{Path(__file__).parents[2]}:{os.environ.get("PYTHONPATH", "")}'
-    rig.serve(ros_command=[ros2, 'launch', str(share)], environment={
-        'ROS_LOG_DIR': str(rig.folder),
-        **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ},
-        'PYTHONPATH': path})
-    client = rig.client()
-    client.request('start', nodes=[rig.node('n', 'print("here")\n')])
-    assert rig.wait('exited', node='n')['returncode'] == 0
-    assert rig.text('n') == 'here\n'
-    client.request('release')
-    assert 'here' not in (rig.directory / 'launch.log').read_text()

@@ -47,7 +47,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     broken.mkdir()
     (broken / 'av.py').write_text("raise OSError('libavcodec.so.60 is not there')\n")
     index.mkdir()
-    ros = RosInstall('ros', ('ros2', 'launch'), (f'{tmp_path}/not there yet.sh',), {
+    ros = RosInstall('ros', (f'{tmp_path}/not there yet.sh',), {
         'PATH': f"{Path(sys.executable).parent}:{os.environ['PATH']}", 'PYTHONPATH': str(broken),
         'PIP_NO_INDEX': '1', 'PIP_FIND_LINKS': str(index)}, HostFacts(home=str(tmp_path)))
     told: list[object] = []

@@ -164,7 +164,7 @@ def with_ros(computer: BareComputer) -> Iterator[None]:
 
 def under() -> plan.Underlay:
     environment = {'PATH': os.environ['PATH'], 'ROS_DISTRO': 'jazzy'}
-    return plan.Underlay((sys.prefix,), f'{sys.prefix}/bin/ros2', environment)
+    return plan.Underlay((sys.prefix,), environment)
 
 
 def prepared(shell: SSHShell, root: Path) -> bootstrap.RosInstall:

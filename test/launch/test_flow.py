@@ -414,18 +414,17 @@ def test_a_refused_node_is_an_error_line(run, fake, planner, capfd):
     assert "process can't be started: no such program" in capfd.readouterr().out
 
 
-def test_end_of_the_launch_on_the_machine_ends_its_nodes(run, fake, planner, capfd):
-    fake.on_start = lambda machine, node: machine.say(
-        'launch_exited', returncode=-9, said='no such library')
+def test_death_of_the_agent_ends_its_nodes(run, fake, planner, capfd):
+    fake.on_start = lambda machine, node: machine.say('restarted')
     node = talker(planner)
     assert run(LaunchDescription([node])) == 0
     assert node.return_code == -9
-    assert 'planner: the launch on the machine ended with exit status -9: no such library' in (
+    assert 'planner: its agent died and was started again; the nodes have ended' in (
         capfd.readouterr().out)
 
 
 @pytest.mark.parametrize('reported', [False, True])
-def test_nodes_respawn_after_the_end_of_the_agents_launch(
+def test_nodes_respawn_after_the_death_of_their_agent(
     run, fake, planner, monkeypatch, reported,
 ):
     monkeypatch.setattr(session, '_RESPAWN_DELAY', 0.01)
@@ -438,7 +437,7 @@ def test_nodes_respawn_after_the_end_of_the_agents_launch(
             return
         if reported:
             machine.say('exited', node, returncode=-2, respawns=True)
-        machine.say('launch_exited', returncode=-9, said='')
+        machine.say('restarted')
 
     fake.on_start = lives_twice
     node = talker(planner, respawn=True, respawn_max_retries=5)
@@ -455,14 +454,14 @@ def test_nodes_respawn_after_the_end_of_the_agents_launch(
 
 def test_nodes_respawn_at_most_as_often_as_they_may(run, fake, planner, monkeypatch):
     monkeypatch.setattr(session, '_RESPAWN_DELAY', 0.01)
-    fake.on_start = lambda machine, node: machine.say('launch_exited', returncode=-9, said='')
+    fake.on_start = lambda machine, node: machine.say('restarted')
     assert run(LaunchDescription([
         talker(planner, respawn=True, respawn_max_retries=1), talker(planner)])) == 0
     assert len(fake.noted('start')) == 3
 
 
 def test_shutdown_before_a_node_respawns(run, fake, planner):
-    fake.on_start = lambda machine, node: machine.say('launch_exited', returncode=-9, said='')
+    fake.on_start = lambda machine, node: machine.say('restarted')
     node = talker(planner, respawn=True, respawn_delay=60.0)
     assert run(LaunchDescription([
         node, RegisterEventHandler(OnProcessExit(target_action=node, on_exit=[Shutdown()])),

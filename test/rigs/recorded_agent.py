@@ -11,7 +11,7 @@ FOLDER = Path(__file__).with_name('agent_messages')
 
 
 def events() -> list[dict[str, Any]]:
-    """Return its events: at least one of each kind."""
+    """Return its events."""
     return [json.loads(line) for line in (FOLDER / 'events.jsonl').read_text().splitlines()]
 
 

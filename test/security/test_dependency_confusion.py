@@ -30,7 +30,7 @@ from fogros2.plan import Underlay
 OURS = ('fogros2', 'ros2-embedded')
 #: What fogros2 requires on the robot alone.
 ROBOT_ONLY = ('paramiko', 'setuptools')
-UNDER = Underlay(('/robot/.venv',), '/robot/.venv/bin/ros2', {})
+UNDER = Underlay(('/robot/.venv',), {})
 #: What the attacker's code leaves where it has run: beside the interpreter that ran it.
 MARK = 'attacked'
 #: pip installs this, and Python runs it at each of its starts.

@@ -91,7 +91,7 @@ def test_no_text_of_an_event_controls_the_terminal(
         {**node, 'event': 'refused', 'error': attack, 'hint': attack, 'seq': 2},
         {**node, 'event': 'started', 'pid': 1, 'cmd': ['x', attack], 'seq': 3},
         {'event': 'watchdog', 'reason': attack, 'action': attack, 'seq': 4},
-        {'event': 'launch_exited', 'returncode': 1, 'said': attack, 'seq': 5}])
+        {'event': 'ending', 'reason': attack, 'seq': 5}])
     lines = Lines()
     for event in found:
         logs.show(str(event.get('name', '')), str(event.get('stream', '')), lines.of(event), None)

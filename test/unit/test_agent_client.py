@@ -340,7 +340,7 @@ INVALID = [
      'returncode'),
     ('{"event": "vpn_repaired", "what": "vpn", "seconds": NaN}', 'seconds'),
     ('{"event": "vpn_repaired", "what": "vpn", "seconds": 1e999}', 'seconds'),
-    ('{"event": "launch_exited", "returncode": [], "said": ""}', 'returncode'),
+    ('{"event": "restarted", "seq": "x"}', 'seq'),
     ('{"event": "unheard of", "seq": "x"}', 'seq'),
     ('{"event": "ending", "reason": "x", "seq": %s}' % NUMBER, 'seq'),
     ('{"event": "ending", "reason": {"a": 1}, "seq": 1}', 'reason'),

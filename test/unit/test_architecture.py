@@ -26,7 +26,7 @@ PACKAGES = ('fogros2_replicas', 'fogros2_share', 'image_transport_h264', 'point_
 ORDER = """
     model untrusted errors events clock
     waiting report process
-    agent cloud_launch ros_types
+    agent ros_types
     plugin_system store journal ros2_daemon monitor_addresses sealing invitation
     kubernetes_client
     shell vpn dds
@@ -61,9 +61,8 @@ UNLISTED = {
 }
 #: Where plugins live: each plugin is one module or package below one of these.
 INTERFACES = ('provider', 'shell', 'vpn', 'dds', 'image_transport')
-#: Only these may import launch or rclpy; the last two are for programs of ROS 2.
-ROS_ALLOWED = (
-    'describe', 'launch_internals', 'runtime', 'actions', 'cloud_launch', 'ros_types')
+#: Only these may import launch or rclpy; the last is for programs of ROS 2.
+ROS_ALLOWED = ('describe', 'launch_internals', 'runtime', 'actions', 'ros_types')
 ROS = ('launch', 'launch_ros', 'rclpy', 'ros2cli', 'ament_index_python')
 #: SDKs belong to one plugin each.
 SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_client',
@@ -268,9 +267,8 @@ def test_forbidden_words(pattern: str) -> None:
 
 def test_only_one_module_starts_processes() -> None:
     """A command that is waited for goes through ``process``; streams and daemons are few."""
-    # cloud_launch, guests, idle and relocation are programs for machines
-    allowed = {'process.py', 'cloud_launch.py', 'guests.py', 'idle.py', 'relocation.py',
-               'serve.py'}
+    # guests, idle and relocation are programs for machines
+    allowed = {'process.py', 'guests.py', 'idle.py', 'relocation.py', 'serve.py'}
     for path in (*python_files(CORE), *python_files(ROOT / 'fogros2_monitor')):
         if path.name not in allowed and 'subprocess' in path.read_text():
             names = {name for name, _ in imports(path)}

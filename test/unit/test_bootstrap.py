@@ -39,7 +39,7 @@ WHEELS = Wheels('/cache', 'k1', (3, 12), 'x86_64', 'glibc 2.28',
                     'fogros2-1-py3-none-any.whl': 'f1', 'ros2_embedded-1-py3-none-any.whl': 'e1',
                     'numpy-1-cp312-cp312-manylinux_2_28_x86_64.whl': 'n1',
                     'pip-25-py3-none-any.whl': 'b1'})
-UNDER = Underlay(('/robot/.venv',), '/robot/.venv/bin/ros2', {
+UNDER = Underlay(('/robot/.venv',), {
     'PATH': '/robot/.venv/bin:/usr/bin', 'AMENT_PREFIX_PATH': '/ws/install/a:/robot/.venv',
     'ROS_DOMAIN_ID': '7', 'ROS_DISTRO': 'jazzy'})
 
@@ -101,7 +101,7 @@ def test_the_probe_works_here() -> None:
     assert facts.free_bytes is not None and facts.free_bytes > 0
     assert ('rsync' in facts.programs) == (process.which('rsync') is not None)
     assert sys.prefix in facts.environments
-    assert facts.cloud_launch.endswith('fogros2/cloud_launch.py')
+    assert facts.fogros2
 
 
 def test_a_machine_that_has_the_robot_s_network_is_refused() -> None:
@@ -127,7 +127,7 @@ def test_the_probe_survives_odd_prefixes(tmp_path: Path) -> None:
     result = process.run(host.probe([str(odd), '/nowhere']), timeout=30)
     facts = host.parse_facts(result.stdout)
     assert list(facts.environments) == [str(odd)]
-    assert facts.cloud_launch == ''
+    assert not facts.fogros2
 
 
 def test_ros_built_from_sources_is_found(tmp_path: Path) -> None:
@@ -190,13 +190,11 @@ def test_machine_that_lies_about_itself_is_refused(answer: str) -> None:
 
 def test_a_machine_like_the_robot_needs_nothing() -> None:
     robot = dataclasses.replace(NOBLE, environments={'/robot/.venv': '1-2'})
-    machine = dataclasses.replace(robot, cloud_launch='/robot/.venv/x/cloud_launch.py')
+    machine = dataclasses.replace(robot, fogros2=True)
     spec = MachineSpec('m', 'container')
     todo = bootstrap.plan_alike(spec, machine, robot, UNDER)
     assert todo is not None
     assert (todo.mode, todo.tools, todo.commands, todo.note) == ('none', (), (), 'there already')
-    assert todo.install.command == (
-        '/robot/.venv/bin/ros2', 'launch', '/robot/.venv/x/cloud_launch.py')
     assert todo.install.environment == UNDER.environment
     other = dataclasses.replace(machine, environments={'/robot/.venv': '9-9'})
     assert bootstrap.plan_alike(spec, other, robot, UNDER) is None
@@ -223,9 +221,7 @@ def test_auto_installs_ros_by_pip_elsewhere() -> None:
     script = scripts(todo.commands)
     assert '--no-index' in script and '--without-pip' in script
     venv = '/home/ubuntu/.local/share/fogros2/k1/venv'
-    assert todo.install.command == (
-        f'{venv}/bin/ros2', 'launch',
-        f'{venv}/lib/python3.12/site-packages/fogros2/cloud_launch.py')
+    assert todo.install.environment['AMENT_PREFIX_PATH'] == venv
     assert not any(command.sudo for command in todo.commands)
     again = plan(dataclasses.replace(NOBLE, installed=frozenset({'k1'})))
     assert (again.mode, again.commands) == ('none', ())
@@ -282,7 +278,7 @@ def test_ros_has_no_packages_for_rare_processors() -> None:
 
 def test_same_packages_of_another_processor_are_not_alike() -> None:
     robot = dataclasses.replace(ROS, environments={'/robot/.venv': '1-2'},
-                                cloud_launch='/robot/.venv/x/cloud_launch.py')
+                                fogros2=True)
     arm = dataclasses.replace(robot, architecture='aarch64')
     spec = MachineSpec('m', 'container')
     assert bootstrap.plan_alike(spec, robot, robot, UNDER, ()) is not None
@@ -344,7 +340,7 @@ def test_wheel_without_a_build_for_the_machine_is_named() -> None:
 
 
 def test_the_launchs_middleware_is_what_a_machine_gets() -> None:
-    under = Underlay(('/opt/ros/jazzy',), '/opt/ros/jazzy/bin/ros2', {}, 'rmw_cyclonedds_cpp')
+    under = Underlay(('/opt/ros/jazzy',), {}, 'rmw_cyclonedds_cpp')
 
     def planned(facts: HostFacts, mode: Bootstrap) -> bootstrap.Preparation:
         return bootstrap.plan(

@@ -274,7 +274,7 @@ def test_a_users_paths_extend_the_machines(
 
 def test_missing_packages_of_keys_are_no_error() -> None:
     facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=False)
-    install = bootstrap.RosInstall('ros', ('ros2',), facts=facts, robot=facts)
+    install = bootstrap.RosInstall('ros', facts=facts, robot=facts)
     spec = MachineSpec('lab', 'ssh')
     outputs = {'look for dependencies': 'python3-scipy\n',
                'resolve rosdep keys': '#apt\npython3-scipy\n',
@@ -295,7 +295,7 @@ def test_missing_packages_of_keys_are_no_error() -> None:
 @pytest.mark.parametrize('pip', [(), ('x',)])
 def test_silent_rosdep_is_a_warning_and_asked_again(pip: tuple[str, ...]) -> None:
     facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=True)
-    install = bootstrap.RosInstall('pip', ('ros2',), facts=facts, robot=facts)
+    install = bootstrap.RosInstall('pip', facts=facts, robot=facts)
     ran: list[Command] = []
 
     def run(command: Command, **_: object) -> Result:
@@ -327,7 +327,7 @@ def test_package_that_cannot_be_installed_has_a_remedy(
     option: dict[str, tuple[str, ...]], remedy: str,
 ) -> None:
     facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=True)
-    install = bootstrap.RosInstall('ros', ('ros2',), facts=facts, robot=facts)
+    install = bootstrap.RosInstall('ros', facts=facts, robot=facts)
     spec: MachineSpec = dataclasses.replace(MachineSpec('lab', 'ssh'), **option)
 
     def run(command: Command, **_: object) -> Result:
@@ -343,7 +343,7 @@ def test_package_that_cannot_be_installed_has_a_remedy(
 @pytest.mark.parametrize('root', [True, False])
 def test_machine_without_pip_is_found_before_apt(root: bool) -> None:
     facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=root)
-    install = bootstrap.RosInstall('ros', ('ros2',), facts=facts, robot=facts)
+    install = bootstrap.RosInstall('ros', facts=facts, robot=facts)
     spec = MachineSpec('lab', 'ssh', apt=('slow',), pip=('scikit-learn',))
     ran: list[str] = []
 

@@ -314,7 +314,7 @@ def test_a_step_that_fails_ends_those_beside_it(launch, provider, monkeypatch):
         wait_until(lambda: False, timeout=60, cancel=job.cancel, what='the workspace')
 
     skip_early_steps(monkeypatch)
-    monkeypatch.setattr(installing, 'install_ros', lambda *_: RosInstall('ros', ()))
+    monkeypatch.setattr(installing, 'install_ros', lambda *_: RosInstall('ros'))
     monkeypatch.setattr(Joining, 'join', join)
     monkeypatch.setattr(installing, 'send_workspaces', send)
     begin = time.monotonic()
@@ -330,7 +330,7 @@ def test_workspace_vpn_and_ros_are_set_up_in_parallel(
     equipped = []
 
     def install_ros(context, job, on_plan):
-        on_plan(RosInstall('ros', ()))
+        on_plan(RosInstall('ros'))
         assert travelling.wait(10) and joining.wait(10)
         assert not equipped
         raise PrerequisiteError('no such package')

@@ -31,8 +31,8 @@ def install(root: Path) -> Path:
         root / 'src' / 'fogros2' / 'package.xml':
             '<package format="3"><name>fogros2</name></package>',
         site / 'fogros2' / '__init__.py': '',
-        site / 'fogros2' / 'cloud_launch.py': 'x = 1\n',
-        site / 'fogros2' / '__pycache__' / 'cloud_launch.cpython-312.pyc': 'no\n',
+        site / 'fogros2' / 'clock.py': 'x = 1\n',
+        site / 'fogros2' / '__pycache__' / 'clock.cpython-312.pyc': 'no\n',
         site / 'fogros2_examples' / 'talker.py': '',
         site / 'other' / '__init__.py': 'not ours\n',
         info / 'PKG-INFO': 'Metadata-Version: 2.1\nName: fogros2\nVersion: 0.1.0\n',
@@ -72,7 +72,7 @@ def test_a_wheel_is_made_of_what_colcon_installed(colcon, tmp_path):
         'fogros2-0.1.0-py3-none-any.whl', '', False)
     with zipfile.ZipFile(Path(packed.folder, packed.fogros2)) as archive:
         assert set(archive.namelist()) == {
-            'fogros2/__init__.py', 'fogros2/cloud_launch.py', 'fogros2_examples/talker.py',
+            'fogros2/__init__.py', 'fogros2/clock.py', 'fogros2_examples/talker.py',
             *(f'fogros2-0.1.0.data/data/{path}' for path in (
                 f'{INDEX}/fogros2', f'{INDEX}/fogros2_examples',
                 'share/fogros2/launch/cloud.launch.py', 'lib/fogros2_examples/talker')),
@@ -89,7 +89,7 @@ def test_another_content_is_another_wheel(colcon, tmp_path, monkeypatch):
     assert wheels.collect(tmp_path / 'cache') is first
     monkeypatch.setattr(wheels, 'FRESH', 0.0)
     assert wheels.collect(tmp_path / 'cache').key == first.key
-    (module,) = colcon.glob('lib/*/site-packages/fogros2/cloud_launch.py')
+    (module,) = colcon.glob('lib/*/site-packages/fogros2/clock.py')
     module.write_text('x = 2\n')
     assert wheels.collect(tmp_path / 'cache').key != first.key
 
@@ -111,7 +111,7 @@ def test_path_without_a_setup_script_is_reported(colcon, tmp_path, monkeypatch):
         wheels.collect(tmp_path / 'cache')
 
 
-def test_workspace_with_fogros2_brings_the_cloud_launch_file(tmp_path):
+def test_workspace_with_fogros2_needs_no_wheel(tmp_path):
     root = tmp_path / 'ws'
     install(root)
     workspace = inspect(root)
@@ -121,19 +121,16 @@ def test_workspace_with_fogros2_brings_the_cloud_launch_file(tmp_path):
         frozenset({'ip', 'nft', 'rsync', 'wg', 'wireguard-go', 'colcon', 'rosdep'}),
         {'jazzy': '/opt/ros/jazzy'}, {'jazzy': ('rmw_fastrtps_cpp',)},
         environments={'/opt/ros/jazzy': '1-1'})
-    under = Underlay(('/opt/ros/jazzy',), '/opt/ros/jazzy/bin/ros2', {
+    under = Underlay(('/opt/ros/jazzy',), {
         'AMENT_PREFIX_PATH': f'{root}/install/fogros2:/opt/ros/jazzy'})
     spec = MachineSpec('m', 'ssh', workspace=str(root))
     alike = bootstrap.plan_alike(spec, robot, robot, under, [workspace])
     assert alike is not None
-    assert alike.install.command == (
-        '/opt/ros/jazzy/bin/ros2', 'launch', 'fogros2', 'cloud.launch.py')
 
     # a machine with a ROS 2 of its own needs no wheel either
     other = dataclasses.replace(robot, environments={})
     packed = Wheels('/cache', 'k', (3, 12), 'x86_64', 'glibc 2.28', 'f.whl', ros=False)
     todo = bootstrap.plan(spec, other, robot, under, packed, [workspace])
     assert not todo.wheels_target and todo.commands == ()
-    assert todo.install.command == alike.install.command
     assert todo.install.setup == ('/opt/ros/jazzy/setup.sh',)
     assert todo.install.environment['AMENT_PREFIX_PATH'] == f'{root}/install/fogros2'

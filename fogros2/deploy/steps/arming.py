@@ -42,6 +42,16 @@ mv -f -- "$aside" "$3"
 python3 -IS "$3" serve --detach --config "$4"
 """
 
+# Send the agent to a machine whose boot script waits for it; keep an earlier one.
+# $1 program. Standard input is the agent's source.
+_SEND = """\
+[ -e "$1" ] && exit
+umask 077
+cat >"$1.new"
+chmod 755 "$1.new"
+mv -f -- "$1.new" "$1"
+"""
+
 # Remove the agent. A released agent is about to exit; an agent that was never reached still runs.
 # Another robot's agent stays: its configuration names its launch.
 # $1 folder, $2 launch, $3 our configuration.
@@ -101,6 +111,9 @@ class Arming(Step):
                 job.undoing('watchdog', self._remove)
                 if agent is None:
                     self._install(program, config)
+            elif job.capabilities.agent_sent:
+                job.run(Command(('sh', '-ec', _SEND, 'sh', program), sudo=True,
+                                input=joined().encode(), what='send the agent'))
             job.save(agent=job.directory, agent_program=program)
             job.agent = agent = agent or wait_until(
                 lambda: self._claim(program, config),
@@ -185,7 +198,7 @@ class Arming(Step):
                 environment={
                     'FOGROS2_VPN_ADDRESS': address,
                     **plan.extended({**ros.environment, **dds}, job.spec.environment)},
-                setup=list(ros.setup), ros_command=list(ros.command))
+                setup=list(ros.setup))
         except AgentError as error:
             if 'in use' in str(error):
                 raise VpnError(

@@ -72,7 +72,8 @@ class VmProvider(Provider):
     adapter: ClassVar[type[VmCloud]]
     capabilities: ClassVar[Capabilities] = Capabilities(
         firewall=True, one_time_host_key=True, choices=True, adopt=True, regions=True,
-        prices=True, agent_directory=AGENT_DIRECTORY, agent_program=AGENT_PROGRAM)
+        prices=True, agent_directory=AGENT_DIRECTORY, agent_program=AGENT_PROGRAM,
+        agent_sent=True)
 
     def __init__(self, cloud: Optional[VmCloud] = None) -> None:
         # its calls are not cancelled

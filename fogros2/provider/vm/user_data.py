@@ -2,23 +2,22 @@
 """
 Write the user data of a machine: a #cloud-config, gzipped unless the cloud takes only text.
 
-It contains, in this order: the one-time SSH host key and the login key (before sshd starts), the
-agent (before anything slow), and, in the background, programs that an Ubuntu image lacks. It is
-JSON, which is also YAML. cloud-init runs ``bootcmd`` at every boot. So a stopped machine has its
-agent again, and a machine of a baked image does not use the agent's settings of the former one.
+It contains, in this order: the one-time SSH host key and the login key (before sshd starts), a
+script that runs the agent (before anything slow), and, in the background, programs that an Ubuntu
+image lacks. It is JSON, which is also YAML. The launch sends the agent over the first connection;
+until then, the script ends the machine at ``boot_timeout``. cloud-init runs ``bootcmd`` at every
+boot. So a stopped machine starts its agent again, and a machine of a baked image uses neither the
+agent of the former one nor its settings.
 """
 
 from __future__ import annotations
 
-import base64
-import bz2
 from collections.abc import Mapping, Sequence
 import gzip
 import json
 import shlex
 from typing import Any
 
-from fogros2.agent_client import joined
 from fogros2.errors import ProviderError
 from fogros2.provider.vm.host_key import HostKey
 
@@ -33,24 +32,28 @@ LOG = '/var/log/fogros2-agent.log'
 #: Seconds for which the agent may fail to start before the machine ends.
 UNGUARDED = 120
 
-# Starts at the beginning of the boot; the login user is created a little later.
+# Starts at the beginning of the boot, before the login user exists; later comes the agent.
 _WATCHDOG = """\
 #!/bin/sh
 # Keeps the agent running, however it ends; a machine whose agent does not start ends.
 exec >>{log} 2>&1 </dev/null
-left={unguarded}
-while [ $left -gt 0 ]; do
-    if id -u {user} >/dev/null 2>&1; then
-        begin=$(date +%s)
+# the clock may be set while the machine boots
+uptime() {{ read -r now _ </proc/uptime; now=${{now%.*}}; }}
+uptime
+end=$((now + {boot_timeout}))
+while [ $now -lt $end ]; do
+    if [ -e {program} ] && id -u {user} >/dev/null 2>&1; then
+        begin=$now
         python3 -IS {program} serve --config {folder}/agent.json
+        uptime
         # an agent that ran for a while starts again
-        [ $(($(date +%s) - begin)) -lt 10 ] || left={unguarded}
+        [ $((now - begin)) -lt 10 ] || end=$((now + {unguarded}))
     fi
-    left=$((left - 1))
-    sleep 1
+    sleep 0.2
+    uptime
 done
-echo 'the agent does not start: ending the machine'
-{end}
+echo 'no agent came or starts: ending the machine'
+until {end}; do sleep 30; done
 """
 
 _BOOT = """\
@@ -62,16 +65,11 @@ if [ "$(cat {folder}/instance 2>/dev/null)" != "$INSTANCE_ID" ]; then
     home=$(getent passwd {user} | cut -d: -f6)
     [ -z "$home" ] || rm -f "$home/.ssh/authorized_keys"
     rm -f /root/.ssh/authorized_keys
-    rm -f {folder}/kept_until
+    rm -f {folder}/kept_until {program}
     echo "$INSTANCE_ID" >{folder}/instance
 else
     owned=  # at a later boot, the first launch that connects uses the machine
 fi
-python3 -ISc 'import base64, bz2, sys
-sys.stdout.buffer.write(bz2.decompress(base64.b64decode(sys.stdin.read())))' \\
-    >{program} <<'{mark}'
-{agent}
-{mark}
 cat >{folder}/watchdog.sh <<'{mark}'
 {watchdog}
 {mark}
@@ -136,10 +134,9 @@ def cloud_config(
         armed = {'user': user, 'kept_until': f'{FOLDER}/kept_until', **agent_config}
         armed['end_command'] = armed.get('end_command') or list(END_COMMAND)
         names = {'user': user, 'folder': FOLDER, 'program': AGENT_PROGRAM, 'log': LOG,
-                 'unguarded': UNGUARDED, 'end': shlex.join(armed['end_command'])}
-        # bzip2 is smaller here than gzip or xz
-        agent = base64.b64encode(bz2.compress(joined().encode())).decode()
+                 'unguarded': UNGUARDED, 'end': shlex.join(armed['end_command']),
+                 'boot_timeout': round(armed.get('boot_timeout', 1800.0))}
         config['bootcmd'] = [['sh', '-c', _BOOT.format(
-            agent=agent, watchdog=_WATCHDOG.format(**names), mark='FOGROS2-END',
+            watchdog=_WATCHDOG.format(**names), mark='FOGROS2-END',
             config=json.dumps(armed), **names)]]
     return config

@@ -72,7 +72,7 @@ for port in 40000, 8000:
 """
 #: Has a rebooted instance's agent start something.
 ASK_AGENT = """
-[ -e /run/before ] || echo '{"id": 1, "command": "launch"}' |
+[ -e /run/before ] || echo '{"id": 1, "command": "start", "nodes": []}' |
     python3 -IS /opt/fogros2/agent.py connect --directory /run/fogros2
 """
 
