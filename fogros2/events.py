@@ -153,19 +153,11 @@ class Empty(TypedDict):
     """The answer to a request that has no result."""
 
 
-class _Configured(TypedDict):
+class Configured(TypedDict):
+    """The machine's name, and the number of the next event."""
+
     machine: str
     next: int
-
-
-class Configured(_Configured, total=False):
-    """
-    The machine's name, and the number of the next event.
-
-    ``signed``: heartbeats need an HMAC; an agent of the first version omits it.
-    """
-
-    signed: bool
 
 
 class StartedNodes(TypedDict):
@@ -239,22 +231,6 @@ class Refusal(TypedDict, total=False):
     kind: str
 
 
-class _Heartbeat(TypedDict):
-    launch: str
-    t: float
-
-
-class HeartbeatAnswer(_Heartbeat, total=False):
-    """
-    The robot's heartbeat as the agent returns it.
-
-    ``t`` is the robot's monotonic clock in seconds; ``clock`` is the machine's time in seconds
-    since the epoch, which an agent of the first version omits.
-    """
-
-    clock: float
-
-
 _EVENTS: Mapping[str, Any] = {
     get_args(get_type_hints(kind)['event'])[0]: kind for kind in get_args(AgentEvent)}
 _ANSWERS: Mapping[str, Any] = {
@@ -289,13 +265,3 @@ def answer(command: str, message: dict[str, Any]) -> dict[str, Any]:
     refused = message.get('ok') is not True and command != 'log'
     checked(message, Refusal if refused else _ANSWERS.get(command, Empty))
     return message
-
-
-def heartbeat(message: Any) -> HeartbeatAnswer:
-    """
-    Return the received answer to a heartbeat.
-
-    :raises InvalidMessage: a field is missing or has another type.
-    """
-    checked(message, HeartbeatAnswer, 'heartbeat')
-    return message  # type: ignore[no-any-return]

@@ -445,7 +445,7 @@ class Agent:
         self.save()
         self._note_kept()
         self.heartbeats.open()
-        return {'machine': self.config['machine'], 'next': self.journal.next, 'signed': True}
+        return {'machine': self.config['machine'], 'next': self.journal.next}
 
     def _watch_notice(self) -> None:
         if self.config['notice']:

@@ -7,12 +7,11 @@ import contextlib
 import socket
 import threading
 import time
-from typing import Any, Optional
+from typing import Optional
 
-from fogros2 import events, untrusted
 from fogros2.agent.protocol import ANSWER, BEAT, DATAGRAM, sign, verify
 from fogros2.clock import ClockOffset, OffsetFilter
-from fogros2.model import to_json
+from fogros2.untrusted import LARGEST
 
 #: Interval of heartbeats in seconds.
 HEARTBEAT_INTERVAL = 2.0
@@ -35,17 +34,15 @@ class Heartbeat:
 
     :param address: the machine's VPN address.
     :param port: the agent's port on the machine.
-    :param launch_id: the launch for which the agent was configured.
-    :param key: signs the heartbeats, hexadecimal; '' for an agent that knows no signed ones.
+    :param key: the launch's, which the agent is configured with; hexadecimal.
     :param interval: seconds between heartbeats.
     """
 
     def __init__(
-        self, address: str, port: int, launch_id: str, key: str = '',
+        self, address: str, port: int, key: str,
         interval: float = HEARTBEAT_INTERVAL,
     ) -> None:
         self._target = (address, port)
-        self._launch_id = launch_id
         self._key = key
         self._interval = interval
         self._stopped = threading.Event()
@@ -63,7 +60,7 @@ class Heartbeat:
 
     @property
     def clock_offset(self) -> Optional[ClockOffset]:
-        """The best of the recent measurements; None before the first, or with an older agent."""
+        """The best of the recent measurements; None before the first."""
         return self._offset
 
     @property
@@ -88,10 +85,8 @@ class Heartbeat:
 
     def _send(self, link: socket.socket, number: int) -> None:
         now = time.monotonic()
-        data = sign(self._key, BEAT.pack(number, now)) if self._key else to_json(
-            {'launch': self._launch_id, 'n': number, 't': now}).encode()
         with contextlib.suppress(OSError):  # no route while the VPN is down
-            link.sendto(data, self._target)
+            link.sendto(sign(self._key, BEAT.pack(number, now)), self._target)
 
     def _listen(self, link: socket.socket, until: float) -> None:
         while not self._stopped.is_set():
@@ -108,19 +103,13 @@ class Heartbeat:
                 self._stopped.wait(0.05)
                 continue
             now = time.monotonic()
-            try:
-                answer = events.heartbeat(self._parsed(data))
-            except untrusted.InvalidMessage:
-                continue  # an invalid message, perhaps of a stranger
-            if peer != self._target or answer['launch'] != self._launch_id:
+            answer = verify(self._key, ANSWER, data)
+            if answer is None or peer != self._target:
                 continue
-            round_trip = now - answer['t']
+            _, sent, clock = answer
+            if not (abs(sent) <= LARGEST and abs(clock) <= LARGEST):
+                continue
+            round_trip = now - sent
             self._round_trip, self._answered_at = round_trip, now
-            if 'clock' in answer and 0 <= round_trip < LONGEST:
-                self._offset = self._offsets.add(round_trip, time.time(), answer['clock'])
-
-    def _parsed(self, data: bytes) -> Any:
-        if not self._key:
-            return untrusted.parsed(data)
-        fields = verify(self._key, ANSWER, data)
-        return fields and {'launch': self._launch_id, 't': fields[1], 'clock': fields[2]}
+            if 0 <= round_trip < LONGEST:
+                self._offset = self._offsets.add(round_trip, time.time(), clock)

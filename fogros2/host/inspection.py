@@ -203,7 +203,7 @@ def parse_facts(output: str) -> HostFacts:
         routes=tuple(filter(_is_network, values.get('route', ()))),
         network=one('network'), installed=frozenset(values.get('installed', ())),
         environments={path: signature for signature, path in split('environment', 2)},
-        fogros2='fogros2' in found)
+        fogros2='fogros2' in values)
 
 
 def _is_network(text: str) -> bool:

@@ -744,7 +744,7 @@ def test_missing_heartbeats_end_the_machine(rig, free_udp_port):
     node = rig.wait('started', node='n')['pid']
     client.request('configure', heartbeat={
         'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1', 'key': KEY})
-    heartbeat = Heartbeat('127.0.0.1', free_udp_port, 'abc123', KEY, interval=0.1)
+    heartbeat = Heartbeat('127.0.0.1', free_udp_port, KEY, interval=0.1)
     begin = time.monotonic()
     wait_until(lambda: time.monotonic() - begin > 1.5, timeout=5, what='longer than the timeout')
     assert heartbeat.round_trip is not None and 0 < heartbeat.round_trip < 1.0
@@ -764,7 +764,7 @@ def test_missing_heartbeats_end_the_machine(rig, free_udp_port):
 def test_machine_with_a_slow_clock_is_measured(rig, free_udp_port, slow_agent):
     rig.serve(program=slow_agent, heartbeat={
         'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1', 'key': KEY})
-    heartbeat = Heartbeat('127.0.0.1', free_udp_port, 'abc123', KEY, interval=0.1)
+    heartbeat = Heartbeat('127.0.0.1', free_udp_port, KEY, interval=0.1)
     try:
         wait_until(lambda: heartbeat.clock_offset is not None, timeout=10, what='the offset')
         offset = heartbeat.clock_offset
@@ -788,7 +788,7 @@ def test_foreign_heartbeats_do_not_count(rig, free_udp_port, wrong):
                 link.sendto(data, ('127.0.0.1', free_udp_port))
         else:
             heartbeat = stack.enter_context(contextlib.closing(Heartbeat(
-                '127.0.0.1', free_udp_port, 'abc123', 'ff' * 32 if wrong == 'key' else KEY,
+                '127.0.0.1', free_udp_port, 'ff' * 32 if wrong == 'key' else KEY,
                 interval=0.05)))
         assert rig.wait('watchdog')['reason'] == 'robot gone'
         assert heartbeat is None or heartbeat.round_trip is None

@@ -209,7 +209,7 @@ def test_robot_takes_no_answer_of_a_stranger() -> None:
         stranger.bind(('127.0.0.1', 0))
         stranger.settimeout(10)
         with contextlib.closing(Heartbeat(
-                '127.0.0.1', stranger.getsockname()[1], LAUNCH, KEY, interval=0.05)) as robot:
+                '127.0.0.1', stranger.getsockname()[1], KEY, interval=0.05)) as robot:
             for _ in range(5):
                 beat, sender = stranger.recvfrom(2048)
                 number, sent = BEAT.unpack(beat[:BEAT.size])

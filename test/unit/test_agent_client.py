@@ -5,13 +5,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import json
+from math import inf, nan
 import queue
 import socket
 import threading
+import time
 from typing import Any
 
 import pytest
 
+from fogros2.agent.protocol import ANSWER, BEAT, sign, verify
 from fogros2.agent_client import AgentClient, Heartbeat, interval_for
 from fogros2.errors import (
     AgentError,
@@ -23,6 +26,7 @@ from fogros2.waiting import wait_until
 from rigs import recorded_agent
 
 Answer = Callable[[dict[str, Any]], list[Any]]
+KEY = '5a' * 32
 
 
 class ScriptedStream:
@@ -411,18 +415,17 @@ def test_heartbeats_are_sent_and_answers_measured():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as machine:
         machine.bind(('127.0.0.1', 0))
         machine.settimeout(10)
-        heartbeat = Heartbeat('127.0.0.1', machine.getsockname()[1], 'abc', interval=0.05)
+        heartbeat = Heartbeat('127.0.0.1', machine.getsockname()[1], KEY, interval=0.05)
         for number in (1, 2, 3):
             data, robot = machine.recvfrom(2048)
-            beat = json.loads(data)
-            assert (beat['launch'], beat['n']) == ('abc', number)
-        assert heartbeat.round_trip is None and heartbeat.age is None
-        number = b'9' * 1900  # in the range of Python's integers, out of that of its floats
-        for nonsense in (b'', b'x', b'[]', b'[' * 2000, b'{"launch": "other", "t": 0}',
-                         b'{"launch": "abc", "t": %s}' % number, b'{"launch": "abc", "t": NaN}',
-                         b'{"launch": [], "t": 0}', b'{"launch": "abc", "t": 0, "clock": 1e999}'):
+            beat = verify(KEY, BEAT, data)
+            assert beat is not None and beat[0] == number
+        for nonsense in (b'', b'x', b'[]', data, sign(KEY, ANSWER.pack(number, 0.0, nan)),
+                         sign(KEY, ANSWER.pack(number, -inf, 0.0)), sign(KEY, b'{"t": 0}')):
             machine.sendto(nonsense, robot)
-        machine.sendto(data, robot)
+        machine.recvfrom(2048)
+        assert heartbeat.round_trip is None and heartbeat.age is None
+        machine.sendto(sign(KEY, ANSWER.pack(*beat, time.time())), robot)
         until(lambda: heartbeat.round_trip is not None)
         assert heartbeat.round_trip < 5 and heartbeat.age is not None
         heartbeat.close()
@@ -432,7 +435,7 @@ def test_heartbeats_are_sent_and_answers_measured():
 @pytest.mark.parametrize('address', ['127.0.0.1', '255.255.255.255'])
 def test_heartbeats_continue_while_the_network_is_down(address):
     # a port that answers 'refused', and an address that may not be sent to
-    heartbeat = Heartbeat(address, 9, 'abc', interval=0.02)
+    heartbeat = Heartbeat(address, 9, KEY, interval=0.02)
     heartbeat._thread.join(0.2)
     assert heartbeat._thread.is_alive() and heartbeat.round_trip is None
     heartbeat.close()

@@ -207,7 +207,7 @@ class Arming(Step):
                 ) from error
             raise
         job.heartbeat = Heartbeat(
-            address, port, context.launch, key, interval=interval_for(job.spec.robot_timeout))
+            address, port, key, interval=interval_for(job.spec.robot_timeout))
         job.undo.callback(job.heartbeat.close)
         try:
             wait_until(

@@ -73,13 +73,18 @@ def test_the_link_drops_from_10_to_1_megabit_and_returns(vpn: Any) -> None:
     viewer = stream(vpn, '-p', 'quality:=14.0')
     vpn.relay.tell({'rate': 1e6})
     begin = time.monotonic()
-    squeezed = during(viewer, begin + 2.0, 4.0)
-    # about 40 on an idle computer; a busy one encodes fewer
-    assert len(squeezed) > 10
-    latencies = sorted(line['latency'] for line in squeezed)
-    # 0.3 to 0.4 on an idle computer; the queue takes 1.0
-    assert latencies[len(latencies) // 2] < 0.6
-    assert latencies[-1] < 1.2
+
+    def squeezed() -> bool:
+        lines = during(viewer, max(begin + 2.0, time.monotonic()), 4.0)
+        # about 40 on an idle computer; a busy one encodes fewer
+        assert len(lines) > 10
+        latencies = sorted(line['latency'] for line in lines)
+        assert latencies[-1] < 1.2
+        # 0.3 to 0.4 on an idle computer; the queue takes 1.0
+        return latencies[len(latencies) // 2] < 0.6
+
+    # in the first stretch on an idle computer; a busy one's encoder adapts late
+    wait_until(squeezed, timeout=30.0, what='a stream that fits')
     vpn.relay.tell({'rate': 10e6})
     back = during(viewer, time.monotonic() + 5.0, 2.0)
     assert len(back) > 45
