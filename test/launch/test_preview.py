@@ -116,6 +116,16 @@ def test_values_are_those_of_the_arguments():
         'a: aws (region=us-east-1)', '    demo talker', 'b: container', '    demo talker']
 
 
+def test_one_node_runs_on_a_machine_without_a_launch_file_of_its_own():
+    file = Path(__file__).parents[2] / 'launch/cloud.launch.py'
+    source = AnyLaunchDescriptionSource(str(file))
+    described = source.try_get_launch_description_without_context()
+    given = {'package': 'demo', 'executable': 'mapper'}
+    assert lines(described, **given) == ['cloud: container', '    demo mapper']
+    assert lines(described, ['cloud=aws,region=eu-west-1'], **given) == [
+        'cloud: aws (region=eu-west-1)', '    demo mapper']
+
+
 def test_what_only_a_launch_knows_is_said():
     found = lines([
         node(AWSCloudInstance(name='a', region=LaunchConfiguration('nowhere'))),
