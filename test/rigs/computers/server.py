@@ -20,7 +20,6 @@ import re
 import signal
 import sys
 import threading
-import time
 from typing import Any, ClassVar
 
 from fogros2.errors import FogError
@@ -171,7 +170,7 @@ class Box(abc.ABC):
         elif what == 'move_robot':
             self.net.move_robot(order['address'])
         elif what == 'slow':
-            self.slow.pattern, self.slow.seconds = order['pattern'], float(order['seconds'])
+            self.slow.order(order['pattern'], float(order['seconds']))
         elif what == 'held':
             return self.slow.held
         elif what == 'boot_delay':
@@ -192,6 +191,13 @@ class Slow:
     def __init__(self, inner: Callable[..., Iterable[bytes]]) -> None:
         self._inner = inner
         self.pattern, self.seconds, self.held = '', 0.0, 0
+        self._changed = threading.Condition()
+
+    def order(self, pattern: str, seconds: float) -> None:
+        """Hold requests back from now on; without a pattern none, and no more those that are."""
+        with self._changed:
+            self.pattern, self.seconds = pattern, seconds
+            self._changed.notify_all()
 
     def __call__(
         self, environ: dict[str, Any], start_response: Callable[..., Any],
@@ -201,9 +207,10 @@ class Slow:
         environ['wsgi.input'] = io.BytesIO(body)
         words = f"{environ['REQUEST_METHOD']} {environ['PATH_INFO']} {body.decode('latin-1')}"
         if self.pattern and re.search(self.pattern, words):
-            self.held += 1
-            time.sleep(self.seconds)
-            self.held -= 1
+            with self._changed:
+                self.held += 1
+                self._changed.wait_for(lambda: not self.pattern, self.seconds)
+                self.held -= 1
         return self._inner(environ, start_response)
 
 
