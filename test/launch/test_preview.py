@@ -116,7 +116,7 @@ def test_values_are_those_of_the_arguments():
         'a: aws (region=us-east-1)', '    demo talker', 'b: container', '    demo talker']
 
 
-def test_one_node_runs_on_a_machine_without_a_launch_file_of_its_own():
+def test_any_node_runs_on_a_machine_by_the_package_s_launch():
     file = Path(__file__).parents[2] / 'launch/cloud.launch.py'
     source = AnyLaunchDescriptionSource(str(file))
     described = source.try_get_launch_description_without_context()
