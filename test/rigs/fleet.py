@@ -21,7 +21,7 @@ from rigs.sshd import private_sshd, PrivateSshd
 from rigs.vpn_lab import PASSED
 
 #: Of TEST-NET-3; several, as two runs of the tests may meet on one computer.
-SUBNETS = [f'203.0.113.{host}/27' for host in (64, 96, 128, 160)]
+SUBNETS = [f'203.0.113.{host}/27' for host in (0, 96, 128, 160)]
 #: What each robot's machine runs: it publishes a map for later subscribers, and a count; and it
 #: tells what it hears, and which topics it sees. Its arguments: the robot's name, the map's topic.
 NODE = """
