@@ -47,17 +47,17 @@ class Loop:
         return timer
 
     def select(
-        self, connection: socket.socket | int, wanted: int, call: Callable[[int], Any],
+        self, connection: socket.socket | int, events: int, call: Callable[[int], Any],
     ) -> None:
         """Call a function with the ready events of a socket or descriptor that are ``wanted``."""
         key = self.selector.get_map().get(connection)
-        if not wanted:
+        if not events:
             if key is not None:
                 self.selector.unregister(connection)
         elif key is None:
-            self.selector.register(connection, wanted, call)
-        elif key.events != wanted:
-            self.selector.modify(connection, wanted, call)
+            self.selector.register(connection, events, call)
+        elif key.events != events:
+            self.selector.modify(connection, events, call)
 
     def turn(self, until: float) -> None:
         """Wait for a socket, a timer or the time ``until``; make the calls that are due."""
@@ -115,10 +115,10 @@ class Channel:
     def wait(self) -> None:
         """Wait for data, and until the other end takes the rest of the output."""
         # a socket at its end would wake the selector forever
-        wanted = 0 if self.ended else selectors.EVENT_READ
+        events = 0 if self.ended else selectors.EVENT_READ
         if self.out or self.more:
-            wanted |= selectors.EVENT_WRITE
-        self.loop.select(self.socket, wanted, self.serve)
+            events |= selectors.EVENT_WRITE
+        self.loop.select(self.socket, events, self.serve)
 
     def receive(self) -> bool:
         """Read once, and handle the whole lines; return whether there may be more."""

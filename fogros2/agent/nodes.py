@@ -162,12 +162,12 @@ class Nodes:
         output = os.memfd_create('variables', os.MFD_CLOEXEC)
 
         def ran(status: int) -> None:
-            found = os.pread(output, VARIABLES, 0).decode(errors='surrogateescape')
+            printed = os.pread(output, VARIABLES, 0).decode(errors='surrogateescape')
             os.close(output)
             if status != 0:
                 then(Refused(f"{', '.join(setup)} can't be sourced: exit status {status}"))
                 return
-            pairs = (line.partition('=') for line in found.split('\0') if line)
+            pairs = (line.partition('=') for line in printed.split('\0') if line)
             self.environment = {name: value for name, _, value in pairs}
             self.settings = (setup, variables)
             then(None)

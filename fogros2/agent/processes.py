@@ -89,14 +89,14 @@ def search_path() -> str:
 
 def marked(mark: str) -> list[int]:
     """Return the nodes' processes and their descendants, found by their environment."""
-    wanted = f'{MARK}={mark}'.encode()
-    found = []
+    variable = f'{MARK}={mark}'.encode()
+    pids = []
     for name in os.listdir('/proc'):
         if name.isdigit() and int(name) != os.getpid():
             with contextlib.suppress(OSError), open(f'/proc/{name}/environ', 'rb') as stream:
-                if wanted in stream.read().split(b'\0'):
-                    found.append(int(name))
-    return found
+                if variable in stream.read().split(b'\0'):
+                    pids.append(int(name))
+    return pids
 
 
 def remove_tree(path: str) -> None:
@@ -192,13 +192,13 @@ class Processes:
         steps = list(SWEEP_QUICKLY if quickly else SWEEP)
 
         def look() -> None:
-            left, age = marked(mark), self.loop.clock() - begin
-            if not left or age > SWEEP[-1][0] + 2.0:
+            pids, age = marked(mark), self.loop.clock() - begin
+            if not pids or age > SWEEP[-1][0] + 2.0:
                 then()
                 return
             while steps and age >= steps[0][0]:
                 number = steps.pop(0)[1]
-                for pid in left:
+                for pid in pids:
                     with contextlib.suppress(ProcessLookupError, PermissionError):
                         os.kill(pid, number)
             self.loop.at(0.02, look)

@@ -261,9 +261,9 @@ class Agent:
             return
         with self.identity.root(), contextlib.suppress(OSError):
             if self.config['on_exit'] == 'keep':
-                left = self.watchdog.lifetime_from + self.config['lifetime'] - self.loop.clock()
+                seconds = self.watchdog.lifetime_from + self.config['lifetime'] - self.loop.clock()
                 with open(path, 'w') as stream:
-                    stream.write(f'{time.time() + left}')
+                    stream.write(f'{time.time() + seconds}')
             else:
                 os.unlink(path)
 
@@ -541,8 +541,8 @@ class Agent:
 
     def do_release(self, client: Client, request: Json) -> None:
         """Stop the nodes of a launch and release the machine."""
-        asked, has = request.get('launch'), self.claimed or self.config['launch']
-        if asked and has and asked != has:
+        launch, has = request.get('launch'), self.claimed or self.config['launch']
+        if launch and has and launch != has:
             client.reply(request.get('id'), {})
             return
         self.config.update(checked({'on_exit': request.get('on_exit', self.config['on_exit'])}))
@@ -575,8 +575,8 @@ class Agent:
         if reason is None:
             return
         # 'no launch came' ends a machine whose first launch died, but not an adopted machine
-        gone = reason == 'robot gone' or (reason == 'no launch came' and self.adopted)
-        stay = gone and self.config['on_exit'] == 'keep'
+        unattended = reason == 'robot gone' or (reason == 'no launch came' and self.adopted)
+        stay = unattended and self.config['on_exit'] == 'keep'
         ends = 'end the machine' if self.config['end_command'] else 'leave'
         action = 'stop the nodes' if stay else ends
         say(f'{reason}: {action}')

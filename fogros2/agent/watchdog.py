@@ -79,12 +79,12 @@ class Watchdog:
 
     def deadlines(self) -> list[tuple[float, str]]:
         """Return (time, reason as in the event) of each deadline, soonest first."""
-        found = [(self.lifetime_from + self.config['lifetime'], 'lifetime')]
+        deadlines = [(self.lifetime_from + self.config['lifetime'], 'lifetime')]
         if self.boot_from is not None:
-            found.append((self.boot_from + self.config['boot_timeout'], 'no launch came'))
+            deadlines.append((self.boot_from + self.config['boot_timeout'], 'no launch came'))
         if self.beat_at is not None:
-            found.append((self.beat_at + self.config['robot_timeout'], 'robot gone'))
-        return sorted(found)
+            deadlines.append((self.beat_at + self.config['robot_timeout'], 'robot gone'))
+        return sorted(deadlines)
 
     def due(self, now: float) -> Optional[str]:
         """Return the reason of a deadline that has passed, or None."""

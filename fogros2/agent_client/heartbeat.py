@@ -90,10 +90,10 @@ class Heartbeat:
 
     def _listen(self, link: socket.socket, until: float) -> None:
         while not self._stopped.is_set():
-            left = until - time.monotonic()
-            if left <= 0:
+            remaining = until - time.monotonic()
+            if remaining <= 0:
                 return
-            link.settimeout(min(left, 0.25))
+            link.settimeout(min(remaining, 0.25))
             try:
                 data, peer = link.recvfrom(DATAGRAM)
             except TimeoutError:

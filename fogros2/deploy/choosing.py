@@ -66,10 +66,10 @@ class Choices:
             return [spec]
         if spec.name not in self._places:
             with step(self._report, spec.name, 'offers') as detail:
-                found = provider.places(spec)
-                detail += [str(offer) for offer, _ in found[:2]]
-                detail += [f'{len(found) - 2} more'] * (len(found) > 2)
-            self._places[spec.name] = [place for _, place in found]
+                offers = provider.places(spec)
+                detail += [str(offer) for offer, _ in offers[:2]]
+                detail += [f'{len(offers) - 2} more'] * (len(offers) > 2)
+            self._places[spec.name] = [place for _, place in offers]
         return self._places[spec.name]
 
     def price(self, spec: MachineSpec) -> Optional[Decimal]:

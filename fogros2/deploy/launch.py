@@ -266,10 +266,11 @@ class Launch:
         """Write the middleware's configuration for nodes of the robot that start from now on."""
         vendor = self.dds()
         # of all interfaces, the last is the launch's
-        more = [dataclasses.replace(self._interfaces[-1], name=found.joiner if vendor.by_address
-                                    else f'fog{found.number}')
-                for found in self._invitations.values()]
-        peers = [found.address for found in self._invitations.values()] + [
+        more = [dataclasses.replace(
+            self._interfaces[-1],
+            name=invitation.joiner if vendor.by_address else f'fog{invitation.number}')
+            for invitation in self._invitations.values()]
+        peers = [invitation.address for invitation in self._invitations.values()] + [
             self._address(index) for name, index in self._indices.items()
             if name not in self._invitations] if vendor.asks_machines else []
         write_private(self.store.launch(self.id) / vendor.file_name, vendor.render(
@@ -285,16 +286,16 @@ class Launch:
         text = self.provider(spec.provider).invitation(spec)
         with self._lock:
             if text and spec.name not in self._invitations:
-                found = unseal(text, own_key(self.store))
-                if (found.rmw, found.domain) != (self.dds().rmw, self.domain):
+                invitation = unseal(text, own_key(self.store))
+                if (invitation.rmw, invitation.domain) != (self.dds().rmw, self.domain):
                     raise DdsError(
-                        f"'{spec.name}' has RMW_IMPLEMENTATION={found.rmw} and ROS_DOMAIN_ID="
-                        f'{found.domain}, this launch {self.dds().rmw} and {self.domain}',
+                        f"'{spec.name}' has RMW_IMPLEMENTATION={invitation.rmw} and ROS_DOMAIN_ID="
+                        f'{invitation.domain}, this launch {self.dds().rmw} and {self.domain}',
                         'launch with the same')
-                if not membership.is_up(found):  # else joined by hand, and left by hand
-                    self.undo.callback(clear, self.store.root / 'launches' / found.number)
+                if not membership.is_up(invitation):  # else joined by hand, and left by hand
+                    self.undo.callback(clear, self.store.root / 'launches' / invitation.number)
                 membership.join(text, self.store, self.user_environment, owner=this_process())
-                self._invitations[spec.name] = found
+                self._invitations[spec.name] = invitation
                 if self._robot_environment is not None:
                     self._write_interfaces()
             return self._invitations.get(spec.name)

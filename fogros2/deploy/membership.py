@@ -113,10 +113,10 @@ def _check_free(invitation: Invitation) -> None:
     :raises VpnError: one has.
     """
     used = addresses.parse_used(run([addresses.used_networks()], timeout=Timeouts().vpn))
-    if found := addresses.overlapping(invitation.network, used):
+    if overlaps := addresses.overlapping(invitation.network, used):
         raise VpnError(
             f"the VPN of '{invitation.machine}' has the addresses {invitation.network}, and this "
-            f'computer uses {found[0]}',
+            f'computer uses {overlaps[0]}',
             f'{addresses.POOL_VARIABLE} on the inviting robot names another range: launch again')
 
 

@@ -20,16 +20,17 @@ def end(provider: Provider, record: Record, age: float = 0.0, *, tidy: bool = Tr
     :param tidy: delete what was created beside the machine; the creation does so itself.
     :raises FogError: the provider does not answer.
     """
-    found: list[Machine] = []
+    machines: list[Machine] = []
     with contextlib.suppress(Unsupported):
-        found += provider.find({TAG_NAME: record.name, TAG_LAUNCH: record.last or record.launch})
-    for machine in found:
+        machines += provider.find(
+            {TAG_NAME: record.name, TAG_LAUNCH: record.last or record.launch})
+    for machine in machines:
         provider.destroy(machine.id)
     if not record.token:
         return True
     if tidy:
         provider.tidy(dead=[record.token])
-    return bool(found) or not provider.may_create(record.token, age)
+    return bool(machines) or not provider.may_create(record.token, age)
 
 
 def set_aside(store: Store, record: Record) -> ProviderError:

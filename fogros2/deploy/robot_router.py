@@ -47,16 +47,16 @@ class RobotRouter:
     """
 
     def __init__(self, router: Router, folder: Path, environment: Mapping[str, str]) -> None:
-        found = [path for prefix in plan.ament_prefixes(environment) if os.access(
+        programs = [path for prefix in plan.ament_prefixes(environment) if os.access(
             path := Path(prefix, 'lib', router.package, router.executable), os.X_OK)]
-        if not found:
+        if not programs:
             raise DdsError(
                 f'{router.package} has no {router.executable}, which connects the nodes',
                 f"sudo apt-get install ros-jazzy-{router.package.replace('_', '-')}")
         config = folder / 'router.json5'
         write_private(config, router.config.encode())
         self._log = folder / 'router.log'
-        self._command = Command(('sh', '-c', _RUN, str(found[0])),
+        self._command = Command(('sh', '-c', _RUN, str(programs[0])),
                                 what=f"run the robot's {router.executable}")
         self._environment = {**environment, router.variable: str(config)}
         self._stop = threading.Event()

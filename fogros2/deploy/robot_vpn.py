@@ -182,8 +182,8 @@ class RobotVpn:
     def remove(self, name: str) -> None:
         """Remove a machine from the robot's peers, unless the whole launch is ending."""
         with self._lock:
-            gone = self._members.pop(name, None)
-            if gone is not None and self._peer is not None and not self._ending.is_set():
+            member = self._members.pop(name, None)
+            if member is not None and self._peer is not None and not self._ending.is_set():
                 self._run(self.vpn.peers(self.interface, self._peers()), cancel=False)
 
     def _peers(self) -> list[Peer]:

@@ -79,10 +79,11 @@ class Checkpoints:
         self._folders[folder] = Checkpoint(
             folder, self._store / f'{zlib.crc32(folder.encode()):08x}', self._cancel)
 
-    def _later(self, took: float = 0.0) -> None:
+    def _later(self, duration: float = 0.0) -> None:
         interval = self._session.spec.checkpoint_interval
         # a state is as old as the begin of its copy, until the next copy, which may take longer
-        self._context.asyncio_loop.call_later(max(interval - 3 * took, interval / 10), self._due)
+        self._context.asyncio_loop.call_later(
+            max(interval - 3 * duration, interval / 10), self._due)
 
     def _due(self) -> None:
         async def save() -> None:

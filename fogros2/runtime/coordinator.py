@@ -366,10 +366,10 @@ class Coordinator:
         self, entries: Iterable[Entry] = (), namespace: str = '/',
     ) -> list[StreamTopic]:
         """Return the streams of all machines, and further ones, all resolved."""
-        found: list[StreamTopic] = []
+        streams: list[StreamTopic] = []
         for everywhere, of in (*self._stream_everywhere, (list(entries), namespace)):
-            found += self.resolve_streams(everywhere, of)
-        return found
+            streams += self.resolve_streams(everywhere, of)
+        return streams
 
     def _source(self, source: Optional[SomeMachine]) -> Optional[str]:
         """Return the name of the machine that publishes, None for the robot."""
@@ -391,12 +391,12 @@ class Coordinator:
         :return: the processes that this needs and no earlier stream did.
         :raises ConfigurationError: an unknown transport, or contradictory streams.
         """
-        wanted = [*self.all_streams(), *entries]
-        if not wanted:
+        streams = [*self.all_streams(), *entries]
+        if not streams:
             return []
         away = [name for name, one in self._sessions.items() if one.interrupted]
-        wanted = [streaming.from_robot(entry, away) for entry in wanted]
-        new = self._streams.add(wanted, session.spec.name)
+        streams = [streaming.from_robot(entry, away) for entry in streams]
+        new = self._streams.add(streams, session.spec.name)
         self._on_machine = on_machine
         # another machine may be the source
         self._rename_topics()

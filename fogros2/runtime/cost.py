@@ -13,16 +13,16 @@ def lines(machines: Sequence[tuple[str, Decimal, float]]) -> list[str]:
 
     :param machines: name, US dollars per hour, seconds.
     """
-    found = []
+    costs = []
     total = Decimal(0)
     for name, price, seconds in machines:
         hours = Decimal(seconds) / 3600
         total += price * hours
-        found.append(f'{name}: {short(hours)} h at ${price.normalize():f} an hour, '
+        costs.append(f'{name}: {short(hours)} h at ${price.normalize():f} an hour, '
                      f'${short(price * hours)}')
-    if len(found) > 1:
-        found.append(f'all machines: ${short(total)}')
-    return found
+    if len(costs) > 1:
+        costs.append(f'all machines: ${short(total)}')
+    return costs
 
 
 def short(value: Decimal) -> str:

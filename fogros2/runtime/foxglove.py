@@ -108,5 +108,5 @@ def _report(session: Session, port: int, allow: Sequence[str]) -> None:
 
 
 def _logger() -> logging.Logger:
-    found: logging.Logger = launch.logging.get_logger('fogros2')
-    return found
+    logger: logging.Logger = launch.logging.get_logger('fogros2')
+    return logger

@@ -63,12 +63,12 @@ def react(
         return []
     if session.spec.on_interrupt == 'robot':
         logger.warning(f'{what}; its nodes continue on the robot')
-        ended, new, left = streams.take_over(event.machine)
+        ended, new, lost = streams.take_over(event.machine)
         for node in ended:
             context.emit_event_sync(
                 ShutdownProcess(process_matcher=functools.partial(_runs, node)))
-        if left:
-            logger.warning(f"{', '.join(left)} of '{event.machine}' no longer reaches other "
+        if lost:
+            logger.warning(f"{', '.join(lost)} of '{event.machine}' no longer reaches other "
                            'machines: the robot streams it in another way')
         session.move_all()
         return new

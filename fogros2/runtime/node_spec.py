@@ -176,18 +176,18 @@ def from_action(
     )
 
 
-def robot_paths(node: NodeSpec, roots: Sequence[str], there: Sequence[str]) -> list[str]:
+def robot_paths(node: NodeSpec, roots: Sequence[str], shared: Sequence[str]) -> list[str]:
     """
     Return the paths below some folders of the robot that a node gets, such as ``$(env HOME)``.
 
-    :param there: folders that the machine has too.
+    :param shared: folders that the machine has too.
     """
     texts = (*node.arguments, *node.environment.values(), *node.files.values(), node.cwd or '')
     parts = [part for text in texts for part in ((text,) if isinstance(text, str) else text)]
     pattern = r'(?<![\w./-])(?:{})(?:/[^\s\'",;:=]*)?(?![\w.-])'.format(
         '|'.join(re.escape(root.rstrip('/')) for root in roots if root.strip('/')) or '(?!)')
     return sorted({path for part in parts if isinstance(part, str)
-                   for path in re.findall(pattern, part) if not plan.below(path, there)})
+                   for path in re.findall(pattern, part) if not plan.below(path, shared)})
 
 
 def full_name(node: NodeSpec) -> str:

@@ -82,13 +82,13 @@ class RemoteProcess(private.RemoteStart):
             self._fogros2_image, self._fogros2_image_options,
             provider.has_own_packages(session.spec), bool(provider.invitation(session.spec)))
         if not isinstance(self, AddedProcess):
-            found = node_spec.robot_paths(
+            paths = node_spec.robot_paths(
                 self._fogros2_node, [context.environment.get('HOME', ''), *(plan.ament_prefixes(
                     coordinator.base_environment) if self._fogros2_image else ())],
                 session.spec.workspaces)
-            shared = provider.shared_folders(session.spec) if found else ()
+            shared = provider.shared_folders(session.spec) if paths else ()
             session.warn_of_paths(
-                self._fogros2_node, [path for path in found if not plan.below(path, shared)])
+                self._fogros2_node, [path for path in paths if not plan.below(path, shared)])
         if session.spec.idle_timeout is not None and (
                 self._fogros2_image or session.spec.containers):
             raise ConfigurationError(
@@ -147,15 +147,15 @@ class RemoteProcess(private.RemoteStart):
         session.has_helpers = True
         coordinator = Coordinator.of(context)
         name = session.spec.name
-        found: list[LaunchDescriptionEntity] = []
+        helpers: list[LaunchDescriptionEntity] = []
         for number, line in enumerate(session.spec.containers):
             from fogros2.host import containers
-            found.append(process_on(containers.follow(
+            helpers.append(process_on(containers.follow(
                 containers.parse(line), number, coordinator.launch.id), name))
         if session.spec.share:
             folders = coordinator.launch.provider(
                 session.spec.provider).capabilities.share_folders
-            found.append(process_on(NodeSpec(
+            helpers.append(process_on(NodeSpec(
                 id=f'share-{name}', name='share', package='fogros2', executable='share',
                 respawn=True, respawn_delay=1.0, arguments=(json.dumps({
                     'topics': session.spec.share, 'folders': folders}),)), name))
@@ -163,8 +163,8 @@ class RemoteProcess(private.RemoteStart):
             bridge, started = foxglove.on_machine(
                 coordinator, session, allow=session.spec.monitor_allow)
             send(bridge, name)
-            found += [bridge, started]
-        return found
+            helpers += [bridge, started]
+        return helpers
 
     def _come_here(self, context: LaunchContext) -> None:
         """Start the process on the robot, as launch does; its machine no longer runs it."""
@@ -270,13 +270,13 @@ def _streams_to_robot(
     streams: Sequence[StreamTopic], coordinator: Coordinator,
 ) -> list[ExecuteLocal]:
     """Return the republishers that bring other machines' topics to a process on the robot."""
-    found: list[ExecuteLocal] = []
+    actions: list[ExecuteLocal] = []
     for entry in streams:
         if entry.source is not None:
-            found += coordinator.stream(
+            actions += coordinator.stream(
                 [entry.but(direction='to_robot', source=None)],
                 coordinator.session(entry.source), process_on)
-    return found
+    return actions
 
 
 _remote_classes: dict[type[ExecuteLocal], type[RemoteProcess]] = {}

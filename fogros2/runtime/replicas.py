@@ -40,9 +40,9 @@ def check(
             f'replicas need two machines or more, not {len(machines)}',
             'add machines, or use CloudGroup for one')
     outputs = [output for _, output in topics]
-    for kind, given in (('machine', machines), ('name', [*services, *outputs])):
-        for name in given:
-            if given.count(name) > 1:
+    for kind, values in (('machine', machines), ('name', [*services, *outputs])):
+        for name in values:
+            if values.count(name) > 1:
                 raise ConfigurationError(
                     f"replicas have the {kind} '{name}' twice", 'name each once')
     if not services and not topics:

@@ -52,15 +52,15 @@ class AddedProcess(ExecuteProcess):
 def _substitutions(text: Text) -> list[Substitution]:
     if isinstance(text, str):
         return [TextSubstitution(text=text)]
-    found: list[Substitution] = []
+    substitutions: list[Substitution] = []
     for part in text:
         if isinstance(part, str):
-            found.append(TextSubstitution(text=part))
+            substitutions.append(TextSubstitution(text=part))
             continue
         (kind, package), = part.items()
         if kind not in _PACKAGE_PATHS:
             raise ConfigurationError(
                 f"an image transport's node uses a {kind}, which can't be sent to a machine",
                 'pass its settings as parameters')
-        found.append(_PACKAGE_PATHS[kind](package))
-    return found
+        substitutions.append(_PACKAGE_PATHS[kind](package))
+    return substitutions

@@ -44,16 +44,16 @@ def resolve(
     :param namespace: namespace of relative names.
     :param source: returns the name of the machine that a source means, None for the robot.
     """
-    found: list[StreamTopic] = []
+    resolved: list[StreamTopic] = []
     for entry in map(streams.topic_of, entries):
         topic = values.resolve(context, entry.topic)
-        found.append(entry.but(
+        resolved.append(entry.but(
             topic=topic and absolute(topic, namespace),
             transport=values.resolve(context, entry.transport),
             direction=values.resolve(context, entry.direction), source=source(entry.source),
             parameters={key: _parameter(context, value)
                         for key, value in entry.parameters.items()}))
-    return found
+    return resolved
 
 
 class Streams:
@@ -99,7 +99,7 @@ class Streams:
         """
         before = self._nodes_elsewhere(machine)
         several = [one for one in self._streams if machine not in (one.source, one.target)]
-        left: list[str] = []
+        unreachable: list[str] = []
         for one in self._streams:
             ends = {host for host in (one.source, one.target) if host != machine}
             if len(ends) == 2 or ends == {None}:
@@ -114,13 +114,13 @@ class Streams:
                     _compare(moved, other)
                 streams.nodes([*several, moved])
             except ConfigurationError:
-                left.append(one.topic)
+                unreachable.append(one.topic)
             else:
                 several.append(moved)
         self._streams = several
         ended = sorted(before - self._nodes_elsewhere(machine))
         self._handed_out -= set(ended)
-        return ended, self._not_handed_out(), left
+        return ended, self._not_handed_out(), unreachable
 
     def _linked(self, one: Stream) -> Stream:
         """Return the stream with the limited links that it crosses."""

@@ -82,10 +82,10 @@ def crossing_images(
         ('sh', '-c', '{ cat; sleep "$0"; } | "$@"', str(INSPECTION), *program),
         input=line.encode(), environment=environment, what='look for images that cross the VPN'),
         timeout=TIMEOUT, check=False, cancel=ended).stdout
-    found: list[str] = []
+    topics: list[str] = []
     for line in output.splitlines():
-        found = images(line) or found
-    return found
+        topics = images(line) or topics
+    return topics
 
 
 def images(line: str) -> list[str]:

@@ -20,8 +20,8 @@ def words(command: Command, *, root: bool) -> list[str]:
     :param root: whether the login user is root.
     """
     line = [f'{name}={value}' for name, value in command.environment.items()]
-    found = ['env', *line, *command.argv] if line else list(command.argv)
-    return ['sudo', '-n', '--', *found] if command.sudo and not root else found
+    argv = ['env', *line, *command.argv] if line else list(command.argv)
+    return ['sudo', '-n', '--', *argv] if command.sudo and not root else argv
 
 
 def remote_line(command: Command, *, user: str) -> str:

@@ -46,17 +46,17 @@ def look_up(settings: Settings) -> Known:
     :raises HostKeyError: a file cannot be read.
     :raises PrerequisiteError: OpenSSH's ssh-keygen is missing.
     """
-    found = _look_up(settings, label_of(settings))
-    if not found.keys and settings.port != 22 and not settings.label:
+    known = _look_up(settings, label_of(settings))
+    if not known.keys and settings.port != 22 and not settings.label:
         # a key of the same host is accepted at its other ports
         plain = _look_up(settings, settings.host)
         return dataclasses.replace(
-            found, keys=plain.keys, revoked=(*found.revoked, *plain.revoked))
-    return found
+            known, keys=plain.keys, revoked=(*known.revoked, *plain.revoked))
+    return known
 
 
 def _look_up(settings: Settings, label: str) -> Known:
-    found: dict[str, list[str]] = {'': [], '@cert-authority': [], '@revoked': []}
+    keys: dict[str, list[str]] = {'': [], '@cert-authority': [], '@revoked': []}
     for name in settings.known_hosts:
         file = Path(name).expanduser()
         try:
@@ -73,8 +73,8 @@ def _look_up(settings: Settings, label: str) -> Known:
             words = line.split()
             marker = words.pop(0) if words and words[0].startswith('@') else ''
             if len(words) > 2 and words[0] != '#' and _is_key(*words[1:3]):
-                found[marker].append(' '.join(words[1:3]))
-    return Known(*map(tuple, found.values()))
+                keys[marker].append(' '.join(words[1:3]))
+    return Known(*map(tuple, keys.values()))
 
 
 def _is_key(kind: str, text: str) -> bool:

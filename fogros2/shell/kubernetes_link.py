@@ -126,8 +126,8 @@ class Link(multiplexed.Link):
             if time.monotonic() > deadline:
                 raise DeadlineExceeded(f"'{self._name}' doesn't answer")
 
-    def _no_program(self, said: bytes) -> FogError:
-        text = said.decode(errors='replace')
+    def _no_program(self, stderr: bytes) -> FogError:
+        text = stderr.decode(errors='replace')
         if 'python3' in text and ('not found' in text or 'no such file' in text.lower()):
             return ShellError(
                 f"the image of '{self._name}' has no python3",

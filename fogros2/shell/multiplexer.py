@@ -93,12 +93,12 @@ class Multiplexer:
             incoming += data
             for received in frames(incoming):
                 self.take(*received)
-        left = list(self.processes.values())
+        running = list(self.processes.values())
         for name in (signal.SIGTERM, signal.SIGKILL):
-            for process in left:
+            for process in running:
                 process.signal(name)
             until = time.monotonic() + 0.5
-            while any(p.child.returncode is None for p in left) and time.monotonic() < until:
+            while any(p.child.returncode is None for p in running) and time.monotonic() < until:
                 time.sleep(0.01)
 
     def send(self, kind: int, number: int, payload: bytes = b'') -> None:

@@ -48,7 +48,7 @@ def dial(words: Sequence[str], timeout: float) -> ProxySocket:
         except OSError as error:
             ours.close()
             raise ConnectError(f"{words[0]} can't be started: {error.strerror}") from error
-    found = ProxySocket(ours.family, ours.type, fileno=ours.detach())
-    found.child = child
-    found.settimeout(timeout)
-    return found
+    proxy = ProxySocket(ours.family, ours.type, fileno=ours.detach())
+    proxy.child = child
+    proxy.settimeout(timeout)
+    return proxy

@@ -115,8 +115,8 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
     def _known(self) -> tuple[Optional[Link], int]:
         """Return the connection if it is alive, and the number of calls of close()."""
         with self._lock:
-            found = self._connection
-            return found if found is not None and found.is_alive() else None, self._closings
+            link = self._connection
+            return link if link is not None and link.is_alive() else None, self._closings
 
     def _drop(self, connection: Link) -> None:
         """Close a connection that is lost."""

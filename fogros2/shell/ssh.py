@@ -122,11 +122,11 @@ class SSHShell(RemoteShell['paramiko.Transport']):
             if mark:
                 return rest or channel.recv(size)
             if not data:
-                said = clean(before.decode(errors='replace')).strip().split('\n')[-1]
-                if not said or not channel.get_transport().is_alive():
+                line = clean(before.decode(errors='replace')).strip().split('\n')[-1]
+                if not line or not channel.get_transport().is_alive():
                     return b''
                 raise ShellError(f"the login shell of '{self.name}' runs no command, it prints: "
-                                 f'{said}', 'see its ~/.bashrc, and authorized_keys')
+                                 f'{line}', 'see its ~/.bashrc, and authorized_keys')
             del before[:-len(command_line.MARK) - 1000]
             limit = channel.gettimeout()
             if limit is not None and time.monotonic() - begin >= limit:

@@ -50,11 +50,11 @@ def of(endpoint: Endpoint) -> Settings:
 
     :raises ConfigurationError: OpenSSH refuses its configuration.
     """
-    found = read(endpoint.alias, endpoint.user, endpoint.port) if endpoint.alias \
+    settings = read(endpoint.alias, endpoint.user, endpoint.port) if endpoint.alias \
         else Settings(endpoint.host, endpoint.port, endpoint.user)
     if endpoint.key_file is not None:
-        found = dataclasses.replace(found, keys=(endpoint.key_file,), only_keys=True)
-    return found
+        settings = dataclasses.replace(settings, keys=(endpoint.key_file,), only_keys=True)
+    return settings
 
 
 def read(name: str, user: str = '', port: int = 0) -> Settings:
@@ -75,31 +75,31 @@ def read(name: str, user: str = '', port: int = 0) -> Settings:
         # ssh takes the account's home, Python $HOME
         own = Path(home, '.ssh/config')
         files = ['-F', str(own) if own.is_file() else 'none']
-    given = [*(('-l', user) if user else ()), *(('-p', str(port)) if port else ())]
-    done = process.run(Command(('ssh', *files, '-G', '-T', *given, '--', name)),
+    options = [*(('-l', user) if user else ()), *(('-p', str(port)) if port else ())]
+    done = process.run(Command(('ssh', *files, '-G', '-T', *options, '--', name)),
                        timeout=_TIMEOUT, check=False)
-    said: dict[str, list[str]] = {}
+    values: dict[str, list[str]] = {}
     for line in done.stdout.splitlines():
         keyword, _, value = line.partition(' ')
-        said.setdefault(keyword, []).append(value)
-    if done.returncode != 0 or 'hostname' not in said:
+        values.setdefault(keyword, []).append(value)
+    if done.returncode != 0 or 'hostname' not in values:
         raise ConfigurationError(f"OpenSSH has no use for its settings of '{name}': "
                                  f'{" ".join(done.stderr.split())}', f"try: ssh -G '{name}'")
 
     def first(keyword: str, default: str = '') -> str:
-        return said.get(keyword, [default])[0]
+        return values.get(keyword, [default])[0]
 
     host, user, number = first('hostname'), first('user'), first('port')
     tokens = {'h': host, 'n': name, 'p': number, 'r': user, 'd': home, 'u': account.pw_name}
 
     def expanded(text: str) -> str:
-        return re.sub('%(.)', lambda found: tokens.get(found[1], found[1] if found[1] == '%'
-                                                       else found[0]), text)
+        return re.sub('%(.)', lambda match: tokens.get(match[1], match[1] if match[1] == '%'
+                                                       else match[0]), text)
 
     known = ' '.join(first(f'{kind}knownhostsfile') for kind in ('user', 'global')).split()
     return Settings(
         host, int(number), user,
-        keys=tuple(expanded(key) for key in said.get('identityfile', ())),
+        keys=tuple(expanded(key) for key in values.get('identityfile', ())),
         only_keys=first('identitiesonly') == 'yes', agent=expanded(first('identityagent')),
         proxy=_proxy(first('proxyjump'), expanded(first('proxycommand')), host, number, files),
         known_hosts=tuple(re.sub(f'^{re.escape(account.pw_dir)}/[.]ssh/', f'{home}/.ssh/',

@@ -359,8 +359,8 @@ def _explained(
             f"'{name}' ({settings.host}) has no host key of the type that is known",
             'another machine answers there, or the machine was reinstalled')
     where = f"'{name}' ({settings.host} port {settings.port})"
-    if isinstance(sock, proxy.ProxySocket) and (said := sock.complaint()):
-        return ConnectError(f'the way to {where} fails: {said}',
+    if isinstance(sock, proxy.ProxySocket) and (complaint := sock.complaint()):
+        return ConnectError(f'the way to {where} fails: {complaint}',
                             f"try it with ssh; it is: {' '.join(settings.proxy)}")
     if 'banner' in text or isinstance(error, EOFError):
         return ConnectError(f'{where} does not answer as an SSH server',

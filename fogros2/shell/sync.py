@@ -73,14 +73,14 @@ class RsyncShell(Shell):
         process.require(['rsync'])
         check_source(source)
         path = command_line.remote_path(target)
-        there = self.run(
+        answer = self.run(
             Command.script(
                 f'mkdir -p -- {path}; command -v rsync >/dev/null || echo no-rsync; '
                 f'ls -A -- {path} | head -n 1', what=f'making {target}'),
             timeout=timeout, cancel=cancel).stdout.split()
-        if 'no-rsync' in there:
+        if 'no-rsync' in answer:
             raise missing_there(self.where)
-        bulk = not there and self.endpoint.kind == 'ssh' and not self.endpoint.alias \
+        bulk = not answer and self.endpoint.kind == 'ssh' and not self.endpoint.alias \
             and process.which('ssh') is not None and is_large(source, BULK)
         with open_ssh(self.endpoint) if bulk else self._remote_shell() as (rsh, files, failures):
             result = process.run(
@@ -292,10 +292,10 @@ def explained(result: Result, source: Path, where: str) -> FogError:
     if result.returncode in _LOST:
         return ConnectError(f'the connection to {where} was lost while {source} was sent',
                             "check the robot's network")
-    said = [line for line in text.splitlines() if line.startswith('rsync:')] or text.splitlines()
-    told = Result(result.returncode, '', '\n'.join(said[:3]))
+    lines = [line for line in text.splitlines() if line.startswith('rsync:')] or text.splitlines()
+    short = Result(result.returncode, '', '\n'.join(lines[:3]))
     hint = 'give the login user the right to write there' if 'Permission denied' in text else ''
-    return CommandError(Command(('rsync',), what=f'sending {source}'), told, where, hint)
+    return CommandError(Command(('rsync',), what=f'sending {source}'), short, where, hint)
 
 
 @contextlib.contextmanager

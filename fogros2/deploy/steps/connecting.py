@@ -163,8 +163,8 @@ class Connection(Step):
         if not provider.capabilities.owned:
             return min(timeouts.ssh, LOGIN_TIMEOUT)
         boots = provider.capabilities.one_time_host_key and not record.host_key
-        left = timeouts.boot - (time.time() - record.armed) if boots else 0.0
-        return max(timeouts.ssh, left)
+        remaining = timeouts.boot - (time.time() - record.armed) if boots else 0.0
+        return max(timeouts.ssh, remaining)
 
     def _check(self) -> None:
         """

@@ -80,18 +80,18 @@ class Containers(Step):
 
     def _get(self, images: Iterable[str]) -> dict[str, str]:
         """Download images that nodes run in; return each image's name in the engine."""
-        found = dict.fromkeys(images, '')
-        if not found:
-            return found
+        digests = dict.fromkeys(images, '')
+        if not digests:
+            return digests
         rmw = self._context.dds.rmw
         with self._lock:
-            for image in found:
+            for image in digests:
                 if (image, rmw) not in self._images:
                     self._context.provider.check_containers(self._job.spec)
                     with self._job.step(f'image {image}'):
                         self._image(image, rmw)
-                found[image] = self._images[image, rmw]
-        return found
+                digests[image] = self._images[image, rmw]
+        return digests
 
     def _image(self, image: str, rmw: str = '') -> str:
         """Return the engine's name of an image; download the image if it is missing."""

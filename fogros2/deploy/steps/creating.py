@@ -96,18 +96,18 @@ class Creation(Step):
             if not requests.end(context.provider, before):
                 context.store.set_aside(before)
             return None
-        found: Optional[Machine] = None
+        machine: Optional[Machine] = None
         with contextlib.suppress(MachineNotFound):
-            found = context.provider.describe(before.machine_id)
-        if found is None or found.state is MachineState.DELETED:
+            machine = context.provider.describe(before.machine_id)
+        if machine is None or machine.state is MachineState.DELETED:
             context.provider.destroy(before.machine_id)  # what was made for it may still be there
             return None
-        self._check_alike(before.asked, found)
+        self._check_alike(before.asked, machine)
         # the earlier choices still hold; everything else comes from this launch
         job.spec = dataclasses.replace(job.spec, options=before.spec.options)
         job.record = dataclasses.replace(before, spec=job.spec)
         job.former = before.last or before.launch
-        return found
+        return machine
 
     def _check_alike(self, before: Any, machine: Machine) -> None:
         """Raise if the kept machine was created with other options than this launch asks for."""

@@ -96,21 +96,21 @@ class Modules(Step):
                     detail.append(self._install(names))
 
     def _install(self, names: Sequence[str]) -> str:
-        there = self._ask(names)
+        present = self._ask(names)
         target, how = '', 'there already'
-        if there.missing:
-            copy = modules.copy(there)
+        if present.missing:
+            copy = modules.copy(present)
             target = modules.folder(
-                self._home, there, copy.versions if copy else modules.pinned(there.missing))
+                self._home, present, copy.versions if copy else modules.pinned(present.missing))
             how = 'there from before'
             if not self._has(target):
-                self._fill(target, there, copy)
-                how = f"{', '.join(there.missing)} {'installed' if copy is None else 'sent'}"
-        self._folders |= {name: target if name in there.missing else '' for name in names}
+                self._fill(target, present, copy)
+                how = f"{', '.join(present.missing)} {'installed' if copy is None else 'sent'}"
+        self._folders |= {name: target if name in present.missing else '' for name in names}
         return how
 
     def _fill(
-        self, target: str, there: modules.Answer, copy: Optional[modules.Copy],
+        self, target: str, present: modules.Answer, copy: Optional[modules.Copy],
     ) -> None:
         """Install the missing modules into a folder of the machine."""
         if copy is not None:
@@ -123,15 +123,15 @@ class Modules(Step):
         else:
             try:
                 self._run(modules.install(
-                    self._environment, self._setup, target, there.missing))
+                    self._environment, self._setup, target, present.missing))
             except CommandError as error:
                 self._discard(target)
-                raise self._without(there, str(error)) from error
-        left = self._ask(there.missing, f'{target}/site')
-        if left.missing:
+                raise self._without(present, str(error)) from error
+        after = self._ask(present.missing, f'{target}/site')
+        if after.missing:
             self._discard(target)
-            raise self._without(left, ': '.join(
-                ['they were installed, and cannot be imported', *left.broken]))
+            raise self._without(after, ': '.join(
+                ['they were installed, and cannot be imported', *after.broken]))
         self._run(Command(('touch', f'{target}/complete'), what='note what is there'))
 
     def _discard(self, target: str) -> None:
@@ -150,23 +150,23 @@ class Modules(Step):
     def _run(self, command: Command) -> str:
         return self._job.run(command, timeout=self._context.timeouts.install)
 
-    def _without(self, there: modules.Answer, why: str) -> PrerequisiteError:
-        names = ' '.join(modules.MODULES[name].distributions[0] for name in there.missing)
+    def _without(self, present: modules.Answer, why: str) -> PrerequisiteError:
+        names = ' '.join(modules.MODULES[name].distributions[0] for name in present.missing)
         library = re.search(r'(\S+\.so[.\d]*): cannot open shared object file', why)
         if library:
             package = _PACKAGES.get(library[1])
             hint = (f'install {package} there with apt' if package else
                     f'install the package there that has it: apt-file search {library[1]}')
-        elif there.architecture != platform.machine():
+        elif present.architecture != platform.machine():
             hint = (f"take an image with them (pip install {names}): this robot's own are for "
-                    f'{platform.machine()} processors, and the machine has {there.architecture}')
-        elif there.python != sys.version_info[:2]:
-            version = '.'.join(map(str, there.python))
+                    f'{platform.machine()} processors, and the machine has {present.architecture}')
+        elif present.python != sys.version_info[:2]:
+            version = '.'.join(map(str, present.python))
             hint = (f'take an image with them (pip install {names}), or a robot with Python '
                     f'{version} as there, whose modules can be sent')
         else:
             hint = (f'install them on the robot with pip, so that they can be sent, or use a '
                     f'machine that has them: pip install {names}')
         return PrerequisiteError(
-            f"'{self._job.name}' can't get {', '.join(there.missing)}, which programs there "
+            f"'{self._job.name}' can't get {', '.join(present.missing)}, which programs there "
             f'import: {why}', hint)
