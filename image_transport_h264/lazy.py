@@ -18,7 +18,6 @@ from rclpy.subscription import Subscription
 
 from image_transport_h264 import memory
 from image_transport_h264.acknowledgement import wait_for_all_acked
-from image_transport_h264.turns import Turns
 from image_transport_h264.worker import Worker
 
 
@@ -31,6 +30,8 @@ def _qos(
 
 #: Packets of a stream; reliable for recorders and other subscribers that ask for it.
 STREAM_QOS = _qos(8)
+#: Slices of images, and their acknowledgements; there are fewer at once, see ``slices.py``.
+SLICES_QOS = _qos(64)
 #: Images: the newest ones.
 IMAGE_QOS = _qos(2)
 #: Messages that are useless if they are late: acknowledgements, and pieces of packets.
@@ -88,7 +89,6 @@ class LazyNode(Node):
         super().__init__(name)
         self._complained: set[str] = set()
         self._complaining = threading.Lock()
-        self._turns = Turns()
         self._counts: dict[Publisher, int] = {}
         self._workers: list[Worker[Any]] = []
         self.failed = False
@@ -104,7 +104,6 @@ class LazyNode(Node):
         """Stop the workers, then destroy the node."""
         for worker in self._workers:
             worker.stop()
-        self._turns.close()
         super().destroy_node()
 
     def fail(self) -> None:
@@ -120,17 +119,6 @@ class LazyNode(Node):
             if not rclpy.ok(context=self.context):
                 return
             self.complain('slow subscriber', f'not published on {publisher.topic_name}: {error}')
-
-    def put_through(self, publisher: Publisher, message: Any) -> None:
-        """
-        Publish a large message when it is this node's turn, and wait for its acknowledgement.
-
-        Large images in quick succession leave a slow link no room to repeat lost parts, so no
-        image would ever arrive. Of the images that come meanwhile, only the newest is kept.
-        """
-        with self._turns.taken(LONGEST):
-            self.put_out(publisher, message)
-            self.all_acknowledged(publisher)
 
     def all_acknowledged(self, publisher: Publisher) -> bool:
         """Wait until reliable readers have all messages; return False after a time-out."""

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from image_transport_h264.codec import Packet
 
 #: Last part of the names of a stream's auxiliary topics.
-KEY_REQUEST, FEEDBACK, PIECES, CAMERA_INFO = 'keyframe', 'feedback', 'pieces', 'camera_info'
+KEY_REQUEST, FEEDBACK, PIECES = 'keyframe', 'feedback', 'pieces'
+SLICES, CAMERA_INFO = 'slices', 'camera_info'
 
 #: seconds, nanoseconds, length of the frame id
 _HEADER = struct.Struct('>iIH')

@@ -30,6 +30,7 @@ from image_transport_h264.lazy import (
 from image_transport_h264.message import FEEDBACK, KEY_REQUEST, PIECES
 from image_transport_h264.picture import MAX_PIXELS
 from image_transport_h264.repair import Assembler
+from image_transport_h264.slices import SliceReceiver
 
 Publish = Callable[[bytes], None]
 #: A packet, with its tag if it is to be acknowledged when it is decoded.
@@ -73,7 +74,8 @@ def make_receiver(node: LazyNode, codec: str, stream: str, publish: Publish) -> 
         work = functools.partial(_decode_still, node, publish, _max_pixels(node))
     elif codec != 'raw':
         raise ValueError(f"codec '{codec}' is not one of h264, jpeg, png, raw")
-    return Receiver(Tap(node, kind, stream, IMAGE_QOS, node.start_worker('decode', work).put))
+    put = node.start_worker('decode', work).put
+    return Receiver(Tap(node, kind, stream, IMAGE_QOS, put), SliceReceiver(node, stream, put).tap)
 
 
 def _max_pixels(node: LazyNode) -> int:
@@ -118,7 +120,7 @@ class VideoReceiver(Receiver):
         self._tap = Tap(node, CompressedImage, stream, STREAM_QOS, self._whole, adapt=False)
         pieces = Tap(node, UInt8MultiArray, f'{stream}/{PIECES}', PIECES_QOS, self._piece,
                      adapt=False)
-        super().__init__(self._tap, pieces)
+        super().__init__(self._tap, pieces, SliceReceiver(node, stream, self._whole).tap)
 
     def _whole(self, coded: bytes) -> None:
         try:

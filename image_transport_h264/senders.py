@@ -33,9 +33,10 @@ from image_transport_h264.message import FEEDBACK, KEY_REQUEST, PIECES
 from image_transport_h264.pacing import MOST, Pace, Sent
 from image_transport_h264.rate import LEAST_BITS
 from image_transport_h264.repair import pieces
+from image_transport_h264.slices import SliceSender
 
 CODECS = ('h264', 'jpeg', 'png', 'raw')
-#: Bytes from which the nodes of this computer take turns to send images.
+#: Bytes from which images are sent in slices.
 LARGE = 200_000
 
 
@@ -85,6 +86,7 @@ class PictureSender(Sender):
         self._node = node
         self._publisher = node.offer(kind, stream, STREAM_QOS, changed)
         self.publishers = [self._publisher]
+        self._slices = SliceSender(node, stream, changed)
         self._budget = Budget(node, stream, self.listeners)
         self._latency = 0.0
         self._pace = Pace()
@@ -96,8 +98,8 @@ class PictureSender(Sender):
         self._budget.pace()
         begin, size = time.monotonic(), len(image)
         self._budget.sent(size, 8.0 * size, self._latency)
-        if size >= LARGE:
-            self._node.put_through(self._publisher, image)
+        if size >= LARGE and self._slices.replace(self._publisher):
+            self._slices.send(image)
             self._latency = time.monotonic() - begin
             return
         self._settle()
@@ -192,6 +194,7 @@ class VideoSender(Sender):
                 publisher = node.offer(kind, f'{base}/{topic}', STREAM_QOS, self._matched)
                 self._others.append((publisher, kind, make))
                 self.publishers.append(publisher)
+        self._slices = SliceSender(node, stream, self._matched)
         self._pieces = node.create_publisher(
             UInt8MultiArray, f'{stream}/{PIECES}', PIECES_QOS)
         node.create_subscription(
@@ -264,8 +267,12 @@ class VideoSender(Sender):
             # An incomplete deep picture is useless, so the middleware repeats lost parts; the
             # wait for the acknowledgement limits the rate to the link's.
             self._budget.sent(len(packet.data), 8.0 * len(packet.data), 0.0)
-            self._node.put_through(
-                self._video, message.compressed(header, packet.format, packet.data))
+            whole = message.compressed(header, packet.format, packet.data)
+            if self._slices.replace(self._video):
+                self._slices.send(whole)
+            else:
+                self._node.put_out(self._video, whole)
+                self._node.all_acknowledged(self._video)
             return
         with self._lock:
             protects = self._control.protects(now)
