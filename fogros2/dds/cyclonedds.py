@@ -342,10 +342,12 @@ def _check_multicast(listed: Sequence[Element]) -> None:
     for one in listed:
         name, multicast = _attribute(one, 'name'), _attribute(one, 'multicast').lower()
         if multicast == 'false' or name and multicast != 'true' and not _has_multicast(name):
+            own = ''.join(f'{key}="{value}" ' for key, value in one.items()
+                          if key.lower() != 'multicast')
             raise DdsError(
-                f"CYCLONEDDS_URI makes nodes use {name or _attribute(one, 'address')} without "
+                f"CYCLONEDDS_URI makes nodes use {name or own.strip() or 'an interface'} without "
                 'multicast, so they would discover no machine',
-                f'write <NetworkInterface name="{name}" multicast="true"/>')
+                f'write <NetworkInterface {own}multicast="true"/>')
 
 
 def _has_multicast(interface: str) -> bool:
