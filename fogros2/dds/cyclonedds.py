@@ -345,8 +345,9 @@ def _check_multicast(listed: Sequence[Element]) -> None:
             own = ''.join(f'{key}="{value}" ' for key, value in one.items()
                           if key.lower() != 'multicast')
             raise DdsError(
-                f"CYCLONEDDS_URI makes nodes use {name or own.strip() or 'an interface'} without "
-                'multicast, so they would discover no machine',
+                'CYCLONEDDS_URI makes nodes use '
+                f"{name or _attribute(one, 'address') or 'an interface'} without multicast, so "
+                'they would discover no machine',
                 f'write <NetworkInterface {own}multicast="true"/>')
 
 
