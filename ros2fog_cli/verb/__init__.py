@@ -170,7 +170,7 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 def print_json(**fields: object) -> None:
     """Print what ``--json`` of a verb shows."""
     from ros2fog_cli.api import output
-    say(output.as_json(fields))
+    print(output.as_json(fields), flush=True)
 
 
 def add_page(parser: argparse.ArgumentParser) -> None:

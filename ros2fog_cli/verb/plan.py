@@ -21,6 +21,7 @@ class PlanVerb(VerbExtension):
     def main(self, *, args: argparse.Namespace) -> int:
         """Ask the clouds for regions, types and prices, and create nothing; 1 if one refuses."""
         from decimal import Decimal
+        import os
 
         from launch.launch_description_sources import get_launch_description_from_any_launch_file
 
@@ -28,8 +29,12 @@ class PlanVerb(VerbExtension):
         from fogros2.deploy.choosing import Choices
         from fogros2.describe.overrides import Overrides
         from fogros2.errors import ConfigurationError, FogError
+        from fogros2.launch_internals import hints
         from fogros2.report import silent
         from ros2fog_cli.api import preview, progress
+        if not os.path.isfile(args.file):
+            raise ConfigurationError(f"there is no file '{args.file}'", 'give the path of one')
+        hints.of_actions()
         try:
             description = get_launch_description_from_any_launch_file(args.file)
         except Exception as error:

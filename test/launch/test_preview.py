@@ -215,4 +215,4 @@ All machines: $0.0832 an hour
 
 
 def test_plan_of_a_missing_file_is_an_error(tmp_path):
-    assert "can't be read" in main(argv=['fog', 'plan', str(tmp_path / 'no.launch.py')])
+    assert "there is no file" in main(argv=['fog', 'plan', str(tmp_path / 'no.launch.py')])

@@ -96,9 +96,15 @@ class LaunchCommand(CommandExtension):
             words.append(f'launch-prefix:={args.launch_prefix}')
         import launch
         from launch.actions import IncludeLaunchDescription
-        from launch.launch_description_sources import get_launch_description_from_any_launch_file
+        from launch.launch_description_sources import (
+            get_launch_description_from_any_launch_file,
+            InvalidLaunchFileError,
+        )
         if args.print or args.show_args:
-            description = get_launch_description_from_any_launch_file(path)
+            try:
+                description = get_launch_description_from_any_launch_file(path)
+            except InvalidLaunchFileError as exc:
+                raise RuntimeError(str(exc)) from exc
             if args.print:
                 print(launch.LaunchIntrospector().format_launch_description(description))
             else:
