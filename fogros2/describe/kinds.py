@@ -113,7 +113,8 @@ def _fits(kind: Kind, value: Any) -> bool:
     if value is None or isinstance(value, values.Converted):
         return True
     if isinstance(value, Mapping):
-        return kind in ('mapping', 'text or mapping') and all(isinstance(one, str) for one in value)
+        return kind in ('mapping', 'text or mapping') and all(
+            isinstance(one, str) for one in value)
     # a substitution is recognised by its method: describing a machine does not import launch
     if kind == 'mapping' or hasattr(value, 'perform'):
         return kind != 'mapping'

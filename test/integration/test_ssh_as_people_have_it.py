@@ -319,11 +319,11 @@ def test_login_shell_that_runs_no_command_is_named(tmp_path, home):
 def test_login_shell_that_ends_silently_is_named(tmp_path, home, talk):
     with private_sshd(tmp_path / 'sshd', f'ForceCommand {talk}\n') as server, \
             contextlib.closing(SSHShell(server.endpoint, name='planner')) as shell, \
-            pytest.raises(ShellError, match=r"runs no command(, it prints: closed)? \(see"):
+            pytest.raises(ShellError, match=r'runs no command(, it prints: closed)? \(see'):
         shell.put(b'data', '~/file', mode=0o600)
 
 
-def test_commands_that_bash_prints_before_it_runs_them_are_no_output(tmp_path, home):
+def test_commands_that_bash_prints_are_no_output(tmp_path, home):
     there = tmp_path / 'there'
     there.mkdir()
     (there / '.bashrc').write_text("trap 'echo $BASH_COMMAND' DEBUG\n")

@@ -2,6 +2,7 @@
 """The command ``ros2 launch``."""
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from typing import Any
@@ -101,17 +102,20 @@ class LaunchCommand(CommandExtension):
             InvalidLaunchFileError,
         )
         if args.print or args.show_args:
-            try:
-                description = get_launch_description_from_any_launch_file(path)
-            except InvalidLaunchFileError as exc:
-                raise RuntimeError(str(exc)) from exc
-            if args.print:
-                print(launch.LaunchIntrospector().format_launch_description(description))
-            else:
-                _print_arguments(description)
-            for option in self._options:
-                preview = getattr(option, 'preview', lambda *_: '')
-                print(preview(description, args, _parse(words)), end='')
+            with contextlib.ExitStack() as undo:
+                for option in self._options:
+                    undo.enter_context(getattr(option, 'reading', contextlib.nullcontext)())
+                try:
+                    description = get_launch_description_from_any_launch_file(path)
+                except InvalidLaunchFileError as exc:
+                    raise RuntimeError(str(exc)) from exc
+                if args.print:
+                    print(launch.LaunchIntrospector().format_launch_description(description))
+                else:
+                    _print_arguments(description)
+                for option in self._options:
+                    preview = getattr(option, 'preview', lambda *_: '')
+                    print(preview(description, args, _parse(words)), end='')
             return None
         for option in self._options:
             option.prestart(args)
