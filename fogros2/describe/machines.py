@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 _UNITS = {'s': 1.0, 'm': 60.0, 'h': 3600.0, 'd': 86400.0}
 _PREFIXES = {'': 1.0, 'k': 1e3, 'M': 1e6, 'G': 1e9}
+#: Seconds that a duration may have: a century.
+_LONGEST = 3.2e9
 _DURATION = re.compile(r'(?:\d+(?:\.\d+)?[smhd])+')
 
 
@@ -448,7 +450,7 @@ def parse_duration(what: str, value: Union[str, int, float]) -> float:
 
     :raises ConfigurationError: not a duration, or not above zero.
     """
-    seconds = 0.0
+    seconds: float = 0
     if isinstance(value, str):
         text = value.replace(' ', '')
         try:
@@ -459,11 +461,11 @@ def parse_duration(what: str, value: Union[str, int, float]) -> float:
                     float(number) * _UNITS[unit]
                     for number, unit in re.findall(r'([\d.]+)([smhd])', text))
     else:
-        seconds = float(value)
-    if not 0 < seconds < float('inf'):
+        seconds = value
+    if not 0 < seconds < _LONGEST:
         raise ConfigurationError(
             f'{what}={value!r} is no duration', "use seconds, or text such as '8h' or '1h30m'")
-    return seconds
+    return float(seconds)
 
 
 def parse_bandwidth(what: str, value: Union[str, int, float]) -> float:
