@@ -207,7 +207,8 @@ def test_durations_have_at_most_two_units(value, seconds):
     assert parse_duration('lifetime', value) == seconds
 
 
-@pytest.mark.parametrize('value', ['', 'h', '-1', '0', 'inf', '8 hours', 'nan', -3, 10**400, '1e10'])
+@pytest.mark.parametrize(
+    'value', ['', 'h', '-1', '0', 'inf', '8 hours', 'nan', -3, 10**400, '1e10'])
 def test_no_durations(value):
     with pytest.raises(ConfigurationError):
         parse_duration('lifetime', value)
