@@ -220,7 +220,7 @@ class Store:
         path = self.machine(name) / 'record.json'
         try:
             return record_from_json(json.loads(path.read_text()))
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             names = [path.name for path in (self.root / 'machines').glob('[!.]*')]
             raise StoreError(
                 f"this robot has no record of a machine '{name}'", did_you_mean(

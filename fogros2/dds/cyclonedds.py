@@ -342,10 +342,13 @@ def _check_multicast(listed: Sequence[Element]) -> None:
     for one in listed:
         name, multicast = _attribute(one, 'name'), _attribute(one, 'multicast').lower()
         if multicast == 'false' or name and multicast != 'true' and not _has_multicast(name):
+            own = ''.join(f'{key}="{value}" ' for key, value in one.items()
+                          if key.lower() != 'multicast')
             raise DdsError(
-                f"CYCLONEDDS_URI makes nodes use {name or _attribute(one, 'address')} without "
-                'multicast, so they would discover no machine',
-                f'write <NetworkInterface name="{name}" multicast="true"/>')
+                'CYCLONEDDS_URI makes nodes use '
+                f"{name or _attribute(one, 'address') or 'an interface'} without multicast, so "
+                'they would discover no machine',
+                f'write <NetworkInterface {own}multicast="true"/>')
 
 
 def _has_multicast(interface: str) -> bool:

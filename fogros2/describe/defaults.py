@@ -90,7 +90,7 @@ def _parsed(path: Path) -> dict[str, Any]:
             continue
         try:
             parsed: dict[str, Any] = toml.loads(path.read_text())
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise ConfigurationError(f"{path} can't be read: {error}",
                                      'it is TOML, such as: lifetime = "4h"') from error
         return parsed

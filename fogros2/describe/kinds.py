@@ -12,6 +12,7 @@ import dataclasses
 from decimal import Decimal
 import functools
 import inspect
+import os
 from typing import Any, get_args, get_origin, get_type_hints, Literal, Union
 
 from fogros2.describe import values
@@ -93,12 +94,49 @@ def _options(hint: Any) -> Iterable[Any]:
         yield hint
 
 
+def check(keywords: Mapping[str, Keyword], arguments: Mapping[str, Any]) -> None:
+    """
+    Check the types of a constructor's arguments.
+
+    :raises ConfigurationError: an argument is nothing that its keyword can take.
+    """
+    for name, keyword in keywords.items():
+        value = arguments[name]
+        if keyword.kind == 'list' and isinstance(value, str):
+            raise ConfigurationError(f'{name}={value!r} is no list', f'{name}=[{value!r}]')
+        if not _fits(keyword.kind, value):
+            raise ConfigurationError(f'{name}={value!r} has the wrong type',
+                                     f'it takes a {keyword.kind}')
+
+
+def _fits(kind: Kind, value: Any) -> bool:
+    if value is None or isinstance(value, values.Converted):
+        return True
+    if isinstance(value, Mapping):
+        return kind in ('mapping', 'text or mapping') and all(
+            isinstance(one, str) for one in value)
+    # a substitution is recognised by its method: describing a machine does not import launch
+    if kind == 'mapping' or hasattr(value, 'perform'):
+        return kind != 'mapping'
+    if kind == 'table':
+        return isinstance(value, (list, tuple)) and all(isinstance(row, Mapping) for row in value)
+    if kind == 'list':
+        return isinstance(value, (list, tuple, set, frozenset)) and all(
+            one is not None and _fits('text', one) for one in value)
+    if isinstance(value, (list, tuple)):  # parts of a text
+        return all(isinstance(one, (str, os.PathLike)) or hasattr(one, 'perform')
+                   for one in value)
+    return isinstance(value, (str, int, float, Decimal, os.PathLike))
+
+
 def options_of(constructor: Callable[..., Any], arguments: Mapping[str, Any]) -> dict[str, Any]:
     """
     Return the arguments of a machine's constructor as options, marked by their kinds.
 
     :param arguments: the arguments by name, and other names, which are ignored.
+    :raises ConfigurationError: an argument has a wrong type.
     """
+    check(parameters_of(constructor), arguments)
     return {name: _MARKS[keyword.kind](arguments[name]) if keyword.kind in _MARKS
             else arguments[name] for name, keyword in parameters_of(constructor).items()}
 

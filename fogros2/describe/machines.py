@@ -11,7 +11,7 @@ import shlex
 from typing import Any, cast, get_args, Optional, TYPE_CHECKING, Union
 
 from fogros2.describe import names, networks, values, variables
-from fogros2.describe.kinds import options_of
+from fogros2.describe.kinds import check, options_of, parameters_of
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.host import containers, dependencies
 from fogros2.host.checkpoint import check_folder
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 _UNITS = {'s': 1.0, 'm': 60.0, 'h': 3600.0, 'd': 86400.0}
 _PREFIXES = {'': 1.0, 'k': 1e3, 'M': 1e6, 'G': 1e9}
+#: Seconds that a duration may have: a century.
+_LONGEST = 3.2e9
 _DURATION = re.compile(r'(?:\d+(?:\.\d+)?[smhd])+')
 
 
@@ -125,6 +127,7 @@ class CloudInstance:
             raise ConfigurationError(
                 f'{type(self).__name__} is no machine yet',
                 'use one of its kinds, such as ContainerInstance or AWSCloudInstance')
+        check(parameters_of(CloudInstance.__init__), parameters)
         self._made_up = name is None
         self._name = names.two_words() if name is None else name
         self._workspace = ros_workspace
@@ -289,16 +292,16 @@ class CloudInstance:
             if workspace is None:
                 workspace = next(iter(chain), None)
             elif workspace:
-                workspace = os.path.abspath(os.path.expanduser(workspace))
+                workspace = os.path.abspath(os.path.expanduser(str(workspace)))
             spec = MachineSpec(
-                name=check_name(values.resolve(context, self._name)),
+                name=check_name(str(values.resolve(context, self._name))),
                 provider=self.provider,
                 options={
                     key: self._resolved(context, key, value)
                     for key, value in self._options.items()},
                 workspace=workspace or None, underlays=underlays(workspace or None, chain),
                 environment=variables.to_send({
-                    key: values.resolve(context, value)
+                    key: str(self._resolved(context, 'environment', value))
                     for key, value in self._environment.items()}, context.environment),
                 containers=tuple(values.resolve(context, line) for line in self._containers),
                 launch_foxglove=self._resolved(
@@ -314,7 +317,7 @@ class CloudInstance:
     def _wanted(self, context: LaunchContext, program: str) -> tuple[str, ...]:
         wanted = [value for some in self._lists[program]
                   for value in values.resolve(context, some)]
-        return tuple(dict.fromkeys(_LIST_CHECKS[program](value) for value in wanted))
+        return tuple(dict.fromkeys(_LIST_CHECKS[program](str(value)) for value in wanted))
 
     def _resolved(self, context: LaunchContext, keyword: str, value: Any) -> Any:
         with values.named(keyword):
@@ -374,12 +377,11 @@ class ContainerInstance(CloudInstance):
         containers: Optional[Bool] = None,
         **common: Any,
     ) -> None:
-        options = options_of(ContainerInstance.__init__, locals())
+        options = options_of(ContainerInstance.__init__, {**locals(), 'on': None})
         if on is not None:
             self.provider = 'hosted'
-            if isinstance(on, SSHInstance):
-                options['on'] = on._options
-            elif not isinstance(on, Mapping):
+            options['on'] = on._options if isinstance(on, SSHInstance) else on
+            if not isinstance(options['on'], Mapping):
                 raise ConfigurationError(
                     f'on={type(on).__name__} is no host of container machines',
                     'use SSHInstance; fleet= makes a machine of a cloud one')
@@ -448,7 +450,7 @@ def parse_duration(what: str, value: Union[str, int, float]) -> float:
 
     :raises ConfigurationError: not a duration, or not above zero.
     """
-    seconds = 0.0
+    seconds: float = 0
     if isinstance(value, str):
         text = value.replace(' ', '')
         try:
@@ -459,11 +461,11 @@ def parse_duration(what: str, value: Union[str, int, float]) -> float:
                     float(number) * _UNITS[unit]
                     for number, unit in re.findall(r'([\d.]+)([smhd])', text))
     else:
-        seconds = float(value)
-    if not 0 < seconds < float('inf'):
+        seconds = value
+    if not 0 < seconds < _LONGEST:
         raise ConfigurationError(
             f'{what}={value!r} is no duration', "use seconds, or text such as '8h' or '1h30m'")
-    return seconds
+    return float(seconds)
 
 
 def parse_bandwidth(what: str, value: Union[str, int, float]) -> float:
@@ -522,7 +524,7 @@ def _listed(program: str, content: Any) -> list[Union[values.Items, values.List]
 
     :raises ConfigurationError: not a list, or a wrong item.
     """
-    items = values.checked_items(program, content, _LIST_CHECKS[program])
+    items = values.checked_items(content, _LIST_CHECKS[program])
     return [] if items is None else [items]
 
 

@@ -17,7 +17,7 @@ _SUCH = "write networks such as '198.51.100.0/28', or addresses"
 
 def items(content: Any) -> Any:
     """Read a value of ``monitor_allow``; see :func:`values.checked_items`."""
-    return values.checked_items('monitor_allow', content, normal)
+    return values.checked_items(content, normal)
 
 
 def resolve(context: LaunchContext, networks: Any) -> tuple[str, ...]:
@@ -27,7 +27,7 @@ def resolve(context: LaunchContext, networks: Any) -> tuple[str, ...]:
     :param networks: a result of :func:`items`.
     :raises ConfigurationError: an invalid network.
     """
-    return tuple(normal(value) for value in values.resolve(context, networks) or ())
+    return tuple(normal(str(value)) for value in values.resolve(context, networks) or ())
 
 
 def normal(text: str) -> str:

@@ -55,15 +55,12 @@ def items(
     return List(values) if hasattr(values, 'perform') else Items(values)
 
 
-def checked_items(name: str, sequence: Any, check: Callable[[str], object]) -> Any:
+def checked_items(sequence: Any, check: Callable[[str], object]) -> Any:
     """
     Return the values of a list as separate items, None for none; check those that are known.
 
-    :param name: the keyword, for messages.
-    :raises ConfigurationError: a single text, or an invalid value.
+    :raises ConfigurationError: an invalid value.
     """
-    if isinstance(sequence, str):
-        raise ConfigurationError(f'{name}={sequence!r} is no list', f'{name}=[{sequence!r}]')
     parts = items(sequence)
     for value in parts if isinstance(parts, Items) else ():
         if isinstance(value, str):
@@ -149,7 +146,11 @@ def resolve(context: LaunchContext, value: Any) -> Any:
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
-    return perform_substitutions(context, normalize_to_list_of_substitutions(value))
+    try:
+        parts = normalize_to_list_of_substitutions(value)
+    except TypeError as error:
+        raise ConfigurationError(f'{value!r} is no text', 'write a text or a number') from error
+    return perform_substitutions(context, parts)
 
 
 def is_text(value: Any) -> bool:

@@ -42,14 +42,13 @@ find . -printf '%P %y %s %T@ %C@\\n' | LC_ALL=C sort | sha256sum
 _ASIDE = 'if [ -e {0} ] && [ ! -e {1} ]; then mv -T -- {0} {1}; echo moved; fi'
 
 
-def check_folder(what: str, value: str) -> str:
+def check_folder(what: str, value: object) -> str:
     """
     Return a folder in the form ``~/map`` or ``/var/map``; ``$HOME`` stands for ``~``.
 
     :raises ConfigurationError: it is no folder below the home or the root.
     """
-    path = f'~{value[5:]}' if value.startswith('$HOME/') else value
-    path = path.rstrip('/')
+    path = re.sub(r'^\$HOME/', '~/', str(value)).rstrip('/')
     parts = path.split('/')
     if len(parts) < 2 or parts[0] not in ('~', '') or {'', '.', '..'} & {*parts[1:]}:
         raise ConfigurationError(f'{what}={value!r} is no folder that can be copied',

@@ -37,6 +37,8 @@ _ASSIGNMENT = re.compile(r'[A-Za-z_]\w*=')
 #: Names of the scripts that are sent with a process.
 _OUTER, _INNER = 'container', 'in-container'
 _VARIABLE = re.compile('[A-Za-z_][A-Za-z0-9_]*')
+#: An image's name may have a registry, a tag, a digest; podman's a transport, such as dir:/path.
+_IMAGE = re.compile('[A-Za-z0-9][A-Za-z0-9._:/@+-]*')
 #: Variables that decide which nodes hear each other. Each container on the machine's network gets
 #: the values of the machine's nodes.
 _DDS_VARIABLES = (
@@ -148,7 +150,7 @@ def parse(line: str) -> Container:
         if not word.startswith('--'):
             rest = word[1:].lstrip(docker_lines.SHORT_FLAGS)
             options += ['-P'] if 'P' in word[:len(word) - len(rest)] else []
-            if not rest:
+            if rest[:1] in ('', '='):  # such as -it=true
                 continue
             word = f'-{rest}'
             name, equals, value = word[:2], word[2:], word[2:].lstrip('=')
@@ -176,6 +178,8 @@ def parse(line: str) -> Container:
         if docker_lines.MARK in text:
             raise wrong(f"has {text.replace(docker_lines.MARK, '')} as image, name, gpus or "
                         'restart', 'write it out: the launch has to know it')
+    if not _IMAGE.fullmatch(words[at]):
+        raise wrong(f"has '{words[at]}' where the image has to be")
     return Container(words[at], tuple(options), tuple(words[at + 1:]), settings['--gpus'],
                      settings['--name'], settings['--restart'])
 

@@ -180,7 +180,7 @@ def wants(
     :param gpu: a number, True for one, or part of the name of one.
     :raises ConfigurationError: a value is out of range.
     """
-    named = gpu if isinstance(gpu, str) and not gpu.isdigit() else ''
+    named = gpu if isinstance(gpu, str) and not gpu.isdecimal() else ''
     number = 1 if named or gpu is True else int(gpu or 0)
     if gpu_memory_gb and not number:
         number = 1

@@ -70,13 +70,14 @@ def convert(name: str, value: Any, default: Any) -> Any:
             return value.lower() == 'true'
         expected = 'True or False'
     elif isinstance(default, int):
-        if isinstance(value, str) and value.isdigit():
+        if isinstance(value, str) and value.isdecimal():
             value = int(value)
         if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
             return value
         expected = 'a whole number'
     elif isinstance(default, float):
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and value > 0:
+        if isinstance(value, (int, float)) and not isinstance(value, bool) \
+                and 0 < value < 1e12:
             return float(value)
         expected = 'a number above 0'
     elif isinstance(default, str):

@@ -7,10 +7,11 @@ A machine may print without end.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import contextlib
 import functools
 import logging
+import os
 from pathlib import Path
 import sys
 
@@ -53,6 +54,19 @@ def prepare() -> None:
             f"launch's log folder can't be made: {error.filename}: {error.strerror}",
             'ROS_LOG_DIR names another folder for it') from error
     handler.handleError = functools.partial(_report, handler, handler.handleError)
+
+
+@contextlib.contextmanager
+def none() -> Iterator[None]:
+    """Let launch make no log files in this block, which reads a launch file and runs nothing."""
+    config = launch.logging.launch_config
+    before = config.log_handler_factory
+    config.log_dir, config.log_handler_factory = os.sep, lambda *_, **__: logging.NullHandler()
+    try:
+        yield
+    finally:
+        config.log_dir, config.log_handler_factory = None, before
+        config.file_handlers.clear()
 
 
 def _report(

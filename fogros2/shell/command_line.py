@@ -38,9 +38,11 @@ def marked_line(line: str) -> str:
     """
     Return a line that prints a mark before the output of its command, in the user's home.
 
-    The login shell may have printed something before, and have changed its folder.
+    The login shell may have printed something before, and have changed its folder; with a trap of
+    bash it prints each of its commands.
     """
-    return f"cd; echo {MARK.decode().strip()}; exec {line.removeprefix('exec ')}"
+    script = f"cd; echo {MARK.decode().strip()}; exec {line.removeprefix('exec ')}"
+    return f'exec sh -c {shlex.quote(script)}'
 
 
 def end_script(pid: int) -> str:

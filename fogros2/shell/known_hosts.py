@@ -43,29 +43,32 @@ def look_up(settings: Settings) -> Known:
     """
     Return what the files of known_hosts say of a host.
 
-    :raises HostKeyError: a file cannot be read.
+    :raises HostKeyError: no key is known, and a file cannot be read.
     :raises PrerequisiteError: OpenSSH's ssh-keygen is missing.
     """
-    known = _look_up(settings, label_of(settings))
+    files, error = list[Path](), None
+    for file in (Path(name).expanduser() for name in settings.known_hosts):
+        try:
+            with file.open('rb'):
+                files.append(file)
+        except FileNotFoundError:
+            continue
+        except OSError as failed:
+            error = failed
+    known = _look_up(files, label_of(settings))
     if not known.keys and settings.port != 22 and not settings.label:
         # a key of the same host is accepted at its other ports
-        plain = _look_up(settings, settings.host)
-        return dataclasses.replace(
+        plain = _look_up(files, settings.host)
+        known = dataclasses.replace(
             known, keys=plain.keys, revoked=(*known.revoked, *plain.revoked))
+    if error is not None and not known.keys and not known.authorities:
+        raise HostKeyError(f'{error.filename} can not be read: {error.strerror}') from error
     return known
 
 
-def _look_up(settings: Settings, label: str) -> Known:
+def _look_up(files: list[Path], label: str) -> Known:
     keys: dict[str, list[str]] = {'': [], '@cert-authority': [], '@revoked': []}
-    for name in settings.known_hosts:
-        file = Path(name).expanduser()
-        try:
-            with file.open('rb'):
-                pass
-        except FileNotFoundError:
-            continue
-        except OSError as error:
-            raise HostKeyError(f'{file} can not be read: {error.strerror}') from error
+    for file in files:
         process.require(['ssh-keygen'], package_of={'ssh-keygen': 'openssh-client'})
         # it knows patterns and hashed names, and skips damaged lines
         for line in process.run(Command(('ssh-keygen', '-F', label.lower(), '-f', str(file))),

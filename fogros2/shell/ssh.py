@@ -12,7 +12,7 @@ from typing import Optional, TYPE_CHECKING
 from fogros2.errors import ConnectError, FogError, ShellError
 from fogros2.model import Command
 from fogros2.shell import command_line, ssh_connection
-from fogros2.shell.lines import Channel, Output
+from fogros2.shell.lines import Channel, Output, take_errors
 from fogros2.shell.remote import RemoteShell
 from fogros2.untrusted import clean
 from fogros2.waiting import wait_until
@@ -110,25 +110,26 @@ class SSHShell(RemoteShell['paramiko.Transport']):
         """
         Receive without what the login shell printed before the command, such as in ~/.bashrc.
 
-        :raises ShellError: it printed, and ran no command.
+        :raises ShellError: it ended, and ran no command.
         """
         begin = time.monotonic()
         while True:
             data = type(channel).recv(channel, size)
             before += data
             _, mark, rest = bytes(before).partition(command_line.MARK)
-            if mark or not data:
-                del vars(channel)['recv']
             if mark:
+                del vars(channel)['recv']
                 return rest or channel.recv(size)
-            if not data:
-                line = clean(before.decode(errors='replace')).strip().split('\n')[-1]
-                if not line or not channel.get_transport().is_alive():
-                    return b''
-                raise ShellError(f"the login shell of '{self.name}' runs no command, it prints: "
-                                 f'{line}', 'see its ~/.bashrc, and authorized_keys')
-            del before[:-len(command_line.MARK) - 1000]
             limit = channel.gettimeout()
+            if not data and channel.status_event.wait(limit):
+                if channel.recv_exit_status() == -1:
+                    return b''  # the connection is lost
+                before += take_errors(channel)
+                line = clean(before.decode(errors='replace')).strip().split('\n')[-1]
+                raise ShellError(f"the login shell of '{self.name}' runs no command"
+                                 + (f', it prints: {line}' if line else ''),
+                                 'see its ~/.bashrc, and authorized_keys')
+            del before[:-len(command_line.MARK) - 1000]
             if limit is not None and time.monotonic() - begin >= limit:
                 raise TimeoutError
 

@@ -96,14 +96,16 @@ def read(name: str, user: str = '', port: int = 0) -> Settings:
         return re.sub('%(.)', lambda match: tokens.get(match[1], match[1] if match[1] == '%'
                                                        else match[0]), text)
 
-    known = ' '.join(first(f'{kind}knownhostsfile') for kind in ('user', 'global')).split()
+    # ssh prints no quotes around a path with a space
+    known = [file for kind in ('user', 'global') for file in re.split(
+        ' (?=[/~])', expanded(first(f'{kind}knownhostsfile')))]
     return Settings(
         host, int(number), user,
-        keys=tuple(expanded(key) for key in values.get('identityfile', ())),
+        keys=tuple(os.path.expandvars(expanded(key)) for key in values.get('identityfile', ())),
         only_keys=first('identitiesonly') == 'yes', agent=expanded(first('identityagent')),
         proxy=_proxy(first('proxyjump'), expanded(first('proxycommand')), host, number, files),
         known_hosts=tuple(re.sub(f'^{re.escape(account.pw_dir)}/[.]ssh/', f'{home}/.ssh/',
-                                 expanded(file)) for file in known),
+                                 file) for file in known),
         label=first('hostkeyalias'))
 
 

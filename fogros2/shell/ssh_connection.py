@@ -236,9 +236,11 @@ def _verify(
         raise HostKeyError(
             f'{where} shows another host key than known_hosts has',
             f"if the machine was set up anew: ssh-keygen -R '{label}'")
+    file = settings.known_hosts[0]
     raise HostKeyError(
-        f"the host key of '{name}' ({settings.host}) is unknown",
-        f'if it is right, add this line to {settings.known_hosts[0]}: {label} {line}')
+        f"the host key of '{name}' ({settings.host}) is unknown", 'if it is right, ' + (
+            f"give host_key='{line}'" if file in ('none', os.devnull) else
+            f'add this line to {file}: {label} {line}'))
 
 
 def _log_in(transport: paramiko.Transport, settings: Settings, name: str) -> None:
@@ -334,9 +336,6 @@ def load_key(path: Path, name: str) -> paramiko.PKey:
     :raises AuthenticationError: the key cannot be read, or has a passphrase.
     """
     import paramiko
-    if not os.access(path, os.R_OK):
-        raise AuthenticationError(f"the key {path} for '{name}' can not be read",
-                                  'check the owner and the mode of the file')
     for kind in (paramiko.Ed25519Key, paramiko.ECDSAKey, paramiko.RSAKey):
         try:
             key: paramiko.PKey = kind.from_private_key_file(str(path))
@@ -344,6 +343,10 @@ def load_key(path: Path, name: str) -> paramiko.PKey:
         except paramiko.PasswordRequiredException as error:
             raise AuthenticationError(f'the key {path} has a passphrase',
                                       f'ssh-add {path}') from error
+        except OSError as error:
+            raise AuthenticationError(
+                f"the key {path} for '{name}' can not be read: {error.strerror}",
+                'check the owner and the mode of the file') from error
         except (paramiko.SSHException, ValueError, IndexError):
             continue  # another type of key
     raise AuthenticationError(f'{path} is no private key that SSH knows',

@@ -148,6 +148,18 @@ def test_launch_arguments_are_shown(package):
     assert ros2('launch', '--show-args', str(empty))[1].endswith('\n\n  No arguments.\n')
 
 
+@pytest.mark.parametrize('option', ['-s', '-p'])
+@pytest.mark.parametrize(('name', 'text', 'why'), [
+    ('a.launch.xml', '<launch><nod/></launch>', 'Unrecognized entity of the type: nod'),
+    ('a.launch.py', 'def generate_launch_description():\n    pass\n',
+     "generate_launch_description() of '{}' returned NoneType, no LaunchDescription")])
+def test_file_that_is_no_launch_file_is_one_line(package, option, name, text, why):
+    path = package / name
+    path.write_text(text)
+    status, out, err = ros2('launch', option, str(path))
+    assert (status, out, err.count('\n')) == (1, '', 1) and why.format(path) in err
+
+
 def test_launch_description_is_printed(package):
     status, out, _ = ros2('launch', '-p', 'pkg', 'a.launch.py')
     assert status == 0 and "── LogInfo('says ' + LaunchConfig('word'))" in out

@@ -7,9 +7,11 @@ The texts of machines may control a terminal: what the verbs print is cleaned on
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 import contextlib
+import errno
 import json
+import os
 import sys
 from typing import Any, cast, Optional, TextIO
 
@@ -19,16 +21,45 @@ from fogros2.untrusted import clean
 JSON_VERSION = 1
 
 
-class _Cleaned:
-    """A stream that replaces control characters; it has the other methods of ``stream``."""
+class _Output:
+    """
+    A stream that replaces control characters; it has the other methods of ``stream``.
 
-    def __init__(self, stream: TextIO) -> None:
-        self.stream = stream
+    :param needed: whether a text that can not be written ends the verb.
+    :param change: what is done with each text.
+    """
+
+    def __init__(
+        self, stream: TextIO, needed: bool, change: Callable[[str], str] = clean,
+    ) -> None:
+        self.stream, self.needed, self.change = stream, needed, change
 
     def write(self, text: str) -> int:
-        """Write a text without control characters."""
-        self.stream.write(clean(text))
+        """
+        Write a text.
+
+        :raises BrokenPipeError: it can not be written, such as behind ``| head``.
+        """
+        try:
+            self.stream.write(self.change(text))
+        except OSError as error:
+            self._lost(error)
         return len(text)
+
+    def flush(self) -> None:
+        """Write what is kept, as :meth:`write` does."""
+        try:
+            self.stream.flush()
+        except OSError as error:
+            self._lost(error)
+
+    def _lost(self, error: OSError) -> None:
+        # the stream keeps the text, and the exit would fail to write it again
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self.stream.fileno())
+        if self.needed:
+            if error.errno != errno.EPIPE:
+                print(f"can't write the output: {error.strerror}", file=sys.stderr)
+            raise BrokenPipeError from error
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.stream, name)
@@ -36,15 +67,19 @@ class _Cleaned:
 
 @contextlib.contextmanager
 def cleaned() -> Iterator[None]:
-    """Clean what is printed in this block."""
-    with contextlib.redirect_stdout(cast(TextIO, _Cleaned(sys.stdout))), \
-            contextlib.redirect_stderr(cast(TextIO, _Cleaned(sys.stderr))):
+    """Clean what is printed in this block; a closed stream is /dev/null."""
+    for name, mode in (('stdin', 'r'), ('stdout', 'w'), ('stderr', 'w')):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))
+    with contextlib.redirect_stdout(cast(TextIO, _Output(sys.stdout, True))), \
+            contextlib.redirect_stderr(cast(TextIO, _Output(sys.stderr, False))):
         yield
 
 
 def uncleaned(stream: TextIO) -> TextIO:
     """Return the stream for text that moves the cursor, or that a shell evaluates."""
-    return stream.stream if isinstance(stream, _Cleaned) else stream
+    return cast(TextIO, _Output(stream.stream, stream.needed, str)) \
+        if isinstance(stream, _Output) else stream
 
 
 def as_json(fields: dict[str, Any], *, indent: Optional[int] = 2) -> str:

@@ -270,14 +270,6 @@ def follow(
     return not absent.is_set()
 
 
-def hush() -> None:
-    """Redirect stdout and stderr to /dev/null, so that the interpreter's exit reports no error."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    for target in (1, 2):
-        os.dup2(nowhere, target)
-    os.close(nowhere)
-
-
 def robot_environment(record: Record, store: Store) -> Optional[dict[str, str]]:
     """
     Return the variables to join a launch from another terminal, None if the launch is over.

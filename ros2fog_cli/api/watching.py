@@ -14,7 +14,7 @@ from typing import Any, Optional
 from fogros2.errors import DeadlineExceeded
 from fogros2.store import check_name
 from fogros2.waiting import wait_until
-from ros2fog_cli.api import output, reach, screen
+from ros2fog_cli.api import output, screen
 from ros2fog_cli.api.live import Live, PRESENT
 
 #: Time-out of the measurement of stream rates, in seconds.
@@ -41,10 +41,8 @@ def watch(
             _lines(live, name, interval, as_json)
         else:
             _screen(live, name, interval)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, BrokenPipeError):
         pass  # the user ends the watch
-    except BrokenPipeError:
-        reach.hush()
     finally:
         live.close()
     return 0

@@ -30,15 +30,18 @@ class FogCommand(CommandExtension):
         self, *, parser: argparse.ArgumentParser, args: argparse.Namespace,
     ) -> Union[int, str, None]:
         """Run the verb, or print version or help; return the exit status."""
-        if args.version:
-            from importlib import metadata
-            print(f"fogros2 {metadata.version('fogros2')}")
-            return 0
-        if not hasattr(args, '_verb'):
-            self._subparser.print_help()
-            return 0
         with output.cleaned():
-            status: Union[int, str, None] = args._verb.main(args=args)
+            try:
+                if args.version:
+                    from importlib import metadata
+                    print(f"fogros2 {metadata.version('fogros2')}")
+                    return 0
+                if not hasattr(args, '_verb'):
+                    self._subparser.print_help()
+                    return 0
+                status: Union[int, str, None] = args._verb.main(args=args)
+            except BrokenPipeError:
+                return 1
         return status
 
 

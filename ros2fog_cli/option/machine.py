@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from typing import Any, Optional, TYPE_CHECKING
 
 from ros2fog_cli.verb import add_overrides
@@ -31,6 +32,13 @@ class MachineOption:
     ) -> None:
         """Add ``--machine``."""
         add_overrides(parser)
+
+    def reading(self) -> contextlib.AbstractContextManager[None]:
+        """Prepare for ``-s`` and ``-p`` to read the launch file; ros2launch does not ask."""
+        from fogros2.launch_internals import hints
+        from fogros2.runtime import log_files
+        hints.of_actions()
+        return log_files.none()
 
     def preview(
         self, launch_description: LaunchDescription, args: argparse.Namespace,

@@ -170,7 +170,7 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 def print_json(**fields: object) -> None:
     """Print what ``--json`` of a verb shows."""
     from ros2fog_cli.api import output
-    say(output.as_json(fields))
+    print(output.as_json(fields), flush=True)
 
 
 def add_page(parser: argparse.ArgumentParser) -> None:
@@ -187,16 +187,12 @@ def say(text: str, *, error: bool = False) -> None:
 
     :param error: print it to standard error.
     """
-    import os
-
     from ros2fog_cli.api import progress
-    stream = sys.stderr if error else sys.stdout
     with progress.aside():
         try:
-            print(text, file=stream, flush=True)
-        except OSError:
-            # the stream keeps the text, and the exit would fail to write it again
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+            print(text, file=sys.stderr if error else sys.stdout, flush=True)
+        except BrokenPipeError:
+            pass
 
 
 def warn(text: str) -> None:

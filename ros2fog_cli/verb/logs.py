@@ -43,10 +43,7 @@ class LogsVerb(VerbExtension):
                 alive = reach.follow(client, take, forever=args.follow)
                 for (name, stream), line in log.begun.items():
                     show(name, stream, [line], args.node)
-            except KeyboardInterrupt:
-                return 0
-            except BrokenPipeError:
-                reach.hush()
+            except (KeyboardInterrupt, BrokenPipeError):
                 return 0
             finally:
                 client.close()

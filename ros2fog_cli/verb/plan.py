@@ -21,6 +21,7 @@ class PlanVerb(VerbExtension):
     def main(self, *, args: argparse.Namespace) -> int:
         """Ask the clouds for regions, types and prices, and create nothing; 1 if one refuses."""
         from decimal import Decimal
+        import os
 
         from launch.launch_description_sources import get_launch_description_from_any_launch_file
 
@@ -28,27 +29,33 @@ class PlanVerb(VerbExtension):
         from fogros2.deploy.choosing import Choices
         from fogros2.describe.overrides import Overrides
         from fogros2.errors import ConfigurationError, FogError
+        from fogros2.launch_internals import hints
         from fogros2.report import silent
+        from fogros2.runtime import log_files
         from ros2fog_cli.api import preview, progress
-        try:
-            description = get_launch_description_from_any_launch_file(args.file)
-        except Exception as error:
-            raise ConfigurationError(f"'{args.file}' can't be read: {error}",
-                                     'ros2 launch FILE -s shows where') from error
-        plan = preview.Preview(description, preview.arguments(args.launch_arguments),
-                               Overrides(args.machine) if args.machine else None)
-        choices, prices, failed = Choices(provider, silent), {}, 0
-        with progress.working('asking for prices'):
-            for machine in plan.machines:
-                if machine.spec is None:
-                    continue
-                try:
-                    machine.spec, price = preview.priced(machine.spec, choices)
-                    if price is not None:
-                        prices[machine.name] = price
-                except FogError as error:
-                    warn(f'{machine.name}: {error}')
-                    failed = 1
+        if not os.path.isfile(args.file):
+            raise ConfigurationError(f"there is no file '{args.file}'", 'give the path of one')
+        hints.of_actions()
+        with log_files.none():
+            try:
+                description = get_launch_description_from_any_launch_file(args.file)
+            except Exception as error:
+                raise ConfigurationError(f"'{args.file}' can't be read: {error}",
+                                         'ros2 launch FILE -s shows where') from error
+            plan = preview.Preview(description, preview.arguments(args.launch_arguments),
+                                   Overrides(args.machine) if args.machine else None)
+            choices, prices, failed = Choices(provider, silent), {}, 0
+            with progress.working('asking for prices'):
+                for machine in plan.machines:
+                    if machine.spec is None:
+                        continue
+                    try:
+                        machine.spec, price = preview.priced(machine.spec, choices)
+                        if price is not None:
+                            prices[machine.name] = price
+                    except FogError as error:
+                        warn(f'{machine.name}: {error}')
+                        failed = 1
         say('\n'.join(plan.lines(prices)) or 'The launch file has no machines and no nodes.')
         if len(prices) > 1:
             say(f'All machines: ${sum(prices.values(), Decimal(0)).normalize():f} an hour')

@@ -56,9 +56,13 @@ class PriceVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the table; a launch would use the first row."""
+        from fogros2.errors import ConfigurationError
         from fogros2.provider import clouds, offers
         from ros2fog_cli.api import replicas, table
         from ros2fog_cli.api.interrupts import interruptible
+        if args.limit < 0:
+            raise ConfigurationError(f'--limit {args.limit} is no number of rows',
+                                     '0 shows all of them')
         wanted = offers.wants(
             arch=args.arch, min_cpu=args.min_cpu, min_memory_gb=args.min_memory,
             cpu_type=args.cpu_type, gpu=args.gpu, gpu_memory_gb=args.gpu_memory,
@@ -89,7 +93,7 @@ class PriceVerb(VerbExtension):
             rest = len(choice.offers) - len(shown)
             if rest:
                 print(f"{rest} more {'cost' if rest > 1 else 'costs'} as much or more (--limit 0)")
-        if args.replicas and not args.json:
+        if args.replicas is not None and not args.json:
             print(replicas.price(choice.offers, args.replicas, spot=args.spot))
         for who, reason in choice.left_out:
             warn(f'{who}: {reason}')

@@ -315,6 +315,22 @@ def test_login_shell_that_runs_no_command_is_named(tmp_path, home):
         shell.run(Command(('true',)), timeout=10.0)
 
 
+@pytest.mark.parametrize('talk', ['true', 'echo closed >&2; false'])
+def test_login_shell_that_ends_silently_is_named(tmp_path, home, talk):
+    with private_sshd(tmp_path / 'sshd', f'ForceCommand {talk}\n') as server, \
+            contextlib.closing(SSHShell(server.endpoint, name='planner')) as shell, \
+            pytest.raises(ShellError, match=r'runs no command(, it prints: closed)? \(see'):
+        shell.put(b'data', '~/file', mode=0o600)
+
+
+def test_commands_that_bash_prints_are_no_output(tmp_path, home):
+    there = tmp_path / 'there'
+    there.mkdir()
+    (there / '.bashrc').write_text("trap 'echo $BASH_COMMAND' DEBUG\n")
+    with private_sshd(tmp_path / 'sshd', f'SetEnv HOME={there} SHLVL=0\n') as server:
+        assert says(SSHShell(server.endpoint, name='planner')) == 'hello\n'
+
+
 def test_talk_without_end_ends_by_the_time_out(tmp_path, home):
     with private_sshd(tmp_path / 'sshd', TALK.format('yes')) as server, \
             contextlib.closing(SSHShell(server.endpoint, name='planner')) as shell, \

@@ -8,6 +8,7 @@ from decimal import Decimal
 from importlib.util import find_spec
 import os
 from pathlib import Path
+import subprocess
 
 from launch import LaunchDescription
 from launch.actions import (
@@ -225,4 +226,25 @@ All machines: $0.0832 an hour
 
 
 def test_plan_of_a_missing_file_is_an_error(tmp_path):
-    assert "can't be read" in main(argv=['fog', 'plan', str(tmp_path / 'no.launch.py')])
+    assert 'there is no file' in main(argv=['fog', 'plan', str(tmp_path / 'no.launch.py')])
+
+
+@pytest.mark.skipif(find_spec('ros2launch') is not None,
+                    reason="ROS 2's own ros2launch makes launch's log folder")
+@pytest.mark.parametrize('words', [['launch', '-s'], ['launch', '-p'], ['fog', 'plan']])
+def test_previews_write_no_file_and_name_the_node_with_a_machine(words, tmp_path):
+    def said(text, home):
+        path = tmp_path / 'x.launch.py'
+        path.write_text('from launch import LaunchDescription as Description\n'
+                        'from launch.actions import LogInfo\nfrom launch_ros.actions import Node\n'
+                        f'def generate_launch_description():\n    return Description([{text}])\n')
+        return subprocess.run(['ros2', *words, str(path)], env={
+            name: value for name, value in {**os.environ, 'HOME': str(home)}.items()
+            if name not in ('ROS_LOG_DIR', 'ROS_HOME')}, capture_output=True, text=True)
+
+    for home in (tmp_path / 'home', '/dev/null'):
+        done = said("LogInfo(msg='a')", home)
+        assert (done.returncode, done.stderr) == (0, '')
+    assert not (tmp_path / 'home').exists()
+    done = said("Node(executable='a', machine='m')", tmp_path / 'home')
+    assert done.returncode == 1 and 'from fogros2 import Node' in done.stderr

@@ -267,3 +267,28 @@ def test_machine_without_ssh_is_refused(capsys: pytest.CaptureFixture[str]) -> N
         in capsys.readouterr().err
     assert run('ssh-config') == 0
     assert run('ssh-config', 'nobody') == 1
+
+
+# -- output that can not be written ---------------------------------------------------------------
+
+@pytest.mark.parametrize('words', [['--version'], ['list', '--json'], ['key'], ['image', 'list']])
+def test_output_that_is_lost_is_one_line(words: list[str], tmp_path: Path) -> None:
+    env = {**os.environ, 'HOME': str(tmp_path)}
+
+    def fog(stdout: Any, **options: Any) -> tuple[int, str]:
+        done = subprocess.run(['ros2', 'fog', *words], stdout=stdout, stderr=subprocess.PIPE,
+                              text=True, env=env, timeout=60, **options)
+        return done.returncode, done.stderr
+
+    with open('/dev/full', 'w') as full:
+        assert fog(full) == (1, "can't write the output: No space left on device\n")
+    end, pipe = os.pipe()
+    os.close(end)
+    try:
+        assert fog(pipe) == (1, '')
+    finally:
+        os.close(pipe)
+    # without standard streams, as a service may start it
+    done = subprocess.run(['sh', '-c', 'exec ros2 fog "$@" <&- >&- 2>&-', 'sh', *words], env=env,
+                          timeout=60)
+    assert done.returncode == 0

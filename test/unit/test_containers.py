@@ -41,6 +41,7 @@ from rigs import deploying
                ('run', '--fast', '-d'))),
     ('docker run -dit --privileged --name eyes --gpus all --ipc=host image',
      Container('image', ('--privileged', '--ipc', 'host'), (), 'all', 'eyes')),
+    ('docker run -it=true --rm=true dir:/a/B@c image', Container('dir:/a/B@c', (), ('image',))),
     ('docker run -p8080:80 -e=X=1 -dP -- image',
      Container('image', ('-p', '8080:80', '-e', 'X=1', '-P'))),
     ('docker run -dp 3000:3000 -itv/a:/b -de A=b -Pdw /x image',
@@ -55,7 +56,8 @@ def test_a_line_is_understood(line, meant):
 @pytest.mark.parametrize(('line', 'why'), [
     ('', 'no line of docker'), ('ls', 'no line of docker'), ('docker ps', 'runs nothing'),
     ('docker run', 'no image'), ('docker run -d', 'no image'), ('docker run -p', 'nothing after'),
-    ("docker run 'image", 'no command line'),
+    ("docker run 'image", 'no command line'), ("docker run '' ls", "has ''"),
+    ('docker run –rm image', "has '–rm' where the image"), ('docker run “image”', 'has .“image”'),
 ])
 def test_what_is_none_is_refused(line, why):
     with pytest.raises(ConfigurationError, match=why):

@@ -258,6 +258,10 @@ def test_configuration_that_is_no_xml_is_refused(uri: str, tmp_path: Path) -> No
 
 
 def test_interface_without_multicast_is_refused() -> None:
+    uri = INSIDE.format('<NetworkInterface autodetermine="true" multicast="false"/>')
+    with pytest.raises(DdsError, match='use an interface without') as refused:
+        CYCLONE.robot_interfaces('foga1b2c3', 'eth0', {'CYCLONEDDS_URI': uri})
+    assert 'autodetermine="true" multicast="true"' in refused.value.hint
     uri = INSIDE.format("<NetworkInterface address='192.0.2.1' multicast='false'/>")
     with pytest.raises(DdsError, match='use 192.0.2.1 without multicast'):
         CYCLONE.robot_interfaces('vpn', None, {'CYCLONEDDS_URI': uri})

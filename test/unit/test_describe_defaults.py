@@ -105,7 +105,8 @@ def test_workspace_wins_over_user_and_overlay_over_underlay(own, tmp_path, monke
     ("[ssh]\nhost = 'a'", "has no 'host'", ''),
     ('lifetime = [1]', 'wrong type', ''), ("ssh_from = 'a'", 'wrong type', 'list'),
     ('[aws]\ndisk_size = true', 'wrong type', 'number'),
-    ('lifetime = ', "can't be read", 'TOML'), ("lifetime = 'soon'", 'lifetime', ''),
+    ('lifetime = ', "can't be read", 'TOML'), (f"x = {'[' * 5000}", "can't be read", ''),
+    ("lifetime = 'soon'", 'lifetime', ''),
     ("robot_timeout = '1h'\non_loss_after = '2m'", 'on_loss_after', 'lower robot_timeout')])
 def test_wrong_file_is_an_error(own, text, message, hint):
     own.write_text(text)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from datetime import timedelta
 import os
 from pathlib import Path
 import subprocess
@@ -143,6 +144,19 @@ def test_substitutions_are_resolved_when_executed(context):
     (lambda: ContainerInstance(idle_timeout='soon'), "idle_timeout='soon' is no duration"),
     (lambda: CloudInstance(), 'CloudInstance is no machine yet'),
     (lambda: ContainerInstance(apt='libzbar0'), "apt='libzbar0' is no list (apt=['libzbar0'])"),
+    (lambda: ContainerInstance(ports='80:80'), "ports='80:80' is no list (ports=['80:80'])"),
+    (lambda: ContainerInstance(monitor_allow='10.0.0.1'), 'is no list'),
+    (lambda: ContainerInstance(devices=5), 'devices=5 has the wrong type (it takes a list)'),
+    (lambda: ContainerInstance(pip=[None]), 'pip=[None] has the wrong type'),
+    (lambda: ContainerInstance(name={}), 'name={} has the wrong type (it takes a text)'),
+    (lambda: ContainerInstance(cpus=[1.5]), 'it takes a number'),
+    (lambda: ContainerInstance(lifetime=timedelta(hours=8)), 'lifetime=datetime.timedelta'),
+    (lambda: ContainerInstance(environment=['A=1']), 'it takes a mapping'),
+    (lambda: ContainerInstance(environment={1: 'A'}), 'it takes a mapping'),
+    (lambda: ContainerInstance(checkpoint=5), 'checkpoint=5 is no folder'),
+    (lambda: ContainerInstance(isolated=b'no'), 'it takes a bool'),
+    (lambda: AWSCloudInstance(tags=['robot']), 'it takes a mapping'),
+    (lambda: AWSCloudInstance(region={'a': 'b'}), 'it takes a text'),
     (lambda: ContainerInstance(apt=['libzbar0 -y']), 'no name of a Debian package'),
     (lambda: ContainerInstance(pip=['fogros2']), "'fogros2' is part of FogROS2"),
     (lambda: ContainerInstance().apt_install('--yes x'), 'no name of a Debian package'),
@@ -193,10 +207,17 @@ def test_durations_have_at_most_two_units(value, seconds):
     assert parse_duration('lifetime', value) == seconds
 
 
-@pytest.mark.parametrize('value', ['', 'h', '-1', '0', 'inf', '8 hours', 'nan', -3])
+@pytest.mark.parametrize(
+    'value', ['', 'h', '-1', '0', 'inf', '8 hours', 'nan', -3, 10**400, '1e10'])
 def test_no_durations(value):
     with pytest.raises(ConfigurationError):
         parse_duration('lifetime', value)
+
+
+def test_numbers_are_texts_where_a_text_is_needed(context):
+    spec = ContainerInstance(name=5, environment={
+        'N': 1, 'S': Path('/x')}).spec(context)
+    assert (spec.name, spec.environment) == ('5', {'N': '1', 'S': '/x'})
 
 
 def test_names_of_their_own_differ():

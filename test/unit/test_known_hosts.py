@@ -90,6 +90,13 @@ def test_file_that_cannot_be_read_is_an_error(tmp_path):
         known_hosts.look_up(Settings('lab', known_hosts=(str(tmp_path),)))
 
 
+def test_file_that_cannot_be_read_matters_to_no_known_host(tmp_path, keys):
+    file = tmp_path / 'global'
+    file.write_text(f'lab {keys[1]["a"]}\n')
+    assert known_hosts.look_up(Settings('lab', known_hosts=(str(tmp_path), str(file)))) == Known(
+        (keys[1]['a'],))
+
+
 def certificate(keys, tmp_path, *words, kind='a', authority='ca'):
     """Return a certificate that ``authority`` signs for a host's key."""
     file = tmp_path / 'host.pub'

@@ -20,6 +20,8 @@ def test_a_value_comes_in_the_kind_of_its_default(value, default, result):
 
 @pytest.mark.parametrize(('value', 'default', 'expected'), [
     (True, '', 'a string'), ('a', (), 'a list of strings'), (-1.0, 1.0, 'a number above 0'),
+    (float('inf'), 1.0, 'a number above 0'), (float('nan'), 1.0, 'a number above 0'),
+    ('²', 8, 'a whole number'),
     ('many', 8, 'a whole number'), (True, 8, 'a whole number'), (1.5, 8, 'a whole number'),
     ('yes', False, 'True or False'), (1, False, 'True or False'),
     ({'a': 1}, {}, 'names and strings')])

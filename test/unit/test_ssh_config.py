@@ -61,6 +61,14 @@ def test_home_is_that_of_the_environment(home):
     assert '~/.ssh/id_ed25519' in plain.keys
 
 
+def test_paths_have_spaces_and_variables(home, monkeypatch):
+    monkeypatch.setenv('FOGT_KEYS', '/keys')
+    configured(home, 'UserKnownHostsFile "/my hosts" /b\nGlobalKnownHostsFile none\n'
+               'IdentityFile ${FOGT_KEYS}/a\n')
+    found = ssh_config.read('lab')
+    assert found.known_hosts == ('/my hosts', '/b', 'none') and found.keys == ('/keys/a',)
+
+
 @pytest.mark.parametrize(('lines', 'words'), [
     ('ProxyJump bastion', ['-W', '[h.example]:2200', '--', 'ssh://bastion']),
     ('ProxyJump me@a:2201,ssh://b:22', ['-W', '[h.example]:2200', '-J', 'me@a:2201', '--',

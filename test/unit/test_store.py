@@ -3,6 +3,7 @@
 
 import errno
 import os
+from pathlib import Path
 import stat
 import subprocess
 import sys
@@ -211,3 +212,8 @@ def read_only(opened):
             raise OSError(errno.EROFS, 'Read-only file system')
         return opened(path, flags, *mode)
     return opener
+
+
+def test_home_that_is_no_folder_has_no_records():
+    with pytest.raises(StoreError, match="no record of a machine 'a'"):
+        Store(Path('/dev/null/state')).load('a')

@@ -164,7 +164,7 @@ class VmOptions:
         return wants(
             arch=self.arch or None, min_cpu=int(self.min_cpu) or None,
             min_memory_gb=self.min_memory_gb or None, cpu_type=self.cpu_type or None,
-            gpu=int(self.gpu) if self.gpu.isdigit() else self.gpu or None,
+            gpu=int(self.gpu) if self.gpu.isdecimal() else self.gpu or None,
             gpu_memory_gb=self.gpu_memory_gb or None, max_price=self.max_price, spot=self.spot)
 
     def check(self) -> None:

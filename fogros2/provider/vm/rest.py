@@ -84,7 +84,7 @@ class RestAccount(Account, abc.ABC):
         if answer.status_code >= 300:
             refused = self.refusal(answer.status_code, content, what)
             pause = answer.headers.get('Retry-After', '')
-            if isinstance(refused, CodedError) and pause.isdigit():
+            if isinstance(refused, CodedError) and pause.isdecimal():
                 refused.pause = float(pause)
             raise refused
         if content is not None and not isinstance(content, dict):

@@ -36,7 +36,11 @@ def get_launch_description_from_python_launch_file(
         raise InvalidPythonLaunchFileError(
             f"launch file at '{python_launch_file_path}' does not contain the required function "
             "'generate_launch_description()'")
-    description: LaunchDescription = module.generate_launch_description()
+    description = module.generate_launch_description()
+    if not isinstance(description, LaunchDescription):
+        raise InvalidPythonLaunchFileError(
+            f"generate_launch_description() of '{python_launch_file_path}' returned "
+            f'{type(description).__name__}, no LaunchDescription')
     return description
 
 

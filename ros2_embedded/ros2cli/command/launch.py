@@ -2,6 +2,7 @@
 """The command ``ros2 launch``."""
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from typing import Any
@@ -96,16 +97,25 @@ class LaunchCommand(CommandExtension):
             words.append(f'launch-prefix:={args.launch_prefix}')
         import launch
         from launch.actions import IncludeLaunchDescription
-        from launch.launch_description_sources import get_launch_description_from_any_launch_file
+        from launch.launch_description_sources import (
+            get_launch_description_from_any_launch_file,
+            InvalidLaunchFileError,
+        )
         if args.print or args.show_args:
-            description = get_launch_description_from_any_launch_file(path)
-            if args.print:
-                print(launch.LaunchIntrospector().format_launch_description(description))
-            else:
-                _print_arguments(description)
-            for option in self._options:
-                preview = getattr(option, 'preview', lambda *_: '')
-                print(preview(description, args, _parse(words)), end='')
+            with contextlib.ExitStack() as undo:
+                for option in self._options:
+                    undo.enter_context(getattr(option, 'reading', contextlib.nullcontext)())
+                try:
+                    description = get_launch_description_from_any_launch_file(path)
+                except InvalidLaunchFileError as exc:
+                    raise RuntimeError(str(exc)) from exc
+                if args.print:
+                    print(launch.LaunchIntrospector().format_launch_description(description))
+                else:
+                    _print_arguments(description)
+                for option in self._options:
+                    preview = getattr(option, 'preview', lambda *_: '')
+                    print(preview(description, args, _parse(words)), end='')
             return None
         for option in self._options:
             option.prestart(args)
