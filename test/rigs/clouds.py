@@ -163,10 +163,9 @@ class Robot:
         return self.launch(self.write(f'{name}.launch.py', LAUNCH.format(
             machine=self.cloud.machine, name=name, options=dict(options or {}))), **variables)
 
-    def ros2(self, *words: str, timeout: float = 180.0, **variables: str,
-             ) -> subprocess.CompletedProcess[str]:
+    def ros2(self, *words: str, **variables: str) -> subprocess.CompletedProcess[str]:
         """Run ``ros2`` on the robot."""
-        return ros2(*words, environment=self.environment(**variables), timeout=timeout,
+        return ros2(*words, environment=self.environment(**variables),
                     prefix=self.box.on_robot([]))
 
     def fog(self, *words: str, **variables: str) -> str:
@@ -175,12 +174,13 @@ class Robot:
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    def run(self, words: Sequence[str], *, timeout: float = 180.0, **variables: str,
-            ) -> subprocess.CompletedProcess[str]:
+    def run(
+        self, words: Sequence[str], **variables: str,
+    ) -> subprocess.CompletedProcess[str]:
         """Run a program on the robot."""
         return subprocess.run(
             [*self.box.on_robot([]), *words], env=self.environment(**variables),
-            stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout)
+            stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=180)
 
     def things(self) -> Any:
         """Return what there is besides machines."""
