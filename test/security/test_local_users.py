@@ -88,7 +88,7 @@ finally:
 #: Root makes a name a user's own; the launch ends, and another process gets its id. Prints what
 #: the helper says to the requests that concern this process, and what it does for them.
 REUSED = """\
-import importlib.util, os, shutil, subprocess, sys, tempfile
+import importlib.util, os, shutil, subprocess, sys, tempfile, time
 from pathlib import Path
 spec = importlib.util.spec_from_file_location('vpn_helper', sys.argv[1])
 vpn = sys.modules['vpn_helper'] = importlib.util.module_from_spec(spec)
@@ -104,6 +104,10 @@ try:
                'port': 51820, 'domain': 0, 'ports': [], 'asked': [], 'peers': []}
     vpn.up(request, 0)
     launch.kill(), launch.wait()
+    # all other ids come before it again, which takes longer than a tick of the start times
+    ended = time.monotonic()
+    while time.monotonic() - ended < 2 / os.sysconf('SC_CLK_TCK'):
+        pass
     Path('/proc/sys/kernel/ns_last_pid').write_text(str(launch.pid - 1))
     other = subprocess.Popen(['sleep', '60'])
     assert other.pid == launch.pid
@@ -210,7 +214,7 @@ def test_vpn_helper_knows_a_process_id_that_was_used_again(root: None) -> None:
         pytest.skip('needs a kernel that lets root choose the next process id')
     said = process.run(Command((
         'unshare', '--pid', '--fork', '--mount-proc', sys.executable, '-I', '-c', REUSED,
-        str(ROOT / 'packaging/vpn_helper/vpn.py')), sudo=True), timeout=30.0).stdout
+        str(ROOT / 'packaging/vpn_helper/vpn.py')), sudo=True), timeout=60.0).stdout
     first, *others = said.splitlines()
     assert first.startswith('root acts on') and len(others) == 3
     assert all(line.endswith('has ended') for line in others), said
