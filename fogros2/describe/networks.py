@@ -16,7 +16,14 @@ _SUCH = "write networks such as '198.51.100.0/28', or addresses"
 
 
 def items(content: Any) -> Any:
-    """Read a value of ``monitor_allow``; see :func:`values.checked_items`."""
+    """
+    Read a value of ``monitor_allow``; see :func:`values.checked_items`.
+
+    :raises ConfigurationError: a single text, or no network.
+    """
+    if isinstance(content, str):
+        raise ConfigurationError(
+            f'monitor_allow={content!r} is no list', f'monitor_allow=[{content!r}]')
     return values.checked_items(content, normal)
 
 

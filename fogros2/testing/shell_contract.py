@@ -109,8 +109,8 @@ class ShellContract:
     def test_command_that_takes_too_long_is_given_up(self, shell: Shell) -> None:
         begin = time.monotonic()
         raised(DeadlineExceeded,
-                lambda: shell.run(Command(('sleep', '30')), timeout=0.3))
-        assert time.monotonic() - begin < 10.0
+                lambda: shell.run(Command(('sleep', '60')), timeout=0.3))
+        assert time.monotonic() - begin < 30.0
         assert shell.run(Command(('true',)), timeout=30.0).returncode == 0
 
     def test_a_command_can_be_cancelled(self, shell: Shell) -> None:
@@ -119,9 +119,9 @@ class ShellContract:
         timer.start()
         begin = time.monotonic()
         raised(Cancelled, lambda: shell.run(
-            Command(('sleep', '30')), timeout=30.0, cancel=cancel))
+            Command(('sleep', '60')), timeout=60.0, cancel=cancel))
         timer.join()
-        assert time.monotonic() - begin < 10.0
+        assert time.monotonic() - begin < 30.0
 
     def test_many_threads_use_one_shell(self, shell: Shell) -> None:
         outputs: dict[int, str] = {}

@@ -159,7 +159,7 @@ class VmContract(ProviderContract):
             assert met.wait(self.timeout)
             provider.cancel.set()
             # nobody waits for the answer to a request that creates nothing
-            assert futures.wait([creation], 3.0).done
+            assert futures.wait([creation], 10.0).done
             raised(Cancelled, creation.result)
 
     # -- faults of the service ------------------------------------------------------------------

@@ -2,6 +2,7 @@
 """Lifecycle nodes: transitions asked for and told, over real services and topics."""
 
 import inspect
+import logging
 import sys
 
 from launch import LaunchDescription, LaunchService
@@ -80,12 +81,12 @@ def test_autostart_configures_and_activates_a_node(path):
     service = LaunchService(noninteractive=True)
     service.include_launch_description(LaunchDescription([
         RegisterEventHandler(OnProcessIO(target_action=node, on_stdout=note)),
-        node, TimerAction(period=30.0, actions=[Shutdown(reason='too late')])]))
+        node, TimerAction(period=120.0, actions=[Shutdown(reason='too late')])]))
     assert service.run() == 0
     assert seen.split() == [b'ready', b'configure', b'activate']
 
 
-def test_launch_configures_and_activates_a_node(path, capsys):
+def test_launch_configures_and_activates_a_node(path, capsys, monkeypatch):
     notes = []
     node = LifecycleNode(
         executable=path, name='managed', namespace='/ns', output='screen')
@@ -100,18 +101,25 @@ def test_launch_configures_and_activates_a_node(path, capsys):
             lifecycle_node_matcher=matches_node_name('/ns/managed'), transition_id=number))
 
     service = LaunchService(noninteractive=True)
+
+    class AfterFailure(logging.Handler):
+        # one after the other: of two calls at once rclpy may lose a response
+        def emit(self, record):
+            if 'TRANSITION_CLEANUP' in record.getMessage():
+                service.emit_event(change(1).event)
+
+    logger = logging.getLogger(LifecycleNode.execute.__globals__['__name__'])
+    monkeypatch.setattr(logger, 'handlers', [*logger.handlers, AfterFailure()])
     service.include_launch_description(LaunchDescription([
         RegisterEventHandler(OnProcessIO(target_action=node, on_stdout=lambda event: (
-            # one after the other: of two calls at once rclpy may lose a response
-            change(2), TimerAction(period=0.5, actions=[change(1)])
-        ) if b'ready' in event.text else None)),
+            change(2) if b'ready' in event.text else None))),
         RegisterEventHandler(OnStateTransition(
             target_lifecycle_node=node, goal_state='inactive',
             entities=[OpaqueFunction(function=note), change(3)])),
         RegisterEventHandler(OnStateTransition(
             target_lifecycle_node=node, transition='activate', start_state='activating',
             goal_state='active', entities=[OpaqueFunction(function=note), Shutdown()])),
-        node, TimerAction(period=30.0, actions=[Shutdown(reason='too late')])]))
+        node, TimerAction(period=120.0, actions=[Shutdown(reason='too late')])]))
     assert service.run() == 0
     assert notes == [('configure', 'configuring', 'inactive', True),
                      ('activate', 'activating', 'active', True)]

@@ -206,7 +206,7 @@ XML = '''<launch>
   </executable>
   <timer period="0.01"><log message="timer"/></timer>
   <executable cmd="sleep 60" on_exit="shutdown" sigterm_timeout="2.5" respawn="false"/>
-  <timer period="0.3"><shutdown reason="enough"/></timer>
+  <timer period="1.0"><shutdown reason="enough"/></timer>
 </launch>
 '''
 
@@ -231,7 +231,7 @@ launch:
                env: [{name: X, value: y}]}
 - timer: {period: 0.01, children: [log: {message: timer}]}
 - executable: {cmd: sleep 60, on_exit: shutdown, sigterm_timeout: 2.5, respawn: 'false'}
-- timer: {period: 0.3, children: [shutdown: {reason: enough}]}
+- timer: {period: 1.0, children: [shutdown: {reason: enough}]}
 '''
 
 

@@ -48,7 +48,7 @@ def worker():
         process.terminate()
 
 
-def ros2(*command, status=0, timeout=40, until=None, by=signal.SIGINT):
+def ros2(*command, status=0, timeout=120, until=None, by=signal.SIGINT):
     """Run a command; once it has said ``until``, send it a signal."""
     if command[1] in ('list', 'info', 'get', 'set', 'echo'):
         command = (*command[:2], '--no-daemon', *command[2:])  # which would outlive the test
@@ -119,7 +119,7 @@ def test_first_message_reaches_the_awaited_subscription():
             stdout=subprocess.PIPE, text=True)
         ros2('topic', 'pub', '--once', topic, 'std_msgs/msg/String', '{data: go}')
         try:
-            assert reader.communicate(timeout=10)[0] == 'data: go\n---\n'
+            assert reader.communicate(timeout=60)[0] == 'data: go\n---\n'
         finally:
             reader.kill()
             reader.wait()
@@ -134,7 +134,7 @@ def test_topic_pub_repeats_until_interrupted(worker, options):
     try:
         assert [worker.stdout.readline() for _ in range(2)] == ['again\n'] * 2
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=40) == signal.SIGINT
+        assert process.wait(timeout=120) == signal.SIGINT
     finally:
         process.kill()
         process.wait()
@@ -144,7 +144,7 @@ def test_topic_pub_repeats_until_interrupted(worker, options):
     ('topic', 'pub', '--once', '/nobody', 'std_msgs/msg/String'),
     ('service', 'call', '/nobody', 'std_srvs/srv/SetBool')])
 def test_sigterm_ends_a_waiting_command(command):
-    said = ros2(*command, until='aiting for ', by=signal.SIGTERM, status=None, timeout=10)
+    said = ros2(*command, until='aiting for ', by=signal.SIGTERM, status=None, timeout=60)
     assert 'publishing' not in said and 'response' not in said
     if importlib.util.find_spec('embedded_default'):
         assert len(said.splitlines()) == 1

@@ -81,7 +81,7 @@ def launched(prefix, tmp_path, *command, until=None):
         text=True, start_new_session=True, env={
             **os.environ, 'ROS_LOG_DIR': str(tmp_path), 'USER': 'me', 'PYTHONUNBUFFERED': '1',
             'AMENT_PREFIX_PATH': f"{prefix}:{os.environ.get('AMENT_PREFIX_PATH', '')}"})
-    watchdog = threading.Timer(60, os.killpg, [process.pid, signal.SIGKILL])
+    watchdog = threading.Timer(300, os.killpg, [process.pid, signal.SIGKILL])
     watchdog.start()
     lines = []
     try:

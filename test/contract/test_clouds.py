@@ -34,8 +34,6 @@ def memory(request, monkeypatch):
 
 
 class TestClouds(VmContract):
-    timeout = 10.0
-
     @pytest.fixture(autouse=True)
     def _memory(self, memory):
         self.memory = memory
@@ -62,7 +60,7 @@ def create(memory, name='planner', **options):
 
 
 def gone(memory):
-    wait_until(lambda: not memory.left(), timeout=5.0, what='nothing to be left')
+    wait_until(lambda: not memory.left(), timeout=60.0, what='nothing to be left')
 
 
 @pytest.mark.parametrize(('name', 'step', 'how'), STEPS)
@@ -123,7 +121,7 @@ def test_launch_takes_few_requests(memory):
     memory.hurry()
     machine, _ = create(memory)
     provider = memory.provider()
-    provider.reachable(machine, name='planner', timeout=10.0)
+    provider.reachable(machine, name='planner', timeout=60.0)
     provider.pin(machine, PUBLIC_KEY)
     provider.allow(machine, 22, [])
     provider.destroy(machine)

@@ -39,24 +39,24 @@ def test_what_runs_ends_on_the_shell_that_it_began_on():
 
     def slow(command):
         begun.set()
-        assert go_on.wait(5.0)
+        assert go_on.wait(60.0)
         said.append(before.closed)
         return Result(0, '', '')
 
     before, after = FakeShell(handlers={'slow': slow}), FakeShell()
     shell = MovableShell(before)
     running = threading.Thread(
-        target=lambda: shell.run(Command(('slow',)), timeout=5.0))
+        target=lambda: shell.run(Command(('slow',)), timeout=60.0))
     running.start()
-    assert begun.wait(5.0)
+    assert begun.wait(60.0)
     moving = threading.Thread(target=lambda: shell.move(after))
     moving.start()
     # a call of now takes the new way, and waits for nobody
-    wait_until(lambda: shell.run(Command(('true',)), timeout=5.0) and len(after.commands) > 0,
-               timeout=2.0, what='the new way')
+    wait_until(lambda: shell.run(Command(('true',)), timeout=60.0) and len(after.commands) > 0,
+               timeout=60.0, what='the new way')
     assert before.closed == 0
     go_on.set()
     for thread in (running, moving):
-        thread.join(5.0)
+        thread.join(60.0)
     assert said == [0]
     assert before.closed == 1

@@ -98,7 +98,7 @@ def no_filter_left() -> Iterator[None]:
     """Remove the DDS filter of this process that a failed test left: it would fail others."""
     yield
     for name in re.findall(r'/(fog[0-9a-f]{6})\b', Path('/proc/self/cgroup').read_text()):
-        run(Command(('nft', 'delete', 'table', 'inet', name), sudo=True), timeout=10, check=False)
+        run(Command(('nft', 'delete', 'table', 'inet', name), sudo=True), timeout=60, check=False)
 
 
 @pytest.fixture
@@ -107,7 +107,7 @@ def nothing_left(
 ) -> Iterator[None]:
     """Fail a test after which something is there that wasn't before, and is nobody else's."""
     traces = Traces(state_home, tmp_path_factory.getbasetemp(), os.environ[RUN])
-    with nothing_left_of(traces, timeout=10.0):
+    with nothing_left_of(traces, timeout=60.0):
         yield
 
 
@@ -216,7 +216,7 @@ def children() -> Iterator[list[subprocess.Popen[bytes]]]:
     for child in started:
         if child.poll() is None:
             child.kill()
-        child.wait(10)
+        child.wait(60)
 
 
 @pytest.fixture

@@ -77,7 +77,7 @@ def test_a_launch_takes_few_calls_and_leaves_nothing(aws):
     spec = provider.resolve(spec)
     machine_id = provider.create(spec, request)
     machine = provider.reachable(
-        machine_id, name='planner', timeout=20.0)
+        machine_id, name='planner', timeout=60.0)
     provider.pin(machine_id, f'{KEY} root@planner')
     provider.allow(machine_id, 22, [])
     started = sum(aws.count().values())
@@ -393,7 +393,7 @@ def test_leftovers_of_a_full_region_are_reported(aws):
     aws.refuse('DeleteKeyPair', 'UnauthorizedOperation')
     machine_id = aws.provider.create(*ask(region=HOME, regions=[AWAY]))
     machine = aws.provider.reachable(
-        machine_id, name='planner', timeout=20.0)
+        machine_id, name='planner', timeout=60.0)
     assert machine.note.startswith("the login key of 'planner' in eu-central-1 may be left")
 
 

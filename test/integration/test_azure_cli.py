@@ -10,8 +10,6 @@ from fogros2.provider.azure.provider import AzureProvider
 from fogros2.testing import request_for
 from rigs.azure import cli, service
 
-pytestmark = pytest.mark.timeout(600)
-
 SPEC = MachineSpec('planner', 'azure', {'vm_size': 'Standard_B2als_v2', 'region': 'westeurope'})
 
 

@@ -62,11 +62,11 @@ class Robot:
         return self.provider.create(self.spec(**options), self.request())
 
     def reach(self, machine_id: str):
-        return self.provider.reachable(machine_id, name='planner', timeout=5.0)
+        return self.provider.reachable(machine_id, name='planner', timeout=60.0)
 
     def gone(self) -> None:
         """Wait until the deletions that were asked for have been carried out."""
-        wait_until(lambda: not self.azure.vms() and not self.azure.groups, timeout=5.0,
+        wait_until(lambda: not self.azure.vms() and not self.azure.groups, timeout=60.0,
                    what='everything to be deleted')
 
     def asked(self, kind: str = '', method: str = '') -> list[str]:
@@ -161,7 +161,7 @@ def test_no_room_leads_to_the_next_size(robot, code, late):
     machine_id = robot.create(vm_sizes=[LARGE])
     machine = robot.reach(machine_id)
     assert machine.kind == LARGE and machine.cost_per_hour == Decimal('0.096')
-    wait_until(lambda: len(robot.azure.vms()) == len(robot.azure.groups) == 1, timeout=5.0,
+    wait_until(lambda: len(robot.azure.vms()) == len(robot.azure.groups) == 1, timeout=60.0,
                what='the first to be deleted')
     robot.provider.destroy(machine_id)
     assert robot.azure.groups == {}
@@ -229,11 +229,11 @@ def test_schedule_of_a_long_life_is_set_anew(robot, monkeypatch):
     robot.azure.rights = service.CONTRIBUTOR
     monkeypatch.setattr(ending, 'DAY', 0.4)
     machine_id = robot.create()
-    wait_until(lambda: len(robot.asked('schedules', 'PUT')) > 2, timeout=5.0, what='two more')
+    wait_until(lambda: len(robot.asked('schedules', 'PUT')) > 2, timeout=60.0, what='two more')
     robot.provider.destroy(machine_id)
     # until the machine is gone
     wait_until(lambda: 'fog-rearm' not in [thread.name for thread in threading.enumerate()],
-               timeout=5.0, what='the last one')
+               timeout=60.0, what='the last one')
 
 
 def test_user_data_stays_below_the_limit_of_the_clouds(robot):
@@ -273,10 +273,10 @@ def test_role_of_the_page_has_exactly_the_actions_needed(robot):
         robot.provider.allow(machine_id, 22, sources)
     image_id = robot.provider.bake(machine_id, 'planner', 'abcd')
     wait_until(lambda: [one.state for one in robot.provider.images()] == ['available'],
-               timeout=5.0, what='the image')
+               timeout=60.0, what='the image')
     robot.provider.stop(machine_id)
     wait_until(lambda: robot.provider.describe(machine_id).state is MachineState.STOPPED,
-               timeout=5.0, what='the stop')
+               timeout=60.0, what='the stop')
     robot.provider.start(machine_id)
     robot.provider.tidy()
     robot.provider.delete_image(image_id)
@@ -297,7 +297,7 @@ def test_image_is_baked_reused_and_deleted(robot):
     machine_id = robot.create()
     image_id = robot.provider.bake(machine_id, 'planner', 'abcd')
     wait_until(lambda: [one.state for one in robot.provider.images()] == ['available'],
-               timeout=5.0, what='the image')
+               timeout=60.0, what='the image')
     request = robot.request(dependencies='abcd')
     again = robot.provider.create(robot.spec('mapper'), request)
     assert image_id.split('/')[1] in robot.provider.describe(again).image
@@ -323,7 +323,7 @@ def test_failed_bake_leaves_no_group(robot):
     robot.azure.faults.append(Fault('Wrong', 400, 'PUT', 'galleries'))
     with pytest.raises(ProviderError, match='Wrong'):
         robot.provider.bake(machine_id, 'planner', 'abcd')
-    wait_until(lambda: len(robot.azure.vms()) == len(robot.azure.groups) == 1, timeout=5.0,
+    wait_until(lambda: len(robot.azure.vms()) == len(robot.azure.groups) == 1, timeout=60.0,
                what='the group to be deleted')
     robot.provider.destroy(machine_id)
 
@@ -381,7 +381,7 @@ def test_no_room_at_a_start_is_named(robot):
     robot.reach(machine_id)
     robot.provider.stop(machine_id)
     wait_until(lambda: robot.provider.describe(machine_id).state is MachineState.STOPPED,
-               timeout=5.0, what='the stop')
+               timeout=60.0, what='the stop')
     robot.azure.faults.append(Fault('AllocationFailed', 409, 'POST', 'virtualMachines', late=True))
     with pytest.raises(ProviderError, match='no free machine'):
         robot.provider.start(machine_id)

@@ -82,10 +82,10 @@ def write(tmp_path):
 @pytest.fixture
 def refused(write):
     """Return what launches such a file, which has to fail well, and what it said."""
-    def launch(machine, *, environment=None, within=20.0, wrap=(), **node):
+    def launch(machine, *, environment=None, within=50.0, wrap=(), **node):
         begin = time.monotonic()
         done = subprocess.run(
-            [*wrap, 'ros2', 'launch', str(write(machine, **node))], text=True, timeout=60,
+            [*wrap, 'ros2', 'launch', str(write(machine, **node))], text=True, timeout=170,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
             env={**os.environ, **(environment or {})})
         assert time.monotonic() - begin < within, done.stdout

@@ -128,7 +128,6 @@ class Machine(LocalShell):
             f'python 3 {self.python.version[1]} 1 {self.python.path}']), '')
 
 
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize('offline', [False, True], ids=['own index', 'sent by the robot'])
 def test_machine_with_another_python_gets_ros(
     packed: Wheels, tmp_path: Path, offline: bool,

@@ -15,8 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SEARCHED = os.pathsep.join([os.path.dirname(sys.executable), os.environ.get('PATH', '')])
 COLCON = shutil.which('colcon', path=SEARCHED)
 
-pytestmark = [pytest.mark.skipif(COLCON is None, reason='colcon is not installed'),
-              pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.skipif(COLCON is None, reason='colcon is not installed')]
 
 OTHER = {
     'package.xml': '<package format="3"><name>other</name><version>1.0.0</version>'

@@ -55,7 +55,7 @@ class TestContainerProvider(ProviderContract):
 
 
 def said(shell: SSHShell, *words: str, sudo: bool = False) -> str:
-    return shell.run(Command(words, sudo=sudo), timeout=20.0).stdout.strip()
+    return shell.run(Command(words, sudo=sudo), timeout=60.0).stdout.strip()
 
 
 def test_a_machine_has_its_own_name_address_users_and_processes(cloud):
@@ -110,7 +110,7 @@ def test_a_machine_may_make_interfaces_and_no_more(cloud):
         said(shell, 'ip', 'tuntap', 'add', 'fogtest', 'mode', 'tun', sudo=True)
         assert 'fogtest' in said(shell, 'ip', 'link', 'show', 'fogtest')
         mounted = shell.run(Command(('mount', '-t', 'tmpfs', 'none', '/mnt'), sudo=True),
-                            timeout=10.0, check=False)
+                            timeout=60.0, check=False)
         assert mounted.returncode != 0
 
 
@@ -119,7 +119,7 @@ def test_the_python_of_this_process_is_there_read_only(cloud):
         assert said(shell, sys.executable, '-c', 'import paramiko, sys; print(sys.prefix)') \
             == sys.prefix
         if not sys.prefix.startswith('/usr'):
-            written = shell.run(Command(('touch', f'{sys.prefix}/x'), sudo=True), timeout=10.0,
+            written = shell.run(Command(('touch', f'{sys.prefix}/x'), sudo=True), timeout=60.0,
                                 check=False)
             assert 'Read-only' in written.stderr
 
@@ -133,9 +133,9 @@ def test_the_host_key_is_the_machine_s_own_and_pinned(cloud):
                 'ssh-ed25519 '
                 'AAAAC3NzaC1lZDI1NTE5AAAAINhr1xZ0GZJ4Mqbso1vdFbxmsNCtINbcVrdTGUPNy8U9')))
         with cloud.shell(pinned, user='fog') as other, pytest.raises(HostKeyError):
-            other.run(Command(('true',)), timeout=10.0)
+            other.run(Command(('true',)), timeout=60.0)
         with cloud.shell(machine, user='root') as other, pytest.raises(ShellError):
-            other.run(Command(('true',)), timeout=10.0)
+            other.run(Command(('true',)), timeout=60.0)
 
 
 def test_options_reach_the_machine(cloud, tmp_path):
@@ -151,10 +151,10 @@ def test_options_reach_the_machine(cloud, tmp_path):
         assert said(shell, 'id', '-u', sudo=True) == '0'
         assert said(shell, 'cat', '/data/file') == 'here'
         assert said(shell, 'printenv', 'COLOUR') == 'blue sky'
-        assert shell.run(Command(('touch', '/data/x'), sudo=True), timeout=10.0,
+        assert shell.run(Command(('touch', '/data/x'), sudo=True), timeout=60.0,
                          check=False).returncode != 0
         told = process.run(Command(('podman', 'inspect', f'fogros2-{machine.name}'), sudo=True),
-                           timeout=10.0).stdout
+                           timeout=60.0).stdout
         host = json.loads(told)[0]['HostConfig']
         assert host['Memory'] == 200 << 20
         assert host['NanoCpus'] == 500_000_000
@@ -164,7 +164,7 @@ def test_options_reach_the_machine(cloud, tmp_path):
 def test_the_end_command_ends_it_for_good(cloud):
     with cloud.machine() as (machine, shell):
         with contextlib.suppress(ShellError):
-            shell.run(Command(machine.end_command, sudo=True), timeout=10.0)
+            shell.run(Command(machine.end_command, sudo=True), timeout=60.0)
 
         def gone() -> bool:
             try:
@@ -173,8 +173,8 @@ def test_the_end_command_ends_it_for_good(cloud):
                 return True
             return False
 
-        wait_until(gone, timeout=10.0, what='the machine to end')
-        wait_until(lambda: not cloud.traces(), timeout=10.0, what='its root and filter to go')
+        wait_until(gone, timeout=60.0, what='the machine to end')
+        wait_until(lambda: not cloud.traces(), timeout=60.0, what='its root and filter to go')
         cloud.provider.destroy(machine.id)
 
 
@@ -199,9 +199,9 @@ def test_a_stopped_machine_keeps_its_disk_and_its_key(cloud):
         said(shell, 'ls', '/usr/local/bin/kept', '/var/lib/kept', '/etc/kept')
         # by itself too it ends as stopped
         with contextlib.suppress(ShellError):
-            shell.run(Command(again.end_command, sudo=True), timeout=10.0)
+            shell.run(Command(again.end_command, sudo=True), timeout=60.0)
     wait_until(lambda: cloud.provider.describe(first.id).state is MachineState.STOPPED,
-               timeout=10.0, what='the machine to stop')
+               timeout=60.0, what='the machine to stop')
 
 
 def test_a_machine_made_to_be_deleted_isn_t_stopped(cloud):
@@ -259,13 +259,13 @@ def test_a_launch_killed_while_it_creates_leaves_all_or_nothing(cloud, cloud_net
     child.stdin.flush()
     threading.Event().wait(delay)  # the fault's moment, not a wait for something
     child.send_signal(signal.SIGKILL)
-    child.wait(10.0)
+    child.wait(60.0)
 
     def settled() -> bool:
-        running = process.run(Command(('pgrep', '-f', token)), timeout=10.0, check=False).stdout
+        running = process.run(Command(('pgrep', '-f', token)), timeout=60.0, check=False).stdout
         return not running or bool(list(cloud.provider.find({'fogros2-name': spec.name})))
 
-    wait_until(settled, timeout=20.0, what='the engine to finish')
+    wait_until(settled, timeout=60.0, what='the engine to finish')
     for machine in cloud.provider.find({'fogros2-name': spec.name}):
         cloud.provider.destroy(machine.id)
 
@@ -283,16 +283,16 @@ def test_the_agent_is_armed_at_boot_and_comes_back(cloud):
     machine = cloud.reached(cloud.create(cloud.spec(), agent_config=config))
     with cloud.shell(machine) as shell:
         def running() -> str:
-            return shell.run(Command(('pgrep', '-f', 'agent.py serve')), timeout=10.0,
+            return shell.run(Command(('pgrep', '-f', 'agent.py serve')), timeout=60.0,
                              check=False).stdout.strip()
 
-        first = wait_until(lambda: running() or None, timeout=10.0, what='the agent')
+        first = wait_until(lambda: running() or None, timeout=60.0, what='the agent')
         wait_until(lambda: shell.run(
-            Command(('test', '-S', '/run/fogros2/agent.sock')), timeout=10.0,
-            check=False).returncode == 0, timeout=10.0, what="the agent's socket")
+            Command(('test', '-S', '/run/fogros2/agent.sock')), timeout=60.0,
+            check=False).returncode == 0, timeout=60.0, what="the agent's socket")
         said(shell, 'kill', '-KILL', first, sudo=True)
         # the one that is killed may be there a moment longer
-        wait_until(lambda: running() not in ('', first), timeout=10.0, what='the agent to return')
+        wait_until(lambda: running() not in ('', first), timeout=60.0, what='the agent to return')
 
 
 def test_an_agent_that_waits_in_vain_ends_the_machine(cloud):
@@ -306,7 +306,7 @@ def test_an_agent_that_waits_in_vain_ends_the_machine(cloud):
             return True
         return False
 
-    wait_until(gone, timeout=20.0, what='the machine to end itself')
+    wait_until(gone, timeout=60.0, what='the machine to end itself')
 
 
 @pytest.fixture
@@ -347,7 +347,7 @@ def test_an_image_gets_user_key_and_server_at_boot(image, cloud):
     machine = cloud.reached(cloud.create(spec))
     # podman's name of a copy has digits alone; those of tests beside this one go by themselves
     wait_until(lambda: not [name for name in set(os.listdir('/var/tmp')) - before
-                            if name.isdigit()], timeout=20.0, what='no copy in /var/tmp')
+                            if name.isdigit()], timeout=60.0, what='no copy in /var/tmp')
     with cloud.shell(machine) as shell:
         assert said(shell, 'hostname') == spec.name
         assert said(shell, 'pwd') == '/home/fog'
@@ -389,7 +389,7 @@ def test_incomplete_image_is_reported(image, cloud):
         return ''
 
     assert 'the image lacks sshd sudo rsync python3' in wait_until(
-        lambda: fails() or None, timeout=20.0, what='the machine to complain')
+        lambda: fails() or None, timeout=60.0, what='the machine to complain')
 
 
 def test_full_disk_of_a_machine_is_named(cloud, tmp_path):

@@ -170,7 +170,7 @@ def test_container_of_a_killed_follower_is_removed(image, launch, tmp_path):
     follower.wait(60)
     assert there(launch) != []
     at_machine(containers.remove(launch))
-    wait_until(lambda: not there(launch) or None, timeout=20, what='the container to be gone')
+    wait_until(lambda: not there(launch) or None, timeout=60, what='the container to be gone')
     follower.stdout.close()
 
 
@@ -278,7 +278,7 @@ def test_node_killed_in_its_image_reports_sigkill(image, launch, tmp_path):
 def test_node_interrupted_before_its_start_ends(image, launch, tmp_path, moment):
     process = node(image, launch, tmp_path, 'sh', '-c', 'exec busybox sleep 1000')
     wait_until(lambda: there(launch) if moment == 'container-there'
-               else list(tmp_path.glob(moment)), timeout=20, longest=0.01, what=moment)
+               else list(tmp_path.glob(moment)), timeout=60, longest=0.01, what=moment)
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=60)
     assert process.returncode != 0
@@ -404,7 +404,7 @@ def test_container_machine_runs_containers_and_images(
                           'told --ros-args')
         status = ros2('fog', 'status', name).stdout
         assert re.search(r'talker-\d +running', status) and re.search(r'box-\d +running', status)
-        wait_until(lambda: '] in the box' in ros2('fog', 'logs', name).stdout, timeout=20,
+        wait_until(lambda: '] in the box' in ros2('fog', 'logs', name).stdout, timeout=60,
                    what='what the container said')
         # by whatever its end comes, launch sees it as of any process
         run(Command(('podman', 'exec', f'fogros2-{name}', 'pkill', '-KILL', '-f',
@@ -431,7 +431,7 @@ def test_restarted_machine_runs_containers_again(images, crun, cloud_network):
                    timeout=60, check=check).stdout
 
     def up() -> None:
-        wait_until(lambda: said('pgrep -x sshd', check=False), timeout=20, what='the machine')
+        wait_until(lambda: said('pgrep -x sshd', check=False), timeout=60, what='the machine')
 
     try:
         up()

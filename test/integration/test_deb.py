@@ -108,7 +108,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build the package of this tree."""
     if which('dpkg-deb') is None:
         pytest.skip('needs dpkg-deb')
-    if run(Command(('git', '-C', str(ROOT), 'rev-parse')), timeout=10.0,
+    if run(Command(('git', '-C', str(ROOT), 'rev-parse')), timeout=60.0,
            check=False).returncode != 0:
         pytest.skip('this tree is under no version control, which says what goes in')
     spec = importlib.util.spec_from_file_location('deb', ROOT / 'packaging' / 'deb.py')
@@ -146,7 +146,7 @@ def make(target: Path) -> None:
 @pytest.fixture(scope='module')
 def archive(root: None) -> Path:
     """Return a packed system, made unless it is in the cache."""
-    if run(Command((*NAMESPACES, 'true'), sudo=True), timeout=10.0, check=False).returncode != 0:
+    if run(Command((*NAMESPACES, 'true'), sudo=True), timeout=60.0, check=False).returncode != 0:
         pytest.skip('root may make no namespaces here, as in a container without privileges')
     cache = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache', 'fogros2', 'deb')
     cache.mkdir(parents=True, exist_ok=True)
@@ -191,7 +191,7 @@ def write_repository(folder: Path, packages: Mapping[str, str]) -> None:
 
 def stubs_for(built: Path) -> dict[str, str]:
     """Return what the package depends on and isn't real: name -> the oldest version it takes."""
-    depends = run(Command(('dpkg-deb', '--field', str(built), 'Depends')), timeout=10.0).stdout
+    depends = run(Command(('dpkg-deb', '--field', str(built), 'Depends')), timeout=60.0).stdout
     found = {}
     for word in depends.strip().split(', '):
         match = re.fullmatch(r'(\S+)(?: \(>= (\S+)\))?', word)

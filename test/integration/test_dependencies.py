@@ -118,7 +118,7 @@ def said(machine) -> str:
     node = NodeSpec(f'n-{time.monotonic_ns()}', 'node', arguments=('python3', '-c', NODE))
     machine.start([node])
     wait_until(lambda: any(e['event'] == 'exited' and e['node'] == node.id for e in heard),
-               timeout=30, what='the node to end')
+               timeout=60, what='the node to end')
     return ' '.join(e['text'] for e in heard if e['event'] == 'output' and e['node'] == node.id)
 
 

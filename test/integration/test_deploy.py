@@ -69,7 +69,7 @@ def test_a_node_runs_on_a_machine_of_its_own_and_everything_goes(spec):
         machine.subscribe(heard.append)
         code = 'import os, socket; print(socket.gethostname(), os.getuid(), flush=True)'
         machine.start([one_node('a', ('python3', '-c', code))])
-        wait_until(lambda: any(e['event'] == 'exited' for e in heard), timeout=30,
+        wait_until(lambda: any(e['event'] == 'exited' for e in heard), timeout=60,
                    what='the node to end')
         text = ''.join(e['text'] for e in heard if e['event'] == 'output').split()
         assert text[0] == f'planner-{RUN}'
@@ -107,7 +107,7 @@ def test_launch_stops_the_daemon_of_its_terminals_before_its_vpn():
         assert environment and interface.exists()
     finally:
         assert launch.down() == []
-    thread.join(10)
+    thread.join(60)
     assert not thread.is_alive()
     assert seen == [True] and not interface.exists() and not folder.exists()
 
@@ -121,7 +121,7 @@ def test_machine_with_a_slow_clock_is_warned_of_and_shown(
     name = spec().name
     try:
         launch.up(spec())
-        wait_until(lambda: any(isinstance(e, ClockMeasured) for e in events), timeout=10,
+        wait_until(lambda: any(isinstance(e, ClockMeasured) for e in events), timeout=60,
                    what='the offset')
         assert main(argv=['fog', 'status', name, '--json']) == 0
         clock = json.loads(capsys.readouterr().out)['clock']
@@ -198,7 +198,7 @@ def test_machines_come_up_in_parallel_and_reach_each_other(spec):
         for machine in machines.values():
             for other in machines.values():
                 machine.shell.run(
-                    Command(('ping', '-c', '1', '-W', '5', other.vpn_address)), timeout=20)
+                    Command(('ping', '-c', '1', '-W', '5', other.vpn_address)), timeout=60)
     finally:
         assert launch.down() == []
 
@@ -250,11 +250,11 @@ def test_a_killed_wireguard_comes_back(spec):
         machine = launch.up(spec())
         interface = launch.robot_vpn().interface.name
         before = wireguard_of(interface)
-        run(Command(('sh', '-c', 'kill -9 "$@"', 'sh', *map(str, before)), sudo=True), timeout=10)
-        wait_until(lambda: wireguard_of(interface) - before, timeout=20,
+        run(Command(('sh', '-c', 'kill -9 "$@"', 'sh', *map(str, before)), sudo=True), timeout=60)
+        wait_until(lambda: wireguard_of(interface) - before, timeout=60,
                    what='another wireguard-go')
         begin = time.monotonic()
-        wait_until(lambda: machine.heartbeat.age < time.monotonic() - begin, timeout=20,
+        wait_until(lambda: machine.heartbeat.age < time.monotonic() - begin, timeout=60,
                    what='an answer through the VPN')
     finally:
         assert launch.down() == []

@@ -51,7 +51,7 @@ def test_the_next_launch_takes_the_kept_machine_of_a_killed_one(cloud_network):
     try:
         machine = launch.up(MachineSpec(name, 'container', {'network': cloud_network}))
         assert machine.machine.id == before.machine_id
-        there = machine.shell.run(Command(('ls', '/sys/class/net')), timeout=10).stdout.split()
+        there = machine.shell.run(Command(('ls', '/sys/class/net')), timeout=60).stdout.split()
         assert machine.interface.name in there
         assert interface not in there, 'the VPN of the killed launch'
     finally:
@@ -104,4 +104,4 @@ def test_gc_deletes_interface_without_the_launchs_notes(tun, what, monkeypatch, 
 
 def run(words):
     """Return what a command of root prints."""
-    return process.run(Command(tuple(words), sudo=True), timeout=10).stdout
+    return process.run(Command(tuple(words), sudo=True), timeout=60).stdout

@@ -67,7 +67,8 @@ def test_end_does_not_wait_for_an_unreachable_machine(cloud_network):
             == machine.machine.id
     finally:
         assert again.down() == []
-    assert seconds < 15, f'{seconds:.0f} s'
+    # a command of a machine that answers has 60 s
+    assert seconds < 45, f'{seconds:.0f} s'
     told, = failures
     assert f"'{spec.name}' does not answer" in str(told) and '(nodes, VPN)' in str(told)
     assert f'ros2 fog delete {spec.name}' in told.hint
@@ -79,8 +80,8 @@ def arm(start, machine, robot):
     job.machine, job.shell = machine, LocalShell(Endpoint('local'), name=job.name)
     # an install that takes 30 s was seen once: show what it waits for
     waiting = threading.Timer(20, lambda: print(run(Command(
-        ('ps', '-eo', 'pid,ppid,stat,wchan:24,args', '--forest')), timeout=10).stdout))
-    start.wait(10)
+        ('ps', '-eo', 'pid,ppid,stat,wchan:24,args', '--forest')), timeout=60).stdout))
+    start.wait(60)
     waiting.start()
     try:
         Arming(context, job).arm()

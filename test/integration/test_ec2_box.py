@@ -50,7 +50,7 @@ def key(tmp_path_factory):
     path = tmp_path_factory.mktemp('key') / 'id'
     for name in (path, path.with_name('host')):
         process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f', str(name))),
-                    timeout=20)
+                    timeout=60)
     return path
 
 
@@ -158,7 +158,7 @@ def test_an_instance_is_a_computer(box, key):
 
 def test_the_robot_has_no_way_out_and_may_move(box):
     def on_robot(*words):
-        return subprocess.run(box.on_robot(words), capture_output=True, text=True, timeout=20)
+        return subprocess.run(box.on_robot(words), capture_output=True, text=True, timeout=60)
 
     assert on_robot('curl', '-s', box.checkip).stdout.strip() == ROBOT
     assert on_robot('curl', '-s', '-m', '2', 'http://192.0.2.1/').returncode != 0
@@ -222,7 +222,7 @@ def test_an_image_remembers_the_files(box, key):
     def described():
         return it.ec2.describe_images(ImageIds=[image])['Images'][0]
 
-    wait_until(lambda: described()['State'] == 'available', timeout=20, what='the image')
+    wait_until(lambda: described()['State'] == 'available', timeout=60, what='the image')
     assert it.described()['State']['Name'] == 'running'
     snapshot = described()['BlockDeviceMappings'][0]['Ebs']['SnapshotId']
     (tags,) = [s['Tags'] for s in it.ec2.describe_snapshots(
@@ -293,7 +293,7 @@ def test_it_boots_as_slowly_as_it_is_told(box, key):
     box.set_boot_delay(60.0)
     other = Launched(box, key)
     other.ec2.terminate_instances(InstanceIds=[other.id])
-    box.wait_for(other.id, 'terminated', timeout=5)
+    box.wait_for(other.id, 'terminated', timeout=30)
 
 
 @pytest.mark.parametrize('code', [
@@ -394,11 +394,11 @@ def test_groups_name_groups_and_a_reboot_is_no_new_boot(box, key):
         return box.run(one.id, 'cat /boots /firsts', check=False).split() == [
             'boot', 'boot', 'first']
 
-    wait_until(booted_twice, timeout=20, longest=0.2, what='the reboot')
+    wait_until(booted_twice, timeout=60, longest=0.2, what='the reboot')
     assert one.runs().described()['PublicIpAddress'] == public
     # and by its own word
     box.run(one.id, 'reboot', check=False)
-    wait_until(lambda: box.run(one.id, 'wc -l </boots', check=False).strip() == '3', timeout=20,
+    wait_until(lambda: box.run(one.id, 'wc -l </boots', check=False).strip() == '3', timeout=60,
                longest=0.2, what='the second reboot')
 
 
@@ -419,11 +419,11 @@ with Ec2Box() as box:
 def traces_of(mark):
     """Return what a box with this mark has on this computer now."""
     found = [name for name in process.run(
-        Command(('ip', 'netns', 'list'), sudo=True), timeout=20).stdout.split()
+        Command(('ip', 'netns', 'list'), sudo=True), timeout=60).stdout.split()
         if name.startswith(f'fogt{mark}')]
     found += process.run(Command(
         ('podman', 'ps', '-aq', f'--filter=label=fogros2-ec2={mark}'), sudo=True),
-        timeout=20).stdout.split()
+        timeout=60).stdout.split()
     found += [str(path) for path in Path('/var/lib/fogros2-ec2').glob(mark)]
     return found + [str(path) for path in Path('/etc/netns').glob(f'fogt{mark}*')]
 
@@ -438,11 +438,11 @@ def test_box_leaves_nothing_whichever_process_dies(box, whose, tmp_path):
     if whose == 'test':
         child.kill()
     else:
-        process.run(Command(('kill', '-KILL', pid), sudo=True), timeout=20)
+        process.run(Command(('kill', '-KILL', pid), sudo=True), timeout=60)
         assert traces_of(mark)
         os.kill(child.pid, signal.SIGKILL)
         with Ec2Box():
             pass  # the next one tidies up
-    child.wait(10)
+    child.wait(60)
     child.stdout.close()
-    wait_until(lambda: not traces_of(mark), timeout=15, what='the box to be gone')
+    wait_until(lambda: not traces_of(mark), timeout=60, what='the box to be gone')

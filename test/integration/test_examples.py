@@ -124,7 +124,7 @@ def test_machine_is_chosen_by_a_launch_argument(launch, words):
     'talker.container.launch.xml', 'talker.kube.launch.py', 'talker.ssh.launch.py',
     'two_clouds.launch.py', 'video.container.launch.yaml'])
 def test_showing_a_launch_file_creates_nothing(name, option, state_home):
-    shown = ros2('launch', str(example(name)), option, timeout=20)
+    shown = ros2('launch', str(example(name)), option, timeout=60)
     assert shown.returncode == 0, shown.stdout + shown.stderr
     if option == '-s':
         assert "'count':" in shown.stdout

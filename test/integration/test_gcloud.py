@@ -7,13 +7,10 @@ import json
 import os
 import subprocess
 
-import pytest
-
 from rigs import isolated
 from rigs.gce.catalogue import IMAGES
 
 
-@pytest.mark.timeout(600)
 def test_gcloud_creates_lists_and_deletes(gce, tmp_path):
     url = 'http://127.0.0.1:8080'
     variables = {

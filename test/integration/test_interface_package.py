@@ -130,7 +130,6 @@ def environment(tmp_path: Path) -> Iterator[dict[str, str]]:
         yield dict(line.split('=', 1) for line in sourced.split('\0') if '=' in line)
 
 
-@pytest.mark.timeout(600)
 def test_own_message_service_and_action_work_between_nodes(environment: dict[str, str]) -> None:
     processes = [subprocess.Popen([sys.executable, '-c', code], env=environment, text=True,
                                   stdout=subprocess.PIPE) for code in (SERVER, CLIENT)]

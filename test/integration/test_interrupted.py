@@ -96,7 +96,7 @@ def test_nodes_continue_on_the_robot(launched, engine, how):
     run = launched(name, 'robot')
     run.wait_for(f'I heard: [Hello World from {name} ')
     remove(engine, name, *how)
-    run.wait_for(f'noticed: {name} lost True', timeout=30)
+    run.wait_for(f'noticed: {name} lost True')
     run.wait_for(f"the machine '{name}' is gone")
     # the robot's own name and address stand in what the node says now
     here = subprocess.run(['hostname'], capture_output=True, text=True).stdout.strip()
@@ -119,15 +119,17 @@ def test_preemption_notice_moves_the_nodes_in_time(
     words = argv(Command((engine, 'exec', f'fogros2-{name}', 'sh', '-c',
                           'echo "terminate at 12:00" >/run/notice'), sudo=True))
     subprocess.run(words, check=True, capture_output=True, timeout=60)
-    run.wait_for(f'noticed: {name} lost False', timeout=30)
+    run.wait_for(f'noticed: {name} lost False')
     run.wait_for(f"the machine '{name}' is being reclaimed: terminate at 12:00; its nodes")
     here = subprocess.run(['hostname'], capture_output=True, text=True).stdout.strip()
     run.wait_for(f'I heard: [Hello World from {here} ')
     # the one there has ended: nobody says anything twice
     begin = time.monotonic()
     wait_until(lambda: len(run.since(begin, f'I heard: [Hello World from {here} ')) >= 5,
-               timeout=20.0, what='messages of the robot')
-    assert run.since(begin, f'Hello World from {name} ') == []
+               timeout=60.0, what='messages of the robot')
+    # its last messages may be read late
+    second, _ = run.since(begin, f'I heard: [Hello World from {here} ')[1]
+    assert run.since(second, f'Hello World from {name} ') == []
     assert 'process has' not in run.text and run.errors == [], run.text
     run.interrupt()
     assert run.ended() == 0, run.text
@@ -144,14 +146,16 @@ def test_new_machine_replaces_a_killed_one(launched, engine):
     here = subprocess.run(['hostname'], capture_output=True, text=True).stdout.strip()
     # the new machine may be there before the listener finds this node
     run.wait_for(f'Publishing: "Hello World from {here} ')
-    run.wait_for(f'{name}: a new machine runs the nodes', timeout=120)
+    run.wait_for(f'{name}: a new machine runs the nodes')
     replaced = time.monotonic()
     wait_until(lambda: run.since(replaced, f'I heard: [Hello World from {name} ') or None,
-               timeout=30, what='a message of the new machine')
+               timeout=60, what='a message of the new machine')
     last = run.times[-1]
     wait_until(lambda: len(run.since(last, f'Hello World from {name} ')) > 5,
-               timeout=20, what='more messages')
-    assert run.since(last + 0.5, f'Hello World from {here} ') == [], 'it runs once'
+               timeout=60, what='more messages')
+    # the last messages of the robot's may be read late
+    third, _ = run.since(last, f'Hello World from {name} ')[2]
+    assert run.since(third, f'Hello World from {here} ') == [], 'it runs once'
     assert len(run.since(begin, 'process started')) == 2, run.text
     run.interrupt()
     assert run.ended() == 0, run.text
@@ -162,6 +166,6 @@ def test_launch_ends_with_a_lost_machine(launched, engine):
     run = launched(name, 'shutdown')
     run.wait_for('I heard')
     remove(engine, name, 'rm', '-f', '-t', '0')
-    assert run.ended(60) == 1, run.text
+    assert run.ended() == 1, run.text
     assert len(run.errors) == 1 and f"the machine '{name}' is gone" in run.errors[0], run.text
     assert f'noticed: {name} lost True' in run.text and 'Traceback' not in run.text

@@ -140,7 +140,7 @@ def launched(tmp_path, cloud_network):
     for launch in started:
         if launch.child.poll() is None:
             os.killpg(launch.child.pid, signal.SIGKILL)
-        launch.child.wait(10)
+        launch.child.wait(60)
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
@@ -190,7 +190,7 @@ def test_full_disk_takes_everything_back(launched, monkeypatch, tmp_path, step, 
     disk = tmp_path / 'small'
     disk.mkdir()
     if process.run(Command(('mount', '-t', 'tmpfs', '-o', 'size=512k,mode=1777', 'tmpfs',
-                            str(disk)), sudo=True), timeout=10.0, check=False).returncode != 0:
+                            str(disk)), sudo=True), timeout=60.0, check=False).returncode != 0:
         pytest.skip('needs the right to mount')
     try:
         monkeypatch.setenv(variable, str(disk))
@@ -198,7 +198,7 @@ def test_full_disk_takes_everything_back(launched, monkeypatch, tmp_path, step, 
         end_at(launch, step, lambda: fill(disk))
         assert variable != 'ROS_LOG_DIR' or 'Logging error' not in ''.join(launch.said)
     finally:
-        process.run(Command(('umount', '-l', str(disk)), sudo=True), timeout=10.0)
+        process.run(Command(('umount', '-l', str(disk)), sudo=True), timeout=60.0)
 
 
 def fill(disk: Path) -> None:
@@ -212,7 +212,7 @@ def fill(disk: Path) -> None:
 
 @pytest.mark.parametrize('step', STEPS)
 def test_a_killed_launch_leaves_a_machine_that_ends_itself(launched, step):
-    launch = launched(timeout=3)
+    launch = launched(timeout=6)
     launch.wait_for(STEPS[step])
     launch.child.kill()
     launch.ended()

@@ -58,7 +58,7 @@ def free_port() -> int:
 
 def status(port: int) -> int:
     """Return how the gate answers a request with its token."""
-    with contextlib.closing(http.client.HTTPConnection('localhost', port, timeout=20)) as link:
+    with contextlib.closing(http.client.HTTPConnection('localhost', port, timeout=60)) as link:
         link.request('GET', '/?token=sesame')
         return link.getresponse().status
 
@@ -78,7 +78,7 @@ def program(module: str, *words: str) -> Iterator[queue.Queue[str]]:
     finally:
         process.stdin.close()  # as when the bridge ends
         assert process.wait(60) == 0
-        reader.join(10)
+        reader.join(60)
         process.stdout.close()
 
 
@@ -89,14 +89,14 @@ def test_application_is_served_until_the_bridge_ends(image, tmp_path):
     with program('gate', '--to', '127.0.0.1:1', '--listen', f'127.0.0.1:{outside}',
                  '--application', f'127.0.0.1:{inside}', '--token-file', str(token),
                  '--until-eof') as gate:
-        assert gate.get(timeout=20) == f'listening on 127.0.0.1:{outside}'
+        assert gate.get(timeout=60) == f'listening on 127.0.0.1:{outside}'
         assert status(outside) == 200, 'the page with links'
         with program('application', '--image', image, '--port', str(inside),
                      '--name', 'planner') as said:
             assert said.get(timeout=60) == (
                 'the web application is there: ros2 fog monitor planner')
             assert status(outside) == 303
-            link = http.client.HTTPConnection('127.0.0.1', outside, timeout=20)
+            link = http.client.HTTPConnection('127.0.0.1', outside, timeout=60)
             with contextlib.closing(link):
                 place = urls.served('', 'sesame').removeprefix('http://')
                 link.request('GET', place)
@@ -109,7 +109,7 @@ def test_application_is_served_until_the_bridge_ends(image, tmp_path):
             assert there(inside)
         assert not there(inside)
         assert status(outside) == 200
-        link = http.client.HTTPConnection('127.0.0.1', outside, timeout=20)
+        link = http.client.HTTPConnection('127.0.0.1', outside, timeout=60)
         with contextlib.closing(link):
             link.request('GET', '/?token=sesame')
             answer = link.getresponse()
@@ -133,4 +133,4 @@ def test_slow_image_download_does_not_delay_the_bridges_end(tmp_path, monkeypatc
     monkeypatch.setenv('PATH', f'{tmp_path}{os.pathsep}{os.environ["PATH"]}')
     with program('application', '--image', 'x', '--port', str(free_port()), '--name', 'x') as said:
         assert said.get(timeout=60) == 'getting x'
-    wait_until(lambda: said.empty() or None, timeout=5, what='silence')
+    wait_until(lambda: said.empty() or None, timeout=60, what='silence')

@@ -74,7 +74,7 @@ def test_missing_module_of_the_robot_is_refused_first(
     path.write_text(LAUNCH.format(name=NAME, network=cloud_network, look='true', dds='fastdds'))
     with launching() as launch:
         launched = launch(str(path))
-        assert launched.ended(30.0) == 1, launched.text
+        assert launched.ended() == 1, launched.text
     assert 'rmw_fastrtps_cpp' in launched.errors[0], launched.text
     assert ': machine' not in launched.text
 
@@ -90,7 +90,7 @@ def test_fast_dds_carries_a_launch(tmp_path: Path, cloud_network: str) -> None:
         launched.wait_for('[far_listener]: I heard:', times=3)
         launched.wait_for('all four are seen')
         launched.interrupt()
-        assert launched.ended(30.0) == 0, launched.text
+        assert launched.ended() == 0, launched.text
     assert not launched.errors, launched.text
 
 
@@ -106,7 +106,7 @@ with zenoh.open(zenoh.Config.from_file(os.environ['ZENOH_ROUTER_CONFIG_URI'])):
 TALKER = """
 import os, sys, time, zenoh
 with zenoh.open(zenoh.Config.from_file(os.environ['ZENOH_SESSION_CONFIG_URI'])) as session:
-    for number in range(400):
+    for number in range(6000):
         session.put(sys.argv[1], f'{number} from {os.uname().nodename}')
         time.sleep(0.1)
 """
@@ -115,7 +115,7 @@ import os, sys, time, zenoh
 with zenoh.open(zenoh.Config.from_file(os.environ['ZENOH_SESSION_CONFIG_URI'])) as session:
     session.declare_subscriber(sys.argv[1], lambda sample: print(
         'I heard', sys.argv[1], sample.payload.to_string(), flush=True))
-    time.sleep(40)
+    time.sleep(600)
 """
 ZENOH = """
 from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
@@ -162,9 +162,9 @@ def test_zenoh_has_a_router_on_each_side(tmp_path: Path, cloud_network: str) -> 
         launched.wait_for('I heard up', times=3)
         launched.wait_for('I heard down', times=3)
         routers = process.run(
-            Command(('pgrep', '-f', f'{root}.*/rmw_zenohd')), timeout=10.0).stdout.split()
+            Command(('pgrep', '-f', f'{root}.*/rmw_zenohd')), timeout=60.0).stdout.split()
         # the robot's program and the shell that ends it with the launch; the machine's
         assert len(routers) >= 3
         launched.interrupt()
-        launched.ended(30.0)
+        launched.ended()
     assert not [one for one in routers if runs(one)]

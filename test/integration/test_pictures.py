@@ -15,7 +15,7 @@ from rigs import pictures
 from rigs.browser import program
 from rigs.launched import embedded
 
-pytestmark = [pytest.mark.timeout(240), pytest.mark.usefixtures('nothing_left', 'engine')]
+pytestmark = [pytest.mark.usefixtures('nothing_left', 'engine')]
 DOC = pictures.ROOT / 'doc'
 
 

@@ -90,12 +90,12 @@ def test_each_failure_to_plan_has_its_own_end(racer):
     start, goal = pose(0.5, 0.5, 0.5), pose(3.5, 0.5, 0.5)
     outcome = racer.plan(start, goal, seconds=0.5)
     assert outcome['end'] == 'time' and outcome['path'] == []
-    assert 0.5 <= outcome['seconds'] < 3
-    assert racer.plan(pose(2, 0.5, 0.5), goal, seconds=5)['end'] == 'start'
-    assert racer.plan(start, pose(3.5, 0.5, 9), seconds=5)['end'] == 'goal'
+    assert 0.5 <= outcome['seconds'] < 30
+    assert racer.plan(pose(2, 0.5, 0.5), goal, seconds=60)['end'] == 'start'
+    assert racer.plan(start, pose(3.5, 0.5, 9), seconds=60)['end'] == 'goal'
     # and it goes on
     racer.enter(box_room(wall=False))
-    assert racer.plan(start, goal, seconds=20)['end'] == 'found'
+    assert racer.plan(start, goal, seconds=120)['end'] == 'found'
 
 
 def test_same_seed_finds_the_same_path(racer):
@@ -104,7 +104,7 @@ def test_same_seed_finds_the_same_path(racer):
     try:
         scene = box_room(wall=False)
         one.enter(scene)
-        found = [one.plan(scene.start, scene.goal, seconds=20, seed=5) for _ in range(2)]
+        found = [one.plan(scene.start, scene.goal, seconds=120, seed=5) for _ in range(2)]
     finally:
         one.close()
     assert found[0]['path'] == found[1]['path'] and found[0]['checks'] == found[1]['checks']
@@ -117,8 +117,8 @@ def test_dead_search_is_reported_and_replaced():
         os.kill(racer._process.pid, signal.SIGSTOP)
         threading.Timer(0.3, racer._process.kill).start()
         with pytest.raises(RuntimeError, match='has ended'):
-            racer.plan(scene.start, scene.goal, seconds=20)
-        assert racer.plan(scene.start, scene.goal, seconds=20)['end'] == 'found'
+            racer.plan(scene.start, scene.goal, seconds=120)
+        assert racer.plan(scene.start, scene.goal, seconds=120)['end'] == 'found'
     finally:
         racer.close()
 
@@ -132,9 +132,9 @@ def test_searches_end_with_the_process_that_asked():
     asking.start()
     children = Path(f'/proc/{worker}/task/{worker}/children')
     searches = wait_until(lambda: len(found := children.read_text().split()) == 2 and found,
-                          timeout=20.0, what='the searches')
+                          timeout=60.0, what='the searches')
     racer._process.stdin.close()
-    asking.join(20)
+    asking.join(60)
     racer.close()
     assert not asking.is_alive()
     assert not [pid for pid in searches if Path('/proc', pid).exists()]

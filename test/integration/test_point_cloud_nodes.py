@@ -112,7 +112,7 @@ def test_a_decoder_that_dies_stops_nobody(bench: Bench) -> None:
     bench.until(lambda: seen and other, 'clouds', meanwhile=publish)
     process, _, _ = bench.processes.pop()
     process.kill()
-    process.wait(10)
+    process.wait(60)
     before = len(seen)
     bench.until(lambda: len(seen) >= before + 10, 'clouds', meanwhile=publish)
 

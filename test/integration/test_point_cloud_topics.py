@@ -112,11 +112,11 @@ def test_clouds_cross_in_both_directions(tmp_path: Path, cloud_network: str) -> 
         viewer=viewer))
     with launching() as launch:
         launched = launch(str(path))
-        assert launched.ended(90.0) == 0, launched.text
+        assert launched.ended() == 0, launched.text
     said = re.search(r'viewer says (.*)', launched.text)
     assert said, launched.text
     found = json.loads(said[1])
-    assert found['both'] >= 20 and found['points'] > 0, found
+    assert found['both'] >= 5 and found['points'] > 0, found
     # the resolution of the first stream, and the coarsest one, of a busy computer; the second
     # stream is lossless
     assert found['near'] <= 0.005 and found['far'] <= COARSEST / 2, found

@@ -61,7 +61,6 @@ def policy(tmp_path):
     return path
 
 
-@pytest.mark.timeout(400)
 @pytest.mark.parametrize('machine', ['robot', 'container'])
 def test_arm_reaches_a_target(machine, policy, tmp_path):
     drawn, runs = tmp_path / 'policy.png', tmp_path / 'runs.jsonl'

@@ -28,7 +28,6 @@ from fogros2.waiting import wait_until
 from rigs.domains import taken
 
 ROOT = Path(__file__).parents[2]
-pytestmark = pytest.mark.timeout(90)
 
 
 class Bench:
@@ -74,11 +73,11 @@ class Bench:
         return client.call_async(request)
 
     def answer(self, future):
-        wait_until(future.done, timeout=20.0, what='an answer')
+        wait_until(future.done, timeout=60.0, what='an answer')
         return future.result()
 
     def until(self, condition, what):
-        wait_until(lambda: bool(condition()), timeout=20.0, what=what)
+        wait_until(lambda: bool(condition()), timeout=60.0, what=what)
 
     def said(self, words):
         self.until(lambda: words in ''.join(self.lines), repr(words))
@@ -95,10 +94,10 @@ class Bench:
     def close(self):
         if self.process is not None:
             self.process.terminate()
-            self.process.wait(20)
+            self.process.wait(60)
         self.executor.shutdown()
         rclpy.shutdown(context=self.context)
-        self.thread.join(10)
+        self.thread.join(60)
 
 
 @pytest.fixture
@@ -165,7 +164,7 @@ def test_reported_death_sends_the_request_on(bench):
 
     for name in 'ab':
         bench.serve(name, Sum, answer_of(name))
-    bench.start(['/plan'], hedge_after=60_000)
+    bench.start(['/plan'], hedge_after=600_000)
     bench.all_live()
     # the first request goes to both: their latencies are not known
     bench.answer(bench.call(Sum, Sum.Request()))
@@ -203,7 +202,7 @@ def test_outputs_are_forwarded_as_bytes_once_for_each_input(bench):
         camera.publish(image)
         return len(came) >= 30
 
-    wait_until(shoot, timeout=40.0, what='outputs', longest=0.05)
+    wait_until(shoot, timeout=60.0, what='outputs', longest=0.05)
     stamps = [info.header.stamp.sec for info in came]
     assert stamps == sorted(set(stamps))
     assert {(info.header.frame_id, info.height) for info in came} == {('eye', 9)}
@@ -224,7 +223,7 @@ def test_outputs_without_stamps_come_from_one_replica(bench):
             output.publish(String(data=name))
         return len(came) >= 10
 
-    wait_until(say, timeout=40.0, what='outputs', longest=0.05)
+    wait_until(say, timeout=60.0, what='outputs', longest=0.05)
     bench.said('stamps of its messages match no /text')
     assert len(set(came[3:])) == 1
 

@@ -23,6 +23,8 @@ pytestmark = [
 ]
 
 RUN = uuid.uuid4().hex[:6]
+#: Milliseconds until the next replica is asked: more than a busy computer takes to report a death.
+HEDGE = 3000.0
 CALL = re.compile(r'call (\d+) by (\d+): ([\d.]+) ms')
 
 
@@ -35,25 +37,25 @@ def test_calls_go_on_when_a_node_dies_and_a_machine_is_lost(
 ):
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     names = [f'replica-{RUN}-{number}' for number in range(3)]
-    path = replicated.write(tmp_path / 'replicated.launch.py', names, cloud_network)
+    path = replicated.write(tmp_path / 'replicated.launch.py', names, cloud_network, HEDGE)
     with launching() as launch:
         run = launch(str(path))
-        run.wait_for('death of', times=1, timeout=120)
+        run.wait_for('death of', times=1)
         cost = float(re.search(r'death of \d: ([\d.]+) ms from then', run.text)[1])
-        assert cost < replicated.HEDGE, 'the agent reports the end before the next one is asked'
+        assert cost < HEDGE, 'the agent reports the end before the next one is asked'
         # let its node start again, then take away the machine that answers
         run.wait_for('process started with pid', times=6)
         before = calls(run)
-        wait_until(lambda: len(calls(run)) > len(before) + 10, timeout=20.0, what='calls')
+        wait_until(lambda: len(calls(run)) > len(before) + 10, timeout=60.0, what='calls')
         gone = calls(run)[-1][1]
         subprocess.run(argv(Command((
             engine, 'rm', '-f', '-t', '0', f'fogros2-{names[gone]}'), sudo=True)),
             check=True, capture_output=True, timeout=60)
         begin = time.monotonic()
-        run.wait_for(f"the machine '{names[gone]}' is gone", timeout=60)
+        run.wait_for(f"the machine '{names[gone]}' is gone")
         run.wait_for('the other replicas go on')
         count = len(calls(run))
-        wait_until(lambda: len(calls(run)) > count + 20, timeout=30.0, what='calls')
+        wait_until(lambda: len(calls(run)) > count + 20, timeout=60.0, what='calls')
         after = [by for at, line in run.since(begin, 'call ') for by in [CALL.search(line)] if by]
         assert all(int(match[2]) != gone for match in after[5:])
         assert not re.search(r'call \d+ is lost', run.text)
@@ -61,6 +63,6 @@ def test_calls_go_on_when_a_node_dies_and_a_machine_is_lost(
         wait_until(lambda: re.search(
             r'REPLICA OF +STATE.*\n/plan +live',
             ros2('fog', 'status', names[calls(run)[-1][1]]).stdout),
-            timeout=30.0, what='a live replica')
+            timeout=60.0, what='a live replica')
         run.interrupt()
         assert run.ended() == 0, run.text

@@ -46,7 +46,7 @@ def launch(
         said = run(Command((engine, 'network', 'inspect', cloud_network), sudo=True), timeout=30.0)
         bridge = json.loads(said.stdout)[0]['network_interface']
         run(Command.script(f'echo 1 >/proc/sys/net/ipv4/conf/{bridge}/forwarding', sudo=True),
-            timeout=10.0)
+            timeout=60.0)
         yield started
         started.interrupt()
         assert started.ended() == 0, started.text
@@ -80,7 +80,7 @@ def test_second_robot_behind_nat_hears_and_is_heard(launch: Launched, second: Se
     assert second.run('ros2', 'fog', 'leave', NAME) == f'left {NAME}\n'
     assert 'has not joined' in second.run('ros2', 'fog', 'leave', NAME, status=1)
     assert fog('revoke', NAME).startswith('revoked ')
-    wait_until(lambda: 'GUEST' not in fog('status', NAME), timeout=10, what='the guest to be gone')
+    wait_until(lambda: 'GUEST' not in fog('status', NAME), timeout=60, what='the guest to be gone')
 
 
 def test_each_obstacle_is_one_clear_error(launch: Launched, second: SecondRobot) -> None:
@@ -89,6 +89,6 @@ def test_each_obstacle_is_one_clear_error(launch: Launched, second: SecondRobot)
     said = second.run('ros2', 'fog', 'join', text, status=1)
     assert 'this computer uses 198.18.0.0/15' in said and 'FOGROS2_VPN_POOL' in said
     text = invited(second, '--for', '1s')
-    wait_until(lambda: 'GUEST' not in fog('status', NAME), timeout=30, what='the expiry')
+    wait_until(lambda: 'GUEST' not in fog('status', NAME), timeout=60, what='the expiry')
     assert 'has expired' in second.run('ros2', 'fog', 'join', text, status=1)
     assert 'no guest robot9' in fog('revoke', NAME, 'robot9', status=1)

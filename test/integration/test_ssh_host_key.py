@@ -18,9 +18,9 @@ from rigs.sshd import private_sshd
 
 def shown(server, key):
     """Return whether the server shows a key now; it may be reading it."""
-    shell = SSHShell(dataclasses.replace(server.endpoint, host_key=key), name='it', timeout=10)
+    shell = SSHShell(dataclasses.replace(server.endpoint, host_key=key), name='it', timeout=60)
     try:
-        shell.run(Command(('true',)), timeout=10)
+        shell.run(Command(('true',)), timeout=60)
         return True
     except (HostKeyError, ConnectError):
         return False
@@ -41,16 +41,16 @@ def test_a_server_gets_a_new_key_and_connections_go_on(root, tmp_path, others):
         extra = f'HostKey {tmp_path / "rsa"}\n'
     with private_sshd(folder, extra) as server:
         before = server.host_key
-        shell = SSHShell(server.endpoint, name='it', timeout=10)
+        shell = SSHShell(server.endpoint, name='it', timeout=60)
         stream = shell.open(Command(('cat',)))
         stream.write(b'one\n')
         assert stream.readline() == b'one\n'
-        key = host_key.parse(shell.run(host_key.renew(), timeout=20).stdout)
+        key = host_key.parse(shell.run(host_key.renew(), timeout=60).stdout)
         assert key == server.host_key != before
         assert (folder / 'host_key').stat().st_mode & 0o777 == 0o600
         assert sorted(path.name for path in folder.glob('host_key*')) == [
             'host_key', 'host_key.pub']
-        wait_until(lambda: shown(server, key), timeout=10, what='the new key')
+        wait_until(lambda: shown(server, key), timeout=60, what='the new key')
         assert not shown(server, before)
         stream.write(b'two\n')
         assert stream.readline() == b'two\n'
@@ -61,8 +61,8 @@ def test_server_without_the_key_type_is_reported(root, tmp_path, monkeypatch):
     if os.geteuid() != 0:
         pytest.skip("the server of this test is its user's, not root's")
     with private_sshd(tmp_path / 'sshd') as server:
-        shell = SSHShell(server.endpoint, name='it', timeout=10)
-        shell.run(Command(('true',)), timeout=10)
+        shell = SSHShell(server.endpoint, name='it', timeout=60)
+        shell.run(Command(('true',)), timeout=60)
         # its own are gone, and this computer's aren't a test's to replace
         command = host_key.renew()
         script = command.argv[-1].replace('/etc/ssh/', f'{tmp_path}/')

@@ -99,7 +99,7 @@ def sent_since(computer, marker):
 
 def test_bare_computer_gets_missing_packages_once(computer, launch, home):
     first = launch(*example(computer, host_key=computer.host_key))
-    assert first.ended(150) == 0, first.text
+    assert first.ended() == 0, first.text
     assert f'I heard: [Hello World from {computer.name}' in first.text
     assert ('ROS 2 installed by pip' in first.text) == embedded()
     assert 'WARNING' not in first.text and first.errors == []
@@ -127,7 +127,7 @@ def test_a_killed_launch_is_cleared_up_by_its_agent(computer, launch, tmp_path):
         def generate_launch_description():
             machine = SSHInstance(
                 '{computer.address}', '{computer.user}', key='{computer.key}',
-                host_key='{computer.host_key}', name='killed-{RUN}', robot_timeout=3)
+                host_key='{computer.host_key}', name='killed-{RUN}', robot_timeout=6)
             return FogROSLaunchDescription([
                 CloudNode(machine=machine, package='fogros2_examples', executable='talker'),
             ])
@@ -138,7 +138,7 @@ def test_a_killed_launch_is_cleared_up_by_its_agent(computer, launch, tmp_path):
     assert 'agent.py' in running and 'talker' in running and f'killed-{RUN}' in running
     killed.kill()
     # the agent's own folder stays with its log, root's and the user's alone
-    wait_until(lambda: nothing_runs(computer) in ([], [f'killed-{RUN}']), timeout=30,
+    wait_until(lambda: nothing_runs(computer) in ([], [f'killed-{RUN}']), timeout=60,
                what='the agent to end everything')
     deleted = ros2('fog', 'delete', f'killed-{RUN}', '--yes')
     assert deleted.returncode == 0, deleted.stderr
@@ -240,7 +240,7 @@ def test_streams_bring_what_they_import_once(computer, launch, tmp_path):
     for turn, how in enumerate(('av, cv2 sent', 'there from before')):
         computer.run('touch /tmp/marker')
         seen = launch(str(path))
-        seen.wait_for('images/s', timeout=120)
+        seen.wait_for('images/s')
         seen.interrupt()
         assert seen.ended() == 0, seen.text
         assert f'({how})' in seen.text

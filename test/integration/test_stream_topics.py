@@ -162,15 +162,15 @@ def test_streams_go_on_when_the_machine_between_goes(
     path.write_text(GOING.format(name=NAME, network=cloud_network))
     with launching() as launch:
         run = launch(str(path))
-        run.wait_for('[last]:', timeout=60.0)
+        run.wait_for('[last]:')
         process.run(Command((engine, 'rm', '-f', '-t', '0', f'fogros2-{NAME}-a'), sudo=True),
                     timeout=60.0)
-        run.wait_for(f"the machine '{NAME}-a' is gone", timeout=30.0)
+        run.wait_for(f"the machine '{NAME}-a' is gone")
         # the one here takes the camera's images as they are, and gives the other machine its own
         wait_until(lambda: re.search(r'^\[image_processor-\d+\].* images/s', run.text, re.M),
-                   timeout=30.0, what='images of the camera')
+                   timeout=60.0, what='images of the camera')
         since = time.monotonic()
-        wait_until(lambda: len(run.since(since, '[last]: ')) >= 2, timeout=30.0,
+        wait_until(lambda: len(run.since(since, '[last]: ')) >= 2, timeout=60.0,
                    what='images of the one here on the other machine')
         run.interrupt()
         assert run.ended() == 0, run.text
@@ -191,13 +191,13 @@ def test_images_cross_encoded(tmp_path: Path, cloud_network: str, description: s
         name=NAME, network=cloud_network, python=sys.executable, viewer=viewer))
     with launching() as launch:
         launched = launch(str(path))
-        assert launched.ended(60.0) == 0, launched.text
+        assert launched.ended() == 0, launched.text
     said = re.search(r'viewer says (.*)', launched.text)
     assert said, launched.text
     found = json.loads(said[1])
     assert found['kinds'] == [['camera', 'bgr8', 480, 640, 1920, 640 * 480 * 3]]
     # of some the viewer here lost the raw one, as its QoS allows
-    assert found['same'] and found['both'] >= 50, found
+    assert found['same'] and found['both'] >= 10, found
     assert no_node_failed(launched), launched.text
     # one raw image a direction would be 1.8 MB
     assert 0 < found['traffic'] < found['seen'] * 200_000, found
@@ -207,7 +207,7 @@ def test_status_shows_the_rate_of_each_stream(cloud_network: str) -> None:
     with launching() as start:
         run = start('fogros2_examples', 'video.container.launch.xml', f'name:={NAME}-rate')
         run.wait_for('process started with pid', times=4)
-        status = ros2('fog', 'status', f'{NAME}-rate', timeout=60)
+        status = ros2('fog', 'status', f'{NAME}-rate')
         assert status.returncode == 0, status.stdout + status.stderr
         rate = re.search(r'^/camera +h264 +robot +\S+ +([0-9.]+)/s ', status.stdout, re.MULTILINE)
         assert rate is not None and float(rate[1]) > 1, status.stdout

@@ -41,7 +41,7 @@ def server(tmp_path: Path) -> Iterator[PrivateSshd]:
 
 @pytest.fixture
 def shell(server: PrivateSshd) -> Iterator[SSHShell]:
-    with contextlib.closing(SSHShell(server.endpoint, name='planner', timeout=10.0)) as opened:
+    with contextlib.closing(SSHShell(server.endpoint, name='planner', timeout=60.0)) as opened:
         yield opened
 
 
@@ -62,7 +62,7 @@ def compare(source: Path, target: Path) -> str:
 
 def rsyncs() -> list[str]:
     """Return the rsync processes of this computer that have to do with these tests."""
-    lines = process.run(Command(('ps', '-eo', 'args')), timeout=10.0).stdout.splitlines()
+    lines = process.run(Command(('ps', '-eo', 'args')), timeout=60.0).stdout.splitlines()
     return [line for line in lines if 'rsync' in line and 'sync-target' in line]
 
 
@@ -116,16 +116,16 @@ def test_pinned_key_wins_over_known_hosts(
 
 def test_a_wrong_host_key_stops_openssh_too(server, shell, source, tmp_path, monkeypatch):
     monkeypatch.setattr(sync, 'BULK', 1000)
-    shell.run(Command(('true',)), timeout=10.0)
+    shell.run(Command(('true',)), timeout=60.0)
     # the connection stands, and for the second one another machine answers
     for name in ('host_key', 'host_key.pub'):
         (server.folder / name).unlink()
     process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f',
-                         str(server.folder / 'host_key'))), timeout=10.0)
+                         str(server.folder / 'host_key'))), timeout=60.0)
     listener = server.child
     assert listener is not None
     listener.terminate()
-    listener.wait(10.0)
+    listener.wait(60.0)
     server.start()
     shell.endpoint = server.endpoint.__class__(**{
         **vars(shell.endpoint), 'host_key': 'ssh-ed25519 '
@@ -155,7 +155,7 @@ def test_a_target_in_the_home_is_found(server, source, tmp_path):
     name = f'.sync-target-{os.getpid()}'
     with contextlib.closing(SSHShell(server.endpoint, name='planner')) as shell:
         shell.sync(source / '1', f'~/{name}/x', excludes=[], timeout=60.0)
-        home = shell.run(Command(('printenv', 'HOME')), timeout=10.0).stdout.strip()
+        home = shell.run(Command(('printenv', 'HOME')), timeout=60.0).stdout.strip()
         try:
             assert not compare(source / '1', Path(home, name, 'x'))
         finally:
@@ -187,7 +187,7 @@ def test_full_disk_is_named(shell, tmp_path, root):
     (tmp_path / 'source').mkdir()
     (tmp_path / 'source/big').write_bytes(os.urandom(3 << 20))
     if process.run(Command(('mount', '-t', 'tmpfs', '-o', 'size=1m,mode=777', 'tmpfs', str(disk)),
-                           sudo=True), timeout=10.0, check=False).returncode != 0:
+                           sudo=True), timeout=60.0, check=False).returncode != 0:
         pytest.skip('needs the right to mount a file system')
     try:
         with pytest.raises(ShellError, match="disk of 'planner' is full"):
@@ -195,7 +195,7 @@ def test_full_disk_is_named(shell, tmp_path, root):
         with pytest.raises(CommandError, match="disk of 'planner' is full"):
             shell.put(os.urandom(2 << 20), f'{disk}/there', mode=0o600)
     finally:
-        process.run(Command(('umount', str(disk)), sudo=True), timeout=10.0)
+        process.run(Command(('umount', str(disk)), sudo=True), timeout=60.0)
 
 
 def test_a_folder_that_can_t_be_made_is_named(shell, source):
@@ -208,24 +208,13 @@ def test_a_lost_connection_under_sync_is_an_error(
     server, shell, tmp_path, monkeypatch, bulk,
 ):
     monkeypatch.setattr(sync, 'BULK', 1000 if bulk else 1 << 40)
-    source = sized(tmp_path / 'source', 256 << 20)
-    failed: list[BaseException] = []
-    going = threading.Event()
-
-    def run() -> None:
-        try:
-            shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0,
-                       on_progress=lambda done, total: going.set())
-        except ShellError as error:
-            failed.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    assert going.wait(20.0)
-    server.cut()
-    thread.join(20.0)
-    assert isinstance(failed[0], ConnectError), failed
-    wait_until(lambda: not rsyncs(), timeout=10.0, what='rsync to end')
+    # a second's work would be over before a busy computer cuts the connection
+    source = sized(tmp_path / 'source', 16 << 30)
+    cuts = iter([server.cut])
+    with pytest.raises(ConnectError):
+        shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0,
+                   on_progress=lambda done, total: next(cuts, lambda: None)())
+    wait_until(lambda: not rsyncs(), timeout=60.0, what='rsync to end')
 
 
 @pytest.mark.parametrize('bulk', [True, False])
@@ -237,8 +226,8 @@ def test_sync_can_be_cancelled(shell, tmp_path, monkeypatch, bulk):
     with pytest.raises(Cancelled):
         shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0,
                    cancel=cancel, on_progress=lambda done, total: cancel.set())
-    wait_until(lambda: not rsyncs(), timeout=10.0, what='rsync to end')
-    assert shell.run(Command(('true',)), timeout=10.0).returncode == 0
+    wait_until(lambda: not rsyncs(), timeout=60.0, what='rsync to end')
+    assert shell.run(Command(('true',)), timeout=60.0).returncode == 0
 
 
 def sized(folder: Path, size: int) -> Path:

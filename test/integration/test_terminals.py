@@ -73,7 +73,7 @@ def test_terminals_see_the_machine_and_leave_no_daemon(
             assert len(daemons(domain)) == 2
             run.interrupt()
             assert run.ended() == 0, run.text
-        wait_until(lambda: daemons(domain) == before, timeout=30, what='the daemon to end')
+        wait_until(lambda: daemons(domain) == before, timeout=60, what='the daemon to end')
         # other terminals have not noticed anything
         assert '/rosout' in terminal('ros2', 'topic', 'list')
     finally:

@@ -49,7 +49,7 @@ def start(children):
             [sys.executable, *words], stdin=subprocess.PIPE, env={**os.environ, **variables})
         children.append(child)
         wait_until(lambda: words[0].encode() in Path(f'/proc/{child.pid}/cmdline').read_bytes(),
-                   timeout=5, what='the program to be loaded')
+                   timeout=60, what='the program to be loaded')
         return child
 
     return start
@@ -59,9 +59,9 @@ def start(children):
 def interface(launch_id, tun):
     """Make a VPN interface of a launch, on which no program runs."""
     name = f'fog{launch_id}'
-    run(Command(('ip', 'tuntap', 'add', 'mode', 'tun', 'name', name), sudo=True), timeout=10)
+    run(Command(('ip', 'tuntap', 'add', 'mode', 'tun', 'name', name), sudo=True), timeout=60)
     yield name
-    run(Command(('ip', 'link', 'delete', name), sudo=True), timeout=10)
+    run(Command(('ip', 'link', 'delete', name), sudo=True), timeout=60)
 
 
 def store(folder, launch_id):
@@ -97,7 +97,7 @@ def test_leftover_interface_is_found(look, tun, launch_id, state_home, request):
     with pytest.raises(AssertionError, match=f'left behind.*interface fog{launch_id}'):
         with nothing_left(traces, timeout=0.1):
             store(state_home, launch_id)
-            wait_until(lambda: launch_id in traces.marks, timeout=5, what='a look')
+            wait_until(lambda: launch_id in traces.marks, timeout=60, what='a look')
             request.getfixturevalue('interface')
             shutil.rmtree(state_home / 'launches')
 

@@ -62,7 +62,6 @@ getent group fogros2 >/dev/null && groupdel fogros2
 for user in fogada fogbob fogeve; do useradd -m -s /bin/sh $user; done
 """
 
-pytestmark = pytest.mark.timeout(120)
 
 
 class Copy:
@@ -267,7 +266,7 @@ def test_so_many_interfaces_and_no_more(copy: Copy) -> None:
     # none of them was brought up: their launch ends, and the timer's service takes them away
     assert copy.run('root', HELPER, 'tidy').stdout == ''
     copy.run('root', 'kill', '-9', str(pid))
-    wait_until(lambda: copy.run('root', 'kill', '-0', str(pid)).returncode != 0, timeout=5.0,
+    wait_until(lambda: copy.run('root', 'kill', '-0', str(pid)).returncode != 0, timeout=60.0,
                what='the launch to be gone')
     assert copy.run('root', HELPER, 'tidy').stdout.count('is gone') == 16
     if process.which('systemd-analyze'):
@@ -304,14 +303,14 @@ def test_a_launch_takes_it_by_itself(copy: Copy, killed: bool) -> None:
         'fogada', sys.executable, '-c', PRODUCT, '/home/fogada/state')), sudo=True))
     child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert child.stdin is not None and child.stdout is not None
-    timer = threading.Timer(60.0, child.kill)
+    timer = threading.Timer(300.0, child.kill)
     timer.start()
     try:
         name, key, pid = json.loads(child.stdout.readline())
         assert key == f'/run/fogros2-vpn/{name}/key' and name in copy.links()
         if killed:
             copy.run('fogada', 'kill', '-9', str(pid), check=True)
-            child.wait(10.0)
+            child.wait(60.0)
             said = copy.run('fogada', 'env', 'FOGROS2_STATE_HOME=/home/fogada/state', 'ros2',
                             'fog', 'gc')
             assert said.returncode == 0, said

@@ -47,7 +47,7 @@ def test_node_imports_from_an_underlay_on_an_isolated_machine(
         machine.subscribe(heard.append)
         machine.start([NodeSpec('n-1', 'node', package='fogt_top', executable='node')])
         wait_until(lambda: any(e['event'] == 'exited' and e['node'] == 'n-1' for e in heard),
-                   timeout=30, what='the node to end')
+                   timeout=60, what='the node to end')
     finally:
         assert launch.down() == []
     said = ''.join(e['text'] for e in heard if e['event'] == 'output' and e['node'] == 'n-1')

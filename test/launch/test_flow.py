@@ -380,7 +380,7 @@ def test_signals_reach_the_node(run, fake, planner, capfd):
         RegisterEventHandler(OnProcessStart(target_action=node, on_start=[
             EmitEvent(event=SignalProcess(
                 signal_number='SIGUSR2', process_matcher=matches_action(node))),
-            TimerAction(period=0.05, actions=[Shutdown()])])),
+            TimerAction(period=0.5, actions=[Shutdown()])])),
     ])) == 0
     machine = fake.machines['planner']
     assert machine.signals == [(machine.nodes['talker'].id, 'SIGUSR2')]

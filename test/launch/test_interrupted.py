@@ -114,6 +114,16 @@ def end(event=None):
     return [Shutdown(reason='the test is over')]
 
 
+def end_when(true):
+    """Return what ends the launch as soon as something is true."""
+    def look(context):
+        return end() if true() else [TimerAction(period=0.05, actions=do())]
+
+    def do(event=None):
+        return [OpaqueFunction(function=look)]
+    return do
+
+
 def says(fake, kind, **fields):
     """Return what has the machine say something, once all there is to visit was visited."""
     def do(event=None):
@@ -299,8 +309,8 @@ def test_groups_continue_with_names_and_plain_programs(run, fake, planner, watch
     program = package / 'lib/demo/says'
     program.write_text(HERE)
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
-    watch.at_start = {2: says(fake, 'lost', reason='evicted'), 4: lambda event: [
-        TimerAction(period=0.3, actions=end())]}
+    watch.at_start = {2: says(fake, 'lost', reason='evicted'), 4: end_when(
+        lambda: all(words in ''.join(watch.said) for words in ('__ns:=/arm', 'no node')))}
     assert run(LaunchDescription([*watch(), CloudGroup(planner, [
         PushROSNamespace('arm'), SetRemap('a', 'b'),
         Node(package='demo', executable='says', name='mapper'),
@@ -383,7 +393,7 @@ def test_the_node_takes_topics_as_they_are(run, fake, harmless, planner, talker,
     # two of the user's, three decoders, an encoder there; two encoders and a decoder here
     watch.at_start = {
         9: says(fake, 'lost', reason='evicted'),
-        10: lambda event: [TimerAction(period=0.3, actions=end())]}
+        10: end_when(lambda: 'image:=/camera' in ''.join(watch.said) and len(watch.exits) >= 2)}
     assert run(FogROSLaunchDescription([
         *watch(), node, talker(machine=other, exec_name='elsewhere', stream_topics=[both])])) == 0
     there = [word for spec in fake.machines['planner'].all if spec.executable == 'says'
@@ -405,7 +415,7 @@ def test_other_machines_have_its_topics_from_the_robot_then(
     # out, and a decoder for what comes in
     watch.at_start = {
         7: says(fake, 'lost', reason='evicted'),
-        12: lambda event: [TimerAction(period=0.3, actions=end())]}
+        12: end_when(lambda: watch.exits)}
     assert run(FogROSLaunchDescription([
         *watch(), talker(machine=planner, exec_name='maps'),
         talker(machine=other, exec_name='sees', stream_topics=[

@@ -23,8 +23,6 @@ from fogros2.runtime import replacer
 from fogros2.shell.local import LocalShell
 from fogros2.waiting import wait_until
 
-pytestmark = pytest.mark.timeout(60)
-
 HERE = """#!/bin/sh
 echo "here: $*"
 exec sleep 60
@@ -283,7 +281,7 @@ def test_folder_is_copied_at_intervals(run, fake, watch, tmp_path, capfd, monkey
         tries.append(checkpoint.LIMIT), save(kept, shell, **words))[1])
 
     def wait_for(what):
-        wait_until(what, timeout=20, what='a snapshot', longest=0.05)
+        wait_until(what, timeout=60, what='a snapshot', longest=0.05)
 
     def write(context):
         def work():

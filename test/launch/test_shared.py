@@ -17,8 +17,6 @@ from fogros2.provider import Capabilities
 from fogros2.report import silent
 from fogros2.testing import FakeProvider
 
-pytestmark = pytest.mark.timeout(60)
-
 
 @pytest.fixture
 def sharing(fake):

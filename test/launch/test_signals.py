@@ -75,7 +75,7 @@ class Program:
             stderr=subprocess.STDOUT, text=True, preexec_fn=defaults,
             env={**os.environ, 'PYTHONUNBUFFERED': '1', 'ROS_LOG_DIR': str(tmp_path / 'log')})
         self.lines = []
-        self.killer = threading.Timer(60, self.process.kill)
+        self.killer = threading.Timer(300, self.process.kill)
         self.killer.start()
 
     def send(self, number):

@@ -115,10 +115,10 @@ def bare_computer(
         shown = Command(('cat', str(public)), sudo=True)
 
         def host_key() -> str | None:
-            text = process.run(shown, timeout=10.0, check=False).stdout
+            text = process.run(shown, timeout=60.0, check=False).stdout
             return ' '.join(text.split()[:2]) or None
 
-        pinned = wait_until(host_key, timeout=30.0, what=f"{name}'s SSH server")
+        pinned = wait_until(host_key, timeout=60.0, what=f"{name}'s SSH server")
         (entry,) = engine.inspect([name])
         address = str(entry['NetworkSettings']['Networks'][network]['IPAddress'])
         yield BareComputer(name, address, key, pinned, engine)

@@ -68,7 +68,7 @@ class Bench:
                 self.start('decoder', '-r', 'image:=/seen/camera', *common))
 
     def until(
-        self, condition: Callable[[], object], what: str, *, timeout: float = 20.0,
+        self, condition: Callable[[], object], what: str, *, timeout: float = 60.0,
         meanwhile: Callable[[], object] = lambda: None,
     ) -> None:
         """Let the node work, and do something 30 times a second, until a condition holds."""
@@ -107,7 +107,7 @@ class Bench:
         codes = []
         for process, _, reader in self.processes:
             try:
-                codes.append(process.wait(15))
+                codes.append(process.wait(60))
             except subprocess.TimeoutExpired:
                 process.kill()
                 codes.append(process.wait())

@@ -58,7 +58,7 @@ class Browser:
             at = Path(self._folder, 'profile', 'DevToolsActivePort')
             # its second line is the browser's own path: with that, the file is whole
             wait_until(lambda: at.exists() and len(at.read_text().split()) == 2,
-                       timeout=30.0, what='the browser', longest=0.1)
+                       timeout=60.0, what='the browser', longest=0.1)
             port = at.read_text().split()[0]
             with urllib.request.urlopen(f'http://127.0.0.1:{port}/json/list') as answer:
                 pages = [page for page in json.load(answer) if page['type'] == 'page']
@@ -130,7 +130,7 @@ class Browser:
             raise AssertionError(f"{expression}: {answer['exceptionDetails']}")
         return answer['result'].get('value')
 
-    def until(self, expression: str, *, timeout: float = 20.0) -> Any:
+    def until(self, expression: str, *, timeout: float = 60.0) -> Any:
         """Wait until an expression is true in the page, and return its value."""
         def there() -> Any:
             return self.ask(expression)

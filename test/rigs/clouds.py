@@ -163,24 +163,24 @@ class Robot:
         return self.launch(self.write(f'{name}.launch.py', LAUNCH.format(
             machine=self.cloud.machine, name=name, options=dict(options or {}))), **variables)
 
-    def ros2(self, *words: str, timeout: float = 60.0, **variables: str,
-             ) -> subprocess.CompletedProcess[str]:
+    def ros2(self, *words: str, **variables: str) -> subprocess.CompletedProcess[str]:
         """Run ``ros2`` on the robot."""
-        return ros2(*words, environment=self.environment(**variables), timeout=timeout,
+        return ros2(*words, environment=self.environment(**variables),
                     prefix=self.box.on_robot([]))
 
     def fog(self, *words: str, **variables: str) -> str:
         """Run ``ros2 fog``, which has to succeed, and return its output."""
-        done = self.ros2('fog', *words, timeout=60.0, **variables)
+        done = self.ros2('fog', *words, **variables)
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    def run(self, words: Sequence[str], *, timeout: float = 60.0, **variables: str,
-            ) -> subprocess.CompletedProcess[str]:
+    def run(
+        self, words: Sequence[str], **variables: str,
+    ) -> subprocess.CompletedProcess[str]:
         """Run a program on the robot."""
         return subprocess.run(
             [*self.box.on_robot([]), *words], env=self.environment(**variables),
-            stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout)
+            stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=180)
 
     def things(self) -> Any:
         """Return what there is besides machines."""
@@ -270,7 +270,7 @@ class Aws(Cloud):
         """Delete everything."""
         for found in box.alive():
             self._api(box, found.region).terminate_instances(InstanceIds=[found.id])
-        wait_until(lambda: not box.alive(), timeout=20, what='instances to end')
+        wait_until(lambda: not box.alive(), timeout=60, what='instances to end')
         delete = {'groups': ('delete_security_group', 'GroupId'),
                   'keys': ('delete_key_pair', 'KeyName'),
                   'disks': ('delete_volume', 'VolumeId'),
@@ -486,7 +486,7 @@ class Azure(Cloud):
     def clear(self, box: Any) -> None:
         """Delete everything."""
         box.clear()
-        wait_until(lambda: not self.left(box) and not box.alive(), timeout=20,
+        wait_until(lambda: not self.left(box) and not box.alive(), timeout=60,
                    what='groups to be deleted')
 
     def secrets(self, variables: Mapping[str, str]) -> list[str]:

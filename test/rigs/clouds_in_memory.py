@@ -412,7 +412,7 @@ class Gcp(Memory):
             self.served.project.cloud.end(instance['id'], 'terminate')
         project = self.served.project  # which shows an instance for a while that has ended
         wait_until(lambda: not self.served.instances and not [*project._lingering('instance')],
-                   timeout=5.0, what='the instances to end')
+                   timeout=60.0, what='the instances to end')
 
     def retag(self, tags: Mapping[str, str]) -> None:
         """Change the tags in the descriptions of rules."""

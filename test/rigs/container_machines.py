@@ -46,7 +46,7 @@ def cloud_network(engine: str) -> Iterator[str]:
 def key(tmp_path: Path) -> Path:
     path = tmp_path / 'id'
     run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f', str(path))),
-                timeout=10.0)
+                timeout=60.0)
     return path
 
 
@@ -94,7 +94,7 @@ class Cloud:
         def look() -> Machine | None:
             machine = self.provider.describe(machine_id)
             return machine if machine.shell else None
-        return wait_until(look, timeout=20.0, what='the machine')
+        return wait_until(look, timeout=60.0, what='the machine')
 
     @contextlib.contextmanager
     def shell(self, machine: Machine, user: str = '') -> Iterator[SSHShell]:
@@ -102,16 +102,16 @@ class Cloud:
         endpoint = dataclasses.replace(machine.shell, key_file=str(self.key))
         if user:
             endpoint = dataclasses.replace(endpoint, user=user)
-        shell = SSHShell(endpoint, name=machine.name, timeout=5.0)
+        shell = SSHShell(endpoint, name=machine.name, timeout=20.0)
 
         def answers() -> bool:
             with contextlib.suppress(ShellError):
-                return shell.run(Command(('true',)), timeout=5.0).returncode == 0
+                return shell.run(Command(('true',)), timeout=20.0).returncode == 0
             return False
 
         try:
             if not user:
-                wait_until(answers, timeout=20.0, what='the SSH server')
+                wait_until(answers, timeout=60.0, what='the SSH server')
             yield shell
         finally:
             shell.close()
@@ -129,4 +129,4 @@ def cloud(cloud_network: str, key: Path) -> Iterator[Cloud]:
     yield made
     for machine_id in made.ids:
         made.provider.destroy(machine_id)
-    wait_until(lambda: not made.traces(), timeout=10.0, what='all traces to be gone')
+    wait_until(lambda: not made.traces(), timeout=60.0, what='all traces to be gone')

@@ -29,7 +29,7 @@ class Dashboard:
         """Press Ctrl-C, and return its exit status."""
         self.child.send_signal(signal.SIGINT)
         try:
-            code = self.child.wait(20)
+            code = self.child.wait(60)
         finally:
             self.child.kill()
         assert self.child.stdout is not None

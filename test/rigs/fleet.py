@@ -150,7 +150,7 @@ def network() -> Iterator[str]:
         rules = f'ip saddr {subnet} ip daddr != {subnet} ct state new drop'
         table = (f'table inet {name} {{ chain out {{ '
                  f'type filter hook forward priority filter - 5; {rules}; }}; }}')
-        run(Command(('nft', '-f', '-'), sudo=True, input=table.encode()), timeout=10.0)
+        run(Command(('nft', '-f', '-'), sudo=True, input=table.encode()), timeout=60.0)
         yield name
 
 

@@ -81,7 +81,7 @@ class Launched:
         others = self.text.replace('[WARNING] [launch]: user interrupted with ctrl-c', '')
         return self.errors == [] and 'WARNING' not in others and 'Traceback' not in others
 
-    def wait_for(self, words: str, *, times: int = 1, timeout: float = 60.0) -> None:
+    def wait_for(self, words: str, *, times: int = 1, timeout: float = 180.0) -> None:
         """
         Wait until lines with ``words`` came.
 
@@ -105,7 +105,7 @@ class Launched:
         """Press Ctrl-C."""
         self.child.send_signal(signal.SIGINT)
 
-    def ended(self, timeout: float = 60.0) -> int:
+    def ended(self, timeout: float = 180.0) -> int:
         """
         Wait for its end and return the exit status.
 
@@ -123,7 +123,7 @@ class Launched:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.child.pid, signal.SIGKILL)
         self.child.kill()  # it may not have come to make the group
-        self.ended(10.0)
+        self.ended(60.0)
 
 
 @contextlib.contextmanager
@@ -145,13 +145,13 @@ def launching() -> Iterator[Callable[..., Launched]]:
                 launch.interrupt()
         for launch in started:
             try:
-                launch.ended(60.0)
+                launch.ended()
             finally:
                 launch.kill()
 
 
 def ros2(
-    *words: str, environment: Optional[Mapping[str, str]] = None, timeout: float = 60.0,
+    *words: str, environment: Optional[Mapping[str, str]] = None, timeout: float = 180.0,
     prefix: Sequence[str] = (),
 ) -> subprocess.CompletedProcess[str]:
     """Run ``ros2`` with these words and return what it left; nobody is there to be asked."""

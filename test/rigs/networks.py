@@ -29,7 +29,7 @@ def abandoned(listed: str) -> list[str]:
 def _remove(name: str) -> None:
     run(Command(('podman', 'network', 'rm', '-f', name), sudo=True), timeout=60.0, check=False)
     # the packet filter of a fleet's network
-    run(Command(('nft', 'delete', 'table', 'inet', name), sudo=True), timeout=10.0, check=False)
+    run(Command(('nft', 'delete', 'table', 'inet', name), sudo=True), timeout=60.0, check=False)
 
 
 @contextlib.contextmanager

@@ -113,7 +113,7 @@ def dashboard(path: Path) -> None:
         browser.do('Emulation.setScrollbarsHidden', hidden=True)
         browser.open(watched.url)
         launched = launch(str(file))
-        launched.wait_for('I heard', times=WATCHED, timeout=120.0)
+        launched.wait_for('I heard', times=WATCHED)
         browser.until('[...document.querySelectorAll("figure img")].filter('
                       'image => image.complete && image.naturalWidth === 640).length === 2')
         browser.screenshot(path, whole=True)

@@ -84,8 +84,10 @@ def generate_launch_description():
 """
 
 
-def write(path: Path, names: Sequence[str], network: Optional[str]) -> Path:
+def write(
+    path: Path, names: Sequence[str], network: Optional[str], hedge: float = HEDGE,
+) -> Path:
     """Write the launch file; names of machines end with ``-`` and a number."""
     path.write_text(LAUNCH.format(names=list(names), network=network, server=SERVER,
-                                  client=CLIENT, hedge=HEDGE))
+                                  client=CLIENT, hedge=hedge))
     return path

@@ -73,7 +73,7 @@ class SecondRobot:
         self.ip('-n', robot, 'route', 'add', 'default', 'via', '192.168.78.1')
         run(Command(('ip', 'netns', 'exec', nat, 'sh', '-ec',
                      'echo 1 >/proc/sys/net/ipv4/ip_forward; nft -f -'), sudo=True,
-                    input=NAT.encode()), timeout=10.0)
+                    input=NAT.encode()), timeout=60.0)
 
     def reaches(self, engine: str, network: str) -> str:
         """Let packets pass between this robot and a network of the tests; return its gateway."""
@@ -82,10 +82,10 @@ class SecondRobot:
         # this computer forwards nothing from there
         for link in (said['network_interface'], self.spaces[0]):
             run(Command.script(f'echo 1 >/proc/sys/net/ipv4/conf/{link}/forwarding', sudo=True),
-                timeout=10.0)
+                timeout=60.0)
         shown = json.loads(run(Command((
             'ip', '-json', '-4', 'address', 'show', said['network_interface'])),
-            timeout=10.0).stdout)
+            timeout=60.0).stdout)
         return str(shown[0]['addr_info'][0]['local'])
 
     def close(self) -> None:
@@ -93,10 +93,10 @@ class SecondRobot:
             self.run('ros2', 'fog', 'leave', name)
         for words in (('link', 'delete', self.spaces[0]),
                       *(('netns', 'delete', space) for space in self.spaces)):
-            run(Command(('ip', *words), sudo=True), timeout=10.0, check=False)
+            run(Command(('ip', *words), sudo=True), timeout=60.0, check=False)
 
     def ip(self, *words: str) -> None:
-        run(Command(('ip', *words), sudo=True), timeout=10.0)
+        run(Command(('ip', *words), sudo=True), timeout=60.0)
 
     def start(self, *words: str) -> subprocess.Popen[str]:
         """Start a program there; its output is read by the caller."""

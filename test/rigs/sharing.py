@@ -65,7 +65,7 @@ class Robot:
         """Interrupt its relay."""
         assert self.relay is not None
         self.relay.send_signal(signal.SIGINT)
-        return self.relay.wait(15)
+        return self.relay.wait(60)
 
     def heard(self, kind: Any, topic: str, qos: Any = 10) -> list[Any]:
         """Return the messages that its node hears, a list that grows."""
@@ -81,7 +81,7 @@ class Robot:
             self.relay.kill()
             self.relay.wait()
         self.executor.shutdown()
-        self.thread.join(10)
+        self.thread.join(60)
         self.node.destroy_node()
         self.context.try_shutdown()
 
@@ -111,4 +111,4 @@ def repeated(publisher: Any, make: Callable[[int], Any], heard: list[Any], count
         publisher.publish(make(next(numbers)))
         return len(heard) >= count
 
-    wait_until(look, timeout=40, longest=0.05, what='the shared messages')
+    wait_until(look, timeout=60, longest=0.05, what='the shared messages')

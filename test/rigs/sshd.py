@@ -74,7 +74,7 @@ class PrivateSshd:
         self.child = subprocess.Popen(
             [sshd, '-D', '-f', str(config), '-E', str(self.folder / 'log')],
             start_new_session=True, stdin=subprocess.DEVNULL)
-        wait_until(self._listens, timeout=10.0, what='sshd to listen',
+        wait_until(self._listens, timeout=60.0, what='sshd to listen',
                    hint=str(self.folder / 'log'))
 
     def _listens(self) -> bool:
@@ -106,7 +106,7 @@ class PrivateSshd:
         if self.child is not None:
             self.cut()
             self.child.terminate()
-            self.child.wait(10.0)
+            self.child.wait(60.0)
             self.child = None
 
 

@@ -53,7 +53,7 @@ def screen(
                     break  # the command has ended
                 said += more
         text = said.decode()
-        assert child.wait(10) == 0, text
+        assert child.wait(60) == 0, text
         return text
     finally:
         os.close(terminal)

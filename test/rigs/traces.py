@@ -264,7 +264,7 @@ def _read_json(process: Path, path: str) -> dict[str, Any]:
     if not path.startswith('/'):
         return {}
     words = ('cat', f'{process}/root{path}')
-    text = run(Command(words, sudo=True), timeout=10.0, check=False).stdout
+    text = run(Command(words, sudo=True), timeout=60.0, check=False).stdout
     try:
         value = json.loads(text)
     except ValueError:

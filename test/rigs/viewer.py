@@ -96,7 +96,7 @@ class Viewer:
         self._process.stdin.write(json.dumps(what) + '\n')
         self._process.stdin.flush()
 
-    def until(self, key: str, value: Any = None, *, timeout: float = 20.0) -> dict[str, Any]:
+    def until(self, key: str, value: Any = None, *, timeout: float = 60.0) -> dict[str, Any]:
         """Return the next of what it tells that has ``key``, and under it ``value`` if given."""
         def fits(told: dict[str, Any]) -> bool:
             return key in told and value in (None, told[key])
@@ -137,5 +137,5 @@ class Viewer:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._reader.join(10)
+        self._reader.join(60)
         self._process.stdout.close()

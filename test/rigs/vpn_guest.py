@@ -69,8 +69,8 @@ class Guest:
         self.lab.do('guest', self.lab.vpn.up(self.interface, [
             Peer('machine', self.machine_key, MACHINE, f'{OUTSIDE}:{PORT}')]))
         if answered:
-            wait_until(lambda: self.received() > 0, timeout=10.0, what='an answer')
-            assert self.lab.ping('guest', MACHINE, timeout=5.0)
+            wait_until(lambda: self.received() > 0, timeout=60.0, what='an answer')
+            assert self.lab.ping('guest', MACHINE, timeout=60.0)
 
     def down(self) -> None:
         """Take the interface down; the key stays, as that of a computer does."""

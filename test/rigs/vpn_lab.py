@@ -85,7 +85,7 @@ class Child:
                 self._news.notify_all()
 
     def wait(self, key: str, value: object = None, *, after: float = 0.0, count: int = 1,
-             timeout: float = 10.0) -> list[dict[str, Any]]:
+             timeout: float = 60.0) -> list[dict[str, Any]]:
         """
         Return the first ``count`` lines with ``key`` (equal to ``value``), sent after a time.
 
@@ -113,7 +113,7 @@ class Child:
         begin = len(self.said)
         self.process.stdin.write(json.dumps(settings) + '\n')
         with self._news:
-            assert self._news.wait_for(lambda: len(self.said) > begin, 5.0)
+            assert self._news.wait_for(lambda: len(self.said) > begin, 60.0)
             return self.said[begin]
 
     def stop(self) -> None:
@@ -123,7 +123,7 @@ class Child:
             self.process.wait(5)
         except subprocess.TimeoutExpired:
             self.process.kill()
-            self.process.wait(5)
+            self.process.wait(60)
         self._thread.join(2.0)
         for pipe in (self.process.stdin, self.process.stdout):
             if pipe is not None:
@@ -209,10 +209,10 @@ class Lab:
                 self.run(host, command, check=False)
         for space in self.spaces.values():
             process.run(Command(('ip', 'netns', 'delete', space), sudo=True),
-                        timeout=10.0, check=False)
+                        timeout=60.0, check=False)
 
     def ip(self, *words: str) -> None:
-        process.run(Command(('ip', *words), sudo=True), timeout=10.0)
+        process.run(Command(('ip', *words), sudo=True), timeout=60.0)
 
     def argv(self, host: str, words: Sequence[str], group: str = '') -> tuple[str, ...]:
         return ('ip', 'netns', 'exec', self.spaces[host], 'sh', '-c', ENTER, 'sh', group, *words)
@@ -222,7 +222,7 @@ class Lab:
         return process.run(
             Command(self.argv(host, command.argv), sudo=True, input=command.input,
                     what=command.what),
-            timeout=20.0, check=check)
+            timeout=60.0, check=check)
 
     def shell(self, host: str, text: str, *, check: bool = True) -> str:
         return self.run(host, Command(('sh', '-c', text)), check=check).stdout
@@ -293,7 +293,7 @@ class Lab:
         self.do('robot', self.vpn.up(self.interfaces['robot'], []))
         self.do('machine', self.vpn.up(self.interfaces['machine'], peers['machine']))
         self.do('robot', self.vpn.peers(self.interfaces['robot'], peers['robot']))
-        wait_until(self.handshaken, timeout=10.0, what='the handshake')
+        wait_until(self.handshaken, timeout=60.0, what='the handshake')
 
     def handshaken(self) -> bool:
         interface = self.interfaces['robot']
@@ -347,10 +347,10 @@ class Lab:
             environment['PYTHONPATH'] = str(CYCLONE_0_10)
         child = self.start(host, [sys.executable, str(program), *words],
                            group='' if stock else self.interfaces[host].name, **environment)
-        child.wait('ready', timeout=20.0)
+        child.wait('ready', timeout=60.0)
         return child
 
-    def ping(self, host: str, address: str, *, timeout: float = 1.0) -> bool:
+    def ping(self, host: str, address: str, *, timeout: float = 4.0) -> bool:
         """Tell whether an echo comes back within some seconds; asks again and again."""
         seconds = max(1, round(timeout))
         words = ('ping', '-n', '-q', '-c1', '-i0.2', f'-w{seconds}', address)

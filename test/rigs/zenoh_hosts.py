@@ -52,5 +52,5 @@ class Hosts:
 
     def _start(self, host: str, *words: str, **environment: str) -> Child:
         child = self.lab.start(host, [sys.executable, str(NODE), *words], **environment)
-        child.wait('ready', timeout=20.0)
+        child.wait('ready', timeout=60.0)
         return child

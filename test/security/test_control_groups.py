@@ -32,7 +32,7 @@ VPN = WireGuard()
 
 
 def sudo(*words: str, check: bool = True) -> str:
-    return process.run(Command(words, sudo=True), timeout=20.0, check=check).stdout
+    return process.run(Command(words, sudo=True), timeout=60.0, check=check).stdout
 
 
 def write(word: str, path: Path) -> None:
@@ -42,7 +42,7 @@ def write(word: str, path: Path) -> None:
 def do(space: str, command: Command, *, check: bool = True) -> None:
     """Run a script of the VPN's in a network namespace, as the launch does with root's rights."""
     words = 'ip', 'netns', 'exec', space, 'sh', '-ec', ENTER, 'sh', *command.argv
-    said = process.run(Command(words, sudo=True, input=command.input), timeout=20.0,
+    said = process.run(Command(words, sudo=True, input=command.input), timeout=60.0,
                        check=check).stdout
     assert 'no control group' not in said, said
 

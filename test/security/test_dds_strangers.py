@@ -59,7 +59,7 @@ def listener(vpn: Lab, host: str, *at: str, group: str = '') -> Child:
 
 
 def send(vpn: Lab, host: str, text: str, *to: str) -> None:
-    vpn.start(host, [sys.executable, '-c', SENDER, text, *to]).process.wait(10)
+    vpn.start(host, [sys.executable, '-c', SENDER, text, *to]).process.wait(60)
 
 
 def route(vpn: Lab, host: str, *words: str) -> None:
@@ -117,7 +117,7 @@ def test_robot_sends_no_dds_where_a_machine_points(vpn: Lab) -> None:
     machine = listener(vpn, 'machine', f'{MACHINE}:6000')
     announce(vpn, 'machine', [f'{ROBOT}:7410'], *traps, f'{MACHINE}:6000')
     # the robot answers all participants alike, and may answer in the VPN
-    machine.wait('said', count=20, timeout=20.0)
+    machine.wait('said', count=20, timeout=60.0)
     assert lan.lines('said') == [] and local.lines('said') == []
     assert robot.process.poll() is None
 
@@ -133,7 +133,7 @@ def test_machine_answers_no_participant_outside_the_vpn(vpn: Lab) -> None:
     announce(vpn, 'net', [f'{OUTSIDE}:7410', f'{MACHINE}:7410', '239.255.0.1:7400',
                           '239.18.7.2:7402'], f'{ROBOT}:7498')
     announce(vpn, 'robot', [f'{MACHINE}:7410'], f'{ROBOT}:7499')
-    robot.wait('at', f'{ROBOT}:7499', count=20, timeout=20.0)
+    robot.wait('at', f'{ROBOT}:7499', count=20, timeout=60.0)
     assert robot.lines('at', f'{ROBOT}:7498') == []
 
 
@@ -149,5 +149,5 @@ def test_robot_limited_to_itself_answers_no_participant_of_lan(vpn: Lab) -> None
     announce(vpn, 'lan', [f'{LAN}:7410', f'{ROBOT}:7410', '239.255.0.1:7400', '239.18.7.1:7402'],
              f'{MACHINE}:6000')
     announce(vpn, 'machine', [f'{ROBOT}:7410'], f'{MACHINE}:6001')
-    machine.wait('at', f'{MACHINE}:6001', count=20, timeout=20.0)
+    machine.wait('at', f'{MACHINE}:6001', count=20, timeout=60.0)
     assert machine.lines('at', f'{MACHINE}:6000') == []

@@ -47,7 +47,7 @@ class Detached:
             'machine': 'planner', 'launch': 'abc123', 'directory': str(self.directory)}))
         done = subprocess.run(
             [sys.executable, '-IS', str(program), 'serve', '--detach', '--config', str(config)],
-            capture_output=True, timeout=20, check=True)
+            capture_output=True, timeout=60, check=True)
         config.unlink()
         program.unlink()
         self.pid: int = json.loads(done.stdout)['pid']
@@ -55,7 +55,7 @@ class Detached:
 
     def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
         with socket.socket(socket.AF_UNIX) as link, contextlib.suppress(OSError):
-            link.settimeout(10)
+            link.settimeout(60)
             link.connect(str(self.directory / 'agent.sock'))
             link.sendall(json.dumps({'id': 1, 'command': command, **arguments}).encode() + b'\n')
             answer: dict[str, Any] = json.loads(link.makefile('rb').readline() or b'{}')
@@ -65,7 +65,7 @@ class Detached:
     def successor(self) -> int:
         """Return the pid of the agent after this one."""
         before = self.pid
-        wait_until(lambda: self.ask('status').get('pid', before) != before, timeout=10,
+        wait_until(lambda: self.ask('status').get('pid', before) != before, timeout=60,
                    what='an agent in its place')
         self.pid = self.ask('status')['pid']
         return self.pid
@@ -96,25 +96,25 @@ def test_agent_that_ends_in_order_stays_away(agent: Detached, how: str) -> None:
         agent.ask('release', exit=True)
     else:
         os.kill(agent.pid, signal.SIGTERM)
-    wait_until(lambda: not runs(agent.supervisor), timeout=10, what='its supervisor to end')
+    wait_until(lambda: not runs(agent.supervisor), timeout=60, what='its supervisor to end')
     assert not runs(agent.pid) and not agent.ask('ping')
 
 
 def test_agent_whose_folder_was_removed_stays_away(agent: Detached) -> None:
     agent.directory.rename(agent.directory.with_name('aside'))
     os.kill(agent.pid, signal.SIGKILL)
-    wait_until(lambda: not runs(agent.supervisor), timeout=10, what='its supervisor to end')
+    wait_until(lambda: not runs(agent.supervisor), timeout=60, what='its supervisor to end')
     assert not agent.directory.exists()
 
 
 def test_supervisor_leaves_the_folder_to_another_agent(agent: Detached) -> None:
     os.kill(agent.supervisor, signal.SIGSTOP)
     os.kill(agent.pid, signal.SIGKILL)
-    wait_until(lambda: not agent.ask('ping'), timeout=10, what='the end of the agent')
+    wait_until(lambda: not agent.ask('ping'), timeout=60, what='the end of the agent')
     other = Detached(agent.directory.parent)
     with contextlib.closing(other):
         os.kill(agent.supervisor, signal.SIGCONT)
-        wait_until(lambda: not runs(agent.supervisor), timeout=10, what='its supervisor to end')
+        wait_until(lambda: not runs(agent.supervisor), timeout=60, what='its supervisor to end')
         assert other.ask('status')['pid'] == other.pid
 
 
@@ -137,7 +137,7 @@ def test_agent_of_a_container_always_starts_again(tmp_path: Path, status: object
         'PATH': f'{tmp_path}:{os.environ["PATH"]}'})
     try:
         wait_until(lambda: calls.exists() and len(calls.read_text().splitlines()) > 1,
-                   timeout=10, what='a second agent')
+                   timeout=60, what='a second agent')
         assert first.poll() is None
     finally:
         os.killpg(first.pid, signal.SIGKILL)

@@ -43,7 +43,7 @@ def test_key_is_read_from_the_beginning_of_an_endless_log(podman: Path) -> None:
     """As ``ros2 fog list`` does for machines with an image, each time."""
     begin = time.monotonic()
     assert ContainerProvider()._host_key(ENGINE, ENTRY) == 'ssh-ed25519 AAAA'
-    assert time.monotonic() - begin < 20
+    assert time.monotonic() - begin < 60
 
 
 def test_reason_of_an_end_is_read_from_the_end_of_a_long_log(podman: Path) -> None:

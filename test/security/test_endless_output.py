@@ -193,7 +193,7 @@ def test_odd_frame_ends_the_connection_with_one_error(
 ) -> None:
     link, machine = linked
     channel = link.open(Command(('true',)))
-    channel.settimeout(10.0)
+    channel.settimeout(60.0)
     machine.sendall(frame)
     assert channel.recv(1) == b'' and channel.recv_exit_status() == -1
     with pytest.raises(ConnectError, match="the connection to 'planner' was lost: "):

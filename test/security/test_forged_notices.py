@@ -41,7 +41,7 @@ class Agent:
         self.process = subprocess.Popen(
             [sys.executable, '-IS', str(program), 'serve', '--config', str(path)],
             stderr=subprocess.DEVNULL)
-        wait_until(self._answers, timeout=10, what='the agent')
+        wait_until(self._answers, timeout=60, what='the agent')
 
     def _answers(self) -> bool:
         with contextlib.suppress(OSError):
@@ -51,7 +51,7 @@ class Agent:
     def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
         """Return the agent's answer to a request."""
         with socket.socket(socket.AF_UNIX) as link:
-            link.settimeout(10)
+            link.settimeout(60)
             link.connect(str(self.directory / 'agent.sock'))
             link.sendall(json.dumps({'id': 1, 'command': command, **arguments}).encode() + b'\n')
             answer: dict[str, Any] = json.loads(link.makefile('rb').readline())
@@ -60,7 +60,7 @@ class Agent:
     def notices(self) -> list[str]:
         """Return the reasons of all notices that the robot gets."""
         with socket.socket(socket.AF_UNIX) as link:
-            link.settimeout(10)
+            link.settimeout(60)
             link.connect(str(self.directory / 'agent.sock'))
             link.sendall(b'{"id": 1, "command": "log", "from": 1}\n')
             lines = link.makefile('rb')
@@ -79,7 +79,7 @@ def serve(tmp_path: Path) -> Iterator[Callable[..., Agent]]:
 
     yield make
     made[0].process.terminate()
-    made[0].process.wait(10)
+    made[0].process.wait(60)
 
 
 @pytest.mark.parametrize('real', [[], ['false'], ['sh', '-c', 'echo real']])
@@ -96,14 +96,14 @@ def test_node_cannot_change_the_command_of_the_notice(
         assert not forged['ok'], forged
     assert agent.ask('configure', launch='abc123', again=True)['ok']
     wanted = ['real'] if 'sh' in real else []
-    wait_until(lambda: agent.notices() == wanted, timeout=10, what='the notice')
+    wait_until(lambda: agent.notices() == wanted, timeout=60, what='the notice')
     assert agent.ask('status')['ok'] and agent.notices() == wanted
 
 
 def test_next_launch_sets_its_own_command(serve: Callable[..., Agent]) -> None:
     agent = serve(notice=['false'])  # as a launch starts it
     assert agent.ask('configure', launch='def456', force='abc123', notice=['echo', 'new'])['ok']
-    wait_until(lambda: agent.notices() == ['new'], timeout=10, what='the notice')
+    wait_until(lambda: agent.notices() == ['new'], timeout=60, what='the notice')
 
 
 def launched(on_interrupt: str, confirms: list[bool]) -> tuple[list[Any], list[Any]]:

@@ -41,9 +41,9 @@ def cloud(root: None) -> Iterator[str]:
     name = f'fogmeta{os.getpid() % 10000}'
     for words in (('netns', 'add', name), ('-n', name, 'link', 'set', 'lo', 'up'), *(
             ('-n', name, 'addr', 'add', host, 'dev', 'lo') for host in SERVICES)):
-        process.run(Command(('ip', *words), sudo=True), timeout=10.0)
+        process.run(Command(('ip', *words), sudo=True), timeout=60.0)
     yield name
-    process.run(Command(('ip', 'netns', 'del', name), sudo=True), timeout=10.0)
+    process.run(Command(('ip', 'netns', 'del', name), sudo=True), timeout=60.0)
 
 
 def inside(cloud: str, *words: str) -> str:

@@ -25,7 +25,7 @@ __all__ = ['cloud', 'cloud_network', 'engine', 'key']
 
 def sudo(script: str, *words: str) -> str:
     return process.run(Command(('sh', '-ec', script, 'sh', *words), sudo=True),
-                       timeout=20.0).stdout
+                       timeout=60.0).stdout
 
 
 @pytest.fixture
@@ -41,13 +41,13 @@ def own(root: None) -> Iterator[str]:
 def end_of_tick() -> None:
     """Wait until a change is seen in the time of the path that was changed last."""
     begin = time.time_ns()
-    wait_until(lambda: time.time_ns() > begin + hidden_files.TICK, timeout=5.0, what='a tick')
+    wait_until(lambda: time.time_ns() > begin + hidden_files.TICK, timeout=60.0, what='a tick')
 
 
 def seen(cloud: Cloud, machine_id: str, folder: str) -> set[str]:
     """Return the lines that root on a machine finds in files below a folder."""
     with cloud.shell(cloud.reached(machine_id)) as shell:
-        return set(shell.run(Command(('grep', '-rhs', '', folder), sudo=True), timeout=20.0,
+        return set(shell.run(Command(('grep', '-rhs', '', folder), sudo=True), timeout=60.0,
                              check=False).stdout.splitlines())
 
 
@@ -59,7 +59,7 @@ def test_root_on_a_machine_reads_no_file_of_root_here(cloud: Cloud, own: str) ->
     second = cloud.create(cloud.spec())
     assert seen(cloud, second, own) == {'public'}
     with cloud.shell(cloud.reached(second)) as shell:
-        undo = shell.run(Command(('umount', f'{own}/a secret'), sudo=True), timeout=20.0,
+        undo = shell.run(Command(('umount', f'{own}/a secret'), sudo=True), timeout=60.0,
                          check=False)
         assert 'must be superuser' in undo.stderr
     cloud.provider.stop(first)

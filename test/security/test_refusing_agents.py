@@ -114,7 +114,7 @@ def test_refused_log_does_not_end_the_launch() -> None:
     client = AgentClient(shell, '/run/x', agent_path='/run/x/agent.py')
     try:
         client.subscribe(events.append, since=1)
-        wait_until(lambda: bool(events), timeout=10, what='the end of the agent')
+        wait_until(lambda: bool(events), timeout=60, what='the end of the agent')
     finally:
         client.close()
     assert [(event['event'], event['state']) for event in events] == [('connection', 'absent')]

@@ -68,7 +68,7 @@ def python(code: str, *words: str) -> subprocess.CompletedProcess[str]:
     """Run code as root, without the folders of this environment."""
     return subprocess.run(
         process.argv(Command(('/usr/bin/python3', '-IS', '-c', code, *words), sudo=True)),
-        capture_output=True, text=True, timeout=20)
+        capture_output=True, text=True, timeout=60)
 
 
 def folder_of(machine_id: str) -> Path:
@@ -78,7 +78,7 @@ def folder_of(machine_id: str) -> Path:
 def processes(machine_id: str) -> list[str]:
     """Return the ids of a machine's processes."""
     said = process.run(Command(('podman', 'top', machine_id.split(':')[1], 'hpid'), sudo=True),
-                       timeout=20.0).stdout
+                       timeout=60.0).stdout
     return said.split()[1:]
 
 
@@ -86,7 +86,7 @@ def processes(machine_id: str) -> list[str]:
 def test_no_account_looks_into_a_machine_s_root(cloud: Cloud, account: int) -> None:
     with cloud.machine() as (machine, shell):
         # the machine's user has a process, as the nodes are
-        shell.run(Command(('sh', '-c', 'sleep 600 >/dev/null 2>&1 &')), timeout=20.0)
+        shell.run(Command(('sh', '-c', 'sleep 600 >/dev/null 2>&1 &')), timeout=60.0)
         roots = [f'/proc/{pid}/root' for pid in processes(machine.id)]
         top = folder_of(machine.id)
         own = str(top / 'root')
@@ -95,7 +95,7 @@ def test_no_account_looks_into_a_machine_s_root(cloud: Cloud, account: int) -> N
         assert python(LOOK, str(account), own, *roots).stdout == ''
         modes = [stat.S_IMODE(int(said, 16)) for said in process.run(
             Command(('stat', '-c', '%f', str(top), str(top.parent)), sudo=True),
-            timeout=10.0).stdout.split()]
+            timeout=60.0).stdout.split()]
         assert modes == [0o700, 0o700]
 
 
@@ -105,14 +105,14 @@ def test_setuid_file_and_device_of_a_machine_are_none_here(cloud: Cloud, on_exit
         if on_exit == 'stop':
             # as after a boot, which keeps no mount
             cloud.provider.stop(machine.id)
-            process.run(Command(('umount', str(folder_of(machine.id))), sudo=True), timeout=10.0,
+            process.run(Command(('umount', str(folder_of(machine.id))), sudo=True), timeout=60.0,
                         check=False)
             cloud.provider.start(machine.id)
         with cloud.shell(cloud.reached(machine.id)) as shell:
             shell.run(Command(('sh', '-ec', 'cp -L /usr/bin/id /opt/id; chmod 4755 /opt/id; '
-                               'mknod -m 666 /opt/null c 1 3'), sudo=True), timeout=20.0)
+                               'mknod -m 666 /opt/null c 1 3'), sudo=True), timeout=60.0)
             # programs of the system get their rights there
-            assert shell.run(Command(('sudo', '-n', 'id', '-u')), timeout=20.0).stdout == '0\n'
+            assert shell.run(Command(('sudo', '-n', 'id', '-u')), timeout=60.0).stdout == '0\n'
         opt = str(folder_of(machine.id) / 'root/opt')
         assert python(RUN, opt, 'id').stdout == f'{NOBODY}\n'
         assert 'PermissionError' in python(OPEN, opt, 'null').stderr
@@ -122,7 +122,7 @@ def test_each_machine_has_a_login_id_of_its_own(cloud: Cloud) -> None:
     numbers = set()
     for _ in range(2):
         with cloud.machine() as (_, shell):
-            numbers.add(int(shell.run(Command(('id', '-u')), timeout=20.0).stdout))
+            numbers.add(int(shell.run(Command(('id', '-u')), timeout=60.0).stdout))
     assert len(numbers) == 2
     for number in numbers:
         assert number in login_ids.IDS
@@ -162,7 +162,7 @@ def test_shared_folder_of_another_machine_gives_no_rights(cloud: Cloud) -> None:
     """A guest on one machine could run what root on another machine has put there."""
     with cloud.machine(share=('/map',)) as (machine, _):
         said = process.run(Command(('podman', 'exec', machine.id.split(':')[1], 'findmnt', '-J',
-                                    '-o', 'TARGET,OPTIONS'), sudo=True), timeout=20.0).stdout
+                                    '-o', 'TARGET,OPTIONS'), sudo=True), timeout=60.0).stdout
         options = {each['target']: each['options'].split(',') for top in
                    json.loads(said)['filesystems'] for each in (top, *top.get('children', ()))}
     assert {'ro', 'nosuid', 'nodev', 'noexec'} <= set(options['/opt/fogros2/shared'])

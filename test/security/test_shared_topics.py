@@ -21,7 +21,6 @@ from fogros2_share.node import MOST, NAME, OWN, PROOF, TOPICS
 from rigs.sharing import LATCHED, repeated, Robot, robot
 
 __all__ = ['robot']
-pytestmark = pytest.mark.timeout(120)
 Robots = Callable[[str], Robot]
 
 
@@ -29,7 +28,7 @@ Robots = Callable[[str], Robot]
 def reading(one: Robot, name: str = '', files: Sequence[int] = ()) -> Iterator[socket.socket]:
     """Connect to a robot's relay; say a machine's name and hand over files, as a relay does."""
     with socket.socket(socket.AF_UNIX) as link:
-        link.settimeout(20)
+        link.settimeout(60)
         link.connect(str(one.folder / OWN / NAME))
         if name:
             socket.send_fds(link, [name.encode()], list(files))
@@ -54,7 +53,7 @@ def topic(stream: BinaryIO) -> str:
 
 
 def started(one: Robot) -> None:
-    wait_until((one.folder / OWN / NAME).exists, timeout=40, what='the relay')
+    wait_until((one.folder / OWN / NAME).exists, timeout=60, what='the relay')
 
 
 def test_link_in_place_of_a_socket_is_not_followed(robot: Robots, tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ def received(sent: list[dict[str, Any]]) -> list[Any]:
     client = AgentClient(shell, '/run/x', agent_path='/run/x/agent.py')
     try:
         client.subscribe(found.append, since=1)
-        wait_until(lambda: len(found) == len(sent) or None, timeout=10, what='the events')
+        wait_until(lambda: len(found) == len(sent) or None, timeout=60, what='the events')
     finally:
         client.close()
     return found

@@ -56,7 +56,7 @@ class Bridge:
         self.reader = threading.Thread(target=lambda: self.lines.extend(process.stdout))
         self.reader.start()
         wait_until(lambda: self.text.count('listening on') == 3 and 'serving ws://' in self.text,
-                   timeout=30, what='the bridge and its gate')
+                   timeout=60, what='the bridge and its gate')
         self.token = (folder / 'token').read_text().strip()
 
     @property
@@ -75,7 +75,7 @@ class Bridge:
 def opened(place: tuple[str, int], request: str, *, tls: bool = False) -> int:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    with socket.create_connection(place, timeout=20) as plain, \
+    with socket.create_connection(place, timeout=60) as plain, \
             context.wrap_socket(plain) if tls else contextlib.nullcontext(plain) as connection:
         connection.sendall(request.encode())
         said = connection.recv(4096)
@@ -106,9 +106,9 @@ def bridge(tmp_path_factory: pytest.TempPathFactory, domain: str) -> Iterator[Br
         yield running
     finally:
         process.terminate()
-        process.wait(20)
+        process.wait(60)
         if running is not None:
-            running.reader.join(20)
+            running.reader.join(60)
         process.stdout.close()
 
 
@@ -172,7 +172,7 @@ def test_log_has_no_token(bridge):
     assert opened(bridge.places['shared'], HANDSHAKE.format(
         target='/?token=wrong', host='localhost', more=''), tls=True) == 401
     wait_until(lambda: 'turned away 127.0.0.1: a wrong token' in bridge.text,
-               timeout=20, what='the refusal')
+               timeout=60, what='the refusal')
     assert bridge.token not in bridge.text
 
 

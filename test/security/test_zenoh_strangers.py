@@ -27,7 +27,7 @@ def test_machine_meets_the_launch_s_nodes_alone(vpn: Lab, tmp_path: Path) -> Non
     machine = hosts.node('machine', 'to:/machine', 'from:/robot', 'from:/lan', 'from:/other')
     for child, topic in ((lan, '/other'), (other, '/lan'), (robot, '/machine'),
                          (machine, '/robot')):
-        child.wait('topic', topic, count=20, timeout=20.0)
+        child.wait('topic', topic, count=20, timeout=60.0)
     for child, topic in ((machine, '/lan'), (machine, '/other'),
                          (lan, '/machine'), (other, '/machine')):
         assert child.lines('topic', topic) == [], topic

@@ -106,7 +106,7 @@ def make() -> Iterator[Callable[..., AgentClient]]:
 
 
 def until(probe: Callable[[], Any]) -> None:
-    wait_until(lambda: bool(probe()), timeout=10, what='it', longest=0.02)
+    wait_until(lambda: bool(probe()), timeout=60, what='it', longest=0.02)
 
 
 def test_reply_goes_to_its_request(make):
@@ -203,7 +203,7 @@ def test_lost_requests_are_repeated_except_signals(make):
     until(lambda: len(mute.asked) == 2)
     mute.say(None)
     for thread in threads:
-        thread.join(10)
+        thread.join(60)
     assert results['stop']['ok'] is True
     assert 'connection was lost' in str(results['signal'])
 
@@ -290,7 +290,7 @@ def test_close_ends_the_thread_and_waiting_requests(make):
     thread.start()
     until(lambda: stream.asked)
     client.close()
-    thread.join(10)
+    thread.join(60)
     assert 'closed' in str(caught[0])
     with pytest.raises(AgentError, match='closed'):
         client.request('status')
@@ -378,7 +378,7 @@ def test_invalid_message_is_reported_once_and_fails_the_machine(make, line, fiel
     stream.say({'event': 'unheard of'})  # from a newer agent: ignored
     stream.say(line.encode() + b'\n')
     stream.say(ending(1))
-    asking.join(10)
+    asking.join(60)
     assert 'sent an invalid message' in str(caught[0]) and field in str(caught[0])
     until(lambda: not client._thread.is_alive())
     assert [(e['event'], e.get('state')) for e in seen] == [('connection', 'absent')]
@@ -414,7 +414,7 @@ def test_torn_line_at_the_end_of_a_connection_is_no_fault(make):
 def test_heartbeats_are_sent_and_answers_measured():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as machine:
         machine.bind(('127.0.0.1', 0))
-        machine.settimeout(10)
+        machine.settimeout(60)
         heartbeat = Heartbeat('127.0.0.1', machine.getsockname()[1], KEY, interval=0.05)
         for number in (1, 2, 3):
             data, robot = machine.recvfrom(2048)

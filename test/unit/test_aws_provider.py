@@ -476,7 +476,7 @@ def test_booted_instance_starts_the_agent_that_it_gets(booted):
     subprocess.run(['sh', '-ec', arming._SEND, 'sh', str(program)], input=joined(), text=True,
                    check=True)
     server = top / 'run/fogros2/agent.sock'
-    wait_until(server.exists, timeout=20.0, what='the agent')
+    wait_until(server.exists, timeout=60.0, what='the agent')
     answer = subprocess.run(
         [sys.executable, '-IS', str(program), 'connect', '--directory', str(server.parent)],
         input=b'{"id": 1, "command": "status"}\n', capture_output=True, timeout=20)
@@ -486,8 +486,8 @@ def test_booted_instance_starts_the_agent_that_it_gets(booted):
     assert program.read_text() == joined()
     # a signal ends the agent in order; without another one, nothing would end the instance
     os.kill(status['pid'], signal.SIGTERM)
-    wait_until(lambda: not Path(f"/proc/{status['pid']}").exists(), timeout=20, what='its end')
-    wait_until(server.exists, timeout=20.0, what='another agent')
+    wait_until(lambda: not Path(f"/proc/{status['pid']}").exists(), timeout=60, what='its end')
+    wait_until(server.exists, timeout=60.0, what='another agent')
 
 
 def test_keys_that_an_image_brings_along_are_taken_away_once(booted, tmp_path):
@@ -527,7 +527,7 @@ def test_machine_that_gets_no_agent_ends(booted, user):
         name='planner', user=user, authorized_keys=['ssh-ed25519 AAAA'],
         host_key=one_time(TOKEN), agent_config={'machine': 'planner', 'boot_timeout': 1.0})
     top = booted(told)
-    wait_until((top / 'ended').exists, timeout=20.0, what='the end')
+    wait_until((top / 'ended').exists, timeout=60.0, what='the end')
     assert (top / 'ended').read_text() == '-h now\n'
 
 
@@ -654,4 +654,4 @@ def test_unreachable_aws_is_one_line(monkeypatch):
         with pytest.raises(PrerequisiteError, match='AWS does not answer') as caught:
             ask()
         assert 'AWS_ENDPOINT_URL' in caught.value.hint
-    assert time.monotonic() - begin < 15.0
+    assert time.monotonic() - begin < 30.0

@@ -686,10 +686,10 @@ def test_doctor_shows_the_error_of_a_provider(monkeypatch: pytest.MonkeyPatch) -
 
 def test_doctor_gives_up_a_silent_provider(monkeypatch: pytest.MonkeyPatch) -> None:
     over = threading.Event()
-    monkeypatch.setattr(Cloud, 'answers', lambda self: str(over.wait(30)))
+    monkeypatch.setattr(Cloud, 'answers', lambda self: str(over.wait(60)))
     begin = time.monotonic()
     assert 'no answer within 0.1 s' in doctor.provider('cloud', timeout=0.1).detail
-    assert time.monotonic() - begin < 5
+    assert time.monotonic() - begin < 30
     over.set()
 
 
@@ -722,7 +722,7 @@ def slow_cloud(monkeypatch: pytest.MonkeyPatch, over: Callable[[], bool]) -> Non
     destroy = Cloud.destroy
 
     def slow(self: Cloud, machine_id: str) -> None:
-        wait_until(over, timeout=30.0, what=f'{machine_id} to be terminated')
+        wait_until(over, timeout=60.0, what=f'{machine_id} to be terminated')
         destroy(self, machine_id)
 
     monkeypatch.setattr(Cloud, 'destroy', slow)

@@ -223,7 +223,7 @@ read -r _ <{tmp_path}/up
     environment = {key: value for key, value in os.environ.items()
                    if key not in ('CYCLONEDDS_URI', 'ROS_DOMAIN_ID')}
     ask = ('from fogros2.waiting import wait_until; from ros2fog_cli.api import lan; '
-           'print(wait_until(lambda: lan.participants(0, 0.6) or None, timeout=20.0, what="it"))')
+           'print(wait_until(lambda: lan.participants(0, 0.6) or None, timeout=60.0, what="it"))')
     done = subprocess.run(['unshare', '-n', 'sh', str(script), _PEER, ask], text=True, timeout=60,
                           capture_output=True, env=environment, cwd=tmp_path)
     assert done.stdout.strip() == "{'198.51.100.2': 1}", done.stderr

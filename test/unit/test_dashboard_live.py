@@ -49,7 +49,7 @@ def live(monkeypatch: pytest.MonkeyPatch) -> Iterator[Live]:
     monkeypatch.setattr('ros2fog_cli.api.live.LOOK', 0.02)
     made = Live()
     made.start()
-    wait_until(lambda: 'machines' in made.state(), timeout=10.0, what='the first look')
+    wait_until(lambda: 'machines' in made.state(), timeout=60.0, what='the first look')
     yield made
     made.close()
 
@@ -74,7 +74,7 @@ def when(live: Live, name: str, fits: Callable[[dict[str, Any]], bool]) -> dict[
         return next((one for one in live.state()['machines']
                      if one['name'] == name and fits(one)), None)
 
-    answer: dict[str, Any] = wait_until(found, timeout=10.0, what=name)
+    answer: dict[str, Any] = wait_until(found, timeout=60.0, what=name)
     return answer
 
 
@@ -121,7 +121,7 @@ def test_deletion_is_refused_forced_and_reported(live: Live) -> None:
         live.delete('a')
     assert 'id-a' in Memory.machines
     live.delete('a', force=True)
-    wait_until(lambda: 'id-a' not in Memory.machines, timeout=10.0, what='its end')
+    wait_until(lambda: 'id-a' not in Memory.machines, timeout=60.0, what='its end')
     live.delete('stuck', force=True)
     shown = when(live, 'stuck', lambda one: bool(one['trouble']))
     assert 'the cloud said no' in shown['trouble'] and not shown['deleting']
@@ -155,15 +155,15 @@ def test_machines_of_one_name_are_separate(request: pytest.FixtureRequest) -> No
     def shown() -> dict[str, str]:
         return {one['key']: one['id'] for one in live.state()['machines'] if not one['ended']}
 
-    wait_until(lambda: len(shown()) == 2, timeout=10.0, what='both')
+    wait_until(lambda: len(shown()) == 2, timeout=60.0, what='both')
     assert shown() == {'a': 'id-1', 'a id-2': 'id-2'}
     Store().save(Record('a', 'memory', MachineSpec('a', 'memory'), **alive()))
-    wait_until(lambda: shown().get('a') is None, timeout=10.0, what='the third')
+    wait_until(lambda: shown().get('a') is None, timeout=60.0, what='the third')
     machine('a', **alive())
     wait_until(lambda: shown() == {'a': 'id-a', 'a id-1': 'id-1', 'a id-2': 'id-2'},
-               timeout=10.0, what='all three')
+               timeout=60.0, what='all three')
     live.delete('a id-2')
-    wait_until(lambda: 'a id-2' not in shown(), timeout=10.0, what='its end')
+    wait_until(lambda: 'a id-2' not in shown(), timeout=60.0, what='its end')
     assert set(Memory.machines) == {'id-a', 'id-1'}
     assert shown() == {'a': 'id-a', 'a id-1': 'id-1'}
 
@@ -185,10 +185,10 @@ def test_nothing_is_polled_while_nobody_watches(monkeypatch: pytest.MonkeyPatch)
     live = Live()
     live.start()
     try:
-        wait_until(lambda: asked and time.monotonic() - asked[-1] > 0.5, timeout=10.0,
+        wait_until(lambda: asked and time.monotonic() - asked[-1] > 0.5, timeout=60.0,
                    what='quiet')
         before = len(asked)
         live.state(-1, 0.0)
-        wait_until(lambda: len(asked) > before, timeout=5.0, what='a look')
+        wait_until(lambda: len(asked) > before, timeout=60.0, what='a look')
     finally:
         live.close()

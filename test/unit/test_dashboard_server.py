@@ -193,7 +193,7 @@ def test_closed_dashboard_waits_for_no_file() -> None:
     assert ask(dashboard, '/')[0] == 200
     dashboard.close()
     # a thread that waits for the closed socket's number keeps the next file with it open
-    thread.join(10.0)
+    thread.join(60.0)
     assert not thread.is_alive()
     dashboard.close()
 

@@ -117,7 +117,7 @@ def test_sudo_ticket_is_kept_while_a_script_runs(tmp_path):
         stdin=subprocess.PIPE, env={**os.environ, 'PATH': f'{tmp_path}:{os.environ["PATH"]}'})
     try:
         wait_until(lambda: said.exists() and '-n -v' in said.read_text().splitlines(),
-                   timeout=20.0, what='sudo to be asked for more time')
+                   timeout=60.0, what='sudo to be asked for more time')
     finally:
         script.communicate(b'\n')
 

@@ -231,7 +231,7 @@ def test_stopped_machine_is_no_leftover_and_gets_a_new_lifetime(gce, stopped):
     machine = provider.create(spec, request_for(spec, **{TAG_ON_EXIT: 'stop'}))
     provider.stop(machine)
     if stopped:
-        wait_until(lambda: provider.describe(machine).state is MachineState.STOPPED, timeout=5,
+        wait_until(lambda: provider.describe(machine).state is MachineState.STOPPED, timeout=60,
                    what='it to be stopped')
     again = dataclasses.replace(SPEC, lifetime=60.0)
     provider.adopt(machine, again, {TAG_ON_EXIT: 'delete'})

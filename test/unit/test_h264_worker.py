@@ -17,19 +17,19 @@ def test_the_newest_waits_and_what_is_older_goes() -> None:
 
     def work(item: int) -> None:
         begun.set()
-        assert go.wait(5)
+        assert go.wait(60)
         seen.append(item)
         if item == 4:
             last.set()
 
     worker = Worker('test', work, lambda: None)
     worker.put(1)
-    assert begun.wait(5)
+    assert begun.wait(60)
     for item in (2, 3, 4):
         worker.put(item)
     assert worker.waiting == 1
     go.set()
-    assert last.wait(5)
+    assert last.wait(60)
     worker.stop()
     assert seen == [1, 4]
 
@@ -44,7 +44,7 @@ def test_a_thread_that_ends_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
     worker = Worker('test', work, failed.set)
     worker.put(7)
-    assert failed.wait(5)
+    assert failed.wait(60)
     worker.stop()
     assert told == ['item 7']
 

@@ -122,7 +122,7 @@ def test_samples_count_processes_with_the_mark_alone():
     busy = 'import sys\nwhile True: sum(range(10 ** 5))'
     with subprocess.Popen([sys.executable, '-c', busy], env={**os.environ, MARK: mark}) as process:
         try:
-            wait_until(lambda: computed(marked(mark)) > 0.2, timeout=20, what='work')
+            wait_until(lambda: computed(marked(mark)) > 0.2, timeout=60, what='work')
         finally:
             process.kill()
     assert computed(marked(mark)) == 0.0 == computed([str(process.pid)])
@@ -131,17 +131,23 @@ def test_samples_count_processes_with_the_mark_alone():
 
 def test_thread_that_others_keep_from_the_processor_is_ready():
     mark = f'ready-{os.getpid()}'
-    codes = {'works': 'while True: pass', 'waits': 'import time; time.sleep(1e6)'}
+    codes = {'works': 'while True: pass', 'waits': 'print(flush=True); input()'}
     with contextlib.ExitStack() as stack:
         threads = {}
         for name, code in codes.items():
             child = stack.enter_context(subprocess.Popen(
-                ['nice', '-n', '19', sys.executable, '-c', code], env={**os.environ, MARK: mark}))
+                ['nice', '-n', '19', sys.executable, '-c', code], stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE, env={**os.environ, MARK: mark}))
             stack.callback(child.kill)
             threads[name] = str(child.pid)
-        wait_until(lambda: computed([threads['works']]) > 0.0, timeout=20, what='work')
+        wait_until(lambda: computed([threads['works']]) > 0.0, timeout=60, what='work')
+        assert child.stdout is not None and child.stdout.readline() == b'\n'
+        # one that still starts would be ready too
+        stat = Path('/proc', threads['waits'], 'stat')
+        wait_until(lambda: stat.read_text().rpartition(')')[2].split()[0] == 'S', timeout=60,
+                   what='the one that waits')
         begin, before = time.monotonic(), ready(marked(mark))
-        wait_until(lambda: time.monotonic() - begin > 1.0, timeout=5, what='a second')
+        wait_until(lambda: time.monotonic() - begin > 1.0, timeout=60, what='a second')
         after, passed = ready(marked(mark)), time.monotonic() - begin
     assert after[threads['works']] - before[threads['works']] > idle.READY * passed
     assert after[threads['waits']] - before[threads['waits']] < idle.READY * passed
@@ -165,7 +171,7 @@ def test_terminal_of_the_user_is_seen():
             preexec_fn=lambda: __import__('fcntl').ioctl(0, __import__('termios').TIOCSCTTY, 0),
     ) as process:
         try:
-            wait_until(lambda: has_terminal(user), timeout=10, what='the terminal')
+            wait_until(lambda: has_terminal(user), timeout=60, what='the terminal')
         finally:
             process.kill()
             os.close(ours)

@@ -25,6 +25,7 @@ from fogros2.errors import Cancelled, DeadlineExceeded, PrerequisiteError
 from fogros2.kubernetes_client import ApiError, Unreachable
 from fogros2.store import Store
 from fogros2.testing.shell_contract import raised
+from fogros2.waiting import ON_ITS_WAY
 
 pytest.importorskip('kubernetes', reason='needs the client: pip install kubernetes')
 
@@ -62,7 +63,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
             self.end_headers()
             for event in what:
                 if event == 'hold':
-                    self.server.ended.wait(20.0)
+                    self.server.ended.wait(60.0)
                     break
                 line = json.dumps(event).encode() + b'\n'
                 self.wfile.write(f'{len(line):x}\r\n'.encode() + line + b'\r\n')
@@ -214,7 +215,7 @@ def test_a_server_that_does_not_answer_is_given_up(tmp_path, monkeypatch):
     api = kubernetes_client.connect()
     begin = time.monotonic()
     error = raised(Unreachable, lambda: api.request('GET', '/x', timeout=0.5))
-    assert 0.4 < time.monotonic() - begin < 10.0
+    assert 0.4 < time.monotonic() - begin < 30.0
     assert 'Connection refused' in str(error)
     assert '0x' not in str(error)
 
@@ -276,7 +277,7 @@ def test_a_watch_ends_with_the_launch_and_by_its_deadline(api, server):
     timer.join()
     raised(DeadlineExceeded, lambda: follow(api, lambda kind, thing: None, timeout=0.3))
     # nobody waits for a thread that reads on
-    assert time.monotonic() - begin < 3.0
+    assert time.monotonic() - begin < ON_ITS_WAY
     assert not [thread for thread in threading.enumerate() if thread.name == 'fog-watch']
 
 
@@ -297,12 +298,12 @@ def test_ctrl_c_ends_a_request_without_an_answer(api, server, call):
 
     def silent() -> Answer:
         asked.set()
-        server.ended.wait(20.0)
+        server.ended.wait(60.0)
         return 200, {}
 
     server.answers = [silent]
     cancel = threading.Event()
-    interrupting = threading.Thread(target=lambda: (asked.wait(10.0), cancel.set()))
+    interrupting = threading.Thread(target=lambda: (asked.wait(60.0), cancel.set()))
     interrupting.start()
     begin = time.monotonic()
     if call == 'request':
@@ -310,7 +311,7 @@ def test_ctrl_c_ends_a_request_without_an_answer(api, server, call):
     else:
         raised(Cancelled, lambda: follow(api, lambda kind, thing: None, cancel=cancel))
     interrupting.join()
-    assert time.monotonic() - begin < 3.0
+    assert time.monotonic() - begin < ON_ITS_WAY
 
 
 def test_what_is_made_just_after_a_ctrl_c_is_known(api, server):

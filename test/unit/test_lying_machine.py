@@ -104,7 +104,7 @@ def test_command_starts_anew_after_its_connection_was_closed(monkeypatch):
     monkeypatch.setattr(shell, '_connect', lambda *_: transport)
     monkeypatch.setattr(shell, '_session', lambda *_: next(channels))
     shell.start('true')
-    assert [line.endswith('exec true') for line in started] == [True]
+    assert len(started) == 1 and 'exec true' in started[0]
     with pytest.raises(ConnectError, match='can not start a command'):
         shell.start('true')
 

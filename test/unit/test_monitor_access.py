@@ -193,7 +193,7 @@ def test_silent_connection_does_not_hold_up_the_browser():
             assert link.getresponse().status == 303
         closing = threading.Thread(target=ticket.close, daemon=True)
         closing.start()
-        closing.join(5)
+        closing.join(60)
         assert not closing.is_alive()
 
 

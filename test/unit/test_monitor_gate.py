@@ -199,7 +199,7 @@ class Running:
         return self._lines.get(timeout=20)
 
     def ended(self) -> list[str]:
-        self._reader.join(20)
+        self._reader.join(60)
         return list(self._lines.queue)
 
 
@@ -218,7 +218,7 @@ def running(folder: Path, to: int, *words: str) -> Iterator[Running]:
         yield Running(process, folder)
     finally:
         process.terminate()
-        assert process.wait(20) == 0
+        assert process.wait(60) == 0
         process.stdout.close()
 
 

@@ -35,7 +35,7 @@ def echo() -> Iterator[int]:
         thread.start()
         yield listener.getsockname()[1]
         listener.shutdown(socket.SHUT_RDWR)
-        thread.join(10)
+        thread.join(60)
 
 
 @contextlib.contextmanager
@@ -49,7 +49,7 @@ def tunnel(port: int) -> Iterator[tuple[int, list[str]]]:
         yield made.port, said
     finally:
         made.close()
-        thread.join(10)
+        thread.join(60)
         shell.close()
         assert not thread.is_alive()
 

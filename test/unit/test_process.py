@@ -67,7 +67,7 @@ def test_command_under_sudo_ends_with_its_children(as_user: None, script: str) -
     def gone() -> bool:
         return not any(seconds.encode() in words(entry) for entry in Path('/proc').glob('[0-9]*'))
 
-    wait_until(gone, timeout=5.0, what='the sleep to be gone')
+    wait_until(gone, timeout=60.0, what='the sleep to be gone')
 
 
 def words(entry: Path) -> bytes:

@@ -68,7 +68,7 @@ def test_program_of_a_node_maps_no_library_of_ros(program: Sequence[str]) -> Non
         # it waits in system call 0, read: the dynamic linker has done its work
         wait_until(lambda: child.joinpath('syscall').read_text().startswith('0 ')
                    and 'State:\tS' in child.joinpath('status').read_text(),
-                   what='the program to read', timeout=30)
+                   what='the program to read', timeout=60)
         maps = child.joinpath('maps').read_text()
         node.communicate()
     assert 'libc.so' in maps and str(PREFIX) not in maps

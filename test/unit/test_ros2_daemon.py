@@ -65,7 +65,7 @@ def test_stop_waits_for_the_end_of_the_daemon(tmp_path: Path) -> None:
     ros2_daemon.stop(tmp_path)
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(('127.0.0.1', port_of(tmp_path)))
-    thread.join(5)
+    thread.join(60)
     assert not thread.is_alive()
 
 

@@ -47,7 +47,7 @@ def test_the_end_script_ends_a_group():
                    check=True, timeout=10)
     subprocess.run(['sh', '-c', command_line.end_script(child.pid)], check=False, timeout=20,
                    stderr=subprocess.DEVNULL)
-    assert child.wait(10) == -signal.SIGKILL
+    assert child.wait(60) == -signal.SIGKILL
 
 
 @pytest.mark.parametrize('path, quoted', [

@@ -66,13 +66,13 @@ def test_hanging_region_does_not_delay_the_others(network: Callable[..., None]) 
 
     def connect(host: str, port: int, timeout: float) -> float:
         if 'us-east-1' in host:
-            over.wait(30)
+            over.wait(60)
         return 0.05
 
     network(connect, DEADLINE=0.2)
     begin = time.monotonic()
     found = AWS.measure(['us-east-1', 'us-west-1'])
-    assert time.monotonic() - begin < 5
+    assert time.monotonic() - begin < 30
     assert [one.region for one in found] == ['us-west-1', 'us-east-1']
     over.set()
 
@@ -82,13 +82,13 @@ def test_nearest_region_does_not_wait_for_far_ones(network: Callable[..., None])
 
     def connect(host: str, port: int, timeout: float) -> float:
         if 'us-east-1' in host:
-            over.wait(30)
+            over.wait(60)
         return 0.05
 
-    network(connect, DEADLINE=20.0)
+    network(connect, DEADLINE=60.0)
     begin = time.monotonic()
     found = AWS.measure(['us-east-1', 'us-west-1', 'xx'], grace=0.1)
-    assert time.monotonic() - begin < 10
+    assert time.monotonic() - begin < 30
     assert found[0].region == 'us-west-1' and found[-1].milliseconds is None
     over.set()
 
@@ -156,13 +156,13 @@ def test_a_connection_is_timed_without_its_look_up(monkeypatch: pytest.MonkeyPat
     real = socket.getaddrinfo
 
     def slow(*words: object, **more: object) -> object:
-        time.sleep(0.3)
+        time.sleep(1.0)
         return real('127.0.0.1', port, type=socket.SOCK_STREAM)
 
     with socket.create_server(('127.0.0.1', 0)) as server:
         port = server.getsockname()[1]
         monkeypatch.setattr(socket, 'getaddrinfo', slow)
-        assert regions.connect_time('ec2.nowhere.amazonaws.com', port, 2.0) < 0.25
+        assert regions.connect_time('ec2.nowhere.amazonaws.com', port, 20.0) < 0.9
     with pytest.raises(OSError):
         regions.connect_time('ec2.nowhere.amazonaws.com', port, 2.0)
 

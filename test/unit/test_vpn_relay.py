@@ -62,7 +62,7 @@ def test_packets_pass_both_ways_and_a_rebind_moves_the_client(relay: ModuleType)
         try:
             for one in (target, client):
                 one.bind(('127.0.0.1', 0))
-                one.settimeout(5.0)
+                one.settimeout(60.0)
             link = relay.Relay(target.getsockname())
             address = await link.start(('127.0.0.1', 0))
             got, ports = [], set()
@@ -93,7 +93,7 @@ def test_relay_adds_less_than_a_millisecond(
     async def run() -> list[float]:
         pending, late = relay.Pending(), []
         try:
-            for _ in range(30):
+            for _ in range(300):
                 came = asyncio.Event()
                 begin = time.monotonic()
                 pending.add(begin + 2e-4, came.set)
@@ -119,7 +119,7 @@ def test_packets_under_way_overtake_each_other_by_their_times(relay: ModuleType)
             pending.add(now + 0.03, lambda: done.set_result(None))
             for delay, name in ((0.02, 'c'), (0.01, 'a'), (0.01, 'b'), (-1.0, 'first')):
                 pending.add(now + delay, functools.partial(order.append, name))
-            await asyncio.wait_for(done, 5.0)
+            await asyncio.wait_for(done, 60.0)
         finally:
             pending.close()
         return ' '.join(order)

@@ -111,7 +111,7 @@ def make(cloud: Cloud, box: Any, provider: VmProvider) -> Callable[..., Machine]
         spec = MachineSpec(name, cloud.name, options, on_exit=on_exit)
         machine = provider.reachable(provider.create(
             spec, request_for(spec, **{TAG_ON_EXIT: on_exit})), name=name, timeout=30.0)
-        wait_until(lambda: all(i.ready > 0 for i in box.alive()), timeout=20, what='SSH servers')
+        wait_until(lambda: all(i.ready > 0 for i in box.alive()), timeout=60, what='SSH servers')
         return machine
     return made
 

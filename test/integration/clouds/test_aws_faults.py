@@ -30,7 +30,6 @@ UBUNTU = 'ID=ubuntu\nVERSION_ID="24.04"\nVERSION_CODENAME=noble\nUBUNTU_CODENAME
 SLEEPS = '#!/bin/sh\necho "$0 $*" >>/tmp/slow.$(id -u)\nexec sleep 600\n'
 
 
-@pytest.mark.timeout(240)
 def test_instance_ends_whose_robot_vanished_early(robot, box, name, tmp_path):
     """In the boot, while ROS is installed, and while the workspace is on its way."""
     installing, syncing = 'ami-0bbbbbbbbbbbbbbbb', 'ami-0cccccccccccccccc'
@@ -57,7 +56,7 @@ def test_instance_ends_whose_robot_vanished_early(robot, box, name, tmp_path):
         wait_until(lambda: instance('boot'), timeout=60, what='a machine that boots')
     finally:
         os.killpg(booting.pid, signal.SIGKILL)
-        booting.wait(10)
+        booting.wait(60)
 
     def slow(phase, word):
         assert runs[phase].child.poll() is None, runs[phase].text

@@ -8,7 +8,6 @@ import pytest
 from fogros2.waiting import wait_until
 
 CLOUDS = ('aws',)
-pytestmark = pytest.mark.timeout(120)
 
 
 @pytest.mark.soak  # the choice by FogROS2's own launch file is the same
@@ -31,10 +30,10 @@ def test_the_nearest_region_and_the_cheapest_type(robot, box, name):
 def test_a_robot_that_moves_during_the_boot_is_let_in(robot, box, name):
     box.set_boot_delay(5.0)
     run = robot.launch('fogros2_examples', 'talker.aws.launch.py', f'name:={name}', 'count:=1')
-    wait_until(box.alive, timeout=30, what='an instance')
+    wait_until(box.alive, timeout=60, what='an instance')
     box.move_robot()
     try:
-        assert run.ended(90) == 0, run.text
+        assert run.ended() == 0, run.text
         assert run.clean, run.text
     finally:
         box.move_robot(back=True)

@@ -11,7 +11,6 @@ pytest.importorskip('ompl', reason='ompl is in the extra applications')
 pytest.importorskip('fcl', reason='python-fcl is in the extra applications')
 
 CLOUDS = ('aws',)
-pytestmark = pytest.mark.timeout(120)
 
 
 def test_motion_planning(robot, box, tmp_path):

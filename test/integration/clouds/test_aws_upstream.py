@@ -6,10 +6,7 @@ from __future__ import annotations
 import difflib
 from pathlib import Path
 
-import pytest
-
 CLOUDS = ('aws',)
-pytestmark = pytest.mark.timeout(120)
 
 #: Ours, with what FogROS2's talker.aws.launch.py uses: a release that the robot doesn't have, an
 #: image by its id, and entities that are added one by one.

@@ -6,7 +6,6 @@ from __future__ import annotations
 import pytest
 
 CLOUDS = ('azure',)
-pytestmark = pytest.mark.timeout(120)
 
 #: A launch file of the form that FogROS2's pull request 109 shows.
 PULL_REQUEST = '''\

@@ -13,7 +13,7 @@ from fogros2.model import MachineState
 from fogros2.waiting import wait_until
 
 CLOUDS = ('azure',)
-pytestmark = [pytest.mark.soak, pytest.mark.timeout(120)]
+pytestmark = pytest.mark.soak
 
 
 def test_killed_robot_s_machine_deletes_its_group(robot, box, name):
@@ -56,7 +56,7 @@ def test_machine_waits_until_its_role_works(cloud, box, make, name):
     box.set_rights(owner=True)
     assert 'status' not in box.run(instance.id, f'{ends} || echo status=$?',
                                    check=False)
-    wait_until(lambda: not box.things()['groups'], timeout=20, what='its group to be deleted')
+    wait_until(lambda: not box.things()['groups'], timeout=60, what='its group to be deleted')
 
 
 def test_machine_that_stops_at_its_end_deallocates_itself(cloud, provider, box, make, name):
@@ -68,7 +68,7 @@ def test_machine_that_stops_at_its_end_deallocates_itself(cloud, provider, box, 
     assert provider.describe(machine.id).state is MachineState.STOPPED
     provider.start(machine.id)
     box.wait_for(instance.id, 'running', computer=True)
-    assert provider.reachable(machine.id, name=name, timeout=20).shell == machine.shell
+    assert provider.reachable(machine.id, name=name, timeout=60).shell == machine.shell
     assert box.run(instance.id, 'cat /root/kept').strip() == 'kept'
     provider.destroy(machine.id)
     with pytest.raises(MachineNotFound):

@@ -3,13 +3,10 @@
 
 from __future__ import annotations
 
-import pytest
-
 from rigs.clouds import Gcp, Robot
 from rigs.launched import launching
 
 CLOUDS = ('gcp',)
-pytestmark = pytest.mark.timeout(120)
 
 
 def test_fogros2s_talker_gcp_runs_byte_for_byte(upstream, box, tmp_path):

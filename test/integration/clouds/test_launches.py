@@ -11,13 +11,13 @@ from pathlib import Path
 import re
 import subprocess
 import sys
+import time
 
 import pytest
 
+from fogros2.deploy.steps.watching import POLL_INTERVAL
 from fogros2.waiting import wait_until
 from rigs.computers.network import ROBOT
-
-pytestmark = pytest.mark.timeout(240)
 
 CHECK = Path(__file__).resolve().parents[3] / 'tools' / 'cloud_check.py'
 #: What a cloud may be asked for one launch at the most, from its beginning to its end.
@@ -61,7 +61,7 @@ import socket, sys
 for port in 40000, 8000:
     for kind in socket.SOCK_STREAM, socket.SOCK_DGRAM:
         with socket.socket(socket.AF_INET, kind) as one:
-            one.settimeout(1)
+            one.settimeout(2)
             try:
                 one.connect((sys.argv[1], port))
                 one.send(b'ask')
@@ -86,6 +86,7 @@ def complaint(run):
 
 
 def test_talker_from_nothing_to_nothing(cloud, robot, box, name):
+    begin = time.monotonic()
     run = robot.talker(name)
     run.wait_for(f'I heard: [Hello World from {name} ')
     (instance,) = box.alive()
@@ -115,7 +116,8 @@ def test_talker_from_nothing_to_nothing(cloud, robot, box, name):
     if cloud.price:
         assert f'{name}: ' in run.text and f'h at ${cloud.price} an hour, $' in run.text
     asked = cloud.asked(box)
-    assert len(asked) - looked <= CALLS, asked
+    # it looks at its machine as long as that runs
+    assert len(asked) - looked <= CALLS + (time.monotonic() - begin) / POLL_INTERVAL, asked
 
 
 @pytest.mark.parametrize('cloud', [
@@ -211,12 +213,12 @@ def test_kept_machine_is_a_host_for_the_robots_of_its_fleet(cloud, robot, box, n
     def reached():
         done = robot.run([
             'ssh', '-i', str(key), '-F', '/dev/null', '-o', 'BatchMode=yes',
-            '-o', 'ConnectTimeout=3', '-o', 'StrictHostKeyChecking=yes',
+            '-o', 'ConnectTimeout=10', '-o', 'StrictHostKeyChecking=yes',
             '-o', f'UserKnownHostsFile={known}', f'ubuntu@{instance.public}', 'sudo whoami'])
         asked = robot.run([sys.executable, '-c', ASK, instance.public])
         return [*done.stdout.split(), *asked.stdout.splitlines()]
 
-    wait_until(lambda: len(reached()) == 3, timeout=20, what='the ports to answer')
+    wait_until(lambda: len(reached()) == 3, timeout=60, what='the ports to answer')
     run.interrupt()
     assert run.ended() == 0, run.text
     assert reached() == ['root', '40000 STREAM', '40000 DGRAM']
@@ -235,7 +237,7 @@ def test_kept_machine_is_a_host_for_the_robots_of_its_fleet(cloud, robot, box, n
     # after a reboot, it waits for no launch, which would end it
     box.run(instance.id, 'touch /run/before; reboot', check=False)
     wait_until(lambda: 'no launch has this machine' in box.run(
-        instance.id, ASK_AGENT, check=False), timeout=30, what='the agent after the reboot')
+        instance.id, ASK_AGENT, check=False), timeout=60, what='the agent after the reboot')
     robot.fog('delete', '--yes', name)
 
 
@@ -259,7 +261,7 @@ def test_spot_machines_are_taken_away(cloud, robot, box, name):
     moves.wait_for(f'I heard: [Hello World from {os.uname().nodename} ')
     moves.interrupt()
     assert moves.ended() == 0, moves.text
-    wait_until(lambda: not robot.things(), timeout=30, what='nothing to be left')
+    wait_until(lambda: not robot.things(), timeout=60, what='nothing to be left')
 
 
 @pytest.mark.soak
@@ -274,14 +276,14 @@ def test_new_spot_machine_replaces_a_reclaimed_one(cloud, robot, box, name):
     run.wait_for(f"the machine '{name}' is {'being reclaimed' if cloud.name == 'aws' else ''}",
                  timeout=60)
     run.wait_for(f'I heard: [Hello World from {os.uname().nodename} ')
-    run.wait_for(f'{name}: a new machine runs the nodes', timeout=90)
+    run.wait_for(f'{name}: a new machine runs the nodes')
     heard = run.text.count(f'I heard: [Hello World from {name} ')
     run.wait_for(f'I heard: [Hello World from {name} ', times=heard + 1)
     (second,) = box.alive()
     assert second.id != first.id and second.spot
     run.interrupt()
     assert run.ended() == 0, run.text
-    wait_until(lambda: not robot.things(), timeout=30, what='nothing to be left')
+    wait_until(lambda: not robot.things(), timeout=60, what='nothing to be left')
 
 
 @pytest.mark.soak
@@ -294,7 +296,7 @@ def test_machine_ends_whose_robot_was_killed(cloud, robot, box, name):
     # what the machine can't take along goes with the robot's record of it
     robot.fog('gc')
     robot.fog('delete', '--yes', 'all')
-    wait_until(lambda: not box.alive() and not robot.things(), timeout=30,
+    wait_until(lambda: not box.alive() and not robot.things(), timeout=60,
                what='nothing to be left')
 
 
@@ -311,7 +313,6 @@ def test_launch_gets_round_what_passes(cloud, robot, box, name):
 
 
 @pytest.mark.soak
-@pytest.mark.timeout(400)
 def test_fault_at_each_step_leaves_nothing(cloud, robot, box, name):
     for number, (code, words, fails) in enumerate(cloud.faults):
         box.fail(code, **words)
@@ -319,7 +320,7 @@ def test_fault_at_each_step_leaves_nothing(cloud, robot, box, name):
         assert run.ended() != 0 or not fails, f'{code} {words}: {run.text}'
         assert 'Traceback' not in run.text, run.text
         box.heal()
-        wait_until(lambda: not box.alive() and not robot.things(), timeout=30,
+        wait_until(lambda: not box.alive() and not robot.things(), timeout=60,
                    what=f'nothing to be left after {code} {words}')
 
 
@@ -389,7 +390,7 @@ def test_known_problems_are_reported_before_creation(cloud, robot, box, name):
 
 @pytest.mark.soak
 def test_cloud_check_runs_the_talker_and_deletes_it(cloud, robot, box):
-    done = robot.run([sys.executable, str(CHECK), cloud.name], timeout=150, YES='1')
+    done = robot.run([sys.executable, str(CHECK), cloud.name], YES='1')
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stderr == '' and cloud.checked in done.stdout
     if cloud.price:

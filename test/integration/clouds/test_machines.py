@@ -13,7 +13,7 @@ from fogros2.errors import FogError, MachineNotFound
 from fogros2.model import MachineState
 from fogros2.waiting import wait_until
 
-pytestmark = [pytest.mark.soak, pytest.mark.timeout(120)]
+pytestmark = pytest.mark.soak
 
 #: Looks at all ports below 1024, and some above, of the address that it is given.
 SCAN = """
@@ -68,7 +68,7 @@ def test_cancelled_creation_leaves_nothing(provider, box, make, name):
     provider.cancel = None
     for machine in provider.find({'fogros2-name': name}):
         provider.destroy(machine.id)
-    wait_until(lambda: not box.alive(), timeout=20, what='the machine to end')
+    wait_until(lambda: not box.alive(), timeout=60, what='the machine to end')
 
 
 def test_spot_machine_gets_the_notice_and_is_deleted(provider, box, make, name):
@@ -84,10 +84,10 @@ def test_spot_machine_gets_the_notice_and_is_deleted(provider, box, make, name):
     box.interrupt(instance.id, notice=4.0)
     assert noticed()
     assert provider.reclaims(machine.id) == (provider.name == 'aws')
-    box.wait_for(instance.id, 'terminated', timeout=20)
+    box.wait_for(instance.id, 'terminated', timeout=60)
     with pytest.raises(MachineNotFound):
         wait_until(lambda: provider.describe(machine.id).state is MachineState.DELETED,
-                   timeout=5, what='the end')
+                   timeout=60, what='the end')
         assert provider.reclaims(machine.id)
         raise MachineNotFound('EC2 still reports an instance that has ended')
     provider.destroy(machine.id)
@@ -99,15 +99,15 @@ def test_stopped_machine_keeps_its_disk(provider, box, make, name):
     box.run(instance.id, 'echo kept >/root/kept; sync')
     provider.stop(machine.id)
     box.wait_for(instance.id, 'stopped', 'deallocated')
-    wait_until(lambda: provider.describe(machine.id).state is MachineState.STOPPED, timeout=10,
+    wait_until(lambda: provider.describe(machine.id).state is MachineState.STOPPED, timeout=60,
                what='the stop to be reported')
     provider.start(machine.id)
     box.wait_for(instance.id, 'running', computer=True)
-    assert provider.reachable(machine.id, name=name, timeout=20).shell.host_key \
+    assert provider.reachable(machine.id, name=name, timeout=60).shell.host_key \
         == machine.shell.host_key
     assert box.run(instance.id, 'cat /root/kept').strip() == 'kept'
     provider.destroy(machine.id)
     with pytest.raises(MachineNotFound):
         wait_until(lambda: provider.describe(machine.id).state is MachineState.DELETED,
-                   timeout=5, what='the end')
+                   timeout=60, what='the end')
         raise MachineNotFound('EC2 still reports an instance that has ended')

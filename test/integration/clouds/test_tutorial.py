@@ -24,7 +24,6 @@ FILE = 'first.launch.py'
 SET_UP = re.compile(r'VIRTUAL_ENV|PATH|PYTHONPATH|LD_LIBRARY_PATH|(ROS|AMENT|COLCON|CMAKE)_.*')
 
 CLOUDS = ('aws',)
-pytestmark = pytest.mark.timeout(180)
 
 
 class Tutorial:

@@ -52,7 +52,7 @@ def start(vpn: Lab, words: tuple[str, ...], *topics: str, host: str = 'machine')
     child = vpn.start(host, [*words, sys.executable, str(NODE), *topics],
                       group=vpn.interfaces[host].name, ROS_LOG_DIR=str(vpn.folder),
                       HOME=str(vpn.folder), **vpn.configure(host))
-    child.wait('ready', timeout=20.0)
+    child.wait('ready', timeout=60.0)
     return child
 
 

@@ -32,7 +32,7 @@ def test_robot_and_machine_hear_each_other_and_the_lan_goes_on(hosts: Hosts) -> 
     machine = hosts.node('machine', 'from:/up', 'to:/down')
     for child, topic in ((machine, '/up'), (robot, '/down'), (beside, '/local'),
                          (lan, '/to_lan'), (robot, '/from_lan'), (terminal, '/to_lan')):
-        child.wait('topic', topic, count=3, timeout=15.0)
+        child.wait('topic', topic, count=3, timeout=60.0)
     assert len(lan.lines('topic', '/up')) == 0
 
 
@@ -49,5 +49,5 @@ def test_machines_hear_each_other_and_a_router_may_die(hosts: Hosts) -> None:
     first.stop()
     hosts.router('machine')
     since = hearer.lines('topic', '/all')[-1]['arrival']
-    hearer.wait('topic', '/all', count=3, after=since + 0.5, timeout=15.0)
-    second.wait('topic', '/over', count=3, after=since + 0.5, timeout=15.0)
+    hearer.wait('topic', '/all', count=3, after=since + 0.5, timeout=60.0)
+    second.wait('topic', '/over', count=3, after=since + 0.5, timeout=60.0)

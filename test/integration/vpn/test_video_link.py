@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import math
 import os
 from pathlib import Path
 import sys
@@ -53,14 +54,14 @@ def stream(
     start(vpn, 'machine', str(scripts / 'decoder'), '--ros-args', '-r', f'image:=/seen{topic}',
           *(('-p', f'links:="{links}"') if links else ()), *common)
     viewer = start(vpn, 'machine', str(HERE / 'video_node.py'), 'viewer', f'/seen{topic}')
-    start(vpn, 'robot', str(HERE / 'video_node.py'), 'camera', topic).wait('ready', timeout=30.0)
-    viewer.wait('image', count=images, timeout=30.0)
+    start(vpn, 'robot', str(HERE / 'video_node.py'), 'camera', topic).wait('ready', timeout=60.0)
+    viewer.wait('image', count=images, timeout=90.0)
     return viewer
 
 
 def during(viewer: Any, begin: float, seconds: float) -> list[dict[str, Any]]:
     """Return what arrived in a stretch of time that may not be over yet."""
-    wait_until(lambda: time.monotonic() > begin + seconds, timeout=seconds + 5.0,
+    wait_until(lambda: time.monotonic() > begin + seconds, timeout=seconds + 30.0,
                what='the stretch to be over')
     return [line for line in viewer.lines('image')
             if begin <= line['arrival'] < begin + seconds]
@@ -71,24 +72,31 @@ def test_the_link_drops_from_10_to_1_megabit_and_returns(vpn: Any) -> None:
     vpn.relay.tell({'rate': 10e6, 'queue': 1.0})
     # a quality that takes about 3 Mbit/s
     viewer = stream(vpn, '-p', 'quality:=14.0')
+
+    def stretch() -> tuple[int, float]:
+        latencies = sorted(line['latency'] for line in during(viewer, time.monotonic(), 2.0))
+        return len(latencies), latencies[len(latencies) // 2] if latencies else math.inf
+
+    # 60 on an idle computer, within 0.05 s
+    images, latency = stretch()
     vpn.relay.tell({'rate': 1e6})
     begin = time.monotonic()
 
     def squeezed() -> bool:
         lines = during(viewer, max(begin + 2.0, time.monotonic()), 4.0)
-        # about 40 on an idle computer; a busy one encodes fewer
-        assert len(lines) > 10
         latencies = sorted(line['latency'] for line in lines)
-        assert latencies[-1] < 1.2
-        # 0.3 to 0.4 on an idle computer; the queue takes 1.0
-        return latencies[len(latencies) // 2] < 0.6
+        # about 40 images on an idle computer, half of them within 0.3 to 0.4; the queue takes 1.0
+        return len(lines) > 10 and latencies[len(lines) // 2] < 0.6 and latencies[-1] < 1.2
+
+    def recovered() -> bool:
+        again, late = stretch()
+        return again > 0.75 * images and late < latency + 0.1
 
     # in the first stretch on an idle computer; a busy one's encoder adapts late
-    wait_until(squeezed, timeout=30.0, what='a stream that fits')
+    wait_until(squeezed, timeout=60.0, what='a stream that fits')
     vpn.relay.tell({'rate': 10e6})
-    back = during(viewer, time.monotonic() + 5.0, 2.0)
-    assert len(back) > 45
-    assert sorted(line['latency'] for line in back)[len(back) // 2] < 0.15
+    # after about 5 s on an idle computer
+    wait_until(recovered, timeout=60.0, what='the stream of before')
 
 
 def test_late_subscriber_of_a_budget_spoils_no_stream(vpn: Any) -> None:
@@ -110,13 +118,22 @@ def test_late_subscriber_of_a_budget_spoils_no_stream(vpn: Any) -> None:
     # the right stream begins before it knows the left one; without a budget it is 5 Mbit/s all
     # the time, and the queue of the link fills up
     assert 8 * size / seconds < 4.5e6
-    arrivals = [line['arrival'] for line in both]
-    # 30 images a second on an idle computer; a busy one encodes fewer
-    assert len(arrivals) > 4 * seconds
-    gaps = sorted(after - one for one, after in zip(arrivals, arrivals[1:]))
-    # usually 0.1 to 0.3 s; the start of the right stream may cost the left one a key picture
-    assert gaps[-2] < 1.0 and gaps[-1] < 5.0
-    assert len(during(right, time.monotonic() - 5.0, 5.0)) > 20
+    assert len(both) > seconds
+
+    def gap(lines: list[dict[str, Any]]) -> float:
+        arrivals = [line['arrival'] for line in lines]
+        return max(after - one for one, after in zip(arrivals, arrivals[1:]))
+
+    # the start of the right stream may cost the left one a key picture
+    assert gap(both) < 15.0
+
+    def flow() -> bool:
+        begin = time.monotonic()
+        lines = during(left, begin, 4.0), during(right, begin, 4.0)
+        # 30 images a second on an idle computer, 0.1 s apart at the most; a busy one has fewer
+        return all(len(one) > 20 and gap(one) < 1.0 for one in lines)
+
+    wait_until(flow, timeout=60.0, what='two streams that flow')
 
 
 @pytest.mark.parametrize('delay', [0.0, 0.05])
@@ -143,18 +160,17 @@ def test_jpeg_fills_link_and_never_queues(vpn: Any, rate: float, delay: float) -
     viewer = stream(vpn, codec='jpeg')
     wire = wire_seconds(rate)
 
-    def full() -> Any:
+    def full() -> bool:
         lines = during(viewer, time.monotonic() + 2.0, 5.0)
-        return lines if len(lines) >= 0.6 * 5.0 / wire else None
+        numbers = [line['image'] for line in lines]
+        assert numbers == sorted(set(numbers))
+        latencies = sorted(line['latency'] - delay for line in lines)
+        # its own time on the wire, twice: before it leaves, it waits for the one before
+        return len(lines) >= 0.6 * 5.0 / wire \
+            and latencies[len(latencies) // 2] < 3 * wire + 1 / 30 and latencies[-1] < 0.8
 
     # a busy computer may have no time for that many images at first
-    lines = wait_until(full, timeout=90.0, what='a full link')
-    numbers = [line['image'] for line in lines]
-    assert numbers == sorted(set(numbers))
-    latencies = sorted(line['latency'] - delay for line in lines)
-    # its own time on the wire, twice: before it leaves, it waits for the one before
-    assert latencies[len(latencies) // 2] < 3 * wire + 1 / 30
-    assert latencies[-1] < 0.8
+    wait_until(full, timeout=90.0, what='a full link without a queue')
 
 
 @pytest.fixture
@@ -177,12 +193,16 @@ def test_raw_best_effort_images_arrive_whole(receive_buffers: None, lab: Any) ->
     lab.link('robot', 'e9', '192.0.2.10/24', 'machine', 'e9', '192.0.2.11/24')
     lab.connect(f"192.0.2.11:{lab.interfaces['machine'].port}")
     viewer = start(lab, 'machine', str(HERE / 'video_node.py'), 'viewer', 'best_effort')
-    viewer.wait('ready', timeout=30.0)
+    viewer.wait('ready', timeout=60.0)
     start(lab, 'robot', str(HERE / 'video_node.py'), 'camera', 'best_effort')
     viewer.wait('image', count=10, timeout=60.0)
-    lines = during(viewer, time.monotonic(), 5.0)
-    expected = lines[-1]['image'] - lines[0]['image'] + 1
-    assert len(lines) >= 0.8 * expected and expected > 25
+
+    def whole() -> bool:
+        lines = during(viewer, time.monotonic(), 5.0)
+        expected = lines[-1]['image'] - lines[0]['image'] + 1 if lines else 0
+        return len(lines) >= 0.8 * expected and expected > 25
+
+    wait_until(whole, timeout=60.0, what='images without a loss')
 
 
 def test_losses_cost_neither_pictures_nor_pixels(vpn: Any) -> None:
@@ -206,7 +226,7 @@ def test_losses_cost_neither_pictures_nor_pixels(vpn: Any) -> None:
             and median(lossy) < median(whole) + 0.05
 
     # 120 images on an idle computer; a busy one encodes fewer, and not always as many
-    wait_until(compared, timeout=30.0, what='two stretches with as many images')
+    wait_until(compared, timeout=90.0, what='two stretches with as many images')
     # smears would show at once: they cost tens of decibels
     assert len(pictures) > 2
     assert min(pictures) > 30

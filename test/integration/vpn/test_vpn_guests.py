@@ -24,7 +24,7 @@ def test_two_robots_hear_a_machine_and_not_each_other(vpn: Lab, guest: Guest) ->
     second = vpn.node('guest', 'to:/two', 'from:/map', 'from:/one')
     for child, topic in ((machine, '/one'), (machine, '/two'), (robot, '/map'),
                          (second, '/map')):
-        child.wait('topic', topic, count=5, timeout=20.0)
+        child.wait('topic', topic, count=5, timeout=60.0)
     assert robot.lines('topic', '/two') == [] and second.lines('topic', '/one') == []
 
 
@@ -33,4 +33,4 @@ def test_guest_comes_before_the_nodes_of_the_machine(vpn: Lab, guest: Guest) -> 
     guest.up()
     second = vpn.node('guest', 'from:/map')
     vpn.node('machine', 'to:/map')
-    second.wait('topic', '/map', count=5, timeout=20.0)
+    second.wait('topic', '/map', count=5, timeout=60.0)

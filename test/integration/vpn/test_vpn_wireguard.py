@@ -8,7 +8,6 @@ import os
 from pathlib import Path
 import stat
 import sys
-import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -42,7 +41,7 @@ while True:
             data, sender = key.fileobj.recvfrom(100)
             key.fileobj.sendto(data, sender)
 '''
-#: Prints which of its arguments (udp:host:port, tcp:host:port) answer within half a second.
+#: Prints which of its arguments (udp:host:port, tcp:host:port) answer within three seconds.
 CLIENT = '''
 import select, socket, sys, time
 waiting = {}
@@ -57,7 +56,7 @@ for word in sys.argv[1:]:
     if kind == 'udp':
         one.send(b'x')
     waiting[one] = word
-end = time.monotonic() + 0.5
+end = time.monotonic() + 3.0
 while waiting and time.monotonic() < end:
     streams = [one for one in waiting if one.type == socket.SOCK_STREAM]
     readable, writable, _ = select.select(list(waiting), streams, [], 0.05)
@@ -92,12 +91,15 @@ def test_up_carries_and_down_leaves_nothing(vpn: Lab) -> None:
 
 
 def test_up_again_changes_nothing_and_keeps_the_session(vpn: Lab) -> None:
-    process_id = vpn.wireguard_go('robot')
-    begin = time.monotonic()
+    def handshakes() -> list[object]:
+        status = vpn.run('robot', vpn.vpn.status(vpn.interfaces['robot'])).stdout
+        return [peer['handshake'] for peer in vpn.vpn.parse_status(status).values()]
+
+    process_id, before = vpn.wireguard_go('robot'), handshakes()
     vpn.do('robot', vpn.vpn.up(vpn.interfaces['robot'], vpn.peers()['robot']))
-    assert time.monotonic() - begin < 1.0
     assert vpn.wireguard_go('robot') == process_id
     assert vpn.ping('robot', MACHINE)
+    assert handshakes() == before
     assert vpn.shell('robot', f'nft list table inet {vpn.interfaces["robot"].name}').count(
         'chain ') == 5
 
@@ -140,7 +142,7 @@ def test_another_peer_doesnt_disturb_the_first(vpn: Lab) -> None:
         assert after[key]['handshake'] == peer['handshake']
         assert after[key]['received'] > peer['received']
     vpn.do('robot', vpn.vpn.peers(interface, [second]))
-    assert not vpn.ping('robot', MACHINE)
+    assert not vpn.ping('robot', MACHINE, timeout=1.0)
 
 
 @pytest.mark.parametrize('host', ['robot', 'machine'])
@@ -149,11 +151,11 @@ def test_a_killed_wireguard_go_is_repaired_on_the_same_interface(vpn: Lab, host:
         pytest.skip('this kernel has WireGuard itself')
     assert vpn.ping('robot', MACHINE) and vpn.alive('robot') and vpn.alive('machine')
     index = vpn.shell(host, f'cat /sys/class/net/{vpn.interfaces[host].name}/ifindex')
-    process.run(Command(('kill', '-9', str(vpn.wireguard_go(host))), sudo=True), timeout=5.0)
-    wait_until(lambda: not vpn.alive(host), timeout=5.0, what='the process to be missed')
+    process.run(Command(('kill', '-9', str(vpn.wireguard_go(host))), sudo=True), timeout=60.0)
+    wait_until(lambda: not vpn.alive(host), timeout=60.0, what='the process to be missed')
     vpn.repair(host)
     assert vpn.alive(host)
-    assert vpn.ping('robot', MACHINE, timeout=3.0)
+    assert vpn.ping('robot', MACHINE, timeout=4.0)
     assert index == vpn.shell(host, f'cat /sys/class/net/{vpn.interfaces[host].name}/ifindex')
 
 
@@ -164,10 +166,10 @@ def test_a_new_address_of_the_robot_is_taken_up(vpn: Lab) -> None:
     vpn.ip('-n', space, 'address', 'add', '198.51.100.9/24', 'dev', 'e0')
     assert not vpn.alive('robot')
     vpn.repair('robot')
-    assert vpn.ping('robot', MACHINE, timeout=3.0)
+    assert vpn.ping('robot', MACHINE, timeout=4.0)
     assert vpn.alive('robot')
     vpn.bad(rebind=True)
-    assert vpn.ping('robot', MACHINE, timeout=3.0)
+    assert vpn.ping('robot', MACHINE, timeout=4.0)
 
 
 def test_networks_that_lead_to_no_machine_may_come_and_go(vpn: Lab) -> None:
@@ -184,7 +186,7 @@ def test_networks_that_lead_to_no_machine_may_come_and_go(vpn: Lab) -> None:
     vpn.ip('-n', space, 'route', 'add', '198.51.100.1/32', 'dev', 'e0', 'src', '198.51.100.7')
     assert not vpn.alive('robot')
     vpn.repair('robot')
-    assert vpn.alive('robot') and vpn.ping('robot', MACHINE, timeout=3.0)
+    assert vpn.alive('robot') and vpn.ping('robot', MACHINE, timeout=4.0)
 
 
 def test_a_hijacked_machine_reaches_dds_and_ping_alone(vpn: Lab) -> None:
@@ -210,7 +212,7 @@ def test_a_hijacked_machine_reaches_dds_and_ping_alone(vpn: Lab) -> None:
 
     assert reached() == [f'udp:{ROBOT}:7411']
     assert vpn.ping('machine', ROBOT)
-    assert not vpn.ping('machine', '192.168.77.2')
+    assert not vpn.ping('machine', '192.168.77.2', timeout=1.0)
     # and the other way the robot is answered
     answered = vpn.run('robot', Command((
         sys.executable, '-c', CLIENT, f'udp:{MACHINE}:9000', f'tcp:{MACHINE}:22'))).stdout

@@ -166,7 +166,7 @@ def free_network() -> ipaddress.IPv4Network:
     :raises ClusterError: all are taken.
     """
     routes = json.loads(process.run(Command(('ip', '-j', 'route', 'show', 'table', 'all')),
-                                    timeout=10.0).stdout)
+                                    timeout=60.0).stdout)
     taken = [ipaddress.ip_network(route['dst'], strict=False) for route in routes
              if route.get('dst', 'default') != 'default' and ':' not in route['dst']]
     for text in CABLES:

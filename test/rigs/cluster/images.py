@@ -207,7 +207,7 @@ def _make(
 def why_not_ready(store: Path) -> str:
     """Return why ``READY`` has no ROS in it, '' if it has."""
     # the folder is root's alone
-    return process.run(Command(('cat', str(store / _WHY_NOT)), sudo=True), timeout=10.0).stdout
+    return process.run(Command(('cat', str(store / _WHY_NOT)), sudo=True), timeout=60.0).stdout
 
 
 def _unpack(
@@ -267,7 +267,7 @@ def static_busybox() -> Path:
     if found is None:
         raise PrerequisiteError('busybox not found', 'sudo apt-get install busybox-static')
     # ldd fails for a static program, and has no arrow for a static one that can be relocated
-    libraries = process.run(Command(('ldd', found)), timeout=10.0, check=False).stdout
+    libraries = process.run(Command(('ldd', found)), timeout=60.0, check=False).stdout
     if '=>' in libraries:
         raise PrerequisiteError(
             f'{found} needs shared libraries, which an image with busybox alone does not have',

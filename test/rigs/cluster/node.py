@@ -333,7 +333,7 @@ class Node:
         request = urllib.request.Request(self.plan['server'] + path, headers={
             'Authorization': f'Bearer {self.plan["token"]}'})
         try:
-            with urllib.request.urlopen(request, timeout=5, context=context) as answer:
+            with urllib.request.urlopen(request, timeout=60, context=context) as answer:
                 return str(answer.read().decode())
         except OSError:
             return ''
@@ -387,7 +387,7 @@ class Node:
         for archive in self.plan['import']:
             call('ctr', '-n', 'k8s.io', 'images', 'import', archive)
         self.running['containerd'].terminate()
-        self.running.pop('containerd').wait(20)
+        self.running.pop('containerd').wait(60)
 
 
 def mount(kind: str, target: Path) -> None:

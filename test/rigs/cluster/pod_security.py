@@ -114,4 +114,4 @@ def pod_security(host: str, client: Client) -> Iterator[None]:
         client.ask('DELETE', f'{path_of}/pod-security')
         server.shutdown()
         server.server_close()
-        thread.join(5.0)
+        thread.join(60.0)

@@ -134,7 +134,7 @@ class Box:
                 child.stdout.close()
                 if child.poll() is None:
                     child.kill()
-                    child.wait(10.0)
+                    child.wait(60.0)
         if self._folder is not None:
             self._folder.cleanup()
             self._folder = None

@@ -338,4 +338,4 @@ class Cloud(abc.ABC):
             machine.computer.cut()
         for machine in machines:
             if machine.thread is not None:
-                machine.thread.join(10.0)
+                machine.thread.join(60.0)

@@ -202,7 +202,7 @@ class Network:
             process.run(Command(
                 ('ip', 'netns', 'exec', self.router, 'nft', '-f', '-'), sudo=True,
                 input=rules(hosts).encode(), what="put the router's rules in force"),
-                timeout=20.0)
+                timeout=60.0)
 
     def remove(self, space: str) -> None:
         """Take a namespace away, and its link with it."""
@@ -221,7 +221,7 @@ class Network:
 
 def sweep(mark: str) -> None:
     """Take the namespaces of the box ``mark`` away, and end what still runs in them."""
-    text = process.run(Command(('ip', 'netns', 'list'), sudo=True), timeout=20.0,
+    text = process.run(Command(('ip', 'netns', 'list'), sudo=True), timeout=60.0,
                        check=False).stdout
     for line in text.splitlines():
         name = line.split()[0] if line.strip() else ''
