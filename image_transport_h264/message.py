@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 #: Last part of the names of a stream's auxiliary topics.
 KEY_REQUEST, FEEDBACK, PIECES = 'keyframe', 'feedback', 'pieces'
-SLICES, CAMERA_INFO = 'slices', 'camera_info'
+SLICES, ACKNOWLEDGED, CAMERA_INFO = 'slices', 'acknowledged', 'camera_info'
 
 #: seconds, nanoseconds, length of the frame id
 _HEADER = struct.Struct('>iIH')

@@ -24,7 +24,7 @@ from std_msgs.msg import UInt8MultiArray, UInt64MultiArray
 from image_transport_h264 import message
 from image_transport_h264.cdr import CdrError
 from image_transport_h264.lazy import LazyNode, LONGEST, SLICES_QOS, Tap
-from image_transport_h264.message import FEEDBACK, SLICES
+from image_transport_h264.message import ACKNOWLEDGED, SLICES
 from image_transport_h264.pacing import Pace, Sent
 from image_transport_h264.rate import MOST_RECEIVERS
 
@@ -53,7 +53,7 @@ class SliceSender:
         self._publisher = node.offer(
             UInt8MultiArray, f'{stream}/{SLICES}', SLICES_QOS, changed)
         node.create_subscription(
-            UInt64MultiArray, f'{stream}/{SLICES}/{FEEDBACK}', self._heard, SLICES_QOS)
+            UInt64MultiArray, f'{stream}/{ACKNOWLEDGED}', self._heard, SLICES_QOS)
         self._identity = secrets.randbits(63)
         self._number = 0
         self._size = LEAST
@@ -132,7 +132,7 @@ class SliceReceiver:
     def __init__(self, node: LazyNode, stream: str, whole: Callable[[bytes], None]) -> None:
         self._node, self._whole = node, whole
         self._feedback = node.create_publisher(
-            UInt64MultiArray, f'{stream}/{SLICES}/{FEEDBACK}', SLICES_QOS)
+            UInt64MultiArray, f'{stream}/{ACKNOWLEDGED}', SLICES_QOS)
         self._identity = secrets.randbits(63)
         self._image: Optional[_Image] = None
         self.tap = Tap(node, UInt8MultiArray, f'{stream}/{SLICES}', SLICES_QOS, self._take,

@@ -16,7 +16,8 @@ _DECODER = re.compile(r'(?P<topic>\w+)_(?P<transport>[a-z0-9]+)_decoder'
                       r'(?:_from_(?P<source>\w+?))?(?:_on_(?P<host>\w+))?')
 #: Topics that every node has, and auxiliary topics of a stream.
 _HIDDEN = re.compile(r'/rosout|/parameter_events|.*/_.*|_.*')
-_OF_STREAM = ('keyframe', 'feedback', 'pieces', 'camera_info', 'link', 'share')
+_OF_STREAM = ('keyframe', 'feedback', 'pieces', 'slices', 'acknowledged', 'camera_info', 'link',
+              'share')
 #: Types that are too large for a measurement of the rate: if a node is not where its name says,
 #: such a topic might cross the VPN only because of the measurement.
 _LARGE = frozenset({'sensor_msgs/msg/Image', 'sensor_msgs/msg/PointCloud2',

@@ -82,6 +82,12 @@ def uncleaned(stream: TextIO) -> TextIO:
         if isinstance(stream, _Output) else stream
 
 
+def needed(stream: TextIO) -> TextIO:
+    """Return the stream for what the verb is for: if it can not be written, the verb ends."""
+    return cast(TextIO, _Output(stream.stream, True, stream.change)) \
+        if isinstance(stream, _Output) else stream
+
+
 def as_json(fields: dict[str, Any], *, indent: Optional[int] = 2) -> str:
     """
     Return fields, and their version, as a JSON object; ``doc/reference/scripts.md`` lists them.

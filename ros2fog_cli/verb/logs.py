@@ -60,5 +60,7 @@ def show(name: str, stream: str, lines: list[str], node: Optional[str]) -> None:
     if node and name not in ('', node):
         return
     prefix = f'[{name}] ' if name else ''
+    from ros2fog_cli.api import output
+    file = output.needed(sys.stderr) if stream == 'stderr' else sys.stdout
     for line in lines:
-        print(f'{prefix}{line}', file=sys.stderr if stream == 'stderr' else sys.stdout, flush=True)
+        print(f'{prefix}{line}', file=file, flush=True)

@@ -96,7 +96,7 @@ def test_next_slice_waits_for_the_slowest_receiver(wire: Wire) -> None:
     images, slow = receiver(wire), receiver(wire)
     late: list[UInt64MultiArray] = []
     one = sender(wire)
-    (acknowledged,) = wire.heard['/camera/raw/slices/feedback']
+    (acknowledged,) = wire.heard['/camera/raw/acknowledged']
     receivers: list[int] = []
 
     def delay(topic: str, data: Any) -> bool:
