@@ -85,8 +85,9 @@ finally:
     os.kill(child, signal.SIGKILL)
     shutil.rmtree(top)
 """
-#: Root makes a name a user's own; the launch ends, and another process gets its id. Prints what
-#: the helper says to the requests that concern this process, and what it does for them.
+#: Root makes a name a user's own; the launch ends, and another process gets its id, at last while
+#: a request waits. Prints what the helper says to the requests that concern this process, and what
+#: it does for them.
 REUSED = """\
 import importlib.util, os, shutil, subprocess, sys, tempfile, time
 from pathlib import Path
@@ -98,11 +99,9 @@ vpn.RECORDS = top / 'records'
 vpn.prepare()
 vpn.run = lambda commands: print('root acts on', launch.pid)
 launch = subprocess.Popen(['sleep', '60'])
-try:
-    vpn.claim('fog0a1b2c', 0, launch.pid)
-    request = {'name': 'fog0a1b2c', 'network': '198.18.7.0/24', 'address': '198.18.7.1',
-               'port': 51820, 'domain': 0, 'ports': [], 'asked': [], 'peers': []}
-    vpn.up(request, 0)
+
+
+def end(network=''):
     launch.kill(), launch.wait()
     # all other ids come before it again, which takes longer than a tick of the start times
     ended = time.monotonic()
@@ -111,12 +110,28 @@ try:
     Path('/proc/sys/kernel/ns_last_pid').write_text(str(launch.pid - 1))
     other = subprocess.Popen(['sleep', '60'])
     assert other.pid == launch.pid
+    return []
+
+
+try:
+    vpn.claim('fog0a1b2c', 0, launch.pid)
+    request = {'name': 'fog0a1b2c', 'network': '198.18.7.0/24', 'address': '198.18.7.1',
+               'port': 51820, 'domain': 0, 'ports': [], 'asked': [], 'peers': []}
+    vpn.up(request, 0)
+    end()
     for verb in 'up', 'peers', 'repair':
         try:
             vpn.VERBS[verb](request, 0)
         except vpn.Refused as error:
             print(error)
-    other.kill(), other.wait()
+    launch = subprocess.Popen(['sleep', '60'])
+    vpn.claim('fog0a1b2d', 0, launch.pid)
+    vpn.taken = end
+    try:
+        vpn.up({**request, 'name': 'fog0a1b2d', 'network': '198.18.8.0/24',
+                'address': '198.18.8.1'}, 0)
+    except vpn.Refused as error:
+        print(error)
 finally:
     shutil.rmtree(top)
 """
@@ -216,7 +231,7 @@ def test_vpn_helper_knows_a_process_id_that_was_used_again(root: None) -> None:
         'unshare', '--pid', '--fork', '--mount-proc', sys.executable, '-I', '-c', REUSED,
         str(ROOT / 'packaging/vpn_helper/vpn.py')), sudo=True), timeout=60.0).stdout
     first, *others = said.splitlines()
-    assert first.startswith('root acts on') and len(others) == 3
+    assert first.startswith('root acts on') and len(others) == 4
     assert all(line.endswith('has ended') for line in others), said
 
 
