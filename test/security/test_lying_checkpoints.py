@@ -85,7 +85,7 @@ LocalShell(Endpoint('local'), name='planner').fetch(
 @pytest.mark.skipif(os.geteuid() != 0, reason='root alone gives a folder to another account')
 def test_folders_that_nobody_may_read_are_counted(home: Path) -> None:
     with tempfile.TemporaryDirectory() as name:
-        os.chmod(name, 0o755)
+        Path(name).chmod(0o755)
         for number in range(4):
             folder = Path(name, str(number))
             folder.mkdir()
