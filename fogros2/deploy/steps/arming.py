@@ -58,12 +58,12 @@ mv -f -- "$1.new" "$1"
 # Another robot's agent stays: its configuration names its launch.
 # $1 folder, $2 launch, $3 our configuration.
 _REMOVE = """\
-running() { grep -qs serve /proc/$pid/cmdline; }
+running() { grep -qs serve "/proc/$pid/cmdline"; }
 rm -f -- "$3"
 if read -r pid 2>/dev/null <"$1/agent.pid" && running; then
     owner=$(sed -n 's/.*"launch": "\\([^"]*\\)".*/\\1/p' "$1/config.json" 2>/dev/null) || :
     case $owner in ''|"$2") ;; *) exit 0 ;; esac
-    kill -s TERM $pid 2>/dev/null || :
+    kill -s TERM "$pid" 2>/dev/null || :
     n=0
     while running && [ $n -lt 100 ]; do sleep 0.1; n=$((n + 1)); done
 fi
