@@ -30,7 +30,7 @@ from fogros2.shell import relay
 from fogros2.testing.fakes import FakeShell
 from fogros2.vpn.guests import Door
 from fogros2.waiting import wait_until
-from fogros2_monitor import accounts
+from fogros2_monitor import accounts, request
 from fogros2_monitor.dashboard.server import Dashboard
 from fogros2_monitor.gate import Gate
 from fogros2_monitor.tunnel import Tunnel
@@ -178,6 +178,16 @@ except OSError:
 print(len(links), flush=True)
 sys.stdin.read()
 """
+#: Serves a page at a port of the loopback, which it prints.
+SQUAT = """\
+import socket
+listener = socket.create_server(('127.0.0.1', 0))
+print(listener.getsockname()[1], flush=True)
+while True:
+    link, _ = listener.accept()
+    link.sendall(b'HTTP/1.1 200 OK\\r\\n\\r\\nof another account')
+    link.close()
+"""
 #: Opens a connection, and closes its socket at once.
 LEAVE = """\
 import socket
@@ -309,6 +319,31 @@ def test_no_account_takes_up_the_gate_s_connections(root: None, address: str) ->
         return answer
 
     assert loops.run(knock()).startswith(b'HTTP/1.1 401 ')
+
+
+@pytest.mark.parametrize(('head', 'status'), [
+    ('Cookie: {}={}', b'200 OK'), ('Upgrade: websocket', b'502 Bad Gateway')])
+def test_no_account_stands_for_bridge_or_application(
+    root: None, head: str, status: bytes,
+) -> None:
+    """It listens at their port before them."""
+    async def look(port: int) -> bytes:
+        listener = socket.create_server(('127.0.0.1', 0))
+        listener.setblocking(False)
+        gate = Gate(('127.0.0.1', port), 'token', ('127.0.0.1', port))
+        serving = asyncio.ensure_future(gate.serve(listener))
+        reader, writer = await asyncio.open_connection(*listener.getsockname())
+        target = '/' if 'Cookie' in head else '/?token=token'
+        line = head.format(*request.cookie('token'))
+        writer.write(f'GET {target} HTTP/1.1\r\nHost: localhost\r\n{line}\r\n\r\n'.encode())
+        answer = await reader.read()
+        serving.cancel()
+        return answer
+
+    with stranger(SQUAT) as child:
+        assert child.stdout
+        answer = loops.run(look(int(child.stdout.readline())))
+    assert answer.startswith(b'HTTP/1.1 ' + status) and b'of another account' not in answer
 
 
 @FAMILIES
