@@ -44,6 +44,21 @@ def is_foreign(connection: socket.socket) -> bool:
     return _is_here(peer) if user is None else user not in (0, os.getuid())
 
 
+def is_strangers(connection: socket.socket) -> bool:
+    """
+    Return whether another account of this computer, root aside, serves a TCP connection.
+
+    It could listen before the program that is expected there. An engine that redirects a port by
+    the packet filter has no socket.
+
+    :raises OSError: the server has gone.
+    """
+    peer, own = connection.getpeername(), connection.getsockname()
+    # in this order: a listener that has gone has accepted the connection before
+    users = [_account(peer, end) for end in ((own[0], 0), own)]
+    return any(user not in (None, 0, os.getuid()) for user in users)
+
+
 def plain_address(address: str) -> str:
     """Return a peer's address; map an IPv4 address of a dual-stack socket back to IPv4."""
     peer = ipaddress.ip_address(address.partition('%')[0])

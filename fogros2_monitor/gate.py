@@ -152,7 +152,7 @@ class Gate:
         """Forward a request to the bridge or the web application, or answer it."""
         if request.websocket:
             try:
-                inner = await asyncio.open_connection(*self._to, limit=_BLOCK)
+                inner = await _connect(self._to)
             except OSError as error:
                 raise Refused(
                     '502 Bad Gateway', f'the bridge does not answer: {error}') from error
@@ -161,7 +161,7 @@ class Gate:
         try:
             if self._application is None:
                 raise ConnectionRefusedError
-            inner = await asyncio.open_connection(*self._application)
+            inner = await _connect(self._application)
         except OSError:
             # Browsers request the icon by themselves; it gets no page.
             writer.write(page.answer('404 Not Found') if request.target == '/favicon.ico'
@@ -179,6 +179,19 @@ class Gate:
         if (who, why) not in self._logged and len(self._logged) < LOGGED:
             self._logged.add((who, why))
             print(f'turned away {who}: {why}', file=sys.stderr, flush=True)
+
+
+async def _connect(to: tuple[str, int]) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """
+    Connect to a server of this account.
+
+    :raises OSError: there is none.
+    """
+    reader, writer = await asyncio.open_connection(*to, limit=_BLOCK)
+    if accounts.is_strangers(writer.get_extra_info('socket')):
+        writer.close()
+        raise PermissionError('another account listens there')
+    return reader, writer
 
 
 async def _pass(

@@ -61,6 +61,8 @@ class SliceSender:
         self._under_way: deque[tuple[int, Sent]] = deque()
         #: The last acknowledgement of each receiver: number of the slice, and when it came (s).
         self._heard_of: dict[int, tuple[int, float]] = {}
+        #: Which receiver sets the pace: the slowest one, unless it hangs.
+        self._pacemaker: Callable[..., int] = min
         self._news = threading.Condition()
 
     def replace(self, whole: Publisher) -> bool:
@@ -69,7 +71,7 @@ class SliceSender:
 
     def send(self, data: bytes) -> bool:
         """Publish a message, and wait until most has arrived; return False if none arrives."""
-        begin = time.monotonic()
+        begin, self._pacemaker = time.monotonic(), min
         # all of a size, as the pace compares their times
         size = -(-len(data) // -(-len(data) // self._size))
         for place in range(0, len(data), size):
@@ -80,7 +82,12 @@ class SliceSender:
             self._node.put_out(self._publisher, message.in_pieces(
                 _HEADER.pack(self._identity, self._number, len(data), place) + part))
             with self._news:
-                if not self._news.wait_for(self._pace.may_send, LONGEST):
+                if self._news.wait_for(self._pace.may_send, LONGEST):
+                    continue
+                # a receiver that hangs keeps the rest of the image from no other one
+                self._pacemaker = max
+                self._settle(time.monotonic())
+                if not self._pace.may_send():
                     # the link is cut, or nobody listens any more
                     self._under_way.clear()
                     self._pace = Pace()
@@ -99,20 +106,27 @@ class SliceSender:
             self._under_way.clear()
 
     def _heard(self, feedback: UInt64MultiArray) -> None:
-        """Take an acknowledgement; a slice has arrived when the slowest receiver has it."""
+        """Take an acknowledgement."""
         if len(feedback.data) != 3 or feedback.data[1] != self._identity:
             return
         receiver, now = feedback.data[0], time.monotonic()
         with self._news:
+            if feedback.data[2] > self._number:
+                return
             self._heard_of = {other: (number, when) for other, (number, when)
                               in self._heard_of.items() if when > now - LONGEST}
             if receiver not in self._heard_of and len(self._heard_of) == MOST_RECEIVERS:
                 return
             self._heard_of[receiver] = feedback.data[2], now
-            arrived = min(number for number, _ in self._heard_of.values())
-            while self._under_way and self._under_way[0][0] <= arrived:
-                self._pace.acknowledged(self._under_way.popleft()[1], now)
+            self._settle(now)
             self._news.notify()
+
+    def _settle(self, now: float) -> None:
+        """Report slices that have arrived to the pace."""
+        arrived = self._pacemaker(
+            (number for number, _ in self._heard_of.values()), default=0)
+        while self._under_way and self._under_way[0][0] <= arrived:
+            self._pace.acknowledged(self._under_way.popleft()[1], now)
 
 
 @dataclasses.dataclass

@@ -259,7 +259,8 @@ class Nodes:
                 ours.append(reader)
                 theirs.append(writer)
             pid = self._spawn(node, ours, theirs)
-        except (AttributeError, OSError, Refused, TypeError, ValueError) as error:
+        except (AttributeError, OSError, RecursionError, Refused, TypeError,
+                ValueError) as error:
             for fd in ours:
                 os.close(fd)
             reason = error if isinstance(error, Refused) else Refused(

@@ -105,10 +105,13 @@ def interpreter(command: list[str]) -> list[str]:
 
     :raises Refused: the first line names a missing interpreter that is not Python.
     """
+    # the agent would wait for the writer of a named pipe
+    if not command or not os.path.isfile(command[0]):
+        return []
     try:
         with open(command[0], 'rb') as file:
             line = file.readline(1024)
-    except (IndexError, OSError):
+    except OSError:
         return []
     match = re.match(rb'#!\s*(/\S+)', line)
     if match is None or os.path.exists(match[1]):

@@ -146,7 +146,8 @@ def checked(new: Json) -> Json:
         try:
             socket.inet_aton(heartbeat['bind'])
             socket.inet_aton(heartbeat['peer'])
-            if not 0 < heartbeat['port'] < 65536 or len(bytes.fromhex(heartbeat['key'])) < 16:
+            port, secret = heartbeat['port'], bytes.fromhex(heartbeat['key'])
+            if not isinstance(port, int) or not 0 < port < 65536 or len(secret) < 16:
                 raise ValueError('port or key')
         except (KeyError, OSError, TypeError, ValueError) as error:
             raise Refused(

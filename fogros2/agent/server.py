@@ -226,7 +226,7 @@ class Agent:
         try:
             with open(self.path('config.json')) as stream:
                 saved = checked(json.load(stream))
-        except (AttributeError, OSError, Refused, ValueError):
+        except (AttributeError, OSError, RecursionError, Refused, ValueError):
             return
         if saved.get('machine') == self.config['machine']:
             # the user could have written the file: take nothing that root would execute
@@ -234,7 +234,8 @@ class Agent:
             self._restart_watchdog()
             if not self.config['launch'] and self.config['on_exit'] == 'keep':
                 self._expect_no_launch()
-            with contextlib.suppress(OSError, OverflowError, TypeError, ValueError), \
+            with contextlib.suppress(
+                    OSError, OverflowError, RecursionError, TypeError, ValueError), \
                     open(self.path('watchdog.json')) as stream:
                 self.nodes.mark, *state = json.load(stream)
                 if self.config['launch']:

@@ -103,13 +103,13 @@ class RsyncShell(Shell):
         Make the local folder ``target`` equal to the machine's ``source``; see the protocol.
 
         The machine is not trusted: no special files, no links out of the folder, no set-uid bits,
-        and the target is measured while it grows.
+        and the target is measured while it grows, so its folders stay readable.
         """
         room = Room(target, limit, cancel, f'{self.where} has sent more than '
                     f'{limit / 1e9:.1f} GB in place of {source}')
         process.require(['rsync'])
         words = ['rsync', '-rltp', _EXACT_TIMES, '-s', '--delete', '--safe-links']
-        words += ['--chmod=u-s,g-s']
+        words += ['--chmod=u-s,g-s,Du+rx']
         words += [f'--link-dest={known.resolve()}'] if known is not None else []
         with self._remote_shell() as (rsh, files, failures):
             words += ['-e', relay.RSH] if rsh else []

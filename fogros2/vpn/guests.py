@@ -228,6 +228,10 @@ def evict(user: str) -> None:
             (sys.executable, '-ISc', KILL), user=entry.pw_uid, group=entry.pw_gid,
             extra_groups=(), stderr=subprocess.DEVNULL).returncode:
         time.sleep(0.02)
+    with contextlib.suppress(FileNotFoundError):
+        # memory of System V outlives its processes; of other accounts' it removes nothing
+        subprocess.run(('ipcrm', '--all'), user=entry.pw_uid, group=entry.pw_gid, extra_groups=(),
+                       stderr=subprocess.DEVNULL)
     for words in (('userdel', user), ('groupdel', user)):  # mostly, the group goes with the user
         subprocess.run(words, stderr=subprocess.DEVNULL)
     with contextlib.suppress(FileNotFoundError):

@@ -435,7 +435,6 @@ def up(request: Mapping[str, Any], uid: int) -> None:
     address = own_address(request['address'], network)
     peers = peers_of(request['peers'], network, address)
     with own(request['name'], uid) as before:
-        _refuse_ended(before)
         record = dataclasses.replace(
             before, network=network, address=address, port=port, domain=domain, ports=ports,
             asked=asked)
@@ -446,6 +445,7 @@ def up(request: Mapping[str, Any], uid: int) -> None:
                       if other.name != record.name and other.network]
             if found := addresses.overlapping(network, [*others, *taken(record.name)]):
                 raise Refused(f'{network} is in use already: {found[0]}')
+            _refuse_ended(before)  # it may have ended while this waited
             record.save(RECORDS / record.name)
         run(record.vpn().up(record.interface(), peers))
 

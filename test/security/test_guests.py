@@ -52,9 +52,9 @@ DDS = 'udp:0.0.0.0:7410'
 #: What a guest reaches besides DDS: the door, and the port for its heartbeats.
 OWN = [f'tcp:0.0.0.0:{GUEST_PORT}', f'udp:0.0.0.0:{guest_heartbeats(GUEST)}']
 #: Gives a guest an account, whose program leaves files; ends it, and gives another one. Prints
-#: the ids of both.
+#: the ids of both, and what System V keeps of the first.
 ACCOUNTS = """
-import os, pwd, socket, subprocess, sys, types
+import os, pathlib, pwd, socket, subprocess, sys, types
 guests = types.ModuleType('guests')
 exec(compile(sys.stdin.read(), 'guests', 'exec'), guests.__dict__)
 LEAVE = '''
@@ -75,10 +75,13 @@ for _ in range(2):
     found = pwd.getpwnam('fogabc123m0g224')
     ids.append(found.pw_uid)
     if len(ids) == 1:
-        subprocess.run([sys.executable, '-c', LEAVE, *FOLDERS], user=found.pw_uid,
-                       group=found.pw_gid, extra_groups=(), check=True)
+        for words in ([sys.executable, '-c', LEAVE, *FOLDERS],
+                      ['ipcmk', '--shmem', '4096', '--queue', '--semaphore', '1']):
+            subprocess.run(words, user=found.pw_uid, group=found.pw_gid, extra_groups=(),
+                           stdout=subprocess.DEVNULL, check=True)
     guests.evict('fogabc123m0g224')
-print(*ids)
+print(*ids, sum(path.read_text().count(str(ids[0])) for path in
+                pathlib.Path('/proc/sysvipc').iterdir()))
 """
 #: Seconds in which WireGuard makes a second attempt at a handshake.
 ATTEMPTS = 6.0
@@ -177,5 +180,6 @@ def test_next_guest_owns_no_file_of_a_former_one(cloud: Cloud) -> None:
         look = Command(('find', '/', '/dev/shm', '-xdev', '-name', '*of a guest*'), sudo=True)
         wait_until(lambda: not shell.run(look, timeout=60.0, check=False).stdout, timeout=60.0,
                    what='all files of the guest to be gone')
-    first, second = map(int, said.split())
+    first, second, kept = map(int, said.split())
+    assert kept == 0
     assert first != second and first in guests.IDS and second in guests.IDS

@@ -67,6 +67,23 @@ def test_root_on_a_machine_reads_no_file_of_root_here(cloud: Cloud, own: str) ->
     assert seen(cloud, first, own) == {'public'}
 
 
+def test_root_on_a_machine_reads_no_private_file_of_an_underlay(
+    cloud: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    underlay = tmp_path / 'underlay'
+    underlay.mkdir(0o755)
+    (underlay / 'public').write_text('public\n')
+    (underlay / 'private').write_text('secret\n')
+    (underlay / 'private').chmod(0o600)
+    module = tmp_path / 'module.py'
+    module.write_text('public too\n')
+    monkeypatch.setattr(container_root, 'editable', lambda site: [str(module)])
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(underlay), os.pathsep)
+    identity = cloud.create(cloud.spec())
+    assert seen(cloud, identity, str(underlay)) == {'public'}
+    assert seen(cloud, identity, str(module)) == {'public too'}
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason='root alone makes the folder of a machine')
 def test_search_of_a_failed_creation_leaves_no_folder(tmp_path: Path) -> None:
     """The engine fails at once, while the search is at work in the folder."""

@@ -30,7 +30,7 @@ from fogros2.shell import relay
 from fogros2.testing.fakes import FakeShell
 from fogros2.vpn.guests import Door
 from fogros2.waiting import wait_until
-from fogros2_monitor import accounts
+from fogros2_monitor import accounts, request
 from fogros2_monitor.dashboard.server import Dashboard
 from fogros2_monitor.gate import Gate
 from fogros2_monitor.tunnel import Tunnel
@@ -85,8 +85,9 @@ finally:
     os.kill(child, signal.SIGKILL)
     shutil.rmtree(top)
 """
-#: Root makes a name a user's own; the launch ends, and another process gets its id. Prints what
-#: the helper says to the requests that concern this process, and what it does for them.
+#: Root makes a name a user's own; the launch ends, and another process gets its id, at last while
+#: a request waits. Prints what the helper says to the requests that concern this process, and what
+#: it does for them.
 REUSED = """\
 import importlib.util, os, shutil, subprocess, sys, tempfile, time
 from pathlib import Path
@@ -98,11 +99,9 @@ vpn.RECORDS = top / 'records'
 vpn.prepare()
 vpn.run = lambda commands: print('root acts on', launch.pid)
 launch = subprocess.Popen(['sleep', '60'])
-try:
-    vpn.claim('fog0a1b2c', 0, launch.pid)
-    request = {'name': 'fog0a1b2c', 'network': '198.18.7.0/24', 'address': '198.18.7.1',
-               'port': 51820, 'domain': 0, 'ports': [], 'asked': [], 'peers': []}
-    vpn.up(request, 0)
+
+
+def end(network=''):
     launch.kill(), launch.wait()
     # all other ids come before it again, which takes longer than a tick of the start times
     ended = time.monotonic()
@@ -111,12 +110,28 @@ try:
     Path('/proc/sys/kernel/ns_last_pid').write_text(str(launch.pid - 1))
     other = subprocess.Popen(['sleep', '60'])
     assert other.pid == launch.pid
+    return []
+
+
+try:
+    vpn.claim('fog0a1b2c', 0, launch.pid)
+    request = {'name': 'fog0a1b2c', 'network': '198.18.7.0/24', 'address': '198.18.7.1',
+               'port': 51820, 'domain': 0, 'ports': [], 'asked': [], 'peers': []}
+    vpn.up(request, 0)
+    end()
     for verb in 'up', 'peers', 'repair':
         try:
             vpn.VERBS[verb](request, 0)
         except vpn.Refused as error:
             print(error)
-    other.kill(), other.wait()
+    launch = subprocess.Popen(['sleep', '60'])
+    vpn.claim('fog0a1b2d', 0, launch.pid)
+    vpn.taken = end
+    try:
+        vpn.up({**request, 'name': 'fog0a1b2d', 'network': '198.18.8.0/24',
+                'address': '198.18.8.1'}, 0)
+    except vpn.Refused as error:
+        print(error)
 finally:
     shutil.rmtree(top)
 """
@@ -162,6 +177,16 @@ except OSError:
     links = links[:-10]
 print(len(links), flush=True)
 sys.stdin.read()
+"""
+#: Serves a page at a port of the loopback, which it prints.
+SQUAT = """\
+import socket
+listener = socket.create_server(('127.0.0.1', 0))
+print(listener.getsockname()[1], flush=True)
+while True:
+    link, _ = listener.accept()
+    link.sendall(b'HTTP/1.1 200 OK\\r\\n\\r\\nof another account')
+    link.close()
 """
 #: Opens a connection, and closes its socket at once.
 LEAVE = """\
@@ -216,7 +241,7 @@ def test_vpn_helper_knows_a_process_id_that_was_used_again(root: None) -> None:
         'unshare', '--pid', '--fork', '--mount-proc', sys.executable, '-I', '-c', REUSED,
         str(ROOT / 'packaging/vpn_helper/vpn.py')), sudo=True), timeout=60.0).stdout
     first, *others = said.splitlines()
-    assert first.startswith('root acts on') and len(others) == 3
+    assert first.startswith('root acts on') and len(others) == 4
     assert all(line.endswith('has ended') for line in others), said
 
 
@@ -294,6 +319,31 @@ def test_no_account_takes_up_the_gate_s_connections(root: None, address: str) ->
         return answer
 
     assert loops.run(knock()).startswith(b'HTTP/1.1 401 ')
+
+
+@pytest.mark.parametrize(('head', 'status'), [
+    ('Cookie: {}={}', b'200 OK'), ('Upgrade: websocket', b'502 Bad Gateway')])
+def test_no_account_stands_for_bridge_or_application(
+    root: None, head: str, status: bytes,
+) -> None:
+    """It listens at their port before them."""
+    async def look(port: int) -> bytes:
+        listener = socket.create_server(('127.0.0.1', 0))
+        listener.setblocking(False)
+        gate = Gate(('127.0.0.1', port), 'token', ('127.0.0.1', port))
+        serving = asyncio.ensure_future(gate.serve(listener))
+        reader, writer = await asyncio.open_connection(*listener.getsockname())
+        target = '/' if 'Cookie' in head else '/?token=token'
+        line = head.format(*request.cookie('token'))
+        writer.write(f'GET {target} HTTP/1.1\r\nHost: localhost\r\n{line}\r\n\r\n'.encode())
+        answer = await reader.read()
+        serving.cancel()
+        return answer
+
+    with stranger(SQUAT) as child:
+        assert child.stdout
+        answer = loops.run(look(int(child.stdout.readline())))
+    assert answer.startswith(b'HTTP/1.1 ' + status) and b'of another account' not in answer
 
 
 @FAMILIES

@@ -70,6 +70,33 @@ def test_files_without_content_are_counted(shell: Lying, tmp_path: Path) -> None
                     timeout=60.0)
 
 
+#: Fetches a folder, as another account.
+FETCH = f"""\
+import os, sys
+from pathlib import Path
+from fogros2.model import Endpoint
+from fogros2.shell.local import LocalShell
+os.setgroups([]), os.setgid({NOBODY}), os.setuid({NOBODY})
+LocalShell(Endpoint('local'), name='planner').fetch(
+    sys.argv[1], Path(sys.argv[2]), known=None, limit=1 << 20, timeout=60.0)
+"""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='root alone gives a folder to another account')
+def test_folders_that_nobody_may_read_are_counted(home: Path) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        Path(name).chmod(0o755)
+        for number in range(4):
+            folder = Path(name, str(number))
+            folder.mkdir()
+            (folder / 'large').write_bytes(bytes(1 << 19))
+            # the copy belongs to the account, which has no right to it
+            folder.chmod(0o055)
+        done = subprocess.run([sys.executable, '-c', FETCH, name, str(home / 'copy')],
+                              capture_output=True, text=True, timeout=60)
+    assert 'has sent more than' in done.stderr
+
+
 @pytest.fixture
 def home() -> Iterator[Path]:
     """Return a folder of an account that is not root's."""

@@ -226,6 +226,7 @@ def test_clock_counts_suspended_time():
     {'lifetime': '8'}, {'on_exit': 'burn'}, {'end_command': 'shutdown'}, {'end_command': [3]},
     {'environment': {'A': 3}}, {'environment': {'': 'x'}}, {'environment': {'A': 'x\0'}},
     {'heartbeat': {**HEARTBEAT, 'port': 0}}, {'heartbeat': {**HEARTBEAT, 'port': '7'}},
+    {'heartbeat': {**HEARTBEAT, 'port': 5.5}},
     {'heartbeat': {**HEARTBEAT, 'bind': 'name'}}, {'heartbeat': {**HEARTBEAT, 'key': 'ab' * 15}},
     {'heartbeat': {**HEARTBEAT, 'key': None}}, {'heartbeat': {**HEARTBEAT, 'key': 'secret'}},
     {'heartbeat': [1]}, {'machine': 7}, {'log_bytes': -1},

@@ -146,6 +146,21 @@ def test_invalid_spec_is_refused(spec: Any) -> None:
         Node({'id': '1', 'name': 'n', **spec})
 
 
+def test_marker_that_is_too_deep_refuses_only_the_node(nodes: Nodes) -> None:
+    deep: list[Any] = []
+    for _ in range(100_000):
+        deep = [deep]
+    node = Node({'id': '1', 'name': 'n', 'arguments': [['x', {'new': deep}]]})
+    nodes.start([node])
+    assert node.status['state'] == 'refused'
+
+
+def test_named_pipe_as_argument_is_not_read(prepared: Prepared, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / 'pipe')
+    words = ['cat', f'{tmp_path}/pipe']
+    assert prepared(prefix=words[:1], arguments=words[1:])[0] == words
+
+
 def test_full_disk_refuses_only_the_node(
     nodes: Nodes, prepared: Prepared, monkeypatch: pytest.MonkeyPatch,
 ) -> None:

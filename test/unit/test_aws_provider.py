@@ -473,8 +473,11 @@ def test_booted_instance_starts_the_agent_that_it_gets(booted):
                       'lifetime': 600.0})
     top = booted(told)
     program = top / 'opt/fogros2/agent.py'
-    subprocess.run(['sh', '-ec', arming._SEND, 'sh', str(program)], input=joined(), text=True,
-                   check=True)
+    send = ['sh', '-ec', arming._SEND, 'sh', str(program), str(len(joined()))]
+    # a connection that is lost meanwhile
+    assert subprocess.run(send, input=joined()[:-100], text=True).returncode
+    assert not program.exists()
+    subprocess.run(send, input=joined(), text=True, check=True)
     server = top / 'run/fogros2/agent.sock'
     wait_until(server.exists, timeout=60.0, what='the agent')
     answer = subprocess.run(

@@ -34,6 +34,14 @@ def test_agent_names_its_launch_before_it_serves(tmp_path):
     assert (tmp_path / 'agent.pid').read_text() == f'{os.getpid()}\n'
 
 
+@pytest.mark.parametrize('name', ['config.json', 'watchdog.json'])
+def test_file_that_is_too_deep_does_not_stop_the_agent(tmp_path, name):
+    settings = {'machine': 'planner', 'launch': 'first', 'directory': str(tmp_path)}
+    (tmp_path / 'config.json').write_text(json.dumps(settings))
+    (tmp_path / name).write_text('[' * 100_000)
+    server.Agent(settings).open()
+
+
 @pytest.mark.parametrize('value', [0, -1, 2 ** 53])
 def test_number_in_range_is_valid(value):
     assert events.event({'event': 'end_failed', 'returncode': value})

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import secrets
 import threading
+import time
 from typing import Any
 
 import pytest
@@ -160,10 +161,24 @@ def test_strangers_acknowledge_nothing(wire: Wire) -> None:
     one = sender(wire)
     for data in ([], [1, 2, 3], [1, 2], [1, 2, 3, 4]):
         one._heard(UInt64MultiArray(data=data))
+    one._heard(UInt64MultiArray(data=[1, one._identity, 1]))
     assert one._heard_of == {}
     for number in range(1000):
         one._heard(UInt64MultiArray(data=[number, one._identity, 0]))
     assert len(one._heard_of) < 100
+
+
+def test_receiver_that_hangs_keeps_no_image_from_others(
+    wire: Wire, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(slices, 'LONGEST', 0.05)
+    images = receiver(wire)
+    one = sender(wire)
+    wire.heard['/camera/raw/slices'].insert(0, lambda data: one._heard(
+        UInt64MultiArray(data=[1, one._identity, 0])))
+    begin = time.monotonic()
+    assert one.send(bytes(40 * LEAST)) and images == [bytes(40 * LEAST)]
+    assert time.monotonic() - begin < 1.0
 
 
 def test_whole_images_go_to_subscribers_without_slices(wire: Wire) -> None:

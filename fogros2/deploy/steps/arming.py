@@ -43,11 +43,13 @@ python3 -IS "$3" serve --detach --config "$4"
 """
 
 # Send the agent to a machine whose boot script waits for it; keep an earlier one.
-# $1 program. Standard input is the agent's source.
+# $1 program, $2 its bytes. Standard input is the agent's source.
 _SEND = """\
 [ -e "$1" ] && exit
 umask 077
 cat >"$1.new"
+# a lost connection ends standard input too
+[ "$(wc -c <"$1.new")" -eq "$2" ]
 chmod 755 "$1.new"
 mv -f -- "$1.new" "$1"
 """
@@ -56,12 +58,12 @@ mv -f -- "$1.new" "$1"
 # Another robot's agent stays: its configuration names its launch.
 # $1 folder, $2 launch, $3 our configuration.
 _REMOVE = """\
-running() { grep -qs serve /proc/$pid/cmdline; }
+running() { grep -qs serve "/proc/$pid/cmdline"; }
 rm -f -- "$3"
 if read -r pid 2>/dev/null <"$1/agent.pid" && running; then
     owner=$(sed -n 's/.*"launch": "\\([^"]*\\)".*/\\1/p' "$1/config.json" 2>/dev/null) || :
     case $owner in ''|"$2") ;; *) exit 0 ;; esac
-    kill -s TERM $pid 2>/dev/null || :
+    kill -s TERM "$pid" 2>/dev/null || :
     n=0
     while running && [ $n -lt 100 ]; do sleep 0.1; n=$((n + 1)); done
 fi
@@ -112,8 +114,9 @@ class Arming(Step):
                 if agent is None:
                     self._install(program, config)
             elif job.capabilities.agent_sent:
-                job.run(Command(('sh', '-ec', _SEND, 'sh', program), sudo=True,
-                                input=joined().encode(), what='send the agent'))
+                source = joined().encode()
+                job.run(Command(('sh', '-ec', _SEND, 'sh', program, str(len(source))), sudo=True,
+                                input=source, what='send the agent'))
             job.save(agent=job.directory, agent_program=program)
             job.agent = agent = agent or wait_until(
                 lambda: self._claim(program, config),

@@ -264,8 +264,12 @@ class ContainerProvider(Provider):
             # Podman deletes its own layer when the container ends; a stopped machine keeps it.
             upper = f',upperdir={top}/layers{path}/upper,workdir={top}/layers{path}/work'
             words += ['-v', f"{base}{path}:{path}:O{upper if kept else ''}"]
-        for mount in () if base else container_root.environment_mounts(*spec.workspaces):
+        environment = () if base else container_root.environment_mounts(*spec.workspaces)
+        for mount in environment:
             words += ['-v', f'{mount}:{mount}:ro']
+        # nodes that run as root may need files of an environment that only its owner may read
+        shown = () if base else system if options.user == 'root' else (
+            *system, *filter(os.path.isdir, environment))
         number = login_ids.login_id(request.token)
         archive = _entry(spec, request, options, number)
         container_root.accounts(archive, options.user, number, Path(f'{base}/etc'))
@@ -276,7 +280,7 @@ class ContainerProvider(Provider):
         command = Command(
             ('sh', '-ec', _CREATE, 'sh', str(top), *hooks(top, kept=kept),
              hidden_files.source(), clean(top),
-             '' if base else ''.join(f'{path}\n' for path in system),
+             ''.join(f'{path}\n' for path in shown),
              *(system if kept else ()), '', engine.name, *engine.flags, *hook_flags(top),
              'run', '-d', '--cidfile', f'{top}/cid', '--label-file', f'{top}/labels', *words,
              '--rootfs', f'{top}/root', '/bin/sh', f'/{container_entry.FOLDER}/entry.sh'),

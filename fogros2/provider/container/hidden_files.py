@@ -75,8 +75,8 @@ def search(top: str, local: str = LOCAL) -> tuple[list[str], dict[str, int]]:
                 paths.append(folder)
                 continue
             entries = list(os.scandir(folder))
-        except FileNotFoundError:
-            continue  # removed meanwhile, and so are files
+        except (FileNotFoundError, PermissionError):
+            continue  # removed meanwhile, as files may be; or on a server that knows no root
         for entry in entries:
             if entry.is_dir(follow_symlinks=False):
                 todo.append(entry.path)
