@@ -65,9 +65,9 @@ def settings(name: str, to: Endpoint, folder: Path) -> str:
     config = ssh_config.of(to)
     host = to.host if to.host_key else config.host
     pairs = [('HostName', host.replace('%', '%%')), ('Port', str(config.port)),
-             ('User', config.user)]
-    if config.proxy:
-        pairs.append(('ProxyCommand', shlex.join(config.proxy).replace('%', '%%')))
+             ('User', config.user),
+             # not by the user's ProxyJump for all hosts, which the launch does not use either
+             ('ProxyCommand', shlex.join(config.proxy).replace('%', '%%') or 'none')]
     if config.only_keys:
         pairs += [('IdentityFile', _path(key, '%')) for key in config.keys]
         pairs.append(('IdentitiesOnly', 'yes'))

@@ -75,3 +75,16 @@ def test_odd_state_folder_is_included_alone(tmp_path: Path, name: str) -> None:
     file = tmp_path / 'config'
     file.write_text(ssh_settings.include(Store(tmp_path / name)))
     assert settings(file, 'planner')['hostname'] == '198.51.100.7'
+
+
+def test_settings_of_all_hosts_lead_to_no_other_machine(tmp_path: Path) -> None:
+    endpoint = Endpoint('ssh', '198.51.100.7', 22, 'fog', 'ssh-ed25519 AAAA', '/k')
+    file = tmp_path / 'config'
+    file.write_text(ssh_settings.settings('a', endpoint, tmp_path) + (
+        'Host *\n    ProxyJump bastion\n    Port 7\n    User me\n    IdentityFile /mine\n'
+        '    HostKeyAlias x\n    UserKnownHostsFile /x\n    StrictHostKeyChecking no\n'))
+    found, others = settings(file, 'a'), settings(file, 'b')
+    assert others['proxyjump'] == 'bastion' and 'proxyjump' not in found
+    assert (found['port'], found['user'], found['hostkeyalias'], found['userknownhostsfile']) == (
+        '22', 'fog', 'fogros2-a', str(tmp_path / ssh_settings.KNOWN_HOSTS))
+    assert found['stricthostkeychecking'] in ('yes', 'true')
