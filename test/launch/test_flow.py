@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 import threading
 
 from launch import LaunchDescription
@@ -559,6 +560,8 @@ def test_checks_come_before_any_machine(run, fake, planner, capfd):
     assert 'this will not do (do otherwise)' in capfd.readouterr().out
 
 
+@pytest.mark.skipif(not any(map(find_spec, ('tomllib', 'tomli'))),
+                    reason='needs Python 3.11 or tomli')
 @pytest.mark.parametrize('when', ['here', 'prepare'])
 def test_wrong_option_of_a_file_names_the_file(
     run, fake, planner, capfd, monkeypatch, tmp_path, when,
