@@ -34,14 +34,15 @@ def check_writable(text: str, endings: Sequence[str] = ()) -> None:
 
 def checked(
     read: Mapping[str, str], written: Mapping[str, Sequence[str]] = {},
-    made: Sequence[str] = (),
+    made: Sequence[str] = (), folders: Sequence[str] = (),
 ) -> OpaqueFunction:
     """
     Return an action that checks files on the robot before the launch creates a machine.
 
-    :param read: launch arguments that name a file or folder, and the remedy if it is missing.
+    :param read: launch arguments that name a file, and the remedy if it is missing.
     :param written: launch arguments that name a file to write, and its file extensions.
     :param made: values that name no file.
+    :param folders: the arguments of ``read`` that may name a folder instead.
     """
     # not imported for nodes
     from launch.actions import OpaqueFunction
@@ -49,7 +50,9 @@ def checked(
     def check(context: LaunchContext) -> None:
         given = context.launch_configurations
         for name, remedy in read.items():
-            if given[name] not in ('', *made) and not os.access(given[name], os.R_OK):
+            exists = os.path.exists if name in folders else os.path.isfile
+            if given[name] not in ('', *made) and not (
+                    exists(given[name]) and os.access(given[name], os.R_OK)):
                 raise RuntimeError(f'{name}:={given[name]}: there is no such file here ({remedy})')
         for name, endings in written.items():
             try:

@@ -26,7 +26,6 @@ from launch.actions import (
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.fog_machine import FogMachine
 from fogros2.describe import keywords
-from fogros2.describe.machines import CloudInstance
 from fogros2.errors import ConfigurationError
 from fogros2.launch_internals import private
 from fogros2.launch_internals.wrapping import below, wrap
@@ -71,13 +70,7 @@ class FogROSLaunchDescription(LaunchDescription):
         for name in unknown:
             parameters = set(inspect.signature(FogROSLaunchDescription).parameters) - {'unknown'}
             raise keywords.unknown('a FogROSLaunchDescription', name, parameters)
-        entities = list(initial_entities or ())
-        for machine in entities:
-            if isinstance(machine, CloudInstance):
-                raise ConfigurationError(
-                    'a machine alone does nothing in a FogROSLaunchDescription',
-                    'give it to a node: Node(machine=...)')
-        super().__init__(entities, deprecated_reason=deprecated_reason)
+        super().__init__(initial_entities, deprecated_reason=deprecated_reason)
         if robot_nodes not in get_args(RobotNodes):
             raise ConfigurationError(
                 f'robot_nodes={robot_nodes!r} is unknown', f'use one of {get_args(RobotNodes)}')

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+import contextlib
 import dataclasses
 import importlib
 import inspect
 import os
 from pathlib import Path
+import re
 from typing import Any, Optional, TYPE_CHECKING
 
 from fogros2.describe import keywords, values
@@ -80,6 +82,19 @@ def check(environment: Mapping[str, str]) -> None:
     """
     for path in files(environment):
         read(path)
+
+
+@contextlib.contextmanager
+def named(environment: Mapping[str, str]) -> Iterator[None]:
+    """Name the files that set an option in the error that a provider raises for the option."""
+    try:
+        yield
+    except ConfigurationError as error:
+        words = re.findall(r'\w+', str(error))
+        setters = [f'{path} sets {name}' for path in files(environment)
+                   for table in read(path).values() for name in table if name in words]
+        error.hint = '; '.join(filter(None, [error.hint, *setters]))
+        raise
 
 
 def _parsed(path: Path) -> dict[str, Any]:

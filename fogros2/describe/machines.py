@@ -8,7 +8,7 @@ import inspect
 import os
 import re
 import shlex
-from typing import Any, cast, get_args, Optional, TYPE_CHECKING, Union
+from typing import Any, cast, get_args, NoReturn, Optional, TYPE_CHECKING, Union
 
 from fogros2.describe import names, networks, values, variables
 from fogros2.describe.kinds import check, options_of, parameters_of
@@ -272,6 +272,14 @@ class CloudInstance:
 
     def takes_containers(self) -> None:
         """Note that containers will run on the machine; a provider's class may override it."""
+
+    def visit(self, context: object = None) -> NoReturn:
+        """Refuse a machine among the actions of a launch description; launch calls this."""
+        raise ConfigurationError('a machine alone does nothing in a launch description',
+                                 'give it to a node: Node(machine=...)')
+
+    #: launch asks for these before it visits an entity.
+    describe_sub_entities = visit
 
     def is_up(self, running: RunningMachine) -> None:
         """Note that the machine is up; the launch calls this."""

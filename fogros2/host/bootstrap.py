@@ -27,7 +27,7 @@ from fogros2 import process, untrusted
 from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError, WorkspaceError
 from fogros2.host import dependencies as needs
 from fogros2.host import inspection as host
-from fogros2.host import locked
+from fogros2.host import locked, modules
 from fogros2.host import wheels as wheel_cache
 from fogros2.host import workspace as workspaces
 from fogros2.host.inspection import DISTRO, HostFacts, MIN_PYTHON, Python
@@ -320,7 +320,8 @@ def _remedy(hint: str) -> Iterator[None]:
         yield
     except CommandError as error:
         raise CommandError(
-            error.command, error.result, error.where, error.hint or hint) from error
+            error.command, error.result, error.where,
+            error.hint or modules.library_hint(str(error)) or hint) from error
 
 
 def check_elsewhere(spec: MachineSpec, facts: HostFacts, robot: HostFacts) -> None:

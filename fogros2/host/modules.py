@@ -85,6 +85,10 @@ NEEDS: Mapping[tuple[str, str], tuple[str, ...]] = {
     ('fogros2', 'bridge'): ('foxglove',),
 }
 
+#: Debian packages of the shared libraries that the wheels of OpenCV and PyAV need.
+_LIBRARIES = {'libGL.so.1': 'libgl1', 'libglib-2.0.so.0': 'libglib2.0-0',
+              'libgthread-2.0.so.0': 'libglib2.0-0', 'libxcb.so.1': 'libxcb1'}
+
 #: Imports each module, because an installed module may lack a shared library.
 _ASK = """\
 import importlib, json, os, platform, re, sys
@@ -225,6 +229,16 @@ def answer(output: str) -> Answer:
         raise PrerequisiteError(
             f'no Python of the machine could list its modules: {output[-200:]!r}',
             'is python3 there at least 3.10, and does a login there print nothing?') from error
+
+
+def library_hint(text: str) -> str:
+    """Return the remedy for a shared library that an import lacks, '' if it lacks none."""
+    library = re.search(r'(\S+\.so[.\d]*): cannot open shared object file', text)
+    if library is None:
+        return ''
+    package = _LIBRARIES.get(library[1])
+    return f"give the machine apt=['{package}']" if package else (
+        f'give the machine apt= with the package that has it: apt-file search {library[1]}')
 
 
 def copy(facts: Answer) -> Optional[Copy]:

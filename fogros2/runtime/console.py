@@ -183,7 +183,7 @@ class Console:
                 return
             for (machine, step), running in self._running.items():
                 if running.seconds >= running.told + STILL:
-                    running.told += STILL
+                    running.told = running.seconds // STILL * STILL
                     doing = [running.doing] if running.doing else []
                     if running.progress is not None:
                         doing.append(_bytes(running.progress))

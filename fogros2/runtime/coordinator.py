@@ -183,7 +183,8 @@ class Coordinator:
                     continue
                 specs.setdefault(spec.name, spec)
                 programs.setdefault(spec.name, []).extend([] if program is None else [program])
-        self.launch.check_here(list(specs.values()), programs)
+        with defaults.named(self._context.environment):
+            self.launch.check_here(list(specs.values()), programs)
 
     def _spec_now(self, machine: Optional[SomeMachine]) -> MachineSpec:
         """Return the spec of a machine whose values may still change."""
@@ -471,10 +472,11 @@ class Coordinator:
     async def _bring_up(self, sessions: list[Session]) -> None:
         try:
             await asyncio.gather(*(session.choose() for session in sessions))
-            await self._in_thread(
-                self.launch.prepare, [session.spec for session in sessions],
-                {session.spec.name: session.programs for session in sessions},
-                {session.spec.name: session.images for session in sessions})
+            with defaults.named(self._context.environment):
+                await self._in_thread(
+                    self.launch.prepare, [session.spec for session in sessions],
+                    {session.spec.name: session.programs for session in sessions},
+                    {session.spec.name: session.images for session in sessions})
         except FogError as error:
             self._fail(error)
             return

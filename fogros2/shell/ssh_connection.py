@@ -106,7 +106,7 @@ def connect(endpoint: Endpoint, *, name: str, timeout: float) -> paramiko.Transp
     known = known_keys(endpoint, settings)
     sock = proxy.dial(settings.proxy, timeout) if settings.proxy \
         else _dial(settings, name, timeout)
-    transport = paramiko.Transport(sock)
+    transport = transport_over(sock)
     # paramiko's own limits follow the clock, which may be set back meanwhile
     late = threading.Event()
 
@@ -178,6 +178,20 @@ def _choose(transport: paramiko.Transport, known: Known) -> None:
         types = [n + known_hosts.CERTIFICATE for n in options.key_types
                  if n not in ('ssh-rsa', 'ssh-dss')] + types
     options.key_types = types
+
+
+def transport_over(sock: socket.socket) -> paramiko.Transport:
+    """Return a transport whose channels raise an OSError too if the key exchange times out."""
+    import paramiko
+
+    class Transport(paramiko.Transport):
+        def _send_user_message(self, data: paramiko.Message) -> None:
+            try:
+                super()._send_user_message(data)  # type: ignore[misc]
+            except paramiko.SSHException as error:
+                raise TimeoutError(str(error)) from error
+
+    return Transport(sock)
 
 
 def limited(channel: paramiko.Channel, window: int) -> paramiko.Channel:

@@ -26,7 +26,7 @@ from fogros2.errors import (
     Unsupported,
 )
 from fogros2.model import CreateRequest, Machine, MachineSpec, MachineState
-from fogros2.provider import Capabilities, Provider, TAG_EXPIRES, TAG_NAME, TAG_ON_EXIT
+from fogros2.provider import Capabilities, Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ON_EXIT
 from fogros2.provider.offers import MachineType, Offer, wants
 from fogros2.testing.shell_contract import raised
 from fogros2.waiting import wait_until
@@ -225,8 +225,9 @@ class ProviderContract:
     def test_adopted_machine_has_the_tags_of_its_launch(self) -> None:
         with self.machine({TAG_EXPIRES: '1'}) as (provider, spec, _, machine_id):
             before = self.reached(provider, machine_id).tags
-            provider.adopt(machine_id, spec, {TAG_EXPIRES: '2'})
-            changed = {TAG_EXPIRES: '2'} if provider.capabilities.adopt else {}
+            tags = {TAG_EXPIRES: '2', TAG_LAUNCH: 'next'}
+            provider.adopt(machine_id, spec, tags)
+            changed = tags if provider.capabilities.adopt else {}
             assert {**before, **changed}.items() <= provider.describe(machine_id).tags.items()
 
     def test_stopped_machine_starts_again(self) -> None:

@@ -28,8 +28,8 @@ Fault = Literal['throttled', 'unavailable', 'lost', 'full', 'silent']
 #: Requests that fail, if all shall.
 ALWAYS = 1000
 #: The words of a command that only switches a computer off.
-_OFF = frozenset('sudo sh bash c ec exec shutdown poweroff halt systemctl telinit init 0 h P p f '
-                 'force now'.split())
+_OFF = frozenset('sudo env nohup busybox sh bash c ec exec sync sleep true shutdown poweroff halt '
+                 'systemctl telinit init h P p i f force no wall now'.split())
 
 
 class VmContract(ProviderContract):
@@ -109,7 +109,8 @@ class VmContract(ProviderContract):
             assert command
             # a folder, such as /sbin, tells nothing
             words = re.findall(r'\w+', re.sub(r'\S*/', ' ', ' '.join(command)))
-            assert not (self.billed_when_off and set(words) <= _OFF), (
+            assert not (self.billed_when_off and all(
+                word in _OFF or word.isdecimal() for word in words)), (
                 f'a machine that is off is billed, and {command} only switches it off')
 
     def test_offers_are_sorted_by_price(self) -> None:

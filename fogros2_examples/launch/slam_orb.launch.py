@@ -50,7 +50,7 @@ def generate_launch_description():
           for name, (value, what) in (asked | shown).items()),
         # Other machines than containers can run containers by default.
         checked({'dataset': "'' stands for the synthetic room"},
-                {'picture': PICTURES, 'results': ()}),
+                {'picture': PICTURES, 'results': ()}, folders=['dataset']),
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'slam', 'mounts': LaunchConfiguration('mounts'),
             'containers': PythonExpression(

@@ -54,15 +54,16 @@ class LaunchDescription(LaunchDescriptionEntity):
         ) -> None:
             entity: Any
             for entity in entities:
-                if entity._role == 'argument':
+                role = getattr(entity, '_role', '')
+                if role == 'argument':
                     if any(entity.name == argument.name for argument, _ in found):
                         continue
                     entity._conditionally_included = conditional or entity.condition is not None
                     found.append((entity, includes))
-                if entity._role == 'reset':
+                if role == 'reset':
                     # What follows can't see the arguments of this launch.
                     return
-                inner = [*includes, entity] if entity._role == 'include' else includes
+                inner = [*includes, entity] if role == 'include' else includes
                 collect(entity.describe_sub_entities(), False, inner)
                 for _, conditional_entities in entity.describe_conditional_sub_entities():
                     collect(conditional_entities, True, inner)

@@ -28,7 +28,7 @@ _PACKAGES = ('ros-rclpy', 'cryptography', 'paramiko', 'PyYAML', 'boto3', 'google
              'azure-identity', 'kubernetes', 'av', 'foxglove-sdk')
 #: Variables whose values are shown, by how they begin, and names of secrets.
 _SHOWN = ('ROS_', 'RMW_', 'FOGROS2_', 'CYCLONEDDS_', 'FASTDDS_', 'FASTRTPS_', 'ZENOH_')
-_WORD = 'secret|token|passw|passphr|credential|authorization|signature'
+_WORD = 'secret|token|passw|passphr|credential|authorization|signature|cookie'
 _SHORT = '(?:pass|pwd|psk|sig)(?![a-z])'
 #: PWD itself is the current folder.
 _SECRET_NAME = re.compile(f'key|{_WORD}|_{_SHORT}|sshpass', re.IGNORECASE)
@@ -37,10 +37,13 @@ _SECRETS = (
                r'(?:\s*-----END [A-Z ]+-----)?', re.MULTILINE),
     # a password may have '@' and '/', although it should not
     re.compile(r'(?<=://)(?:[^/\s:]*:\S+|[^/\s]+)(?=@)'),
-    re.compile(rf'(?i)(?P<kept>(?:\w[_-]key|{_WORD}|(?<![a-z]){_SHORT})[\w-]*'
-               r'["\']?\s*[:=>]\s*["\']?(?:bearer\s+)?)[^\s&"\',;)]+'),
+    re.compile(r'(?i)(?P<kept>authorization["\']?\s*[:=]\s*).+'),
+    re.compile(r'(?i)(?P<kept>\bbearer\s+|\bsshpass\s+-p\s*|\s-u\s+(?=\S+:))\S+'),
+    re.compile(rf'(?i)(?P<kept>(?:\w[_-]?key|[?&]key|{_WORD}|(?<![a-z]){_SHORT})[\w-]*'
+               r'["\']?\s*[:=>]\s*b?["\']?)[^\s&"\',;)]+'),
     re.compile(rf'(?i)(?P<kept>--[\w-]*(?:key|{_WORD}|{_SHORT})[\w-]*\s+["\']?)[^\s"\']+'),
-    re.compile(r'\b(?:gh[pousr]_|github_pat_|glpat-|hf_|xox[a-z]-|sk-|AIza|pypi-)[\w-]{16,}'),
+    re.compile(r'\b(?:gh[pousr]_|github_pat_|glpat-|hf_|xox[a-z]-|sk-|AIza|pypi-|npm_|'
+               r'dop_v1_|whsec_|SG\.)[\w.-]{16,}'),
     re.compile(r'\b(?:AKIA|ASIA)[A-Z0-9]{16}\b'),
     re.compile(r'\beyJ[\w-]+\.[\w-]+\.?[\w-]*'),
     re.compile(r'\b[0-9a-fA-F]{32,}\b'),

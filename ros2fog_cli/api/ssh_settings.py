@@ -9,6 +9,7 @@ with a pattern in the user's configuration reads those that exist.
 from __future__ import annotations
 
 import dataclasses
+import glob
 from pathlib import Path
 import re
 import shlex
@@ -64,9 +65,9 @@ def settings(name: str, to: Endpoint, folder: Path) -> str:
     config = ssh_config.of(to)
     host = to.host if to.host_key else config.host
     pairs = [('HostName', host.replace('%', '%%')), ('Port', str(config.port)),
-             ('User', config.user)]
-    if config.proxy:
-        pairs.append(('ProxyCommand', shlex.join(config.proxy).replace('%', '%%')))
+             ('User', config.user),
+             # not by the user's ProxyJump for all hosts, which the launch does not use either
+             ('ProxyCommand', shlex.join(config.proxy).replace('%', '%%') or 'none')]
     if config.only_keys:
         pairs += [('IdentityFile', _path(key, '%')) for key in config.keys]
         pairs.append(('IdentitiesOnly', 'yes'))
@@ -88,7 +89,8 @@ def settings(name: str, to: Endpoint, folder: Path) -> str:
 
 def include(store: Store) -> str:
     """Return the line for the user's configuration."""
-    return f"Include {_path(str(store.root.absolute() / 'machines' / '*' / FILE))}"
+    root = glob.escape(str(store.root.absolute())).replace('\\', 4 * '\\')
+    return f"Include {_path(f'{root}/machines/*/{FILE}')}"
 
 
 def included(line: str, path: Path = Path('~/.ssh/config')) -> bool:
@@ -107,6 +109,6 @@ def _path(path: str, doubled: str = '') -> str:
     :raises ShellError: it cannot be quoted.
     """
     text = path.replace(doubled, 2 * doubled) if doubled else path
-    if '"' in text:
+    if '"' in text or '${' in text:
         raise ShellError(f'ssh would misread the path {text!r}', 'rename the file or folder')
     return f'"{text}"' if _MISREAD.search(text) else text

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from ros2fog_cli.verb import say, VerbExtension, warn
+from ros2fog_cli.verb import VerbExtension, warn
 
 
 class BugreportVerb(VerbExtension):
@@ -23,6 +23,7 @@ class BugreportVerb(VerbExtension):
         from ros2fog_cli.api import bugreport, doctor
         home = os.environ.get('ROS_HOME') or '~/.ros'
         log = Path(os.environ.get('ROS_LOG_DIR') or f'{home}/log').expanduser()
-        say(bugreport.report(doctor.examine(lan_seconds=0), Store(), os.environ, log))
+        print(bugreport.report(doctor.examine(lan_seconds=0), Store(), os.environ, log),
+              flush=True)
         warn('read it before you send it: only known forms of secrets are left out')
         return 0

@@ -27,6 +27,7 @@ class PlanVerb(VerbExtension):
 
         from fogros2.deploy import provider
         from fogros2.deploy.choosing import Choices
+        from fogros2.describe import defaults
         from fogros2.describe.overrides import Overrides
         from fogros2.errors import ConfigurationError, FogError
         from fogros2.launch_internals import hints
@@ -50,7 +51,8 @@ class PlanVerb(VerbExtension):
                     if machine.spec is None:
                         continue
                     try:
-                        machine.spec, price = preview.priced(machine.spec, choices)
+                        with defaults.named(os.environ):
+                            machine.spec, price = preview.priced(machine.spec, choices)
                         if price is not None:
                             prices[machine.name] = price
                     except FogError as error:

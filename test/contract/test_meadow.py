@@ -269,6 +269,10 @@ def replaced_tags(set_tags):
         adapter.RULES.encode(tags))
 
 
+def only_the_first_tag(set_tags):
+    return lambda self, machine, tags: set_tags(self, machine, dict([*tags.items()][:1]))
+
+
 def without_wait(delete):
     return lambda self, machine: self.end_attempt(machine.region, machine.attempt)
 
@@ -280,6 +284,9 @@ def without_repeats(repeated):
 MUTANTS = {
     'tags are replaced': Mutant(
         'test_adopted_machine_has_the_tags_of_its_launch', Meadow, 'set_tags', replaced_tags),
+    'one tag of several is written': Mutant(
+        'test_adopted_machine_has_the_tags_of_its_launch', Meadow, 'set_tags',
+        only_the_first_tag),
     'a pin replaces tags': Mutant(
         'test_pinned_host_key_is_reported_everywhere', Meadow, 'set_tags', replaced_tags),
     'user data is lost': Mutant(
@@ -319,6 +326,10 @@ MUTANTS = {
     'the end only switches off': Mutant(
         'test_machine_ends_its_own_billing', Meadow, 'end_command',
         lambda right: lambda self, *words: END_COMMAND),
+    'a script only switches off': Mutant(
+        'test_machine_ends_its_own_billing', Meadow, 'end_command',
+        lambda right: lambda self, *words: (
+            '/bin/sh', '-c', 'sync; sleep 1; /usr/bin/systemctl poweroff -i --no-wall')),
     'throttled requests are not repeated': Mutant(
         'test_throttled_creation_is_made_again', adapter.Account, 'repeated', without_repeats),
 }

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 import threading
 
 from launch import LaunchDescription
@@ -35,6 +36,7 @@ from fogros2.errors import (
 )
 from fogros2.runtime import remote_run, session
 from rigs.launching import ends
+from ros2fog_cli.api.preview import Preview
 
 
 def talker(machine, **kwargs):
@@ -97,9 +99,21 @@ def test_unknown_value_of_robot_nodes_is_refused():
         FogROSLaunchDescription(robot_nodes='soon')
 
 
-def test_machine_without_a_node_is_an_error(planner):
-    with pytest.raises(ConfigurationError, match='a machine alone does nothing'):
-        FogROSLaunchDescription([planner])
+@pytest.mark.parametrize('kind', [LaunchDescription, FogROSLaunchDescription])
+@pytest.mark.parametrize('within', [
+    lambda machine: machine, lambda machine: GroupAction([machine]),
+    lambda machine: TimerAction(period=0.0, actions=[machine]),
+    lambda machine: OpaqueFunction(function=lambda context: [machine])])
+def test_machine_without_a_node_is_an_error(run, planner, caplog, kind, within):
+    assert run(kind([within(planner)])) == 1
+    assert 'a machine alone does nothing in a launch description' in caplog.text
+
+
+def test_machine_without_a_node_is_an_error_of_a_preview(planner):
+    description = LaunchDescription([planner])
+    for look in (description.get_launch_arguments, lambda: Preview(description, {})):
+        with pytest.raises(ConfigurationError, match='a machine alone does nothing'):
+            look()
 
 
 def test_waiting_process_keeps_its_configuration(run, fake, planner, capfd):
@@ -544,6 +558,21 @@ def test_checks_come_before_any_machine(run, fake, planner, capfd):
     assert run(LaunchDescription([talker(planner)])) == 1
     assert not fake.noted('up')
     assert 'this will not do (do otherwise)' in capfd.readouterr().out
+
+
+@pytest.mark.skipif(not any(map(find_spec, ('tomllib', 'tomli'))),
+                    reason='needs Python 3.11 or tomli')
+@pytest.mark.parametrize('when', ['here', 'prepare'])
+def test_wrong_option_of_a_file_names_the_file(
+    run, fake, planner, capfd, monkeypatch, tmp_path, when,
+):
+    monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path))
+    file = tmp_path / 'fogros2/fogros2.toml'
+    file.parent.mkdir()
+    file.write_text("[container]\nmemory = '2x'\n")
+    setattr(fake, f'{when}_error', ConfigurationError('no memory', 'write 2g'))
+    assert run(LaunchDescription([talker(planner)])) == 1
+    assert f'no memory (write 2g; {file} sets memory)' in capfd.readouterr().out
 
 
 @pytest.mark.parametrize('description', [LaunchDescription, FogROSLaunchDescription])

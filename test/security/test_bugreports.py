@@ -47,6 +47,11 @@ def test_output_of_nodes_is_in_no_report(log: Path) -> None:
     '<Security><Authentication><Password>hunter2</Password></Authentication></Security>',
     'pwd=hunter2', 'DB_PASS: hunter2', 'run --passphrase hunter2', 'run --api-key "hunter2"',
     'clone with ghp_hunter2hunter2hunter2hunter2hunter2h', 'hf_hunter2HunterHunterHunter',
+    'Authorization: Basic hunter2', 'authorization=Digest username="a", response="hunter2"',
+    'sent Bearer hunter2', 'curl -u me:hunter2 x', 'sshpass -p hunter2 ssh x', 'apikey: hunter2',
+    'PrivateKey = hunter2', 'AccountKey=hunter2;', 'https://x?key=hunter2',
+    "{'token': b'hunter2'}", 'Set-Cookie: session=hunter2', 'npm_hunter2hunter2hunter2',
+    'SG.hunter2hunter2.hunter2hunter2',
     'glpat-hunter2HunterHunterHunter', 'AIzaSyhunter2HunterHunterHunterHunter'])
 def test_secrets_that_programs_write_are_hidden(text: str) -> None:
     environment = {'ROS_EXTRA': text}

@@ -321,10 +321,15 @@ def test_silent_rosdep_is_a_warning_and_asked_again(pip: tuple[str, ...]) -> Non
     assert b': >complete' in fill('/none', (), {}, {}, ()).input
 
 
-@pytest.mark.parametrize(('option', 'remedy'), [
-    ({'apt': ('none',)}, 'apt= of the machine'), ({'pip': ('none',)}, 'pip= of the machine')])
+@pytest.mark.parametrize(('option', 'reason', 'remedy'), [
+    ({'apt': ('none',)}, 'E: Unable to locate it', 'apt= of the machine'),
+    ({'pip': ('none',)}, 'E: Unable to locate it', 'pip= of the machine'),
+    ({'pip': ('opencv-python',)}, "'cv2' of opencv-python can't be imported there: ImportError: "
+     'libGL.so.1: cannot open shared object file: No such file',
+     "give the machine apt=['libgl1']"),
+])
 def test_package_that_cannot_be_installed_has_a_remedy(
-    option: dict[str, tuple[str, ...]], remedy: str,
+    option: dict[str, tuple[str, ...]], reason: str, remedy: str,
 ) -> None:
     facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=True)
     install = bootstrap.RosInstall('ros', facts=facts, robot=facts)
@@ -332,10 +337,10 @@ def test_package_that_cannot_be_installed_has_a_remedy(
 
     def run(command: Command, **_: object) -> Result:
         if command.what.startswith('install'):
-            raise CommandError(command, Result(100, '', 'E: Unable to locate it'), "'lab'")
+            raise CommandError(command, Result(100, '', reason), "'lab'")
         return Result(0, 'none', '')
 
-    with pytest.raises(CommandError, match="on 'lab'.*Unable to locate it") as raised:
+    with pytest.raises(CommandError, match=f"on 'lab'.*{reason}") as raised:
         bootstrap._complete(spec, install, '/home/fog/pip', [], run, lambda *warning: None)
     assert raised.value.hint.startswith(remedy)
 

@@ -15,6 +15,8 @@ from fogros2 import AWSCloudInstance, ContainerInstance, SSHInstance
 from fogros2.describe import defaults
 from fogros2.describe.overrides import Overrides
 from fogros2.errors import ConfigurationError, PrerequisiteError
+from fogros2.provider.aws.provider import AWSProvider
+from fogros2.provider.container import ContainerProvider
 from ros2fog_cli.api import doctor
 
 pytestmark = pytest.mark.skipif(
@@ -113,6 +115,20 @@ def test_wrong_file_is_an_error(own, text, message, hint):
     with pytest.raises(ConfigurationError, match=message) as wrong:
         spec(ContainerInstance(name='a'))
     assert hint in wrong.value.hint
+
+
+@pytest.mark.parametrize(('provider', 'text', 'name'), [
+    (ContainerProvider, "[container]\nmemory = '2x'", 'memory'),
+    (ContainerProvider, "[container]\nports = ['a:b']", 'ports'),
+    (AWSProvider, "ssh_from = ['nowhere']", 'ssh_from'),
+    (AWSProvider, '[aws]\ndisk_size = 1', 'disk_size')])
+def test_option_that_a_provider_refuses_names_the_file(own, provider, text, name):
+    own.write_text(f"lifetime = '2h'\n{text}")
+    machine = spec({'container': ContainerInstance, 'aws': AWSCloudInstance}[provider.name](
+        name='a', ros_workspace=''))
+    with pytest.raises(ConfigurationError) as wrong, defaults.named(os.environ):
+        provider().check(machine)
+    assert wrong.value.hint.endswith(f'; {own} sets {name}')
 
 
 def test_python_without_toml_names_the_remedy(own, monkeypatch):

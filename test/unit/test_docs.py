@@ -16,7 +16,9 @@ import pytest
 
 import fogros2
 from fogros2.describe import overrides
+from fogros2.provider import Capabilities, Provider
 from fogros2.provider.kubernetes import manifests
+from fogros2.provider.vm.cloud import VmCloud
 from fogros2.waiting import Timeouts
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -205,6 +207,15 @@ def test_modules_that_a_page_names_exist(page):
     named = re.findall(r'`([\w/]+(?:/|\.py))`', text)
     assert [name for name in named if not (ROOT / name).exists()
             and not (ROOT / 'fogros2' / name).exists()] == []
+
+
+@pytest.mark.parametrize(('kind', 'page'), [
+    (Provider, 'providers.md'), (Capabilities, 'providers.md'), (VmCloud, 'providers_vm.md')])
+def test_page_names_all_that_a_provider_may_have(kind, page):
+    text = (ROOT / 'doc/developers' / page).read_text() \
+        + (ROOT / 'doc/provider_template/fogros2_meadow.py').read_text()
+    assert [name for name in vars(kind)
+            if not name.startswith('_') and not re.search(rf'\b{name}\b', text)] == []
 
 
 def test_providers_import_what_their_page_says():

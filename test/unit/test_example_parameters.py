@@ -79,16 +79,20 @@ def test_launch_ends_with_the_status_of_its_node():
 
 @pytest.mark.parametrize(('given', 'said'), [
     ({'policy': 'absent.onnx'}, 'policy:=absent.onnx: there is no such file here (train one)'),
+    ({'policy': '.'}, 'policy:=.: there is no such file here (train one)'),
+    ({'dataset': 'absent'}, 'dataset:=absent: there is no such file here (record one)'),
     ({'picture': 'here.txt'}, 'picture:=here.txt: it has to end in .png, .jpg, .jpeg'),
     ({'runs': 'nowhere/runs'}, 'runs:=nowhere/runs: there is no folder nowhere'),
     ({}, ''), ({'policy': 'synthetic'}, ''), ({'policy': 'there.onnx'}, ''),
-    ({'policy': '.', 'picture': 'new.png', 'runs': 'there.onnx'}, '')])
+    ({'dataset': '.', 'picture': 'new.png', 'runs': 'there.onnx'}, '')])
 def test_files_are_checked_before_the_machine(given, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'there.onnx').touch()
     context = LaunchContext()
-    context.launch_configurations.update({'policy': '', 'picture': '', 'runs': '', **given})
-    action = checked({'policy': 'train one'}, {'picture': PICTURES, 'runs': ()}, ['synthetic'])
+    context.launch_configurations.update(
+        {'policy': '', 'dataset': '', 'picture': '', 'runs': '', **given})
+    action = checked({'policy': 'train one', 'dataset': 'record one'},
+                     {'picture': PICTURES, 'runs': ()}, ['synthetic'], ['dataset'])
     if not said:
         assert not action.execute(context)
         return

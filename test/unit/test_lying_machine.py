@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import threading
 from types import SimpleNamespace
 
@@ -14,7 +15,7 @@ pytest.importorskip('launch.actions', reason='launch is not installed')
 from fogros2.deploy import RunningMachine
 from fogros2.errors import AgentError, ConnectError
 from fogros2.model import Command, Endpoint, MachineSpec
-from fogros2.shell import lines, relay
+from fogros2.shell import lines, relay, ssh_connection
 from fogros2.shell.ssh import SSHShell
 from fogros2.testing.fakes import FakeProvider
 from rigs import deploying
@@ -85,6 +86,24 @@ def test_channel_of_a_lost_connection_closes(monkeypatch, error):
     monkeypatch.setattr(shell, 'start', lambda *words: channel)
     with pytest.raises(ConnectError, match='was lost while'):
         shell.run(Command(('true',)), timeout=5.0)
+
+
+def test_key_exchange_without_an_end_is_a_lost_connection():
+    """The server may ask for new keys at any time, and then be silent."""
+    paramiko = pytest.importorskip('paramiko')
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        transport = ssh_connection.transport_over(ours)
+        transport.active, transport.clear_to_send_timeout = True, 0.0
+        channel = paramiko.Channel(0)
+        channel._set_transport(transport)
+        channel._set_window(1 << 16, 1 << 15)
+        channel._set_remote_channel(0, 1 << 16, 1 << 15)
+        stream = lines.LineStream(channel, 'planner')
+        with pytest.raises(ConnectError, match='is gone: Key-exchange timed out'):
+            stream.write(b'line')
+        stream.close()
+        transport.close()
 
 
 def test_command_starts_anew_after_its_connection_was_closed(monkeypatch):

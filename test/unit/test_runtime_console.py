@@ -136,6 +136,15 @@ def test_slow_step_is_told_with_what_it_waits_for(lines):
         'planner: workspace']
 
 
+def test_launch_that_was_stopped_says_once_what_it_does(lines):
+    console = Console(io.StringIO())
+    with step(console, 'planner', 'machine'):
+        later(console, 500.0)  # Ctrl-Z and fg
+        later(console, 1.0)
+    console.close()
+    assert [text for _, text in lines][1:-1] == ['planner: machine: still working after 480 s']
+
+
 def test_running_time_is_on_a_terminal(lines):
     terminal = Terminal()
     console = Console(terminal)

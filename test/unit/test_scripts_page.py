@@ -6,10 +6,12 @@ from __future__ import annotations
 import ast
 import dataclasses
 from decimal import Decimal
+import functools
 import json
 from pathlib import Path
 import re
 from typing import Any, get_type_hints
+from unittest.mock import Mock
 
 import pytest
 from ros2cli.cli import main
@@ -24,7 +26,7 @@ from fogros2.store import Record, Store
 from fogros2.testing.fakes import FakeProvider
 from fogros2.testing.plugins import instead
 from fogros2_replicas import figures
-from ros2fog_cli.api import images, output, shown
+from ros2fog_cli.api import images, output, shown, watching
 from ros2fog_cli.api.doctor import Check
 from ros2fog_cli.api.guests import Guest
 from ros2fog_cli.api.machines import Entry
@@ -106,6 +108,23 @@ def test_fields_of_status_are_on_the_page(capsys: pytest.CaptureFixture[str]) ->
     assert sorted(parts('guests')) == sorted(get_type_hints(Guest))
     (row,) = figures.rows('a', [figures.Figures('a')])
     assert sorted(parts('replicas')) == sorted(row)
+
+
+def test_fields_of_streams_are_on_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip('rclpy')
+    from fogros2_monitor.dashboard.graph import GraphNode
+    from fogros2_monitor.dashboard.ways import Stream
+
+    node = Mock(_ears={}, _reports={'/b': (0.0, None)})
+    for name in ('_rates', '_share'):
+        setattr(node, name, functools.partial(getattr(GraphNode, name), node))
+    stream = GraphNode._stream(node, Stream('/image', 'h264', '/b', 'kind', 'a', '', True))
+    monkeypatch.setattr(watching, 'TIMEOUT', 0.0)
+    monkeypatch.setattr(watching, 'Live', lambda **_: Mock(state=lambda: {
+        # graphs.py adds these for the dashboard
+        'streams': [{**stream, 'id': 'x /image', 'picture': 0}]}))
+    (found,) = watching.streams('a')
+    assert sorted(parts('streams')) == sorted(found)
 
 
 def test_fields_of_the_agent_are_on_the_page() -> None:

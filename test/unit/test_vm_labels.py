@@ -12,7 +12,8 @@ from fogros2.provider.vm.labels import LabelRules
 TAGS = {
     'fogros2-name': 'planner',
     'fogros2-host-key': 'ssh-ed25519 AAAAC3NzaC1lZDI1NTE5' + 'x/+=' * 20,
-    'fogros2-robot': 'Robot_7-1000', 'fogros2-note': 'Grüße', 'fogros2-empty': '', 'team_1': 'red'}
+    'fogros2-robot': 'Robot_7-1000', 'fogros2-note': 'Grüße', 'fogros2-empty': '', 'team_1': 'red',
+    'lab': 'a', 'lab_1': 'b', 'lab_2': 'c', '_1': 'd'}
 
 
 @pytest.mark.parametrize('rules', [LabelRules(), LabelRules(plain='a-z0-9', longest=7),

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 import platform
-import re
 import sys
 import threading
 from typing import Optional
@@ -18,10 +17,6 @@ from fogros2.errors import CommandError, PrerequisiteError
 from fogros2.host import bootstrap, modules, workspace
 from fogros2.model import Command, NodeSpec
 from fogros2.report import Progress, Warned
-
-#: Debian packages of the shared libraries that the wheels of OpenCV and PyAV need.
-_PACKAGES = {'libGL.so.1': 'libgl1', 'libglib-2.0.so.0': 'libglib2.0-0',
-             'libgthread-2.0.so.0': 'libglib2.0-0', 'libxcb.so.1': 'libxcb1'}
 
 
 def install_ros(
@@ -152,12 +147,7 @@ class Modules(Step):
 
     def _without(self, present: modules.Answer, why: str) -> PrerequisiteError:
         names = ' '.join(modules.MODULES[name].distributions[0] for name in present.missing)
-        library = re.search(r'(\S+\.so[.\d]*): cannot open shared object file', why)
-        if library:
-            package = _PACKAGES.get(library[1])
-            hint = (f'install {package} there with apt' if package else
-                    f'install the package there that has it: apt-file search {library[1]}')
-        elif present.architecture != platform.machine():
+        if present.architecture != platform.machine():
             hint = (f"take an image with them (pip install {names}): this robot's own are for "
                     f'{platform.machine()} processors, and the machine has {present.architecture}')
         elif present.python != sys.version_info[:2]:
@@ -169,4 +159,4 @@ class Modules(Step):
                     f'machine that has them: pip install {names}')
         return PrerequisiteError(
             f"'{self._job.name}' can't get {', '.join(present.missing)}, which programs there "
-            f'import: {why}', hint)
+            f'import: {why}', modules.library_hint(why) or hint)

@@ -39,13 +39,21 @@ class LabelRules:
         """Return the tags that ``encode`` stored."""
         tags: dict[str, str] = {}
         for key in labels:
-            if re.fullmatch(r'.*_\d+', key) and key.rpartition('_')[0] in labels:
+            if self._continues(key, labels):
                 continue
             coded, index = labels[key], 1
-            while f'{key}_{index}' in labels:
+            while self._continues(f'{key}_{index}', labels):
                 coded += labels[f'{key}_{index}']
                 index += 1
             # no other number is a character's
             tags[key] = re.sub('_([0-9a-f]{1,5}|10[0-9a-f]{4})_',
                                lambda match: chr(int(match[1], 16)), coded)
         return tags
+
+    def _continues(self, key: str, labels: Mapping[str, str]) -> bool:
+        """Return whether a label continues a value; a user's own ``team_1`` need not."""
+        base, _, number = key.rpartition('_')
+        if key not in labels or not number.isdecimal():
+            return False
+        before = base if number == '1' else f'{base}_{int(number) - 1}'
+        return len(labels.get(before, '')) == self.longest

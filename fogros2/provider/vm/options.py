@@ -186,7 +186,7 @@ class VmOptions:
             raise ConfigurationError(f'a disk can not have {self.disk_size} GB',
                                      f'disk_size= takes {least} to {most}')
         for network in self.ssh_from:
-            cidr(network)
+            cidr(network, 'ssh_from: ')
         if len(' '.join(self.ssh_from)) > 256:
             raise ConfigurationError('ssh_from= names too many networks for a tag',
                                      'name fewer, or larger ones')
@@ -246,16 +246,17 @@ def _value(name: str, value: Any, default: Any) -> Any:
     return convert(name, value, default)
 
 
-def cidr(text: str) -> str:
+def cidr(text: str, what: str = '') -> str:
     """
     Return an address or network in CIDR form.
 
+    :param what: the beginning of the error.
     :raises ConfigurationError: it is neither.
     """
     try:
         return str(ipaddress.ip_network(text.strip(), strict=False))
     except ValueError as error:
-        raise ConfigurationError(f"'{text}' is no address or network",
+        raise ConfigurationError(f"{what}'{text}' is no address or network",
                                  "such as '198.51.100.7' or '198.51.100.0/24'") from error
 
 

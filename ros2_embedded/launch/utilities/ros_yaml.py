@@ -6,18 +6,21 @@ PyYAML reads 1e-3 as a text, 12:30 as a number and y as a text; rcl decides othe
 """
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import re
+import sys
 from typing import Any
 
 _TRUE = {'y', 'Y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON'}
 _FALSE = {'n', 'N', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF'}
 #: What strtol reads with base 0.
 _INT = re.compile(r'[-+]?(0[xX][0-9a-fA-F]+|0[0-7]*|[1-9][0-9]*)')
-#: What strtod reads, without hexadecimal numbers, and YAML's names for infinity and no number.
+#: What strtod reads, and YAML's names for infinity and no number.
 _FLOAT = re.compile(r'[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?'
-                    r'|[-+]?(?i:inf|infinity|nan)|[-+]?\.(inf|Inf|INF|nan|NaN|NAN)')
+                    r'|[-+]?(?i:inf|infinity|nan)|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)')
+_HEX_FLOAT = re.compile(r'(?i:[-+]?0x([0-9a-f]+\.?[0-9a-f]*|\.[0-9a-f]+)(p[-+]?[0-9]+)?)')
 _TEXT = 'tag:yaml.org,2002:str'
 
 
@@ -33,8 +36,13 @@ def typed(text: str) -> bool | int | float | str:
             return number
     if _FLOAT.fullmatch(text):
         found = float(text if text[-1].isdigit() else text.replace('.', ''))
-        if not math.isinf(found) or not any(letter.isdigit() for letter in text):
+        mantissa = re.split('[eE]', text)[0] if text[-1].isdigit() else ''
+        # rcl takes a number out of range for a text
+        if not re.search('[1-9]', mantissa) or sys.float_info.min <= abs(found) < math.inf:
             return found
+    if _HEX_FLOAT.fullmatch(text):
+        with contextlib.suppress(OverflowError):
+            return float.fromhex(text)
     return text
 
 
