@@ -28,8 +28,8 @@ Robots = Callable[[str], Robot]
 def reading(one: Robot, name: str = '', files: Sequence[int] = ()) -> Iterator[socket.socket]:
     """Connect to a robot's relay; say a machine's name and hand over files, as a relay does."""
     with socket.socket(socket.AF_UNIX) as link:
+        link.connect(str(one.folder / OWN / NAME))  # waits for room in the queue of connections
         link.settimeout(60)
-        link.connect(str(one.folder / OWN / NAME))
         if name:
             socket.send_fds(link, [name.encode()], list(files))
         yield link
