@@ -75,6 +75,8 @@ class Launch:
         self._rmw = ''
         self._interfaces: list[DdsInterface] = []
         self._robot_environment: Optional[dict[str, str]] = None
+        #: Networks of the VPNs that this launch will join.
+        self._others: list[str] = []
         #: How this launch has joined machines of other robots, by their names here.
         self._invitations: dict[str, Invitation] = {}
 
@@ -97,6 +99,9 @@ class Launch:
         for answer in answers:
             if answer in done:
                 answer.result()
+        self._others = [
+            unseal(text, own_key(self.store)).network
+            for text in (self.provider(spec.provider).invitation(spec) for spec in specs) if text]
 
     def prepare(
         self, specs: Sequence[MachineSpec],
@@ -314,7 +319,8 @@ class Launch:
                     asked=addresses_of(self.dds().asked(self.user_environment)))
                 self._vpn = RobotVpn(
                     choose_interface(
-                        self.id, folder, self.user_environment, self.timeouts.vpn), vpn,
+                        self.id, folder, self.user_environment, self.timeouts.vpn,
+                        self._others), vpn,
                     report=self.report, undo=self.undo, timeout=self.timeouts.vpn,
                     cancel=self.cancel, ending=self._ending,
                     choose_port=functools.partial(addresses.choose_port, self.user_environment))

@@ -30,16 +30,18 @@ POLL_INTERVAL, LONGEST_POLL_INTERVAL = 1.0, 15.0
 
 def choose_interface(
     launch_id: str, folder: Path, environment: Mapping[str, str], timeout: float,
+    others: Iterable[str],
 ) -> VpnInterface:
     """
     Return an interface with a subnet and a port that this computer does not use.
 
     :param folder: the launch's folder.
+    :param others: networks of other VPNs that the launch joins later.
     :raises FogError: there is none, or this computer's networks cannot be read.
     """
     used = addresses.parse_used(run([addresses.used_networks()], timeout=timeout))
     network = addresses.choose_subnet(
-        used, launch_id=launch_id, pool=addresses.pool_from(environment))
+        [*used, *others], launch_id=launch_id, pool=addresses.pool_from(environment))
     interface = plan.robot_interface(
         launch_id, network, addresses.choose_port(environment), str(folder / 'vpn.key'),
         os.getpid())

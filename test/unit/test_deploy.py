@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from fogros2 import plan, process
+from fogros2 import invitation, plan, process
 from fogros2.agent_client import AgentClient
 from fogros2.deploy import Launch, robot_vpn
 from fogros2.deploy import launch as deployed
@@ -60,6 +60,7 @@ from fogros2.shell import host_key
 from fogros2.store import Store
 from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream, FakeVpn
 from fogros2.testing.plugins import instead
+from fogros2.vpn import addresses
 from fogros2.waiting import Periodic, Timeouts, wait_until
 
 SPEC = MachineSpec('planner', 'fake')
@@ -149,6 +150,19 @@ def test_machine_is_deleted_if_its_id_cannot_be_stored(
     with pytest.raises(StoreError):
         launch.up(SPEC)
     assert list(provider.find({})) == []
+
+
+def test_launch_s_network_differs_from_one_that_it_joins(launch, monkeypatch):
+    monkeypatch.setenv('FOGROS2_STATE_HOME', str(launch.store.root))
+    own = addresses.choose_subnet([], launch_id=launch.id)
+    text = invitation.seal(invitation.Invitation(
+        'planner', 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw=', own.replace('.0/24', '.2'),
+        '203.0.113.9:50000', own.replace('.0/24', '.224'), own, 'rmw_fastrtps_cpp', 3,
+        time.time() + 600, 'foga1b2c3m0', '5a' * 32),
+        invitation.public_text(invitation.own_key(launch.store)))
+    monkeypatch.setattr(addresses, 'parse_used', lambda output: [])
+    launch.check_here([MachineSpec('planner', 'joined', {'invitation': text})])
+    assert launch.robot_vpn().interface.network != own
 
 
 def test_robot_asks_machines_and_names_its_middleware(launch, events, monkeypatch):
