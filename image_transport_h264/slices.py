@@ -69,8 +69,8 @@ class SliceSender:
         """Return whether all subscribers of the whole messages take slices too."""
         return self._node.subscribers(self._publisher) >= self._node.subscribers(whole)
 
-    def send(self, data: bytes) -> bool:
-        """Publish a message, and wait until most has arrived; return False if none arrives."""
+    def send(self, data: bytes) -> None:
+        """Publish a message, and wait until most has arrived; give up one that does not arrive."""
         begin, self._pacemaker = time.monotonic(), min
         # all of a size, as the pace compares their times
         size = -(-len(data) // -(-len(data) // self._size))
@@ -91,9 +91,8 @@ class SliceSender:
                     # the link is cut, or nobody listens any more
                     self._under_way.clear()
                     self._pace = Pace()
-                    return False
+                    return
         self._adapt((time.monotonic() - begin) * size / len(data))
-        return True
 
     def _adapt(self, seconds: float) -> None:
         """Choose the size of the next image's slices by the time that one took."""

@@ -55,7 +55,8 @@ class _Output:
 
     def _lost(self, error: OSError) -> None:
         # the stream keeps the text, and the exit would fail to write it again
-        os.dup2(os.open(os.devnull, os.O_WRONLY), self.stream.fileno())
+        with open(os.devnull, 'w') as nowhere:
+            os.dup2(nowhere.fileno(), self.stream.fileno())
         if self.needed:
             if error.errno != errno.EPIPE:
                 print(f"can't write the output: {error.strerror}", file=sys.stderr)

@@ -76,7 +76,7 @@ def sizes(wire: Wire) -> list[int]:
 def test_image_arrives_in_slices_of_one_size(wire: Wire, size: int) -> None:
     images = receiver(wire)
     data = secrets.token_bytes(size)
-    assert sender(wire).send(data)
+    sender(wire).send(data)
     assert images == [data]
     first, *_, last = [*sizes(wire), sizes(wire)[-1]]
     assert max(sizes(wire)) == first <= LEAST and first - last < len(wire.sent)
@@ -130,9 +130,11 @@ def test_cut_link_costs_the_image_and_no_more(
     images = receiver(wire)
     one = sender(wire)
     wire.lose = lambda topic, data: True
-    assert not one.send(bytes(2 * LEAST))
+    one.send(bytes(2 * LEAST))
+    assert len(wire.sent) == 1
     wire.lose = lambda topic, data: False
-    assert one.send(bytes(3 * LEAST)) and images == [bytes(3 * LEAST)]
+    one.send(bytes(3 * LEAST))
+    assert images == [bytes(3 * LEAST)]
 
 
 @pytest.mark.parametrize('first', [0, 1, 2])
@@ -177,7 +179,8 @@ def test_receiver_that_hangs_keeps_no_image_from_others(
     wire.heard['/camera/raw/slices'].insert(0, lambda data: one._heard(
         UInt64MultiArray(data=[1, one._identity, 0])))
     begin = time.monotonic()
-    assert one.send(bytes(40 * LEAST)) and images == [bytes(40 * LEAST)]
+    one.send(bytes(40 * LEAST))
+    assert images == [bytes(40 * LEAST)]
     assert time.monotonic() - begin < 1.0
 
 
