@@ -12,7 +12,7 @@ The commands run at HEAD: changes that are not committed are not in it.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import contextlib
 import dataclasses
 import datetime
@@ -26,7 +26,6 @@ import signal
 import sys
 import time
 from typing import Any, Optional
-import xml.etree.ElementTree as ElementTree
 
 from clean_system import clean_system, CleanSystemError, commit_of, say, Suite, System
 import closing_line
@@ -140,40 +139,15 @@ def run_command(
     reports = [path for path in sorted((system.project / '.cache').glob('test-*.xml'))
                if path.stat().st_mtime > begin]
     copy_results(system.project, logs)
-    failed, skipped = test_names(reports)
+    tests = closing_line.read(reports)
     return Outcome(
         system=variant.suite.title, password=variant.password, command=command,
         commit=commit, date=datetime.date.today().isoformat(), status=status,
         packages=len(new), minutes=round(minutes, 1),
         downloaded=system.received() - received + system.saved(new) + local_wheels(
             system.project / '.cache/setup.log', begin),
-        tests=added_up(reports), failed=failed, skipped=skipped,
+        tests=tests.counts if reports else None, failed=tests.failed, skipped=tests.skipped,
         left=leftovers.after(system, before))
-
-
-def added_up(reports: Iterable[Path]) -> Optional[tuple[int, int, int]]:
-    """Return how many tests of all reports passed, failed and were skipped."""
-    counts = [closing_line.counts(str(path)) for path in reports]
-    if not counts:
-        return None
-    passed, failed, skipped = map(sum, zip(*counts))
-    return passed, failed, skipped
-
-
-def test_names(reports: Iterable[Path]) -> tuple[list[str], dict[str, list[str]]]:
-    """Return the names of tests that failed, and of those that were skipped, by reason."""
-    failed: list[str] = []
-    skipped: dict[str, list[str]] = {}
-    for report in reports:
-        for case in ElementTree.parse(report).iter('testcase'):
-            # what follows is the group of the test
-            test = case.get('name', '').partition('@')[0]
-            name = f"{case.get('classname', '').rpartition('.')[2]}::{test}"
-            if case.find('failure') is not None or case.find('error') is not None:
-                failed.append(name)
-            elif (skip := case.find('skipped')) is not None:
-                skipped.setdefault(skip.get('message', ''), []).append(name)
-    return failed, skipped
 
 
 def local_wheels(log: Path, since: float) -> int:

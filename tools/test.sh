@@ -20,19 +20,22 @@ trap 'rm -rf "$TMPDIR"' EXIT
 trap 'exit 130' INT
 trap 'exit 143' TERM
 keep_ticket
-part=test
+part=test again=
 if [ "${1:-}" = kubernetes ]; then
     part=$1; shift
+    [ $# != 0 ] || again=0
     set -- test/integration/kubernetes "$@"
 elif [ $# = 0 ]; then
     # Three at a time: much of what tests with machines take is waiting. Tests named by hand run in
-    # turn, so that their output is seen as it comes.
+    # turn, so that their output is seen as it comes. The processes' names of tests have their
+    # group, so what runs again has one process too.
+    again=1
     set -- --ignore=test/integration/kubernetes -n 3 --dist loadgroup --no-loadscope-reorder
 else
     # pytest collects it nevertheless if it is named
     set -- --ignore=test/integration/kubernetes "$@"
 fi
-rm -f .cache/"$part"-*.xml
+rm -f .cache/"$part"-*.xml .cache/again-"$part"-*.xml
 status=0
 # what the user has set for nodes of their own must not decide what a test sees
 unset RMW_IMPLEMENTATION CYCLONEDDS_URI ROS_DOMAIN_ID ROS_AUTOMATIC_DISCOVERY_RANGE \
@@ -41,16 +44,24 @@ unset RMW_IMPLEMENTATION CYCLONEDDS_URI ROS_DOMAIN_ID ROS_AUTOMATIC_DISCOVERY_RA
 ros=$(ros_setup)
 [ -z "$ros" ] || export ROS2_SETUP="$ros"
 
+# Of a whole run, what failed runs once more, alone, until a third test fails again. The closing
+# lines name it.
 suite() {
-    name=$1; shift
+    name=$1 report=$2; shift 2
     say "Tests on $name"
-    tools/run.sh "$@" || status=1
+    tools/run.sh "$@" --junit-xml=.cache/"$report" && return
+    if [ $? = 1 ] && [ -n "$again" ]; then
+        say 'What failed, once more and alone'
+        tools/run.sh "$@" -n "$again" --last-failed --maxfail=3 \
+            --junit-xml=.cache/again-"$report" && return
+    fi
+    status=1
 }
-suite "ROS 2's wheels" embedded -- pytest --junit-xml=.cache/"$part"-embedded.xml "$@"
+suite "ROS 2's wheels" "$part-embedded.xml" embedded -- pytest "$@"
 if [ -n "$ros" ]; then
     # Jazzy's own plugins are written for an older pytest, and nothing here uses them
-    suite 'ROS 2 Jazzy' ros -- pytest -p no:launch_testing -p no:launch_ros -p no:launch_pytest \
-        --junit-xml=.cache/"$part"-ros.xml "$@"
+    suite 'ROS 2 Jazzy' "$part-ros.xml" ros -- pytest \
+        -p no:launch_testing -p no:launch_ros -p no:launch_pytest "$@"
 else
     say "ROS 2 Jazzy isn't installed here: tested on its wheels alone"
 fi

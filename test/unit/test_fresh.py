@@ -90,20 +90,34 @@ def test_cached_package_is_found_by_its_version(tools):
         'libc6:amd64', 'libc6_1%3a2.36-9_amd64.deb')
 
 
+def cases(path: Path, **results: str) -> Path:
+    """Write a JUnit file: names of tests, and what their entries hold."""
+    path.write_text('<testsuites><testsuite>' + ''.join(
+        f'<testcase classname="test.test_a" name="{name}">{result}</testcase>'
+        for name, result in results.items()) + '</testsuite></testsuites>')
+    return path
+
+
 def test_tests_are_counted_and_named(tools, tmp_path):
-    report = tmp_path / 'test-fast.xml'
-    report.write_text(
-        '<testsuites><testsuite tests="4" failures="1" errors="0" skipped="2">'
-        '<testcase classname="test.unit.test_a" name="test_good"/>'
-        '<testcase classname="test.unit.test_a" name="test_bad[1]"><failure/></testcase>'
-        '<testcase classname="test.unit.test_b" name="test_x"><skipped message="no y"/></testcase>'
-        '<testcase classname="test.unit.test_b" name="test_z@g"><skipped message="no y"/>'
-        '</testcase></testsuite></testsuites>')
-    fresh = tools['fresh']
-    assert fresh.added_up([report]) == (1, 1, 2)
-    assert fresh.added_up([]) is None
-    assert fresh.test_names([report]) == (
-        ['test_a::test_bad[1]'], {'no y': ['test_b::test_x', 'test_b::test_z']})
+    report = cases(tmp_path / 'test-fast.xml', **{
+        'good[a@b]': '', 'good[a@c]': '', 'bad[1]@/x.py': '<failure/>',
+        'skipped': '<skipped message="no y"/>', 'other@g': '<skipped message="no y"/>'})
+    read = tools['closing_line'].read([report])
+    assert read.counts == (2, 1, 2)
+    assert read.failed == ['test.test_a::bad[1]']
+    assert read.skipped == {'no y': ['test.test_a::skipped', 'test.test_a::other']}
+
+
+def test_what_passes_when_run_again_is_named(tools, tmp_path, capsys, monkeypatch):
+    first = cases(tmp_path / 'test-x.xml', good='', chance='<failure/>', teardown='',
+                  bad='<failure/>')
+    cases(tmp_path / 'again-test-x.xml', chance='', teardown='', bad='<error/>')
+    monkeypatch.setattr(sys, 'argv', ['closing_line.py', str(first)])
+    assert tools['closing_line'].main() == 1
+    assert capsys.readouterr().out.splitlines() == [
+        'passed only when run again: test.test_a::chance',
+        'passed only when run again: test.test_a::teardown',
+        'failed: test.test_a::bad', '3 passed, 1 failed, 0 skipped']
 
 
 def test_sudo_ticket_is_kept_while_a_script_runs(tmp_path):
