@@ -125,7 +125,7 @@ def test_image_has_the_providers_of_all_clouds(robot: Callable[..., str]) -> Non
 
 
 def test_image_has_the_sources_alone(robot: Callable[..., str]) -> None:
+    packages = {path.parent.name for path in ROOT.glob('*/__init__.py')} - {'test'}
     assert set(robot('ls', '-A', '/opt/fogros2').split()) == {
-        '.venv', *(path.name for path in ROOT.iterdir()
-                   if not path.name.startswith('.')
-                   and path.name not in ('benchmarks', 'build', 'install', 'log', 'test'))}
+        '.venv', 'LICENSE', 'README.md', 'package.xml', 'pyproject.toml', 'setup.cfg', 'setup.py',
+        'deploy', 'launch', 'packaging', 'resource', 'ros2_embedded', 'tools', *packages}
