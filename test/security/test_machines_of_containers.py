@@ -161,7 +161,7 @@ def robot() -> Iterator[Robot]:
 
 
 def bridge_of(network: str) -> tuple[str, str, str]:
-    """Return this computer's interface and IPv4 address in a network of podman, and the network."""
+    """Return this computer's interface and IPv4 address in a network of podman, and the subnet."""
     told = json.loads(run(Command(('podman', 'network', 'inspect', network), sudo=True),
                           timeout=60).stdout)[0]
     subnet = told['subnets'][0]
