@@ -365,7 +365,7 @@ def test_a_whole_launch_of_a_user_without_rights(copy: Copy) -> None:
         pytest.skip("this Python's folder is on a disk of its own, and no layer over / has it")
     copy.run('root', 'sh', '-ec', MACHINE, check=True)
     copy.run('fogada', 'sh', '-c', 'cat >~/first.launch.py', data=LAUNCH.encode(), check=True)
-    script = ('cd; export ROS_DOMAIN_ID=101; sudo -n true && exit 99; '
+    script = ('cd; export ROS_DOMAIN_ID=31; sudo -n true && exit 99; '
               # a shell without a terminal has what it starts beside it ignore Ctrl-C
               'env --default-signal=INT ros2 launch ./first.launch.py >said 2>&1 </dev/null & '
               'for n in $(seq 60); do grep -q "I heard" said && break; sleep 1; done; '
