@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses
+import glob
 import json
 from pathlib import Path
 import subprocess
@@ -225,8 +226,9 @@ def robot_of(host: Fleet, robot: str) -> str:
 
 def slowed(identity: str) -> bool:
     """Return whether the kernel has slowed a container down."""
-    for group in Path('/sys/fs/cgroup').rglob(f'*{identity}*/cpu.stat'):
-        for line in group.read_text().splitlines():
+    # Path.rglob fails where a group of another container goes meanwhile
+    for group in glob.glob(f'/sys/fs/cgroup/**/*{identity}*/cpu.stat', recursive=True):
+        for line in Path(group).read_text().splitlines():
             if line.startswith('nr_throttled ') and int(line.split()[1]) > 0:
                 return True
     return False

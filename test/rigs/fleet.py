@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import contextlib
+import glob
 import json
 import os
 from pathlib import Path
@@ -132,8 +133,9 @@ class Fleet:
     def traces(self) -> list[str]:
         """Return what is left of machines on the host."""
         tables = run(Command(('nft', 'list', 'tables'), sudo=True), timeout=30.0).stdout
-        shared = container_machine.SHARED.glob('*/*')
-        return [*self.containers(), *(str(path) for path in shared if path.name in self._tokens),
+        shared = glob.glob(f'{container_machine.SHARED}/*/*')
+        return [*self.containers(), *(
+                    path for path in shared if os.path.basename(path) in self._tokens),
                 # other tests have machines on this computer, too
                 *(line for line in tables.splitlines() if line.partition('fogros2-')[2] in (
                     self._tokens))]

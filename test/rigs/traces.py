@@ -165,8 +165,8 @@ def look(state: Path, files: Path, run: str) -> set[Trace]:
     for folder in ('run', 'tmp', 'var/tmp'):
         found |= {Trace(f'file {path}', ours=True)
                   for path in Path('/', folder).glob('fogros2*')}
-    found |= {Trace(f'state {path.relative_to(state)}', ours=True)
-              for path in state.rglob('*') if not path.is_dir()}
+    found |= {Trace(f'state {Path(folder, name).relative_to(state)}', ours=True)
+              for folder, _, names in os.walk(state) for name in names}
     return found
 
 

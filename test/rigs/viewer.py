@@ -50,7 +50,10 @@ def install(source: Path, cache: Path) -> str:
                 return f'npm could not install the client: {(made.stderr or made.stdout)[-300:]}'
             done.write_bytes(wanted)
         for each in source.glob('*.mjs'):
-            shutil.copy(each, cache)  # to where its modules are found from
+            # to where its modules are found from, unless it is there: another run may read it
+            target = cache / each.name
+            if not target.exists() or target.read_bytes() != each.read_bytes():
+                shutil.copy(each, target)
     return ''
 
 

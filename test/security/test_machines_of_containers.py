@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import ipaddress
 import json
 import os
 import selectors
@@ -159,11 +160,12 @@ def robot() -> Iterator[Robot]:
     made.close()
 
 
-def bridge_of(network: str) -> tuple[str, str]:
-    """Return the interface and the IPv4 address of this computer in a network of podman."""
+def bridge_of(network: str) -> tuple[str, str, str]:
+    """Return this computer's interface and IPv4 address in a network of podman, and the subnet."""
     told = json.loads(run(Command(('podman', 'network', 'inspect', network), sudo=True),
                           timeout=60).stdout)[0]
-    return told['network_interface'], told['subnets'][0]['gateway']
+    subnet = told['subnets'][0]
+    return told['network_interface'], subnet['gateway'], subnet['subnet']
 
 
 def addresses(interface: str = '') -> list[tuple[str, str]]:
@@ -175,16 +177,16 @@ def addresses(interface: str = '') -> list[tuple[str, str]]:
 
 def attack(robot: Robot, shell: SSHShell, network: str, *targets: str) -> str:
     """Attack the robot from a machine; return what answered."""
-    bridge, gateway = bridge_of(network)
+    bridge, gateway, subnet = bridge_of(network)
     robot.join(bridge)
     own = {address for family, address in addresses() if family == 'inet'} - {'127.0.0.1'}
     links = [address for family, address in addresses(bridge) if family == 'inet6']
     assert gateway in own and links
-    # the last address of the network is nobody's
-    start, _, last = gateway.rpartition('.')
+    # the last address of the network is nobody's: engines count up
+    stolen = ipaddress.ip_network(subnet)[-2]
     hosts = [*sorted(own), *(f'{link}%eth0' for link in links), GROUPS[0], f'{GROUPS[1]}%eth0']
     return shell.run(Command(
-        ('python3', '-c', ATTACK, gateway, f'{start}.{int(last) + 12}/28',
+        ('python3', '-c', ATTACK, gateway, f'{stolen}/32',
          *(f'{host} {robot.port}' for host in hosts), *targets), sudo=True), timeout=90).stdout
 
 
@@ -193,7 +195,7 @@ def test_machine_reaches_no_port_of_the_robot(cloud: Cloud, robot: Robot) -> Non
     with cloud.machine(options={'network': '', 'ports': [f'{published}:22']}) as (other, _), \
             cloud.machine(options={'network': ''}) as (_, shell):
         assert other.shell is not None
-        _, gateway = bridge_of(DEFAULT)
+        _, gateway, _ = bridge_of(DEFAULT)
         said = attack(robot, shell, DEFAULT, f'{other.shell.host} 22', f'{gateway} {published}')
         assert robot.heard == []
         # the other machine itself answers, but not at the port that the robot lends it

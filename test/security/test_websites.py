@@ -48,10 +48,12 @@ HANDSHAKE = (
 class Bridge:
     """A bridge with all three doors, as on a machine."""
 
-    def __init__(self, process: subprocess.Popen[str], folder: Path, port: int) -> None:
+    def __init__(
+        self, process: subprocess.Popen[str], folder: Path, port: int, public: int,
+    ) -> None:
         self.process = process
         self.places = {'loopback': ('127.0.0.1', port), 'vpn': (VPN, port),
-                       'shared': ('127.0.0.1', port + 1)}
+                       'shared': ('127.0.0.1', public)}
         self.lines: list[str] = []
         self.reader = threading.Thread(target=lambda: self.lines.extend(process.stdout))
         self.reader.start()
@@ -91,18 +93,18 @@ def domain() -> Iterator[str]:
 @pytest.fixture(scope='module')
 def bridge(tmp_path_factory: pytest.TempPathFactory, domain: str) -> Iterator[Bridge]:
     folder = tmp_path_factory.mktemp('secrets') / 'monitor' / 'launch'
-    with socket.create_server(('127.0.0.1', 0)) as probe:
-        port = probe.getsockname()[1]
+    with socket.create_server(('127.0.0.1', 0)) as one, socket.create_server(('', 0)) as other:
+        port, public = (probe.getsockname()[1] for probe in (one, other))
     process = subprocess.Popen(
         [sys.executable, '-m', 'fogros2_monitor.serve', '--name', 'planner',
-         '--listen', f'127.0.0.1:{port}', '--vpn', str(port), '--public', str(port + 1),
+         '--listen', f'127.0.0.1:{port}', '--vpn', str(port), '--public', str(public),
          '--secrets', str(folder)],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         env={**os.environ, 'FOGROS2_VPN_ADDRESS': VPN, 'ROS_DOMAIN_ID': domain,
              'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'})
     running = None
     try:
-        running = Bridge(process, folder, port)
+        running = Bridge(process, folder, port, public)
         yield running
     finally:
         process.terminate()

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import dataclasses
 import datetime
 from decimal import Decimal
@@ -461,7 +462,8 @@ def booted(tmp_path):
         except OSError:
             continue
         if str(tmp_path).encode() in words and found.parent.name != str(os.getpid()):
-            os.kill(int(found.parent.name), signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(found.parent.name), signal.SIGKILL)
 
 
 def test_booted_instance_starts_the_agent_that_it_gets(booted):

@@ -70,8 +70,9 @@ def test_no_topic_is_in_shared_memory(vpn: Lab) -> None:
     children = [vpn.node('robot', 'to:/up'), vpn.node('machine', 'from:/up')]
     children[1].wait('topic', '/up')
     # the nodes belong to root where sudo has started them
-    maps = vpn.shell('robot', 'for each in /proc/[0-9]*; do grep -qs dds_node.py $each/cmdline '
-                     '&& cat $each/maps; done; :')
+    maps = ''.join(vpn.shell(host, f'cd /proc; for each in $(ip netns pids {vpn.spaces[host]}); '
+                             'do cat $each/maps; done 2>/dev/null; :')
+                   for host in ('robot', 'machine'))
     assert 'libfastrtps' in maps
     assert '/dev/shm/fastrtps' not in maps
 

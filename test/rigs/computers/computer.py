@@ -314,10 +314,10 @@ def left_over() -> list[str]:
     for folder in DISKS.glob('*'):
         try:
             pid, _, begun = (folder / 'owner').read_text().partition(' ')
-        except OSError:
+            if started(int(pid)) != begun:
+                found.append(folder.name)
+        except (OSError, ValueError):  # another box is about to write it
             continue
-        if started(int(pid)) != begun:
-            found.append(folder.name)
     return found
 
 
