@@ -133,7 +133,7 @@ class Session:
     @property
     def ready(self) -> bool:
         """Whether the machine is up and all of its processes have started or ended."""
-        return self.running is not None and all(run.started for run in self._runs.values())
+        return self.running is not None and all(run.state.started for run in self._runs.values())
 
     @property
     def programs(self) -> Sequence[tuple[str, str]]:
@@ -227,7 +227,7 @@ class Session:
 
     def nodes(self) -> list[NodeSpec]:
         """Return the machine's nodes that have started."""
-        return [run.node for run in self._runs.values() if run.started]
+        return [run.node for run in self._runs.values() if run.state.started]
 
     def submit(self, run: RemoteRun) -> None:
         """Start a process when the machine is up."""
@@ -235,16 +235,16 @@ class Session:
             self._logger.error(
                 f'{self.spec.name}: {run.node.name} does not start: the machine has ended, '
                 'because nobody used it (launch again)')
-            run.end()
+            run.on('over')
             return
         self._runs[run.node.id] = run
         if self.replacer is not None:
             self.replacer.allow(run.node)
         if self.interrupted:
             if self.replacer is None:
-                run.move(stop=False)
+                run.on('move_gone')
             else:
-                run.halt(stop=False)
+                run.on('halt_gone')
             return
         self._waiting.append(run)
         if self.running is not None:
@@ -351,7 +351,7 @@ class Session:
                               'error': str(error.args[0]), 'hint': error.hint})
         except FogError:
             for run in runs:
-                run.end()
+                run.on('over')
             raise
 
     async def _stop_collected(self) -> None:
@@ -384,7 +384,7 @@ class Session:
         self._logs.add(sum(len(str(value)) for value in event.values()))
         run = self._runs.get(str(event.get('node', '')))
         if run is not None:
-            if event['event'] == 'exited' and self._ending and not run.stopping:
+            if event['event'] == 'exited' and self._ending and not run.state.stopping:
                 self._held.append((run, event))
                 return
             run.on_event(event)
@@ -470,7 +470,7 @@ class Session:
         ended = [run for run, _ in self._held]
         self._held.clear()
         for run in list(self._runs.values()):
-            run.move(stop=not self.lost and run not in ended)
+            run.on('move_gone' if self.lost or run in ended else 'move')
 
     async def _end_idle(self) -> None:
         """End the machine and its processes, while the launch goes on: nobody uses it."""
@@ -481,7 +481,7 @@ class Session:
         self._logger.info(f"{self.spec.name}: {reason}; on_exit='{self.spec.on_exit}'")
         runs = list(self._runs.values())
         for run in runs:
-            run.stop()
+            run.on('stop')
         await asyncio.gather(*(run.complete for run in runs))
         await self._in_thread(self.running.end, reason)
         self._logger.info(f'{self.spec.name}: the machine has ended')
@@ -495,7 +495,7 @@ class Session:
         ended = [run for run, _ in self._held]
         self._held.clear()
         for run in list(self._runs.values()):
-            run.halt(stop=not self.lost and run not in ended)
+            run.on('halt_gone' if self.lost or run in ended else 'halt')
         self._check_drained()
 
     def halted(self, run: RemoteRun) -> bool:
@@ -528,11 +528,11 @@ class Session:
             if self.checkpoints:
                 await self.checkpoints.restore(self.checkpoints.robot)
             for run in [*self._away, *self._runs.values()]:
-                run.arrive()
+                run.on('left')
 
     def homeless(self) -> list[str]:
         """Return the names of processes that cannot run on the robot."""
-        return [run.node.name for run in self._away if run.homeless]
+        return [run.node.name for run in self._away if run.state.phase == 'away']
 
     def replace(self, running: RunningMachine) -> None:
         """Use another machine from now on."""
@@ -565,7 +565,7 @@ class Session:
     def end_all(self) -> None:
         """End all processes of a machine that is gone, for launch."""
         for run in list(self._runs.values()):
-            run.end()
+            run.on('over')
 
     def _release_exits(self) -> None:
         """Report the exits that were held back: the machine is not known to be gone."""
@@ -577,7 +577,7 @@ class Session:
     def _respawning(self) -> list[RemoteRun]:
         """Return the processes that start again when they end."""
         return [run for run in self._runs.values() if run not in self._waiting
-                and run.started and not run.stopping and not self.interrupted
+                and run.state.started and not run.state.stopping and not self.interrupted
                 and run.node.respawn and run.node.respawn_max_retries != 0]
 
     def _start_again(self, runs: list[RemoteRun]) -> None:
@@ -598,9 +598,9 @@ class Session:
             if run in self._waiting:
                 continue
             node = run.node
-            if run in respawning and run.respawning:
+            if run in respawning and run.state.phase == 'respawning':
                 continue  # the agent has reported the exit
-            if run.started:
+            if run.state.started:
                 run.on_event({'event': 'exited', 'node': node.id, 'name': node.name,
                               'returncode': _UNREPORTED, 'respawns': run in respawning})
             else:
