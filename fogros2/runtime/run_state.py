@@ -24,9 +24,9 @@ Phase = Literal['waiting', 'running', 'respawning', 'leaving', 'away', 'here', '
 Event = Literal[
     'stop', 'move', 'move_gone', 'halt', 'halt_gone', 'absent', 'overdue', 'started', 'exited',
     'respawns', 'refused', 'left', 'free', 'back', 'over']
-#: ``ask``: let the machine end it. ``expect``: ``overdue`` follows if it does not. ``report``: tell
-#: launch what the event says. ``leave``: note that it has left its machine. ``come``: start it on
-#: the robot. ``end``: no more events follow.
+#: ``ask``: let the machine end it. ``expect``: ``overdue`` follows if it does not. ``report``: pass
+#: on to launch what the event says. ``leave``: note that it has left its machine. ``come``: start
+#: it on the robot. ``end``: no more events follow.
 Command = Literal['ask', 'expect', 'report', 'leave', 'come', 'end']
 
 
@@ -84,7 +84,9 @@ def decide(state: RunState, event: Event) -> tuple[RunState, tuple[Command, ...]
             return change(state, phase='away'), ('ask', 'leave')
         return change(state, phase='leaving'), ('ask', 'expect') if event == 'move' else ('ask',)
     if event == 'overdue':
-        return (ended[0], ('report', 'end')) if state.stopping else left if leaving else (state, ())
+        if state.stopping:
+            return ended[0], ('report', 'end')
+        return left if leaving else (state, ())
     if event in ('move_gone', 'halt_gone', 'absent'):
         return ended if state.stopping or event == 'absent' and not leaving else left
     return left if event == 'left' else (state, ())

@@ -8,11 +8,10 @@ from typing import get_args
 
 import pytest
 
-from fogros2.runtime.run_state import decide, Event, Phase, RunState
+from fogros2.runtime.run_state import Command, decide, Event, Phase, RunState
 
 
-
-def after(*events: Event, movable: bool = True) -> tuple[RunState, list[str]]:
+def after(*events: Event, movable: bool = True) -> tuple[RunState, list[Command]]:
     """Return the state after events, and the commands on the way."""
     state, said = RunState(movable), []
     for event in events:
