@@ -24,9 +24,9 @@ Phase = Literal['waiting', 'running', 'respawning', 'leaving', 'away', 'here', '
 Event = Literal[
     'stop', 'move', 'move_gone', 'halt', 'halt_gone', 'absent', 'overdue', 'started', 'exited',
     'respawns', 'refused', 'left', 'free', 'back', 'over']
-#: ``ask``: let the machine end it. ``expect``: ``overdue`` follows if it does not. ``report``: pass
-#: on to launch what the event says. ``leave``: note that it has left its machine. ``come``: start
-#: it on the robot. ``end``: no more events follow.
+#: ``ask``: let the machine end it. ``expect``: ``overdue`` follows if it does not. ``report``:
+#: pass on to launch what the event says. ``leave``: note that it has left its machine. ``come``:
+#: start it on the robot. ``end``: no more events follow.
 Command = Literal['ask', 'expect', 'report', 'leave', 'come', 'end']
 
 
