@@ -11,6 +11,6 @@ new machine replaces another one, ``checkpoints`` saves folders of its nodes, ``
 the decisions out, ``run_state`` decides what follows for one process on a machine, ``remote_run``
 connects it with launch, ``machine_state`` decides what follows for one machine of the launch,
 ``session`` is that machine, ``interruption`` handles its preemption, ``coordinator`` connects the
-launch with its machines, ``foxglove`` runs the bridge, ``remote_process`` is the action of a remote
-process, and ``replicas`` starts the node that serves the public names of replicated nodes.
+launch with its machines, ``foxglove`` runs the bridge, ``remote_process`` is the action of a
+remote process, and ``replicas`` starts the node that serves the public names of replicated nodes.
 """
