@@ -8,8 +8,9 @@ shows steps, ``cost`` formats prices, ``signals`` makes SIGTERM an orderly shutd
 to a NodeSpec, ``streaming`` collects the streams, ``republishers`` has the processes that FogROS2
 adds, ``backlog`` holds a machine's events until launch takes them, ``replacement`` decides how a
 new machine replaces another one, ``checkpoints`` saves folders of its nodes, ``replacer`` carries
-the decisions out, ``remote_run`` follows one process on a machine, ``session`` is one machine of
-the launch, ``interruption`` handles its preemption, ``coordinator`` connects the launch with its
-machines, ``foxglove`` runs the bridge, ``remote_process`` is the action of a remote process, and
-``replicas`` starts the node that serves the public names of replicated nodes.
+the decisions out, ``run_state`` decides what follows for one process on a machine, ``remote_run``
+connects it with launch, ``machine_state`` decides what follows for one machine of the launch,
+``session`` is that machine, ``interruption`` handles its preemption, ``coordinator`` connects the
+launch with its machines, ``foxglove`` runs the bridge, ``remote_process`` is the action of a
+remote process, and ``replicas`` starts the node that serves the public names of replicated nodes.
 """

@@ -202,7 +202,7 @@ class RemoteProcess(private.RemoteStart):
         # machine escalates to SIGTERM and SIGKILL by itself, even if the connection is lost
         run: Optional[RemoteRun] = private.transport(self)
         if run is not None:
-            run.stop()
+            run.on('stop')
         return None
 
 

@@ -14,10 +14,12 @@ from launch.actions import ExecuteLocal
 from launch.events.process import ProcessExited, ProcessStarted, ProcessStderr, ProcessStdout
 import launch.logging
 
-from fogros2.events import Event, NodeExited, NodeOutput, NodeRefused, NodeStarted
+from fogros2.events import Event, NodeExited, NodeOutput, NodeStarted
 from fogros2.launch_internals import private
 from fogros2.model import MachineSpec, NodeSpec
+from fogros2.runtime import run_state
 from fogros2.runtime.replacer import Replacer
+from fogros2.runtime.run_state import RunState
 
 #: Messages of Qt, GTK and Tk that there is no screen.
 _NO_SCREEN = re.compile(
@@ -70,16 +72,11 @@ class RemoteRun:
         self._action = action
         self._come_here = come_here
         self._go_back = go_back
-        self.started = False
-        self.stopping = False
-        #: Whether it exited and its machine will restart it.
-        self.respawning = False
+        self.state = RunState(movable=come_here is not None)
         self._hinted = False
         self._started_at = 0.0
         #: Output since the process was stopped while it started; None for other processes.
         self._withheld: Optional[list[NodeOutput]] = None
-        #: Whether it is moving to the robot; whether it runs there as launch's own process.
-        self._moving = self._here = False
         self._context = context
         self._session = session
         self._details: dict[str, Any] = dict(action.process_details or {})
@@ -97,7 +94,7 @@ class RemoteRun:
     def send_signal(self, number: Union[int, str]) -> None:
         """Send the process a signal, given by number or name."""
         name = number if isinstance(number, str) else signal.Signals(number).name
-        if self.started:
+        if self.state.started:
             self._session.signal(self, name)
         else:
             self._logger.warning(f"'{name}' not sent: the process hasn't started yet")
@@ -109,119 +106,60 @@ class RemoteRun:
     def close(self) -> None:
         """Do nothing: there is no transport to close."""
 
-    # -- ending ---------------------------------------------------------------------------------
+    # -- its state ------------------------------------------------------------------------------
 
-    def stop(self) -> None:
-        """Stop the process by SIGINT, SIGTERM and SIGKILL, with its time-outs."""
-        if self.complete.done() or self.stopping:
-            return
-        self.stopping = True
-        if not self.started or self._context.asyncio_loop.time() - self._started_at < STARTING:
-            self._withheld = []
-        if not self._session.stop(self) or self.respawning:
-            # nothing runs, so no exit will be reported
-            self.end()
-            return
-        self._context.asyncio_loop.call_later(self._timeout, self.give_up)
-
-    @property
-    def _timeout(self) -> float:
-        """Seconds until the machine has to have ended the process and reported it."""
-        return self.node.sigterm_timeout + self.node.sigkill_timeout + GRACE
-
-    def give_up(self) -> None:
-        """Stop waiting for a process whose end is overdue."""
-        if not self.complete.done() and not self._here:
-            self._logger.error(
-                f"machine '{self._session.spec.name}' did not report the end of the process; "
-                'its agent will end it')
-            self.end()
-
-    # -- on the robot instead -------------------------------------------------------------------
-
-    def move(self, *, stop: bool) -> None:
+    def on(self, event: run_state.Event, said: Optional[Event] = None) -> None:
         """
-        Move the process to the robot; launch sees a new start, and no exit before it.
+        Change the state, and do what follows.
 
-        A process that cannot move, such as a republisher, ends.
-
-        :param stop: whether the machine has to end it first; False if the machine is gone.
+        :param said: the agent's event behind it.
         """
-        if self.complete.done() or self._here or (self._moving and stop):
-            return
-        if self._come_here is None or self.stopping:
-            if stop:
-                self.stop()
+        if self.complete.done():
+            return  # launch has ended it
+        self.state, commands = run_state.decide(self.state, event)
+        for command in commands:
+            if command == 'report':
+                self._report(said)
             else:
-                self.end()
-            return
-        self._moving = True
-        if stop and self._session.stop(self) and not self.respawning:
-            self._context.asyncio_loop.call_later(self._timeout, self._arrive)
-        else:
-            self._arrive()
-
-    def halt(self, *, stop: bool) -> None:
-        """
-        Let the machine end the process, because another machine will continue it.
-
-        :param stop: whether the machine can be asked; False if it is gone.
-        """
-        if self.complete.done() or self._here:
-            return
-        if self.stopping:
-            if not stop:
-                self.end()
-            return
-        self._moving = True
-        if not (stop and self._session.stop(self)) or self.respawning:
-            self._arrive()
-
-    def arrive(self) -> None:
-        """Continue on the robot, if the program is there; else wait for the machine."""
-        if not self._here:
-            self._moving = True
-            self._arrive()
-
-    @property
-    def homeless(self) -> bool:
-        """Whether the process runs neither on its machine nor on the robot."""
-        return not self._here and not self.complete.done()
-
-    async def come_back(self) -> bool:
-        """Prepare the start on the new machine; return False if the process has ended."""
-        if self._here and not self.complete.done():
-            await self._go_back(self)
-        self._here = self._moving = self.started = self.respawning = False
-        self.node = dataclasses.replace(self.node, id=f'{self.node.id}+')
-        return not self.complete.done()
-
-    def _arrive(self) -> None:
-        if not self._moving or self.complete.done():
-            return
-        if self._session.halted(self) or self._here:
-            return  # it may still run there
-        if self.stopping or self._context.is_shutdown:
-            self.end()
-            return
-        if self._come_here is None:
-            return
-        self._moving = False
-        self._here = True
-        self._session.forget(self)
-        self._come_here(self._context)
+                getattr(self, f'_{command}')()
 
     def unreported(self) -> None:
         """Stop waiting for the remote process: the agent will not report its exit."""
-        if self._moving and self._session.replacer is not None:
-            return  # only the agent, the provider or time confirms the end
-        if self._moving:
-            self._arrive()
-        else:
-            self.end()
+        # of a machine that is replaced, only the agent, the provider or time confirms the end
+        if self.state.phase != 'leaving' or self._session.replacer is None:
+            self.on('absent')
 
-    def end(self) -> None:
-        """Complete launch's future: no more events will follow."""
+    async def come_back(self) -> bool:
+        """Prepare the start on the new machine; return False if the process has ended."""
+        if self.state.phase == 'here' and not self.complete.done():
+            await self._go_back(self)
+        self.on('back')
+        self.node = dataclasses.replace(self.node, id=f'{self.node.id}+')
+        return not self.complete.done()
+
+    def _ask(self) -> None:
+        if self.state.stopping and self._withheld is None and (
+                not self.state.started
+                or self._context.asyncio_loop.time() - self._started_at < STARTING):
+            self._withheld = []
+        if not self._session.stop(self):
+            self.on('absent')
+
+    def _expect(self) -> None:
+        seconds = self.node.sigterm_timeout + self.node.sigkill_timeout + GRACE
+        self._context.asyncio_loop.call_later(seconds, self.on, 'overdue')
+
+    def _leave(self) -> None:
+        if not self._session.halted(self):
+            self.on('stop' if self._context.is_shutdown else 'free')
+
+    def _come(self) -> None:
+        assert self._come_here is not None
+        self._session.forget(self)
+        # launch sees a new start, and no exit before it
+        self._come_here(self._context)
+
+    def _end(self) -> None:
         if not self.complete.done():
             self.complete.set_result(None)
         self._session.forget(self)
@@ -230,14 +168,30 @@ class RemoteRun:
 
     def on_event(self, event: Event) -> None:
         """Turn an event of the agent into launch's event."""
-        handler = getattr(self, f"_on_{event['event']}", None)
-        if handler is not None and not self.complete.done() and not self._here:
-            handler(event)
+        if event['event'] == 'output':
+            if not (self.state.over or self.complete.done()):
+                self._print(event)
+        elif event['event'] == 'exited':
+            self.on('respawns' if event['respawns'] else 'exited', event)
+        elif event['event'] == 'started' or event['event'] == 'refused':
+            self.on(event['event'], event)
 
-    def _on_started(self, event: NodeStarted) -> None:
-        self.started = True
+    def _report(self, said: Optional[Event]) -> None:
+        """Tell launch what the agent says, or that it says nothing."""
+        if said is None:
+            self._logger.error(
+                f"machine '{self._session.spec.name}' did not report the end of the process; "
+                'its agent will end it')
+        elif said['event'] == 'started':
+            self._report_start(said)
+        elif said['event'] == 'exited':
+            self._report_exit(said)
+        elif said['event'] == 'refused':
+            hint = f" ({said['hint']})" if said['hint'] else ''
+            self._logger.error(f"process can't be started: {said['error']}{hint}")
+
+    def _report_start(self, event: NodeStarted) -> None:
         self._started_at = self._context.asyncio_loop.time()
-        self.respawning = False
         details = self._action.process_details
         assert details is not None
         details['pid'] = event['pid']
@@ -246,10 +200,8 @@ class RemoteRun:
         self._details = dict(details)
         self._logger.info(f"process started with pid [{event['pid']}]")
         self._context.emit_event_sync(ProcessStarted(**self._details))
-        if self.stopping:
-            self._session.stop(self)
 
-    def _on_output(self, event: NodeOutput) -> None:
+    def _print(self, event: NodeOutput) -> None:
         if self._withheld is not None:
             self._withheld.append(event)
             return
@@ -262,10 +214,7 @@ class RemoteRun:
         self._details.setdefault('pid', 0)
         self._context.emit_event_sync(kind(text=event['text'].encode(), **self._details))
 
-    def _on_exited(self, event: NodeExited) -> None:
-        if self._moving and not self.stopping:
-            self._arrive()
-            return
+    def _report_exit(self, event: NodeExited) -> None:
         self._returncode = event['returncode']
         self._details.setdefault('pid', 0)
         pid = self._details['pid']
@@ -274,7 +223,7 @@ class RemoteRun:
             self._returncode in (-signal.SIGINT, -signal.SIGTERM)
             or any('KeyboardInterrupt' in output['text'] for output in withheld))
         for output in () if half else withheld or ():
-            self._on_output(output)
+            self._print(output)
         if half:
             self._logger.warning(f'process was ended while it started [pid {pid}]')
         elif self._returncode == 0:
@@ -285,14 +234,3 @@ class RemoteRun:
                 f"process has died [pid {pid}, exit code {self._returncode}, cmd '{command}'].")
         self._context.emit_event_sync(
             ProcessExited(returncode=self._returncode, **self._details))
-        self.respawning = event['respawns']
-        if not self.respawning or self.stopping:
-            self.end()
-
-    def _on_refused(self, event: NodeRefused) -> None:
-        if self._moving:
-            self._arrive()
-            return
-        hint = f" ({event['hint']})" if event['hint'] else ''
-        self._logger.error(f"process can't be started: {event['error']}{hint}")
-        self.end()

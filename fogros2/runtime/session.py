@@ -22,10 +22,11 @@ from fogros2.errors import (
 )
 from fogros2.events import Event
 from fogros2.model import MachineSpec, NodeSpec
-from fogros2.runtime import streaming
+from fogros2.runtime import machine_state, streaming
 from fogros2.runtime.backlog import Backlog
 from fogros2.runtime.checkpoints import Checkpoints
 from fogros2.runtime.log_files import LogFiles
+from fogros2.runtime.machine_state import MachineState
 from fogros2.runtime.node_spec import full_name
 from fogros2.runtime.remote_run import RemoteRun
 from fogros2.runtime.replacer import Replacer
@@ -96,17 +97,7 @@ class Session:
         self._fail = fail
         self._changed = changed
         self._preempted = preempted
-        #: Whether the provider reclaims the machine; it may still run.
-        self.interrupted = False
-        #: Whether the machine is gone.
-        self.lost = False
-        self._ending = False
-        #: Whether the provider is asked about a notice.
-        self._confirming = False
-        #: Whether nobody used the machine, so that the launch has ended it.
-        self._ended = False
-        #: Whether all processes of a machine that is being replaced have ended there.
-        self._drained = False
+        self.state = MachineState(survivable=spec.on_interrupt != 'shutdown')
         self._backlog = Backlog(loop, self._on_event, busy, self._dropped)
         self._held: list[tuple[RemoteRun, Event]] = []
         self._runs: dict[str, RemoteRun] = {}
@@ -131,9 +122,19 @@ class Session:
         self._logs = LogFiles()
 
     @property
+    def interrupted(self) -> bool:
+        """Whether the provider reclaims the machine, which may still run, or it is gone."""
+        return self.state.interrupted
+
+    @property
+    def lost(self) -> bool:
+        """Whether the machine is gone."""
+        return self.state.phase == 'gone'
+
+    @property
     def ready(self) -> bool:
         """Whether the machine is up and all of its processes have started or ended."""
-        return self.running is not None and all(run.started for run in self._runs.values())
+        return self.running is not None and all(run.state.started for run in self._runs.values())
 
     @property
     def programs(self) -> Sequence[tuple[str, str]]:
@@ -227,24 +228,24 @@ class Session:
 
     def nodes(self) -> list[NodeSpec]:
         """Return the machine's nodes that have started."""
-        return [run.node for run in self._runs.values() if run.started]
+        return [run.node for run in self._runs.values() if run.state.started]
 
     def submit(self, run: RemoteRun) -> None:
         """Start a process when the machine is up."""
-        if self._ended:
+        if self.state.phase == 'over':
             self._logger.error(
                 f'{self.spec.name}: {run.node.name} does not start: the machine has ended, '
                 'because nobody used it (launch again)')
-            run.end()
+            run.on('over')
             return
         self._runs[run.node.id] = run
         if self.replacer is not None:
             self.replacer.allow(run.node)
         if self.interrupted:
             if self.replacer is None:
-                run.move(stop=False)
+                run.on('move_gone')
             else:
-                run.halt(stop=False)
+                run.on('halt_gone')
             return
         self._waiting.append(run)
         if self.running is not None:
@@ -301,6 +302,7 @@ class Session:
     def up(self, running: RunningMachine) -> None:
         """Start the waiting processes: the machine is up."""
         self.running = running
+        self._on('up')
         if not self.came_up.done():
             self.came_up.set_result(True)
         for instance in self.instances:
@@ -351,7 +353,7 @@ class Session:
                               'error': str(error.args[0]), 'hint': error.hint})
         except FogError:
             for run in runs:
-                run.end()
+                run.on('over')
             raise
 
     async def _stop_collected(self) -> None:
@@ -384,7 +386,8 @@ class Session:
         self._logs.add(sum(len(str(value)) for value in event.values()))
         run = self._runs.get(str(event.get('node', '')))
         if run is not None:
-            if event['event'] == 'exited' and self._ending and not run.stopping:
+            if event['event'] == 'exited' and self.state.phase == 'ending' and (
+                    not run.state.stopping):
                 self._held.append((run, event))
                 return
             run.on_event(event)
@@ -396,10 +399,12 @@ class Session:
                 self.request(self._end_idle)
             return
         if event['event'] == 'lost':
-            self._interrupted(True, event['reason'] or 'no reason')
+            self._on('gone', event['reason'] or 'no reason')
             return
         if event['event'] == 'notice':
-            self._announced(event['reason'] or 'no reason')
+            # of a machine whose nodes move to the robot, nothing ends: the notice may be forged
+            self._on('reclaimed' if self.spec.on_interrupt == 'robot' else 'claim',
+                     event['reason'] or 'no reason')
             return
         kind: str = event['event']
         if event['event'] == 'connection':
@@ -407,14 +412,13 @@ class Session:
         if kind in _NOTICES:
             level, text = _NOTICES[kind]
             self._logger.log(level, f'{self.spec.name}: {text.format_map(event)}')
-        if kind in _LAST_EVENTS and self.spec.on_interrupt != 'shutdown' and not self.interrupted:
-            self._ending = True
-            self._loop.call_later(_HOLD, self._release_exits)
-        elif kind == 'restarted' and not self._ending:
+        if kind in _LAST_EVENTS:
+            self._on('last_words')
+        elif kind == 'restarted' and self.state.phase != 'ending':
             respawning = self._respawning()
             self._end_unreported(respawning)
             self._start_again(respawning)
-        elif kind == 'connection absent' and not self._ending and not (
+        elif kind == 'connection absent' and self.state.phase != 'ending' and not (
                 self.interrupted and self.replacer):
             respawning = self._respawning()
             self._end_unreported([])
@@ -423,16 +427,32 @@ class Session:
                     f"{', '.join(run.node.name for run in respawning)} can't respawn: the agent "
                     f"of '{self.spec.name}' is gone", 'launch again'))
 
-    def _announced(self, reason: str) -> None:
-        """Handle the machine's report that its provider reclaims it, which may be forged."""
-        if self.spec.on_interrupt == 'robot':
-            self._interrupted(False, reason)  # its nodes move, nothing ends
-        elif not (self.interrupted or self._confirming):
-            self._confirming = True
-            self._logger.warning(
-                f'{self.spec.name}: the machine reports that its provider reclaims it: {reason}; '
-                'its nodes go on until the provider confirms that, or the machine is gone')
-            self.request(functools.partial(self._confirm, reason))
+    def _on(self, event: machine_state.Event, reason: str = '') -> None:
+        """
+        Change the machine's state, and do what follows.
+
+        :param reason: of an interruption, for the user.
+        """
+        self.state, commands = machine_state.decide(self.state, event)
+        for command in commands:
+            if command == 'hold':
+                self._loop.call_later(_HOLD, self._on, 'spared')
+            elif command == 'release':
+                held, self._held = self._held, []
+                for run, exited in held:
+                    run.on_event(exited)
+            elif command == 'save':
+                self.request(self._last_checkpoint)
+            elif command == 'announce':
+                self._preempted(self, reason)
+            elif command == 'bury':
+                self._bury(reason)
+            else:
+                self._logger.warning(
+                    f'{self.spec.name}: the machine reports that its provider reclaims it: '
+                    f'{reason}; its nodes go on until the provider confirms that, or the machine '
+                    'is gone')
+                self.request(functools.partial(self._confirm, reason))
 
     async def _confirm(self, reason: str) -> None:
         running = self.running
@@ -446,22 +466,17 @@ class Session:
             if running is not self.running or self.interrupted:
                 return
             if confirmed:
-                self._interrupted(False, reason)
+                self._on('reclaimed', reason)
             else:
                 self._logger.info(
                     f'{self.spec.name}: its provider has not confirmed that it reclaims it')
         finally:
-            self._confirming = False
+            self._on('refuted')
 
-    def _interrupted(self, lost: bool, reason: str) -> None:
-        first = not self.interrupted
-        self.interrupted, self.lost = True, self.lost or lost
-        self._ending = False
-        if first:
-            self._preempted(self, reason)
-        elif lost and self.replacer is not None:
+    def _bury(self, reason: str) -> None:
+        if self.replacer is not None:
             self.replacer.on('lost')
-        elif lost:
+        else:
             self._logger.info(f'{self.spec.name}: the machine is gone: {reason}')
             self.move_all()
 
@@ -470,18 +485,18 @@ class Session:
         ended = [run for run, _ in self._held]
         self._held.clear()
         for run in list(self._runs.values()):
-            run.move(stop=not self.lost and run not in ended)
+            run.on('move_gone' if self.lost or run in ended else 'move')
 
     async def _end_idle(self) -> None:
         """End the machine and its processes, while the launch goes on: nobody uses it."""
-        if self.interrupted or self.running is None:
+        self._on('idle')
+        if self.state.phase != 'over' or self.running is None:
             return
-        self._ended = True
         reason = f'nobody has used it for {self.spec.idle_timeout:g} s'
         self._logger.info(f"{self.spec.name}: {reason}; on_exit='{self.spec.on_exit}'")
         runs = list(self._runs.values())
         for run in runs:
-            run.stop()
+            run.on('stop')
         await asyncio.gather(*(run.complete for run in runs))
         await self._in_thread(self.running.end, reason)
         self._logger.info(f'{self.spec.name}: the machine has ended')
@@ -495,7 +510,7 @@ class Session:
         ended = [run for run, _ in self._held]
         self._held.clear()
         for run in list(self._runs.values()):
-            run.halt(stop=not self.lost and run not in ended)
+            run.on('halt_gone' if self.lost or run in ended else 'halt')
         self._check_drained()
 
     def halted(self, run: RemoteRun) -> bool:
@@ -509,10 +524,8 @@ class Session:
         return not self.replacer.state.moved
 
     def _check_drained(self) -> None:
-        if self.replacer is not None and self.interrupted and not self._runs and not self.lost \
-                and not self._drained:
-            self._drained = True
-            self.request(self._last_checkpoint)
+        if self.replacer is not None and not self._runs:
+            self._on('empty')
 
     async def _last_checkpoint(self) -> None:
         assert self.running is not None and self.replacer is not None
@@ -528,16 +541,16 @@ class Session:
             if self.checkpoints:
                 await self.checkpoints.restore(self.checkpoints.robot)
             for run in [*self._away, *self._runs.values()]:
-                run.arrive()
+                run.on('left')
 
     def homeless(self) -> list[str]:
         """Return the names of processes that cannot run on the robot."""
-        return [run.node.name for run in self._away if run.homeless]
+        return [run.node.name for run in self._away if run.state.phase == 'away']
 
     def replace(self, running: RunningMachine) -> None:
         """Use another machine from now on."""
         self.running = running
-        self.lost = False
+        self._on('replaced')
         for instance in self.instances:
             instance.is_up(running)
 
@@ -554,7 +567,7 @@ class Session:
                         await self.checkpoints.save(self.checkpoints.robot, still=True)
                     await self.checkpoints.restore(self.running.shell)
         self._away.clear()
-        self.interrupted = self._drained = False
+        self._on('returned')
         for run in [run for run, alive in back.items() if alive]:
             self._runs[run.node.id] = run
             self._waiting.append(run)
@@ -565,19 +578,12 @@ class Session:
     def end_all(self) -> None:
         """End all processes of a machine that is gone, for launch."""
         for run in list(self._runs.values()):
-            run.end()
-
-    def _release_exits(self) -> None:
-        """Report the exits that were held back: the machine is not known to be gone."""
-        self._ending = False
-        held, self._held = self._held, []
-        for run, event in held:
-            run.on_event(event)
+            run.on('over')
 
     def _respawning(self) -> list[RemoteRun]:
         """Return the processes that start again when they end."""
         return [run for run in self._runs.values() if run not in self._waiting
-                and run.started and not run.stopping and not self.interrupted
+                and run.state.started and not run.state.stopping and not self.interrupted
                 and run.node.respawn and run.node.respawn_max_retries != 0]
 
     def _start_again(self, runs: list[RemoteRun]) -> None:
@@ -598,9 +604,9 @@ class Session:
             if run in self._waiting:
                 continue
             node = run.node
-            if run in respawning and run.respawning:
+            if run in respawning and run.state.phase == 'respawning':
                 continue  # the agent has reported the exit
-            if run.started:
+            if run.state.started:
                 run.on_event({'event': 'exited', 'node': node.id, 'name': node.name,
                               'returncode': _UNREPORTED, 'respawns': run in respawning})
             else:
