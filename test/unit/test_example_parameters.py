@@ -3,19 +3,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import types
 
 import numpy
 import pytest
 
-pytest.importorskip('rclpy')
+rclpy = pytest.importorskip('rclpy')
 from launch import LaunchContext
 from launch.actions import Shutdown
 
 from fogros2_examples.ending import ended
 from fogros2_examples.files import checked, PICTURES
-from fogros2_examples.parameters import BadParameter, within, writable
+from fogros2_examples.parameters import BadParameter, run, within, writable
 from fogros2_examples.policy.onnx_file import perceptron
 
 
@@ -127,3 +128,16 @@ def test_unusable_files_are_refused_before_the_machine(argument, reader, content
     with pytest.raises(RuntimeError) as caught:
         action.execute(context)
     assert str(caught.value).startswith(f'{argument}:={path}: ') and said in str(caught.value)
+
+
+@pytest.mark.parametrize('ended', [True, False])
+def test_error_after_a_signal_ends_a_node_quietly(ended):
+    """Ctrl-C between two messages invalidates the context of the publisher."""
+    def turn(node):
+        if ended:
+            rclpy.shutdown()
+        raise RuntimeError("publisher's context is invalid")
+
+    with contextlib.nullcontext() if ended else pytest.raises(RuntimeError):
+        run('talker', lambda: None, turn)
+    rclpy.try_shutdown()
