@@ -10,9 +10,10 @@ import types
 import numpy
 import pytest
 
-rclpy = pytest.importorskip('rclpy')
+pytest.importorskip('rclpy')
 from launch import LaunchContext
 from launch.actions import Shutdown
+import rclpy
 
 from fogros2_examples.ending import ended
 from fogros2_examples.files import checked, PICTURES
