@@ -10,12 +10,11 @@ from pathlib import Path
 
 import cv2
 import numpy
-import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
 from fogros2_examples.letterbox import letterbox
+from fogros2_examples.parameters import run
 from fogros2_examples.scene import Pixels, Scene
 
 
@@ -101,11 +100,4 @@ class Camera(Node):
 
 def main() -> None:
     """Run until a signal, or until ``count`` images are published."""
-    rclpy.init()
-    try:
-        rclpy.spin(Camera())
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
-    except SystemExit:
-        rclpy.try_shutdown()
-        raise
+    run('camera', Camera)

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+import contextlib
 import os
 from pathlib import Path
+import pkgutil
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -34,7 +36,7 @@ def check_writable(text: str, endings: Sequence[str] = ()) -> None:
 
 def checked(
     read: Mapping[str, str], written: Mapping[str, Sequence[str]] = {},
-    made: Sequence[str] = (), folders: Sequence[str] = (),
+    made: Sequence[str] = (), folders: Sequence[str] = (), readers: Mapping[str, str] = {},
 ) -> OpaqueFunction:
     """
     Return an action that checks files on the robot before the launch creates a machine.
@@ -43,22 +45,33 @@ def checked(
     :param written: launch arguments that name a file to write, and its file extensions.
     :param made: values that name no file.
     :param folders: the arguments of ``read`` that may name a folder instead.
+    :param readers: by argument of ``read``, 'module:function' that raises a ValueError for a file
+        that the nodes cannot use.
     """
     # not imported for nodes
     from launch.actions import OpaqueFunction
 
     def check(context: LaunchContext) -> None:
         given = context.launch_configurations
+
+        def refuse(name: str, reader: Callable[..., object], *arguments: object) -> None:
+            try:
+                reader(*arguments)
+            except ValueError as error:
+                raise RuntimeError(f'{name}:={given[name]}: {error}') from error
+
         for name, remedy in read.items():
             exists = os.path.exists if name in folders else os.path.isfile
             if given[name] not in ('', *made) and not (
                     exists(given[name]) and os.access(given[name], os.R_OK)):
                 raise RuntimeError(f'{name}:={given[name]}: there is no such file here ({remedy})')
+        for name, reader in readers.items():
+            # the launch reports a module that the robot lacks
+            with contextlib.suppress(ImportError):
+                if given[name] not in ('', *made):
+                    refuse(name, pkgutil.resolve_name(reader), Path(given[name]))
         for name, endings in written.items():
-            try:
-                if given[name]:
-                    check_writable(given[name], endings)
-            except ValueError as error:
-                raise RuntimeError(f'{name}:={given[name]}: {error}') from error
+            if given[name]:
+                refuse(name, check_writable, given[name], endings)
 
     return OpaqueFunction(function=check)

@@ -8,11 +8,11 @@ import time
 
 import cv2
 import numpy
-import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
+
+from fogros2_examples.parameters import run
 
 
 class ImageProcessor(Node):
@@ -55,8 +55,4 @@ class ImageProcessor(Node):
 
 def main() -> None:
     """Run until interrupted."""
-    rclpy.init()
-    try:
-        rclpy.spin(ImageProcessor())
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
+    run('image_processor', ImageProcessor)

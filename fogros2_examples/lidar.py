@@ -8,12 +8,11 @@ from typing import Any, cast
 
 import numpy
 from numpy.typing import NDArray
-import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2, PointField
 
 from fogros2_examples.city import City, TURN
+from fogros2_examples.parameters import run
 
 #: Scans that are computed at the start, and published forwards and backwards in turn.
 SCANS = 5
@@ -60,11 +59,4 @@ class Lidar(Node):
 
 def main() -> None:
     """Run the node until its last scan or a signal."""
-    rclpy.init()
-    node = Lidar()
-    try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        node.destroy_node()
+    run('lidar', Lidar)

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from std_msgs.msg import String
+
+from fogros2_examples.parameters import run
 
 
 class Listener(Node):
@@ -28,11 +28,4 @@ class Listener(Node):
 
 def main() -> None:
     """Run until a signal, or until ``count`` messages have arrived."""
-    rclpy.init()
-    try:
-        rclpy.spin(Listener())
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
-    except SystemExit:
-        rclpy.try_shutdown()
-        raise
+    run('listener', Listener)

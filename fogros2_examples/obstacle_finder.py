@@ -6,11 +6,11 @@ from __future__ import annotations
 import array
 
 import numpy
-import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import PointCloud2
+
+from fogros2_examples.parameters import run
 
 #: Metres above the ground and from the lidar between which a point is an obstacle.
 LOW, HIGH, FAR = 0.3, 2.5, 20.0
@@ -48,11 +48,4 @@ class ObstacleFinder(Node):
 
 def main() -> None:
     """Run the node until a signal."""
-    rclpy.init()
-    node = ObstacleFinder()
-    try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        node.destroy_node()
+    run('obstacle_finder', ObstacleFinder)

@@ -64,6 +64,9 @@ def run(name: str, make: Callable[[], Any], turn: Callable[[Any], object] = rclp
         raise SystemExit(f'{name}: {error}') from error
     except (KeyboardInterrupt, ExternalShutdownException):
         pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
+    except RuntimeError:  # RCLError: the signal came before a message was published
+        if rclpy.ok():
+            raise
     except SystemExit:
         rclpy.try_shutdown()
         raise

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import socket
 
-import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from std_msgs.msg import String
+
+from fogros2_examples.parameters import run
 
 
 def own_address() -> str:
@@ -48,8 +48,4 @@ class Talker(Node):
 
 def main() -> None:
     """Run until interrupted."""
-    rclpy.init()
-    try:
-        rclpy.spin(Talker())
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
+    run('talker', Talker)

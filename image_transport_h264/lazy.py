@@ -64,8 +64,9 @@ def run(kind: Callable[[], LazyNode]) -> None:
     memory.keep()
     signal.signal(signal.SIGINT, interrupt)
     rclpy.init()
-    node = kind()
+    node: Optional[LazyNode] = None
     try:
+        node = kind()
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass  # rclpy shuts down already, in its own thread; do not do it twice
@@ -76,8 +77,9 @@ def run(kind: Callable[[], LazyNode]) -> None:
     finally:
         # A second Ctrl-C must not interrupt the clean-up.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        failed = node.failed
-        node.destroy_node()
+        failed = node is not None and node.failed
+        if node is not None:
+            node.destroy_node()
     if failed:
         raise SystemExit(1)
 

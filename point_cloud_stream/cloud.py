@@ -42,8 +42,8 @@ class Field:
 
     @property
     def size(self) -> int:
-        """Bytes of the field in a point."""
-        return SIZES[self.datatype] * self.count
+        """Bytes of the field in a point; some drivers write 0 for one value, as PCL allows."""
+        return SIZES[self.datatype] * max(self.count, 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,13 +89,15 @@ class Layout:
 
     def places(self) -> list[int]:
         """
-        Return the offsets of x, y and z.
+        Return the offsets of x, y and z; an empty cloud need not have these fields.
 
         :raises CloudError: one of the three is no single float32.
         """
         offsets = {field.name: field.offset for field in self.fields
-                   if (field.datatype, field.count) == (FLOAT32, 1)}
+                   if field.datatype == FLOAT32 and field.count < 2}
         if not offsets.keys() >= {*COORDINATES}:
+            if not self.points:
+                return []
             raise CloudError('x, y and z are not float32')
         return [offsets[name] for name in COORDINATES]
 
@@ -144,14 +146,16 @@ def unpack(data: bytes) -> tuple[Layout, int]:
                   bool(flags & 2)), at
 
 
-def rows(layout: Layout, data: Any) -> Octets:
+def rows(layout: Layout, data: Any) -> tuple[Octets, Octets]:
     """
-    Return the points as an array (points, point_step), which shares the data where possible.
+    Return the points (points, point_step), which share the data where possible, and the padding.
+
+    The padding is the bytes after each row's points (height, bytes).
 
     :raises CloudError: the data have another length than ``row_step * height``.
     """
     flat = numpy.frombuffer(data, numpy.uint8)
     if flat.size != layout.row_step * layout.height:
         raise CloudError('the data are not row_step * height bytes')
-    lines = flat.reshape(layout.height, layout.row_step)[:, :layout.width * layout.point_step]
-    return lines.reshape(layout.points, layout.point_step)
+    lines, used = flat.reshape(layout.height, layout.row_step), layout.width * layout.point_step
+    return lines[:, :used].reshape(layout.points, layout.point_step), lines[:, used:]

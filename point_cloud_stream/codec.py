@@ -9,7 +9,7 @@ large for the resolution ("odd" points) are coded bit by bit. Each cloud can be 
 
 A coded cloud is MAGIC, the model, the quantisation step (float64, little-endian), the layout
 (``cloud``), and columns (``numbers``): odd points, their coordinates, those of the others, then
-all other numbers of a point.
+all other numbers of a point, and the padding of rows.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def encode(
     :raises CloudError: the cloud contradicts itself, or has no x, y, z as float32.
     """
     layout.check()
-    points = cloud.rows(layout, data)
+    points, padding = cloud.rows(layout, data)
     dropped_fields = [each for each in layout.fields if each.name in drop - {*COORDINATES}]
     if dropped_fields:
         points = points.copy()
@@ -76,13 +76,15 @@ def encode(
     out = Writer()
     bits = [_strided(layout, points, at, 4).astype('<u4') for at in layout.places()]
     model, step = LOSSLESS, SLACK * resolution
-    if resolution > 0:
+    if resolution > 0 and bits:
         model = _write(out, layout, bits, step)
     else:
         for column in bits:
             out.shortest(column)
     for at, size in layout.columns():
         out.shortest(_strided(layout, points, at, size).astype(f'<u{size}'))
+    if padding.size:
+        out.shortest(padding.reshape(-1))
     head = _HEAD.pack(MAGIC, model, step) + layout.pack()
     return Coded(head + out.data(), resolution, layout.points * (3, 1, 0)[model])
 
@@ -131,14 +133,18 @@ def decode(data: bytes, max_bytes: int = MAX_BYTES) -> tuple[Layout, Octets]:
     columns = Reader(data, _HEAD.size + length)
     lines = numpy.zeros((layout.height, layout.row_step), numpy.uint8)
     points = numpy.zeros((layout.points, layout.point_step), numpy.uint8)
-    bits = [columns.numbers(layout.points, 4) for _ in COORDINATES] if model == LOSSLESS else (
+    places = layout.places()
+    bits = [columns.numbers(layout.points, 4) for _ in places] if model == LOSSLESS else (
         _read(columns, model, layout, step))
-    for at, column in zip(layout.places(), bits):
+    for at, column in zip(places, bits):
         _strided(layout, points, at, 4)[:] = column
     for at, size in layout.columns():
         _strided(layout, points, at, size)[:] = columns.numbers(layout.points, size)
     used = layout.width * layout.point_step
     lines[:, :used] = points.reshape(layout.height, used)
+    padding = lines[:, used:]
+    if padding.size:
+        padding[:] = columns.numbers(padding.size, 1).reshape(padding.shape)
     return layout, lines.reshape(-1)
 
 

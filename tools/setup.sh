@@ -329,6 +329,7 @@ prepare() {
         [ "$now" = none ] && with= || with="[$now]"
         # Debian 12's pip tries versions back to those without wheels, and gives up there
         [ "$now" = none ] || pip_in "$folder" install 'pip>=24'
+        say "Installing what FogROS2$with needs into ${folder#"$PWD"/}, from the package index"
         pip_in "$folder" install --no-build-isolation "$@$with"
         # both demand NumPy 1, and the tests show that NumPy 2 will do
         case $now in test*) pip_in "$folder" install --no-deps openpi-client openpi-server ;; esac

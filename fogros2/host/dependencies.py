@@ -119,10 +119,15 @@ for requirement in sys.argv[1:]:
         files = metadata.distribution(re.match('[A-Za-z0-9._-]+', requirement)[0]).files or ()
     except metadata.PackageNotFoundError:
         continue
-    tops = {file.parts[0].partition('.')[0] for file in files if file.suffix in ('.py', '.so')
-            and (len(file.parts) == 1 or file.name == '__init__.py' and len(file.parts) == 2)}
+    paths = [file.parts[:-1] if file.name == '__init__.py' else (file.name.partition('.')[0], )
+             for file in files if file.name == '__init__.py'
+             or file.suffix in ('.py', '.so') and len(file.parts) == 1]
+    paths = [path for path in paths
+             if path and path[0] not in ('..', 'test', 'tests', 'docs', 'examples')]
+    # parts of a namespace, such as ruamel.yaml, have no module of one name
+    least = min(map(len, paths), default=0)
     reasons = []
-    for module in sorted(tops - {'test', 'tests', 'docs', 'examples'}):
+    for module in sorted({'.'.join(path) for path in paths if len(path) == least}):
         try:
             importlib.import_module(module)
             break

@@ -21,6 +21,10 @@ from fogros2.runtime import run_state
 from fogros2.runtime.replacer import Replacer
 from fogros2.runtime.run_state import RunState
 
+#: Texts of a process that a signal interrupted while it started: NumPy, for one, turns Python's
+#: KeyboardInterrupt into an ImportError, and rclpy and rclcpp find an invalid context.
+_INTERRUPTED = re.compile(
+    r'KeyboardInterrupt|Traceback \(most recent call last\)|context is (not |in)valid')
 #: Messages of Qt, GTK and Tk that there is no screen.
 _NO_SCREEN = re.compile(
     r'Qt platform plugin|could not connect to display|cannot open display|GTK backend|'
@@ -221,7 +225,7 @@ class RemoteRun:
         withheld, self._withheld = self._withheld, None
         half = withheld is not None and (
             self._returncode in (-signal.SIGINT, -signal.SIGTERM)
-            or any('KeyboardInterrupt' in output['text'] for output in withheld))
+            or self._returncode and any(_INTERRUPTED.search(each['text']) for each in withheld))
         for output in () if half else withheld or ():
             self._print(output)
         if half:

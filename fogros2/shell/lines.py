@@ -90,7 +90,7 @@ def take_errors(channel: Channel) -> bytes:
 def close(channel: Channel) -> None:
     """Close a channel, whose connection may be gone."""
     # paramiko sends a message for it
-    with contextlib.suppress(OSError, EOFError):
+    with contextlib.suppress(OSError):
         channel.close()
 
 
@@ -110,8 +110,8 @@ class LineStream:
         """Send bytes to the program's standard input."""
         try:
             self._channel.sendall(data)
-        except (OSError, EOFError) as error:
-            # paramiko's error for a program that ends meanwhile has no text.
+        except OSError as error:
+            # the error for a program that ends meanwhile has no text
             why = str(error) or 'it ended'
             raise ConnectError(f"the connection to '{self._name}' is gone: {why}") from error
 
@@ -125,8 +125,7 @@ class LineStream:
                 self._buffer = b''
                 return b''
             data = b''
-            # paramiko's EOFError: the answer that makes room for more could not be sent
-            with contextlib.suppress(OSError, EOFError, FogError):
+            with contextlib.suppress(OSError, FogError):
                 data = self._channel.recv(_CHUNK)
                 take_errors(self._channel)
             if not data:

@@ -70,7 +70,7 @@ def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
     ended, end = os.pipe()
 
     def up() -> None:
-        with contextlib.suppress(OSError, EOFError, FogError):
+        with contextlib.suppress(OSError, FogError):
             while ended not in select.select([stdin, ended], [], [])[0]:
                 # Large reads save system calls; sendall() splits them into packets.
                 data = os.read(stdin, 1 << 18)
@@ -81,7 +81,7 @@ def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
 
     def errors() -> None:
         with contextlib.suppress(OSError):
-            while data := channel.recv_stderr(1 << 15):
+            while data := _received(channel.recv_stderr, 1 << 15):
                 _write(stderr, data)
 
     threads = [threading.Thread(target=up, name='fog-relay-up', daemon=True),
@@ -92,7 +92,7 @@ def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
             undo.callback(lines.close, channel)
             for thread in threads:
                 thread.start()
-            while data := channel.recv(1 << 18):
+            while data := _received(channel.recv, 1 << 18):
                 _write(stdout, data)
             threads[1].join(5.0)
             status = int(channel.recv_exit_status())
@@ -101,6 +101,13 @@ def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
         threads[0].join(5.0)
         os.close(ended)
     return status if 0 <= status < 256 else 255
+
+
+def _received(receive: Callable[[int], bytes], size: int) -> bytes:
+    """Return the next bytes, b'' at the end and if the connection is gone."""
+    with contextlib.suppress(ConnectionError):
+        return receive(size)
+    return b''
 
 
 def _write(target: int, data: bytes) -> None:

@@ -170,7 +170,8 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
         try:
             feeder = _feed(
                 channel, command.input, end=bool(command.input) or self.ends_empty_input)
-            with noted(_what(command)):
+            # ``_status`` reports a connection that is gone
+            with noted(_what(command)), contextlib.suppress(ConnectionError):
                 self._collect(channel, output, begin + timeout, cancel, command)
             returncode = self._status(channel, command)
             if feeder is not None:
@@ -258,7 +259,7 @@ def _feed(channel: Channel, data: bytes, *, end: bool = True) -> Optional[thread
     def send() -> None:
         rest = memoryview(data)
         # The command may end before it reads all input; its exit status has the reason.
-        with contextlib.suppress(OSError, EOFError, FogError):
+        with contextlib.suppress(OSError, FogError):
             while rest:
                 # The time-out belongs to the channel, but is meant only for reads.
                 with contextlib.suppress(TimeoutError):

@@ -181,13 +181,20 @@ def _choose(transport: paramiko.Transport, known: Known) -> None:
 
 
 def transport_over(sock: socket.socket) -> paramiko.Transport:
-    """Return a transport whose channels raise an OSError too if the key exchange times out."""
+    """
+    Return a transport whose channels raise only OSErrors.
+
+    paramiko raises an EOFError for a connection that is gone, even in a read, which makes room for
+    more; and an SSHException if the key exchange takes too long.
+    """
     import paramiko
 
     class Transport(paramiko.Transport):
         def _send_user_message(self, data: paramiko.Message) -> None:
             try:
                 super()._send_user_message(data)  # type: ignore[misc]
+            except EOFError as error:
+                raise ConnectionResetError(str(error)) from error
             except paramiko.SSHException as error:
                 raise TimeoutError(str(error)) from error
 

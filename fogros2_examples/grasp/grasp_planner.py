@@ -13,8 +13,6 @@ from typing import Optional
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseArray
-import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
@@ -23,6 +21,7 @@ from visualization_msgs.msg import MarkerArray
 from fogros2_examples.grasp.antipodal import Grasp, Gripper, plan
 from fogros2_examples.grasp.messages import BadImage, depth_of, grasp_messages
 from fogros2_examples.grasp.surface import NothingThere, surface
+from fogros2_examples.parameters import run
 
 #: Keeps the last message for late subscribers.
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -103,8 +102,4 @@ class GraspPlanner(Node):
 
 def main() -> None:
     """Run until interrupted."""
-    rclpy.init()
-    try:
-        rclpy.spin(GraspPlanner())
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
+    run('grasp_planner', GraspPlanner)

@@ -27,7 +27,8 @@ def generate_launch_description():
                               description='how many plans, 0 for ever more'),
         DeclareLaunchArgument('picture', default_value='', description='a PNG file to write'),
         checked({'environment': 'apartment and cubicles are no files'}, {'picture': PICTURES},
-                made=('apartment', 'cubicles')),
+                made=('apartment', 'cubicles'),
+                readers={'environment': 'fogros2_examples.planning.app_files:loaded'}),
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'planner', 'launch_foxglove': LaunchConfiguration('foxglove')}),
         CloudNode(machine='planner', package='fogros2_examples', executable='motion_planner',

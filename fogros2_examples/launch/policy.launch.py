@@ -33,7 +33,8 @@ def generate_launch_description():
                               description='how many times slower the policy runs'),
         *(DeclareLaunchArgument(name, default_value=str(value), description=what)
           for name, (value, what) in shown.items()),
-        checked({'policy': 'make demo-policy trains one'}, {'runs': (), 'picture': PICTURES}),
+        checked({'policy': 'make demo-policy trains one'}, {'runs': (), 'picture': PICTURES},
+                readers={'policy': 'fogros2_examples.policy.onnx_file:check'}),
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'policy', 'launch_foxglove': LaunchConfiguration('foxglove')}),
         CloudNode(machine='policy', package='fogros2_examples', executable='policy_server',

@@ -37,7 +37,8 @@ def generate_launch_description():
         *(DeclareLaunchArgument(name, default_value=str(value), description=what)
           for name, (value, what) in shown.items()),
         checked({'dataset': "'' stands for the synthetic room"},
-                {'picture': PICTURES, 'results': ()}, folders=['dataset']),
+                {'picture': PICTURES, 'results': ()}, folders=['dataset'],
+                readers={'dataset': 'fogros2_examples.slam.tum:read'}),
         FogMachine(LaunchConfiguration('machine'), {'name': 'slam', 'on_interrupt': answer,
                    'launch_foxglove': LaunchConfiguration('foxglove')}),
         CloudNode(machine='slam', package='fogros2_examples', executable='slam', output='screen',

@@ -50,7 +50,8 @@ def generate_launch_description():
           for name, (value, what) in (asked | shown).items()),
         # Other machines than containers can run containers by default.
         checked({'dataset': "'' stands for the synthetic room"},
-                {'picture': PICTURES, 'results': ()}, folders=['dataset']),
+                {'picture': PICTURES, 'results': ()}, folders=['dataset'],
+                readers={'dataset': 'fogros2_examples.slam.tum:read'}),
         FogMachine(LaunchConfiguration('machine'), {
             'name': 'slam', 'mounts': LaunchConfiguration('mounts'),
             'containers': PythonExpression(

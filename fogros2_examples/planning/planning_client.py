@@ -79,13 +79,8 @@ class PlanningClient(Node):
     def run(self) -> int:
         """Request all plans, and return the exit status: 0 if all paths were found."""
         try:
-            scene = loaded(File(self.environment)) if self.environment.endswith('.cfg') else (
-                MADE[self.environment]())
-        except KeyError:
-            self.get_logger().fatal(
-                f"no environment is called '{self.environment}': there are {', '.join(MADE)}, "
-                'and files of OMPL.app (.cfg)')
-            return 2
+            scene = MADE[self.environment]() if self.environment in MADE else (
+                loaded(File(self.environment)))
         except BadFile as error:
             self.get_logger().fatal(str(error))
             return 2

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Write a multi-layer perceptron as an ONNX model.
+Write a multi-layer perceptron as an ONNX model, and recognise models.
 
 The messages are those of onnx.proto3 (https://github.com/onnx/onnx), in the encoding of Protocol
 Buffers. A dozen of their fields is enough, so the package ``onnx`` is not needed.
@@ -9,6 +9,7 @@ Buffers. A dozen of their fields is enough, so the package ``onnx`` is not neede
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Union
 
 import numpy
@@ -20,6 +21,20 @@ Layer = tuple[Singles, Singles]
 #: Names as LeRobot has them, and types of numbers.
 STATE, ACTION = 'observation.state', 'action'
 _FLOAT, _INT64 = 1, 7
+#: Tags with which a ModelProto can begin: its fields, integers (1 and 5) or of a length.
+_FIRST = frozenset(number << 3 | 2 * (number not in (1, 5)) for number in (*range(1, 9), 14))
+
+
+def check(path: Path) -> None:
+    """
+    Check that a file begins as an ONNX model does, without ONNX Runtime.
+
+    :raises ValueError: the file is empty, a pointer of Git LFS, an archive or another text.
+    """
+    with path.open('rb') as file:
+        first = file.read(1)
+    if not first or first[0] not in _FIRST:
+        raise ValueError('it is no ONNX model' if first else 'the file is empty')
 
 
 def _number(value: int) -> bytes:

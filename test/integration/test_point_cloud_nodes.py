@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip('zstandard', reason='the extra "point-clouds" is not installed')
 pytest.importorskip('rclpy', reason='rclpy is not installed')
 import numpy
-from sensor_msgs.msg import CompressedImage, PointCloud2
+from sensor_msgs.msg import CompressedImage, PointCloud2, PointField
 
 from fogros2_examples.city import City
 from fogros2_examples.lidar import message
@@ -76,6 +76,91 @@ def test_clouds_come_out_as_they_went_in(
                 assert error <= bound, error
             else:
                 assert (after[name] == scan[name]).all()
+
+
+def unusual(name: str) -> PointCloud2:
+    """Return a cloud as other drivers publish it."""
+    big, count, kind = name.startswith('big endian'), 40, {
+        'names': ['x', 'y', 'z'], 'formats': 3 * ['f4'], 'offsets': [0, 4, 8], 'itemsize': 16}
+    if 'packed colours' in name:
+        kind = {'names': ['x', 'y', 'z', 'rgb'], 'formats': 3 * ['f4'] + ['u4'],
+                'offsets': [0, 4, 8, 16], 'itemsize': 32}
+    if 'types' in name:
+        kind = {'names': [*'abcdefh', *'zyx', 'größe', ''],
+                'formats': ['i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'f8', 'f4', 'f4', 'f4', '5f4',
+                            'u1'],
+                'offsets': [0, 1, 2, 4, 7, 11, 15, 23, 27, 31, 35, 55], 'itemsize': 61}
+    layout = numpy.dtype(kind).newbyteorder('>' if big else '<')
+    data = numpy.random.default_rng(7).integers(0, 256, count * layout.itemsize, numpy.uint8)
+    values = data.view(layout).reshape(5, -1)
+    for axis in 'xyz':
+        values[axis] = numpy.random.default_rng(ord(axis)).uniform(-40, 40, values.shape)
+    if 'NaN' in name:
+        values['x'][::2], values['y'][1], values['z'][:, 3] = numpy.nan, -numpy.inf, 1e20
+        if 'all' in name:
+            for axis in 'xyz':
+                values[axis] = numpy.nan
+    fields = []
+    codes = {'i1': 1, 'u1': 2, 'i2': 3, 'u2': 4, 'i4': 5, 'u4': 6, 'f4': 7, 'f8': 8}
+    for field in layout.names:
+        base, offset = layout.fields[field][:2]
+        fields.append(PointField(
+            name=field, offset=offset, count=int(numpy.prod(base.shape, dtype=int)),
+            datatype=7 if field == 'rgb' else codes[base.base.str[1:]]))
+    rows, columns = (1, count) if 'row' in name else values.shape
+    if 'empty' in name:
+        rows, columns = ((0, 0) if 'fields' in name else (1, 0) if 'line' in name else (5, 0))
+    if 'fields' in name:
+        fields, layout = [], numpy.dtype([])
+    if 'count 0' in name:
+        for field in fields:
+            field.count = 0
+    padding = 13 if 'padding' in name else 0
+    octets = data[:rows * columns * layout.itemsize].reshape(rows, columns * layout.itemsize)
+    octets = numpy.pad(octets, ((0, 0), (0, padding)), constant_values=9)
+    return PointCloud2(
+        height=rows, width=columns, fields=fields, is_bigendian=big,
+        point_step=layout.itemsize, row_step=octets.shape[1], is_dense='NaN' not in name,
+        data=array.array('B', octets.tobytes()))
+
+
+def arrived(bench: Bench, publisher: Any, cloud: PointCloud2, seen: list[Any]) -> PointCloud2:
+    """Publish a cloud until it has arrived, and return the cloud that did."""
+    def same() -> list[Any]:
+        return [each for each in seen if each.header.frame_id == cloud.header.frame_id]
+
+    bench.until(same, cloud.header.frame_id, meanwhile=lambda: publisher.publish(cloud))
+    return same()[0]
+
+
+@pytest.mark.parametrize('lossless', ['true', 'false'])
+def test_unusual_clouds_come_out_as_they_went_in(bench: Bench, lossless: str) -> None:
+    names = ['packed colours, count 0', 'row, packed colours', 'NaN', 'row, NaN', 'all NaN',
+             'types', 'row, types', 'big endian', 'big endian, types, padding', 'padding', 'empty',
+             'empty line', 'empty, no rows or fields', 'empty, padding', 'types, NaN, padding']
+    pair(bench, '-p', f'lossless:={lossless}')
+    seen = bench.heard(PointCloud2, '/seen/points')
+    publisher = bench.node.create_publisher(PointCloud2, '/points', RELIABLE)
+    for name in names:
+        sent = unusual(name)
+        sent.header.frame_id = name
+        got = arrived(bench, publisher, sent, seen)
+        for axis in 'xyz' if lossless == 'false' and sent.data else '':
+            before, after = (coordinates(each, axis) for each in (sent, got))
+            with numpy.errstate(invalid='ignore'):
+                errors = numpy.abs(before.astype(float) - after)
+            assert (numpy.isfinite(before) == numpy.isfinite(after)).all(), name
+            assert numpy.nanmax(errors, initial=0.0) <= 0.0005, name
+            after[:] = before
+        assert got == sent, name
+
+
+def coordinates(cloud: PointCloud2, axis: str) -> Any:
+    """Return one coordinate of all points, which shares their memory."""
+    offset = next(field.offset for field in cloud.fields if field.name == axis)
+    return numpy.ndarray(
+        (cloud.height, cloud.width), '>f4' if cloud.is_bigendian else '<f4', cloud.data, offset,
+        (cloud.row_step, cloud.point_step))
 
 
 def test_dropped_fields_are_gone(bench: Bench) -> None:

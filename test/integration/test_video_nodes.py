@@ -487,6 +487,35 @@ def test_error_after_an_interrupt_is_no_failure(
         assert ('Traceback' in said) is (not interrupted), said
 
 
+#: A node that is interrupted, or fails, before it is there.
+STARTING = """
+import sys
+import rclpy
+from image_transport_h264.lazy import LazyNode, run
+
+
+class Starting(LazyNode):
+    def __init__(self):
+        if len(sys.argv) > 1:
+            rclpy.shutdown()  # as the thread of rclpy's signal handler does
+        super().__init__('starting')
+        raise TypeError('a defect')
+
+
+run(Starting)
+"""
+
+
+@pytest.mark.parametrize('interrupted', [True, False])
+def test_interrupt_of_a_node_that_starts_is_no_failure(bench: Bench, interrupted: bool) -> None:
+    done = subprocess.run(
+        [sys.executable, '-c', STARTING, *['interrupted'] * interrupted], env=bench.environment,
+        capture_output=True, text=True, timeout=60)
+    assert done.returncode == (not interrupted)
+    assert ('a defect' in done.stderr) is (not interrupted) and (
+        not interrupted or 'Traceback' not in done.stderr), done.stderr
+
+
 #: Asks how many subscribers there are, before the executor can tell that one has come.
 ASKS = """
 import time

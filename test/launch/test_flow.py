@@ -718,7 +718,10 @@ def test_one_request_stops_several_nodes(run, fake, planner):
 
 @pytest.mark.parametrize(('returncode', 'text', 'half'), [
     (-2, 'its Traceback', True), (-15, '', True), (1, 'KeyboardInterrupt', True),
-    (1, 'out of memory', False), (0, 'bye', False)])
+    (1, 'Traceback (most recent call last):\nImportError: numpy', True),
+    (-6, 'what(): the given context is not valid, as rcl_shutdown() was called', True),
+    (1, 'out of memory', False), (0, 'Traceback (most recent call last):', False),
+    (0, 'bye', False)])
 def test_node_that_ended_while_it_started_is_a_warning(
         run, fake, planner, capfd, returncode, text, half):
     def on_start(machine, node):

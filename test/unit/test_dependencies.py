@@ -164,6 +164,18 @@ def test_package_that_cannot_be_imported_is_reported(tmp_path: Path) -> None:
 
 
 @RUNS_PIP
+def test_part_of_a_namespace_is_imported(tmp_path: Path) -> None:
+    wheel(tmp_path, 'fogt_part', **{'fogt_space/part/__init__': 'import absent_library',
+                                    'fogt_space/part/deep/__init__': ''})
+    wheel(tmp_path, 'fogt_other', **{'fogt_space/other/__init__': ''})
+    _, done = installed(tmp_path, 'fogt-other')
+    assert done.returncode == 0, done.stderr
+    _, done = installed(tmp_path, 'fogt-part')
+    assert done.returncode == 1 and done.stderr.splitlines()[-1].startswith(
+        "'fogt_space.part' of fogt-part can't be imported there: ModuleNotFoundError: ")
+
+
+@RUNS_PIP
 def test_installed_packages_are_found_after_the_systems(tmp_path: Path) -> None:
     wheel(tmp_path, 'fogt_one', fogt_one='name = "pip"', colorsys='raise ImportError("pip")',
           pytest='raise ImportError("pip")')

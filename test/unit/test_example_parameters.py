@@ -3,18 +3,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import types
 
+import numpy
 import pytest
 
 pytest.importorskip('rclpy')
 from launch import LaunchContext
 from launch.actions import Shutdown
+import rclpy
 
 from fogros2_examples.ending import ended
 from fogros2_examples.files import checked, PICTURES
-from fogros2_examples.parameters import BadParameter, within, writable
+from fogros2_examples.parameters import BadParameter, run, within, writable
+from fogros2_examples.policy.onnx_file import perceptron
 
 
 class Given:
@@ -99,3 +103,42 @@ def test_files_are_checked_before_the_machine(given, said, tmp_path, monkeypatch
     with pytest.raises(RuntimeError) as caught:
         action.execute(context)
     assert str(caught.value) == said
+
+
+@pytest.mark.parametrize(('argument', 'reader', 'content', 'said'), [
+    ('policy', 'fogros2_examples.policy.onnx_file:check', b'', 'the file is empty'),
+    ('policy', 'fogros2_examples.policy.onnx_file:check',
+     b'version https://git-lfs.github.com/spec/v1\n', 'it is no ONNX model'),
+    ('policy', 'fogros2_examples.policy.onnx_file:check', b'PK\3\4', 'it is no ONNX model'),
+    ('policy', 'fogros2_examples.policy.onnx_file:check', perceptron({}, [(
+        numpy.zeros((6, 12), 'f4'), numpy.zeros(12, 'f4'))], 2), ''),
+    ('environment', 'fogros2_examples.planning.app_files:loaded', b'', "has no 'problem'"),
+    ('environment', 'fogros2_examples.planning.app_files:loaded',
+     b'[problem]\nrobot = "absent.dae"\n', 'absent.dae'),
+    ('dataset', 'fogros2_examples.slam.tum:read', None, 'rgb.txt'),
+    ('dataset', 'absent_module:read', b'', '')])
+def test_unusable_files_are_refused_before_the_machine(argument, reader, content, said, tmp_path):
+    path = tmp_path / 'file'
+    path.mkdir() if content is None else path.write_bytes(content)
+    context = LaunchContext()
+    context.launch_configurations[argument] = str(path)
+    action = checked({argument: ''}, folders=['dataset'], readers={argument: reader})
+    if not said:
+        assert not action.execute(context)
+        return
+    with pytest.raises(RuntimeError) as caught:
+        action.execute(context)
+    assert str(caught.value).startswith(f'{argument}:={path}: ') and said in str(caught.value)
+
+
+@pytest.mark.parametrize('ended', [True, False])
+def test_error_after_a_signal_ends_a_node_quietly(ended):
+    """Ctrl-C between two messages invalidates the context of the publisher."""
+    def turn(node):
+        if ended:
+            rclpy.shutdown()
+        raise RuntimeError("publisher's context is invalid")
+
+    with contextlib.nullcontext() if ended else pytest.raises(RuntimeError):
+        run('talker', lambda: None, turn)
+    rclpy.try_shutdown()

@@ -56,7 +56,7 @@ class Told:
 
 
 @pytest.mark.parametrize(('error', 'why'), [
-    (EOFError(), 'it ended'), (OSError('Socket is closed'), 'Socket is closed')])
+    (ConnectionResetError(), 'it ended'), (OSError('Socket is closed'), 'Socket is closed')])
 def test_a_connection_that_ends_while_a_line_is_written_is_gone(error, why):
     def sendall(data):
         raise error
@@ -66,16 +66,17 @@ def test_a_connection_that_ends_while_a_line_is_written_is_gone(error, why):
         stream.write(b'line')
 
 
-@pytest.mark.parametrize('error', [EOFError(), OSError('Socket is closed')])
-def test_channel_of_a_lost_connection_closes(monkeypatch, error):
+@pytest.mark.parametrize('receives', [True, False])
+@pytest.mark.parametrize('error', [ConnectionResetError(), BrokenPipeError()])
+def test_channel_of_a_lost_connection_closes(monkeypatch, error, receives):
     """Paramiko sends a message for it; the thread that watches the agent went on no longer."""
     def fail(*words):
         raise error
 
     channel = SimpleNamespace(
         close=fail, sendall=fail, send=fail, shutdown_write=fail,
-        settimeout=lambda seconds: None, recv=lambda size: b'',
-        recv_stderr=lambda size: b'', recv_stderr_ready=lambda: False,
+        settimeout=lambda seconds: None, recv=fail if receives else lambda size: b'',
+        recv_stderr=fail if receives else lambda size: b'', recv_stderr_ready=lambda: False,
         exit_status_ready=lambda: False, recv_exit_status=lambda: -1, eof_received=False,
         status_event=threading.Event(), get_transport=lambda: SimpleNamespace(
             is_alive=lambda: False))
@@ -103,6 +104,20 @@ def test_key_exchange_without_an_end_is_a_lost_connection():
         with pytest.raises(ConnectError, match='is gone: Key-exchange timed out'):
             stream.write(b'line')
         stream.close()
+        transport.close()
+
+
+def test_gone_connection_is_an_oserror_of_its_channels():
+    """Reading, too, sends a message, which makes room for more."""
+    paramiko = pytest.importorskip('paramiko')
+    ours, theirs = socket.socketpair()
+    with ours:
+        theirs.close()
+        transport = ssh_connection.transport_over(ours)
+        transport.active = True
+        transport.clear_to_send.set()
+        with pytest.raises(ConnectionResetError):
+            transport._send_user_message(paramiko.Message(b'1'))
         transport.close()
 
 

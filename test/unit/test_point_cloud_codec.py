@@ -143,9 +143,31 @@ def test_any_layout_keeps_its_other_bytes(kind: Any, big: bool) -> None:
 
 def test_rows_may_have_padding() -> None:
     what = layout(SCAN, row_step=SCAN.strides[0] + 7)
-    padded = numpy.pad(SCAN.view(numpy.uint8).reshape(16, -1), ((0, 0), (0, 7)))
+    padded = numpy.pad(SCAN.view(numpy.uint8).reshape(16, -1), ((0, 0), (0, 7)),
+                       constant_values=9)
     there, data = decode(encode(what, padded.tobytes(), 0.0).data)
     assert there == what and data.tobytes() == padded.tobytes()
+
+
+@pytest.mark.parametrize('resolution', [0.0, 0.01])
+def test_empty_cloud_needs_no_fields(resolution: float) -> None:
+    """Nodes publish a default message when they have found nothing."""
+    for what in Layout(0, 0, (), 0, 0), Layout(1, 0, (), 16, 0), Layout(3, 0, (), 4, 5):
+        data = bytes(what.height * what.row_step)
+        there, after = decode(encode(what, data, resolution).data)
+        assert there == what and after.tobytes() == data
+
+
+@pytest.mark.parametrize('resolution', [0.0, 0.01])
+def test_count_of_zero_is_one_value(resolution: float) -> None:
+    """PCL takes it so, because some drivers do not fill in the count."""
+    what = layout(SCAN)
+    what = dataclasses.replace(what, fields=tuple(
+        dataclasses.replace(field, count=0) for field in what.fields))
+    there, data = decode(encode(what, SCAN.tobytes(), resolution).data)
+    after = data.view(SCAN.dtype).reshape(SCAN.shape)
+    assert there == what and (after['time'] == SCAN['time']).all()
+    assert largest_error(SCAN, after) <= resolution / 2
 
 
 def test_dropped_fields_take_nothing_and_become_zero() -> None:
