@@ -36,6 +36,7 @@ from fogros2.model import Command
 from fogros2.plan import DEFAULT_RMW
 from fogros2.process import run
 from fogros2.store import Store
+from fogros2_share.node import OWN, TOPICS
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
 from rigs.domains import taken
@@ -174,9 +175,10 @@ def latency(folder: Path, domains: Sequence[str], size: int, bare: bool) -> floa
             undo.callback(node.destroy_node)
         for number, words in enumerate([[str(Path(__file__)), '--bare', *domains]] if bare else [[
                 str(ROOT / 'fogros2_share/scripts/share'), json.dumps({
-                    'topics': ['/data'], 'folders': [str(folder / domain), str(folder)]})]
+                    'topics': ['/data'], 'folders': [str(folder / domain / OWN), str(folder)]})]
                 for domain in domains]):
-            (folder / domains[number]).mkdir(exist_ok=True)
+            (folder / domains[number] / OWN).mkdir(parents=True, exist_ok=True)
+            (folder / domains[number] / TOPICS).write_text('/data\n')
             child = subprocess.Popen([sys.executable, *words], env={
                 **os.environ, 'ROS_DOMAIN_ID': domains[number]})
             undo.callback(child.wait)

@@ -65,11 +65,14 @@ def waits() -> dict[str, list[float]]:
 
 def serve(name: str) -> None:
     """
-    Answer after TAKES seconds, or after the recorded time of a round if ``b`` is 1.
+    Answer with the ``depth`` of a request, after TAKES seconds if its prefix is '0'.
+
+    With '1', it is after the recorded time of that round, with '2' at once. A service of ROS 2's
+    own stands for one of the user's, which would have to be built first.
 
     SIGUSR1 makes all waits ten times longer.
     """
-    from example_interfaces.srv import AddTwoInts
+    from rcl_interfaces.srv import ListParameters
     import rclpy
     from rclpy.callback_groups import ReentrantCallbackGroup
     from rclpy.executors import MultiThreadedExecutor
@@ -79,14 +82,15 @@ def serve(name: str) -> None:
     signal.signal(signal.SIGUSR1, lambda *_: factor.append(10))
 
     def answer(request: Any, response: Any) -> Any:
-        seconds = {0: TAKES, 1: recorded[request.a] if request.b == 1 else 0, 2: 0.0}[request.b]
+        (kind,) = request.prefixes
+        seconds = {'0': TAKES, '1': recorded[request.depth] if kind == '1' else 0, '2': 0.0}[kind]
         time.sleep(seconds * factor[-1])
-        response.sum = request.a
+        response.result.names = [str(request.depth)]
         return response
 
     rclpy.init()
     node = rclpy.create_node('planner')
-    node.create_service(AddTwoInts, f'/fogros2/{name}/plan', answer,
+    node.create_service(ListParameters, f'/fogros2/{name}/plan', answer,
                         callback_group=ReentrantCallbackGroup())
     executor = MultiThreadedExecutor(24)
     executor.add_node(node)
@@ -95,18 +99,18 @@ def serve(name: str) -> None:
 
 def relay() -> None:
     """Serve ``/relayed`` by one replica, as plainly as rclpy does it."""
-    from example_interfaces.srv import AddTwoInts
+    from rcl_interfaces.srv import ListParameters
     import rclpy
     from rclpy.callback_groups import ReentrantCallbackGroup
 
     rclpy.init()
     node = rclpy.create_node('relay')
-    client = node.create_client(AddTwoInts, '/fogros2/a/plan')
+    client = node.create_client(ListParameters, '/fogros2/a/plan')
 
     async def answer(request: Any, response: Any) -> Any:
         return await client.call_async(request)
 
-    node.create_service(AddTwoInts, '/relayed', answer, callback_group=ReentrantCallbackGroup())
+    node.create_service(ListParameters, '/relayed', answer, callback_group=ReentrantCallbackGroup())
     rclpy.spin(node)
 
 
@@ -143,8 +147,8 @@ class Bench:
 
     def ready(self, service: str) -> None:
         """Wait until a service answers."""
-        from example_interfaces.srv import AddTwoInts
-        self._clients[service] = self._node.create_client(AddTwoInts, service)
+        from rcl_interfaces.srv import ListParameters
+        self._clients[service] = self._node.create_client(ListParameters, service)
         if not self._clients[service].wait_for_service(30.0):
             raise SystemExit(f'{service} does not answer')
         for _ in range(5):
@@ -156,10 +160,11 @@ class Bench:
         import rclpy
         client = self._clients[service]
         begin = time.perf_counter()
-        future = client.call_async(client.srv_type.Request(a=number, b=kind))
+        future = client.call_async(client.srv_type.Request(depth=number, prefixes=[str(kind)]))
         rclpy.spin_until_future_complete(self._node, future, timeout_sec=limit)
         taken = time.perf_counter() - begin
-        return taken if future.done() and future.result().sum == number else float('inf')
+        answered = future.done() and future.result().result.names == [str(number)]
+        return taken if answered else float('inf')
 
     def tell(self, event: str) -> None:
         """Write an event, as the launch does."""

@@ -13,7 +13,7 @@ from fogros2.describe import keywords
 from fogros2.describe.machines import checked
 from fogros2.launch_internals.wrapping import wrap
 from fogros2.runtime.coordinator import Coordinator
-from fogros2.runtime.remote_process import RemoteProcess, send, send_components
+from fogros2.runtime.remote_process import remote_of, send, send_components
 from fogros2.runtime.republishers import AddedProcess
 
 if TYPE_CHECKING:
@@ -60,8 +60,8 @@ class CloudGroup(GroupAction):
         if isinstance(entity, Action) and entity.condition is not None and (
                 not entity.condition.evaluate(context)):
             return  # launch skips it
-        if isinstance(entity, ExecuteLocal) and not isinstance(
-                entity, (RemoteProcess, AddedProcess)):
+        if isinstance(entity, ExecuteLocal) and remote_of(entity) is None and not isinstance(
+                entity, AddedProcess):
             send(entity, self._resolved, self._streams)
         else:
             send_components(entity, self._resolved, self._streams, context)

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 import functools
 import inspect
-from typing import get_args, Optional, TYPE_CHECKING, TypeGuard, Union
+from typing import get_args, Optional, TYPE_CHECKING, Union
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import (
@@ -32,7 +32,7 @@ from fogros2.launch_internals.wrapping import below, wrap
 from fogros2.model import RobotNodes
 from fogros2.runtime import node_spec, streaming
 from fogros2.runtime.coordinator import Coordinator, Planned
-from fogros2.runtime.remote_process import RemoteProcess
+from fogros2.runtime.remote_process import remote_of, RemoteProcess
 
 if TYPE_CHECKING:
     from fogros2.image_transport.streams import Entry
@@ -96,7 +96,7 @@ class FogROSLaunchDescription(LaunchDescription):
                 continue
             coordinator.know(entity.machine)
             # streams of a process that executes late are checked before a machine is created
-            streaming.check(getattr(entity, 'stream_topics', ()))
+            streaming.check(entity.stream_topics)
             if certain:
                 planned += _planned(entity)
         if planned:
@@ -115,11 +115,11 @@ class FogROSLaunchDescription(LaunchDescription):
         return wrap(entities, functools.partial(_hold, coordinator))
 
 
-def has_machine(
+def holder(
     entity: LaunchDescriptionEntity,
-) -> TypeGuard[Union[RemoteProcess, CloudGroup, FogMachine]]:
-    """Return whether an entity is a machine, or has one."""
-    return isinstance(entity, (RemoteProcess, CloudGroup, FogMachine))
+) -> Optional[Union[RemoteProcess, CloudGroup, FogMachine]]:
+    """Return what has the machine of an entity, None for an entity without one."""
+    return entity if isinstance(entity, (CloudGroup, FogMachine)) else remote_of(entity)
 
 
 def _planned(entity: Union[RemoteProcess, CloudGroup]) -> Iterator[Planned]:
@@ -138,7 +138,7 @@ def _processes(
     """Yield the processes without a condition and without a machine of their own, at any depth."""
     for entities in several:
         for entity in entities:
-            if getattr(entity, 'condition', None) is not None or has_machine(entity):
+            if getattr(entity, 'condition', None) is not None or holder(entity):
                 continue
             if isinstance(entity, ExecuteLocal):
                 yield entity
@@ -157,14 +157,14 @@ def cloud_entities(
     entities: Iterable[LaunchDescriptionEntity], certain: bool = True,
 ) -> Iterator[tuple[Union[RemoteProcess, CloudGroup, FogMachine], bool]]:
     """
-    Yield the entities that belong to a machine, at any depth, without reading files.
+    Yield what has a machine, at any depth, without reading files.
 
     The flag is True if no condition precedes the entity: it executes, or an event can execute it.
     """
     for entity in entities:
         sure = certain and getattr(entity, 'condition', None) is None
-        if has_machine(entity):
-            yield entity, sure
+        if (found := holder(entity)) is not None:
+            yield found, sure
         if not isinstance(entity, IncludeLaunchDescription):
             for some in below(entity):
                 yield from cloud_entities(some, sure)
@@ -174,5 +174,5 @@ def _hold(
     coordinator: Coordinator, entity: LaunchDescriptionEntity, context: LaunchContext,
 ) -> None:
     """Make a robot process or a timer wait until the cloud is up."""
-    if isinstance(entity, (ExecuteLocal, TimerAction)) and not isinstance(entity, RemoteProcess):
+    if isinstance(entity, (ExecuteLocal, TimerAction)) and remote_of(entity) is None:
         private.delay_start(entity, coordinator.hold)

@@ -44,8 +44,8 @@ class Node(launch_ros.actions.Node):
     :raises ConfigurationError: ``machine`` is no machine, or another option needs one.
     """
 
-    #: Whether the action itself has a machine; False for the machine of an enclosing CloudGroup.
-    _fogros2_own_machine = False
+    #: None without a machine of its own; that of an enclosing CloudGroup does not count.
+    _remote: Optional[RemoteProcess] = None
 
     def __init__(
         self, *, machine: Optional[SomeMachine] = None, stream_topics: Sequence[Entry] = (),
@@ -71,38 +71,34 @@ class Node(launch_ros.actions.Node):
         self._image = image
         self._checkpoint = checkpoint
         self._image_options = values.items(image_options)
-        self._fogros2_own_machine = True
         if image is not None and isinstance(machine, CloudInstance):
             machine.takes_containers()
-        send(self, checked(machine))
+        self._remote = send(self, checked(machine))
+        self._remote.has_image = image is not None
 
     def prepare(self, context: LaunchContext) -> None:
         """Resolve the action and its streams; relative topics are in the node's namespace."""
-        if self._fogros2_own_machine and self._image is not None:
-            self._use_image(context)
+        remote = self._remote
+        if remote is not None and self._image is not None:
+            self._use_image(context, remote)
         super().prepare(context)
-        if self._fogros2_own_machine:
+        if remote is not None:
             namespace = self.expanded_node_namespace
             if namespace == self.UNSPECIFIED_NODE_NAMESPACE:
                 namespace = '/'
-            self._fogros2_streams = Coordinator.of(context).resolve_streams(
+            remote.streams = Coordinator.of(context).resolve_streams(
                 self.stream_topics, namespace)
-            assert isinstance(self, RemoteProcess)
-            self.add_checkpoint(values.resolve(context, self._checkpoint))
+            remote.add_checkpoint(values.resolve(context, self._checkpoint))
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Execute the action; components that it loads use the topic names of its machine."""
-        if context.is_shutdown or not self._fogros2_own_machine:
-            executed: Optional[list[LaunchDescriptionEntity]] = super().execute(context)
-            return executed
-        assert isinstance(self, RemoteProcess)
-        entities: list[LaunchDescriptionEntity] = super().execute(context) or []
-        for entity in entities:
-            send_components(entity, self.machine, self._fogros2_streams, context)
+        entities: Optional[list[LaunchDescriptionEntity]] = super().execute(context)
+        if self._remote is not None:
+            for entity in entities or ():
+                send_components(entity, self._remote.machine, self._remote.streams, context)
         return entities
 
-    def _use_image(self, context: LaunchContext) -> None:
-        assert isinstance(self, RemoteProcess)
+    def _use_image(self, context: LaunchContext, remote: RemoteProcess) -> None:
         image = values.resolve(context, self._image)
         options = values.resolve(context, self._image_options)
         containers.node_container(image, options)
@@ -110,11 +106,11 @@ class Node(launch_ros.actions.Node):
             raise ConfigurationError(
                 f"a node in the image '{image}' can't run in a shell of the machine",
                 'leave shell= out')
-        if Coordinator.of(context).on_robot(self.machine):
+        if Coordinator.of(context).on_robot(remote.machine):
             raise ConfigurationError(
                 f"the image '{image}' is for a machine, and the robot runs this node itself",
                 'leave image= out for the robot, or choose another machine')
-        self._fogros2_image, self._fogros2_image_options = image, options
+        remote.image, remote.image_options = image, options
 
 
 class LifecycleNode(Node, launch_ros.actions.LifecycleNode):

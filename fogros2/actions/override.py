@@ -9,7 +9,7 @@ from typing import Optional, TYPE_CHECKING
 from launch import Action, LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import IncludeLaunchDescription, OpaqueFunction
 
-from fogros2.actions.launch_description import cloud_entities, has_machine
+from fogros2.actions.launch_description import cloud_entities, holder
 from fogros2.describe.overrides import Overrides
 from fogros2.launch_internals.wrapping import below, wrap
 from fogros2.runtime.coordinator import Coordinator
@@ -66,8 +66,9 @@ def _look_through(
     """
     whole = True
     for entity in entities:
-        if has_machine(entity) and entity.machine is not None:
-            machines.append(entity.machine)
+        member = holder(entity)
+        if member is not None and member.machine is not None:
+            machines.append(member.machine)
         for some in below(entity):
             whole = _look_through(some, machines) and whole
         if isinstance(entity, OpaqueFunction) or (

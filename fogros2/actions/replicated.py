@@ -17,6 +17,8 @@ from fogros2.image_transport.topics import absolute, local_topic
 from fogros2.launch_internals import components
 from fogros2.runtime import replicas
 from fogros2.runtime.coordinator import Coordinator
+from fogros2.runtime.remote_process import remote_of
+from fogros2.runtime.republishers import AddedProcess
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
@@ -122,7 +124,8 @@ class _Replica(CloudGroup):
             raise ConfigurationError(
                 f'{type(entity).__name__} cannot be replicated: the launch changes it by a '
                 'service whose name all replicas have', 'run it on one machine')
-        if isinstance(entity, CloudGroup) or getattr(entity, '_fogros2_own_machine', False):
+        if isinstance(entity, CloudGroup) or (
+                remote_of(entity) is not None and not isinstance(entity, AddedProcess)):
             raise ConfigurationError('a part of replicas has a machine of its own',
                                      'leave its machine= out, or move it out of Replicated')
         super()._send(entity, context)

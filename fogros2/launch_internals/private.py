@@ -4,10 +4,10 @@ Give the other packages access to private parts of launch, and say why each is n
 
 launch has no public extension point to start a process elsewhere. ``ExecuteLocal.execute``
 resolves the action, registers its handlers and then creates a task from its private method
-``__execute_process``. FogROS2 extends launch at that method: a :class:`RemoteStart` replaces it
-and sets ``_subprocess_transport`` and ``_subprocess_protocol``, and :func:`delay_start` calls it
-later. Everything else (substitutions, handlers, output, ``on_exit``, signals) stays launch's own
-code. The options that the method reads have no getters.
+``__execute_process``. FogROS2 extends launch at that method: :func:`replace_methods` replaces it,
+:func:`set_transport` sets ``_subprocess_transport`` and ``_subprocess_protocol``, and
+:func:`delay_start` calls it later. Everything else (substitutions, handlers, output, ``on_exit``,
+signals) stays launch's own code. The options that the method reads have no getters.
 
 The names are those of Jazzy (launch 3.4), which the embedded default shares;
 ``test/unit/test_launch_internals.py`` checks each name.
@@ -17,11 +17,11 @@ from __future__ import annotations
 
 import asyncio
 import collections
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Coroutine, Iterable
 import contextlib
 import functools
 import signal
-from typing import Any, Optional, Union
+from typing import Any, NamedTuple, Optional, Union
 
 from launch import (
     Event,
@@ -75,30 +75,26 @@ def transport(action: ExecuteLocal) -> Any:
     return action._subprocess_transport
 
 
-class RemoteStart(ExecuteLocal):
+class Methods(NamedTuple):
     """
-    A process action whose start and shutdown a subclass can replace.
+    What launch calls of a process action.
 
-    As the last base of a class it comes between launch's action and ExecuteLocal.
+    :param start: starts the process, and awaits its end.
+    :param shut_down: takes the context and, by keyword, ``send_sigint``.
     """
 
-    async def fogros2_start(self, context: LaunchContext) -> None:
-        """Start the process as launch does, and await its end."""
-        await getattr(super(), EXECUTE_PROCESS)(context)
+    execute: Callable[[LaunchContext], Optional[list[LaunchDescriptionEntity]]]
+    prepare: Callable[[LaunchContext], None]
+    start: Callable[[LaunchContext], Coroutine[Any, Any, None]]
+    shut_down: Callable[..., Optional[list[LaunchDescriptionEntity]]]
 
-    def fogros2_shut_down(
-        self, context: LaunchContext, send_sigint: bool,
-    ) -> Optional[list[LaunchDescriptionEntity]]:
-        """End the process as launch does."""
-        return super()._shutdown_process(context, send_sigint=send_sigint)
 
-    async def _ExecuteLocal__execute_process(self, context: LaunchContext) -> None:
-        await self.fogros2_start(context)
-
-    def _shutdown_process(
-        self, context: LaunchContext, *, send_sigint: bool,
-    ) -> Optional[list[LaunchDescriptionEntity]]:
-        return self.fogros2_shut_down(context, send_sigint)
+def replace_methods(action: ExecuteLocal, methods: Methods) -> Methods:
+    """Make launch call other methods in place of an action's own; return its own."""
+    names = ('execute', 'prepare', EXECUTE_PROCESS, '_shutdown_process')
+    own = Methods(*(getattr(action, name) for name in names))
+    vars(action).update(zip(names, methods))
+    return own
 
 
 class Stay:

@@ -272,18 +272,23 @@ class Provider(abc.ABC):
         :param tags: the core's tags that change.
         """
 
-    def reachable(self, machine_id: str, *, name: str, timeout: float) -> Machine:
+    def reachable(
+        self, machine_id: str, *, name: str, timeout: float, known: Optional[Machine] = None,
+    ) -> Machine:
         """
         Wait until a machine runs and a connection can be tried; return it.
 
         A provider whose API can be watched overrides this method instead of polling.
 
+        :param known: what ``describe`` has just returned, which saves the first look.
         :raises ProviderError: the machine ended, or cannot start, with the provider's reason.
         :raises DeadlineExceeded: after ``timeout`` seconds.
         :raises Cancelled: ``cancel`` was set.
         """
+        seen = [known] if known is not None else []
+
         def look() -> Optional[Machine]:
-            machine = self.describe(machine_id)
+            machine = seen.pop() if seen else self.describe(machine_id)
             if machine.state in (MachineState.DELETED, MachineState.STOPPING):
                 raise ProviderError(f"the machine '{name}' ended while it was coming up",
                                     "the provider's own log says why")

@@ -21,7 +21,7 @@ from fogros2.image_transport import topics as names
 from fogros2.launch_internals import private
 from fogros2.model import NodeSpec
 from fogros2.runtime.interruption import MachineInterrupted
-from fogros2.runtime.remote_process import RemoteProcess
+from fogros2.runtime.remote_process import remote_of
 from fogros2.runtime.republishers import AddedProcess
 from fogros2.runtime.session import Session
 
@@ -105,11 +105,12 @@ def _news(event: Event, sessions: Mapping[str, Session]) -> str:
     if not isinstance(event, (ProcessExited, ProcessStarted)):
         return ''
     action = event.action
-    if not isinstance(action, RemoteProcess) or isinstance(action, AddedProcess):
+    remote = remote_of(action)
+    if remote is None or isinstance(action, AddedProcess):
         return ''
     what = 'died' if isinstance(event, ProcessExited) else 'started'
     return next((f'{what} {name}' for name, session in sessions.items()
-                 if session is getattr(action, '_fogros2_session', None)), '')
+                 if session is remote.session), '')
 
 
 def _tell(path: Path, line: str) -> None:

@@ -30,7 +30,7 @@ from fogros2.describe.overrides import Overrides
 from fogros2.errors import ConfigurationError
 from fogros2.launch_internals.wrapping import below
 from fogros2.model import MachineSpec
-from fogros2.runtime.remote_process import RemoteProcess
+from fogros2.runtime.remote_process import remote_of
 
 #: Raised by substitutions and conditions that only a launch can evaluate, by wrong values, and by
 #: the code of included files, which can raise anything.
@@ -142,7 +142,8 @@ class Preview:
                 with contextlib.suppress(_UNKNOWN):
                     self._name(entity.described(self._context))
             elif isinstance(entity, ExecuteLocal):
-                at = self._name(entity.machine) if isinstance(entity, RemoteProcess) else where
+                remote = remote_of(entity)
+                at = where if remote is None else self._name(remote.machine)
                 self._planned(at).nodes.append(self._program(entity) + own)
             else:
                 self.open = self.open or isinstance(entity, OpaqueFunction)

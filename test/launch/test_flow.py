@@ -797,18 +797,6 @@ def test_group_runs_a_component_container(run, fake, planner, capfd):
     assert '__node:=box' in spec.arguments
 
 
-def test_value_that_cannot_be_sent_is_refused_by_name(run, fake, planner, capfd):
-    from fogros2 import CloudGroup
-
-    class Sealed(ExecuteProcess):
-        def __init_subclass__(cls):
-            raise TypeError('it is sealed')
-
-    assert run(LaunchDescription([CloudGroup(planner, [Sealed(cmd=['true'])])])) == 1
-    assert "Sealed can't run on a machine: it is sealed" in capfd.readouterr().out
-    assert not fake.noted('up')
-
-
 def test_a_machine_is_required():
     from fogros2 import CloudGroup
     with pytest.raises(ConfigurationError, match='is no machine'):

@@ -36,7 +36,7 @@ from fogros2 import (
     LifecycleNode,
     Node,
 )
-from fogros2.actions.launch_description import has_machine
+from fogros2.actions.launch_description import holder
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
 from fogros2.errors import ConfigurationError
@@ -77,7 +77,7 @@ def stops(action):
 def test_node_without_machine_is_a_launch_ros_node(run, fake, cls, none):
     plain = node(cls, **none)
     assert isinstance(plain, getattr(launch_ros.actions, cls.__name__))
-    assert not has_machine(plain)
+    assert not holder(plain)
     assert run(LaunchDescription([plain, stops(plain)])) == 0
     assert plain.return_code == -2
     assert fake.notes == [] and fake.report is None

@@ -294,6 +294,16 @@ def test_a_kept_machine_is_not_taken_for_another(launch, provider, changes, erro
     assert launch.store.load('planner').machine_id == 'fake-1'
 
 
+@pytest.mark.parametrize('looks', [1, 3])
+def test_provider_is_asked_once_for_a_machine_that_runs(launch, provider, monkeypatch, looks):
+    spec = kept(launch.store, provider)
+    provider._waits['fake-1'] = looks - 1
+    monkeypatch.setattr(Connection, 'open', lambda self: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        launch.up(spec)
+    assert provider.calls.count('describe') == looks
+
+
 @pytest.mark.parametrize('id_known', [True, False])
 def test_what_a_machine_that_is_gone_left_is_deleted(launch, provider, monkeypatch, id_known):
     spec, told = kept(launch.store, provider), []

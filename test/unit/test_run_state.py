@@ -36,13 +36,8 @@ def after(*events: Event, movable: bool = True) -> tuple[RunState, list[Command]
     # its machine gets to know it after the request to end it
     ('stop started', 'running', 'ask expect report ask'),
     ('started respawns stop', 'ended', 'report report ask end'),
-    ('absent', 'ended', 'end')])
-def test_process_on_its_machine(events: str, phase: str, commands: str) -> None:
-    state, said = after(*events.split())  # type: ignore[arg-type]
-    assert (state.phase, ' '.join(said)) == (phase, commands)
-
-
-@pytest.mark.parametrize('events, phase, commands', [
+    ('absent', 'ended', 'end'),
+    # it moves to the robot
     ('started move exited free', 'here', 'report ask expect leave come'),
     ('started move overdue free', 'here', 'report ask expect leave come'),
     ('started move move', 'leaving', 'report ask expect'),
@@ -55,8 +50,14 @@ def test_process_on_its_machine(events: str, phase: str, commands: str) -> None:
     # the launch ends while the process moves
     ('started move stop exited', 'ended', 'report ask expect ask expect report end'),
     ('started move exited stop', 'ended', 'report ask expect leave end'),
-    ('started move exited free stop', 'here', 'report ask expect leave come')])
-def test_process_moves_to_the_robot(events: str, phase: str, commands: str) -> None:
+    ('started move exited free stop', 'here', 'report ask expect leave come'),
+    # another machine continues it
+    ('started halt exited', 'away', 'report ask leave'),
+    ('started halt exited back', 'waiting', 'report ask leave'),
+    ('started halt exited left free back', 'waiting', 'report ask leave leave come'),
+    ('started stop halt', 'running', 'report ask expect'),
+    ('started stop halt_gone', 'ended', 'report ask expect end')])
+def test_process_goes_from_state_to_state(events: str, phase: str, commands: str) -> None:
     state, said = after(*events.split())  # type: ignore[arg-type]
     assert (state.phase, ' '.join(said)) == (phase, commands)
 
@@ -69,17 +70,6 @@ def test_process_moves_to_the_robot(events: str, phase: str, commands: str) -> N
     ('halt_gone stop', 'ended', 'leave end')])
 def test_process_that_cannot_run_on_the_robot(events: str, phase: str, commands: str) -> None:
     state, said = after(*events.split(), movable=False)  # type: ignore[arg-type]
-    assert (state.phase, ' '.join(said)) == (phase, commands)
-
-
-@pytest.mark.parametrize('events, phase, commands', [
-    ('started halt exited', 'away', 'report ask leave'),
-    ('started halt exited back', 'waiting', 'report ask leave'),
-    ('started halt exited left free back', 'waiting', 'report ask leave leave come'),
-    ('started stop halt', 'running', 'report ask expect'),
-    ('started stop halt_gone', 'ended', 'report ask expect end')])
-def test_another_machine_continues_a_process(events: str, phase: str, commands: str) -> None:
-    state, said = after(*events.split())  # type: ignore[arg-type]
     assert (state.phase, ' '.join(said)) == (phase, commands)
 
 

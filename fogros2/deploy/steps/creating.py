@@ -51,14 +51,14 @@ class Creation(Step):
         with job.step('machine') as detail:
             kept = self._kept()
             if kept is not None:
-                self._adopt(kept)
+                kept = self._adopt(kept)
                 detail.append('kept from before')
             else:
                 self._create()
             price = context.choices.price(job.spec)
             context.choices.begin(job.name, price)
             machine = context.provider.reachable(
-                job.machine_id, name=job.name, timeout=context.timeouts.boot)
+                job.machine_id, name=job.name, timeout=context.timeouts.boot, known=kept)
             if machine.cost_per_hour is not None:
                 price = machine.cost_per_hour
                 context.choices.begin(job.name, price)
@@ -124,7 +124,8 @@ class Creation(Step):
                 f"the machine '{job.name}' was not made to be stopped and started",
                 f"keep it with on_exit='keep', or: ros2 fog delete {job.name}")
 
-    def _adopt(self, machine: Machine) -> None:
+    def _adopt(self, machine: Machine) -> Optional[Machine]:
+        """Use a kept machine; return it unless it has to start first."""
         context, job = self._context, self._job
         job.reused = True
         job.undoing('end', self._end)
@@ -136,6 +137,8 @@ class Creation(Step):
             context.provider.open_port(machine, monitor_addresses.gate_port(before.monitor), ())
         if machine.state in (MachineState.STOPPED, MachineState.STOPPING):
             context.provider.start(machine.id)
+            return None
+        return machine
 
     # -- a new machine --------------------------------------------------------------------------
 

@@ -198,7 +198,9 @@ class KubernetesProvider(Provider):
                 return job
         return None
 
-    def reachable(self, machine_id: str, *, name: str, timeout: float) -> Machine:
+    def reachable(
+        self, machine_id: str, *, name: str, timeout: float, known: Optional[Machine] = None,
+    ) -> Machine:
         """Wait until the pod runs, then find how UDP reaches it."""
         where = MachineId.parse(machine_id)
         api = kubernetes_client.connect(where.context)

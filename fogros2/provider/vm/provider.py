@@ -260,7 +260,9 @@ class VmProvider(Provider):
             return dataclasses.replace(self.capabilities, stop=False)
         return dataclasses.replace(self.capabilities, preemption_notice=())
 
-    def reachable(self, machine_id: str, *, name: str, timeout: float) -> Machine:
+    def reachable(
+        self, machine_id: str, *, name: str, timeout: float, known: Optional[Machine] = None,
+    ) -> Machine:
         """Wait until a machine runs and has an address; the polls become rarer."""
         machine = self._id(machine_id)
         cloud = self._cloud.until(self.cancel)
