@@ -363,9 +363,9 @@ def main() -> None:
     try:
         machine = launch.up(MachineSpec(f'bench-policy-{os.getpid()}', 'container'))
         prepare(machine)
-        for name in ('policy.py', 'applications.py', 'streaming.py', 'figures/__init__.py',
-                     'figures/paper.py'):
-            machine.shell.put((HERE / name).read_bytes(), f'{FOLDER}/{name}', mode=0o644)
+        for path in (HERE / 'policy.py', HERE / 'applications.py', HERE / 'streaming.py',
+                     *sorted((HERE / 'figures').glob('*.py'))):
+            machine.shell.put(path.read_bytes(), f'{FOLDER}/{path.relative_to(HERE)}', mode=0o644)
         machine.shell.put(model(), MODEL, mode=0o644)
         output = Output()
         machine.subscribe(output.heard)
