@@ -52,9 +52,10 @@ def read(paths: Iterable[Path]) -> Report:
     report = Report([], [], {}, [])
     for path in paths:
         again = path.with_name(f'again-{path.name}')
-        second = _results(again) if again.exists() else {}
-        report.passed_again.extend(name for name in second if second[name] == 'passed')
-        for name, result in {**_results(path), **second}.items():
+        first, second = _results(path), _results(again) if again.exists() else {}
+        report.passed_again.extend(name for name, result in second.items() if (
+            first.get(name), result) == ('failed', 'passed'))
+        for name, result in {**first, **second}.items():
             if result.startswith('skipped: '):
                 report.skipped.setdefault(result.partition(' ')[2], []).append(name)
             else:

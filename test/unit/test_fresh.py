@@ -109,9 +109,9 @@ def test_tests_are_counted_and_named(tools, tmp_path):
 
 
 def test_what_passes_when_run_again_is_named(tools, tmp_path, capsys, monkeypatch):
-    first = cases(tmp_path / 'test-x.xml', good='', chance='<failure/>', teardown='',
-                  bad='<failure/>')
-    cases(tmp_path / 'again-test-x.xml', chance='', teardown='', bad='<error/>')
+    first = cases(tmp_path / 'test-x.xml', good='', chance='<failure/>',
+                  teardown='<error/>', bad='<failure/>')
+    cases(tmp_path / 'again-test-x.xml', good='', chance='', teardown='', bad='<error/>')
     monkeypatch.setattr(sys, 'argv', ['closing_line.py', str(first)])
     assert tools['closing_line'].main() == 1
     assert capsys.readouterr().out.splitlines() == [
