@@ -127,7 +127,7 @@ def limits() -> dict[str, float]:
 
 def table(outcomes: list[Outcome], note: str) -> str:
     """Return the table as Markdown."""
-    lines = ['# Several streams on one link', '', note, '',
+    lines = ['# Several streams on one link, whose two ends share two cores', '', note, '',
              '| | stream | Hz | round trip, ms: median | p95 | limit |', '|---' * 6 + '|']
     lines += [f'| {o.case} | {o.stream} | {o.rate:.2f} | {o.median:.1f} | {o.p95:.1f} | '
               f'{o.limit:.1f} |' for o in outcomes]
@@ -172,7 +172,7 @@ def main() -> None:
                      'more', runs=1),
                  Row(f'{name}: p95', o.p95, 'ms', (120.0 if points else 40.0) if goal else None,
                      runs=1)]
-    write('shared_link', 'Several streams on one link', rows)
+    write('shared_link', 'Several streams on one link, whose two ends share two cores', rows)
     (RESULTS / 'shared_link-table.md').write_text(text)
 
 
