@@ -23,7 +23,6 @@ from fogros2.deploy.steps.containers import Containers
 from fogros2.deploy.steps.creating import Creation
 from fogros2.deploy.steps.joining import Joined, Joining
 from fogros2.deploy.steps.watching import ClockComparison
-from fogros2.errors import Cancelled
 from fogros2.host.bootstrap import RosInstall
 from fogros2.model import MachineSpec
 
@@ -52,19 +51,10 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
         Creation(context, job).run()
         connection.open()
         joining.choose_interface()
-        # the machine is looked at while its agent starts, and changed afterwards
-        armed: Future[None] = Future()
+        arming.arm()
+        robot.result()
         planned: Future[RosInstall] = Future()
-        ros_step = pool.submit(
-            installing.install_ros, context, job, armed.result, planned.set_result)
-        try:
-            arming.arm()
-            robot.result()
-        except BaseException:
-            job.cancel.set()
-            armed.set_exception(Cancelled('the preparation'))
-            raise
-        armed.set_result(None)
+        ros_step = pool.submit(installing.install_ros, context, job, planned.set_result)
         wait([planned, ros_step], return_when=FIRST_COMPLETED)
         # in parallel with the installation on the machine
         try:

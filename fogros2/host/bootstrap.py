@@ -158,7 +158,6 @@ def dependencies(spec: MachineSpec, under: Underlay, packages: Sequence[str] = (
 def ensure(
     shell: Shell, under: Underlay, spec: MachineSpec, *, timeout: float,
     cancel: Optional[threading.Event] = None,
-    ready: Callable[[], object] = lambda: None,
     on_plan: Callable[[RosInstall], object] = lambda install: None, elsewhere: bool = False,
     packages: Sequence[str] = (), guest: bool = False,
     warn: Callable[[str, str], object] = lambda text, hint: None,
@@ -168,7 +167,6 @@ def ensure(
 
     :param under: environment of the robot's launch.
     :param timeout: time-out of each command in seconds.
-    :param ready: waits until the machine may be changed; before, it is only looked at.
     :param on_plan: callback with the plan, as soon as files can be sent and the VPN set up; these
         steps need not wait for the slowest ones.
     :param elsewhere: refuse a machine with this computer's network, see ``check_elsewhere``.
@@ -220,7 +218,6 @@ def ensure(
     if spec.pip or keys:
         install = dataclasses.replace(
             install, environment=needs.with_pip_folder(folder, install.environment))
-    ready()
     for command in todo.tools:
         shell.run(command, timeout=timeout, cancel=cancel)
     on_plan(install)

@@ -353,7 +353,7 @@ def test_workspace_vpn_and_ros_are_set_up_in_parallel(
     travelling, joining = threading.Event(), threading.Event()
     equipped = []
 
-    def install_ros(context, job, ready, on_plan):
+    def install_ros(context, job, on_plan):
         on_plan(RosInstall('ros'))
         assert travelling.wait(60) and joining.wait(60)
         assert not equipped
@@ -371,26 +371,6 @@ def test_workspace_vpn_and_ros_are_set_up_in_parallel(
     with pytest.raises(PrerequisiteError, match='no such package'):
         launch.up(SPEC)
     assert not equipped
-
-
-def test_machine_is_looked_at_before_its_agent_watches_it(launch, provider, monkeypatch):
-    looked, changed = threading.Event(), []
-
-    def install_ros(context, job, ready, on_plan):
-        looked.set()
-        ready()
-        changed.append(job.name)
-
-    def arm(self):
-        assert looked.wait(60)
-        raise AgentError('no agent')
-
-    skip_early_steps(monkeypatch)
-    monkeypatch.setattr(Arming, 'arm', arm)
-    monkeypatch.setattr(installing, 'install_ros', install_ros)
-    with pytest.raises(AgentError, match='no agent'):
-        launch.up(SPEC)
-    assert not changed
 
 
 class BusyAgent(FakeStream):
