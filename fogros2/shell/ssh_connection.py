@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import errno
 import getpass
 import importlib.util
 import logging
@@ -194,7 +195,9 @@ def transport_over(sock: socket.socket) -> paramiko.Transport:
             try:
                 super()._send_user_message(data)  # type: ignore[misc]
             except EOFError as error:
-                raise ConnectionResetError(str(error)) from error
+                # paramiko's own thread shows number and text of an error of a socket
+                raise ConnectionResetError(
+                    errno.ECONNRESET, 'the connection is gone') from error
             except paramiko.SSHException as error:
                 raise TimeoutError(str(error)) from error
 

@@ -17,6 +17,7 @@ pytest.importorskip('launch.actions', reason='needs ROS 2, or its embedded defau
 from fogros2.agent_client import AgentClient
 from fogros2.errors import AgentError, ConnectError, DeadlineExceeded, FogError, PrerequisiteError
 from fogros2.model import MachineSpec, NodeSpec
+from fogros2.runtime.run_state import RunState
 from fogros2.runtime.session import Session
 from fogros2.waiting import wait_until
 
@@ -26,18 +27,18 @@ NODE = NodeSpec('1', 'talker-1', 'demo', 'talker')
 class Run:
     """A process as a session has it."""
 
-    node, stopping, respawning = NODE, False, False
+    node = NODE
 
     def __init__(self, started: bool) -> None:
-        self.started = started
+        self.state = RunState(True, 'running' if started else 'waiting')
         self.events: list[dict[str, Any]] = []
         self.ended = False
 
     def on_event(self, event: dict[str, Any]) -> None:
         self.events.append(event)
 
-    def end(self) -> None:
-        self.ended = True
+    def on(self, event: str) -> None:
+        self.ended = event == 'over'
 
 
 class Launch:
