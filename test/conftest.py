@@ -9,6 +9,7 @@ from decimal import Decimal
 import logging
 import os
 from pathlib import Path
+import re
 import shutil
 import signal
 import socket
@@ -25,6 +26,8 @@ os.environ['ORT_DISABLE_TELEMETRY'] = '1'
 
 #: What ``colcon test`` runs by default: what makes no machine.
 QUICK = ['test/unit', 'test/contract', 'test/launch']
+#: Folder of what tests leave for the next ones, if it is there.
+CACHE = Path(__file__).parents[1] / '.cache'
 #: Regions that the AWS of the tests has.
 MOTO_REGIONS = ('eu-central-1', 'us-east-1')
 
@@ -43,6 +46,15 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption('junitprefix', None) == 'fogros2' \
             and config.args_source is pytest.Config.ArgsSource.TESTPATHS:
         config.args[:] = [str(config.rootpath / name) for name in QUICK]
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Write down what failed, for ``tools/test.sh``; the names without xdist's groups."""
+    reporter = session.config.pluginmanager.get_plugin('terminalreporter')
+    if reporter is not None and CACHE.is_dir():
+        (CACHE / 'failed-tests.txt').write_text(''.join(dict.fromkeys(
+            re.sub(r'@[^]@]*$', '', report.nodeid) + '\n'
+            for kind in ('failed', 'error') for report in reporter.stats.get(kind, ()))))
 
 
 @pytest.hookimpl(tryfirst=True)  # xdist reads the marks in its own hook of this name

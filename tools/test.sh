@@ -23,13 +23,11 @@ keep_ticket
 part=test again=
 if [ "${1:-}" = kubernetes ]; then
     part=$1; shift
-    [ $# != 0 ] || again=0
     set -- test/integration/kubernetes "$@"
 elif [ $# = 0 ]; then
     # Three at a time: much of what tests with machines take is waiting. Tests named by hand run in
-    # turn, so that their output is seen as it comes. The processes' names of tests have their
-    # group, so what runs again has one process too.
-    again=1
+    # turn, so that their output is seen as it comes.
+    again=yes
     set -- --ignore=test/integration/kubernetes -n 3 --dist loadgroup --no-loadscope-reorder
 else
     # pytest collects it nevertheless if it is named
@@ -52,8 +50,8 @@ suite() {
     tools/run.sh "$@" --junit-xml=.cache/"$report" && return
     if [ $? = 1 ] && [ -n "$again" ]; then
         say 'What failed, once more and alone'
-        tools/run.sh "$@" -n "$again" --last-failed --maxfail=3 \
-            --junit-xml=.cache/again-"$report" && return
+        tools/run.sh "$@" -n 0 --maxfail=3 --junit-xml=.cache/again-"$report" \
+            @.cache/failed-tests.txt && return
     fi
     status=1
 }
