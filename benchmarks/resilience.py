@@ -136,7 +136,7 @@ class Bench:
         self._node = rclpy.create_node('bench')
         executor = SingleThreadedExecutor()
         executor.add_node(self._node)
-        # each call takes longer than the one before if ``spin_until_future_complete`` makes it
+        # rclpy's ``spin_until_future_complete`` becomes slower with each call
         spinning = threading.Thread(target=executor.spin)
         spinning.start()
         stack.callback(spinning.join)

@@ -280,7 +280,8 @@ class Provider(abc.ABC):
 
         A provider whose API can be watched overrides this method instead of polling.
 
-        :param known: what ``describe`` has just returned, which saves the first look.
+        :param known: what ``describe`` has just returned, which saves the first look; a provider
+            that looks at more may ignore it.
         :raises ProviderError: the machine ended, or cannot start, with the provider's reason.
         :raises DeadlineExceeded: after ``timeout`` seconds.
         :raises Cancelled: ``cancel`` was set.

@@ -22,11 +22,9 @@ from fogros2.runtime.remote_run import RemoteRun
 from fogros2.runtime.republishers import AddedProcess
 
 if TYPE_CHECKING:
-
     from fogros2.describe.machines import SomeMachine
     from fogros2.image_transport.streams import Entry, StreamTopic
     from fogros2.runtime.session import Session
-
 
 #: The attribute of an action that has its RemoteProcess.
 _REMOTE = '_fogros2_remote'
