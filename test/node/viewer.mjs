@@ -28,7 +28,19 @@ const channels = new Map(), subscriptions = new Map(), advertised = new Map();
 client.on('open', () => tell({ open: true }));
 client.on('error', (error) => tell({ error: String(error?.message ?? error) }));
 client.on('close', () => { tell({ closed: true }); process.exit(0); });
-client.on('status', (status) => tell({ status: status.message }));
+client.on('status', ({ message }) => {
+  // The SDK announces a channel before it takes subscriptions to it: a fast viewer is refused.
+  const refused = [...channels.values()].find(({ id }) => message === `Unknown channel ID: ${id}`);
+  if (refused === undefined) { tell({ status: message }); return; }
+  for (const [id, subscription] of subscriptions) {
+    if (subscription.topic === refused.topic) {
+      client.unsubscribe(id);
+      subscriptions.delete(id);
+      subscriptions.set(client.subscribe(refused.id), subscription);
+      break;
+    }
+  }
+});
 client.on('advertise', (list) => {
   for (const channel of list) {
     channels.set(channel.topic, channel);

@@ -185,7 +185,7 @@ class Slow:
     A WSGI application that holds requests back, and carries them out then, answered or not.
 
     :ivar pattern: of the requests: their method, path and body; '' for none.
-    :ivar held: number of the requests that are held back now.
+    :ivar held: number of the requests that are held back now, or are being carried out then.
     """
 
     def __init__(self, inner: Callable[..., Iterable[bytes]]) -> None:
@@ -206,12 +206,16 @@ class Slow:
         body = environ['wsgi.input'].read(int(environ.get('CONTENT_LENGTH') or 0))
         environ['wsgi.input'] = io.BytesIO(body)
         words = f"{environ['REQUEST_METHOD']} {environ['PATH_INFO']} {body.decode('latin-1')}"
-        if self.pattern and re.search(self.pattern, words):
+        if not self.pattern or not re.search(self.pattern, words):
+            return self._inner(environ, start_response)
+        with self._changed:
+            self.held += 1
+            self._changed.wait_for(lambda: not self.pattern, self.seconds)
+        try:
+            return self._inner(environ, start_response)
+        finally:
             with self._changed:
-                self.held += 1
-                self._changed.wait_for(lambda: not self.pattern, self.seconds)
                 self.held -= 1
-        return self._inner(environ, start_response)
 
 
 def checkip(inner: Callable[..., Iterable[bytes]]) -> Callable[..., Iterable[bytes]]:
