@@ -127,6 +127,18 @@ def this_process() -> dict[str, Any]:
 
 
 @dataclasses.dataclass(frozen=True)
+class Made:
+    """
+    What a launch has made for a machine, and has to undo; see :mod:`fogros2.deploy.undo`.
+
+    :param port: its TCP port, 0 without.
+    """
+
+    kind: str
+    port: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
 class Record:
     """
     The robot's record of a machine.
@@ -151,6 +163,7 @@ class Record:
     :param monitor: TCP port of its Foxglove bridge, 0 for none.
     :param monitor_open: where external clients reach that bridge (``host:port``), '' if they
         cannot.
+    :param made: what its launch has made and not undone yet, in this order.
     :param damage: why the record cannot be read, '' if it can.
     """
 
@@ -177,6 +190,7 @@ class Record:
     agent_program: str = ''
     monitor: int = 0
     monitor_open: str = ''
+    made: tuple[Made, ...] = ()
     damage: str = ''
 
     @property
@@ -488,4 +502,5 @@ def record_from_json(data: Mapping[str, Any]) -> Record:
     for key, kind in (('shell', Endpoint), ('vpn', VpnInterface), ('robot_vpn', VpnInterface)):
         if values.get(key) is not None:
             values[key] = kind(**values[key])
+    values['made'] = tuple(Made(**each) for each in values.get('made', ()))
     return Record(**values)

@@ -23,6 +23,7 @@ from fogros2.deploy.steps.containers import Containers
 from fogros2.deploy.steps.creating import Creation
 from fogros2.deploy.steps.joining import Joined, Joining
 from fogros2.deploy.steps.watching import ClockComparison
+from fogros2.deploy.undo import NODES
 from fogros2.host.bootstrap import RosInstall
 from fogros2.model import MachineSpec
 
@@ -44,7 +45,7 @@ def bring_up(context: Context, spec: MachineSpec) -> RunningMachine:
 def _run(context: Context, job: MachineJob) -> RunningMachine:
     job.undo.enter_context(context.store.lock(job.name))
     connection, arming = Connection(context, job), Arming(context, job)
-    joining = (Joining if context.invitation is None else Joined)(context, job, arming.release)
+    joining = (Joining if context.invitation is None else Joined)(context, job)
     # the robot's VPN interface needs nothing from the machine: it comes up in parallel
     with ThreadPoolExecutor(6, f'fog-{job.name}') as pool:
         robot = pool.submit(context.vpn.ensure)
@@ -87,8 +88,8 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
     with job.step('agent') as detail:
         arming.start_heartbeat(ros, dds_step.result())
         detail.append(f'VPN round trip {(job.heartbeat.round_trip or 0) * 1e3:.2f} ms')
-    # pushed a second time, so that the nodes stop first on the way down
-    arming.undo_nodes()
+    # a second time, so that the nodes stop first on the way down
+    job.makes(NODES)
     dds.start_router(context, job)
     connection.enter_vpn()
     job.undo.callback(ClockComparison(job.name, job.heartbeat, context.report).close)

@@ -15,7 +15,7 @@ import secrets
 import threading
 from typing import Optional
 
-from fogros2 import model, plan, plugin_system, ros2_daemon
+from fogros2 import model, plan, plugin_system
 from fogros2.dds import addresses_of, DdsVendor
 from fogros2.deploy import membership, robot_router
 from fogros2.deploy.checks import check, check_architecture, check_here, check_names
@@ -251,8 +251,6 @@ class Launch:
                     write_private(path.with_name('domain'), str(self.domain).encode())
                     write_private(path.with_name('rmw'), vendor.rmw.encode())
                 vpn.ensure()
-                # the ROS 2 daemon is a node that uses the interface: it has to end first
-                self.undo.callback(ros2_daemon.stop, path.parent)
                 router = vendor.router(
                     vpn.interface.address,
                     [self._address(index) for index in range(robot_router.MACHINES)], user)
@@ -310,7 +308,7 @@ class Launch:
         with self._lock:
             if self._vpn is None:
                 folder = self.store.launch(self.id)
-                self.undo.callback(self._remove_folder, folder)
+                self.undo.add('VPN interface', self._clear)
                 # `ros2 fog gc` reads this to recognise the folder of a killed launch
                 write_private(
                     folder / 'process.json', model.to_json(this_process()).encode())
@@ -321,14 +319,17 @@ class Launch:
                     choose_interface(
                         self.id, folder, self.user_environment, self.timeouts.vpn,
                         self._others), vpn,
-                    report=self.report, undo=self.undo, timeout=self.timeouts.vpn,
+                    report=self.report, timeout=self.timeouts.vpn,
                     cancel=self.cancel, ending=self._ending,
                     choose_port=functools.partial(addresses.choose_port, self.user_environment))
             return self._vpn
 
-    def _remove_folder(self, folder: Path) -> None:
-        """Remove the launch's folder, unless `ros2 fog gc` needs it to find the interface."""
-        if self._vpn is None or self._vpn.down:
+    def _clear(self) -> None:
+        """Remove what the launch has made on the robot, as for a launch that died."""
+        folder = self.store.launch(self.id)
+        if self._vpn is not None and self._vpn.end():
+            clear(folder)
+        else:
             delete_folder(folder)
 
     def _address(self, index: int) -> str:

@@ -12,13 +12,14 @@ from typing import Any, Optional
 from fogros2 import plan
 from fogros2.agent_client import AgentClient, Heartbeat
 from fogros2.deploy.context import Context
-from fogros2.deploy.undo import UndoStack
-from fogros2.errors import ConnectError, DeadlineExceeded, FogError
-from fogros2.model import Command, Machine, MachineSpec, VpnInterface
-from fogros2.provider import Capabilities
+from fogros2.deploy.undo import PORTS, Site, UndoStack, unmake
+from fogros2.errors import AgentAbsent, ConnectError, DeadlineExceeded, FogError
+from fogros2.model import Command, MachineSpec, VpnInterface
+from fogros2.provider import Capabilities, Provider
 from fogros2.report import step
 from fogros2.shell import Shell
-from fogros2.store import Record
+from fogros2.store import Made, Record
+from fogros2.waiting import Periodic
 
 #: Seconds in which a machine has to answer on the way down, and the time-out of each further
 #: undo step if the machine does not: Ctrl-C must not wait long for a computer that is off.
@@ -29,7 +30,7 @@ SILENCE_TIMEOUT = 15.0
 AGENT_FOLDER = '/run/fogros2'
 
 
-class MachineJob:
+class MachineJob(Site):
     """
     One machine's deployment.
 
@@ -37,7 +38,6 @@ class MachineJob:
     """
 
     #: Each is set by the step that creates it.
-    machine: Machine
     shell: Shell
     agent: AgentClient
     interface: VpnInterface
@@ -48,6 +48,7 @@ class MachineJob:
         self.spec = spec
         self.name = spec.name
         self.record = Record(spec.name, spec.provider, spec, asked=spec.options)
+        self._saving = threading.Lock()
         self.undo = UndoStack(context.report, spec.name, context.failures)
         self.undo.callback(self._report_left)
         self._left: list[str] = []
@@ -66,6 +67,9 @@ class MachineJob:
         #: Functions that ask the machine for an answer; each gets the time-out in seconds.
         self.probes: list[Callable[[float], object]] = []
         self._out_of_reach: Optional[bool] = None
+        self._released = False
+        #: Makes the agent wait again for heartbeats, until these come through the VPN.
+        self.rearming: Optional[Periodic] = None
         #: Set when the launch is cancelled, or when a step fails: parallel steps then end.
         self.cancel = Either(context.cancel)
 
@@ -73,16 +77,38 @@ class MachineJob:
         """Report a step of this machine around a block; see :func:`fogros2.report.step`."""
         return step(self._context.report, self.name, name)
 
+    def makes(self, kind: str, port: int = 0, **changes: Any) -> None:
+        """Push the undo of what the next step makes, and record it with other changes."""
+        self.may_make(kind, port)
+        self.note(kind, port, **changes)
+
+    def may_make(self, kind: str, port: int = 0) -> None:
+        """Push the undo of what may be noted later."""
+        self.undoing(kind, lambda: self._unmake(Made(kind, port)))
+
+    def note(self, kind: str, port: int = 0, **changes: Any) -> None:
+        """Record what the launch makes, before it makes it."""
+        made = Made(kind, port)
+        with self._saving:
+            self._save(made=(*(other for other in self.record.made if other != made), made),
+                       **changes)
+
+    def _unmake(self, made: Made) -> None:
+        if made not in self.record.made:
+            return
+        if self.remains if made.kind in PORTS else self.survives:
+            unmake(self, made)
+        with self._saving:
+            # written with the record's next change: an undo may run twice
+            self.record = dataclasses.replace(self.record, made=tuple(
+                other for other in self.record.made if other != made))
+
     def undoing(self, name: str, undo: Callable[[], None]) -> None:
         """
         Push an undo step; if it fails, report the error, and run the other undo steps.
 
         Steps that fail because the machine does not answer are reported together, at the end.
         """
-        self.undo.callback(self.undone, name, undo)
-
-    def undone(self, name: str, undo: Callable[[], None]) -> None:
-        """Run an undo step now, with the error handling of :meth:`undoing`."""
         def tried() -> None:
             try:
                 undo()
@@ -91,7 +117,7 @@ class MachineJob:
                     raise
                 self._left.append(name)
 
-        self.undo.run(name, tried)
+        self.undo.add(name, tried)
 
     def _report_left(self) -> None:
         """Report what stays on a machine that did not answer, and how the machine ends."""
@@ -113,9 +139,18 @@ class MachineJob:
 
     def save(self, **changes: Any) -> None:
         """Change fields of the record and write it to disk."""
+        with self._saving:
+            self._save(**changes)
+
+    def _save(self, **changes: Any) -> None:
         # the way down needs the changes even if they cannot be written
         self.record = dataclasses.replace(self.record, **changes)
         self._context.store.save(self.record)
+
+    @property
+    def provider(self) -> Provider:
+        """The machine's provider."""
+        return self._context.provider
 
     @property
     def machine_id(self) -> str:
@@ -149,6 +184,12 @@ class MachineJob:
             return not owned
         return self.spec.on_exit == 'keep' or not owned
 
+    @property
+    def remains(self) -> bool:
+        """Whether the machine survives, or is stopped and keeps its firewall."""
+        return self.survives or self.spec.on_exit == 'stop' and not (
+            self.gone or self.failed and not self.reused)
+
     def run(self, *commands: Command, timeout: Optional[float] = None) -> str:
         """Run commands on the machine on the way up; return the last one's output."""
         output = ''
@@ -170,6 +211,24 @@ class MachineJob:
                         raise
                     self.shell.run(command, timeout=seconds)
             except (ConnectError, DeadlineExceeded):
+                self.out_of_reach()
+                raise
+
+    def release(self) -> None:
+        """Make the agent stop the nodes and release the machine; once."""
+        if self._released:
+            return
+        self._released = True
+        if self.rearming is not None:
+            self.rearming.close()
+        with contextlib.suppress(AgentAbsent):
+            try:
+                # answered when the nodes have ended; an agent out of reach ends them by itself
+                self.agent.request(
+                    'release', timeout=self.timeout(self._context.timeouts.command),
+                    silent=SILENCE_TIMEOUT, launch=self._context.launch,
+                    on_exit=self.spec.on_exit, exit=not self.capabilities.agent_program)
+            except DeadlineExceeded:
                 self.out_of_reach()
                 raise
 

@@ -13,7 +13,6 @@ from typing import Optional
 
 from fogros2 import plan, process
 from fogros2.deploy.robot import run
-from fogros2.deploy.undo import UndoStack
 from fogros2.errors import Cancelled, CommandError, FogError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
 from fogros2.report import Reporter, step, StepFailed
@@ -54,7 +53,6 @@ class RobotVpn:
     """
     The robot's VPN interface, one for each launch, and the machines that it connects.
 
-    :param undo: the launch's undo steps.
     :param timeout: of the commands for the interface, in seconds.
     :param cancel: set when the launch is cancelled.
     :param ending: set when the launch is on its way down.
@@ -62,16 +60,14 @@ class RobotVpn:
     """
 
     def __init__(
-        self, interface: VpnInterface, vpn: Vpn, *, report: Reporter, undo: UndoStack,
-        timeout: float, cancel: threading.Event, ending: threading.Event,
-        choose_port: Callable[[], int],
+        self, interface: VpnInterface, vpn: Vpn, *, report: Reporter, timeout: float,
+        cancel: threading.Event, ending: threading.Event, choose_port: Callable[[], int],
     ) -> None:
         self.interface = interface
         self.vpn = vpn
-        #: True while no part of the interface exists on this computer.
-        self.down = True
         self.report = report
-        self._undo = undo
+        #: Whether a part of the interface may exist on this computer.
+        self._made = False
         self._timeout = timeout
         self._cancel = cancel
         self._ending = ending
@@ -100,8 +96,7 @@ class RobotVpn:
                     # take the interface down a second time
                     raise Cancelled('the VPN interface')
                 with step(self.report, '', 'VPN interface') as detail:
-                    self._undo.add('VPN interface', self._take_down)
-                    self.down = False
+                    self._made = True
                     public_key = self._run([self.vpn.keys(self.interface)]).strip()
                     self._bring_up()
                     detail.append(f'{self.interface.name} {self.interface.address}')
@@ -225,12 +220,12 @@ class RobotVpn:
                 'containers and its VPN interface (Ctrl-Z, `sudo -v`, `fg` keeps it; else '
                 '`sudo -v` and `ros2 fog gc` afterwards)', fatal=False))
 
-    def _take_down(self) -> None:
+    def end(self) -> bool:
+        """Stop changing the interface; return whether a part of it may exist."""
         self._stop.set()
         with self._lock:
             self._peer = None
-            self._run(self.vpn.down(self.interface), cancel=False)
-            self.down = True
+            return self._made
 
 
 def report_unfiltered(report: Reporter, machine: str, output: str) -> None:

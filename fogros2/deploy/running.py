@@ -16,6 +16,7 @@ from fogros2.deploy.machine_job import MachineJob, SILENCE_TIMEOUT, Step
 from fogros2.deploy.steps.containers import Containers
 from fogros2.deploy.steps.installing import Modules
 from fogros2.deploy.steps.watching import POLL_INTERVAL, Watch
+from fogros2.deploy.undo import MONITOR_PORT
 from fogros2.errors import AgentError, DeadlineExceeded, FogError
 from fogros2.events import Event
 from fogros2.host import idle
@@ -96,16 +97,10 @@ class RunningMachine(Step):
         :param sources: networks (CIDR) that may connect.
         :raises FogError: the provider cannot open the port.
         """
-        job, provider = self._job, self._context.provider
-
-        def close() -> None:
-            # the firewall rule of a deleted machine goes with the machine
-            if job.survives or job.spec.on_exit == 'stop':
-                provider.open_port(self.machine, port, ())
-
+        job = self._job
         if port not in self._published:  # a program that listens there may have restarted
-            job.undoing('port of the monitor', close)
-            self._published[port] = provider.open_port(self.machine, port, sources)
+            job.makes(MONITOR_PORT, port)
+            self._published[port] = job.provider.open_port(self.machine, port, sources)
             job.save(monitor_open=host_port(*self._published[port]))
         return self._published[port]
 

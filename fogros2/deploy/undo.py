@@ -1,19 +1,52 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Undo steps of a launch and of its machines; one that fails does not stop the others."""
+"""
+Undo what a launch has made, on a machine, at its provider and on the robot.
+
+A machine's record (:class:`~fogros2.store.Record`) lists what the launch has made, each before it
+is made; its other fields are the details. So any process can undo it, by the same functions: the
+launch itself, and ``ros2 fog delete``, ``ros2 fog gc`` or the next launch for one that died.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import abc
+from collections.abc import Callable, Iterable, Iterator, Mapping
 import contextlib
 import time
 
+from fogros2 import plugin_system
 from fogros2.errors import FogError
+from fogros2.host import containers
+from fogros2.model import Command, Machine
+from fogros2.provider import Provider
 from fogros2.report import Reporter, StepFailed
+from fogros2.store import Made, Record
+from fogros2.vpn import Vpn
+
+# Remove the agent. A released agent is about to exit; an agent that was never reached still runs.
+# Another robot's agent stays: its configuration names its launch.
+# $1 folder, $2 launch, $3 our configuration.
+_REMOVE = """\
+running() { grep -qs serve "/proc/$pid/cmdline"; }
+rm -f -- "$3"
+if read -r pid 2>/dev/null <"$1/agent.pid" && running; then
+    owner=$(sed -n 's/.*"launch": "\\([^"]*\\)".*/\\1/p' "$1/config.json" 2>/dev/null) || :
+    case $owner in ''|"$2") ;; *) exit 0 ;; esac
+    kill -s TERM "$pid" 2>/dev/null || :
+    n=0
+    while running && [ $n -lt 100 ]; do sleep 0.1; n=$((n + 1)); done
+fi
+# another robot may be about to start one
+for each in "$1"/start-*.json; do [ ! -e "$each" ] || exit 0; done
+rm -rf -- "$1"
+# the folder of all agents goes with the last one
+rmdir -- "${1%/*}" 2>/dev/null || :
+"""
 
 
 class UndoStack(contextlib.ExitStack):
     """
-    Undo steps, of which the last pushed one runs first.
+    Undo steps, of which the last pushed one runs first; one that fails does not stop the others.
 
     :param machine: name of the machine, '' for the robot.
     :param failures: receives the error of each step that fails; a launch and its machines share
@@ -42,3 +75,95 @@ class UndoStack(contextlib.ExitStack):
         """Report and remember the error of an undo step."""
         self._report(StepFailed(self._machine, name, seconds, str(error)))
         self._failures.append(error)
+
+
+class Site(abc.ABC):
+    """
+    A machine of which something is undone.
+
+    :ivar machine: what the provider told of it.
+    """
+
+    record: Record
+    machine: Machine
+
+    @property
+    @abc.abstractmethod
+    def provider(self) -> Provider:
+        """The machine's provider."""
+
+    @abc.abstractmethod
+    def clean_up(self, commands: Iterable[Command]) -> None:
+        """Run commands on the machine; each of them may run twice."""
+
+    @abc.abstractmethod
+    def release(self) -> None:
+        """Make the agent stop the nodes and release the machine; once."""
+
+
+def first_config(record: Record) -> str:
+    """Return the path of the configuration with which a launch starts an agent."""
+    return f'{record.agent}/start-{record.last}.json'
+
+
+def vpn_down(record: Record) -> Iterator[Command]:
+    """Yield the commands that take a machine's interface down, or leave it to guests."""
+    assert record.vpn is not None
+    vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
+    return (vpn.leave if record.spec.on_exit == 'keep' else vpn.down)(record.vpn)
+
+
+def _remove_agent(site: Site, made: Made) -> None:
+    record = site.record
+    site.clean_up([Command(
+        ('sh', '-ec', _REMOVE, 'sh', record.agent, record.last, first_config(record)),
+        sudo=True, what='remove the agent')])
+
+
+def _take_vpn_down(site: Site, made: Made) -> None:
+    try:
+        site.release()  # the agent would repair the interface
+    finally:
+        site.clean_up(vpn_down(site.record))
+
+
+def _close_ssh(site: Site, made: Made) -> None:
+    site.provider.allow(site.machine.id, made.port, site.record.spec.fleet_networks)
+
+
+#: Kinds of what a launch makes; reports name them.
+WATCHDOG, NODES, VPN, CONTAINERS = 'watchdog', 'nodes', 'VPN', 'containers'
+SSH_PORT, MONITOR_PORT = 'firewall', 'port of the monitor'
+#: Kinds that need the provider alone, and are there while the machine is stopped.
+PORTS = (SSH_PORT, MONITOR_PORT)
+_UNDO: Mapping[str, Callable[[Site, Made], object]] = {
+    WATCHDOG: _remove_agent,
+    NODES: lambda site, made: site.release(),
+    VPN: _take_vpn_down,
+    CONTAINERS: lambda site, made: site.clean_up([containers.remove(site.record.last)]),
+    SSH_PORT: _close_ssh,
+    MONITOR_PORT: lambda site, made: site.provider.open_port(site.machine, made.port, ()),
+}
+
+
+def unmake(site: Site, made: Made) -> None:
+    """
+    Undo one thing that a launch has made; idempotent.
+
+    :raises FogError: it may still be there.
+    """
+    _UNDO[made.kind](site, made)
+
+
+def close_ports(site: Site) -> tuple[Made, ...]:
+    """
+    Close the ports of a launch that died; return the rest of what it has made.
+
+    The machine's agent undoes the rest by itself.
+
+    :raises FogError: one may still be open.
+    """
+    for made in reversed(site.record.made):
+        if made.kind in PORTS:
+            unmake(site, made)
+    return tuple(made for made in site.record.made if made.kind not in PORTS)

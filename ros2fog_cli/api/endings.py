@@ -15,13 +15,15 @@ import re
 import time
 from typing import Optional
 
-from fogros2 import deploy, plugin_system
+from fogros2 import deploy
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
 from fogros2.deploy import requests
 from fogros2.deploy.robot import clear
+from fogros2.deploy.undo import close_ports, Site, unmake
 from fogros2.errors import (
     AgentError,
+    CommandError,
     ConfigurationError,
     DeadlineExceeded,
     FogError,
@@ -31,10 +33,11 @@ from fogros2.errors import (
     ShellError,
 )
 from fogros2.model import Command, Machine, MachineState
+from fogros2.provider import Provider
 from fogros2.report import Reporter
 from fogros2.shell import Shell
 from fogros2.store import process_alive, Record, robot_id, Store
-from fogros2.vpn import owner, Vpn
+from fogros2.vpn import owner
 from fogros2.waiting import Timeouts, wait_until
 from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry
@@ -81,7 +84,7 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
         if entry.machine is not None:
             if entry.record is not None:
                 if not entry.machine.owned:
-                    _leave(entry.record, force=force)
+                    _leave(entry.record, entry.machine, force=force)
                 elif not force:
                     _check_unused(entry, entry.record)
             _destroy(entry.machine)
@@ -196,31 +199,60 @@ def _agent(record: Record, shell: Shell) -> Iterator[Optional[AgentClient]]:
         client.close()
 
 
-def _leave(record: Record, *, force: bool) -> None:
-    """Remove the agent, its nodes and the VPN from a computer that FogROS2 does not own."""
+class _Left(Site):
+    """
+    What a launch that died has left on a machine, which is let go for good.
+
+    :param shell: to the machine; None where only its provider is needed.
+    """
+
+    def __init__(self, record: Record, machine: Machine, shell: Optional[Shell] = None) -> None:
+        self.record = dataclasses.replace(
+            record, spec=dataclasses.replace(record.spec, on_exit='delete'))
+        self.machine = machine
+        self._shell = shell
+
+    @property
+    def provider(self) -> Provider:
+        return machines.load(self.record.provider)
+
+    def clean_up(self, commands: Iterable[Command]) -> None:
+        assert self._shell is not None
+        for command in commands:
+            self._shell.run(command, timeout=Timeouts().command)
+
+    def release(self) -> None:
+        assert self._shell is not None
+        with _agent(self.record, self._shell) as client, contextlib.suppress(AgentError):
+            if client is not None:  # else it has ended by itself
+                client.request('release', on_exit='delete', exit=True, timeout=30.0)
+
+
+def _leave(record: Record, machine: Machine, *, force: bool) -> None:
+    """Undo what a launch has made on a computer that FogROS2 does not own."""
     if record.shell is None:
         return
-    timeouts = Timeouts()
-    joined = bool(machines.load(record.provider).invitation(record.spec))
     shell = shells.connect(record.shell, name=record.name, timeout=10.0)
     try:
         with _agent(record, shell) as client, contextlib.suppress(AgentError):
-            if client is not None:  # else the agent ended by itself
+            if client is not None:
                 launch = client.status()['launch']
                 if launch not in ('', record.launch, record.last):
                     return  # our agent is gone, and another robot uses the computer now
                 if not force and not _sure(record) and _hears_launch(client):
                     raise _used(record)
-                client.request('release', on_exit='delete', exit=True, timeout=30.0)
-        if record.vpn is not None:
-            vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
-            for command in vpn.down(record.vpn):
-                shell.run(command, timeout=timeouts.vpn)
-        if record.agent and not joined:
-            shell.run(Command(('rm', '-rf', '--', record.agent), sudo=True,
-                              what='remove the agent'), timeout=timeouts.command)
+        site = _Left(record, machine, shell)
+        failures = []
+        for made in reversed(record.made):
+            try:
+                unmake(site, made)
+            except CommandError as error:
+                failures.append(error)  # the others have to go nevertheless
+        if failures:
+            raise failures[0]
     except (ShellError, DeadlineExceeded):
-        if not force and not joined:  # another robot's machine may have forgotten this computer
+        # another robot's machine may have forgotten this computer
+        if not force and not machines.load(record.provider).invitation(record.spec):
             raise
     finally:
         shell.close()
@@ -261,7 +293,7 @@ def due(
                       functools.partial(delete, entry, store, report))
         elif dead and record is not None and not record.damage:
             yield Due('leftovers of', entry.name, 'its launch is gone',
-                      functools.partial(let_go, record, store))
+                      functools.partial(let_go, record, entry.machine, store))
     for record, age in store.requests():
         yield Due('machine', record.name, 'its provider had not answered the request for it',
                   functools.partial(end_request, record, age, store))
@@ -344,16 +376,20 @@ def tidy(warn: machines.Warn, *, regions: Optional[Sequence[str]] = None) -> Ite
         yield from lines or ()
 
 
-def let_go(record: Record, store: Store) -> None:
+def let_go(record: Record, machine: Optional[Machine], store: Store) -> None:
     """
     Clean up after a dead launch whose machine is kept; the machine stays.
+
+    :param machine: what the provider tells of it.
 
     :raises FogError: a resource could not be cleaned up.
     """
     folder = store.root / 'launches' / record.launch
     with store.lock(record.name):
+        made = record.made if machine is None else close_ports(_Left(record, machine))
         clear(folder)
-        store.save(dataclasses.replace(record, launch='', pid=0, pid_start=0, robot_vpn=None))
+        store.save(dataclasses.replace(
+            record, launch='', pid=0, pid_start=0, robot_vpn=None, monitor_open='', made=made))
 
 
 def leftovers(store: Store, now: Optional[float] = None) -> list[Path]:

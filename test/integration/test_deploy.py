@@ -19,6 +19,7 @@ from ros2cli.cli import main
 
 from fogros2 import ros2_daemon
 from fogros2.deploy import Launch
+from fogros2.deploy import launch as launched
 from fogros2.errors import FogError, NameTaken, WorkspaceError
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
@@ -165,16 +166,14 @@ def test_a_cancel_in_any_step_leaves_nothing(spec, step):
 
 
 def test_an_undo_that_fails_is_reported_and_the_others_run(spec, monkeypatch):
-    events = []
-    launch = Launch(report=events.append)
-    launch.up(spec())
-    undo = launch.robot_vpn()._take_down
-
-    def failing():
-        undo()
+    def failing(folder):
+        clear(folder)
         raise Injected('the undo failed')
 
-    launch.undo.add('VPN interface', failing)
+    events, clear = [], launched.clear
+    monkeypatch.setattr(launched, 'clear', failing)
+    launch = Launch(report=events.append)
+    launch.up(spec())
     failures = launch.down()
     assert [str(failure) for failure in failures] == ['the undo failed']
     assert any(isinstance(e, StepFailed) and e.reason == 'the undo failed' for e in events)
@@ -222,7 +221,9 @@ def test_a_kept_machine_is_reused_by_the_next_launch(spec):
     kept = spec(on_exit='keep')
     first = Launch(store=store)
     machine_id = first.up(kept).machine.id
+    assert [made.kind for made in store.load(kept.name).made] == ['watchdog', 'VPN', 'nodes']
     assert first.down() == []
+    assert store.load(kept.name).made == ()
     events = []
     second = Launch(store=store, report=events.append)
     try:

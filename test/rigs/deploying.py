@@ -12,7 +12,6 @@ from fogros2.deploy.choosing import Choices
 from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.robot_vpn import RobotVpn
-from fogros2.deploy.undo import UndoStack
 from fogros2.model import MachineSpec, VpnInterface
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent
@@ -41,8 +40,8 @@ def job(
         'launch': '0a0b0c', 'environment': {}, 'store': Store(folder), 'report': report,
         'failures': failures, 'timeouts': Timeouts(), 'cancel': cancel, 'ending': ending,
         'provider': machines, 'choices': Choices(lambda name: machines, report),
-        'vpn': RobotVpn(ROBOT, FakeVpn(), report=report, undo=UndoStack(report, '', failures),
-                        timeout=30.0, cancel=cancel, ending=ending,
+        'vpn': RobotVpn(ROBOT, FakeVpn(), report=report, timeout=30.0,
+                        cancel=cancel, ending=ending,
                         choose_port=addresses.choose_port),
         'dds': FastDds(), **changes}
     context = Context(**fields)

@@ -22,7 +22,7 @@ import pytest
 from ros2cli.cli import main
 
 from fogros2 import process, report
-from fogros2.deploy import robot
+from fogros2.deploy import robot, undo
 from fogros2.errors import (
     ConnectError,
     MachineNotFound,
@@ -40,9 +40,10 @@ from fogros2.model import (
 )
 from fogros2.provider import Capabilities, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.provider.container import ContainerProvider
-from fogros2.store import process_start, Record, robot_name, Store
+from fogros2.store import Made, process_start, Record, robot_name, Store
 from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream
 from fogros2.testing.plugins import instead
+from fogros2.vpn.wireguard import WireGuard
 from rigs import recorded_agent
 from ros2fog_cli.api import endings, joining, machines, table
 from ros2fog_cli.api.machines import Entry
@@ -468,10 +469,63 @@ def test_delete_does_not_wait_for_an_agent_that_ended(monkeypatch: pytest.Monkey
     monkeypatch.setattr(endings.shells, 'connect', lambda *_, **__: shell)
     made = machine('lab', provider='untagged', owned=False)
     record('lab', provider='untagged', shell=made.shell, agent='/run/fogros2/lab',
-           agent_program='/run/fogros2/lab/agent.py', **dead())
+           agent_program='/run/fogros2/lab/agent.py', made=(Made(undo.NODES),), **dead())
     assert run('delete', 'lab', '--yes') == 0
-    assert ran == ['test -e /run/fogros2/lab/agent.py', 'rm -rf -- /run/fogros2/lab']
+    assert {*ran} == {'test -e /run/fogros2/lab/agent.py'}
     assert shell.opened == [] and shell.closed == 1
+
+
+@pytest.mark.parametrize('fails', [False, True])
+def test_delete_undoes_what_the_launch_has_made_on_a_computer_of_somebody(
+    monkeypatch: pytest.MonkeyPatch, fails: bool,
+) -> None:
+    """In the reverse order, by the commands of the launch's own end."""
+    shell = FakeShell(handlers={
+        'test': lambda c: Result(1, '', ''),
+        'sh': lambda c: Result(int(fails and 'containers' in c.what), '', 'no')})
+    monkeypatch.setattr(endings.shells, 'connect', lambda *_, **__: shell)
+    made = machine('lab', provider='untagged', owned=False)
+    vpn = VpnInterface('fogabc123m0', '198.18.0.2', '198.18.0.0/24', 51820, '/none')
+    record('lab', provider='untagged', shell=made.shell, agent='/run/fogros2/lab', last='abc123',
+           agent_program='/run/fogros2/lab/agent.py', vpn=vpn, on_exit='keep', made=tuple(
+               Made(kind) for kind in (
+                   undo.WATCHDOG, undo.VPN, undo.CONTAINERS, undo.NODES)), **dead())
+    assert run('delete', 'lab', '--yes') == int(fails)
+    assert [c.what for c in shell.commands if c.argv[0] != 'test'] == [
+        'remove its containers', 'take the VPN interface fogabc123m0 down', 'remove the agent']
+    assert shell.commands[-1].argv[4:] == (
+        '/run/fogros2/lab', 'abc123', '/run/fogros2/lab/start-abc123.json')
+    down, = (c for c in shell.commands if 'VPN' in c.what)
+    assert down == next(WireGuard().down(vpn)), 'not left to guests'
+    assert Store().exists('lab') == fails
+
+
+def test_gc_closes_the_ports_of_a_kept_machines_launch(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    closed: list[tuple[str, int, tuple[str, ...]]] = []
+    monkeypatch.setattr(Memory, 'capabilities', Capabilities(firewall=True))
+    monkeypatch.setattr(Memory, 'allow', lambda self, *what: closed.append(what))
+    machine('a')
+    ports = Made(undo.SSH_PORT, 2222), Made(undo.MONITOR_PORT, 8766)
+    record('a', on_exit='keep', monitor_open='198.51.100.7:8766',
+           made=(*ports, Made(undo.NODES)), **dead())
+    assert run('gc') == 0
+    assert capsys.readouterr().out == 'cleared leftovers of a: its launch is gone\n'
+    assert closed == [('id-a', 8766, ()), ('id-a', 2222, ())]
+    after = Store().load('a')
+    assert (after.launch, after.monitor_open, after.made) == ('', '', (Made(undo.NODES),))
+
+
+def test_gc_tries_ports_again_that_could_not_be_closed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(Memory, 'allow', Mock(side_effect=[ProviderError('busy'), None]))
+    machine('a')
+    record('a', on_exit='keep', made=(Made(undo.SSH_PORT, 22),), **dead())
+    assert run('gc') == 1 and 'busy' in capsys.readouterr().out
+    assert Store().load('a').made == (Made(undo.SSH_PORT, 22),)
+    assert run('gc') == 0 and Store().load('a').made == ()
 
 
 def test_lifetime_of_a_reused_machine_starts_again() -> None:
@@ -514,7 +568,7 @@ def test_gc_stops_the_daemon_of_a_kept_machines_launch(
         ' '.join(command.argv) for command in commands))
     interface = VpnInterface('fogabc123', '198.18.0.1', '198.18.0.0/24', 51820, '/none')
     kept = record('a', on_exit='keep', robot_vpn=interface, **dead())
-    endings.let_go(kept, Store())
+    endings.let_go(kept, machine('a'), Store())
     # the daemon is a node with the interface
     assert done[0] == 'abc123' and 'fogabc123' in done[-1]
     assert Store().load('a').launch == ''

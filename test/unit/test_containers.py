@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import dataclasses
 import os
 from pathlib import Path
 import subprocess
@@ -28,6 +29,7 @@ from fogros2.model import Command, MachineSpec, NodeSpec, Result
 from fogros2.provider import Provider
 from fogros2.provider.container import ContainerProvider
 from fogros2.shell import Shell
+from fogros2.store import Store
 from fogros2.testing.fakes import FakeProvider, FakeShell
 from rigs import deploying
 
@@ -524,8 +526,9 @@ def beside(
         provider: Optional[Provider] = None,
 ) -> Containers:
     context, job = deploying.job(
-        Path('/nowhere'), MachineSpec('m', 'fake', containers=lines), provider=provider,
+        Store().root, MachineSpec('m', 'fake', containers=lines), provider=provider,
         images=images, launch='abc')
+    job.record = dataclasses.replace(job.record, last='abc')
     job.shell = shell
     return Containers(context, job)
 

@@ -21,7 +21,7 @@ import pytest
 
 from fogros2 import ContainerInstance, Foxglove, monitor_addresses
 from fogros2.actions import foxglove
-from fogros2.deploy import RunningMachine
+from fogros2.deploy import RunningMachine, undo
 from fogros2.deploy.steps.creating import Creation
 from fogros2.describe import networks
 from fogros2.errors import AgentError, ConfigurationError, ProviderError
@@ -30,7 +30,7 @@ from fogros2.provider.kubernetes import manifests, ways
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.runtime import foxglove as runtime_foxglove
 from fogros2.runtime import republishers, streaming
-from fogros2.store import process_start, Record, Store
+from fogros2.store import Made, process_start, Record, Store
 from fogros2.testing.fakes import FakeProvider, FakeShell
 from fogros2_monitor import credentials
 from rigs import deploying
@@ -97,13 +97,14 @@ def test_next_launch_closes_the_port_of_a_killed_one(
     context, job = deploying.job(
         tmp_path, MachineSpec('planner', 'fake', on_exit='keep'), provider=provider)
     with context.store.lock('planner'):
-        job.save(machine_id='fake-1', monitor=8765, monitor_open='198.51.100.9:8766')
+        job.save(machine_id='fake-1', monitor=8765, monitor_open='198.51.100.9:8766',
+                 made=(Made(undo.VPN), Made(undo.MONITOR_PORT, 8766)))
         provider.machines['fake-1'] = machine = Machine(
             'fake-1', 'planner', 'fake', MachineState.RUNNING)
         Creation(context, job)._adopt(machine)
     assert provider.allowed == {('fake-1', 8766): []}
     after = context.store.load('planner')
-    assert (after.monitor, after.monitor_open) == (0, '')
+    assert (after.monitor, after.monitor_open, after.made) == (0, '', (Made(undo.VPN),))
 
 
 def entry(**changes):

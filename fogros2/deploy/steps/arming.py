@@ -10,13 +10,13 @@ from typing import Any, Optional
 
 from fogros2 import model, plan
 from fogros2.agent_client import AgentClient, Heartbeat, interval_for, joined
-from fogros2.deploy.machine_job import AGENT_FOLDER, SILENCE_TIMEOUT, Step
+from fogros2.deploy.machine_job import AGENT_FOLDER, Step
+from fogros2.deploy.undo import first_config, NODES, WATCHDOG
 from fogros2.errors import (
     AgentAbsent,
     AgentError,
     Cancelled,
     CommandError,
-    DeadlineExceeded,
     FogError,
     VpnError,
 )
@@ -54,33 +54,9 @@ chmod 755 "$1.new"
 mv -f -- "$1.new" "$1"
 """
 
-# Remove the agent. A released agent is about to exit; an agent that was never reached still runs.
-# Another robot's agent stays: its configuration names its launch.
-# $1 folder, $2 launch, $3 our configuration.
-_REMOVE = """\
-running() { grep -qs serve "/proc/$pid/cmdline"; }
-rm -f -- "$3"
-if read -r pid 2>/dev/null <"$1/agent.pid" && running; then
-    owner=$(sed -n 's/.*"launch": "\\([^"]*\\)".*/\\1/p' "$1/config.json" 2>/dev/null) || :
-    case $owner in ''|"$2") ;; *) exit 0 ;; esac
-    kill -s TERM "$pid" 2>/dev/null || :
-    n=0
-    while running && [ $n -lt 100 ]; do sleep 0.1; n=$((n + 1)); done
-fi
-# another robot may be about to start one
-for each in "$1"/start-*.json; do [ ! -e "$each" ] || exit 0; done
-rm -rf -- "$1"
-# the folder of all agents goes with the last one
-rmdir -- "${1%/*}" 2>/dev/null || :
-"""
-
 
 class Arming(Step):
     """The agent of one machine, seen from the robot."""
-
-    _released = False
-    #: Makes the agent wait again for heartbeats, until these come through the VPN.
-    _rearming: Optional[Periodic] = None
 
     # -- on the way up --------------------------------------------------------------------------
 
@@ -110,14 +86,16 @@ class Arming(Step):
                         what='look for an agent')).strip():
                     # of a launch that died, or of another robot, which keeps it
                     agent = self._claim(program, config)
-                job.undoing('watchdog', self._remove)
+                job.makes(WATCHDOG, agent=job.directory, agent_program=program)
                 if agent is None:
                     self._install(program, config)
-            elif job.capabilities.agent_sent:
-                source = joined().encode()
-                job.run(Command(('sh', '-ec', _SEND, 'sh', program, str(len(source))), sudo=True,
-                                input=source, what='send the agent'))
-            job.save(agent=job.directory, agent_program=program)
+            else:
+                job.save(agent=job.directory, agent_program=program)
+                if job.capabilities.agent_sent:
+                    source = joined().encode()
+                    job.run(Command(
+                        ('sh', '-ec', _SEND, 'sh', program, str(len(source))), sudo=True,
+                        input=source, what='send the agent'))
             job.agent = agent = agent or wait_until(
                 lambda: self._claim(program, config),
                 timeout=context.timeouts.agent, cancel=job.cancel,
@@ -126,9 +104,9 @@ class Arming(Step):
             # a busy machine gets more time to answer, as long as it sends anything
             job.probes.insert(0, lambda seconds: agent.request(
                 'ping', timeout=3 * seconds, silent=seconds))
-            self.undo_nodes()
-            self._rearming = Periodic('fog-rearm', job.spec.robot_timeout / 4, self._rearm)
-            job.undo.callback(self._rearming.close)
+            job.makes(NODES)
+            job.rearming = Periodic('fog-rearm', job.spec.robot_timeout / 4, self._rearm)
+            job.undo.callback(job.rearming.close)
 
     def _rearm(self) -> None:
         # a later call may get through; the current step reports a lasting failure
@@ -142,7 +120,7 @@ class Arming(Step):
         try:
             job.run(Command(
                 ('sh', '-ec', _INSTALL, 'sh', AGENT_FOLDER, job.directory, program,
-                 self._first_config, str(config['user'])),
+                 first_config(job.record), str(config['user'])),
                 sudo=True, input=line + b'\n' + joined().encode(),
                 what='start the agent'))
         except CommandError as error:
@@ -151,10 +129,6 @@ class Arming(Step):
                     f"another robot has just taken the machine '{job.name}' of this computer",
                     'give the machine another name=') from error
             raise
-
-    @property
-    def _first_config(self) -> str:
-        return f'{self._job.directory}/start-{self._context.launch}.json'
 
     def _claim(self, program: str, config: Mapping[str, Any]) -> Optional[AgentClient]:
         """
@@ -176,13 +150,6 @@ class Arming(Step):
             raise
         job.first_event = int(answer.get('next', 1))
         return agent
-
-    def _remove(self) -> None:
-        job = self._job
-        if job.survives:
-            job.clean_up([Command(
-                ('sh', '-ec', _REMOVE, 'sh', job.directory, self._context.launch,
-                 self._first_config), sudo=True, what='remove the agent')])
 
     # -- with nodes -----------------------------------------------------------------------------
 
@@ -222,30 +189,5 @@ class Arming(Step):
             raise VpnError(
                 f"nothing comes back from '{job.name}' through the VPN",
                 f'is UDP port {job.interface.port} open on the way there?') from error
-        if self._rearming is not None:
-            self._rearming.close()
-
-    # -- the way down ---------------------------------------------------------------------------
-
-    def undo_nodes(self) -> None:
-        """Push the undo that stops the nodes; it has to run first on the way down."""
-        self._job.undoing('nodes', self.release)
-
-    def release(self) -> None:
-        """Make the agent of a surviving machine stop the nodes and release the machine; once."""
-        context, job = self._context, self._job
-        if not job.survives or self._released:
-            return
-        self._released = True
-        if self._rearming is not None:
-            self._rearming.close()
-        with contextlib.suppress(AgentAbsent):
-            try:
-                # answered when the nodes have ended; an agent out of reach ends them by itself
-                job.agent.request(
-                    'release', timeout=job.timeout(context.timeouts.command),
-                    silent=SILENCE_TIMEOUT, launch=context.launch, on_exit=job.spec.on_exit,
-                    exit=not job.capabilities.agent_program)
-            except DeadlineExceeded:
-                job.out_of_reach()
-                raise
+        if job.rearming is not None:
+            job.rearming.close()

@@ -16,6 +16,7 @@ from typing import Optional
 
 from fogros2 import shell as shells
 from fogros2.deploy.machine_job import Step
+from fogros2.deploy.undo import SSH_PORT
 from fogros2.errors import (
     ConnectError,
     DeadlineExceeded,
@@ -63,7 +64,7 @@ class Connection(Step):
                     host_key=job.record.host_key or endpoint.host_key)
             job.save(shell=endpoint)
             if context.capabilities.firewall:
-                job.undoing('firewall', lambda: self._close_port() if job.survives else None)
+                job.makes(SSH_PORT, endpoint.port)
                 if job.reused:
                     # the earlier launch closed the port, or the robot's address has changed
                     self._open_port()
@@ -92,9 +93,9 @@ class Connection(Step):
             except BaseException:
                 inside.close()
                 raise
-            job.undoing('firewall', self._leave_vpn)
+            job.undoing(SSH_PORT, self._leave_vpn)
             self._shell.move(inside)
-            self._close_port()
+            self._allow([])
             detail.append(
                 'SSH through the VPN, and open to the fleet' if self._job.spec.fleet_networks
                 else f'SSH through the VPN alone, port {outside.port} closed')
@@ -105,9 +106,6 @@ class Connection(Step):
         if self._job.survives and outside is not None:
             self._open_port()
             self._shell.move(self._shell_to(outside))
-
-    def _close_port(self) -> None:
-        self._allow([])
 
     def _open_port(self) -> None:
         """Open the SSH port to the robot's current public address."""

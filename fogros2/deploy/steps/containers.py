@@ -8,6 +8,7 @@ import threading
 
 from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob, Step
+from fogros2.deploy.undo import CONTAINERS
 from fogros2.errors import CommandError, PrerequisiteError
 from fogros2.host import container_scripts, containers
 from fogros2.host.bootstrap import apt_install
@@ -37,7 +38,7 @@ class Containers(Step):
         """
         job = self._job
         # pushed now: nodes that start later run in these images, and stop before this undo
-        job.undoing('containers', self._remove)
+        job.may_make(CONTAINERS)
         if job.spec.containers:
             self._start_containers(environment)
         self._get(self._context.images)
@@ -114,6 +115,8 @@ class Containers(Step):
     def _ensure_engine(self) -> None:
         job = self._job
         timeouts = self._context.timeouts
+        if not self._engine:
+            job.note(CONTAINERS)
         if not self._engine and not job.run(containers.FIND, timeout=timeouts.command).strip():
             try:
                 # the configuration of podman may name crun, and its package may bring another
@@ -124,7 +127,3 @@ class Containers(Step):
                     f"'{job.name}' has neither podman nor docker, and podman can't be installed: "
                     f'{error}', 'take an image with one of them') from error
         self._engine = True
-
-    def _remove(self) -> None:
-        if self._engine and self._job.survives:
-            self._job.clean_up([containers.remove(self._context.launch)])

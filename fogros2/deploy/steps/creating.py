@@ -13,6 +13,7 @@ import uuid
 from fogros2 import model, monitor_addresses, plan, process
 from fogros2.deploy import requests
 from fogros2.deploy.machine_job import Step
+from fogros2.deploy.undo import close_ports
 from fogros2.errors import (
     ConfigurationError,
     FogError,
@@ -129,12 +130,12 @@ class Creation(Step):
         context, job = self._context, self._job
         job.reused = True
         job.undoing('end', self._end)
-        before = job.record
+        job.machine = machine
         self._claim(job.record.token)
         context.provider.adopt(machine.id, job.spec, self._tags())
-        if before.monitor_open:
-            # left open by a launch that was killed
-            context.provider.open_port(machine, monitor_addresses.gate_port(before.monitor), ())
+        if job.record.made:
+            # by a launch that was killed
+            job.save(made=close_ports(job))
         if machine.state in (MachineState.STOPPED, MachineState.STOPPING):
             context.provider.start(machine.id)
             return None
@@ -226,7 +227,7 @@ class Creation(Step):
                     return
                 if mode == 'stop' and job.record.machine_id is not None:
                     context.provider.stop(job.record.machine_id)
-                job.save(launch='', pid=0, pid_start=0, robot_vpn=None)
+                job.save(launch='', pid=0, pid_start=0, robot_vpn=None, monitor_open='')
         finally:
             context.choices.end(job.name)
 

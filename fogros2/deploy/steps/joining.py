@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 import contextlib
 import dataclasses
 from typing import Optional
@@ -12,6 +12,7 @@ from fogros2 import plan
 from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob, Step
 from fogros2.deploy.robot_vpn import VpnMember
+from fogros2.deploy.undo import VPN, vpn_down
 from fogros2.errors import CommandError, FogError, VpnError
 from fogros2.model import Command, host_port, Machine, Peer, VpnInterface
 from fogros2.report import step
@@ -26,16 +27,10 @@ socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b'', (sys.argv[1], int(s
 
 
 class Joining(Step):
-    """
-    Add one machine to the launch's VPN, and remove it.
+    """Add one machine to the launch's VPN, and remove it."""
 
-    :param release: makes the agent release the machine; otherwise it would repair the interface
-        that the way down deletes.
-    """
-
-    def __init__(self, context: Context, job: MachineJob, release: Callable[[], None]) -> None:
+    def __init__(self, context: Context, job: MachineJob) -> None:
         super().__init__(context, job)
-        self._release = release
         self._member: Optional[VpnMember] = None
         #: The interface of an earlier launch.
         self._former: Optional[VpnInterface] = None
@@ -72,8 +67,8 @@ class Joining(Step):
         """
         job, interface, robot = self._job, self._job.interface, self._context.vpn
         with job.step('VPN') as detail:
-            job.undoing('VPN', self._leave)
-            job.undoing('VPN', lambda: robot.remove(job.name))
+            job.makes(VPN)
+            job.undoing(VPN, lambda: robot.remove(job.name))
             noted = self._context.store.machine(job.name) / GUESTS
             if self._former is not None and noted.exists():
                 # an earlier launch has left it to guests, and its port is needed
@@ -123,12 +118,7 @@ class Joining(Step):
             'keep', timeout=self._context.timeouts.agent, what='vpn', interval=1.0,
             alive=list(vpn.health_check(job.interface).argv),
             repair=[list(c.argv) for c in vpn.repair(job.interface, peers)],
-            down=[list(c.argv) for c in self._down()])
-
-    def _down(self) -> Iterator[Command]:
-        """Yield the commands that take the interface down, or leave it to guests."""
-        vpn, job = self._context.vpn.vpn, self._job
-        return (vpn.leave if job.spec.on_exit == 'keep' else vpn.down)(job.interface)
+            down=[list(c.argv) for c in vpn_down(job.record)])
 
     def redial(self, machine: Machine) -> None:
         """
@@ -150,12 +140,6 @@ class Joining(Step):
                 job.run(Command(
                     ('python3', '-IS', '-c', _KNOCK, robot.interface.address,
                      str(plan.HEARTBEAT_PORT)), what='greet the robot'))
-
-    def _leave(self) -> None:
-        job = self._job
-        if job.survives:
-            job.undone('nodes', self._release)
-            job.clean_up(self._down())
 
 
 class Joined(Joining):
