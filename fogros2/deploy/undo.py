@@ -81,7 +81,7 @@ class Site(abc.ABC):
     """
     A machine of which something is undone.
 
-    :ivar machine: what the provider told of it.
+    :ivar machine: as the provider reported it.
     """
 
     record: Record

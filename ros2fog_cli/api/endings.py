@@ -380,7 +380,7 @@ def let_go(record: Record, machine: Optional[Machine], store: Store) -> None:
     """
     Clean up after a dead launch whose machine is kept; the machine stays.
 
-    :param machine: what the provider tells of it.
+    :param machine: as the provider reports it; None if it did not answer.
 
     :raises FogError: a resource could not be cleaned up.
     """

@@ -476,7 +476,7 @@ def test_delete_does_not_wait_for_an_agent_that_ended(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize('fails', [False, True])
-def test_delete_undoes_what_the_launch_has_made_on_a_computer_of_somebody(
+def test_delete_undoes_what_a_launch_has_made_on_a_host(
     monkeypatch: pytest.MonkeyPatch, fails: bool,
 ) -> None:
     """In the reverse order, by the commands of the launch's own end."""
