@@ -39,7 +39,7 @@ def machine(name: str, **changes: Any) -> dict[str, Any]:
         'agent': {'since': NOW - 3500, 'rss': 16_000_000, 'heartbeat_age': 1.0},
         'vpn': {'address': '198.18.0.2', 'interface': 'fogabc123', 'received': 9_500_000,
                 'sent': 1_200_000, 'latency': 23.4, 'receiving': 250_000.0, 'sending': 90_000.0,
-                'handshake': NOW - 65},
+                'handshake': NOW - 600},
         'steps': [step('machine', 0, 31.2), step('VPN', 31.2, 0.4), step('agent', 31.6, 0.2)],
         'nodes': [{'name': 'slam-1', 'state': 'running', 'pid': 41, 'returncode': None,
                    'restarts': 2, 'error': None}], 'log': 1, **changes}
@@ -132,7 +132,7 @@ def test_card_shows_the_data_of_a_machine(story: Story, page: Browser) -> None:
                'e => e.textContent.includes("all is well"))')
     text = page.text()
     for words in ('rover-0', '$1.32', 'up for\n60 min', 'time left\n2 h 00 min', '23 ms',
-                  '$0.66', 'at $0.66/h', '65 s ago', '250 kB/s', '90.0 kB/s', '10.7 MB',
+                  '$0.66', 'at $0.66/h', '10 min ago', '250 kB/s', '90.0 kB/s', '10.7 MB',
                   'coming up', '5.0 MB of 20.0 MB', 'process 4711', '30.0 Hz', '81.0 kB/s',
                   'robot → planner', 'planner → robot', '50.0', '36.1 kB/s',
                   'not measured', 'all is well'):
