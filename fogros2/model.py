@@ -68,6 +68,7 @@ class MachineSpec:
         no limit.
     :param apt: Debian packages to install; ``pip`` Python packages, in pip's syntax.
     :param share: topics that it has in common with machines of other robots on its host.
+    :param features: the values of features' keywords, by feature; JSON types only.
     :param wanted: for a machine of any cloud, the requirements for which the launch has chosen
         ``provider`` and ``options``.
     """
@@ -96,6 +97,7 @@ class MachineSpec:
     apt: tuple[str, ...] = ()
     pip: tuple[str, ...] = ()
     share: tuple[str, ...] = ()
+    features: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     wanted: Optional[Mapping[str, Any]] = None
 
     @property

@@ -18,6 +18,7 @@ GROUPS = {
     'fogros2.shell': 'shell',
     'fogros2.vpn': 'VPN',
     'fogros2.dds': 'DDS vendor',
+    'fogros2.feature': 'feature',
     'fogros2.image_transport': 'image transport',
     'fogros2.monitor': 'monitor',
 }

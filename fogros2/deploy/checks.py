@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import contextlib
 from typing import Optional
 
-from fogros2 import plan
+from fogros2 import feature, plan
 from fogros2 import shell as shells
 from fogros2.errors import ConfigurationError, FogError, Unsupported
 from fogros2.host import bootstrap, containers, undeclared, workspace
@@ -81,6 +81,8 @@ def check(
         containers.check(containers.parse(line), rmw)
     if spec.containers or images:
         provider.check_containers(spec)
+    for name, given in spec.features.items():
+        feature.load(name).check(spec, feature.options(name, given))
     chain = [workspace.inspect(path) for path in spec.workspaces]
     if not provider.has_own_packages(spec):
         for package, executable in programs:

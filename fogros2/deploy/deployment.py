@@ -13,6 +13,7 @@ from concurrent.futures import (
 import contextlib
 from typing import Any
 
+from fogros2 import feature
 from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.running import RunningMachine
@@ -88,13 +89,21 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
     with job.step('agent') as detail:
         arming.start_heartbeat(ros, dds_step.result())
         detail.append(f'VPN round trip {(job.heartbeat.round_trip or 0) * 1e3:.2f} ms')
+    # pushed now, so that they end after the nodes and before the VPN
+    features = {name: contextlib.ExitStack() for name in job.spec.features}
+    for name, ending in features.items():
+        job.undoing(name, ending.close)
     # a second time, so that the nodes stop first on the way down
     job.makes(NODES)
     dds.start_router(context, job)
     connection.enter_vpn()
     job.undo.callback(ClockComparison(job.name, job.heartbeat, context.report).close)
     job.failed = False
-    return RunningMachine(context, job, modules, containers, joining.redial)
+    running = RunningMachine(context, job, modules, containers, joining.redial)
+    for name, ending in features.items():
+        ending.enter_context(feature.load(name).machine(
+            running, feature.options(name, job.spec.features[name])))
+    return running
 
 
 def _wait_for_all(job: MachineJob, *tasks: Future[Any]) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import re
 from typing import Any, Optional, TYPE_CHECKING
 
-from fogros2.describe import keywords, values
+from fogros2.describe import features, keywords, values
 from fogros2.describe.kinds import Kind
 from fogros2.describe.machines import check_loss, check_setting, CloudInstance, SETTINGS
 from fogros2.errors import ConfigurationError, PrerequisiteError
@@ -119,7 +119,8 @@ def _allowed(cls: type[CloudInstance]) -> dict[str, Kind]:
                 if parameter.default is None}
     common = keywords.keywords(CloudInstance)
     return {name: keyword.kind for name, keyword in keywords.keywords(cls).items()
-            if name in optional and (name in SETTINGS if name in common else True)}
+            if name in features.keywords()
+            or name in optional and (name in SETTINGS if name in common else True)}
 
 
 def apply(
@@ -140,9 +141,12 @@ def apply(
     settings = {name: check_setting(name, value) for name, value in wanted.items()
                 if name in SETTINGS and name not in given}
     # an empty text is what an argument of a launch file has without a value
+    more = {name: wanted.pop(name) for name in [*wanted] if name in features.keywords()}
     options = {name: value for name, value in wanted.items()
                if name not in SETTINGS and spec.options.get(name, '') == ''}
-    result = dataclasses.replace(spec, options={**spec.options, **options}, **settings)
+    result = dataclasses.replace(
+        spec, options={**spec.options, **options},
+        features=features.merged(features.by_feature(more), spec.features), **settings)
     check_loss(result)
     return result
 

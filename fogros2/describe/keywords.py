@@ -15,7 +15,7 @@ import re
 from typing import Any
 
 from fogros2 import plugin_system
-from fogros2.describe import values
+from fogros2.describe import features, values
 from fogros2.describe.kinds import Keyword, parameters_of
 from fogros2.describe.machines import CloudInstance
 from fogros2.errors import ConfigurationError, did_you_mean
@@ -60,7 +60,7 @@ def keywords(cls: type[CloudInstance]) -> Mapping[str, Keyword]:
         constructor = vars(base)['__init__']
         for name, keyword in parameters_of(constructor).items():
             by_name.setdefault(name, keyword)
-    return by_name
+    return {**features.keywords(), **by_name}
 
 
 def read(keyword: Keyword, text: str) -> Any:

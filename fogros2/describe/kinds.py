@@ -136,9 +136,18 @@ def options_of(constructor: Callable[..., Any], arguments: Mapping[str, Any]) ->
     :param arguments: the arguments by name, and other names, which are ignored.
     :raises ConfigurationError: an argument has a wrong type.
     """
-    check(parameters_of(constructor), arguments)
+    return marked(parameters_of(constructor), arguments)
+
+
+def marked(keywords: Mapping[str, Keyword], arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return the arguments of some keywords, marked by their kinds.
+
+    :raises ConfigurationError: an argument has a wrong type.
+    """
+    check(keywords, arguments)
     return {name: _MARKS[keyword.kind](arguments[name]) if keyword.kind in _MARKS
-            else arguments[name] for name, keyword in parameters_of(constructor).items()}
+            else arguments[name] for name, keyword in keywords.items()}
 
 
 _MARKS: Mapping[Kind, Callable[[Any], Any]] = {

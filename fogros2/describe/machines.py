@@ -10,7 +10,7 @@ import re
 import shlex
 from typing import Any, cast, get_args, NoReturn, Optional, TYPE_CHECKING, Union
 
-from fogros2.describe import names, networks, values, variables
+from fogros2.describe import features, names, networks, values, variables
 from fogros2.describe.kinds import check, options_of, parameters_of
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.host import containers, dependencies
@@ -90,6 +90,7 @@ class CloudInstance:
     :param share: topics, such as '/map', that pass between this launch and those of other robots
         whose machines are on the same host and list them too; serialized, with their QoS.
     :param options: the provider's own options; subclasses set it.
+    :param unknown: keywords of features, see doc/howto/features.md.
     :raises ConfigurationError: an unknown keyword (the hint names the nearest), or a wrong value.
     """
 
@@ -121,8 +122,10 @@ class CloudInstance:
         **unknown: object,
     ) -> None:
         parameters = locals()
-        if unknown:
-            raise self._unknown(next(iter(unknown)))
+        self._features = features.own(unknown) if unknown else {}
+        for keyword in unknown:
+            if keyword not in self._features:
+                raise self._unknown(keyword)
         if not self.provider:
             raise ConfigurationError(
                 f'{type(self).__name__} is no machine yet',
@@ -143,7 +146,7 @@ class CloudInstance:
         self._spec: Optional[MachineSpec] = None
         self._running: Optional[RunningMachine] = None
         # values that are known already are checked where they are written
-        for key, value in self._options.items():
+        for key, value in [*self._options.items(), *self._features.items()]:
             with values.named(key):
                 values.check_plain(value)
         if isinstance(self._name, str):
@@ -164,7 +167,7 @@ class CloudInstance:
         parameters = sorted({
             parameter for cls in type(self).__mro__[:-1]
             for parameter in inspect.signature(cls).parameters
-        } - {'self', 'options', 'unknown', 'common'})
+        } - {'self', 'options', 'unknown', 'common'} | {*features.keywords()})
         return ConfigurationError(
             f"{type(self).__name__} has no attribute '{name}'", did_you_mean(name, parameters))
 
@@ -316,7 +319,10 @@ class CloudInstance:
                     context, 'launch_foxglove', values.Bool(self._foxglove)),
                 monitor_allow=networks.resolve(context, self._monitor_allow),
                 apt=self._wanted(context, 'apt'), pip=self._wanted(context, 'pip'),
-                share=self._wanted(context, 'share'), **settings)
+                share=self._wanted(context, 'share'),
+                features=features.by_feature({
+                    key: self._resolved(context, key, value)
+                    for key, value in self._features.items() if value is not None}), **settings)
             self._check_findable(spec.on_exit)
             check_loss(spec)
             self._spec = spec

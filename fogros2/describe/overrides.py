@@ -8,7 +8,7 @@ import dataclasses
 import fnmatch
 from typing import Any, Optional, TYPE_CHECKING
 
-from fogros2.describe import keywords, values
+from fogros2.describe import features, keywords, values
 from fogros2.errors import ConfigurationError, did_you_mean
 
 if TYPE_CHECKING:
@@ -49,11 +49,13 @@ class Override:
         """
         described = self.machine(spec.name).spec(context)
         before = spec.options if spec.provider == described.provider else {}
-        common = {_FIELDS.get(name, name) for name in self.given if name not in described.options}
+        common = {_FIELDS.get(name, name) for name in self.given
+                  if name not in described.options and name not in features.keywords()}
         if 'workspace' in common:
             common.add('underlays')
         return dataclasses.replace(
             spec, provider=described.provider, options={**before, **described.options},
+            features=features.merged(spec.features, described.features),
             **{field: getattr(described, field) for field in common if field is not None})
 
     def machine(self, name: str) -> CloudInstance:

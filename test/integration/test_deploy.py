@@ -221,7 +221,7 @@ def test_a_kept_machine_is_reused_by_the_next_launch(spec):
     kept = spec(on_exit='keep')
     first = Launch(store=store)
     machine_id = first.up(kept).machine.id
-    assert [made.kind for made in store.load(kept.name).made] == ['watchdog', 'VPN', 'nodes']
+    assert [made.kind for made in store.load(kept.name).made] == ['VPN', 'nodes']
     assert first.down() == []
     assert store.load(kept.name).made == ()
     events = []
