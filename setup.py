@@ -131,6 +131,9 @@ setup(
             'gcp = fogros2.provider.gcp.login:configured',
             'kubernetes = fogros2.kubernetes_client:configured',
         ],
+        'fogros2.feature': [
+            'results = fogros2_features.results:Results',
+        ],
         'fogros2.monitor': [
             'foxglove = fogros2_monitor:FOXGLOVE',
             'graph = fogros2_monitor:GRAPH',

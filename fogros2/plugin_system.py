@@ -24,8 +24,8 @@ GROUPS = {
 }
 #: All packages that setup.py installs; a package index may have unrelated projects of these names.
 OWN_PACKAGES = (
-    'fogros2', 'fogros2_examples', 'fogros2_monitor', 'fogros2_replicas', 'fogros2_share',
-    'image_transport_h264', 'point_cloud_stream', 'ros2fog_cli')
+    'fogros2', 'fogros2_examples', 'fogros2_features', 'fogros2_monitor', 'fogros2_replicas',
+    'fogros2_share', 'image_transport_h264', 'point_cloud_stream', 'ros2fog_cli')
 
 
 @functools.lru_cache(maxsize=1)

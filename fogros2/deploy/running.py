@@ -54,6 +54,15 @@ class RunningMachine(Step):
         job.undo.callback(Watch(
             context, job, gone=self._gone, found=found, lost=self._is_lost).close)
 
+    @property
+    def lost(self) -> str:
+        """Why the machine is gone or must not be used any more, '' while it is there."""
+        return self._lost
+
+    def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
+        """Report a step of this machine around a block; see :func:`fogros2.report.step`."""
+        return self._job.step(name)
+
     def start(self, nodes: Sequence[NodeSpec]) -> None:
         """
         Start nodes; their state changes arrive as events.

@@ -16,8 +16,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE = ROOT / 'fogros2'
-PACKAGES = ('fogros2_replicas', 'fogros2_share', 'image_transport_h264', 'point_cloud_stream',
-            'fogros2', 'fogros2_monitor', 'ros2fog_cli')
+PACKAGES = ('fogros2_features', 'fogros2_replicas', 'fogros2_share', 'image_transport_h264',
+            'point_cloud_stream', 'fogros2', 'fogros2_monitor', 'ros2fog_cli')
 
 #: The parts of the core, lowest first; a module imports only its own part and those before it.
 #: Inside a package the order is the one in which the docstring of its ``__init__`` names the
@@ -34,6 +34,7 @@ ORDER = """
     provider
     plan
     host image_transport
+    feature
     deploy
     describe launch_internals runtime actions
     testing __init__
@@ -69,7 +70,8 @@ SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_c
         'google': 'provider', 'paramiko': 'shell', 'av': 'image_transport',
         'foxglove': 'fogros2_monitor'}
 #: Found by their entry points, or started by the user: the core imports none of them.
-ABOVE = ('fogros2_monitor', 'fogros2_replicas', 'fogros2_share', 'ros2fog_cli', 'rigs')
+ABOVE = ('fogros2_features', 'fogros2_monitor', 'fogros2_replicas', 'fogros2_share',
+         'ros2fog_cli', 'rigs')
 #: All of the core but the import of types.
 BUT_TYPES = r'fogros2(?! import ros_types$)'
 
@@ -181,7 +183,8 @@ def test_exceptions_name_what_exists() -> None:
 
 
 @pytest.mark.parametrize(('folder', 'above'), [
-    ('fogros2', ABOVE), ('fogros2_monitor', ABOVE[1:]),
+    ('fogros2', ABOVE), ('fogros2_monitor', tuple(n for n in ABOVE if n != 'fogros2_monitor')),
+    ('fogros2_features', ABOVE[1:]),
     ('fogros2_replicas', (BUT_TYPES, 'fogros2_monitor', 'ros2fog_cli', 'rigs')),
     ('fogros2_share', (BUT_TYPES, 'fogros2_monitor', 'ros2fog_cli', 'rigs')),
     ('point_cloud_stream', (*ABOVE, 'fogros2')),

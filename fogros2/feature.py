@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a package can add to machines: keywords, a check, and steps with their undo.
+
+A feature is an entry point in the group ``fogros2.feature``. doc/developers/features.md shows how
+to write one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import contextlib
+from typing import Any, ClassVar, Protocol
+
+from fogros2 import plugin_system
+from fogros2.model import Machine, MachineSpec
+from fogros2.shell import Shell
+
+#: The group of entry points.
+GROUP = 'fogros2.feature'
+
+
+class RunningMachine(Protocol):
+    """
+    A machine that is up, as features see it.
+
+    :ivar machine: as the provider reported it.
+    :ivar shell: runs commands there and copies files.
+    :ivar vpn_address: the machine's address in the launch's VPN.
+    """
+
+    spec: MachineSpec
+    machine: Machine
+    shell: Shell
+    vpn_address: str
+
+    @property
+    def lost(self) -> str:
+        """Why the machine is gone or must not be used any more, '' while it is there."""
+
+    def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
+        """Report a step around a block, which may append details to the list that it gets."""
+
+
+class Feature:
+    """
+    A feature of machines; by default, each method does nothing.
+
+    ``options`` is a static method whose parameters are the feature's keywords in launch files, on
+    the command line and in files of defaults. Their annotations give the kinds of the values, and
+    each has a default. It raises ConfigurationError for a wrong value, and returns what the other
+    methods get as ``own``.
+    """
+
+    options: ClassVar[Callable[..., Any]]
+
+    def check(self, spec: MachineSpec, own: Any) -> None:
+        """
+        Check a machine that uses the feature before anything is created.
+
+        :raises FogError: the feature can't work there.
+        """
+
+    def machine(self, running: RunningMachine, own: Any) -> contextlib.AbstractContextManager[Any]:
+        """
+        Return a context that is entered when the machine is up, before its nodes start.
+
+        It is left when the launch gives the machine up, after its nodes and before the VPN end.
+        """
+        return contextlib.nullcontext()
+
+
+def load(name: str) -> Feature:
+    """
+    Return a feature.
+
+    :raises ConfigurationError: it is not installed.
+    """
+    feature: Feature = plugin_system.load(GROUP, name)()
+    return feature
+
+
+def options(name: str, given: Mapping[str, Any]) -> Any:
+    """
+    Return a feature's options from the values of its keywords.
+
+    :raises ConfigurationError: a value is wrong.
+    """
+    return plugin_system.load(GROUP, name).options(**given)

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bring folders of a machine to the robot before the launch gives the machine up."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+import contextlib
+import dataclasses
+import os
+from pathlib import Path
+import re
+import time
+from typing import Optional, TYPE_CHECKING, Union
+
+from fogros2 import untrusted
+from fogros2.errors import ConfigurationError, ConnectError, ShellError
+from fogros2.feature import Feature, RunningMachine
+from fogros2.host.checkpoint import check_folder
+from fogros2.model import Command, MachineSpec
+from fogros2.shell.command_line import remote_path
+
+if TYPE_CHECKING:
+    from launch import SomeSubstitutionsType
+
+    Value = Union[SomeSubstitutionsType, int, float]
+
+#: Where folders come to, and how many bytes they may have together, by default.
+TARGET, LIMIT = '~/fogros2', 10e9
+#: Seconds for one attempt to copy a folder, and the number of attempts on broken connections.
+TIMEOUT, ATTEMPTS = 3600.0, 3
+_UNITS = {'': 1.0, 'k': 1e3, 'M': 1e6, 'G': 1e9, 'T': 1e12}
+# Print the bytes in the folder {0}, nothing without the folder.
+_SIZE = '[ ! -d {0} ] || du -sb -- {0} | cut -f 1'
+
+
+@dataclasses.dataclass(frozen=True)
+class Wanted:
+    """
+    What to bring home.
+
+    :param folders: on the machine, as ``check_folder`` returns them.
+    :param target: folder on the robot; each launch makes one there.
+    :param limit: bytes of all folders together.
+    """
+
+    folders: tuple[str, ...]
+    target: Path
+    limit: float
+
+
+class Results(Feature):
+    """``fetch=['~/bags']``: folders that come home at the end."""
+
+    @staticmethod
+    def options(
+        fetch: Optional[Sequence[SomeSubstitutionsType]] = None,
+        fetch_to: Optional[SomeSubstitutionsType] = None,
+        fetch_limit: Optional[Value] = None,
+    ) -> Wanted:
+        """
+        Return what to bring home.
+
+        :param fetch: folders of the machine.
+        :param fetch_to: folder on the robot.
+        :param fetch_limit: how much they may have together, such as '2GB'.
+        """
+        folders = tuple(dict.fromkeys(
+            check_folder('fetch', str(folder)) for folder in fetch or ()))
+        target = Path(os.path.expanduser(str(fetch_to or TARGET)))
+        if not target.is_absolute():
+            raise ConfigurationError(f"fetch_to='{fetch_to}' is no absolute path",
+                                     "such as '~/fogros2'")
+        return Wanted(folders, target, LIMIT if fetch_limit is None else _bytes(str(fetch_limit)))
+
+    def check(self, spec: MachineSpec, own: Wanted) -> None:
+        """Check that this user may write to the folder on the robot."""
+        parent = next(path for path in (own.target, *own.target.parents) if path.exists())
+        if own.folders and not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
+            raise ConfigurationError(f"fetch_to='{own.target}' can't be written",
+                                     'name a folder of this user')
+
+    @contextlib.contextmanager
+    def machine(self, running: RunningMachine, own: Wanted) -> Iterator[None]:
+        """Bring the folders home when the machine's nodes have ended."""
+        yield
+        if own.folders and not running.lost:
+            with running.step('results') as detail:
+                detail.append(_bring(running, own))
+
+
+def _bring(running: RunningMachine, own: Wanted) -> str:
+    """
+    Copy the folders; return what was done.
+
+    :raises ShellError: together they are too large, or one can't be copied.
+    """
+    sizes = {folder: size for folder in own.folders
+             if (size := _size(running, folder)) is not None}
+    total = sum(sizes.values())
+    if total > own.limit:
+        raise ShellError(
+            f"{', '.join(sizes)} of '{running.spec.name}' have {total / 1e9:.3g} GB, more than "
+            f'fetch_limit={own.limit / 1e9:.3g} GB: they did not come home',
+            'raise fetch_limit=, or write less')
+    if not sizes:
+        return f"no {', '.join(own.folders)} there"
+    home = own.target / f'{running.spec.name}-{time.strftime("%Y%m%d-%H%M%S")}'
+    for folder, target in _targets(home, sizes).items():
+        for attempt in range(1, ATTEMPTS + 1):
+            try:
+                target.mkdir(parents=True, exist_ok=True)
+                # a block of the disk for each small file is not the machine's fault
+                running.shell.fetch(
+                    folder, target, known=None, limit=int(2 * own.limit), timeout=TIMEOUT)
+                break
+            except OSError as error:
+                raise ShellError(f"{target} can't be written: {error.strerror}") from error
+            except ConnectError:
+                if attempt == ATTEMPTS or running.lost:
+                    raise  # rsync kept what has arrived
+    return f'{total / 1e6:.3g} MB to {home}'
+
+
+def _targets(home: Path, folders: Mapping[str, float]) -> dict[str, Path]:
+    """Return where each folder comes to, by its last name, or all of them if two are the same."""
+    names = {folder: folder.rpartition('/')[2] for folder in folders}
+    if len({*names.values()}) < len(names):
+        names = {folder: folder.strip('~/').replace('/', '-') for folder in folders}
+    return {folder: home / name for folder, name in names.items()}
+
+
+def _size(running: RunningMachine, folder: str) -> Optional[int]:
+    """Return a folder's bytes, None without the folder."""
+    text = running.shell.run(
+        Command.script(_SIZE.format(remote_path(folder)), what=f'look at {folder}'),
+        timeout=60.0).stdout.strip()
+    try:
+        return untrusted.number(text) if text else None
+    except untrusted.InvalidMessage as error:
+        raise ShellError(f'the size of {folder} is not known: {error}',
+                         'the machine may be hijacked: delete it') from error
+
+
+def _bytes(text: str) -> float:
+    match = re.fullmatch(r'(\d+(?:\.\d+)?) ?([kMGT]?)B?', text)
+    if match is None or not float(match[1]):
+        raise ConfigurationError(f'fetch_limit={text!r} is no number of bytes', "such as '2GB'")
+    return float(match[1]) * _UNITS[match[2]]

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keywords of features in all forms of launch files, and their steps; results that come home."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from launch import LaunchContext
+from launch.frontend import Parser
+from launch.substitutions import LaunchConfiguration
+import pytest
+
+from fogros2 import AWSCloudInstance, ContainerInstance, plugin_system
+from fogros2.deploy import checks
+from fogros2.describe import defaults, features
+from fogros2.describe.overrides import Overrides
+from fogros2.errors import ConfigurationError, ConnectError, ShellError
+from fogros2.feature import Feature
+from fogros2.model import Endpoint, MachineSpec
+from fogros2.report import silent
+from fogros2.shell import connect
+from fogros2.testing.fakes import FakeProvider
+from fogros2.testing.plugins import instead
+from fogros2_features.results import Results
+
+BAGS = {'results': {'fetch': ['~/bags', '/var/log/x'], 'fetch_limit': '2GB'}}
+
+
+def spec(machine: Any, *overrides: str, **arguments: str) -> MachineSpec:
+    context = LaunchContext()
+    context.environment.update(os.environ)
+    context.launch_configurations.update(arguments)
+    return defaults.resolved(machine, Overrides(overrides) if overrides else None, context)
+
+
+def loaded(kind: str, text: str) -> Any:
+    source = io.StringIO(text.strip())
+    source.name = f'test.launch.{kind}'
+    entity, parser = Parser.load(source)
+    return parser.parse_description(entity).entities[0].machine
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the home of robot and machine, which is empty and without defaults."""
+    monkeypatch.setenv('HOME', str(tmp_path))
+    monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path / 'config'))
+    return tmp_path
+
+
+# -- keywords ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('machine', [
+    lambda: ContainerInstance(name='a', fetch=['~/bags', '/var/log/x'], fetch_limit='2GB'),
+    lambda: ContainerInstance(name='a', fetch=('$HOME/bags', '/var/log/x'), fetch_limit='2GB'),
+    lambda: loaded('xml', '<launch><fog_machine name="a" provider="container" '
+                   'fetch="~/bags, /var/log/x" fetch_limit="2GB"/></launch>'),
+    lambda: loaded('yaml', 'launch: [{fog_machine: {name: a, provider: container, '
+                   'fetch: [~/bags, /var/log/x], fetch_limit: 2GB}}]')])
+def test_keywords_of_a_feature_are_those_of_machines(machine: Any) -> None:
+    found = spec(machine()).features['results']
+    assert Results.options(**found) == Results.options(**BAGS['results'])
+
+
+def test_values_may_be_substitutions() -> None:
+    made = AWSCloudInstance(name='a', fetch=[['~/', LaunchConfiguration('folder')]])
+    assert spec(made, folder='maps').features == {'results': {'fetch': ['~/maps']}}
+
+
+def test_command_line_and_defaults_know_the_keywords(home: Path) -> None:
+    path = home / 'config/fogros2/fogros2.toml'
+    path.parent.mkdir(parents=True)
+    path.write_text("fetch_limit = '5GB'\n[container]\nfetch_to = '/tmp/here'\n")
+    made = ContainerInstance(name='a', fetch=['~/bags'])
+    assert spec(made, 'a=container,fetch_limit=1GB').features == {'results': {
+        'fetch': ['~/bags'], 'fetch_limit': '1GB', 'fetch_to': '/tmp/here'}}
+    assert spec(AWSCloudInstance(name='a')).features == {'results': {'fetch_limit': '5GB'}}
+    path.write_text('fetch = 3\n')
+    with pytest.raises(ConfigurationError, match='fetch = 3 has the wrong type'):
+        spec(made)
+
+
+@pytest.mark.parametrize(('given', 'said'), [
+    ({'fetch': '~/bags'}, "fetch='~/bags' is no list"),
+    ({'fetch': ['bags']}, "fetch='bags' is no folder"),
+    ({'fetch': ['~/../x']}, "fetch='~/../x' is no folder"),
+    ({'fetch_to': 'here'}, "fetch_to='here' is no absolute path"),
+    ({'fetch_limit': '2 apples'}, "fetch_limit='2 apples' is no number of bytes"),
+    ({'fetch_limit': 0}, "fetch_limit='0' is no number of bytes"),
+    ({'fetsch': ['~/bags']}, "no attribute 'fetsch'.*did you mean 'fetch'")])
+def test_wrong_values_are_refused(given: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigurationError, match=said):
+        spec(ContainerInstance(name='a', **given))
+
+
+def test_each_keyword_belongs_to_one_feature_alone() -> None:
+    own = [name for feature in plugin_system.names('fogros2.feature')
+           for name in features._keywords(feature)]
+    assert sorted(own) == sorted(features.keywords())
+
+
+# -- steps ---------------------------------------------------------------------------------------
+
+
+class Counting(Feature):
+    """Notes its calls."""
+
+    calls: list[Any] = []
+
+    @staticmethod
+    def options(count: int = 1) -> int:
+        return count
+
+    def check(self, spec: MachineSpec, own: int) -> None:
+        self.calls.append(('check', spec.name, own))
+
+
+def test_a_machine_is_checked_by_its_features(monkeypatch: pytest.MonkeyPatch) -> None:
+    instead(monkeypatch, 'fogros2.feature', {'counting': Counting})
+    made = MachineSpec('a', 'fake', features={'counting': {'count': 3}})
+    checks.check(made, FakeProvider(), rmw='', environment={}, programs=(), images=(),
+                 report=silent)
+    assert Counting.calls == [('check', 'a', 3)]
+
+
+def test_a_feature_that_is_not_installed_is_one_error() -> None:
+    made = MachineSpec('a', 'fake', features={'gone': {}})
+    with pytest.raises(ConfigurationError, match="there is no feature 'gone'"):
+        checks.check(made, FakeProvider(), rmw='', environment={}, programs=(), images=(),
+                     report=silent)
+
+
+# -- results -------------------------------------------------------------------------------------
+
+
+class Running:
+    """A machine whose home is the robot's."""
+
+    def __init__(self) -> None:
+        self.spec = MachineSpec('a', 'fake')
+        self.machine: Any = SimpleNamespace()
+        self.shell: Any = connect(Endpoint('local'), name='a')
+        self.vpn_address = ''
+        self.lost = ''
+        self.details: list[str] = []
+
+    @contextlib.contextmanager
+    def step(self, name: str) -> Any:
+        assert name == 'results'
+        yield self.details
+
+
+def brought(running: Running, **keywords: Any) -> list[str]:
+    """Run the end of a launch; return what came home, by path and content."""
+    own = Results.options(**keywords)
+    with Results().machine(running, own):
+        assert not own.target.exists()
+    return sorted(f'{path.relative_to(own.target).as_posix().partition("/")[2]}={path.read_text()}'
+                  for path in own.target.rglob('*') if path.is_file())
+
+
+def test_folders_come_home_when_the_launch_ends(home: Path) -> None:
+    for name in ('bags/deep/one', 'maps/one', 'other/maps/two'):
+        (home / name).parent.mkdir(parents=True)
+        (home / name).write_text(name)
+    running = Running()
+    found = brought(running, fetch=['~/bags', '~/none'])
+    assert found == ['bags/deep/one=bags/deep/one']
+    assert f' MB to {home}/fogros2/a-20' in running.details[0]
+    found = brought(running, fetch=['~/maps', '~/other/maps'], fetch_to=str(home / 'two'))
+    assert found == ['maps/one=maps/one', 'other-maps/two=other/maps/two']
+
+
+def test_machine_without_the_folders_is_said(home: Path) -> None:
+    running = Running()
+    assert brought(running, fetch=['~/bags']) == []
+    assert running.details == ['no ~/bags there'] and not (home / 'fogros2').exists()
+
+
+def test_too_large_folders_do_not_come_home(home: Path) -> None:
+    (home / 'bags').mkdir()
+    (home / 'bags/one').write_bytes(bytes(200_000))
+    with pytest.raises(ShellError, match='~/bags of .a. have 0.00020. GB, more than fetch_limit='):
+        brought(Running(), fetch=['~/bags'], fetch_limit='100kB')
+    assert not (home / 'fogros2').exists()
+
+
+def test_broken_connection_is_tried_again(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (home / 'bags').mkdir()
+    (home / 'bags/one').write_text('1')
+    running, tries = Running(), []
+    fetch = running.shell.fetch
+
+    def broken(*words: Any, **more: Any) -> None:
+        tries.append(words)
+        if len(tries) < 3:
+            raise ConnectError('the connection was lost')
+        fetch(*words, **more)
+
+    monkeypatch.setattr(running.shell, 'fetch', broken)
+    assert brought(running, fetch=['~/bags']) == ['bags/one=1'] and len(tries) == 3
+    tries[:] = []
+    running.lost = 'it was deleted'
+    assert brought(running, fetch=['~/bags'], fetch_to=str(home / 'two')) == [] and not tries
+
+
+def test_folder_on_the_robot_is_checked_before(home: Path) -> None:
+    (home / 'file').touch()
+    own = Results.options(fetch=['~/bags'], fetch_to=str(home / 'file/deep'))
+    with pytest.raises(ConfigurationError, match="fetch_to='.*file/deep' can't be written"):
+        Results().check(MachineSpec('a', 'fake'), own)
+    Results().check(MachineSpec('a', 'fake'), Results.options(fetch=['~/bags']))
+
+
+def test_machine_cannot_report_a_size_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    running = Running()
+    monkeypatch.setattr(running.shell, 'run', lambda *_, **__: SimpleNamespace(stdout='\x1b[2J'))
+    with pytest.raises(ShellError, match='size of ~/bags'):
+        brought(running, fetch=['~/bags'])
