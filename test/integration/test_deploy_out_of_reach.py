@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+import dataclasses
 import functools
 import json
 import os
@@ -17,7 +18,7 @@ import uuid
 import pytest
 
 from fogros2.agent_client import AgentClient, joined
-from fogros2.deploy import Launch
+from fogros2.deploy import Launch, undo
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.steps import arming
 from fogros2.deploy.steps.arming import Arming
@@ -77,6 +78,7 @@ def test_end_does_not_wait_for_an_unreachable_machine(cloud_network):
 def arm(start, machine, robot):
     """Return the machine's agent, or why it isn't to be had."""
     context, job = robot
+    job.record = dataclasses.replace(job.record, last=context.launch)
     job.machine, job.shell = machine, LocalShell(Endpoint('local'), name=job.name)
     # an install that takes 30 s was seen once: show what it waits for
     waiting = threading.Timer(20, lambda: print(run(Command(
@@ -140,7 +142,7 @@ def test_agent_is_removed_where_python_is_a_wrapper(root, tmp_path, monkeypatch)
                 input=json.dumps(config).encode() + b'\n' + joined().encode()), timeout=30)
     program = Path('/proc', Path(folder, 'agent.pid').read_text().strip(), 'cmdline')
     assert b'agent.py' in program.read_bytes()
-    run(Command(('sh', '-ec', arming._REMOVE, 'sh', folder, 'first',
+    run(Command(('sh', '-ec', undo._REMOVE, 'sh', folder, 'first',
                  f'{folder}/start-first.json')), timeout=30)
     assert not os.path.exists(folder)
     assert not program.exists() or not program.read_bytes()

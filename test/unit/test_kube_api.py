@@ -25,7 +25,7 @@ from fogros2.errors import Cancelled, DeadlineExceeded, PrerequisiteError
 from fogros2.kubernetes_client import ApiError, Unreachable
 from fogros2.store import Store
 from fogros2.testing.shell_contract import raised
-from fogros2.waiting import ON_ITS_WAY
+from fogros2.waiting import ON_ITS_WAY, wait_until
 
 pytest.importorskip('kubernetes', reason='needs the client: pip install kubernetes')
 
@@ -269,7 +269,7 @@ def test_forbidden_watch_is_reported(api, server):
 
 def test_a_watch_ends_with_the_launch_and_by_its_deadline(api, server):
     server.answers = [(200, ['hold']), (200, ['hold'])]
-    cancel = threading.Event()
+    before, cancel = {*threading.enumerate()}, threading.Event()
     timer = threading.Timer(0.2, cancel.set)
     timer.start()
     begin = time.monotonic()
@@ -278,7 +278,8 @@ def test_a_watch_ends_with_the_launch_and_by_its_deadline(api, server):
     raised(DeadlineExceeded, lambda: follow(api, lambda kind, thing: None, timeout=0.3))
     # nobody waits for a thread that reads on
     assert time.monotonic() - begin < ON_ITS_WAY
-    assert not [thread for thread in threading.enumerate() if thread.name == 'fog-watch']
+    wait_until(lambda: not [thread for thread in {*threading.enumerate()} - before
+                            if thread.name == 'fog-watch'], timeout=60, what='no thread')
 
 
 def test_something_else_can_end_a_watch(api, server):
