@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 import re
 import time
-from typing import Optional, TYPE_CHECKING, Union
+from typing import Optional, TYPE_CHECKING
 
 from fogros2 import untrusted
 from fogros2.errors import ConfigurationError, ConnectError, ShellError
@@ -21,8 +21,6 @@ from fogros2.shell.command_line import remote_path
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
-
-    Value = Union[SomeSubstitutionsType, int, float]
 
 #: Where folders come to, and how many bytes they may have together, by default.
 TARGET, LIMIT = '~/fogros2', 10e9
@@ -55,7 +53,7 @@ class Results(Feature):
     def options(
         fetch: Optional[Sequence[SomeSubstitutionsType]] = None,
         fetch_to: Optional[SomeSubstitutionsType] = None,
-        fetch_limit: Optional[Value] = None,
+        fetch_limit: Optional[SomeSubstitutionsType] = None,
     ) -> Wanted:
         """
         Return what to bring home.

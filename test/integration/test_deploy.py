@@ -232,6 +232,26 @@ def test_a_kept_machine_is_reused_by_the_next_launch(spec):
         assert second.down() == []
 
 
+@pytest.mark.parametrize('limit', ['1MB', '1kB'])
+def test_folders_come_home_before_the_machine_goes(spec, tmp_path, limit):
+    launch = Launch()
+    machine = launch.up(spec(features={'results': {
+        'fetch': ['~/bags'], 'fetch_to': str(tmp_path / 'home'), 'fetch_limit': limit}}))
+    try:
+        machine.shell.run(Command(
+            ('sh', '-c', 'mkdir -p ~/bags/deep && echo here >~/bags/deep/one'),
+            what='write'), timeout=60)
+    finally:
+        failures = launch.down()
+    if limit == '1kB':  # folders themselves have more
+        assert 'more than fetch_limit=1e-06 GB' in str(failures[0]) and len(failures) == 1
+        assert not (tmp_path / 'home').exists()
+    else:
+        assert failures == []
+        one, = (tmp_path / 'home').glob(f'planner-{RUN}-*/bags/deep/one')
+        assert one.read_text() == 'here\n'
+
+
 def test_a_stopped_machine_is_started_by_the_next_launch(spec):
     store = Store()
     first = Launch(store=store)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import contextlib
 import io
 import os
@@ -15,7 +16,7 @@ from launch.frontend import Parser
 from launch.substitutions import LaunchConfiguration
 import pytest
 
-from fogros2 import AWSCloudInstance, ContainerInstance, plugin_system
+from fogros2 import AWSCloudInstance, ContainerInstance, plugin_system, process
 from fogros2.deploy import checks
 from fogros2.describe import defaults, features
 from fogros2.describe.overrides import Overrides
@@ -49,6 +50,7 @@ def loaded(kind: str, text: str) -> Any:
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the home of robot and machine, which is empty and without defaults."""
     monkeypatch.setenv('HOME', str(tmp_path))
+    monkeypatch.setitem(process._ENVIRONMENT, 'HOME', str(tmp_path))
     monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path / 'config'))
     return tmp_path
 
@@ -108,6 +110,15 @@ def test_each_keyword_belongs_to_one_feature_alone() -> None:
 # -- steps ---------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def check(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Return a function that checks a machine with features."""
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(shell_kind='local'))
+    return lambda **given: checks.check(
+        MachineSpec('a', 'fake', features=given), FakeProvider(), rmw='', environment={},
+        programs=(), images=(), report=silent)
+
+
 class Counting(Feature):
     """Notes its calls."""
 
@@ -121,19 +132,17 @@ class Counting(Feature):
         self.calls.append(('check', spec.name, own))
 
 
-def test_a_machine_is_checked_by_its_features(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_is_checked_by_its_features(
+    check: Callable[..., None], monkeypatch: pytest.MonkeyPatch,
+) -> None:
     instead(monkeypatch, 'fogros2.feature', {'counting': Counting})
-    made = MachineSpec('a', 'fake', features={'counting': {'count': 3}})
-    checks.check(made, FakeProvider(), rmw='', environment={}, programs=(), images=(),
-                 report=silent)
+    check(counting={'count': 3})
     assert Counting.calls == [('check', 'a', 3)]
 
 
-def test_a_feature_that_is_not_installed_is_one_error() -> None:
-    made = MachineSpec('a', 'fake', features={'gone': {}})
+def test_a_feature_that_is_not_installed_is_one_error(check: Callable[..., None]) -> None:
     with pytest.raises(ConfigurationError, match="there is no feature 'gone'"):
-        checks.check(made, FakeProvider(), rmw='', environment={}, programs=(), images=(),
-                     report=silent)
+        check(gone={})
 
 
 # -- results -------------------------------------------------------------------------------------
