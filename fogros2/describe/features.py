@@ -27,10 +27,20 @@ def own(values: Mapping[str, Any]) -> dict[str, Any]:
     """
     Return those of some values by name that are of features, marked by their kinds.
 
-    :raises ConfigurationError: a value has a wrong type.
+    :raises ConfigurationError: a value has a wrong type, or is known already and wrong.
     """
     mine = {name: keyword for name, keyword in keywords().items() if name in values}
-    return marked(mine, values)
+    result = marked(mine, values)
+    for name in mine:
+        if _is_plain(values[name]):
+            by_feature({name: values[name]})
+    return result
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, (list, tuple)):
+        return all(isinstance(one, str) for one in value)
+    return isinstance(value, (str, int, float))
 
 
 def by_feature(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
