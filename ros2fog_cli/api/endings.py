@@ -341,6 +341,9 @@ def why_end(
     if entry.gone:
         return 'gone at its provider' if entry.machine_id else 'its launch is gone'
     assert entry.machine is not None
+    if record is not None and record.launch and record.spec.on_exit == 'delete':
+        # also if it was made and not started yet
+        return 'its launch is gone'
     if entry.machine.state is MachineState.STOPPED:
         since = stopped_at if stopped_at is not None else entry.created
         if since is not None and now - since > keep_stopped:
@@ -348,8 +351,6 @@ def why_end(
         return ''
     if entry.expires is not None and now > entry.expires + GRACE:
         return 'past its lifetime'
-    if record is not None and record.launch and record.spec.on_exit == 'delete':
-        return 'its launch is gone'
     return ''
 
 

@@ -500,6 +500,14 @@ def test_delete_undoes_what_a_launch_has_made_on_a_host(
     assert Store().exists('lab') == fails
 
 
+def test_gc_deletes_a_machine_whose_launch_died_before_its_start() -> None:
+    """The engine has made the container: it is stopped, and nobody keeps it."""
+    machine('a', state=MachineState.STOPPED)
+    record('a', None, **dead())
+    assert run('gc') == 0
+    assert 'id-a' not in Memory.machines and not Store().exists('a')
+
+
 def test_gc_closes_the_ports_of_a_kept_machines_launch(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
