@@ -13,7 +13,7 @@ import contextlib
 from typing import Any, ClassVar, Protocol
 
 from fogros2 import plugin_system
-from fogros2.model import Machine, MachineSpec
+from fogros2.model import Command, Machine, MachineSpec
 from fogros2.shell import Shell
 
 #: The group of entry points.
@@ -25,7 +25,7 @@ class RunningMachine(Protocol):
     A machine that is up, as features see it.
 
     :ivar machine: as the provider reported it.
-    :ivar shell: runs commands there and copies files.
+    :ivar shell: copies files; for commands there is ``run``.
     :ivar vpn_address: the machine's address in the launch's VPN.
     """
 
@@ -37,6 +37,14 @@ class RunningMachine(Protocol):
     @property
     def lost(self) -> str:
         """Why the machine is gone or must not be used any more, '' while it is there."""
+
+    def run(self, command: Command, *, timeout: float) -> str:
+        """
+        Run a command there; return its output. Ctrl-C ends it on the way up.
+
+        :param timeout: seconds; on the way down a machine that does not answer gets few.
+        :raises FogError: the command failed, the machine does not answer, or the launch ends.
+        """
 
     def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
         """Report a step around a block, which may append details to the list that it gets."""
@@ -65,7 +73,8 @@ class Feature:
         """
         Return a context that is entered when the machine is up, before its nodes start.
 
-        It is left when the launch gives the machine up, after its nodes and before the VPN end.
+        It is left when the launch gives the machine up, after its nodes and before the machine
+        end. On a machine that stays, agent and VPN may have ended by then; the shell works.
         """
         return contextlib.nullcontext()
 

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 import contextlib
 import dataclasses
+import itertools
 import os
 from pathlib import Path
 import re
@@ -13,7 +14,7 @@ import time
 from typing import Optional, TYPE_CHECKING
 
 from fogros2 import untrusted
-from fogros2.errors import ConfigurationError, ConnectError, ShellError
+from fogros2.errors import ConfigurationError, ConnectError, FogError, ShellError
 from fogros2.feature import Feature, RunningMachine
 from fogros2.host.checkpoint import check_folder
 from fogros2.model import Command, MachineSpec
@@ -26,9 +27,11 @@ if TYPE_CHECKING:
 TARGET, LIMIT = '~/fogros2', 10e9
 #: Seconds for one attempt to copy a folder, and the number of attempts on broken connections.
 TIMEOUT, ATTEMPTS = 3600.0, 3
+#: Bytes that a folder may take on the disk beyond twice its size: each small file has a block.
+SLACK = 100e6
 _UNITS = {'': 1.0, 'k': 1e3, 'M': 1e6, 'G': 1e9, 'T': 1e12}
-# Print the bytes in the folder {0}, nothing without the folder.
-_SIZE = '[ ! -d {0} ] || du -sb -- {0} | cut -f 1'
+# Print the bytes in the folder {0}, or in the one that it links to; nothing without the folder.
+_SIZE = '[ ! -d {0} ] || du -sb -- {0}/. | cut -f 1'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,8 +75,11 @@ class Results(Feature):
 
     def check(self, spec: MachineSpec, own: Wanted) -> None:
         """Check that this user may write to the folder on the robot."""
-        parent = next(path for path in (own.target, *own.target.parents) if path.exists())
-        if own.folders and not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
+        if not own.folders:
+            return
+        # not by Path: another account's folder may be closed to this one
+        parent = next(path for path in (own.target, *own.target.parents) if os.path.exists(path))
+        if not (os.path.isdir(parent) and os.access(parent, os.W_OK | os.X_OK)):
             raise ConfigurationError(f"fetch_to='{own.target}' can't be written",
                                      'name a folder of this user')
 
@@ -90,48 +96,61 @@ def _bring(running: RunningMachine, own: Wanted) -> str:
     """
     Copy the folders; return what was done.
 
-    :raises ShellError: together they are too large, or one can't be copied.
+    :raises FogError: together they are too large, or one can't be copied; the others are.
     """
     sizes = {folder: size for folder in own.folders
              if (size := _size(running, folder)) is not None}
+    missing = [folder for folder in own.folders if folder not in sizes]
     total = sum(sizes.values())
     if total > own.limit:
         raise ShellError(
             f"{', '.join(sizes)} of '{running.spec.name}' have {total / 1e9:.3g} GB, more than "
             f'fetch_limit={own.limit / 1e9:.3g} GB: they did not come home',
             'raise fetch_limit=, or write less')
-    if not sizes:
-        return f"no {', '.join(own.folders)} there"
     home = own.target / f'{running.spec.name}-{time.strftime("%Y%m%d-%H%M%S")}'
+    failures = []
     for folder, target in _targets(home, sizes).items():
-        for attempt in range(1, ATTEMPTS + 1):
-            try:
-                target.mkdir(parents=True, exist_ok=True)
-                # a block of the disk for each small file is not the machine's fault
-                running.shell.fetch(
-                    folder, target, known=None, limit=int(2 * own.limit), timeout=TIMEOUT)
-                break
-            except OSError as error:
-                raise ShellError(f"{target} can't be written: {error.strerror}") from error
-            except ConnectError:
-                if attempt == ATTEMPTS or running.lost:
-                    raise  # rsync kept what has arrived
-    return f'{total / 1e6:.3g} MB to {home}'
+        try:
+            _copy(running, folder, target, sizes[folder])
+        except FogError as error:
+            failures.append(error)
+    if failures:
+        raise failures[0]
+    return ', '.join([f'{total / 1e6:.3g} MB to {home}'] * bool(sizes)
+                     + [f"no {', '.join(missing)} there"] * bool(missing))
 
 
-def _targets(home: Path, folders: Mapping[str, float]) -> dict[str, Path]:
-    """Return where each folder comes to, by its last name, or all of them if two are the same."""
-    names = {folder: folder.rpartition('/')[2] for folder in folders}
-    if len({*names.values()}) < len(names):
-        names = {folder: folder.strip('~/').replace('/', '-') for folder in folders}
-    return {folder: home / name for folder, name in names.items()}
+def _copy(running: RunningMachine, folder: str, target: Path, size: int) -> None:
+    for attempt in range(1, ATTEMPTS + 1):
+        try:
+            target.mkdir(parents=True, exist_ok=True)
+            # the machine may send more than it said
+            running.shell.fetch(folder, target, known=None, limit=int(2 * size + SLACK),
+                                timeout=TIMEOUT)
+            return
+        except OSError as error:
+            raise ShellError(f"{target} can't be written: {error.strerror}") from error
+        except ConnectError:
+            if attempt == ATTEMPTS:
+                raise  # rsync kept what has arrived
+
+
+def _targets(home: Path, folders: Iterable[str]) -> dict[str, Path]:
+    """Return where each folder comes to: by its last name, with a number if that is taken."""
+    targets: dict[str, Path] = {}
+    for folder in folders:
+        name = folder.rpartition('/')[2]
+        numbered = (home / (f'{name}-{number}' if number > 1 else name)
+                    for number in itertools.count(1))
+        targets[folder] = next(path for path in numbered if path not in targets.values())
+    return targets
 
 
 def _size(running: RunningMachine, folder: str) -> Optional[int]:
     """Return a folder's bytes, None without the folder."""
-    text = running.shell.run(
+    text = running.run(
         Command.script(_SIZE.format(remote_path(folder)), what=f'look at {folder}'),
-        timeout=60.0).stdout.strip()
+        timeout=600.0).strip()
     try:
         return untrusted.number(text) if text else None
     except untrusted.InvalidMessage as error:

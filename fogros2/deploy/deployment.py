@@ -92,17 +92,17 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
     # pushed now, so that they end after the nodes and before the VPN
     features = {name: contextlib.ExitStack() for name in job.spec.features}
     for name, ending in features.items():
-        job.undoing(name, ending.close)
+        job.undo.add(name, ending.close)
     # a second time, so that the nodes stop first on the way down
     job.makes(NODES)
     dds.start_router(context, job)
     connection.enter_vpn()
     job.undo.callback(ClockComparison(job.name, job.heartbeat, context.report).close)
-    job.failed = False
     running = RunningMachine(context, job, modules, containers, joining.redial)
     for name, ending in features.items():
         ending.enter_context(feature.load(name).machine(
             running, feature.options(name, job.spec.features[name])))
+    job.failed = False
     return running
 
 

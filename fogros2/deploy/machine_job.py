@@ -98,8 +98,11 @@ class MachineJob(Site):
             return
         if self.remains if made.kind in PORTS else self.survives:
             unmake(self, made)
+        self.forget(made)
+
+    def forget(self, made: Made) -> None:
+        """Note, with the record's next change, that something is undone: an undo may run twice."""
         with self._saving:
-            # written with the record's next change: an undo may run twice
             self.record = dataclasses.replace(self.record, made=tuple(
                 other for other in self.record.made if other != made))
 
@@ -228,8 +231,10 @@ class MachineJob(Site):
                     'release', timeout=self.timeout(self._context.timeouts.command),
                     silent=SILENCE_TIMEOUT, launch=self._context.launch,
                     on_exit=self.spec.on_exit, exit=not self.capabilities.agent_program)
-            except DeadlineExceeded:
-                self.out_of_reach()
+            except FogError as error:
+                self._released = False
+                if isinstance(error, DeadlineExceeded):
+                    self.out_of_reach()
                 raise
 
     def out_of_reach(self) -> None:

@@ -20,7 +20,7 @@ from fogros2.deploy.undo import MONITOR_PORT
 from fogros2.errors import AgentError, DeadlineExceeded, FogError
 from fogros2.events import Event
 from fogros2.host import idle
-from fogros2.model import host_port, Machine, NodeSpec
+from fogros2.model import Command, host_port, Machine, NodeSpec
 from fogros2.waiting import wait_until
 
 
@@ -50,6 +50,10 @@ class RunningMachine(Step):
         self._lock = threading.Lock()
         self._callback: Optional[EventCallback] = None
         self._lost = ''
+        #: Why the machine was ended while its launch goes on: its events are ignored since.
+        self._ended = ''
+        #: Whether undo steps have begun.
+        self._ending = False
         self._published: dict[int, tuple[str, int]] = {}
         job.undo.callback(Watch(
             context, job, gone=self._gone, found=found, lost=self._is_lost).close)
@@ -58,6 +62,17 @@ class RunningMachine(Step):
     def lost(self) -> str:
         """Why the machine is gone or must not be used any more, '' while it is there."""
         return self._lost
+
+    def run(self, command: Command, *, timeout: float) -> str:
+        """
+        Run a command on the machine; return its output.
+
+        :raises ShellError: it failed, or the machine does not answer.
+        :raises Cancelled: the launch is ending, and the machine still came up.
+        """
+        if not self._ending:
+            return self._job.run(command, timeout=timeout)
+        return self.shell.run(command, timeout=self._job.timeout(timeout)).stdout
 
     def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
         """Report a step of this machine around a block; see :func:`fogros2.report.step`."""
@@ -123,11 +138,11 @@ class RunningMachine(Step):
         def tell(event: Event) -> None:
             # an agent that exits at the end of the launch is expected
             expected = event['event'] == 'connection' and self._context.ending.is_set()
-            if not self._lost and not expected:
+            if not (self._lost or self._ended or expected):
                 callback(event)
 
         with self._lock:
-            self._callback, lost = callback, self._lost
+            self._callback, lost = callback, self._lost or self._ended
         if lost:
             callback({'event': 'lost', 'reason': lost})
             return
@@ -189,14 +204,15 @@ class RunningMachine(Step):
         self.heartbeat.close()
         self._context.provider.destroy(self._job.machine_id)
         self._job.gone = self._job.deleted = True
-        self._job.undo.close()
+        self.close()
 
     def end(self, reason: str) -> None:
         """End the machine as its ``on_exit`` says; its further events are ignored."""
         with self._lock:
-            self._lost = reason
+            self._ended = reason
         self.close()
 
     def close(self) -> None:
         """End the machine as its ``on_exit`` says."""
+        self._ending = True
         self._job.undo.close()

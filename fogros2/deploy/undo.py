@@ -10,12 +10,12 @@ launch itself, and ``ros2 fog delete``, ``ros2 fog gc`` or the next launch for o
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import contextlib
 import time
 
 from fogros2 import plugin_system
-from fogros2.errors import FogError
+from fogros2.errors import ConnectError, DeadlineExceeded, FogError
 from fogros2.host import containers
 from fogros2.model import Command, Machine
 from fogros2.provider import Provider
@@ -161,9 +161,22 @@ def close_ports(site: Site) -> tuple[Made, ...]:
 
     The machine's agent undoes the rest by itself.
 
-    :raises FogError: one may still be open.
+    :raises FogError: one may still be open; the others are closed.
     """
-    for made in reversed(site.record.made):
-        if made.kind in PORTS:
-            unmake(site, made)
+    failures = unmake_all(site, [made for made in site.record.made if made.kind in PORTS])
+    if failures:
+        raise failures[0]
     return tuple(made for made in site.record.made if made.kind not in PORTS)
+
+
+def unmake_all(site: Site, things: Sequence[Made]) -> list[FogError]:
+    """Undo several things, the last made first; return the errors of those that failed."""
+    failures = []
+    for made in reversed(things):
+        try:
+            unmake(site, made)
+        except FogError as error:
+            failures.append(error)
+            if isinstance(error, (ConnectError, DeadlineExceeded)):
+                break  # the others would wait for the same machine
+    return failures

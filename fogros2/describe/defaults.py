@@ -146,7 +146,8 @@ def apply(
                if name not in SETTINGS and spec.options.get(name, '') == ''}
     result = dataclasses.replace(
         spec, options={**spec.options, **options},
-        features=features.merged(features.by_feature(more), spec.features), **settings)
+        features=features.merged(features.by_feature(features.known(features.own(more))),
+                                 spec.features), **settings)
     check_loss(result)
     return result
 

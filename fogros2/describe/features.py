@@ -4,36 +4,57 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-import functools
-from typing import Any
+from typing import Any, cast
 
 from fogros2 import plugin_system
+from fogros2.describe import values
 from fogros2.describe.kinds import Keyword, marked, parameters_of
+from fogros2.errors import ConfigurationError
 from fogros2.feature import GROUP, options
 
 
-@functools.cache
 def keywords() -> Mapping[str, Keyword]:
-    """Return the keywords of all features."""
-    return {name: keyword for feature in plugin_system.names(GROUP)
-            for name, keyword in _keywords(feature).items()}
+    """
+    Return the keywords of all features.
+
+    :raises ConfigurationError: two features have the same.
+    """
+    result: dict[str, Keyword] = {}
+    for feature in plugin_system.names(GROUP):
+        for name, keyword in _keywords(feature).items():
+            if name in result:
+                raise ConfigurationError(f"the feature '{feature}' and another have the same "
+                                         f"keyword '{name}'", 'uninstall one of them')
+            result[name] = keyword
+    return result
 
 
 def _keywords(feature: str) -> Mapping[str, Keyword]:
     return parameters_of(plugin_system.load(GROUP, feature).options)
 
 
-def own(values: Mapping[str, Any]) -> dict[str, Any]:
+def own(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     Return those of some values by name that are of features, marked by their kinds.
 
     :raises ConfigurationError: a value has a wrong type, or is known already and wrong.
     """
-    mine = {name: keyword for name, keyword in keywords().items() if name in values}
-    result = marked(mine, values)
-    for name in mine:
-        if _is_plain(values[name]):
-            by_feature({name: values[name]})
+    mine = {name: keyword for name, keyword in keywords().items() if name in given}
+    result = marked(mine, given)
+    by_feature(known({name: value for name, value in result.items() if _is_plain(given[name])}))
+    return result
+
+
+def known(given: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return marked values, which have no substitutions, in their types.
+
+    :raises ConfigurationError: one can't be converted.
+    """
+    result = {}
+    for name, value in given.items():
+        with values.named(name):
+            result[name] = values.resolve(cast(Any, None), value)
     return result
 
 
@@ -43,18 +64,21 @@ def _is_plain(value: Any) -> bool:
     return isinstance(value, (str, int, float))
 
 
-def by_feature(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def by_feature(given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """
     Return the values of keywords by feature, as a MachineSpec has them; check them.
+
+    An empty text is what an argument of a launch file has without a value.
 
     :raises ConfigurationError: a value is wrong.
     """
     result = {}
-    for feature in plugin_system.names(GROUP) if values else ():
-        given = {name: values[name] for name in _keywords(feature) if name in values}
-        if given:
-            options(feature, given)
-            result[feature] = given
+    given = {name: value for name, value in given.items() if value is not None and value != ''}
+    for feature in plugin_system.names(GROUP) if given else ():
+        mine = {name: given[name] for name in _keywords(feature) if name in given}
+        if mine:
+            options(feature, mine)
+            result[feature] = mine
     return result
 
 

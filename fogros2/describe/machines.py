@@ -90,7 +90,7 @@ class CloudInstance:
     :param share: topics, such as '/map', that pass between this launch and those of other robots
         whose machines are on the same host and list them too; serialized, with their QoS.
     :param options: the provider's own options; subclasses set it.
-    :param unknown: keywords of features, see doc/howto/features.md.
+    :param unknown: keywords of features, see doc/developers/features.md.
     :raises ConfigurationError: an unknown keyword (the hint names the nearest), or a wrong value.
     """
 
@@ -321,8 +321,8 @@ class CloudInstance:
                 apt=self._wanted(context, 'apt'), pip=self._wanted(context, 'pip'),
                 share=self._wanted(context, 'share'),
                 features=features.by_feature({
-                    key: self._resolved(context, key, value)
-                    for key, value in self._features.items() if value is not None}), **settings)
+                    key: self._converted(context, key, value)
+                    for key, value in self._features.items()}), **settings)
             self._check_findable(spec.on_exit)
             check_loss(spec)
             self._spec = spec
@@ -332,6 +332,10 @@ class CloudInstance:
         wanted = [value for some in self._lists[program]
                   for value in values.resolve(context, some)]
         return tuple(dict.fromkeys(_LIST_CHECKS[program](str(value)) for value in wanted))
+
+    def _converted(self, context: LaunchContext, keyword: str, value: Any) -> Any:
+        with values.named(keyword):
+            return values.resolve(context, value)
 
     def _resolved(self, context: LaunchContext, keyword: str, value: Any) -> Any:
         with values.named(keyword):

@@ -20,10 +20,9 @@ from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
 from fogros2.deploy import requests
 from fogros2.deploy.robot import clear
-from fogros2.deploy.undo import close_ports, Site, unmake
+from fogros2.deploy.undo import close_ports, PORTS, Site, unmake_all, VPN, WATCHDOG
 from fogros2.errors import (
     AgentError,
-    CommandError,
     ConfigurationError,
     DeadlineExceeded,
     FogError,
@@ -36,7 +35,7 @@ from fogros2.model import Command, Machine, MachineState
 from fogros2.provider import Provider
 from fogros2.report import Reporter
 from fogros2.shell import Shell
-from fogros2.store import process_alive, Record, robot_id, Store
+from fogros2.store import Made, process_alive, Record, robot_id, Store
 from fogros2.vpn import owner
 from fogros2.waiting import Timeouts, wait_until
 from ros2fog_cli.api import machines, reach
@@ -211,6 +210,7 @@ class _Left(Site):
             record, spec=dataclasses.replace(record.spec, on_exit='delete'))
         self.machine = machine
         self._shell = shell
+        self._released = False
 
     @property
     def provider(self) -> Provider:
@@ -223,6 +223,9 @@ class _Left(Site):
 
     def release(self) -> None:
         assert self._shell is not None
+        if self._released:
+            return
+        self._released = True
         with _agent(self.record, self._shell) as client, contextlib.suppress(AgentError):
             if client is not None:  # else it has ended by itself
                 client.request('release', on_exit='delete', exit=True, timeout=30.0)
@@ -232,6 +235,7 @@ def _leave(record: Record, machine: Machine, *, force: bool) -> None:
     """Undo what a launch has made on a computer that FogROS2 does not own."""
     if record.shell is None:
         return
+    joined = bool(machines.load(record.provider).invitation(record.spec))
     shell = shells.connect(record.shell, name=record.name, timeout=10.0)
     try:
         with _agent(record, shell) as client, contextlib.suppress(AgentError):
@@ -241,18 +245,15 @@ def _leave(record: Record, machine: Machine, *, force: bool) -> None:
                     return  # our agent is gone, and another robot uses the computer now
                 if not force and not _sure(record) and _hears_launch(client):
                     raise _used(record)
-        site = _Left(record, machine, shell)
-        failures = []
-        for made in reversed(record.made):
-            try:
-                unmake(site, made)
-            except CommandError as error:
-                failures.append(error)  # the others have to go nevertheless
+        # guests may have kept the VPN after the launch's own end, which is not in ``made`` then
+        always = [Made(WATCHDOG)] * (bool(record.agent) and not joined) \
+            + [Made(VPN)] * (record.vpn is not None)
+        failures = unmake_all(_Left(record, machine, shell), [
+            *always, *(made for made in record.made if made not in always)])
         if failures:
             raise failures[0]
     except (ShellError, DeadlineExceeded):
-        # another robot's machine may have forgotten this computer
-        if not force and not machines.load(record.provider).invitation(record.spec):
+        if not force and not joined:  # another robot's machine may have forgotten this computer
             raise
     finally:
         shell.close()
@@ -291,7 +292,8 @@ def due(
         elif reason:
             yield Due('leftovers of' if entry.gone else 'machine', entry.name, reason,
                       functools.partial(delete, entry, store, report))
-        elif dead and record is not None and not record.damage:
+        elif record is not None and not record.damage and (dead or not record.launch_alive and (
+                entry.machine is not None and any(made.kind in PORTS for made in record.made))):
             yield Due('leftovers of', entry.name, 'its launch is gone',
                       functools.partial(let_go, record, entry.machine, store))
     for record, age in store.requests():
@@ -339,6 +341,9 @@ def why_end(
     if entry.gone:
         return 'gone at its provider' if entry.machine_id else 'its launch is gone'
     assert entry.machine is not None
+    if record is not None and record.launch and record.spec.on_exit == 'delete':
+        # also if it was made and not started yet
+        return 'its launch is gone'
     if entry.machine.state is MachineState.STOPPED:
         since = stopped_at if stopped_at is not None else entry.created
         if since is not None and now - since > keep_stopped:
@@ -346,8 +351,6 @@ def why_end(
         return ''
     if entry.expires is not None and now > entry.expires + GRACE:
         return 'past its lifetime'
-    if record is not None and record.launch and record.spec.on_exit == 'delete':
-        return 'its launch is gone'
     return ''
 
 
@@ -384,12 +387,14 @@ def let_go(record: Record, machine: Optional[Machine], store: Store) -> None:
 
     :raises FogError: a resource could not be cleaned up.
     """
-    folder = store.root / 'launches' / record.launch
     with store.lock(record.name):
-        made = record.made if machine is None else close_ports(_Left(record, machine))
-        clear(folder)
-        store.save(dataclasses.replace(
-            record, launch='', pid=0, pid_start=0, robot_vpn=None, monitor_open='', made=made))
+        if record.launch:
+            clear(store.root / 'launches' / record.launch)
+        record = store.save(dataclasses.replace(
+            record, launch='', pid=0, pid_start=0, robot_vpn=None))
+        if machine is not None:
+            store.save(dataclasses.replace(
+                record, monitor_open='', made=close_ports(_Left(record, machine))))
 
 
 def leftovers(store: Store, now: Optional[float] = None) -> list[Path]:

@@ -21,11 +21,13 @@ from fogros2 import ros2_daemon
 from fogros2.deploy import Launch
 from fogros2.deploy import launch as launched
 from fogros2.errors import FogError, NameTaken, WorkspaceError
+from fogros2.feature import Feature
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
 from fogros2.provider.container import entry as container_entry
 from fogros2.report import ClockMeasured, StepDone, StepFailed, StepStarted
 from fogros2.store import Store
+from fogros2.testing.plugins import instead
 from fogros2.waiting import wait_until
 from ros2fog_cli.api import doctor
 
@@ -250,6 +252,26 @@ def test_folders_come_home_before_the_machine_goes(spec, tmp_path, limit):
         assert failures == []
         one, = (tmp_path / 'home').glob(f'planner-{RUN}-*/bags/deep/one')
         assert one.read_text() == 'here\n'
+
+
+class Failing(Feature):
+    """Ends the machine that it is used on."""
+
+    @staticmethod
+    def options():
+        return None
+
+    def machine(self, running, own):
+        assert running.run(Command(('echo', 'up'), what='look'), timeout=60) == 'up\n'
+        raise Injected('no')
+
+
+def test_machine_whose_feature_fails_is_deleted(spec, monkeypatch):
+    instead(monkeypatch, 'fogros2.feature', {'failing': Failing})
+    launch = Launch()
+    with pytest.raises(Injected):
+        launch.up(spec(on_exit='keep', features={'failing': {}}))
+    assert launch.down() == [] and not launch.store.exists(spec().name)
 
 
 def test_a_stopped_machine_is_started_by_the_next_launch(spec):

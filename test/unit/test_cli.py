@@ -465,13 +465,13 @@ def test_delete_does_not_wait_for_an_agent_that_ended(monkeypatch: pytest.Monkey
     def program(status: int) -> Any:
         return lambda c: ran.append(' '.join(c.argv)) or Result(status, '', '')
 
-    shell = FakeShell(handlers={'test': program(1), 'rm': program(0)})
+    shell = FakeShell(handlers={'test': program(1), 'sh': program(0)})
     monkeypatch.setattr(endings.shells, 'connect', lambda *_, **__: shell)
     made = machine('lab', provider='untagged', owned=False)
     record('lab', provider='untagged', shell=made.shell, agent='/run/fogros2/lab',
            agent_program='/run/fogros2/lab/agent.py', made=(Made(undo.NODES),), **dead())
     assert run('delete', 'lab', '--yes') == 0
-    assert {*ran} == {'test -e /run/fogros2/lab/agent.py'}
+    assert ran.count('test -e /run/fogros2/lab/agent.py') == 2 and len(ran) == 3
     assert shell.opened == [] and shell.closed == 1
 
 
@@ -500,6 +500,14 @@ def test_delete_undoes_what_a_launch_has_made_on_a_host(
     assert Store().exists('lab') == fails
 
 
+def test_gc_deletes_a_machine_whose_launch_died_before_its_start() -> None:
+    """The engine has made the container: it is stopped, and nobody keeps it."""
+    machine('a', state=MachineState.STOPPED)
+    record('a', None, **dead())
+    assert run('gc') == 0
+    assert 'id-a' not in Memory.machines and not Store().exists('a')
+
+
 def test_gc_closes_the_ports_of_a_kept_machines_launch(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -523,9 +531,25 @@ def test_gc_tries_ports_again_that_could_not_be_closed(
     monkeypatch.setattr(Memory, 'allow', Mock(side_effect=[ProviderError('busy'), None]))
     machine('a')
     record('a', on_exit='keep', made=(Made(undo.SSH_PORT, 22),), **dead())
+    folder = Store().launch('abc123')
     assert run('gc') == 1 and 'busy' in capsys.readouterr().out
-    assert Store().load('a').made == (Made(undo.SSH_PORT, 22),)
+    after = Store().load('a')
+    assert (after.launch, after.made) == ('', (Made(undo.SSH_PORT, 22),))
+    assert not folder.exists(), 'nothing else waits for the port'
     assert run('gc') == 0 and Store().load('a').made == ()
+    assert run('gc') == 0 and 'nothing to clear' in capsys.readouterr().out
+
+
+def test_delete_ends_what_guests_have_kept_on_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The launch has left it to them at its own end."""
+    shell = FakeShell(handlers={
+        'test': lambda c: Result(1, '', ''), 'sh': lambda c: Result(0, '', '')})
+    monkeypatch.setattr(endings.shells, 'connect', lambda *_, **__: shell)
+    made = machine('lab', provider='untagged', owned=False)
+    vpn = VpnInterface('fogabc123m0', '198.18.0.2', '198.18.0.0/24', 51820, '/none')
+    record('lab', provider='untagged', shell=made.shell, vpn=vpn, on_exit='keep', launch='')
+    assert run('delete', 'lab', '--yes') == 0
+    assert next(WireGuard().down(vpn)) in shell.commands
 
 
 def test_lifetime_of_a_reused_machine_starts_again() -> None:

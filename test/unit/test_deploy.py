@@ -17,7 +17,7 @@ import pytest
 
 from fogros2 import invitation, plan, process
 from fogros2.agent_client import AgentClient
-from fogros2.deploy import Launch, robot_vpn
+from fogros2.deploy import Launch, robot_vpn, undo
 from fogros2.deploy import launch as deployed
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.robot_vpn import VpnMember
@@ -57,7 +57,7 @@ from fogros2.model import (
 )
 from fogros2.report import StepDone, StepFailed
 from fogros2.shell import host_key
-from fogros2.store import Store
+from fogros2.store import Made, Store
 from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream, FakeVpn
 from fogros2.testing.plugins import instead
 from fogros2.vpn import addresses
@@ -809,6 +809,32 @@ def test_retired_machine_is_deleted_and_created_anew(launch, provider, monkeypat
     assert launch.up(spec) is not first
     launch.retire('planner')
     launch.retire('planner')
+
+
+def test_machine_that_is_ended_in_order_is_not_lost(launch, provider):
+    """Its last steps, such as results that come home, may use it."""
+    context, mine = begun(launch)
+    mine.machine = mine.shell = mine.agent = None
+    mine.heartbeat = SimpleNamespace(age=0.0)
+    mine.interface = SimpleNamespace(address='198.18.7.2')
+    running = RunningMachine(context, mine, None, None)
+    seen = []
+    mine.undo.callback(lambda: seen.append(running.lost))
+    running.end('nobody has used it')
+    assert seen == ['']
+
+
+def test_what_could_not_be_undone_stays_in_the_record(launch, provider):
+    context, mine = begun(launch, dataclasses.replace(SPEC, on_exit='keep'))
+    mine.failed = False
+    ended = [1, 0]
+    mine.shell = FakeShell(handlers={'sh': lambda c: Result(ended.pop(0), '', 'no')})
+    with mine.undo:
+        mine.makes(undo.WATCHDOG, agent='/run/fogros2/planner')
+    assert context.failures and mine.record.made == (Made(undo.WATCHDOG),)
+    with mine.undo:
+        mine.makes(undo.WATCHDOG)
+    assert mine.record.made == ()
 
 
 def test_machine_that_its_provider_knows_is_not_lost(cut, provider, monkeypatch):

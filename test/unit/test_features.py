@@ -5,11 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import contextlib
+import inspect
 import io
 import os
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Optional, TYPE_CHECKING
 
 from launch import LaunchContext
 from launch.frontend import Parser
@@ -18,16 +19,20 @@ import pytest
 
 from fogros2 import AWSCloudInstance, ContainerInstance, plugin_system, process
 from fogros2.deploy import checks
-from fogros2.describe import defaults, features
+from fogros2.describe import defaults, features, keywords
 from fogros2.describe.overrides import Overrides
 from fogros2.errors import ConfigurationError, ConnectError, ShellError
 from fogros2.feature import Feature
-from fogros2.model import Endpoint, MachineSpec
+from fogros2.model import Command, Endpoint, MachineSpec
 from fogros2.report import silent
 from fogros2.shell import connect
 from fogros2.testing.fakes import FakeProvider
 from fogros2.testing.plugins import instead
+from fogros2_features import results
 from fogros2_features.results import Results
+
+if TYPE_CHECKING:
+    from fogros2.describe.machines import Bool, Value
 
 BAGS = {'results': {'fetch': ['~/bags', '/var/log/x'], 'fetch_limit': '2GB'}}
 
@@ -75,6 +80,12 @@ def test_values_may_be_substitutions() -> None:
     assert spec(made, folder='maps').features == {'results': {'fetch': ['~/maps']}}
 
 
+def test_an_empty_text_is_no_value() -> None:
+    made = ContainerInstance(name='a', fetch=['~/bags'], fetch_to='',
+                             fetch_limit=LaunchConfiguration('limit'))
+    assert spec(made, limit='').features == {'results': {'fetch': ['~/bags']}}
+
+
 def test_command_line_and_defaults_know_the_keywords(home: Path) -> None:
     path = home / 'config/fogros2/fogros2.toml'
     path.parent.mkdir(parents=True)
@@ -101,10 +112,10 @@ def test_wrong_values_are_refused(given: dict[str, Any], said: str) -> None:
         ContainerInstance(name='a', **given)
 
 
-def test_each_keyword_belongs_to_one_feature_alone() -> None:
-    own = [name for feature in plugin_system.names('fogros2.feature')
-           for name in features._keywords(feature)]
-    assert sorted(own) == sorted(features.keywords())
+def test_keyword_of_a_feature_is_no_keyword_of_a_machine() -> None:
+    for provider in plugin_system.names('fogros2.machine'):
+        for base in keywords.machine_class(provider).__mro__[:-1]:
+            assert not {*inspect.signature(base).parameters} & {*features.keywords()}
 
 
 # -- steps ---------------------------------------------------------------------------------------
@@ -125,10 +136,10 @@ class Counting(Feature):
     calls: list[Any] = []
 
     @staticmethod
-    def options(count: int = 1) -> int:
-        return count
+    def options(count: Optional[Value] = None, deep: Optional[Bool] = None) -> tuple[Any, Any]:
+        return count, deep
 
-    def check(self, spec: MachineSpec, own: int) -> None:
+    def check(self, spec: MachineSpec, own: tuple[Any, Any]) -> None:
         self.calls.append(('check', spec.name, own))
 
 
@@ -137,7 +148,28 @@ def test_a_machine_is_checked_by_its_features(
 ) -> None:
     instead(monkeypatch, 'fogros2.feature', {'counting': Counting})
     check(counting={'count': 3})
-    assert Counting.calls == [('check', 'a', 3)]
+    assert Counting.calls == [('check', 'a', (3, None))]
+
+
+def test_values_have_the_types_of_their_annotations(
+    home: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    instead(monkeypatch, 'fogros2.feature', {'counting': Counting})
+    path = home / 'config/fogros2/fogros2.toml'
+    path.parent.mkdir(parents=True)
+    path.write_text("count = '3'\n")
+    made = ContainerInstance(name='a', deep='false')
+    assert spec(made).features == {'counting': {'count': 3, 'deep': False}}
+    made = ContainerInstance(name='a', count=LaunchConfiguration('n'))
+    assert spec(made, n='2.5').features == {'counting': {'count': 2.5}}
+    with pytest.raises(ConfigurationError, match="count: 'few' is no number"):
+        ContainerInstance(name='a', count='few')
+
+
+def test_two_features_with_one_keyword_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    instead(monkeypatch, 'fogros2.feature', {'counting': Counting, 'another': Counting})
+    with pytest.raises(ConfigurationError, match="'another' and another have the same keyword"):
+        ContainerInstance(name='a', count=3)
 
 
 def test_a_feature_that_is_not_installed_is_one_error(check: Callable[..., None]) -> None:
@@ -158,6 +190,9 @@ class Running:
         self.vpn_address = ''
         self.lost = ''
         self.details: list[str] = []
+
+    def run(self, command: Command, *, timeout: float) -> str:
+        return str(self.shell.run(command, timeout=timeout).stdout)
 
     @contextlib.contextmanager
     def step(self, name: str) -> Any:
@@ -182,8 +217,43 @@ def test_folders_come_home_when_the_launch_ends(home: Path) -> None:
     found = brought(running, fetch=['~/bags', '~/none'])
     assert found == ['bags/deep/one=bags/deep/one']
     assert f' MB to {home}/fogros2/a-20' in running.details[0]
+    assert running.details[0].endswith(', no ~/none there')
     found = brought(running, fetch=['~/maps', '~/other/maps'], fetch_to=str(home / 'two'))
-    assert found == ['maps/one=maps/one', 'other-maps/two=other/maps/two']
+    assert found == ['maps-2/two=other/maps/two', 'maps/one=maps/one']
+
+
+def test_folders_of_one_name_come_home_beside_each_other(tmp_path: Path) -> None:
+    assert [path.name for path in results._targets(
+        tmp_path, ['~/p/bags', '/p/bags', '~/bags', '~/bags-2']).values()] == [
+            'bags', 'bags-2', 'bags-3', 'bags-2-2']
+
+
+def test_folder_that_is_a_link_counts_with_its_content(home: Path) -> None:
+    (home / 'data').mkdir()
+    (home / 'data/one').write_bytes(bytes(200_000))
+    (home / 'bags').symlink_to('data')
+    with pytest.raises(ShellError, match='more than fetch_limit='):
+        brought(Running(), fetch=['~/bags'], fetch_limit='100kB')
+
+
+def test_one_bad_folder_does_not_keep_the_others(
+    home: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ('bags', 'maps'):
+        (home / name).mkdir()
+        (home / name / 'one').write_text(name)
+    running = Running()
+    fetch = running.shell.fetch
+
+    def broken(source: str, *words: Any, **more: Any) -> None:
+        if source == '~/bags':
+            raise ShellError('~/bags/one can not be read')
+        fetch(source, *words, **more)
+
+    monkeypatch.setattr(running.shell, 'fetch', broken)
+    with pytest.raises(ShellError, match='can not be read'):
+        brought(running, fetch=['~/bags', '~/maps'])
+    assert [path.read_text() for path in home.glob('fogros2/*/maps/one')] == ['maps']
 
 
 def test_machine_without_the_folders_is_said(home: Path) -> None:

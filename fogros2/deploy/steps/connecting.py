@@ -28,6 +28,7 @@ from fogros2.errors import (
 from fogros2.model import Command, Endpoint, MachineState
 from fogros2.shell import host_key, Shell
 from fogros2.shell.movable import MovableShell
+from fogros2.store import Made
 from fogros2.waiting import wait_until
 
 #: Time-out of one login attempt in seconds: a cancel takes effect only at its end. An existing
@@ -96,6 +97,7 @@ class Connection(Step):
             job.undoing(SSH_PORT, self._leave_vpn)
             self._shell.move(inside)
             self._allow([])
+            job.forget(Made(SSH_PORT, outside.port))
             detail.append(
                 'SSH through the VPN, and open to the fleet' if self._job.spec.fleet_networks
                 else f'SSH through the VPN alone, port {outside.port} closed')
@@ -104,6 +106,7 @@ class Connection(Step):
         """Reach a kept machine from outside again, before the VPN is taken down."""
         outside = self._job.record.shell
         if self._job.survives and outside is not None:
+            self._job.note(SSH_PORT, outside.port)
             self._open_port()
             self._shell.move(self._shell_to(outside))
 
