@@ -89,7 +89,7 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
     with job.step('agent') as detail:
         arming.start_heartbeat(ros, dds_step.result())
         detail.append(f'VPN round trip {(job.heartbeat.round_trip or 0) * 1e3:.2f} ms')
-    # pushed now, so that they end after the nodes and before the VPN
+    # pushed now, so that they end after the nodes and before the machine
     features = {name: contextlib.ExitStack() for name in job.spec.features}
     for name, ending in features.items():
         job.undo.add(name, ending.close)
