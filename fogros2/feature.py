@@ -49,6 +49,9 @@ class RunningMachine(Protocol):
     def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
         """Report a step around a block, which may append details to the list that it gets."""
 
+    def warn(self, text: str, remedy: str) -> None:
+        """Warn the user, with what to do about it on a line of its own."""
+
 
 class Feature:
     """
@@ -60,7 +63,7 @@ class Feature:
     methods get as ``own``.
     """
 
-    options: ClassVar[Callable[..., Any]]
+    options: ClassVar[Callable[..., Any]] = staticmethod(lambda: None)
 
     def check(self, spec: MachineSpec, own: Any) -> None:
         """

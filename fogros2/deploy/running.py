@@ -21,6 +21,7 @@ from fogros2.errors import AgentError, DeadlineExceeded, FogError
 from fogros2.events import Event
 from fogros2.host import idle
 from fogros2.model import Command, host_port, Machine, NodeSpec
+from fogros2.report import Warned
 from fogros2.waiting import wait_until
 
 
@@ -57,6 +58,7 @@ class RunningMachine(Step):
         self._published: dict[int, tuple[str, int]] = {}
         job.undo.callback(Watch(
             context, job, gone=self._gone, found=found, lost=self._is_lost).close)
+        job.undo.callback(self._undo_begins)
 
     @property
     def lost(self) -> str:
@@ -77,6 +79,13 @@ class RunningMachine(Step):
     def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
         """Report a step of this machine around a block; see :func:`fogros2.report.step`."""
         return self._job.step(name)
+
+    def warn(self, text: str, remedy: str) -> None:
+        """Warn the user, with what to do about it on a line of its own."""
+        self._context.report(Warned(self.spec.name, f"'{self.spec.name}': {text}", remedy))
+
+    def _undo_begins(self) -> None:
+        self._ending = True
 
     def start(self, nodes: Sequence[NodeSpec]) -> None:
         """
@@ -214,5 +223,4 @@ class RunningMachine(Step):
 
     def close(self) -> None:
         """End the machine as its ``on_exit`` says."""
-        self._ending = True
         self._job.undo.close()

@@ -68,9 +68,10 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
                     isinstance(value, bool) and kinds_of[name] not in ('bool', 'scalar')):
                 raise ConfigurationError(f'{path}: {name} = {value!r} has the wrong type',
                                          f'it takes a {kinds_of[name]}')
-            if name in SETTINGS:
-                with values.named(str(path)):
+            with values.named(str(path)):
+                if name in SETTINGS:
                     check_setting(name, value)
+                features.own({name: value})
     return tables
 
 

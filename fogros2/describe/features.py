@@ -41,7 +41,7 @@ def own(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     mine = {name: keyword for name, keyword in keywords().items() if name in given}
     result = marked(mine, given)
-    by_feature(known({name: value for name, value in result.items() if _is_plain(given[name])}))
+    by_feature(known({name: value for name, value in result.items() if _is_plain(value)}))
     return result
 
 
@@ -59,8 +59,10 @@ def known(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _is_plain(value: Any) -> bool:
-    if isinstance(value, (list, tuple)):
+    if isinstance(value, values.Items):
         return all(isinstance(one, str) for one in value)
+    if isinstance(value, values.Converted):
+        return _is_plain(value.value)
     return isinstance(value, (str, int, float))
 
 

@@ -60,7 +60,11 @@ def keywords(cls: type[CloudInstance]) -> Mapping[str, Keyword]:
         constructor = vars(base)['__init__']
         for name, keyword in parameters_of(constructor).items():
             by_name.setdefault(name, keyword)
-    return {**features.keywords(), **by_name}
+    of_features = features.keywords()
+    for name in by_name.keys() & of_features.keys():
+        raise ConfigurationError(f"a feature has the keyword '{name}' of a {cls.__name__}",
+                                 'uninstall the feature')
+    return {**of_features, **by_name}
 
 
 def read(keyword: Keyword, text: str) -> Any:

@@ -13,6 +13,7 @@ from decimal import Decimal
 import functools
 import inspect
 import os
+import types
 from typing import Any, get_args, get_origin, get_type_hints, Literal, Union
 
 from fogros2.describe import values
@@ -86,7 +87,7 @@ def _kind(hint: Any) -> tuple[Kind, Mapping[str, Kind]]:
 
 
 def _options(hint: Any) -> Iterable[Any]:
-    if get_origin(hint) is Union:
+    if get_origin(hint) in (Union, types.UnionType):
         for option in get_args(hint):
             if option is not type(None):
                 yield from _options(option)

@@ -32,6 +32,8 @@ from fogros2_features import results
 from fogros2_features.results import Results
 
 if TYPE_CHECKING:
+    from launch import SomeSubstitutionsType
+
     from fogros2.describe.machines import Bool, Value
 
 BAGS = {'results': {'fetch': ['~/bags', '/var/log/x'], 'fetch_limit': '2GB'}}
@@ -136,7 +138,10 @@ class Counting(Feature):
     calls: list[Any] = []
 
     @staticmethod
-    def options(count: Optional[Value] = None, deep: Optional[Bool] = None) -> tuple[Any, Any]:
+    def options(
+        count: Optional[Value] = None, deep: Optional[Bool] = None,
+        word: SomeSubstitutionsType | None = None,
+    ) -> tuple[Any, Any]:
         return count, deep
 
     def check(self, spec: MachineSpec, own: tuple[Any, Any]) -> None:
@@ -160,10 +165,31 @@ def test_values_have_the_types_of_their_annotations(
     path.write_text("count = '3'\n")
     made = ContainerInstance(name='a', deep='false')
     assert spec(made).features == {'counting': {'count': 3, 'deep': False}}
+    made = ContainerInstance(name='a', count='3', word=['a', LaunchConfiguration('n')])
+    assert spec(made, n='b').features == {'counting': {'count': 3, 'word': 'ab'}}
+    assert spec(ContainerInstance(name='a', word=['a', 'b'])).features['counting'] == {
+        'count': 3, 'word': 'ab'}
     made = ContainerInstance(name='a', count=LaunchConfiguration('n'))
     assert spec(made, n='2.5').features == {'counting': {'count': 2.5}}
     with pytest.raises(ConfigurationError, match="count: 'few' is no number"):
         ContainerInstance(name='a', count='few')
+    path.write_text("count = 'few'\n")
+    with pytest.raises(ConfigurationError, match="fogros2.toml: count: 'few' is no number"):
+        spec(made)
+
+
+class Image(Feature):
+    """Has a keyword of some machines."""
+
+    @staticmethod
+    def options(image: Optional[SomeSubstitutionsType] = None) -> None:
+        pass
+
+
+def test_a_feature_cannot_take_a_keyword_of_a_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    instead(monkeypatch, 'fogros2.feature', {'image': Image, 'none': Feature})
+    with pytest.raises(ConfigurationError, match="the keyword 'image' of a ContainerInstance"):
+        spec(ContainerInstance(name='a'), 'a=container,image=x')
 
 
 def test_two_features_with_one_keyword_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
