@@ -108,7 +108,8 @@ def until(node, true, publish=lambda: None):
         publish()
         rclpy.spin_once(node, timeout_sec=0.05)
         return bool(true())
-    wait_until(there, timeout=60.0, interval=0.01, what='an answer')
+    # a chunk fits the observation before it for a second: the next has to come soon
+    wait_until(there, timeout=60.0, interval=0.01, longest=0.05, what='an answer')
 
 
 def test_robot_stops_where_it_is_without_a_chunk(tmp_path):
