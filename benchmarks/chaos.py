@@ -215,7 +215,7 @@ def rows(done: list[dict[str, Any]]) -> Iterator[Row]:
                 yield Row(f'{provider}: {what}', sum(map(len, things)), 'things', 0.0,
                           runs=len(its))
             # by design: the machine of such a request may still appear
-            yield Row(f'{provider}: requests without an answer, which a gc after 15 minutes closes',
+            yield Row(f'{provider}: requests without an answer, for a gc after 15 minutes',
                       sum(len(each['left']) - len(left(each)) for each in its), 'requests',
                       runs=len(its))
             yield Row(f'{provider}: longest life after the kill',
