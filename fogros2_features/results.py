@@ -19,6 +19,7 @@ from fogros2.feature import Feature, RunningMachine
 from fogros2.host.checkpoint import check_folder
 from fogros2.model import Command, MachineSpec
 from fogros2.shell.command_line import remote_path
+from fogros2.store import check_owner
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
@@ -79,6 +80,7 @@ class Results(Feature):
             return
         # not by Path: another account's folder may be closed to this one
         parent = next(path for path in (own.target, *own.target.parents) if os.path.exists(path))
+        check_owner(own.target)
         if not (os.path.isdir(parent) and os.access(parent, os.W_OK | os.X_OK)):
             raise ConfigurationError(f"fetch_to='{own.target}' can't be written",
                                      'name a folder of this user')
@@ -108,28 +110,42 @@ def _bring(running: RunningMachine, own: Wanted) -> str:
             f'fetch_limit={own.limit / 1e9:.3g} GB: they did not come home',
             'raise fetch_limit=, or write less')
     home = own.target / f'{running.spec.name}-{time.strftime("%Y%m%d-%H%M%S")}'
-    failures = []
+    done, failures = [], []
+    if sizes:
+        _make(check_owner(own.target))
+        _make(home, new=True)
+        done.append(f'{total / 1e6:.3g} MB to {home}')
     for folder, target in _targets(home, sizes).items():
         try:
             _copy(running, folder, target, sizes[folder])
         except FogError as error:
             failures.append(error)
+            if isinstance(error, ConnectError):
+                break  # the others would wait for the same machine
     if failures:
         raise failures[0]
-    return ', '.join([f'{total / 1e6:.3g} MB to {home}'] * bool(sizes)
-                     + [f"no {', '.join(missing)} there"] * bool(missing))
+    if missing:
+        done.append(f"no {', '.join(missing)} there")
+    return ', '.join(done)
+
+
+def _make(folder: Path, *, new: bool = False) -> None:
+    try:
+        # a new one is nobody else's
+        folder.mkdir(parents=True, exist_ok=not new)
+    except OSError as error:
+        raise ShellError(f"{folder} can't be written: {error.strerror}",
+                         'fetch_to= names another folder') from error
 
 
 def _copy(running: RunningMachine, folder: str, target: Path, size: int) -> None:
+    _make(target)
     for attempt in range(1, ATTEMPTS + 1):
         try:
-            target.mkdir(parents=True, exist_ok=True)
             # the machine may send more than it said
             running.shell.fetch(folder, target, known=None, limit=int(2 * size + SLACK),
                                 timeout=TIMEOUT)
             return
-        except OSError as error:
-            raise ShellError(f"{target} can't be written: {error.strerror}") from error
         except ConnectError:
             if attempt == ATTEMPTS:
                 raise  # rsync kept what has arrived

@@ -246,8 +246,11 @@ def _leave(record: Record, machine: Machine, *, force: bool) -> None:
                 if not force and not _sure(record) and _hears_launch(client):
                     raise _used(record)
         # guests may have kept the VPN after the launch's own end, which is not in ``made`` then
-        always = [Made(WATCHDOG)] * (bool(record.agent) and not joined) \
-            + [Made(VPN)] * (record.vpn is not None)
+        always = []
+        if record.agent and not joined:
+            always.append(Made(WATCHDOG))
+        if record.vpn is not None:
+            always.append(Made(VPN))
         failures = unmake_all(_Left(record, machine, shell), [
             *always, *(made for made in record.made if made not in always)])
         if failures:
@@ -292,9 +295,14 @@ def due(
         elif reason:
             yield Due('leftovers of' if entry.gone else 'machine', entry.name, reason,
                       functools.partial(delete, entry, store, report))
-        elif record is not None and not record.damage and (dead or not record.launch_alive and (
-                entry.machine is not None and any(made.kind in PORTS for made in record.made))):
-            yield Due('leftovers of', entry.name, 'its launch is gone',
+        elif record is not None and not record.damage and not record.launch_alive:
+            if dead:
+                reason = 'its launch is gone'
+            elif entry.machine is not None and any(made.kind in PORTS for made in record.made):
+                reason = 'its launch could not close a port'
+            else:
+                continue
+            yield Due('leftovers of', entry.name, reason,
                       functools.partial(let_go, record, entry.machine, store))
     for record, age in store.requests():
         yield Due('machine', record.name, 'its provider had not answered the request for it',
@@ -384,7 +392,6 @@ def let_go(record: Record, machine: Optional[Machine], store: Store) -> None:
     Clean up after a dead launch whose machine is kept; the machine stays.
 
     :param machine: as the provider reports it; None if it did not answer.
-
     :raises FogError: a resource could not be cleaned up.
     """
     with store.lock(record.name):

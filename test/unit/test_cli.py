@@ -537,6 +537,7 @@ def test_gc_tries_ports_again_that_could_not_be_closed(
     assert (after.launch, after.made) == ('', (Made(undo.SSH_PORT, 22),))
     assert not folder.exists(), 'nothing else waits for the port'
     assert run('gc') == 0 and Store().load('a').made == ()
+    assert 'leftovers of a: its launch could not close a port' in capsys.readouterr().out
     assert run('gc') == 0 and 'nothing to clear' in capsys.readouterr().out
 
 

@@ -21,7 +21,7 @@ from fogros2 import AWSCloudInstance, ContainerInstance, plugin_system, process
 from fogros2.deploy import checks
 from fogros2.describe import defaults, features, keywords
 from fogros2.describe.overrides import Overrides
-from fogros2.errors import ConfigurationError, ConnectError, ShellError
+from fogros2.errors import ConfigurationError, ConnectError, ShellError, StoreError
 from fogros2.feature import Feature
 from fogros2.model import Command, Endpoint, MachineSpec
 from fogros2.report import silent
@@ -321,6 +321,38 @@ def test_folder_on_the_robot_is_checked_before(home: Path) -> None:
     with pytest.raises(ConfigurationError, match="fetch_to='.*file/deep' can't be written"):
         Results().check(MachineSpec('a', 'fake'), own)
     Results().check(MachineSpec('a', 'fake'), Results.options(fetch=['~/bags']))
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='only root can give a folder to another account')
+def test_folder_of_another_account_gets_no_results(home: Path) -> None:
+    (home / 'bags').mkdir()
+    (home / 'theirs').mkdir()
+    os.chown(home / 'theirs', 65534, 65534)
+    given = {'fetch': ['~/bags'], 'fetch_to': str(home / 'theirs')}
+    with pytest.raises(StoreError, match='theirs belongs to another account'):
+        Results().check(MachineSpec('a', 'fake'), Results.options(**given))
+    with pytest.raises(StoreError, match='another account'), \
+            Results().machine(Running(), Results.options(**given)):
+        pass
+    assert not [*(home / 'theirs').iterdir()]
+
+
+def test_lost_connection_is_not_tried_for_each_folder(
+    home: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tries = []
+
+    def broken(source: str, *words: Any, **more: Any) -> None:
+        tries.append(source)
+        raise ConnectError('the connection was lost')
+
+    for name in ('bags', 'maps'):
+        (home / name).mkdir()
+    running = Running()
+    monkeypatch.setattr(running.shell, 'fetch', broken)
+    with pytest.raises(ConnectError):
+        brought(running, fetch=['~/bags', '~/maps'])
+    assert tries == ['~/bags'] * results.ATTEMPTS
 
 
 def test_machine_cannot_report_a_size_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
