@@ -23,6 +23,7 @@ keep_ticket
 part=test again=
 if [ "${1:-}" = kubernetes ]; then
     part=$1; shift
+    [ $# != 0 ] || again=yes
     set -- test/integration/kubernetes "$@"
 elif [ $# = 0 ]; then
     # Three at a time: much of what tests with machines take is waiting. Tests named by hand run in

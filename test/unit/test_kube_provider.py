@@ -523,6 +523,21 @@ def test_trouble_is_found_in_events():
     assert pods.scales_up([event('TriggeredScaleUp', '')])
 
 
+@pytest.mark.parametrize('message, final', [
+    ('pods "m" is forbidden: violates PodSecurity "baseline:latest": NET_ADMIN', True),
+    ('Pod "m" is invalid: spec.containers[0].image: Required value', True),
+    ('admission webhook "policy.example" denied the request: no NET_ADMIN', True),
+    ('pods "m" is forbidden: exceeded quota: q', False),
+    ('Post "https://192.0.2.1:6443/api/v1/namespaces/robots/pods": unexpected EOF', False),
+    ('etcdserver: request timed out', False),
+    ('Internal error occurred: failed calling webhook "policy.example": dial tcp 192.0.2.1:443: '
+     'connect: connection refused', False)])
+def test_only_a_refusal_of_a_pod_is_final(message, final):
+    trouble = pods.trouble_in([{'reason': 'FailedCreate', 'message': message,
+                                'metadata': {'namespace': 'robots'}}])
+    assert trouble is not None and trouble.final == final
+
+
 @pytest.mark.parametrize('server, groups, maker', [
     ('https://ABCD.gr7.eu-north-1.eks.amazonaws.com', [], 'EKS'),
     ('https://robots-dns-1.hcp.westeurope.azmk8s.io:443', [], 'AKS'),

@@ -19,6 +19,9 @@ _PULL = ('ErrImagePull', 'ImagePullBackOff', 'RegistryUnavailable', 'ImageInspec
 #: Answers of a registry that a retry will not change.
 _FINAL = re.compile(r'not ?found|manifest unknown|unauthorized|denied|forbidden|no match for '
                     r'platform|no matching manifest|does not exist|invalid reference', re.I)
+#: The API server's decisions about a pod. Any other failure to create one (a server that restarts,
+#: a webhook that does not answer) ends, and the cluster tries again.
+_REFUSED = re.compile(r'\b(forbidden|invalid|denied)\b')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,7 +149,7 @@ def trouble_in(events: Sequence[Mapping[str, Any]]) -> Optional[Trouble]:
         if reason == 'FailedCreate':
             namespace = str(event['metadata'].get('namespace', ''))
             return Trouble(f'FailedCreate: {message}', hints.of_refusal(message, namespace),
-                           final='quota' not in message)
+                           final='quota' not in message and bool(_REFUSED.search(message)))
         if reason in ('FailedCreatePodSandBox', 'FailedMount'):
             return Trouble(f'{reason}: {message}', 'the node can not begin the pod')
     return None
