@@ -8,12 +8,12 @@ to write one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 from typing import Any, ClassVar, Protocol
 
 from fogros2 import plugin_system
-from fogros2.model import Command, Machine, MachineSpec
+from fogros2.model import Command, Machine, MachineSpec, NodeSpec, VpnInterface
 from fogros2.shell import Shell
 
 #: The group of entry points.
@@ -26,13 +26,18 @@ class RunningMachine(Protocol):
 
     :ivar machine: as the provider reported it.
     :ivar shell: copies files; for commands there is ``run``.
-    :ivar vpn_address: the machine's address in the launch's VPN.
+    :ivar interface: its end of the launch's VPN, and ``vpn_address`` the address there.
     """
 
     spec: MachineSpec
     machine: Machine
     shell: Shell
+    interface: VpnInterface
     vpn_address: str
+
+    @property
+    def directory(self) -> str:
+        """The agent's folder on the machine."""
 
     @property
     def lost(self) -> str:
@@ -51,6 +56,20 @@ class RunningMachine(Protocol):
 
     def warn(self, text: str, remedy: str) -> None:
         """Warn the user, with what to do about it on a line of its own."""
+
+    def watch(
+        self, name: str, argv: Sequence[str], interval: float, then: Callable[[str], None],
+    ) -> None:
+        """
+        Run a program there, as root, every ``interval`` seconds until it exits with 0.
+
+        :param name: of the watch; an earlier one of this name ends.
+        :param argv: its files are ``/run/INTERFACE.*``, which go with the VPN.
+        :param then: called with what it has printed, once, in a thread that must not wait.
+        """
+
+    def give_up(self, reason: str) -> None:
+        """Let the launch end machine and nodes as ``on_exit`` says, and go on without them."""
 
 
 class Feature:
@@ -72,6 +91,13 @@ class Feature:
         :raises FogError: the feature can't work there.
         """
 
+    def check_node(self, spec: MachineSpec, node: NodeSpec, own: Any) -> None:
+        """
+        Check a node of a machine that uses the feature before the machine is created.
+
+        :raises FogError: the feature can't work with it.
+        """
+
     def machine(self, running: RunningMachine, own: Any) -> contextlib.AbstractContextManager[Any]:
         """
         Return a context that is entered when the machine is up, before its nodes start.
@@ -80,6 +106,16 @@ class Feature:
         end. On a machine that stays, agent and VPN may have ended by then; the shell works.
         """
         return contextlib.nullcontext()
+
+    def starting(
+        self, running: RunningMachine, nodes: Sequence[NodeSpec], own: Any,
+    ) -> Sequence[NodeSpec]:
+        """
+        Return nodes as they start on the machine; called whenever some start there.
+
+        :raises FogError: they can't start, and the launch ends.
+        """
+        return nodes
 
 
 def load(name: str) -> Feature:
@@ -99,3 +135,13 @@ def options(name: str, given: Mapping[str, Any]) -> Any:
     :raises ConfigurationError: a value is wrong.
     """
     return plugin_system.load(GROUP, name).options(**given)
+
+
+def used(spec: MachineSpec) -> Iterator[tuple[Feature, Any]]:
+    """
+    Yield the features that a machine uses, with their options.
+
+    :raises ConfigurationError: one is not installed.
+    """
+    for name, given in spec.features.items():
+        yield load(name), options(name, given)

@@ -14,6 +14,8 @@ import sys
 
 import pytest
 
+from fogros2.describe import features
+
 ROOT = Path(__file__).resolve().parents[2]
 CORE = ROOT / 'fogros2'
 PACKAGES = ('fogros2_features', 'fogros2_replicas', 'fogros2_share', 'image_transport_h264',
@@ -195,6 +197,13 @@ def test_package_imports_nothing_above_it(folder: str, above: tuple[str, ...]) -
         assert not re.search(pattern, path.read_text(), re.MULTILINE), path
 
 
+def test_core_names_no_keyword_of_a_feature() -> None:
+    for keyword in features.keywords():
+        for path in python_files(CORE):
+            assert not re.search(rf'\b{keyword}(=|\W*\W{keyword}\b)|[\'"]{keyword}[\'"]',
+                                 path.read_text()), f'{path} names {keyword}'
+
+
 def plugin(module: str) -> str:
     """Return the plugin that a module belongs to, '' for none."""
     unit = '.'.join(module.split('.')[:3])
@@ -270,8 +279,8 @@ def test_forbidden_words(pattern: str) -> None:
 
 def test_only_one_module_starts_processes() -> None:
     """A command that is waited for goes through ``process``; streams and daemons are few."""
-    # guests, idle and relocation are programs for machines
-    allowed = {'process.py', 'guests.py', 'idle.py', 'relocation.py', 'serve.py'}
+    # guests and relocation are programs for machines
+    allowed = {'process.py', 'guests.py', 'relocation.py', 'serve.py'}
     for path in (*python_files(CORE), *python_files(ROOT / 'fogros2_monitor')):
         if path.name not in allowed and 'subprocess' in path.read_text():
             names = {name for name, _ in imports(path)}
