@@ -35,7 +35,7 @@ from fogros2 import (
 )
 from fogros2.errors import AgentError, ProviderError
 from fogros2.runtime import session
-from fogros2.testing.plugins import instead
+from fogros2_testing.plugins import instead
 from rigs.launching import Harmless
 
 REASON = 'spot instance, at 12:00'

@@ -36,7 +36,7 @@ from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
 from fogros2.model import NodeSpec
 from fogros2.runtime import replicas
-from fogros2.testing.plugins import instead
+from fogros2_testing.plugins import instead
 from rigs.launching import Harmless
 
 NAMES = ('one', 'two', 'three')

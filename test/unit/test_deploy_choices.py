@@ -18,8 +18,8 @@ from fogros2.errors import ConfigurationError, NameTaken, ProviderError, Workspa
 from fogros2.model import MachineSpec
 from fogros2.report import StepDone, StepFailed, StepStarted, Warned
 from fogros2.store import Store
-from fogros2.testing.fakes import FakeProvider, FakeVpn
-from fogros2.testing.plugins import instead
+from fogros2_testing.fakes import FakeProvider, FakeVpn
+from fogros2_testing.plugins import instead
 from rigs.pip_site import distribution, package
 
 SPEC = MachineSpec('planner', 'fake', {'size': 'cheapest'})
