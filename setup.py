@@ -132,6 +132,7 @@ setup(
             'kubernetes = fogros2.kubernetes_client:configured',
         ],
         'fogros2.feature': [
+            'budget = fogros2_features.budget:Budget',
             'idle = fogros2_features.idle:IdleTimeout',
             'results = fogros2_features.results:Results',
         ],

@@ -8,9 +8,10 @@ to write one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import contextlib
-from typing import Any, ClassVar, Protocol
+from decimal import Decimal
+from typing import Any, ClassVar, Optional, Protocol
 
 from fogros2 import plugin_system
 from fogros2.model import Command, Machine, MachineSpec, NodeSpec, VpnInterface
@@ -42,6 +43,10 @@ class RunningMachine(Protocol):
     @property
     def lost(self) -> str:
         """Why the machine is gone or must not be used any more, '' while it is there."""
+
+    @property
+    def cost(self) -> tuple[Optional[Decimal], Decimal]:
+        """US dollars per hour, None if unknown, and what its launch has spent so far."""
 
     def run(self, command: Command, *, timeout: float) -> str:
         """
@@ -91,6 +96,20 @@ class Feature:
         :raises FogError: the feature can't work there.
         """
 
+    def lifetime(
+        self, spec: MachineSpec, price: Optional[Decimal], spent: Decimal, own: Any,
+    ) -> float:
+        """
+        Return the most seconds that a machine may have, when its choices are made.
+
+        Called before the machine is created, and once more when its provider confirms the price.
+
+        :param price: US dollars per hour, None if the provider tells none.
+        :param spent: what the launch has spent on machines of this name so far, in US dollars.
+        :raises FogError: there is no such time.
+        """
+        return spec.lifetime
+
     def check_node(self, spec: MachineSpec, node: NodeSpec, own: Any) -> None:
         """
         Check a node of a machine that uses the feature before the machine is created.
@@ -116,6 +135,14 @@ class Feature:
         :raises FogError: they can't start, and the launch ends.
         """
         return nodes
+
+    def status(self, shown: Mapping[str, Any], own: Any) -> Iterable[tuple[str, str]]:
+        """
+        Return rows, each a name and a text, for ``ros2 fog status`` of a machine.
+
+        :param shown: what ``ros2 fog status --json`` prints.
+        """
+        return ()
 
 
 def load(name: str) -> Feature:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import contextlib
+from decimal import Decimal
 import threading
 from typing import Any, Optional
 
@@ -63,6 +64,11 @@ class RunningMachine(Step):
     def lost(self) -> str:
         """Why the machine is gone or must not be used any more, '' while it is there."""
         return self._lost
+
+    @property
+    def cost(self) -> tuple[Optional[Decimal], Decimal]:
+        """US dollars per hour, None if unknown, and what its launch has spent so far."""
+        return self._context.choices.spent(self.spec.name)
 
     @property
     def directory(self) -> str:
