@@ -117,6 +117,10 @@ class Feature:
         :raises FogError: the feature can't work with it.
         """
 
+    def beside(self, spec: MachineSpec, own: Any) -> Sequence[NodeSpec]:
+        """Return programs that run on the machine beside its nodes, from its first node on."""
+        return ()
+
     def machine(self, running: RunningMachine, own: Any) -> contextlib.AbstractContextManager[Any]:
         """
         Return a context that is entered when the machine is up, before its nodes start.

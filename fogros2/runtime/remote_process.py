@@ -174,6 +174,8 @@ class RemoteProcess:
                 id=f'share-{name}', name='share', package='fogros2', executable='share',
                 respawn=True, respawn_delay=1.0, arguments=(json.dumps({
                     'topics': session.spec.share, 'folders': folders}),)), name))
+        helpers += [process_on(node, name) for each, own in feature.used(session.spec)
+                    for node in each.beside(session.spec, own)]
         if session.spec.monitored:
             bridge, started = foxglove.on_machine(
                 coordinator, session, allow=session.spec.monitor_allow)
