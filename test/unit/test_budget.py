@@ -37,7 +37,7 @@ def warned(own: str, lifetime: float, cost: tuple[Any, Any], wait: bool) -> list
                               warn=lambda text, remedy: said.append(f'{text}; {remedy}'))
     with Budget().machine(running, Decimal(own)):  # type: ignore[arg-type]
         if wait:
-            wait_until(lambda: said, timeout=30.0, what='the warning')
+            wait_until(lambda: said or None, timeout=30.0, what='the warning')
     return said
 
 
