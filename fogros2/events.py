@@ -92,10 +92,11 @@ class PreemptionNotice(_Numbered):
     reason: str
 
 
-class MachineIdle(_Numbered):
-    """Nobody has used the machine for its ``idle_timeout``."""
+class WatchEnded(_Numbered):
+    """The program of a watch has exited with 0; ``reason`` is what it printed."""
 
-    event: Literal['idle']
+    event: Literal['watched']
+    what: str
     reason: str
 
 
@@ -138,12 +139,19 @@ class MachineLost(TypedDict):
     reason: str
 
 
+class GivenUp(TypedDict):
+    """The launch is to end the machine as its ``on_exit`` says, and to go on without it."""
+
+    event: Literal['given_up']
+    reason: str
+
+
 NodeEvent = Union[NodeStarted, NodeOutput, NodeExited, NodeRefused]
 #: Events that an agent sends; the robot makes the others itself.
 AgentEvent = Union[
-    NodeEvent, WatchdogFired, VpnRepaired, EndFailed, PreemptionNotice, MachineIdle, AgentEnding,
+    NodeEvent, WatchdogFired, VpnRepaired, EndFailed, PreemptionNotice, WatchEnded, AgentEnding,
     AgentRestarted]
-Event = Union[AgentEvent, ConnectionChanged, Gap, MachineLost]
+Event = Union[AgentEvent, ConnectionChanged, Gap, MachineLost, GivenUp]
 
 
 # -- answers ----------------------------------------------------------------------------------

@@ -8,12 +8,13 @@ to write one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import contextlib
-from typing import Any, ClassVar, Protocol
+from decimal import Decimal
+from typing import Any, ClassVar, Optional, Protocol
 
 from fogros2 import plugin_system
-from fogros2.model import Command, Machine, MachineSpec
+from fogros2.model import Command, Machine, MachineSpec, NodeSpec, VpnInterface
 from fogros2.shell import Shell
 
 #: The group of entry points.
@@ -26,17 +27,26 @@ class RunningMachine(Protocol):
 
     :ivar machine: as the provider reported it.
     :ivar shell: copies files; for commands there is ``run``.
-    :ivar vpn_address: the machine's address in the launch's VPN.
+    :ivar interface: its end of the launch's VPN, and ``vpn_address`` the address there.
     """
 
     spec: MachineSpec
     machine: Machine
     shell: Shell
+    interface: VpnInterface
     vpn_address: str
+
+    @property
+    def directory(self) -> str:
+        """The agent's folder on the machine."""
 
     @property
     def lost(self) -> str:
         """Why the machine is gone or must not be used any more, '' while it is there."""
+
+    @property
+    def cost(self) -> tuple[Optional[Decimal], Decimal]:
+        """US dollars per hour, None if unknown, and what its launch has spent so far."""
 
     def run(self, command: Command, *, timeout: float) -> str:
         """
@@ -51,6 +61,20 @@ class RunningMachine(Protocol):
 
     def warn(self, text: str, remedy: str) -> None:
         """Warn the user, with what to do about it on a line of its own."""
+
+    def watch(
+        self, name: str, argv: Sequence[str], interval: float, then: Callable[[str], None],
+    ) -> None:
+        """
+        Run a program there, as root, every ``interval`` seconds until it exits with 0.
+
+        :param name: of the watch; an earlier one of this name ends.
+        :param argv: its files are ``/run/INTERFACE.*``, which go with the VPN.
+        :param then: called with what it has printed, once, in a thread that must not wait.
+        """
+
+    def give_up(self, reason: str) -> None:
+        """Let the launch end machine and nodes as ``on_exit`` says, and go on without them."""
 
 
 class Feature:
@@ -72,6 +96,31 @@ class Feature:
         :raises FogError: the feature can't work there.
         """
 
+    def lifetime(
+        self, spec: MachineSpec, price: Optional[Decimal], spent: Decimal, own: Any,
+    ) -> float:
+        """
+        Return the most seconds that a machine may have, when its choices are made.
+
+        Called before the machine is created, and once more when its provider confirms the price.
+
+        :param price: US dollars per hour, None if the provider tells none.
+        :param spent: what the launch has spent on machines of this name so far, in US dollars.
+        :raises FogError: there is no such time.
+        """
+        return spec.lifetime
+
+    def check_node(self, spec: MachineSpec, node: NodeSpec, own: Any) -> None:
+        """
+        Check a node of a machine that uses the feature before the machine is created.
+
+        :raises FogError: the feature can't work with it.
+        """
+
+    def beside(self, spec: MachineSpec, own: Any) -> Sequence[NodeSpec]:
+        """Return programs that run on the machine beside its nodes, from its first node on."""
+        return ()
+
     def machine(self, running: RunningMachine, own: Any) -> contextlib.AbstractContextManager[Any]:
         """
         Return a context that is entered when the machine is up, before its nodes start.
@@ -80,6 +129,24 @@ class Feature:
         end. On a machine that stays, agent and VPN may have ended by then; the shell works.
         """
         return contextlib.nullcontext()
+
+    def starting(
+        self, running: RunningMachine, nodes: Sequence[NodeSpec], own: Any,
+    ) -> Sequence[NodeSpec]:
+        """
+        Return nodes as they start on the machine; called whenever some start there.
+
+        :raises FogError: they can't start, and the launch ends.
+        """
+        return nodes
+
+    def status(self, shown: Mapping[str, Any], own: Any) -> Iterable[tuple[str, str]]:
+        """
+        Return rows, each a name and a text, for ``ros2 fog status`` of a machine.
+
+        :param shown: what ``ros2 fog status --json`` prints.
+        """
+        return ()
 
 
 def load(name: str) -> Feature:
@@ -99,3 +166,13 @@ def options(name: str, given: Mapping[str, Any]) -> Any:
     :raises ConfigurationError: a value is wrong.
     """
     return plugin_system.load(GROUP, name).options(**given)
+
+
+def used(spec: MachineSpec) -> Iterator[tuple[Feature, Any]]:
+    """
+    Yield the features that a machine uses, with their options.
+
+    :raises ConfigurationError: one is not installed.
+    """
+    for name, given in spec.features.items():
+        yield load(name), options(name, given)

@@ -53,7 +53,6 @@ class MachineSpec:
     :param on_exit: what happens to the machine when the launch ends.
     :param lifetime: seconds after which the machine ends by itself in any case.
     :param robot_timeout: seconds without the launch's heartbeat after which the nodes stop.
-    :param idle_timeout: seconds without use after which the machine ends, None for never.
     :param environment: variables of every node on the machine.
     :param containers: ``docker run`` command lines that start before the nodes.
     :param on_interrupt: when the provider reclaims the machine while its nodes run: end the
@@ -81,7 +80,6 @@ class MachineSpec:
     on_exit: OnExit = 'delete'
     lifetime: float = DEFAULT_LIFETIME
     robot_timeout: float = DEFAULT_ROBOT_TIMEOUT
-    idle_timeout: Optional[float] = None
     bootstrap: Bootstrap = 'auto'
     environment: Mapping[str, str] = dataclasses.field(default_factory=dict)
     containers: tuple[str, ...] = ()

@@ -17,7 +17,8 @@ from fogros2 import untrusted
 from fogros2.errors import ConfigurationError, ConnectError, FogError, ShellError
 from fogros2.feature import Feature, RunningMachine
 from fogros2.host.checkpoint import check_folder
-from fogros2.model import Command, MachineSpec
+from fogros2.image_transport import topics
+from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.shell.command_line import remote_path
 from fogros2.store import check_owner
 
@@ -30,6 +31,8 @@ TARGET, LIMIT = '~/fogros2', 10e9
 TIMEOUT, ATTEMPTS = 3600.0, 3
 #: Bytes that a folder may take on the disk beyond twice its size: each small file has a block.
 SLACK = 100e6
+#: Where a machine, by its name, keeps recordings until they come home, and the name of the folder.
+RECORDINGS, RECORDED = '~/fogros2-{}', 'recordings'
 _UNITS = {'': 1.0, 'k': 1e3, 'M': 1e6, 'G': 1e9, 'T': 1e12}
 # Print the bytes in the folder {0}, or in the one that it links to; nothing without the folder.
 _SIZE = '[ ! -d {0} ] || du -sb -- {0}/. | cut -f 1'
@@ -43,21 +46,24 @@ class Wanted:
     :param folders: on the machine, as ``check_folder`` returns them.
     :param target: folder on the robot; each launch makes one there.
     :param limit: bytes of all folders together.
+    :param topics: to record.
     """
 
     folders: tuple[str, ...]
     target: Path
     limit: float
+    topics: tuple[str, ...] = ()
 
 
 class Results(Feature):
-    """``fetch=['~/bags']``: folders that come home at the end."""
+    """``fetch=['~/bags']``, ``record=['/tf']``: what comes home at the end."""
 
     @staticmethod
     def options(
         fetch: Optional[Sequence[SomeSubstitutionsType]] = None,
         fetch_to: Optional[SomeSubstitutionsType] = None,
         fetch_limit: Optional[SomeSubstitutionsType] = None,
+        record: Optional[Sequence[SomeSubstitutionsType]] = None,
     ) -> Wanted:
         """
         Return what to bring home.
@@ -65,6 +71,7 @@ class Results(Feature):
         :param fetch: folders of the machine.
         :param fetch_to: folder on the robot.
         :param fetch_limit: how much they may have together, such as '2GB'.
+        :param record: topics that the machine records in an MCAP file.
         """
         folders = tuple(dict.fromkeys(
             check_folder('fetch', str(folder)) for folder in fetch or ()))
@@ -72,11 +79,13 @@ class Results(Feature):
         if not target.is_absolute():
             raise ConfigurationError(f"fetch_to='{fetch_to}' is no absolute path",
                                      "such as '~/fogros2'")
-        return Wanted(folders, target, LIMIT if fetch_limit is None else _bytes(str(fetch_limit)))
+        return Wanted(
+            folders, target, LIMIT if fetch_limit is None else _bytes(str(fetch_limit)),
+            tuple(dict.fromkeys(topics.check_name(str(topic)) for topic in record or ())))
 
     def check(self, spec: MachineSpec, own: Wanted) -> None:
         """Check that this user may write to the folder on the robot."""
-        if not own.folders:
+        if not (own.folders or own.topics):
             return
         # not by Path: another account's folder may be closed to this one
         parent = next(path for path in (own.target, *own.target.parents) if os.path.exists(path))
@@ -85,13 +94,25 @@ class Results(Feature):
             raise ConfigurationError(f"fetch_to='{own.target}' can't be written",
                                      'name a folder of this user')
 
+    def beside(self, spec: MachineSpec, own: Wanted) -> Sequence[NodeSpec]:
+        """Return the program that records, with the names that streams give to topics there."""
+        return [NodeSpec(
+            id=f'record-{spec.name}', name='record', package='fogros2', executable='record',
+            arguments=(f'{RECORDINGS.format(spec.name)}/{RECORDED}', *own.topics, '--ros-args'))] if own.topics else []
+
     @contextlib.contextmanager
     def machine(self, running: RunningMachine, own: Wanted) -> Iterator[None]:
         """Bring the folders home when the machine's nodes have ended."""
         yield
+        recordings = RECORDINGS.format(running.spec.name)
+        if own.topics:
+            own = dataclasses.replace(own, folders=(*own.folders, f'{recordings}/{RECORDED}'))
         if own.folders and not running.lost:
             with running.step('results') as detail:
                 detail.append(_bring(running, own))
+                if own.topics:  # a machine that stays records anew
+                    running.run(Command.script(f'rm -rf -- {remote_path(recordings)}',
+                                               what=f'remove {recordings}'), timeout=60.0)
 
 
 def _bring(running: RunningMachine, own: Wanted) -> str:

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Watch a deployment in a browser: the Foxglove bridge, its gate, and the dashboard.
+Watch a deployment in a browser: the Foxglove bridge, its gate, and the dashboard; record it.
 
 :mod:`~fogros2_monitor.serve` starts the bridge on a machine. :mod:`~fogros2_monitor.gate` admits
 requests that have the token (:mod:`~fogros2_monitor.request`, :mod:`~fogros2_monitor.page`,
 :mod:`~fogros2_monitor.credentials`) and come from no other account of the computer
 (:mod:`~fogros2_monitor.accounts`). :mod:`~fogros2_monitor.bridge` implements Foxglove's
-WebSocket protocol, with the message definitions of :mod:`~fogros2_monitor.definitions`.
+WebSocket protocol, :mod:`~fogros2_monitor.recorder` writes a file; both take messages from the
+graph (:mod:`~fogros2_monitor.topics`), with the definitions of
+:mod:`~fogros2_monitor.definitions`.
 :mod:`~fogros2_monitor.application` runs the web application in a container.
 :mod:`~fogros2_monitor.tunnel` and :mod:`~fogros2_monitor.urls` open the bridge on the robot.
 :mod:`~fogros2_monitor.dashboard` is the page of ``ros2 fog dashboard``.

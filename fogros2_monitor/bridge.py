@@ -16,120 +16,24 @@ Protocol: https://github.com/foxglove/ws-protocol, implemented by ``foxglove-sdk
 from __future__ import annotations
 
 from collections.abc import Callable
-import fnmatch
 import functools
-from typing import Any, Optional
 
 import foxglove
-from foxglove.messages import CompressedVideo, Timestamp
 from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, ServerListener
 import rclpy
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.subscription import Subscription
-from std_msgs.msg import Empty
 
 from fogros2 import ros_types
-from fogros2_monitor.definitions import definition
+from fogros2_monitor.topics import GraphNode, LOOK, Topic
 from image_transport_h264 import memory
-from image_transport_h264.cdr import CdrError
-from image_transport_h264.message import coded
 
-#: Poll interval of the topics in the graph, in seconds.
-LOOK = 0.5
 #: Number of messages to keep for a slow viewer.
 BACKLOG = 64
-_COMPRESSED = 'sensor_msgs/msg/CompressedImage'
-#: Suffix of the topic that requests a keyframe of an H.264 stream.
-_KEYFRAME = '/keyframe'
 
 
-class _Topic:
-    """A topic as viewers see it, with a subscription while a viewer shows it."""
-
-    def __init__(self, node: BridgeNode, name: str, kind: str, video: bool) -> None:
-        self.kind = kind
-        self.video = video
-        self.viewers: set[int] = set()
-        self._node = node
-        self._name = name
-        self._class = ros_types.message(kind)
-        schema = CompressedVideo.get_schema() if video else foxglove.Schema(
-            name=kind, encoding='ros2msg', data=definition(kind).encode())
-        self._channel = foxglove.Channel(
-            name, schema=schema, message_encoding='protobuf' if video else 'cdr',
-            context=node.viewers)
-        self._subscription: Optional[Subscription] = None
-        self._fits: tuple[Any, Any] = (None, None)
-        self._requests: Optional[Publisher] = None
-        if video:
-            self._requests = node.create_publisher(Empty, f'{name}{_KEYFRAME}', 1)
-
-    @property
-    def id(self) -> int:
-        """Return the id of the topic's channel."""
-        return self._channel.id()
-
-    def look(self, viewer: int) -> None:
-        """Send the topic to a viewer from now on, latched messages included."""
-        self.viewers.add(viewer)
-        if self._requests is not None:
-            self._requests.publish(Empty())
-        if self._subscription is not None and self._fits[0] == DurabilityPolicy.TRANSIENT_LOCAL:
-            # Only a new subscription receives latched messages again. The other viewers receive
-            # them twice, which does no harm for a latched topic.
-            self._unsubscribe()
-        if self._subscription is None:
-            self._subscribe()
-
-    def look_away(self, viewer: int) -> None:
-        """Stop sending to a viewer; unsubscribe with the last viewer."""
-        self.viewers.discard(viewer)
-        if not self.viewers:
-            self._unsubscribe()
-
-    def refit(self) -> None:
-        """Subscribe again if new publishers need another QoS profile."""
-        if self._subscription is not None and self._node.get_publishers_info_by_topic(self._name):
-            qos = fitting(self._node, self._name)
-            if (qos.durability, qos.reliability) != self._fits:
-                self._unsubscribe()
-                self._subscribe()
-
-    def close(self) -> None:
-        """Remove the topic from the viewers' lists."""
-        self._unsubscribe()
-        if self._requests is not None:
-            self._node.destroy_publisher(self._requests)
-        self._channel.close()
-
-    def _subscribe(self) -> None:
-        qos = fitting(self._node, self._name)
-        self._fits = qos.durability, qos.reliability
-        self._subscription = self._node.create_subscription(
-            self._class, self._name, self._show_video if self.video else self._channel.log, qos,
-            raw=True)
-
-    def _unsubscribe(self) -> None:
-        if self._subscription is not None:
-            self._node.destroy_subscription(self._subscription)
-            self._subscription = None
-
-    def _show_video(self, message: bytes) -> None:
-        try:
-            header, form, data = coded(message)
-        except CdrError as error:
-            self._node.get_logger().warning(f'{self._name}: {error}', once=True)
-            return
-        self._channel.log(CompressedVideo(
-            timestamp=Timestamp(header.sec, header.nanosec), frame_id=header.frame_id,
-            data=bytes(data), format=form).encode())
-
-
-class BridgeNode(Node, ServerListener):
+class BridgeNode(GraphNode, ServerListener):
     """
     The node that serves the topics of the graph.
 
@@ -138,11 +42,8 @@ class BridgeNode(Node, ServerListener):
 
     def __init__(self, executor: SingleThreadedExecutor) -> None:
         super().__init__('fogros2_bridge')
-        self.viewers = foxglove.Context()
         self._work = executor
-        self._topics: dict[str, _Topic] = {}
         self._published: dict[tuple[int, int], Publisher] = {}
-        self._unknown: set[str] = set()
         address = str(self.declare_parameter('address', '127.0.0.1').value)
         port = int(self.declare_parameter('port', 8765).value)
         self._patterns = list(self.declare_parameter('topics', ['*']).value)
@@ -188,7 +89,7 @@ class BridgeNode(Node, ServerListener):
 
     # -- in the executor's thread ---------------------------------------------------------------
 
-    def _with_topic(self, channel: int, action: Callable[[_Topic], None]) -> None:
+    def _with_topic(self, channel: int, action: Callable[[Topic], None]) -> None:
         def act() -> None:
             for topic in self._topics.values():
                 if topic.id == channel:
@@ -219,43 +120,6 @@ class BridgeNode(Node, ServerListener):
     def _refuse(self, why: str) -> None:
         self.get_logger().warning(why)
         self._server.publish_status(why, foxglove.StatusLevel.Warning)
-
-    def _look(self) -> None:
-        """Add new topics and remove topics that are gone."""
-        kinds = {name: kind for name, kind in ros_types.topics(self).items()
-                 if '/_' not in name  # hidden by ROS 2's naming convention
-                 and any(fnmatch.fnmatchcase(name, pattern) for pattern in self._patterns)}
-        for name in self._topics.keys() - kinds.keys():
-            self._topics.pop(name).close()
-        for name, kind in kinds.items():
-            topic = self._topics.get(name)
-            video = kind == _COMPRESSED and f'{name}{_KEYFRAME}' in kinds
-            if topic is not None and (topic.kind, topic.video) == (kind, video):
-                topic.refit()
-                continue
-            if kind in self._unknown:
-                continue
-            if topic is not None:
-                self._topics.pop(name).close()
-            try:
-                self._topics[name] = _Topic(self, name, kind, video)
-            except LookupError as error:
-                self._unknown.add(kind)
-                self.get_logger().warning(f'{name} is not shown: {error}')
-
-
-def fitting(node: Node, topic: str) -> QoSProfile:
-    """Return the strictest QoS profile that is compatible with all publishers of a topic."""
-    offered = [info.qos_profile for info in node.get_publishers_info_by_topic(topic)]
-    reliable = bool(offered) and all(
-        qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
-    latched = bool(offered) and all(
-        qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
-    depth = sum(qos.depth for qos in offered) if latched else 0
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST, depth=max(10, min(depth, 1000)),
-        reliability=(ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT),
-        durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
 
 
 def main() -> None:

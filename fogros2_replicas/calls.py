@@ -3,7 +3,8 @@
 Decide which replicas of a service get a request, and which answer is the answer; pure.
 
 A request goes to all live replicas, or to the nearest one and after a delay to the next, as in
-"The tail at scale" (Dean, Barroso 2013) and gRPC's hedging. A failure sends it on at once.
+"The tail at scale" (Dean, Barroso 2013) and gRPC's hedging. A failure sends it on at once. One
+replica may be the last: it is asked when no other is live, or has answered by a deadline.
 """
 
 from __future__ import annotations
@@ -53,6 +54,8 @@ class _Call:
     failed: set[str] = dataclasses.field(default_factory=set)
     error: Any = None
     due: float = math.inf
+    #: When the last replica is asked.
+    deadline: float = math.inf
     #: Pause after which it is sent again; 0 while some replica may still answer.
     pause: float = 0.0
 
@@ -63,22 +66,29 @@ class Calls:
 
     :param replicas: their names.
     :param hedge_after: see :data:`HedgeAfter`.
+    :param last: name of the last replica, '' for none.
+    :param deadline: seconds after which it is asked.
     """
 
-    def __init__(self, replicas: Sequence[str], hedge_after: HedgeAfter = None) -> None:
+    def __init__(
+        self, replicas: Sequence[str], hedge_after: HedgeAfter = None, last: str = '',
+        deadline: float = math.inf,
+    ) -> None:
         self.replicas = {name: Figures(name) for name in replicas}
         self._hedge_after = hedge_after
+        self._last = self.replicas.get(last)
+        self._deadline = deadline
         self._calls: dict[int, _Call] = {}
 
     def ask(self, now: float, call: int) -> list[Action]:
         """Return whom to send a new request; ``call`` is its number."""
-        one = self._calls[call] = _Call()
-        live = self._live()
+        one = self._calls[call] = _Call(deadline=now + self._deadline)
+        live = self._live() or self._at_last(one)
         if not live:
             return self._send_to_any(now, call, one)
         targets = live[:1] if self._delay(live[0]) is not None else live
         targets += [replica for replica in self.replicas.values()
-                    if replica.there and replica not in targets
+                    if replica.there and replica not in (*targets, self._last)
                     and now - replica.last >= (REFRESH if replica.live else PROBE)]
         return self._send(now, call, targets)
 
@@ -147,28 +157,40 @@ class Calls:
             if one.pause:
                 actions += self._send_to_any(now, call, one)
                 continue
+            over = now >= one.deadline
             for name in one.asked - one.failed:
-                self.replicas[name].late = self._hedge_after is not None
-            actions += self._send(now, call, self._next(one))
+                self.replicas[name].late = over or self._hedge_after is not None
+            if over:
+                one.deadline = math.inf
+            actions += self._send(
+                now, call, self._at_last(one) if over else self._next(one, self._live()))
+            one.due = min(one.due, one.deadline)
         return actions
 
     # -- the rules ------------------------------------------------------------------------------
 
     def _live(self) -> list[Figures]:
         """Return the live replicas, the nearest first; unknown latencies come before all."""
-        return sorted((replica for replica in self.replicas.values() if replica.live),
+        return sorted((replica for replica in self.replicas.values()
+                       if replica.live and replica is not self._last),
                       key=lambda replica: replica.latency or 0.0)
+
+    def _at_last(self, one: _Call) -> list[Figures]:
+        """Return the last replica, unless there is none or it has the request."""
+        last = self._last
+        return [last] if last is not None and last.there and last.name not in one.asked else []
 
     def _delay(self, replica: Figures) -> Optional[float]:
         if self._hedge_after == 'p95':
             return replica.p95
         return None if self._hedge_after is None else self._hedge_after / 1000
 
-    def _next(self, one: _Call) -> list[Figures]:
-        """Return the next replica for a request: a live one, or one that is left out."""
+    def _next(self, one: _Call, first: Sequence[Figures]) -> list[Figures]:
+        """Return the next replica for a request: of the first ones, or one that is left out."""
         others = (replica for replica in self.replicas.values()
-                  if replica.there and not (replica.live or replica.died))
-        for replica in (*self._live(), *others):
+                  if replica.there and not (replica.live or replica.died)
+                  and replica is not self._last)
+        for replica in (*first, *others):
             if replica.name not in one.asked:
                 return [replica]
         return []
@@ -180,7 +202,7 @@ class Calls:
             replica.last = replica.sent[call] = now
             one.asked.add(replica.name)
             one.failed.discard(replica.name)
-            one.due = min(one.due, now + (self._delay(replica) or PROBE))
+            one.due = min(one.due, now + (self._delay(replica) or PROBE), one.deadline)
             actions.append(Send(call, replica.name))
         return actions
 
@@ -205,7 +227,9 @@ class Calls:
     def _failed(self, now: float, call: int, name: str) -> list[Action]:
         one = self._calls[call]
         one.failed.add(name)
-        actions = self._send(now, call, self._next(one))
+        # the last one while no other may still answer
+        last = [] if one.asked - one.failed else self._at_last(one)
+        actions = self._send(now, call, self._next(one, [*self._live(), *last]))
         if actions or one.asked - one.failed:
             return actions
         if one.error is not None:

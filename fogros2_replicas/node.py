@@ -14,6 +14,7 @@ import difflib
 import functools
 import itertools
 import json
+import math
 import os
 import re
 import select
@@ -53,7 +54,8 @@ class _Served:
 
     def __init__(self, node: FirstAnswer, name: str) -> None:
         self.name, self.node = name, node
-        self.figures = Calls(list(node.replicas), node.settings['hedge_after'])
+        self.figures = Calls(list(node.replicas), node.settings['hedge_after'], node.last,
+                             node.deadline)
         self.opened = False
         self._kind = ''
         self._numbers = itertools.count()
@@ -122,9 +124,10 @@ class _Forwarded:
 
     def __init__(self, node: FirstAnswer, source: str, target: str, streamed: bool) -> None:
         self.name, self.node = target, node
-        self.figures = Pair(list(node.replicas))
+        self.figures = Pair(list(node.replicas), node.last, node.deadline)
         self._source, self._streamed = source, streamed
         self._inputs: Optional[list[Publisher]] = None
+        self._at_last: Optional[Publisher] = None
         self._output: Optional[Publisher] = None
         self._heard: set[str] = set()
         self._kind = ''
@@ -154,17 +157,26 @@ class _Forwarded:
         kind, qos = self.node.published(self._source)
         message = self.node.imported(self._source, kind, ros_types.message)
         if self._inputs is None and message is not None:
-            self._inputs = [] if self._streamed else [
-                self.node.create_publisher(message, prefix + self._source, qos)
-                for prefix in self.node.replicas.values()]
+            inputs = {name: self.node.create_publisher(message, prefix + self._source, qos)
+                      for name, prefix in self.node.replicas.items()
+                      if name == self.node.last or not self._streamed}
+            self._at_last = inputs.pop(self.node.last, None)
+            self._inputs = [*inputs.values()]
             self.node.create_subscription(message, self._source, functools.partial(
                 self._came_in, _reader(message)), qos, raw=True)
 
     def _came_in(self, read: Read, data: bytes) -> None:
-        with self.node.lock:
-            self.figures.input(time.monotonic(), read(data))
         for publisher in self._inputs or ():
             publisher.publish(data)
+        with self.node.lock:
+            self.to_last(self.figures.input(time.monotonic(), read(data), data))
+        self.node.wake()
+
+    def to_last(self, inputs: Iterable[bytes]) -> None:
+        """Send inputs to the last replica."""
+        if self._at_last is not None:
+            for data in inputs:
+                self._at_last.publish(data)
 
     def _came_out(self, name: str, read: Read, data: bytes) -> None:
         with self.node.lock:
@@ -183,14 +195,17 @@ class FirstAnswer(Node):
 
     :param settings: ``name`` of the node; ``replicas``, the prefix of their names by name; the
         public ``services``; ``topics``, each as input, output and whether the input is a stream,
-        which arrives by itself; ``hedge_after`` as in :mod:`fogros2_replicas.calls`; ``folder``,
-        where figures are written to and events of the launch come from.
+        which arrives by itself; ``hedge_after`` as in :mod:`fogros2_replicas.calls`; ``last``, the
+        name of the replica that is asked last, if there is one, and its ``deadline`` in seconds;
+        ``folder``, where figures are written to and events of the launch come from.
     """
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         super().__init__(settings['name'], start_parameter_services=False)
         self.settings = settings
         self.replicas: dict[str, str] = settings['replicas']
+        self.last: str = settings.get('last', '')
+        self.deadline: float = settings.get('deadline', math.inf)
         self.lock = threading.RLock()
         self._complained: set[str] = set()
         self._begin = time.monotonic()
@@ -277,15 +292,14 @@ class FirstAnswer(Node):
 
     def wake(self) -> None:
         """Have the thread look when the next request is due."""
-        if self.settings['hedge_after'] and threading.current_thread() is not self._watcher:
+        if (self.settings['hedge_after'] or self.last) and threading.current_thread() is not self._watcher:
             os.write(self._events, b'\n')
 
     def _watch(self) -> None:
         """Read events of the launch, and send requests that are due to the next replica."""
-        services = [one for one in self._public if isinstance(one, _Served)]
         while rclpy.ok(context=self.context):
             with self.lock:
-                due = min((one.figures.next_due() for one in services), default=1e9)
+                due = min((one.figures.next_due() for one in self._public), default=1e9)
             wait = max(0.0, min(due - time.monotonic(), WRITE))
             ready, _, _ = select.select([self._events], [], [], wait)
             lines = os.read(self._events, 65536).decode().split('\n') if ready else []
@@ -299,8 +313,11 @@ class FirstAnswer(Node):
                             one.do(one.figures.died(now, name))
                         else:
                             one.figures.died(name)
-                for one in services:
-                    one.do(one.figures.due(now))
+                for one in self._public:
+                    if isinstance(one, _Served):
+                        one.do(one.figures.due(now))
+                    else:
+                        one.to_last(one.figures.due(now))
             if any(lines) and self.executor is not None:
                 self.executor.wake()  # an event may have answered a client
 

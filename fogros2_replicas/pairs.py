@@ -3,13 +3,15 @@
 Decide which messages of replicated nodes are forwarded; pure.
 
 Replicas that work on the same input give their outputs the input's stamp. So the n-th message with
-a stamp and a frame id is the same from each replica, and the first one is forwarded.
+a stamp and a frame id is the same from each replica, and the first one is forwarded. One replica
+may be the last: it gets an input only if no other has made an output of it by a deadline.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
+import math
 from typing import Optional
 
 from fogros2_replicas.figures import Figures
@@ -25,6 +27,8 @@ STREAK = 3
 #: An input that is so many nanoseconds older than the newest one means that time was set back; an
 #: output that is so much newer than the newest input is dropped.
 SET_BACK = 1_000_000_000
+#: Most inputs that are held for the last replica.
+HELD = 32
 #: Bytes of a frame id that are compared; maximum number of different ids of one stamp.
 FRAME, FRAMES = 256, 1000
 
@@ -47,10 +51,20 @@ class Pair:
     An input topic and an output topic; all times are seconds of one clock.
 
     :param replicas: their names, in the order of preference.
+    :param last: name of the last replica, '' for none.
+    :param deadline: seconds after which it gets an input.
     """
 
-    def __init__(self, replicas: Sequence[str]) -> None:
+    def __init__(
+        self, replicas: Sequence[str], last: str = '', deadline: float = math.inf,
+    ) -> None:
         self.replicas = {name: Figures(name) for name in replicas}
+        self._last = last
+        self._deadline = deadline
+        #: Inputs that the last replica may get: when, their stamps, and themselves.
+        self._held: deque[tuple[float, int, bytes]] = deque(maxlen=HELD)
+        #: Whether the others have missed a deadline, and made no output in time since.
+        self._late = False
         #: Whether stamps of outputs match inputs; until then one replica is forwarded.
         self.matches = False
         #: Whether too many outputs match no input, which is worth a warning.
@@ -63,8 +77,38 @@ class Pair:
         self._chosen: Optional[str] = None
         self._streaks: Counter[str] = Counter()
 
-    def input(self, now: float, header: Optional[Header]) -> None:
-        """Record an input."""
+    def input(self, now: float, header: Optional[Header], data: bytes = b'') -> list[bytes]:
+        """Record an input; return what the last replica gets now."""
+        self._record(now, header)
+        if not self._last:
+            return []
+        others = any(replica.there and not replica.died for replica in self.replicas.values()
+                     if replica.name != self._last)
+        if self._late or not others:
+            return [data]
+        self._held.append((now + self._deadline, header[0] if header is not None else 0, data))
+        return []
+
+    def next_due(self) -> float:
+        """Return when to call :meth:`due` next; infinity for never."""
+        return self._held[0][0] if self._held else math.inf
+
+    def due(self, now: float) -> list[bytes]:
+        """Return the inputs of which no replica has made an output in time, for the last one."""
+        due = []
+        while now >= self.next_due():
+            due.append(self._held.popleft()[2])
+            self._late = True
+        return due
+
+    def _in_time(self, now: float, header: Optional[Header], begin: Optional[float]) -> None:
+        """Forget the inputs up to that of an output; without a match, all."""
+        if begin is None or now - begin <= self._deadline:
+            self._late = False
+        while self._held and (begin is None or header is None or self._held[0][1] <= header[0]):
+            self._held.popleft()
+
+    def _record(self, now: float, header: Optional[Header]) -> None:
         stamp = header[0] if header is not None else 0
         if not stamp:
             return  # 0 is no stamp
@@ -81,6 +125,8 @@ class Pair:
         replica = self.replicas[name]
         replica.died = False
         begin = None if header is None else self._inputs.get(header[0])
+        if name != self._last:
+            self._in_time(now, header, begin)
         if begin is not None:
             replica.took(now - begin)
             self.matches, self.unmatched = True, False

@@ -247,7 +247,7 @@ def place(provider: str, *, short: bool = True) -> Iterator[Place]:
         else:
             there = _cluster(stack)
             make = stack.enter_context(making_namespaces(
-                there, Client(there.kubeconfig), ROOT / 'deploy' / 'kubernetes' / 'role.yaml'))
+                there, Client(there.kubeconfig), ROOT / 'packaging' / 'kubernetes' / 'role.yaml'))
             yield Pod(there, make(), short=short)
 
 

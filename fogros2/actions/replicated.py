@@ -3,19 +3,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import copy
 from typing import Any, Optional, TYPE_CHECKING, Union
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
-from launch.actions import GroupAction
+from launch.actions import ExecuteLocal, GroupAction
 
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.describe import values
+from fogros2.describe.keywords import ROBOT
 from fogros2.errors import ConfigurationError
 from fogros2.image_transport.topics import absolute, local_topic
-from fogros2.launch_internals import components
-from fogros2.runtime import replicas
+from fogros2.launch_internals import components, private
+from fogros2.launch_internals.wrapping import wrap
+from fogros2.model import NodeSpec
+from fogros2.runtime import replicas, streaming
 from fogros2.runtime.coordinator import Coordinator
 from fogros2.runtime.remote_process import remote_of
 from fogros2.runtime.republishers import AddedProcess
@@ -33,28 +36,31 @@ class Replicated(Action):
 
     The nodes have to be stateless: each request may reach several of them. See doc/replicas.md.
 
-    :param machines: the machines, or their names.
+    :param machines: the machines, or their names; None, or the name 'robot', is the robot, whose
+        own copy is asked last.
     :param actions: the content, of which each machine runs a copy.
     :param services: services of these nodes that the node ``first_answer`` serves on the robot.
     :param topics: pairs of an input of these nodes and the output that they make of it.
     :param hedge_after: milliseconds after which a request goes to the next machine, or 'p95', the
         learned 95th percentile; None: each request goes to all machines at once.
+    :param deadline: seconds without an answer of a machine after which the robot's copy is asked.
     :param stream_topics: image topics that cross the VPN encoded, as for Node.
     :raises ConfigurationError: too few machines, invalid or repeated names.
     """
 
     def __init__(
-        self, machines: Union[Sequence[SomeMachine], values.List], actions: Iterable[Action], *,
+        self, machines: Union[Sequence[Optional[SomeMachine]], values.List], actions: Iterable[Action], *,
         services: Union[Sequence[SomeSubstitutionsType], values.List] = (),
         topics: Union[Sequence[tuple[SomeSubstitutionsType, SomeSubstitutionsType]],
                       values.List] = (),
         hedge_after: Union[float, SomeSubstitutionsType, None] = None,
+        deadline: Union[float, SomeSubstitutionsType, None] = None,
         stream_topics: Sequence[Entry] = (), **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
         self._machines, self._actions = machines, list(actions)
         self._services, self._topics = services, topics
-        self._hedge_after = hedge_after
+        self._hedge_after, self._deadline = hedge_after, deadline
         self._stream_topics = list(stream_topics)
         self._groups = [] if isinstance(machines, values.List) else [
             self._group(machine) for machine in machines]
@@ -77,10 +83,17 @@ class Replicated(Action):
         hedge_after = values.resolve(context, self._hedge_after)
         if isinstance(hedge_after, str) and hedge_after != 'p95':
             hedge_after = values.read_number(hedge_after) if hedge_after else None
+        deadline = values.resolve(context, self._deadline)
+        if isinstance(deadline, str):
+            deadline = values.read_number(deadline) if deadline else None
         # checked before a machine is requested
-        labels = [coordinator.resolve(machine) for machine in machines]
+        labels = [ROBOT if machine is None else coordinator.resolve(machine)
+                  for machine in machines]
         replicas.check([label if isinstance(label, str) else label.name for label in labels],
-                       services, pairs, hedge_after)
+                       services, pairs, hedge_after, deadline)
+        groups = [self._group(None) if label == ROBOT else group for label, group in zip(
+            labels, self._groups or map(self._group, machines))]
+        machines = [machine for machine, label in zip(machines, labels) if label != ROBOT]
         here = [coordinator.on_robot(machine) for machine in machines]
         if all(here):
             return [GroupAction(copy.deepcopy(self._actions))]
@@ -94,12 +107,17 @@ class Replicated(Action):
             session.replicate({one: local_topic(one, name) for one in public})
         first = replicas.first_answer(
             coordinator.launch.store.launch(coordinator.launch.id), sessions, services,
-            [(*pair, pair[0] in streamed) for pair in pairs], hedge_after, context)
-        return [*(self._groups or map(self._group, machines)), first]
+            [(*pair, pair[0] in streamed) for pair in pairs], hedge_after, deadline, context)
+        for group in groups:
+            if isinstance(group, _Last):
+                group.names = {one: local_topic(one, ROBOT) for one in public}
+        return [*groups, first]
 
-    def _group(self, machine: SomeMachine) -> CloudGroup:
-        return _Replica(
-            machine, copy.deepcopy(self._actions), stream_topics=self._stream_topics)
+    def _group(self, machine: Optional[SomeMachine]) -> GroupAction:
+        actions = copy.deepcopy(self._actions)
+        if machine is None:
+            return _Last(actions)
+        return _Replica(machine, actions, stream_topics=self._stream_topics)
 
     def _streamed(
         self, coordinator: Coordinator, namespace: str, outputs: Sequence[str],
@@ -119,16 +137,42 @@ class _Replica(CloudGroup):
     """The content on one machine."""
 
     def _send(self, entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
-        lifecycle = any(cls.__name__ == 'LifecycleNode' for cls in type(entity).__mro__)
-        if lifecycle or components.are_loaded_by(entity):
-            raise ConfigurationError(
-                f'{type(entity).__name__} cannot be replicated: the launch changes it by a '
-                'service whose name all replicas have', 'run it on one machine')
-        if isinstance(entity, CloudGroup) or (
-                remote_of(entity) is not None and not isinstance(entity, AddedProcess)):
-            raise ConfigurationError('a part of replicas has a machine of its own',
-                                     'leave its machine= out, or move it out of Replicated')
+        _check(entity)
         super()._send(entity, context)
+
+
+class _Last(GroupAction):
+    """
+    The content on the robot.
+
+    :ivar names: new names of topics and services by the public ones.
+    """
+
+    names: Mapping[str, str]
+
+    def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
+        return wrap(super().execute(context), self._rename)
+
+    def _rename(self, entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
+        _check(entity)
+        if isinstance(entity, ExecuteLocal):
+            private.change_command(entity, self._renamed)
+
+    def _renamed(self, command: Sequence[str]) -> Sequence[str]:
+        node = streaming.remapped(NodeSpec('', '', arguments=tuple(command)), self.names)
+        return [str(word) for word in node.arguments]
+
+
+def _check(entity: LaunchDescriptionEntity) -> None:
+    lifecycle = any(cls.__name__ == 'LifecycleNode' for cls in type(entity).__mro__)
+    if lifecycle or components.are_loaded_by(entity):
+        raise ConfigurationError(
+            f'{type(entity).__name__} cannot be replicated: the launch changes it by a '
+            'service whose name all replicas have', 'run it on one machine')
+    if isinstance(entity, CloudGroup) or (
+            remote_of(entity) is not None and not isinstance(entity, AddedProcess)):
+        raise ConfigurationError('a part of replicas has a machine of its own',
+                                 'leave its machine= out, or move it out of Replicated')
 
 
 def _pair(pair: Any, context: LaunchContext, namespace: str) -> tuple[str, str]:

@@ -28,6 +28,8 @@ SWEEP = ((0.0, signal.SIGINT), (3.0, signal.SIGTERM), (6.0, signal.SIGKILL))
 SWEEP_QUICKLY = ((0.0, signal.SIGINT), (0.4, signal.SIGTERM), (0.8, signal.SIGKILL))
 #: Maximum bytes of a watch's output in its event, and its poll interval in seconds.
 REASON, WATCH_INTERVAL = 2000, 5.0
+#: The watch for a notice of the provider.
+NOTICE = 'notice'
 #: The variable that marks the nodes and their descendants.
 MARK = 'FOGROS2_AGENT_MARK'
 
@@ -274,7 +276,7 @@ class Checks:
         self.processes.spawn(kept.alive, checked, timeout=CHECK_TIMEOUT)
 
     def watch(self, what: Any, argv: list[str], interval: float = WATCH_INTERVAL) -> None:
-        """Start a watch ('notice' or 'idle'), or replace the one with the same ``what``."""
+        """Start a watch, or replace the one with the same ``what``."""
         watch = self.watched[what] = object()
 
         def look() -> None:
@@ -292,7 +294,8 @@ class Checks:
             if status == 0:
                 del self.watched[what]
                 say(f'{what}: {reason}')
-                self.emit({'event': what, 'reason': reason})
+                kind = {'event': what} if what == NOTICE else {'event': 'watched', 'what': what}
+                self.emit({**kind, 'reason': reason})
             else:
                 self.loop.at(interval, look)
 

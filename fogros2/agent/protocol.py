@@ -14,9 +14,10 @@ A request is ``{"id": 1, "command": ..., ...}``. A reply is ``{"id": 1, "ok": tr
                still has the machine; the request may have been delayed until after a release.
 ``keep``       ``what``, ``alive`` argv, ``repair`` and ``down`` lists of argv, ``interval`` (s):
                health check with repair
-``watch``      ``what`` (idle), ``argv``, run as root every ``interval`` (s, default 5). When it
-               exits with 0, the agent sends one event named ``what``, with the output as
-               ``reason``, and ends the watch. The watch ``notice`` is part of the configuration.
+``watch``      ``what``, ``argv``, run as root every ``interval`` (s, default 5). When it exits
+               with 0, the agent sends one event ``watched`` with ``what`` and, as ``reason``, the
+               output, and ends the watch. The watch ``notice`` is part of the configuration; its
+               event is named so.
 ``start``      ``nodes``: list of NodeSpec; nodes with a known id are ignored. Replies when the
                setup files have been sourced and the processes started.
 ``stop``       ``nodes``: ids, or null for all; replies at once, ``exited`` events follow

@@ -27,6 +27,7 @@ from fogros2.agent.nodes import Node, Nodes
 from fogros2.agent.processes import (
     Checks,
     Identity,
+    NOTICE,
     Processes,
     remove_tree,
     WATCH_INTERVAL,
@@ -450,7 +451,7 @@ class Agent:
 
     def _watch_notice(self) -> None:
         if self.config['notice']:
-            self.checks.watch('notice', self.config['notice'])
+            self.checks.watch(NOTICE, self.config['notice'])
 
     def _restart_watchdog(self) -> None:
         self.watchdog.configured(self.loop.clock(), heartbeat=bool(self.config['heartbeat']))
@@ -476,9 +477,10 @@ class Agent:
         """Start a watch, or replace the one with the same ``what``."""
         self._check_held()
         argv, interval = words(request['argv']), float(request.get('interval', WATCH_INTERVAL))
-        if request['what'] != 'idle' or not argv:
-            raise Refused(f"there is no watch for '{request['what']}'", 'idle')
-        self.checks.watch('idle', argv, max(0.05, interval))
+        what = request['what']
+        if not isinstance(what, str) or what == NOTICE or not argv:
+            raise Refused(f"'{what}' can't be watched")
+        self.checks.watch(what, argv, max(0.05, interval))
         return {}
 
     def do_start(self, client: Client, request: Json) -> None:

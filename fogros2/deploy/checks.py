@@ -81,8 +81,8 @@ def check(
         containers.check(containers.parse(line), rmw)
     if spec.containers or images:
         provider.check_containers(spec)
-    for name, given in spec.features.items():
-        feature.load(name).check(spec, feature.options(name, given))
+    for each, own in feature.used(spec):
+        each.check(spec, own)
     chain = [workspace.inspect(path) for path in spec.workspaces]
     if not provider.has_own_packages(spec):
         for package, executable in programs:

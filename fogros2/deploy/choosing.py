@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import dataclasses
 from decimal import Decimal
 import threading
 import time
 from typing import Optional
 
-from fogros2 import model, plan
+from fogros2 import feature, model, plan
 from fogros2.errors import FogError
 from fogros2.model import MachineSpec
 from fogros2.provider import Provider
@@ -79,6 +80,17 @@ class Choices:
         except FogError:
             return None  # the price is only displayed; a price limit was checked before
 
+    def limited(self, spec: MachineSpec, price: Optional[Decimal]) -> MachineSpec:
+        """
+        Return a spec with the lifetime that its features allow.
+
+        :param price: US dollars per hour, None if unknown.
+        :raises FogError: they allow none.
+        """
+        _, spent = self.spent(spec.name)
+        return dataclasses.replace(spec, lifetime=min([spec.lifetime, *(
+            each.lifetime(spec, price, spent, own) for each, own in feature.used(spec))]))
+
     def begin(self, name: str, price: Optional[Decimal]) -> None:
         """Start to count a machine's cost; a later call changes the price, not the start."""
         if price is None:
@@ -93,6 +105,13 @@ class Choices:
             known = self._costs.get(name)
             if known is not None and known[2] is None:
                 self._costs[name] = (known[0], known[1], time.monotonic())
+
+    def spent(self, name: str) -> tuple[Optional[Decimal], Decimal]:
+        """Return a machine's US dollars per hour, None if unknown, and its cost so far."""
+        for each, price, seconds in self.cost():
+            if each == name:
+                return price, price * Decimal(seconds) / 3600
+        return None, Decimal(0)
 
     def cost(self) -> list[tuple[str, Decimal, float]]:
         """Return (name, US dollars per hour, seconds) of each machine with a known price."""

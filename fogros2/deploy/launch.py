@@ -137,7 +137,9 @@ class Launch:
             self._check_choices(place)
 
     def _check_choices(self, place: MachineSpec) -> None:
-        check_architecture(self._choices.resolved(place), self.provider(place.provider))
+        chosen = self._choices.resolved(place)
+        self._choices.limited(chosen, self._choices.price(chosen))
+        check_architecture(chosen, self.provider(place.provider))
 
     def _places(self, spec: MachineSpec) -> list[MachineSpec]:
         """Return the specs to try; a kept machine with the same requirements stays where it is."""

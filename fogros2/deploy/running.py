@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import contextlib
-from pathlib import Path
-import secrets
+from decimal import Decimal
 import threading
 from typing import Any, Optional
 
+from fogros2 import feature
 from fogros2.agent_client import EventCallback
 from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob, SILENCE_TIMEOUT, Step
@@ -19,7 +19,6 @@ from fogros2.deploy.steps.watching import POLL_INTERVAL, Watch
 from fogros2.deploy.undo import MONITOR_PORT
 from fogros2.errors import AgentError, DeadlineExceeded, FogError
 from fogros2.events import Event
-from fogros2.host import idle
 from fogros2.model import Command, host_port, Machine, NodeSpec
 from fogros2.report import Warned
 from fogros2.waiting import wait_until
@@ -56,6 +55,7 @@ class RunningMachine(Step):
         #: Whether undo steps have begun.
         self._ending = False
         self._published: dict[int, tuple[str, int]] = {}
+        self._watches: dict[str, Callable[[str], None]] = {}
         job.undo.callback(Watch(
             context, job, gone=self._gone, found=found, lost=self._is_lost).close)
         job.undo.callback(self._undo_begins)
@@ -64,6 +64,16 @@ class RunningMachine(Step):
     def lost(self) -> str:
         """Why the machine is gone or must not be used any more, '' while it is there."""
         return self._lost
+
+    @property
+    def cost(self) -> tuple[Optional[Decimal], Decimal]:
+        """US dollars per hour, None if unknown, and what its launch has spent so far."""
+        return self._context.choices.spent(self.spec.name)
+
+    @property
+    def directory(self) -> str:
+        """The agent's folder on the machine."""
+        return self._job.directory
 
     def run(self, command: Command, *, timeout: float) -> str:
         """
@@ -94,14 +104,16 @@ class RunningMachine(Step):
         :raises PrerequisiteError: the machine cannot get their imports or their image.
         """
         nodes = self._modules.fitted(self._containers.inside(nodes))
+        for each, own in feature.used(self.spec):
+            nodes = each.starting(self, nodes, own)
         self.agent.request('start', nodes=nodes)
-        if self.spec.idle_timeout is not None:
-            # the time begins anew with each start
-            timeout = self.spec.idle_timeout
-            self.agent.request(
-                'watch', what='idle', interval=idle.interval(timeout),
-                argv=['python3', '-IS', '-c', Path(idle.__file__).read_text(), self.interface.name,
-                      self._job.directory, str(timeout), secrets.token_hex(4)])
+
+    def watch(
+        self, name: str, argv: Sequence[str], interval: float, then: Callable[[str], None],
+    ) -> None:
+        """Run a program until it exits with 0; see :class:`fogros2.feature.RunningMachine`."""
+        self._watches[name] = then
+        self.agent.request('watch', what=name, interval=interval, argv=list(argv))
 
     def stop(self, ids: Optional[Sequence[str]] = None) -> None:
         """Stop nodes by SIGINT, SIGTERM, SIGKILL in turn; all nodes if ``ids`` is None."""
@@ -147,8 +159,12 @@ class RunningMachine(Step):
         def tell(event: Event) -> None:
             # an agent that exits at the end of the launch is expected
             expected = event['event'] == 'connection' and self._context.ending.is_set()
-            if not (self._lost or self._ended or expected):
+            if self._lost or self._ended or expected:
+                return
+            if event['event'] != 'watched':
                 callback(event)
+            elif then := self._watches.pop(event['what'], None):
+                then(event['reason'])
 
         with self._lock:
             self._callback, lost = callback, self._lost or self._ended
@@ -214,6 +230,13 @@ class RunningMachine(Step):
         self._context.provider.destroy(self._job.machine_id)
         self._job.gone = self._job.deleted = True
         self.close()
+
+    def give_up(self, reason: str) -> None:
+        """Let the launch end the machine and its nodes, and go on without them."""
+        with self._lock:
+            callback = self._callback
+        if callback is not None:
+            callback({'event': 'given_up', 'reason': reason})
 
     def end(self, reason: str) -> None:
         """End the machine as its ``on_exit`` says; its further events are ignored."""

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 #: The file's name, in the user's folder of configurations and in a workspace.
 FILE = 'fogros2.toml'
 _TYPES: Mapping[Kind, tuple[type, ...]] = {
-    'text': (str,), 'number': (int, float, str), 'bool': (bool,), 'list': (list,),
+    'text': (str, int, float), 'number': (int, float, str), 'bool': (bool,), 'list': (list,),
     'table': (list,), 'mapping': (dict,), 'scalar': (str, int, float),
     'text or mapping': (str, dict)}
 

@@ -35,11 +35,7 @@ if TYPE_CHECKING:
     #: A machine in a launch file; a name may be of a machine that is mentioned elsewhere.
     SomeMachine = Union['CloudInstance', SomeSubstitutionsType]
 
-_UNITS = {'s': 1.0, 'm': 60.0, 'h': 3600.0, 'd': 86400.0}
 _PREFIXES = {'': 1.0, 'k': 1e3, 'M': 1e6, 'G': 1e9}
-#: Seconds that a duration may have: a century.
-_LONGEST = 3.2e9
-_DURATION = re.compile(r'(?:\d+(?:\.\d+)?[smhd])+')
 
 
 class CloudInstance:
@@ -63,8 +59,6 @@ class CloudInstance:
     :param robot_timeout: time without contact to the launch until the machine stops its nodes;
         seconds or as above; 2 minutes. A machine that the launch has not reached yet ends
         6 minutes after its boot (a pod: 10 minutes, or this time if it is longer).
-    :param idle_timeout: time without use after which the machine ends as ``on_exit`` says, while
-        the launch goes on; seconds or as above. See doc/howto/idle_machines.md.
     :param bootstrap: how to install ROS 2 there: 'auto' (the default), 'apt', 'pip', 'none'.
     :param environment: variables for every node on the machine; PYTHONPATH, PATH and other lists
         of folders are prepended to the machine's own.
@@ -105,7 +99,6 @@ class CloudInstance:
         on_exit: SomeSubstitutionsType = 'delete',
         lifetime: Optional[Value] = None,
         robot_timeout: Optional[Value] = None,
-        idle_timeout: Optional[Value] = None,
         bootstrap: Optional[SomeSubstitutionsType] = None,
         environment: Optional[Mapping[str, SomeSubstitutionsType]] = None,
         on_interrupt: Optional[SomeSubstitutionsType] = None,
@@ -462,30 +455,6 @@ def checked(machine: SomeMachine) -> SomeMachine:
     return machine
 
 
-def parse_duration(what: str, value: Union[str, int, float]) -> float:
-    """
-    Convert a number, or text such as '90', '8h', '1h30m', '2d', to seconds.
-
-    :raises ConfigurationError: not a duration, or not above zero.
-    """
-    seconds: float = 0
-    if isinstance(value, str):
-        text = value.replace(' ', '')
-        try:
-            seconds = float(text)
-        except ValueError:
-            if _DURATION.fullmatch(text):
-                seconds = sum(
-                    float(number) * _UNITS[unit]
-                    for number, unit in re.findall(r'([\d.]+)([smhd])', text))
-    else:
-        seconds = value
-    if not 0 < seconds < _LONGEST:
-        raise ConfigurationError(
-            f'{what}={value!r} is no duration', "use seconds, or text such as '8h' or '1h30m'")
-    return float(seconds)
-
-
 def parse_bandwidth(what: str, value: Union[str, int, float]) -> float:
     """
     Convert text such as '10Mbit/s', or a number of bits per second, to bits per second.
@@ -550,13 +519,12 @@ _CHECKS: dict[str, Any] = {
     'on_exit': _choice(OnExit),
     'bootstrap': _choice(Bootstrap),
     'on_interrupt': _choice(OnInterrupt),
-    'lifetime': parse_duration,
-    'robot_timeout': parse_duration,
-    'idle_timeout': parse_duration,
-    'on_loss_after': parse_duration,
+    'lifetime': values.parse_duration,
+    'robot_timeout': values.parse_duration,
+    'on_loss_after': values.parse_duration,
     'max_replacements': _count,
     'checkpoint': check_folder,
-    'checkpoint_interval': parse_duration,
+    'checkpoint_interval': values.parse_duration,
     'bandwidth': parse_bandwidth,
 }
 #: Keywords of every machine that a file of defaults may have.

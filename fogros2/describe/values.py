@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 import contextlib
 from decimal import Decimal
 import os
+import re
 from typing import Any, TYPE_CHECKING, Union
 
 from fogros2.errors import ConfigurationError
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
 
 #: Requests a value, in a thread, because that takes time; raises FogError.
 Deferred = Callable[[], str]
+_SECONDS = {'s': 1.0, 'm': 60.0, 'h': 3600.0, 'd': 86400.0}
+#: Seconds that a duration may have: a century.
+_LONGEST = 3.2e9
+_DURATION = re.compile(r'(?:\d+(?:\.\d+)?[smhd])+')
 _BOOLS = {'true': True, '1': True, 'false': False, '0': False}
 
 
@@ -191,6 +196,30 @@ def number(text: str) -> Union[int, float, str]:
         except ValueError:
             continue
     return text
+
+
+def parse_duration(what: str, value: Union[str, int, float]) -> float:
+    """
+    Convert a number, or text such as '90', '8h', '1h30m', '2d', to seconds.
+
+    :raises ConfigurationError: not a duration, or not above zero.
+    """
+    seconds: float = 0
+    if isinstance(value, str):
+        text = value.replace(' ', '')
+        try:
+            seconds = float(text)
+        except ValueError:
+            if _DURATION.fullmatch(text):
+                seconds = sum(
+                    float(number) * _SECONDS[unit]
+                    for number, unit in re.findall(r'([\d.]+)([smhd])', text))
+    else:
+        seconds = value
+    if not 0 < seconds < _LONGEST:
+        raise ConfigurationError(
+            f'{what}={value!r} is no duration', "use seconds, or text such as '8h' or '1h30m'")
+    return float(seconds)
 
 
 def read_bool(value: Any) -> bool:

@@ -83,6 +83,7 @@ NEEDS: Mapping[tuple[str, str], tuple[str, ...]] = {
     ('fogros2_examples', 'policy_server'): ('numpy', 'cv2', 'onnxruntime'),
     ('fogros2_examples', 'policy_client'): ('numpy', 'cv2'),
     ('fogros2', 'bridge'): ('foxglove',),
+    ('fogros2', 'record'): ('foxglove',),
 }
 
 #: Debian packages of the shared libraries that the wheels of OpenCV and PyAV need.

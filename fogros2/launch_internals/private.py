@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import asyncio
 import collections
-from collections.abc import Awaitable, Callable, Coroutine, Iterable
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Sequence
 import contextlib
 import functools
 import signal
@@ -95,6 +95,19 @@ def replace_methods(action: ExecuteLocal, methods: Methods) -> Methods:
     own = Methods(*(getattr(action, name) for name in names))
     vars(action).update(zip(names, methods))
     return own
+
+
+def change_command(
+    action: ExecuteLocal, change: Callable[[Sequence[str]], Sequence[str]],
+) -> None:
+    """Have a process action run a changed command line, once it is resolved."""
+    prepare = action.prepare
+
+    def prepared(context: LaunchContext) -> None:
+        prepare(context)
+        action.process_details['cmd'] = [*change(action.process_details['cmd'])]
+
+    vars(action)['prepare'] = prepared
 
 
 class Stay:

@@ -9,16 +9,17 @@ from typing import Literal
 #: ``awaited``: it does not run yet. ``ending``: its agent ends everything, and nobody knows yet
 #: whether the machine is gone. ``reclaimed``: its provider takes it away, and it still runs.
 #: ``drained``: so, and its nodes have ended. ``gone``: it does not run any more. ``replaced``:
-#: another machine is up, and the nodes are not there yet. ``over``: nobody used it.
+#: another machine is up, and the nodes are not there yet. ``over``: the launch goes on without it.
 Phase = Literal[
     'awaited', 'up', 'ending', 'reclaimed', 'drained', 'gone', 'replaced', 'over']
 #: ``claim``: the machine says that it is reclaimed, which may be forged; ``refuted``: its provider
 #: does not confirm that. ``last_words``: its agent ends everything. ``spared``: after these, the
 #: machine is still there. ``empty``: none of its processes runs there. ``replaced``: another
-#: machine is up; ``returned``: the nodes wait for it. ``idle``: nobody uses it.
+#: machine is up; ``returned``: the nodes wait for it. ``given_up``: the launch
+#: is to go on without it.
 Event = Literal[
     'up', 'claim', 'refuted', 'last_words', 'spared', 'reclaimed', 'empty', 'gone', 'replaced',
-    'returned', 'idle']
+    'returned', 'given_up']
 #: ``confirm``: ask the provider about a claim. ``hold``: keep exits back, for ``spared`` or
 #: ``gone`` to follow. ``release``: report them. ``announce``: the machine is reclaimed, or gone.
 #: ``bury``: it is gone, after it was reclaimed. ``save``: take the last checkpoint.
@@ -68,6 +69,6 @@ def decide(state: MachineState, event: Event) -> tuple[MachineState, tuple[Comma
         return change(state, phase='replaced'), ()
     if event == 'returned' and phase == 'replaced':
         return change(state, phase='up'), ()
-    if event == 'idle' and phase in ('up', 'ending'):
+    if event == 'given_up' and phase in ('up', 'ending'):
         return change(state, phase='over'), ()
     return state, ()

@@ -11,7 +11,7 @@ from typing import cast, Optional, TYPE_CHECKING
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal
 
-from fogros2 import plan
+from fogros2 import feature, plan
 from fogros2.errors import ConfigurationError
 from fogros2.host.checkpoint import check_folder
 from fogros2.launch_internals import components, private
@@ -101,11 +101,8 @@ class RemoteProcess:
             shared = provider.shared_folders(session.spec) if paths else ()
             session.warn_of_paths(
                 self._node, [path for path in paths if not plan.below(path, shared)])
-        if session.spec.idle_timeout is not None and (self.image or session.spec.containers):
-            raise ConfigurationError(
-                f"the machine '{session.spec.name}' has an idle_timeout and runs a container: "
-                'nothing measures what a container computes',
-                'leave idle_timeout= out, or run the nodes without containers')
+        for each, own in feature.used(session.spec):
+            each.check_node(session.spec, self._node, own)
         how = session.spec.on_interrupt
         if how != 'shutdown' and not session.replicated and not (
                 self.image or isinstance(action, AddedProcess)):
@@ -177,6 +174,8 @@ class RemoteProcess:
                 id=f'share-{name}', name='share', package='fogros2', executable='share',
                 respawn=True, respawn_delay=1.0, arguments=(json.dumps({
                     'topics': session.spec.share, 'folders': folders}),)), name))
+        helpers += [process_on(node, name) for each, own in feature.used(session.spec)
+                    for node in each.beside(session.spec, own)]
         if session.spec.monitored:
             bridge, started = foxglove.on_machine(
                 coordinator, session, allow=session.spec.monitor_allow)

@@ -8,14 +8,16 @@ from collections.abc import Mapping, Sequence
 import contextlib
 import functools
 import json
+import math
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, Optional
 
 from launch import Event, EventHandler, LaunchContext
 from launch.actions import OpaqueFunction
 from launch.events.process import ProcessExited, ProcessStarted
 
+from fogros2.describe.keywords import ROBOT
 from fogros2.errors import ConfigurationError
 from fogros2.image_transport import topics as names
 from fogros2.launch_internals import private
@@ -28,7 +30,7 @@ from fogros2.runtime.session import Session
 
 def check(
     machines: Sequence[str], services: Sequence[str], topics: Sequence[tuple[str, str]],
-    hedge_after: Any,
+    hedge_after: Any, deadline: Any = None,
 ) -> None:
     """
     Check what a launch file declares; all names are resolved.
@@ -57,6 +59,11 @@ def check(
         if not names.TOPIC.fullmatch(name) or '__' in name:
             raise ConfigurationError(f"'{name}' is not the full name of a topic or a service",
                                      "such as '/plan' or '/camera/image_raw'")
+    if (ROBOT in machines) != (deadline is not None) or deadline is not None and not (
+            isinstance(deadline, (int, float)) and 0 < deadline < math.inf):
+        raise ConfigurationError(
+            f'deadline={deadline!r}: the robot answers last, after so many seconds',
+            'write machines=[..., None], deadline=0.2, or leave both out')
     if hedge_after is not None and hedge_after != 'p95' and not (
             isinstance(hedge_after, (int, float)) and hedge_after > 0):
         raise ConfigurationError(f'hedge_after={hedge_after!r} is no time',
@@ -65,13 +72,15 @@ def check(
 
 def first_answer(
     folder: Path, sessions: Mapping[str, Session], services: Sequence[str],
-    topics: Sequence[tuple[str, str, bool]], hedge_after: Any, context: LaunchContext,
+    topics: Sequence[tuple[str, str, bool]], hedge_after: Any, deadline: Optional[float],
+    context: LaunchContext,
 ) -> AddedProcess:
     """
     Return the process that serves the public names, from when the first machine is up.
 
     :param folder: the launch's folder, for figures of the replicas.
     :param topics: input, output, and whether the input is a stream.
+    :param deadline: seconds after which the robot's own replica is asked, None without it.
     """
     label = f'first_answer_{names.identifier([*services, *(pair[1] for pair in topics)][0])}'
     events = folder / f'{label}.events'
@@ -80,7 +89,9 @@ def first_answer(
         id=f'robot/{label}', name=label, package='fogros2', executable='first_answer',
         respawn=True, respawn_delay=1.0, arguments=(json.dumps({
             'name': label, 'services': services, 'topics': topics, 'hedge_after': hedge_after,
-            'replicas': {name: names.local_topic('', name) for name in sessions},
+            'replicas': {name: names.local_topic('', name) for name in (
+                *sessions, *[ROBOT] * (deadline is not None))},
+            **({} if deadline is None else {'last': ROBOT, 'deadline': deadline}),
             'folder': str(folder)}),)))
     private.delay_start(process, functools.partial(_first_up, list(sessions.values())))
 

@@ -120,6 +120,8 @@ class Session:
         self._moves = asyncio.Lock()
         self._logger = launch.logging.get_logger('fogros2')
         self._logs = LogFiles()
+        #: Why the machine was given up.
+        self._reason = ''
 
     @property
     def interrupted(self) -> bool:
@@ -235,7 +237,7 @@ class Session:
         if self.state.phase == 'over':
             self._logger.error(
                 f'{self.spec.name}: {run.node.name} does not start: the machine has ended, '
-                'because nobody used it (launch again)')
+                f'because {self._reason} (launch again)')
             run.on('over')
             return
         self._runs[run.node.id] = run
@@ -394,9 +396,8 @@ class Session:
             if event['event'] == 'started':
                 self._changed()
             return
-        if event['event'] == 'idle':
-            if self.spec.idle_timeout is not None:
-                self.request(self._end_idle)
+        if event['event'] == 'given_up':
+            self.request(functools.partial(self._give_up, event['reason']))
             return
         if event['event'] == 'lost':
             self._on('gone', event['reason'] or 'no reason')
@@ -487,12 +488,12 @@ class Session:
         for run in list(self._runs.values()):
             run.on('move_gone' if self.lost or run in ended else 'move')
 
-    async def _end_idle(self) -> None:
-        """End the machine and its processes, while the launch goes on: nobody uses it."""
-        self._on('idle')
+    async def _give_up(self, reason: str) -> None:
+        """End the machine and its processes, while the launch goes on."""
+        self._on('given_up')
         if self.state.phase != 'over' or self.running is None:
             return
-        reason = f'nobody has used it for {self.spec.idle_timeout:g} s'
+        self._reason = reason
         self._logger.info(f"{self.spec.name}: {reason}; on_exit='{self.spec.on_exit}'")
         runs = list(self._runs.values())
         for run in runs:

@@ -145,7 +145,7 @@ class Link(multiplexed.Link):
         if error.status == 403:
             return ShellError(
                 f"this user may not run commands on '{self._name}': {message}",
-                'let it create and get pods/exec: deploy/kubernetes/role.yaml has all that a '
+                'let it create and get pods/exec: packaging/kubernetes/role.yaml has all that a '
                 'robot needs')
         if 'not found' in message or 'completed' in message or error.status in (400, 401):
             return ShellError(f"'{self._name}' takes no commands: {message}", error.hint)

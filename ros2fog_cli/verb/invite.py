@@ -23,7 +23,7 @@ class InviteVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the invitation, which only the other computer can open."""
-        from fogros2.describe.machines import parse_duration
+        from fogros2.describe.values import parse_duration
         from ros2fog_cli.api import guests
         print(guests.invite(args.name, args.key, parse_duration('--for', args.seconds), warn,
                             host=args.address))

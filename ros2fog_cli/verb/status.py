@@ -34,6 +34,7 @@ class StatusVerb(VerbExtension):
         """Print the status; return 1 if there are problems or no expected agent answers."""
         from fogros2 import invitation
         from fogros2.errors import ConfigurationError, FogError
+        from fogros2.feature import used
         from fogros2.store import Store
         from ros2fog_cli.api import guests, reach, replicas
         if args.watch:
@@ -52,7 +53,8 @@ class StatusVerb(VerbExtension):
             return show_joined(reach.link_of_joined(folder), as_json=args.json)
         entry = reach.find(args.name, warn, regions=args.region)
         status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'clock': None, 'agent': None,
-                                  'streams': [], 'guests': [], 'replicas': []}
+                                  'streams': [], 'guests': [], 'replicas': [],
+                                  'features': []}
         problems: list[str] = []
         idle = reach.let_go(entry) and not entry.gone
         if idle:
@@ -88,6 +90,12 @@ class StatusVerb(VerbExtension):
                for node in (status['agent'] or {}).get('nodes', ())):
             from ros2fog_cli.api.watching import streams
             status['streams'] = streams(entry.name, regions=args.region)
+        if entry.record is not None:
+            try:
+                status['features'] = [row for feature, own in used(entry.record.spec)
+                                      for row in feature.status(status, own)]
+            except FogError as error:
+                problems.append(f'features: {error}')
         if args.json:
             print_json(**status, problems=problems)
         else:
@@ -123,6 +131,7 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
     if status['cost'] is not None:
         lines.append(('cost', f"{cost(Decimal(status['cost_per_hour']))} an hour, "
                               f"{cost(Decimal(status['cost']), 2)} so far"))
+    lines += status['features']
     vpn, agent = status['vpn'], status['agent']
     if vpn is not None:
         latency = '-' if vpn['latency'] is None else f"{vpn['latency']:.2f} ms"

@@ -6,4 +6,4 @@ from __future__ import annotations
 import pytest
 
 pytest.register_assert_rewrite(
-    'fogros2.testing.provider_contract', 'fogros2.testing.shell_contract')
+    'fogros2_testing.provider_contract', 'fogros2_testing.shell_contract')

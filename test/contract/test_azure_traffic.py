@@ -18,7 +18,7 @@ import pytest
 
 from fogros2.model import MachineSpec
 from fogros2.provider.azure.provider import AzureProvider
-from fogros2.testing import request_for
+from fogros2_testing import request_for
 from rigs.azure import service, traffic
 
 FIXTURE = Path(__file__).with_name('azure_traffic.json')

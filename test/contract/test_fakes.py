@@ -9,7 +9,7 @@ import pytest
 
 from fogros2.errors import ProviderError
 from fogros2.model import Command, MachineSpec, MachineState, Result
-from fogros2.testing import (
+from fogros2_testing import (
     FakeProvider,
     FakeShell,
     FakeStream,

@@ -75,7 +75,7 @@ def test_googles_client_creates_lists_and_deletes(gce, google):
 def test_googles_client_reads_our_firewall_rules(gce, google):
     from fogros2.model import MachineSpec
     from fogros2.provider.gcp.provider import GCPProvider
-    from fogros2.testing import request_for
+    from fogros2_testing import request_for
     _, client = google
     provider, spec = GCPProvider(), MachineSpec('planner', 'gcp', {})
     machine = provider.create(spec, request_for(spec))

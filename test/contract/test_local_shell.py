@@ -9,7 +9,7 @@ import pytest
 
 from fogros2.model import Command, Endpoint
 from fogros2.shell.local import LocalShell
-from fogros2.testing import ShellContract
+from fogros2_testing import ShellContract
 
 
 class TestLocalShell(ShellContract):

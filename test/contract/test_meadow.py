@@ -21,7 +21,7 @@ from fogros2.provider.vm import account
 from fogros2.provider.vm.cloud import attempt_of, CloudError, VmCloud
 from fogros2.provider.vm.market import Market
 from fogros2.provider.vm.user_data import END_COMMAND
-from fogros2.testing import request_for, VmContract
+from fogros2_testing import request_for, VmContract
 from rigs.meadow import provider as adapter
 from rigs.meadow.provider import Meadow, MeadowError, MeadowProvider
 from rigs.meadow.server import Meadow as Service

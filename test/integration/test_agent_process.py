@@ -987,13 +987,13 @@ def test_watch_reports_its_command_once(rig):
     aside = rig.folder / 'aside'
     aside.write_text('since noon\n' + 'x' * 5000)
     aside.rename(unused)
-    reason = rig.wait('idle')['reason']
+    reason = rig.wait('watched', what='idle')['reason']
     assert reason.startswith('since noon\n') and len(reason) == 2000
     # a second one, for another launch: by its time the first would have told again
     client.request('configure', launch='def456', force='abc123')
     client.request('watch', what='idle', argv=['echo', 'again'], interval=0.05)
-    rig.wait('idle', reason='again')
-    assert len([e for e in rig.events if e['event'] == 'idle']) == 2
+    rig.wait('watched', reason='again')
+    assert len([e for e in rig.events if e['event'] == 'watched']) == 2
     for wrong in ({'what': 'notice', 'argv': ['true']}, {'what': 'idle', 'argv': []},
                   {'what': 'idle', 'argv': 'true'}, {'what': 'idle'}):
         with pytest.raises(AgentError):
@@ -1009,7 +1009,7 @@ def test_watch_ends_with_its_launch(rig):
     unused.write_text('too late')
     client.request('configure', launch='def456')
     client.request('watch', what='idle', argv=['echo', 'ours'], interval=0.05)
-    assert rig.wait('idle')['reason'] == 'ours'
+    assert rig.wait('watched', what='idle')['reason'] == 'ours'
 
 
 def test_signalled_agent_reports_before_its_nodes_end(rig):

@@ -30,7 +30,7 @@ from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.aws.failures import AwsError
 from fogros2.provider.aws.provider import AWSProvider
 from fogros2.provider.vm import user_data
-from fogros2.testing.provider_contract import PUBLIC_KEY
+from fogros2_testing.provider_contract import PUBLIC_KEY
 from rigs.ec2 import iam
 from rigs.ec2.watched import ec2, left, NOTHING, Watched
 

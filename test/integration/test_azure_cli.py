@@ -7,7 +7,7 @@ import pytest
 
 from fogros2.model import MachineSpec
 from fogros2.provider.azure.provider import AzureProvider
-from fogros2.testing import request_for
+from fogros2_testing import request_for
 from rigs.azure import cli, service
 
 SPEC = MachineSpec('planner', 'azure', {'vm_size': 'Standard_B2als_v2', 'region': 'westeurope'})

@@ -32,7 +32,7 @@ from fogros2.provider.container import ContainerProvider, filter_name, login_ids
 from fogros2.provider.container import machine as container_machine
 from fogros2.provider.container import root as container_root
 from fogros2.shell.ssh import SSHShell
-from fogros2.testing import ProviderContract
+from fogros2_testing import ProviderContract
 from fogros2.waiting import wait_until
 from rigs.container_machines import cloud, key
 

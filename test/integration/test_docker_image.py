@@ -128,4 +128,4 @@ def test_image_has_the_sources_alone(robot: Callable[..., str]) -> None:
     packages = {path.parent.name for path in ROOT.glob('*/__init__.py')} - {'test'}
     assert set(robot('ls', '-A', '/opt/fogros2').split()) == {
         '.venv', 'LICENSE', 'README.md', 'package.xml', 'pyproject.toml', 'setup.cfg', 'setup.py',
-        'deploy', 'launch', 'packaging', 'resource', 'ros2_embedded', 'tools', *packages}
+        'launch', 'packaging', 'resource', 'ros2_embedded', 'tools', *packages}

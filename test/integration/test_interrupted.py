@@ -12,7 +12,7 @@ import pytest
 
 from fogros2.model import Command
 from fogros2.process import argv
-from fogros2.testing.plugins import install
+from fogros2_testing.plugins import install
 from fogros2.waiting import wait_until
 from rigs.launched import launching
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge as a process of its own, judged by Foxglove's own client."""
+"""Bridge and recorder as processes, judged by Foxglove's own client and by MCAP's reader."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ import pytest
 pytest.importorskip('foxglove', reason='the extra "monitor" is not installed')
 pytest.importorskip('rclpy', reason='rclpy is not installed')
 from geometry_msgs.msg import Twist
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 import numpy
 import rclpy
 from rclpy.context import Context
@@ -330,8 +332,8 @@ def protobuf(data: bytes) -> dict[int, bytes]:
     return fields
 
 
-def test_stream_is_sent_as_video(bench):
-    av = pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
+def publish_images(bench: Bench) -> None:
+    """Publish images 30 times a second, and their stream as ``/camera/h264``."""
     images = bench.node.create_publisher(Image, '/camera', 2)
     shades = itertools.cycle(range(0, 250, 10))
     header = Header(frame_id='camera_link')
@@ -340,6 +342,11 @@ def test_stream_is_sent_as_video(bench):
         data=bytes([next(shades)]) * (48 * 64))))
     bench.run(str(ROOT / 'image_transport_h264/scripts/encoder'), '--ros-args',
               '-r', 'image:=/camera', '-p', 'stream:=/camera/h264', '-p', 'gop:=1000')
+
+
+def test_stream_is_sent_as_video(bench):
+    av = pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
+    publish_images(bench)
     # the second comes in the midst of a stream, and needs a picture that stands alone
     for _ in range(2):
         viewer = bench.viewer()
@@ -353,3 +360,67 @@ def test_stream_is_sent_as_video(bench):
             with contextlib.suppress(av.error.InvalidDataError):  # one before the picture
                 frames += decoder.decode(av.Packet(fields[3]))
         assert (frames[0].width, frames[0].height) == (64, 48)
+
+
+# -- a recording ---------------------------------------------------------------------------------
+
+RECORD = 'import sys; from fogros2_monitor import recorder; {}sys.exit(recorder.main())'
+
+
+def recorded(folder: Path) -> dict[str, list[Any]]:
+    """Return the messages of the one file in a folder, by topic: decoded, and video as it is."""
+    path, = folder.glob('*.mcap')
+    messages: dict[str, list[Any]] = {}
+    with path.open('rb') as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            if schema.name == 'foxglove.CompressedVideo':
+                messages.setdefault(channel.topic, []).append(protobuf(message.data))
+        for _, channel, message, decoded in reader.iter_decoded_messages(
+                topics=['/words', '/map', '/late']):
+            messages.setdefault(channel.topic, []).append(decoded.data)
+    return messages
+
+
+def test_recording_has_messages_and_streams_as_they_came(bench, tmp_path):
+    av = pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
+    publish_images(bench)
+    latched = bench.node.create_publisher(String, '/map', LATCHED)
+    latched.publish(String(data='all'))
+    words, sent = bench.node.create_publisher(String, '/words', 10), list[int]()
+
+    def speak() -> None:
+        sent.append(len(sent))
+        words.publish(String(data=str(sent[-1])))
+
+    recorder = bench.run('-c', RECORD.format(''), str(tmp_path / 'new'), '/words', '/map', '/late',
+                         '/camera/h264', '--ros-args')
+    for topic in ('/words', '/map', '/camera/h264'):
+        bench.listeners(topic, 1)
+    bench.node.create_timer(0.02, speak)
+    late = bench.node.create_publisher(String, '/late', LATCHED)
+    late.publish(String(data='too'))
+    bench.listeners('/late', 1)
+    unwanted = bench.node.create_publisher(String, '/unwanted', 1)
+    begin = len(sent)
+    bench.until(lambda: len(sent) > begin + 50, 'a second of words')
+    recorder.send_signal(signal.SIGINT)
+    assert recorder.wait(60) == 0
+    got = recorded(tmp_path / 'new')
+    assert unwanted.get_subscription_count() == 0
+    assert (got['/map'], got['/late']) == (['all'], ['too'])
+    numbers = list(map(int, got['/words']))
+    assert len(numbers) > 20 and numbers == sorted({*numbers})
+    decoder = av.CodecContext.create('h264', 'r')
+    frames = [frame for fields in got['/camera/h264']
+              for frame in decoder.decode(av.Packet(fields[3]))]
+    assert (frames[0].width, frames[0].height) == (64, 48)
+
+
+def test_recording_ends_before_the_disk_is_full(bench, tmp_path):
+    recorder = bench.run('-c', RECORD.format('recorder.FREE = 1 << 62; '), str(tmp_path), '/words')
+    bench.processes.remove(recorder)
+    assert recorder.wait(60) == 1
+    bench.until(lambda: 'GB are free: ' in ''.join(bench.lines), 'the reason')
+    assert recorded(tmp_path) == {}

@@ -24,7 +24,7 @@ import pytest
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2.testing.plugins import install
+from fogros2_testing.plugins import install
 from fogros2.waiting import wait_until
 from rigs.launched import Launched, launching
 

@@ -74,7 +74,7 @@ class FakeMachine:
         event = {'event': name, **fields}
         if node is not None:
             event.update(node=node.id, name=node.name)
-        if name not in ('connection', 'gap', 'lost'):
+        if name not in ('connection', 'gap', 'lost', 'given_up'):
             assert events.event(event) is not None  # as the agent's connection checks it
         thread = threading.Thread(target=self.callback, args=(event,))
         thread.start()

@@ -27,7 +27,7 @@ from fogros2 import (
 from fogros2.describe import keywords, values
 from fogros2.errors import ConfigurationError
 from fogros2.runtime.coordinator import Coordinator
-from fogros2.testing.plugins import instead
+from fogros2_testing.plugins import instead
 from rigs.launching import ends, Harmless
 
 if TYPE_CHECKING:

@@ -35,7 +35,7 @@ from fogros2 import (
 )
 from fogros2.errors import AgentError, ProviderError
 from fogros2.runtime import session
-from fogros2.testing.plugins import instead
+from fogros2_testing.plugins import instead
 from rigs.launching import Harmless
 
 REASON = 'spot instance, at 12:00'
@@ -455,14 +455,14 @@ def test_streams_that_come_later_know_of_it(run, fake, harmless, planner, talker
     assert len(fake.machines['planner'].all) == 1
 
 
-# -- nobody uses it -------------------------------------------------------------------------------
+# -- a feature gives it up -------------------------------------------------------------------------------
 
 def test_node_for_a_machine_that_has_ended_does_not_start(
     run, fake, talker, watch, capfd,
 ):
-    idle = ContainerInstance(name='planner', ros_workspace='', idle_timeout='1m')
+    idle = ContainerInstance(name='planner', ros_workspace='')
     late = talker(machine=idle, exec_name='late')
-    watch.at_start = {1: says(fake, 'idle', reason='')}
+    watch.at_start = {1: says(fake, 'given_up', reason='nobody uses it')}
     assert run(FogROSLaunchDescription([
         *watch(), talker(machine=idle, exec_name='talks'),
         RegisterEventHandler(OnProcessExit(on_exit=[
@@ -470,7 +470,7 @@ def test_node_for_a_machine_that_has_ended_does_not_start(
     ])) == 0
     assert [name for name, _ in watch.starts] == ['talks']
     text = capfd.readouterr().out
-    assert 'does not start: the machine has ended, because nobody used it' in text
+    assert 'does not start: the machine has ended, because nobody uses it' in text
 
 
 # -- money ----------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ from fogros2 import (
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides, parse
 from fogros2.errors import ConfigurationError
-from fogros2.testing.plugins import instead
+from fogros2_testing.plugins import instead
 from rigs.launching import ends, Harmless
 from ros2fog_cli.option.machine import MachineOption
 from ros2fog_cli.verb import overrides as complete

@@ -38,8 +38,8 @@ from fogros2.errors import ConfigurationError, ProviderError
 from fogros2.model import CreateRequest, MachineSpec
 from fogros2.provider import Capabilities
 from fogros2.store import Store
-from fogros2.testing.fakes import FakeProvider
-from fogros2.testing.plugins import instead
+from fogros2_testing.fakes import FakeProvider
+from fogros2_testing.plugins import instead
 from ros2fog_cli.api.preview import arguments, Preview
 
 XML = """\

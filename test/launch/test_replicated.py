@@ -36,7 +36,7 @@ from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
 from fogros2.model import NodeSpec
 from fogros2.runtime import replicas
-from fogros2.testing.plugins import instead
+from fogros2_testing.plugins import instead
 from rigs.launching import Harmless
 
 NAMES = ('one', 'two', 'three')
@@ -101,6 +101,39 @@ def test_each_machine_runs_a_copy_under_its_own_names(run, fake, first):
         'name': 'first_answer_plan', 'services': ['/plan'], 'hedge_after': 'p95',
         'topics': [['/image', '/detections', False]],
         'replicas': {name: f'/fogros2/{name}' for name in NAMES}}
+
+
+@pytest.mark.parametrize('robot', [None, 'robot'])
+def test_robot_runs_a_copy_under_a_name_of_its_own(run, fake, first, robot):
+    commands = []
+
+    def started(event, context):
+        commands.append(event.cmd)
+        return Shutdown() if len(commands) == 3 else None
+
+    assert run(FogROSLaunchDescription([
+        RegisterEventHandler(OnProcessStart(on_start=started)),
+        Replicated([*machines('one'), robot],
+                   [talker(name='planner', remappings=[('out', '/plan')])],
+                   services=['/plan'], deadline=0.2)])) == 0
+    command, = (one for one in commands if any('fogros2/robot' in word for word in one))
+    assert command[0].endswith('/lib/demo/talker')
+    assert 'out:=/fogros2/robot/plan' in command and '/plan:=/fogros2/robot/plan' in command
+    settings, = first
+    assert (settings['last'], settings['deadline']) == ('robot', 0.2)
+    assert settings['replicas'] == {'one': '/fogros2/one', 'robot': '/fogros2/robot'}
+
+
+@pytest.mark.parametrize(('robots', 'deadline'), [
+    ([], 0.2), ([None], None), ([None], 0), ([None], -1), ([None], 'soon'), ([None], float('inf')),
+    ([None, 'robot'], 0.2)])
+def test_robot_and_deadline_go_together(run, fake, caplog, robots, deadline):
+    assert run(FogROSLaunchDescription([Replicated(
+        [*machines('one', 'two'), *robots], [talker()], services=['/plan'],
+        deadline=deadline)])) == 1
+    assert fake.noted('up') == []
+    assert any(words in caplog.text for words in (
+        'the robot answers last', 'is no number', "the machine 'robot' twice"))
 
 
 def test_names_are_relative_to_their_namespace(run, fake, first):

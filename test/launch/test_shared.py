@@ -15,7 +15,7 @@ from fogros2.errors import Unsupported
 from fogros2.model import MachineSpec
 from fogros2.provider import Capabilities
 from fogros2.report import silent
-from fogros2.testing import FakeProvider
+from fogros2_testing import FakeProvider
 
 
 @pytest.fixture

@@ -40,7 +40,7 @@ from fogros2 import (
 )
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
-from fogros2.testing.plugins import instead
+from fogros2_testing.plugins import instead
 from rigs.launching import Harmless
 
 BACK = StreamTopic('/seen', 'h264', 'to_robot', bitrate=500_000)

@@ -49,7 +49,7 @@ class Memory(abc.ABC):
 
     @contextlib.contextmanager
     def fault(self, how: str, times: int) -> Iterator[threading.Event]:
-        """Disturb requests for a machine in the block; see ``fogros2.testing.VmContract``."""
+        """Disturb requests for a machine in the block; see ``fogros2_testing.VmContract``."""
         met, over = threading.Event(), threading.Event()
         with self.patch.context() as patch:
             if how == 'silent':

@@ -16,7 +16,7 @@ from fogros2.model import MachineSpec, VpnInterface
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent
 from fogros2.store import Store
-from fogros2.testing.fakes import FakeProvider, FakeVpn
+from fogros2_testing.fakes import FakeProvider, FakeVpn
 from fogros2.vpn import addresses
 from fogros2.waiting import Timeouts
 

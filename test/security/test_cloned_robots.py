@@ -23,8 +23,8 @@ from fogros2.deploy.steps.creating import Creation
 from fogros2.errors import NameTaken
 from fogros2.model import MachineSpec, Result
 from fogros2.store import robot_name, Store
-from fogros2.testing.fakes import FakeProvider, FakeShell, FakeVpn
-from fogros2.testing.plugins import instead
+from fogros2_testing.fakes import FakeProvider, FakeShell, FakeVpn
+from fogros2_testing.plugins import instead
 from rigs.deploying import job
 from ros2fog_cli.api import machines, reach
 

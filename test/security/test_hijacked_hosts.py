@@ -14,7 +14,7 @@ from fogros2.errors import ProviderError
 from fogros2.model import MachineSpec, Result
 from fogros2.provider.container import hosted
 from fogros2.provider.container.hosted import HostedProvider
-from fogros2.testing import FakeShell, request_for
+from fogros2_testing import FakeShell, request_for
 
 ID = 'podman:0123456789ab:0123-token'
 LOGIN = {'port': 40001, 'user': 'fog', 'host_key': 'ssh-ed25519 AA'}

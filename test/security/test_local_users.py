@@ -27,7 +27,7 @@ import pytest
 from fogros2 import process
 from fogros2.model import Command
 from fogros2.shell import relay
-from fogros2.testing.fakes import FakeShell
+from fogros2_testing.fakes import FakeShell
 from fogros2.vpn.guests import Door
 from fogros2.waiting import wait_until
 from fogros2_monitor import accounts, request

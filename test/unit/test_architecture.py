@@ -14,6 +14,8 @@ import sys
 
 import pytest
 
+from fogros2.describe import features
+
 ROOT = Path(__file__).resolve().parents[2]
 CORE = ROOT / 'fogros2'
 PACKAGES = ('fogros2_features', 'fogros2_replicas', 'fogros2_share', 'image_transport_h264',
@@ -37,7 +39,7 @@ ORDER = """
     feature
     deploy
     describe launch_internals runtime actions
-    testing __init__
+    __init__
 """.split()
 #: What is against the order today: (importing module, imported module). Only ever remove lines.
 UPWARD: set[tuple[str, str]] = set()
@@ -57,7 +59,7 @@ NAMED_PLUGINS = {
 CIRCULAR: set[str] = set()
 #: Packages whose docstring does not name all modules in order yet. Only ever remove names.
 UNLISTED = {
-    'fogros2.image_transport', 'fogros2.testing',
+    'fogros2.image_transport',
     'fogros2_monitor', 'fogros2_monitor.dashboard', 'ros2fog_cli', 'ros2fog_cli.api',
 }
 #: Where plugins live: each plugin is one module or package below one of these.
@@ -71,7 +73,7 @@ SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_c
         'foxglove': 'fogros2_monitor'}
 #: Found by their entry points, or started by the user: the core imports none of them.
 ABOVE = ('fogros2_features', 'fogros2_monitor', 'fogros2_replicas', 'fogros2_share',
-         'ros2fog_cli', 'rigs')
+         'fogros2_testing', 'ros2fog_cli', 'rigs')
 #: All of the core but the import of types.
 BUT_TYPES = r'fogros2(?! import ros_types$)'
 
@@ -195,6 +197,13 @@ def test_package_imports_nothing_above_it(folder: str, above: tuple[str, ...]) -
         assert not re.search(pattern, path.read_text(), re.MULTILINE), path
 
 
+def test_core_names_no_keyword_of_a_feature() -> None:
+    for keyword in features.keywords():
+        for path in python_files(CORE):
+            assert not re.search(rf'\b{keyword}(=|\W*\W{keyword}\b)|[\'"]{keyword}[\'"]',
+                                 path.read_text()), f'{path} names {keyword}'
+
+
 def plugin(module: str) -> str:
     """Return the plugin that a module belongs to, '' for none."""
     unit = '.'.join(module.split('.')[:3])
@@ -214,7 +223,6 @@ def test_ros_and_sdks_are_imported_by_their_parts(path: Path) -> None:
     own = part(path)
     for name, _ in imports(path):
         words = name.split('.')
-        assert words[:2] != ['fogros2', 'testing'] or own == 'testing', f'{own} imports {name}'
         assert words[0] not in ROS or own in ROS_ALLOWED, f'{own} imports {name}'
         if words[0] in SDKS:
             assert own == SDKS[words[0]], f'{own} imports {name}'
@@ -270,8 +278,8 @@ def test_forbidden_words(pattern: str) -> None:
 
 def test_only_one_module_starts_processes() -> None:
     """A command that is waited for goes through ``process``; streams and daemons are few."""
-    # guests, idle and relocation are programs for machines
-    allowed = {'process.py', 'guests.py', 'idle.py', 'relocation.py', 'serve.py'}
+    # guests and relocation are programs for machines
+    allowed = {'process.py', 'guests.py', 'relocation.py', 'serve.py'}
     for path in (*python_files(CORE), *python_files(ROOT / 'fogros2_monitor')):
         if path.name not in allowed and 'subprocess' in path.read_text():
             names = {name for name, _ in imports(path)}

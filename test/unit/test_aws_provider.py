@@ -115,8 +115,7 @@ def test_a_wrong_option_is_named_with_what_to_do(options, words):
         Options.parse(options)
 
 
-@pytest.mark.parametrize('words', [
-    {}, {'on_exit': 'stop'}, {'on_exit': 'keep', 'idle_timeout': 9.0}])
+@pytest.mark.parametrize('words', [{}, {'on_exit': 'stop'}])
 def test_machine_of_a_fleet_outlives_its_launch(words):
     options = {'fleet': [f'{KEY} robot two@lab:/x\n'], 'ssh_from': ['198.51.100.0/24']}
     assert Options.of(MachineSpec('gpu-box', 'aws', options, on_exit='keep')).fleet

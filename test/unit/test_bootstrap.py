@@ -20,7 +20,7 @@ from fogros2.host.inspection import HostFacts, Python
 from fogros2.host.wheels import Wheels
 from fogros2.model import Bootstrap, Command, MachineSpec, Result
 from fogros2.plan import Underlay
-from fogros2.testing.fakes import FakeShell
+from fogros2_testing.fakes import FakeShell
 
 TOOLS = frozenset({'ip', 'nft', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'})
 PYTHON = Python('/usr/bin/python3', (3, 12), True)

@@ -19,7 +19,7 @@ from fogros2.host.checkpoint import check_folder, Checkpoint
 from fogros2.model import Endpoint, Result
 from fogros2.process import which
 from fogros2.shell.local import LocalShell
-from fogros2.testing.fakes import FakeShell
+from fogros2_testing.fakes import FakeShell
 
 pytestmark = pytest.mark.skipif(which('rsync') is None, reason='needs rsync')
 

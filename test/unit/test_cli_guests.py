@@ -31,8 +31,8 @@ from fogros2.model import (
 from fogros2.provider import Capabilities
 from fogros2.provider.container import packet_filter
 from fogros2.store import process_start, Record, Store, write_private
-from fogros2.testing.fakes import FakeProvider, FakeShell
-from fogros2.testing.plugins import instead
+from fogros2_testing.fakes import FakeProvider, FakeShell
+from fogros2_testing.plugins import instead
 from ros2fog_cli.api import endings, guests, reach
 
 OTHER = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='

@@ -14,7 +14,7 @@ import pytest
 
 from fogros2.model import Machine, MachineSpec, MachineState
 from fogros2.provider import TAG_NAME
-from fogros2.testing.fakes import FakeProvider
+from fogros2_testing.fakes import FakeProvider
 
 PROGRAM = Path(__file__).resolve().parents[2] / 'tools' / 'cloud_check.py'
 

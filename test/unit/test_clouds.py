@@ -29,8 +29,8 @@ from fogros2.provider.offers import MachineType, Offer, Offers, ranked, Region, 
 from fogros2.provider.vm import regions
 from fogros2.report import Warned
 from fogros2.store import Store
-from fogros2.testing.fakes import FakeProvider, FakeVpn
-from fogros2.testing.plugins import instead
+from fogros2_testing.fakes import FakeProvider, FakeVpn
+from fogros2_testing.plugins import instead
 from rigs.gce.catalogue import API_KEY
 
 

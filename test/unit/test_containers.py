@@ -30,7 +30,7 @@ from fogros2.provider import Provider
 from fogros2.provider.container import ContainerProvider
 from fogros2.shell import Shell
 from fogros2.store import Store
-from fogros2.testing.fakes import FakeProvider, FakeShell
+from fogros2_testing.fakes import FakeProvider, FakeShell
 from rigs import deploying
 
 

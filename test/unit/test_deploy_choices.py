@@ -18,8 +18,8 @@ from fogros2.errors import ConfigurationError, NameTaken, ProviderError, Workspa
 from fogros2.model import MachineSpec
 from fogros2.report import StepDone, StepFailed, StepStarted, Warned
 from fogros2.store import Store
-from fogros2.testing.fakes import FakeProvider, FakeVpn
-from fogros2.testing.plugins import instead
+from fogros2_testing.fakes import FakeProvider, FakeVpn
+from fogros2_testing.plugins import instead
 from rigs.pip_site import distribution, package
 
 SPEC = MachineSpec('planner', 'fake', {'size': 'cheapest'})
@@ -68,6 +68,46 @@ def test_choices_are_made_once_and_shown_with_the_price(
     assert launch.store.load('planner').spec == mine.spec
     done = [event for event in events if isinstance(event, StepDone)][-1]
     assert done.step == 'machine' and '$0.5000 an hour' in done.detail
+
+
+def test_a_budget_limits_the_lifetime_by_the_price(launch, provider, monkeypatch):
+    spec = dataclasses.replace(SPEC, features={'budget': {'budget': '2 USD'}})
+    assert create(launch, spec).spec.lifetime == pytest.approx(4 * 3600.0, abs=1.0)
+    assert launch.store.load('planner').spec.lifetime == pytest.approx(4 * 3600.0, abs=1.0)
+    # what the provider confirms counts
+    describe = provider.describe
+    monkeypatch.setattr(provider, 'describe', lambda machine_id: dataclasses.replace(
+        describe(machine_id), cost_per_hour=Decimal(4)))
+    other = dataclasses.replace(spec, name='other', lifetime=1e6)
+    assert create(launch, other).spec.lifetime == pytest.approx(1800.0, abs=1.0)
+
+
+@pytest.mark.parametrize(('size', 'budget', 'said'), [
+    ('medium', '5 USD', "price of 'planner' is unknown"),
+    ('large', '0.3', r'has \$0.30 of its budget of \$0.30 left, which pays for 540 s')])
+def test_budget_that_can_not_be_kept_is_refused_first(launch, provider, size, budget, said):
+    spec = dataclasses.replace(SPEC, options={'size': size},
+                               features={'budget': {'budget': budget}})
+    with pytest.raises(ConfigurationError, match=said):
+        launch.prepare([spec])
+    assert 'create' not in provider.calls
+
+
+def test_a_replacement_gets_what_is_left_of_a_budget(launch, provider, monkeypatch):
+    clock = [1000.0]
+    monkeypatch.setattr(choosing.time, 'monotonic', lambda: clock[0])
+    spec = dataclasses.replace(SPEC, features={'budget': {'budget': '1'}})
+    mine = create(launch, spec)
+    assert mine.spec.lifetime == 7200.0
+    provider.destroy(mine.machine_id)
+    clock[0] += 5400.0
+    launch.store.delete('planner')
+    assert create(launch, spec).spec.lifetime == 1800.0
+    clock[0] += 1500.0
+    launch.store.delete('planner')
+    provider.machines.clear()
+    with pytest.raises(ConfigurationError, match='pays for 300 s'):
+        create(launch, spec)
 
 
 def test_choice_without_a_match_ends_the_launch_at_once(

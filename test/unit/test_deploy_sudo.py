@@ -12,8 +12,8 @@ from fogros2.deploy import Launch
 from fogros2.model import Command
 from fogros2.report import Event, StepFailed
 from fogros2.store import Store
-from fogros2.testing.fakes import FakeVpn
-from fogros2.testing.plugins import instead
+from fogros2_testing.fakes import FakeVpn
+from fogros2_testing.plugins import instead
 from ros2fog_cli.api import endings
 
 

@@ -97,7 +97,8 @@ def test_workspace_wins_over_user_and_overlay_over_underlay(own, tmp_path, monke
                 workspace(tmp_path / 'underlay', "lifetime = '2h'\nidle_timeout = '6m'\n")]
     monkeypatch.setenv('COLCON_PREFIX_PATH', os.pathsep.join(prefixes))
     found = spec(ContainerInstance(name='a', ros_workspace=''))
-    assert (found.lifetime, found.idle_timeout, found.robot_timeout) == (10800.0, 360.0, 200.0)
+    assert (found.lifetime, found.robot_timeout, found.features) == (
+        10800.0, 200.0, {'idle': {'idle_timeout': '6m'}})
 
 
 @pytest.mark.parametrize(('text', 'message', 'hint'), [

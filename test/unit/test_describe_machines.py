@@ -14,10 +14,10 @@ import pytest
 from fogros2.describe.machines import (
     CloudInstance,
     ContainerInstance,
-    parse_duration,
     SSHInstance,
 )
 from fogros2.describe.machines_cloud import AWSCloudInstance
+from fogros2.describe.values import parse_duration
 from fogros2.errors import ConfigurationError
 from fogros2.host.workspace import find_workspaces
 

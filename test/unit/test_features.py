@@ -26,8 +26,8 @@ from fogros2.feature import Feature
 from fogros2.model import Command, Endpoint, MachineSpec
 from fogros2.report import silent
 from fogros2.shell import connect
-from fogros2.testing.fakes import FakeProvider
-from fogros2.testing.plugins import instead
+from fogros2_testing.fakes import FakeProvider
+from fogros2_testing.plugins import instead
 from fogros2_features import results
 from fogros2_features.results import Results
 
@@ -105,6 +105,7 @@ def test_command_line_and_defaults_know_the_keywords(home: Path) -> None:
     ({'fetch': '~/bags'}, "fetch='~/bags' is no list"),
     ({'fetch': ['bags']}, "fetch='bags' is no folder"),
     ({'fetch': ['~/../x']}, "fetch='~/../x' is no folder"),
+    ({'record': ['tf']}, "'tf' is not the full name of a topic"),
     ({'fetch_to': 'here'}, "fetch_to='here' is no absolute path"),
     ({'fetch_limit': '2 apples'}, "fetch_limit='2 apples' is no number of bytes"),
     ({'fetch_limit': 0}, "fetch_limit='0' is no number of bytes"),
@@ -360,3 +361,24 @@ def test_machine_cannot_report_a_size_that_is_none(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(running.shell, 'run', lambda *_, **__: SimpleNamespace(stdout='\x1b[2J'))
     with pytest.raises(ShellError, match='size of ~/bags'):
         brought(running, fetch=['~/bags'])
+
+
+def test_recorded_topics_have_a_program_beside_the_nodes() -> None:
+    own = Results.options(record=['/tf', '/scan', '/tf'])
+    program, = Results().beside(MachineSpec('mapper', 'container'), own)
+    assert (program.package, program.executable) == ('fogros2', 'record')
+    assert program.arguments == ('~/fogros2-mapper/recordings', '/tf', '/scan', '--ros-args')
+    assert Results().beside(MachineSpec('mapper', 'container'), Results.options()) == []
+
+
+def test_recordings_come_home_once(home: Path) -> None:
+    folder = home / 'fogros2-a/recordings'
+    folder.mkdir(parents=True)
+    (folder / '1.mcap').write_text('tf')
+    assert brought(Running(), record=['/tf']) == ['recordings/1.mcap=tf']
+    assert not folder.parent.exists()
+    folder.mkdir(parents=True)
+    (folder / '2.mcap').write_text('too much')
+    with pytest.raises(ShellError, match='more than fetch_limit='):
+        brought(Running(), record=['/tf'], fetch_limit='1', fetch_to=str(home / 'two'))
+    assert (folder / '2.mcap').exists()

@@ -26,7 +26,7 @@ from fogros2.provider.gcp.provider import GCPProvider
 from fogros2.provider.offers import wants
 from fogros2.provider.vm import cloud
 from fogros2.provider.vm.cloud import Order, Place
-from fogros2.testing import request_for
+from fogros2_testing import request_for
 from fogros2.waiting import wait_until
 
 SPEC = MachineSpec('planner', 'gcp', {})

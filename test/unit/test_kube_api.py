@@ -24,7 +24,7 @@ from fogros2 import kubernetes_client
 from fogros2.errors import Cancelled, DeadlineExceeded, PrerequisiteError
 from fogros2.kubernetes_client import ApiError, Unreachable
 from fogros2.store import Store
-from fogros2.testing.shell_contract import raised
+from fogros2_testing.shell_contract import raised
 from fogros2.waiting import ON_ITS_WAY, wait_until
 
 pytest.importorskip('kubernetes', reason='needs the client: pip install kubernetes')

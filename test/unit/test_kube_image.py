@@ -13,7 +13,7 @@ from fogros2.errors import ConfigurationError, PrerequisiteError, ProviderError
 from fogros2.model import CreateRequest
 from fogros2.provider.kubernetes import image, manifests
 from fogros2.provider.kubernetes.options import Options
-from fogros2.testing.shell_contract import raised
+from fogros2_testing.shell_contract import raised
 
 HASH = '0123456789abcdef'
 

@@ -42,7 +42,7 @@ from fogros2.provider.kubernetes.exposure import Exposure
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.provider.kubernetes.options import Options
 from fogros2.provider.kubernetes.pods import Trouble
-from fogros2.testing.shell_contract import raised
+from fogros2_testing.shell_contract import raised
 from fogros2.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -91,7 +91,7 @@ def test_manifests_are_valid_in_old_and_new_versions(options):
 
 @pytest.mark.parametrize('name', ['role.yaml', 'networkpolicy.yaml'])
 def test_manifests_for_administrators_are_valid(name):
-    documents = list(yaml.safe_load_all((ROOT / 'deploy' / 'kubernetes' / name).read_text()))
+    documents = list(yaml.safe_load_all((ROOT / 'packaging' / 'kubernetes' / name).read_text()))
     assert documents
     for document in documents:
         if name == 'networkpolicy.yaml':
@@ -102,7 +102,7 @@ def test_manifests_for_administrators_are_valid(name):
 
 
 def test_the_sample_role_has_what_is_looked_for():
-    documents = yaml.safe_load_all((ROOT / 'deploy' / 'kubernetes' / 'role.yaml').read_text())
+    documents = yaml.safe_load_all((ROOT / 'packaging' / 'kubernetes' / 'role.yaml').read_text())
     role, = (d for d in documents if d['kind'] == 'Role')
     assert hints.missing_rights(role['rules']) == []
     for number, rule in enumerate(role['rules']):

@@ -20,7 +20,7 @@ from fogros2.kubernetes_client import ApiError, Unreachable
 from fogros2.model import Command, Endpoint
 from fogros2.shell import kubernetes_link, relay
 from fogros2.shell.kubernetes import KubernetesShell
-from fogros2.testing.shell_contract import raised
+from fogros2_testing.shell_contract import raised
 from fogros2.waiting import ON_ITS_WAY, wait_until
 
 pytestmark = pytest.mark.skipif(

@@ -17,7 +17,7 @@ from fogros2.errors import AgentError, ConnectError
 from fogros2.model import Command, Endpoint, MachineSpec
 from fogros2.shell import lines, relay, ssh_connection
 from fogros2.shell.ssh import SSHShell
-from fogros2.testing.fakes import FakeProvider
+from fogros2_testing.fakes import FakeProvider
 from rigs import deploying
 
 

@@ -22,7 +22,7 @@ def after(*events: Event, survivable: bool = True) -> tuple[MachineState, list[C
 
 @pytest.mark.parametrize('events, phase, commands', [
     ('up', 'up', ''),
-    ('up idle gone last_words', 'over', ''),
+    ('up given_up gone last_words', 'over', ''),
     # a machine's word alone changes nothing
     ('up claim claim refuted', 'up', 'confirm'),
     ('up claim refuted claim', 'up', 'confirm confirm'),
@@ -39,7 +39,7 @@ def after(*events: Event, survivable: bool = True) -> tuple[MachineState, list[C
     ('up reclaimed empty replaced returned', 'up', 'announce save'),
     ('up gone replaced gone', 'gone', 'announce bury'),
     ('up gone replaced returned reclaimed', 'reclaimed', 'announce announce'),
-    ('up gone idle', 'gone', 'announce')])
+    ('up gone given_up', 'gone', 'announce')])
 def test_machine_goes_from_state_to_state(events: str, phase: str, commands: str) -> None:
     state, said = after(*events.split())  # type: ignore[arg-type]
     assert (state.phase, ' '.join(said)) == (phase, commands)

@@ -40,7 +40,7 @@ from fogros2.provider.container import machine as container_machine
 from fogros2.provider.container.hosted import HostedProvider, program, result_of
 from fogros2.shell.local import LocalShell
 from fogros2.store import Record, Store
-from fogros2.testing import FakeShell, request_for
+from fogros2_testing import FakeShell, request_for
 
 ID = 'podman:0123456789ab:0123-token'
 REPORT = {

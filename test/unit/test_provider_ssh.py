@@ -11,7 +11,7 @@ import pytest
 from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
 from fogros2.model import MachineSpec, MachineState
 from fogros2.provider.ssh import Options, SSHProvider
-from fogros2.testing import ProviderContract, request_for
+from fogros2_testing import ProviderContract, request_for
 
 
 @pytest.fixture

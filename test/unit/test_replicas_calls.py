@@ -162,6 +162,75 @@ def test_request_that_all_died_with_is_sent_again():
     assert sent(calls.due(calls.next_due())) == ['b']
 
 
+@pytest.fixture
+def robot():
+    """Two machines, and the robot after 200 ms."""
+    return ready(Calls(['a', 'b', 'robot'], last='robot', deadline=0.2))
+
+
+def test_robot_is_not_asked_while_machines_answer(robot):
+    for call in range(100):
+        assert sent(robot.ask(call, call)) == ['a', 'b']
+        assert robot.answered(call + 0.19, call, 'b', 'x') == [Answer(call, 'x')]
+        robot.answered(call + 0.5, call, 'a', 'x')
+    assert robot.next_due() == float('inf')
+
+
+def test_robot_is_asked_at_the_deadline_and_at_once_afterwards(robot):
+    robot.ask(1.0, 1)
+    assert robot.next_due() == 1.2 and robot.due(1.19) == []
+    assert robot.due(1.2) == [Send(1, 'robot')]
+    assert robot.answered(1.25, 1, 'robot', 'own') == [Answer(1, 'own')]
+    assert sent(robot.ask(1.3, 2)) == ['robot']  # the machines owe an answer
+    robot.answered(1.35, 2, 'robot', 'own')
+    # from time to time they get a request too, and count again when one answers it
+    assert sent(robot.ask(1.0 + PROBE, 3)) == ['robot', 'a', 'b']
+    assert robot.answered(1.1 + PROBE, 3, 'a', 'x') == [Answer(3, 'x')]
+    assert sent(robot.ask(1.2 + PROBE, 4)) == ['a']
+
+
+def test_robot_takes_what_machines_lose(robot):
+    robot.ask(1.0, 1)
+    assert robot.died(1.01, 'a') == []
+    assert robot.died(1.02, 'b') == [Send(1, 'robot')]
+    assert sent(robot.ask(1.1, 2)) == ['robot']
+    assert robot.ready(1.2, ['robot']) == []  # both have left the graph
+    assert sent(robot.ask(9.0, 3)) == ['robot']
+
+
+def test_answer_of_a_machine_wins_after_the_deadline_too(robot):
+    robot.ask(1.0, 1)
+    robot.due(1.2)
+    assert robot.answered(1.21, 1, 'a', 'x') == [Answer(1, 'x')]
+    assert robot.answered(1.3, 1, 'robot', 'own') == []
+    assert sent(robot.ask(2.0, 2)) == ['a']  # b still owes it
+
+
+def test_machines_are_hedged_before_the_robot():
+    calls = ready(Calls(['a', 'b', 'robot'], 50, 'robot', 0.2))
+    for name in 'ab':
+        calls.replicas[name].took(0.01)
+    assert sent(calls.ask(1.0, 1)) == ['a']
+    assert sent(calls.due(1.05)) == ['b']
+    assert calls.due(1.1) == [] and calls.next_due() == 1.2
+    assert sent(calls.due(1.2)) == ['robot']
+
+
+def test_failure_of_all_machines_is_not_the_last_word(robot):
+    robot.ask(1.0, 1)
+    robot.answered(1.1, 1, 'a', 'no', failed=True)
+    assert robot.answered(1.1, 1, 'b', 'no', failed=True) == [Send(1, 'robot')]
+    assert robot.answered(1.2, 1, 'robot', 'yes') == [Answer(1, 'yes')]
+
+
+def test_robot_without_its_copy_waits_for_a_machine():
+    calls = Calls(['a', 'robot'], last='robot', deadline=0.2)
+    calls.ready(0.0, ['a'])
+    assert sent(calls.ask(1.0, 1)) == ['a']
+    assert calls.due(1.2) == []
+    assert calls.answered(1.4, 1, 'a', 'x') == [Answer(1, 'x')]
+
+
 def test_figures_are_shares_and_milliseconds(calls):
     for number, name in enumerate('aab'):
         calls.ask(1.0, number)
@@ -176,11 +245,11 @@ def test_figures_are_shares_and_milliseconds(calls):
 
 @settings(deadline=None, max_examples=300)
 @given(st.integers(0, 2**32), st.sampled_from([None, 5.0, 40.0, 'p95']),
-       st.floats(0, 0.3), st.floats(0, 0.3))
-def test_each_request_gets_one_answer(seed, after, lost, failing):
+       st.floats(0, 0.3), st.floats(0, 0.3), st.sampled_from(['', 'c']))
+def test_each_request_gets_one_answer(seed, after, lost, failing, last):
     """Replicas lose requests, fail, die and start again, but the last one answers."""
     rng = random.Random(seed)
-    calls = ready(Calls(NAMES, after))
+    calls = ready(Calls(NAMES, after, last, 0.05))
     events, answers, order = [], {}, iter(range(10**9))
 
     def later(seconds, what, *rest):

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
-from fogros2_replicas.pairs import header_of, MISSES, Pair, SET_BACK, STREAK
+from fogros2_replicas.pairs import HELD, header_of, MISSES, Pair, SET_BACK, STREAK
 
 NAMES = ('a', 'b', 'c')
 
@@ -107,3 +107,66 @@ def test_forwarded_is_what_the_fastest_sent(messages):
     for frame in 'lr':
         sent = [sum(one == (name, newest, frame) for one in messages[first:]) for name in NAMES]
         assert sum(one[1:] == (newest, frame) for one in forwarded) == max(sent)
+
+
+# -- a last replica -------------------------------------------------------------------------------
+
+@pytest.fixture
+def robot():
+    """Return a pair of two machines and the robot, which gets inputs after 0.2 s."""
+    pair = Pair(['a', 'b', 'robot'], 'robot', 0.2)
+    for replica in pair.replicas.values():
+        replica.there = True
+    return pair
+
+
+def test_robot_gets_no_input_that_a_machine_answers(robot):
+    for stamp in range(1, 50):
+        assert robot.input(stamp, (stamp, ''), b'x') == []
+        assert robot.next_due() == stamp + 0.2
+        assert robot.output(stamp + 0.1, 'b', (stamp, ''))
+        assert robot.next_due() == float('inf') and robot.due(stamp + 0.3) == []
+
+
+def test_robot_gets_late_inputs_then_all_at_once(robot):
+    robot.input(1.0, (1, ''), b'1')
+    robot.input(1.1, (2, ''), b'2')
+    assert robot.due(1.25) == [b'1'] and robot.next_due() == 1.3
+    assert robot.output(1.27, 'robot', (1, ''))
+    assert robot.input(1.28, (3, ''), b'3') == [b'3']
+    assert robot.due(1.3) == [b'2']
+    # a machine's output that is late too changes nothing, one in time does
+    assert not robot.output(1.4, 'a', (1, ''))
+    assert robot.input(1.5, (4, ''), b'4') == [b'4']
+    assert robot.output(1.6, 'a', (4, ''))
+    assert robot.input(1.7, (5, ''), b'5') == []
+
+
+def test_an_output_answers_the_inputs_before_it(robot):
+    for stamp in (1, 2, 3):
+        robot.input(0.01 * stamp, (stamp, ''), b'x')
+    robot.output(0.1, 'a', (2, ''))
+    assert robot.next_due() == pytest.approx(0.23)
+    assert robot.due(0.3) == [b'x']
+
+
+def test_robot_alone_gets_all_inputs(robot):
+    robot.died('a')
+    robot.replicas['b'].there = False
+    assert robot.input(1.0, None, b'x') == [b'x'] and robot.due(9.0) == []
+
+
+def test_outputs_without_stamps_answer_all_inputs(robot):
+    assert robot.input(1.0, None, b'1') == robot.input(1.1, None, b'2') == []
+    robot.output(1.15, 'a', None)
+    assert robot.due(9.0) == []
+
+
+def test_few_inputs_are_held_for_the_robot(robot):
+    for stamp in range(1, 200):
+        robot.input(1.0, (stamp, ''), b'%d' % stamp)
+    assert robot.due(2.0) == [b'%d' % stamp for stamp in range(200 - HELD, 200)]
+
+
+def test_replicas_without_a_last_one_hold_nothing(pair):
+    assert pair.input(1.0, (2, ''), b'x') == [] and pair.due(9.0) == []

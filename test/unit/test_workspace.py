@@ -19,7 +19,7 @@ from fogros2.host import workspace
 from fogros2.host.inspection import HostFacts, Python
 from fogros2.model import Command, Endpoint, Result, SyncReport
 from fogros2.shell.local import LocalShell
-from fogros2.testing.fakes import FakeShell
+from fogros2_testing.fakes import FakeShell
 from fogros2.waiting import Timeouts
 from rigs.rosdep import rosdep_source
 

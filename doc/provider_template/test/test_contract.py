@@ -8,7 +8,7 @@ import pytest
 
 from fogros2.errors import ProviderError
 from fogros2.model import CreateRequest, MachineSpec
-from fogros2.testing import ProviderContract
+from fogros2_testing import ProviderContract
 
 
 class TestShelf(ProviderContract):

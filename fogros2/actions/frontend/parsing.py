@@ -140,7 +140,8 @@ def replicated(entity: Entity, parser: Parser) -> Parsed:
     """Read ``<replicated machines="a, b" services="/plan" topics="/in:/out">``."""
     _, kwargs = Action.parse(entity, parser)
     parameters: dict[str, kinds.Kind] = {
-        'machines': 'list', 'services': 'list', 'topics': 'list', 'hedge_after': 'scalar'}
+        'machines': 'list', 'services': 'list', 'topics': 'list', 'hedge_after': 'scalar',
+        'deadline': 'scalar'}
     for name, kind in parameters.items():
         content = value(entity, parser, kinds.Keyword(name, kind))
         if content is not None:

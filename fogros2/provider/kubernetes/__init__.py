@@ -113,7 +113,7 @@ class KubernetesProvider(Provider):
         if lacking and not status.get('incomplete'):
             raise PrerequisiteError(
                 f"this user may not {', '.join(lacking)} in namespace '{namespace}' of "
-                f'{api.server}', 'deploy/kubernetes/role.yaml has all that a robot needs')
+                f'{api.server}', 'packaging/kubernetes/role.yaml has all that a robot needs')
 
     def architecture(self, spec: MachineSpec) -> str:
         """Return the architecture in ``node_selector``, or of all nodes with its labels."""

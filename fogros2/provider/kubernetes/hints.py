@@ -13,7 +13,7 @@ from fogros2.kubernetes_client import ApiError
 
 #: API group, resource, verbs.
 Right = tuple[str, str, tuple[str, ...]]
-#: The rights that a robot needs, as in deploy/kubernetes/role.yaml.
+#: The rights that a robot needs, as in packaging/kubernetes/role.yaml.
 RIGHTS: tuple[Right, ...] = (
     ('batch', 'jobs', ('create', 'get', 'list', 'watch', 'patch', 'delete')),
     ('', 'pods', ('create', 'get', 'list', 'watch', 'deletecollection')),
@@ -38,7 +38,7 @@ def of_refusal(message: str, namespace: str) -> str:
         resource = match['resource'] + (f".{match['group']}" if match['group'] else '')
         where = f"namespace '{match['namespace']}'" if match['namespace'] else 'whole cluster'
         return (f"let '{match['user']}' {match['verb']} {resource} in the {where}: "
-                'deploy/kubernetes/role.yaml has all that a robot needs')
+                'packaging/kubernetes/role.yaml has all that a robot needs')
     if 'violates PodSecurity' in message:
         return ('a VPN takes NET_ADMIN, which the namespace forbids: kubectl label namespace '
                 f'{namespace} pod-security.kubernetes.io/enforce=privileged --overwrite')

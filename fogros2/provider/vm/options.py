@@ -105,9 +105,9 @@ class VmOptions:
         if options.spot and spec.on_exit == 'stop':
             raise ConfigurationError("a spot instance can't be stopped and started again",
                                      "on_exit='delete' or 'keep', or spot=False")
-        if options.fleet and (spec.on_exit != 'keep' or spec.idle_timeout is not None):
+        if options.fleet and spec.on_exit != 'keep':
             raise ConfigurationError('robots of fleet= use the machine after the launch',
-                                     "on_exit='keep', without idle_timeout=")
+                                     "on_exit='keep'")
         return options
 
     def in_region(self: Own, region: str) -> Own:

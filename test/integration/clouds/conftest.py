@@ -16,7 +16,7 @@ import pytest
 from fogros2.model import Machine, MachineSpec
 from fogros2.provider import TAG_ON_EXIT
 from fogros2.provider.vm.provider import VmProvider
-from fogros2.testing import request_for
+from fogros2_testing import request_for
 from fogros2.waiting import wait_until
 from rigs.clouds import Cloud, CLOUDS, Robot
 from rigs.computers.network import ROBOT

@@ -15,7 +15,7 @@ from rigs.cluster import Client, Cluster, cluster, running_cluster
 from rigs.cluster.namespaces import making_namespaces, Namespace
 
 ROOT = Path(__file__).resolve().parents[3]
-ROLE = ROOT / 'deploy' / 'kubernetes' / 'role.yaml'
+ROLE = ROOT / 'packaging' / 'kubernetes' / 'role.yaml'
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

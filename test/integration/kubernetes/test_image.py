@@ -18,7 +18,7 @@ import pytest
 from fogros2.model import Command, MachineSpec
 from fogros2.process import run
 from fogros2.provider.kubernetes import KubernetesProvider
-from fogros2.testing import request_for
+from fogros2_testing import request_for
 from fogros2.waiting import wait_until
 from rigs.cluster import services
 from rigs.cluster.images import static_busybox

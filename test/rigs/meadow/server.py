@@ -74,7 +74,7 @@ class Meadow:
 
     @contextlib.contextmanager
     def fault(self, how: str, times: int) -> Iterator[threading.Event]:
-        """Let the next requests for a machine fail; see ``fogros2.testing.VmContract``."""
+        """Let the next requests for a machine fail; see ``fogros2_testing.VmContract``."""
         self._met.clear()
         if how == 'silent':
             self._answering.clear()

@@ -8,10 +8,10 @@ virtual machines whose service a test can disturb. :class:`ShellContract` works 
 ``FakeProvider`` passes the same contract; ``FakeShell`` runs no command.
 """
 
-from fogros2.testing.fakes import FakeProvider, FakeShell, FakeStream, FakeVpn
-from fogros2.testing.provider_contract import ProviderContract, request_for
-from fogros2.testing.shell_contract import ShellContract
-from fogros2.testing.vm_contract import VmContract
+from fogros2_testing.fakes import FakeProvider, FakeShell, FakeStream, FakeVpn
+from fogros2_testing.provider_contract import ProviderContract, request_for
+from fogros2_testing.shell_contract import ShellContract
+from fogros2_testing.vm_contract import VmContract
 
 __all__ = [
     'FakeProvider', 'FakeShell', 'FakeStream', 'FakeVpn', 'ProviderContract',

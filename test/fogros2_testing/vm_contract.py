@@ -20,8 +20,8 @@ from fogros2.errors import Cancelled, FogError
 from fogros2.model import MachineSpec
 from fogros2.provider import TAG_NAME, TAG_ON_EXIT
 from fogros2.provider.offers import wants
-from fogros2.testing.provider_contract import ProviderContract, PUBLIC_KEY, request_for
-from fogros2.testing.shell_contract import raised
+from fogros2_testing.provider_contract import ProviderContract, PUBLIC_KEY, request_for
+from fogros2_testing.shell_contract import raised
 from fogros2.waiting import in_thread, wait_until
 
 Fault = Literal['throttled', 'unavailable', 'lost', 'full', 'silent']

@@ -28,7 +28,7 @@ from fogros2.errors import (
 from fogros2.model import CreateRequest, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ON_EXIT
 from fogros2.provider.offers import MachineType, Offer, wants
-from fogros2.testing.shell_contract import raised
+from fogros2_testing.shell_contract import raised
 from fogros2.waiting import wait_until
 
 #: A public key without a known private key; providers check its format.

@@ -13,13 +13,19 @@ import socket
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 from hypothesis import given, strategies
+from launch import LaunchContext
 import pytest
 
+from fogros2 import ContainerInstance
 from fogros2.agent import processes
-from fogros2.host import idle
-from fogros2.host.idle import (
+from fogros2.errors import ConfigurationError
+from fogros2.model import MachineSpec, NodeSpec
+from fogros2.waiting import wait_until
+from fogros2_features.idle import IdleTimeout, program
+from fogros2_features.idle.program import (
     carried,
     computed,
     CPU,
@@ -32,7 +38,6 @@ from fogros2.host.idle import (
     ready,
     TRAFFIC,
 )
-from fogros2.waiting import wait_until
 
 #: What each interval between two samples had: its seconds, the seconds that all nodes computed,
 #: bytes in the VPN, and the most seconds that a thread ran or waited for a processor. Recorded of
@@ -149,8 +154,8 @@ def test_thread_that_others_keep_from_the_processor_is_ready():
         begin, before = time.monotonic(), ready(marked(mark))
         wait_until(lambda: time.monotonic() - begin > 1.0, timeout=60, what='a second')
         after, passed = ready(marked(mark)), time.monotonic() - begin
-    assert after[threads['works']] - before[threads['works']] > idle.READY * passed
-    assert after[threads['waits']] - before[threads['waits']] < idle.READY * passed
+    assert after[threads['works']] - before[threads['works']] > program.READY * passed
+    assert after[threads['waits']] - before[threads['waits']] < program.READY * passed
     assert ready([threads['works']]) == {}  # it has ended
 
 
@@ -186,12 +191,12 @@ def machine(monkeypatch, tmp_path):
     def look(
         now: float, cpu: float = 0.0, interface: str = 'lo', token: str = 'a', waited: float = 0.0,
     ) -> bool:
-        monkeypatch.setattr(idle.time, 'monotonic', lambda: now)
-        monkeypatch.setattr(idle, 'computed', lambda processes: cpu)
-        monkeypatch.setattr(idle, 'has_terminal', lambda user: False)
-        monkeypatch.setattr(idle, 'ready', lambda processes: {'7': waited})
-        monkeypatch.setattr(idle, 'TRAFFIC', 1e12)  # others use the loopback interface
-        return idle.main(interface, str(tmp_path), 60.0, token, str(tmp_path))
+        monkeypatch.setattr(program.time, 'monotonic', lambda: now)
+        monkeypatch.setattr(program, 'computed', lambda processes: cpu)
+        monkeypatch.setattr(program, 'has_terminal', lambda user: False)
+        monkeypatch.setattr(program, 'ready', lambda processes: {'7': waited})
+        monkeypatch.setattr(program, 'TRAFFIC', 1e12)  # others use the loopback interface
+        return program.main(interface, str(tmp_path), 60.0, token, str(tmp_path))
 
     return look
 
@@ -209,7 +214,7 @@ def test_starved_node_keeps_the_machine(machine):
 
 @pytest.mark.skipif(os.geteuid() != 0, reason='only root can act as another user')
 def test_program_acts_as_the_user_to_see_its_processes():
-    with idle.acting_as(65534):
+    with program.acting_as(65534):
         assert (os.geteuid(), os.getegid()) == (65534, 65534)
         status = Path('/proc/self/status').read_text()
         assert int(status.partition('CapEff:')[2].split()[0], 16) == 0  # by the identity alone
@@ -236,7 +241,7 @@ def test_machine_whose_nodes_are_unknown_is_not_idle(machine, tmp_path, content)
 def test_program_runs_alone_and_says_why(tmp_path):
     """As the agent runs it: isolated, from its source."""
     (tmp_path / 'watchdog.json').write_text('["no-such-mark", 1]')
-    source = Path(idle.__file__).read_text().replace("'/run'", repr(str(tmp_path)))
+    source = Path(program.__file__).read_text().replace("'/run'", repr(str(tmp_path)))
     words = (sys.executable, '-IS', '-c', source, 'lo', str(tmp_path), '0.000001', 'token')
     first, second = (subprocess.run(words, capture_output=True, text=True) for _ in range(2))
     assert (first.returncode, first.stdout, first.stderr) == (1, '', '')
@@ -247,4 +252,47 @@ def test_program_runs_alone_and_says_why(tmp_path):
 
 @pytest.mark.parametrize(('timeout', 'seconds'), [(5, 2), (60, 6), (600, 30)])
 def test_short_timeouts_are_sampled_more_often(timeout, seconds):
-    assert idle.interval(timeout) == seconds
+    assert program.interval(timeout) == seconds
+
+
+# -- the feature ---------------------------------------------------------------------------------
+
+class Machine:
+    """A machine that notes what is watched there."""
+
+    directory = '/var/lib/agent'
+    interface = SimpleNamespace(name='foga')
+
+    def __init__(self):
+        self.watched = []
+        self.reasons = []
+
+    def watch(self, name, argv, interval, then):
+        self.watched.append((name, argv[:3], argv[4:-1], interval))
+        then('nobody has used it')
+
+    def give_up(self, reason):
+        self.reasons.append(reason)
+
+
+def test_each_start_of_nodes_lets_the_time_begin_anew():
+    machine, node = Machine(), NodeSpec('a', 'a', arguments=('true',))
+    for _ in range(2):
+        assert IdleTimeout().starting(machine, [node], 60.0) == [node]
+    assert machine.watched == [
+        ('idle', ['python3', '-IS', '-c'], ['foga', '/var/lib/agent', '60.0'], 6.0)] * 2
+    assert machine.reasons == ['nobody has used it'] * 2
+
+
+@pytest.mark.parametrize('how', [
+    {'containers': ['--image x']}, {'options': {'fleet': ['key']}}])
+def test_machine_whose_use_is_unknown_has_no_idle_timeout(how):
+    with pytest.raises(ConfigurationError, match='computes|use the machine after'):
+        IdleTimeout().check(MachineSpec('a', 'container', **how), 60.0)
+
+
+@pytest.mark.parametrize('written', [90, '90', '1m30s'])
+def test_time_is_a_number_or_a_text(written):
+    machine = ContainerInstance(name='a', idle_timeout=written)
+    found = machine.spec(LaunchContext()).features['idle']
+    assert IdleTimeout.options(**found) == 90.0

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Record topics of a machine in an MCAP file, without decoding the messages.
+
+The format: https://mcap.dev, written by ``foxglove-sdk``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+import os
+from pathlib import Path
+import shutil
+import sys
+import time
+
+import foxglove
+from foxglove.mcap import MCAPWriteOptions
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.utilities import remove_ros_args
+
+from fogros2_monitor.topics import GraphNode, LOOK, Topic
+from image_transport_h264 import memory
+
+#: Bytes of the disk that stay free.
+FREE = 1_000_000_000
+
+
+class DiskFull(Exception):
+    """The recording would fill the machine's disk."""
+
+
+class RecorderNode(GraphNode):
+    """
+    The node that records topics.
+
+    :param path: of the file, which must not exist.
+    :param names: of topics; they may appear later.
+    """
+
+    def __init__(self, path: Path, names: Sequence[str]) -> None:
+        super().__init__('fogros2_recorder')
+        self._path = path
+        self._patterns = names
+        self._writer = foxglove.open_mcap(
+            path, context=self.viewers, writer_options=MCAPWriteOptions(profile='ros2'))
+        self._look()
+        self.create_timer(LOOK, self._tick)
+        self.get_logger().info(f'recording {", ".join(names)} to {path}')
+
+    def destroy_node(self) -> None:
+        """Complete the file, then destroy the node."""
+        self._writer.close()
+        super().destroy_node()
+
+    def _added(self, topic: Topic) -> Topic:
+        topic.look(0)
+        return topic
+
+    def _tick(self) -> None:
+        if shutil.disk_usage(self._path.parent).free < FREE:
+            raise DiskFull(f'less than {FREE / 1e9:g} GB are free: {self._path} ends here')
+        self._look()
+
+
+def main() -> int:
+    """Record until a signal; return the exit status."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument('folder', help='of the file; ~ is the home of the user')
+    parser.add_argument('topics', nargs='+')
+    arguments = parser.parse_args(remove_ros_args(sys.argv)[1:])
+    memory.keep()
+    folder = Path(arguments.folder).expanduser()
+    folder.mkdir(parents=True, exist_ok=True)
+    rclpy.init()
+    node = RecorderNode(
+        folder / f'{time.strftime("%Y%m%d-%H%M%S")}-{os.getpid()}.mcap', arguments.topics)
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    except DiskFull as error:
+        node.get_logger().error(str(error))
+        return 1
+    finally:
+        node.destroy_node()
+    return 0
