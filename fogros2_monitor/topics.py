@@ -129,14 +129,15 @@ class GraphNode(Node):
 
     def _look(self) -> None:
         """Add new topics and remove topics that are gone."""
-        kinds = {name: kind for name, kind in ros_types.topics(self).items()
+        everything = ros_types.topics(self)
+        kinds = {name: kind for name, kind in everything.items()
                  if '/_' not in name  # hidden by ROS 2's naming convention
                  and any(fnmatch.fnmatchcase(name, pattern) for pattern in self._patterns)}
         for name in self._topics.keys() - kinds.keys():
             self._topics.pop(name).close()
         for name, kind in kinds.items():
             topic = self._topics.get(name)
-            video = kind == _COMPRESSED and f'{name}{_KEYFRAME}' in kinds
+            video = kind == _COMPRESSED and f'{name}{_KEYFRAME}' in everything
             if topic is not None and (topic.kind, topic.video) == (kind, video):
                 topic.refit()
                 continue

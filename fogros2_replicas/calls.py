@@ -77,7 +77,7 @@ class Calls:
         self.replicas = {name: Figures(name) for name in replicas}
         self._hedge_after = hedge_after
         self._last = self.replicas.get(last)
-        self._deadline = deadline
+        self._deadline = deadline if last else math.inf
         self._calls: dict[int, _Call] = {}
 
     def ask(self, now: float, call: int) -> list[Action]:
@@ -160,10 +160,11 @@ class Calls:
             over = now >= one.deadline
             for name in one.asked - one.failed:
                 self.replicas[name].late = over or self._hedge_after is not None
-            if over:
-                one.deadline = math.inf
-            actions += self._send(
-                now, call, self._at_last(one) if over else self._next(one, self._live()))
+            last = self._at_last(one) if over else []
+            if over:  # a last replica that is not there yet is looked for again
+                asked = last or self._last is None or self._last.name in one.asked
+                one.deadline = math.inf if asked else now + PROBE
+            actions += self._send(now, call, last or self._next(one, self._live()))
             one.due = min(one.due, one.deadline)
         return actions
 

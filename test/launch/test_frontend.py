@@ -171,8 +171,10 @@ EXAMPLES = {'text': ('nearest', 'nearest'), 'number': ('2', 2), 'bool': ('true',
 #: Where not every value will do.
 CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'on_loss_after': '5m',
            'checkpoint': '$HOME/map', 'bandwidth': '10Mbit/s',
-           'name': 'planner', 'fetch_to': '/results', 'fetch_limit': '2GB'}
+           'name': 'planner', 'budget': '5 USD', 'idle_timeout': '5m',
+           'fetch_to': '/results', 'fetch_limit': '2GB'}
 LISTS = {'fetch': ('~/bags, /var/map', ['~/bags', '/var/map']),
+         'record': ('/tf, /scan', ['/tf', '/scan']),
          'monitor_allow': ('198.51.100.0/28,::1', ['198.51.100.0/28', '::1']),
          'share': ('/map, /tf_static', ['/map', '/tf_static']),
          'apt': ('libzbar0, g++', ['libzbar0', 'g++']),

@@ -316,7 +316,7 @@ def test_an_argument_completes_name_provider_and_keyword(tmp_path, monkeypatch):
             'aws', 'azure', 'cheapest', 'container', 'gcp', 'joined', 'kubernetes',
             'robot', 'ssh')]
     assert complete('planner=co') == ['planner=container']
-    assert complete('planner=aws,re') == ['planner=aws,region=', 'planner=aws,regions=']
+    assert complete('planner=aws,reg') == ['planner=aws,region=', 'planner=aws,regions=']
     assert 'planner=aws,spot=true,disk_size=' in complete('planner=aws,spot=true,d')
     assert complete('planner=aws,region=') == []
     assert complete('planner=nonsense,re') == []

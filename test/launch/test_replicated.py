@@ -116,9 +116,8 @@ def test_robot_runs_a_copy_under_a_name_of_its_own(run, fake, first, robot):
         Replicated([*machines('one'), robot],
                    [talker(name='planner', remappings=[('out', '/plan')])],
                    services=['/plan'], deadline=0.2)])) == 0
-    command, = (one for one in commands if any('fogros2/robot' in word for word in one))
-    assert command[0].endswith('/lib/demo/talker')
-    assert 'out:=/fogros2/robot/plan' in command and '/plan:=/fogros2/robot/plan' in command
+    command, = (one for one in commands if 'out:=/fogros2/robot/plan' in one)
+    assert command[0].endswith('/lib/demo/talker') and '/plan:=/fogros2/robot/plan' in command
     settings, = first
     assert (settings['last'], settings['deadline']) == ('robot', 0.2)
     assert settings['replicas'] == {'one': '/fogros2/one', 'robot': '/fogros2/robot'}

@@ -199,9 +199,10 @@ def test_package_imports_nothing_above_it(folder: str, above: tuple[str, ...]) -
 
 def test_core_names_no_keyword_of_a_feature() -> None:
     for keyword in features.keywords():
+        # words such as fetch have other uses
+        pattern = rf'\b{keyword}\b' if '_' in keyword else rf'\b{keyword}='
         for path in python_files(CORE):
-            assert not re.search(rf'\b{keyword}(=|\W*\W{keyword}\b)|[\'"]{keyword}[\'"]',
-                                 path.read_text()), f'{path} names {keyword}'
+            assert not re.search(pattern, path.read_text()), f'{path} names {keyword}'
 
 
 def plugin(module: str) -> str:

@@ -170,7 +170,7 @@ def robot():
 
 def test_robot_is_not_asked_while_machines_answer(robot):
     for call in range(100):
-        assert sent(robot.ask(call, call)) == ['a', 'b']
+        assert {*sent(robot.ask(call, call))} == {'a', 'b'}
         assert robot.answered(call + 0.19, call, 'b', 'x') == [Answer(call, 'x')]
         robot.answered(call + 0.5, call, 'a', 'x')
     assert robot.next_due() == float('inf')
