@@ -96,9 +96,10 @@ class Results(Feature):
 
     def beside(self, spec: MachineSpec, own: Wanted) -> Sequence[NodeSpec]:
         """Return the program that records, with the names that streams give to topics there."""
+        folder = f'{RECORDINGS.format(spec.name)}/{RECORDED}'
         return [NodeSpec(
             id=f'record-{spec.name}', name='record', package='fogros2', executable='record',
-            arguments=(f'{RECORDINGS.format(spec.name)}/{RECORDED}', *own.topics, '--ros-args'))] if own.topics else []
+            arguments=(folder, *own.topics, '--ros-args'))] if own.topics else []
 
     @contextlib.contextmanager
     def machine(self, running: RunningMachine, own: Wanted) -> Iterator[None]:

@@ -292,7 +292,8 @@ class FirstAnswer(Node):
 
     def wake(self) -> None:
         """Have the thread look when the next request is due."""
-        if (self.settings['hedge_after'] or self.last) and threading.current_thread() is not self._watcher:
+        waits = self.settings['hedge_after'] or self.last
+        if waits and threading.current_thread() is not self._watcher:
             os.write(self._events, b'\n')
 
     def _watch(self) -> None:

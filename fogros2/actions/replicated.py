@@ -49,7 +49,8 @@ class Replicated(Action):
     """
 
     def __init__(
-        self, machines: Union[Sequence[Optional[SomeMachine]], values.List], actions: Iterable[Action], *,
+        self, machines: Union[Sequence[Optional[SomeMachine]], values.List],
+        actions: Iterable[Action], *,
         services: Union[Sequence[SomeSubstitutionsType], values.List] = (),
         topics: Union[Sequence[tuple[SomeSubstitutionsType, SomeSubstitutionsType]],
                       values.List] = (),
@@ -93,14 +94,15 @@ class Replicated(Action):
                        services, pairs, hedge_after, deadline)
         groups = [self._group(None) if label == ROBOT else group for label, group in zip(
             labels, self._groups or map(self._group, machines))]
-        machines = [machine for machine, label in zip(machines, labels) if label != ROBOT]
-        here = [coordinator.on_robot(machine) for machine in machines]
+        others = [label for label in labels if label != ROBOT]
+        here = [coordinator.on_robot(machine) for machine in others]
         if all(here):
             return [GroupAction(copy.deepcopy(self._actions))]
         if any(here):
             raise ConfigurationError('replicas run partly on the robot, where their names are '
-                                     'those of the first answer', 'give all of them machines')
-        sessions = {session.spec.name: session for session in map(coordinator.session, machines)}
+                                     'those of the first answer',
+                                     'give all of them machines, or write None for the robot')
+        sessions = {session.spec.name: session for session in map(coordinator.session, others)}
         streamed = self._streamed(coordinator, namespace, [output for _, output in pairs])
         public = [*services, *(name for pair in pairs for name in pair)]
         for name, session in sessions.items():

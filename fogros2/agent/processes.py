@@ -294,8 +294,10 @@ class Checks:
             if status == 0:
                 del self.watched[what]
                 say(f'{what}: {reason}')
-                kind = {'event': what} if what == NOTICE else {'event': 'watched', 'what': what}
-                self.emit({**kind, 'reason': reason})
+                if what == NOTICE:
+                    self.emit({'event': 'notice', 'reason': reason})
+                else:
+                    self.emit({'event': 'watched', 'what': what, 'reason': reason})
             else:
                 self.loop.at(interval, look)
 

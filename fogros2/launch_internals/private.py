@@ -105,7 +105,9 @@ def change_command(
 
     def prepared(context: LaunchContext) -> None:
         prepare(context)
-        action.process_details['cmd'] = [*change(action.process_details['cmd'])]
+        details = action.process_details
+        assert details is not None
+        details['cmd'] = [*change(details['cmd'])]
 
     vars(action)['prepare'] = prepared
 

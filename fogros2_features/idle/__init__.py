@@ -28,7 +28,8 @@ class IdleTimeout(Feature):
 
         :param idle_timeout: seconds, or text such as '10m'.
         """
-        return None if idle_timeout is None else parse_duration('idle_timeout', idle_timeout)
+        return None if idle_timeout is None else parse_duration(
+            'idle_timeout', str(idle_timeout))
 
     def check(self, spec: MachineSpec, own: float) -> None:
         """Check that what uses the machine can be measured, and that nobody needs it later."""
@@ -58,4 +59,5 @@ class IdleTimeout(Feature):
 def _not_measured(spec: MachineSpec) -> ConfigurationError:
     return ConfigurationError(
         f"the machine '{spec.name}' has an idle_timeout and runs a container: nothing measures "
-        'what a container computes', 'leave idle_timeout= out, or run the nodes without containers')
+        'what a container computes',
+        'leave idle_timeout= out, or run the nodes without containers')

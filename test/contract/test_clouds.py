@@ -16,9 +16,9 @@ from fogros2.model import MachineSpec
 from fogros2.plugin_system import load
 from fogros2.provider import TAG_ON_EXIT, TAG_ROBOT
 from fogros2.provider.vm import cloud
+from fogros2.waiting import wait_until
 from fogros2_testing import request_for, VmContract
 from fogros2_testing.provider_contract import PUBLIC_KEY
-from fogros2.waiting import wait_until
 from rigs.clouds_in_memory import DAMAGED, MEMORIES
 
 STEPS = [(name, *step) for name, memory in MEMORIES.items() for step in memory.steps]

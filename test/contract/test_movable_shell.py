@@ -9,8 +9,8 @@ import threading
 from fogros2.model import Command, Endpoint, Result
 from fogros2.shell.local import LocalShell
 from fogros2.shell.movable import MovableShell
-from fogros2_testing import FakeShell, ShellContract
 from fogros2.waiting import wait_until
+from fogros2_testing import FakeShell, ShellContract
 
 
 class TestMovableShell(ShellContract):

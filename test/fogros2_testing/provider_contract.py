@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The contract of every provider, as tests for pytest."""
 
-# ruff: noqa: D102 - the name of a test states the behaviour
+
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from fogros2.errors import (
 from fogros2.model import CreateRequest, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ON_EXIT
 from fogros2.provider.offers import MachineType, Offer, wants
-from fogros2_testing.shell_contract import raised
 from fogros2.waiting import wait_until
+from fogros2_testing.shell_contract import raised
 
 #: A public key without a known private key; providers check its format.
 PUBLIC_KEY = ('ssh-ed25519 '

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The contract of every shell, as tests."""
 
-# ruff: noqa: D102 - a test says in its name what it holds
+
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The contract of a cloud of virtual machines, against a service that tests can disturb."""
 
-# ruff: noqa: D102 - the name of a test states the behaviour
+
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from fogros2.errors import Cancelled, FogError
 from fogros2.model import MachineSpec
 from fogros2.provider import TAG_NAME, TAG_ON_EXIT
 from fogros2.provider.offers import wants
+from fogros2.waiting import in_thread, wait_until
 from fogros2_testing.provider_contract import ProviderContract, PUBLIC_KEY, request_for
 from fogros2_testing.shell_contract import raised
-from fogros2.waiting import in_thread, wait_until
 
 Fault = Literal['throttled', 'unavailable', 'lost', 'full', 'silent']
 #: Requests that fail, if all shall.

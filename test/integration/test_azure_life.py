@@ -31,8 +31,8 @@ from fogros2.provider.azure.account import Account
 from fogros2.provider.azure.provider import AzureProvider
 from fogros2.provider.offers import wants
 from fogros2.provider.vm.user_data import LIMIT
-from fogros2_testing.provider_contract import PUBLIC_KEY
 from fogros2.waiting import wait_until
+from fogros2_testing.provider_contract import PUBLIC_KEY
 from rigs.azure import service
 from rigs.azure.service import Fault
 

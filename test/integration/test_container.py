@@ -32,8 +32,8 @@ from fogros2.provider.container import ContainerProvider, filter_name, login_ids
 from fogros2.provider.container import machine as container_machine
 from fogros2.provider.container import root as container_root
 from fogros2.shell.ssh import SSHShell
-from fogros2_testing import ProviderContract
 from fogros2.waiting import wait_until
+from fogros2_testing import ProviderContract
 from rigs.container_machines import cloud, key
 
 __all__ = ['cloud', 'key']

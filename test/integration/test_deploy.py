@@ -27,8 +27,8 @@ from fogros2.process import run
 from fogros2.provider.container import entry as container_entry
 from fogros2.report import ClockMeasured, StepDone, StepFailed, StepStarted
 from fogros2.store import Store
-from fogros2_testing.plugins import instead
 from fogros2.waiting import wait_until
+from fogros2_testing.plugins import instead
 from ros2fog_cli.api import doctor
 
 pytestmark = [

@@ -20,8 +20,8 @@ from fogros2.errors import Cancelled, MachineNotFound, NameTaken, PrerequisiteEr
 from fogros2.model import Command, MachineSpec, MachineState
 from fogros2.provider.container.hosted import HostedProvider
 from fogros2.shell.ssh import SSHShell
-from fogros2_testing import ProviderContract, request_for
 from fogros2.waiting import wait_until
+from fogros2_testing import ProviderContract, request_for
 from rigs.container_machines import key
 from rigs.fleet import Fleet, fleet, heard, LAUNCH
 from rigs.launched import Launched, launching, ROS2

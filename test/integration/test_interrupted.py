@@ -12,8 +12,8 @@ import pytest
 
 from fogros2.model import Command
 from fogros2.process import argv
-from fogros2_testing.plugins import install
 from fogros2.waiting import wait_until
+from fogros2_testing.plugins import install
 from rigs.launched import launching
 
 pytestmark = [

@@ -377,7 +377,7 @@ def recorded(folder: Path) -> dict[str, list[Any]]:
             assert schema is not None
             if schema.name == 'foxglove.CompressedVideo':
                 messages.setdefault(channel.topic, []).append(protobuf(message.data))
-        for _, channel, message, decoded in reader.iter_decoded_messages(
+        for _, channel, _, decoded in reader.iter_decoded_messages(
                 topics=['/words', '/map', '/late']):
             messages.setdefault(channel.topic, []).append(decoded.data)
     return messages

@@ -28,8 +28,8 @@ from fogros2.model import Command, Endpoint, MachineSpec
 from fogros2.provider.ssh import SSHProvider
 from fogros2.shell.ssh import SSHShell
 from fogros2.store import Record, Store
-from fogros2_testing import request_for
 from fogros2.waiting import Periodic, wait_until
+from fogros2_testing import request_for
 from rigs.sshd import private_sshd, PrivateSshd
 from ros2fog_cli.api import ssh_settings
 from ros2fog_cli.api.machines import Entry

@@ -30,8 +30,8 @@ from fogros2.errors import (
 from fogros2.model import Command, Endpoint
 from fogros2.shell import connect, lines
 from fogros2.shell.ssh import SSHShell
-from fogros2_testing import ShellContract
 from fogros2.waiting import wait_until
+from fogros2_testing import ShellContract
 from rigs.sshd import free_port, private_sshd, PrivateSshd
 
 pytestmark = pytest.mark.skipif(

@@ -24,8 +24,8 @@ import pytest
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2_testing.plugins import install
 from fogros2.waiting import wait_until
+from fogros2_testing.plugins import install
 from rigs.launched import Launched, launching
 
 pytestmark = [

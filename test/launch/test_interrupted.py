@@ -455,7 +455,7 @@ def test_streams_that_come_later_know_of_it(run, fake, harmless, planner, talker
     assert len(fake.machines['planner'].all) == 1
 
 
-# -- a feature gives it up -------------------------------------------------------------------------------
+# -- a feature gives it up ------------------------------------------------------------------------
 
 def test_node_for_a_machine_that_has_ended_does_not_start(
     run, fake, talker, watch, capfd,

@@ -16,9 +16,9 @@ from fogros2.model import MachineSpec, VpnInterface
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent
 from fogros2.store import Store
-from fogros2_testing.fakes import FakeProvider, FakeVpn
 from fogros2.vpn import addresses
 from fogros2.waiting import Timeouts
+from fogros2_testing.fakes import FakeProvider, FakeVpn
 
 ROBOT = VpnInterface('fog0a0b0c', '198.18.7.1', '198.18.7.0/24', 0, '/nowhere/key', firewall=True)
 

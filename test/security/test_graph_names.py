@@ -18,12 +18,12 @@ import pytest
 pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is installed')
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
 from fogros2 import ros_types
-from fogros2_testing.fakes import FakeShell, FakeStream
 from fogros2_monitor.dashboard import cameras, graph
 from fogros2_monitor.dashboard.ways import Stream
 from fogros2_monitor.tunnel import Tunnel
 from fogros2_replicas.node import FirstAnswer, WARNINGS
 from fogros2_replicas.pairs import Pair, SET_BACK
+from fogros2_testing.fakes import FakeShell, FakeStream
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Sets the clipboard, clears the screen, hides text.

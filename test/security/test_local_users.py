@@ -27,13 +27,13 @@ import pytest
 from fogros2 import process
 from fogros2.model import Command
 from fogros2.shell import relay
-from fogros2_testing.fakes import FakeShell
 from fogros2.vpn.guests import Door
 from fogros2.waiting import wait_until
 from fogros2_monitor import accounts, request
 from fogros2_monitor.dashboard.server import Dashboard
 from fogros2_monitor.gate import Gate
 from fogros2_monitor.tunnel import Tunnel
+from fogros2_testing.fakes import FakeShell
 from rigs import loops
 from rigs.stranger import stranger
 from ros2fog_cli.api.browser import Ticket

@@ -16,9 +16,9 @@ from fogros2.errors import FogError
 from fogros2.host import checkpoint, dependencies, inspection, modules, wheels
 from fogros2.model import Result, SyncReport
 from fogros2.shell import host_key, sync
-from fogros2_testing import FakeShell
 from fogros2.untrusted import InvalidMessage
 from fogros2.vpn import addresses
+from fogros2_testing import FakeShell
 from ros2fog_cli.api import monitor
 
 DIGITS = '9' * 5000

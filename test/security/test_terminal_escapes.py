@@ -23,8 +23,8 @@ from fogros2.errors import CommandError, FogError, ShellError
 from fogros2.host.checkpoint import Checkpoint
 from fogros2.model import Command, Result
 from fogros2.shell import command_line, sync
-from fogros2_testing import FakeShell
 from fogros2.waiting import wait_until
+from fogros2_testing import FakeShell
 from ros2fog_cli.api import output, progress, table
 from ros2fog_cli.api.log import Lines
 from ros2fog_cli.command.fog import FogCommand

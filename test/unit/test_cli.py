@@ -41,9 +41,9 @@ from fogros2.model import (
 from fogros2.provider import Capabilities, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.provider.container import ContainerProvider
 from fogros2.store import Made, process_start, Record, robot_name, Store
+from fogros2.vpn.wireguard import WireGuard
 from fogros2_testing.fakes import FakeProvider, FakeShell, FakeStream
 from fogros2_testing.plugins import instead
-from fogros2.vpn.wireguard import WireGuard
 from rigs import recorded_agent
 from ros2fog_cli.api import endings, joining, machines, table
 from ros2fog_cli.api.machines import Entry

@@ -48,9 +48,9 @@ from fogros2.provider import (
 )
 from fogros2.provider.offers import MachineType, Offer, Offers, ranked, Region, Wants
 from fogros2.store import process_start, Record, robot_name, Store
+from fogros2.waiting import wait_until
 from fogros2_testing.fakes import FakeProvider, FakeShell
 from fogros2_testing.plugins import instead
-from fogros2.waiting import wait_until
 from ros2fog_cli.api import (
     doctor,
     endings,

@@ -19,9 +19,9 @@ from fogros2.model import Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, TAG_NAME, TAG_ROBOT
 from fogros2.report import silent, StepDone, StepStarted
 from fogros2.store import process_start, Record, robot_name, Store
+from fogros2.waiting import wait_until
 from fogros2_testing.fakes import FakeProvider
 from fogros2_testing.plugins import instead
-from fogros2.waiting import wait_until
 from ros2fog_cli.api.live import Live
 
 

@@ -58,10 +58,10 @@ from fogros2.model import (
 from fogros2.report import StepDone, StepFailed
 from fogros2.shell import host_key
 from fogros2.store import Made, Store
-from fogros2_testing.fakes import FakeProvider, FakeShell, FakeStream, FakeVpn
-from fogros2_testing.plugins import instead
 from fogros2.vpn import addresses
 from fogros2.waiting import Periodic, Timeouts, wait_until
+from fogros2_testing.fakes import FakeProvider, FakeShell, FakeStream, FakeVpn
+from fogros2_testing.plugins import instead
 
 SPEC = MachineSpec('planner', 'fake')
 

@@ -26,10 +26,10 @@ from fogros2.feature import Feature
 from fogros2.model import Command, Endpoint, MachineSpec
 from fogros2.report import silent
 from fogros2.shell import connect
-from fogros2_testing.fakes import FakeProvider
-from fogros2_testing.plugins import instead
 from fogros2_features import results
 from fogros2_features.results import Results
+from fogros2_testing.fakes import FakeProvider
+from fogros2_testing.plugins import instead
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType

@@ -26,8 +26,8 @@ from fogros2.provider.gcp.provider import GCPProvider
 from fogros2.provider.offers import wants
 from fogros2.provider.vm import cloud
 from fogros2.provider.vm.cloud import Order, Place
-from fogros2_testing import request_for
 from fogros2.waiting import wait_until
+from fogros2_testing import request_for
 
 SPEC = MachineSpec('planner', 'gcp', {})
 REQUEST = CreateRequest('5f0c7ab8-3a60-4b66-a3ff-f6f0ff4b9a37', 'ssh-ed25519 AAAA robot',

@@ -24,8 +24,8 @@ from fogros2 import kubernetes_client
 from fogros2.errors import Cancelled, DeadlineExceeded, PrerequisiteError
 from fogros2.kubernetes_client import ApiError, Unreachable
 from fogros2.store import Store
-from fogros2_testing.shell_contract import raised
 from fogros2.waiting import ON_ITS_WAY, wait_until
+from fogros2_testing.shell_contract import raised
 
 pytest.importorskip('kubernetes', reason='needs the client: pip install kubernetes')
 

@@ -42,8 +42,8 @@ from fogros2.provider.kubernetes.exposure import Exposure
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.provider.kubernetes.options import Options
 from fogros2.provider.kubernetes.pods import Trouble
-from fogros2_testing.shell_contract import raised
 from fogros2.waiting import wait_until
+from fogros2_testing.shell_contract import raised
 
 ROOT = Path(__file__).resolve().parents[2]
 #: What the manifests have to hold in, beside the real cluster of the tests (1.20).

@@ -20,8 +20,8 @@ from fogros2.kubernetes_client import ApiError, Unreachable
 from fogros2.model import Command, Endpoint
 from fogros2.shell import kubernetes_link, relay
 from fogros2.shell.kubernetes import KubernetesShell
-from fogros2_testing.shell_contract import raised
 from fogros2.waiting import ON_ITS_WAY, wait_until
+from fogros2_testing.shell_contract import raised
 
 pytestmark = pytest.mark.skipif(
     os.geteuid() != 0, reason='needs root: the multiplexer changes to other users')

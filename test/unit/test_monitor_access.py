@@ -31,8 +31,8 @@ from fogros2.provider.kubernetes.names import MachineId
 from fogros2.runtime import foxglove as runtime_foxglove
 from fogros2.runtime import republishers, streaming
 from fogros2.store import Made, process_start, Record, Store
-from fogros2_testing.fakes import FakeProvider, FakeShell
 from fogros2_monitor import credentials
+from fogros2_testing.fakes import FakeProvider, FakeShell
 from rigs import deploying
 from ros2fog_cli.api import monitor
 from ros2fog_cli.api.browser import Ticket

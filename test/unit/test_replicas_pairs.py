@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
-from fogros2_replicas.pairs import HELD, header_of, MISSES, Pair, SET_BACK, STREAK
+from fogros2_replicas.pairs import header_of, HELD, MISSES, Pair, SET_BACK, STREAK
 
 NAMES = ('a', 'b', 'c')
 

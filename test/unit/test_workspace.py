@@ -19,8 +19,8 @@ from fogros2.host import workspace
 from fogros2.host.inspection import HostFacts, Python
 from fogros2.model import Command, Endpoint, Result, SyncReport
 from fogros2.shell.local import LocalShell
-from fogros2_testing.fakes import FakeShell
 from fogros2.waiting import Timeouts
+from fogros2_testing.fakes import FakeShell
 from rigs.rosdep import rosdep_source
 
 PYTHON = Python('/usr/bin/python3', (3, 12), True)

@@ -16,8 +16,8 @@ import pytest
 from fogros2.model import Machine, MachineSpec
 from fogros2.provider import TAG_ON_EXIT
 from fogros2.provider.vm.provider import VmProvider
-from fogros2_testing import request_for
 from fogros2.waiting import wait_until
+from fogros2_testing import request_for
 from rigs.clouds import Cloud, CLOUDS, Robot
 from rigs.computers.network import ROBOT
 from rigs.launched import launching

@@ -10,8 +10,8 @@ import pytest
 from fogros2.errors import MachineNotFound
 from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_ON_EXIT
-from fogros2_testing import request_for
 from fogros2.waiting import wait_until
+from fogros2_testing import request_for
 from rigs.computers.network import ROBOT_ELSEWHERE
 from rigs.gce.resources import SERVICE_ACCOUNT
 

@@ -15,9 +15,9 @@ from fogros2.errors import NameTaken, ProviderError, ShellError
 from fogros2.model import Command, MachineSpec
 from fogros2.provider.kubernetes import KubernetesProvider
 from fogros2.shell.kubernetes import KubernetesShell
+from fogros2.waiting import wait_until
 from fogros2_testing import ProviderContract, request_for, ShellContract
 from fogros2_testing.shell_contract import raised
-from fogros2.waiting import wait_until
 from rigs.cluster import BARE, Refused
 
 

@@ -18,8 +18,8 @@ import pytest
 from fogros2.model import Command, MachineSpec
 from fogros2.process import run
 from fogros2.provider.kubernetes import KubernetesProvider
-from fogros2_testing import request_for
 from fogros2.waiting import wait_until
+from fogros2_testing import request_for
 from rigs.cluster import services
 from rigs.cluster.images import static_busybox
 from rigs.launched import ros2
