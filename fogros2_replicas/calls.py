@@ -117,7 +117,9 @@ class Calls:
         if failed:
             replica.failures += 1
             one.error = response
-            return self._failed(now, call, name)
+            if replica is not self._last:
+                return self._failed(now, call, name)
+            return self._settle(call, response)  # the others have had their time
         replica.won += 1
         return self._settle(call, response)
 

@@ -51,12 +51,12 @@ class Bench:
         self.executor.add_node(node)
         return node
 
-    def start(self, services=(), topics=(), hedge_after=None, first=()):
+    def start(self, services=(), topics=(), hedge_after=None, first=(), **more):
         self.process = subprocess.Popen(
             [sys.executable, str(ROOT / 'fogros2_replicas/scripts/first_answer'), json.dumps({
                 'name': 'first', 'services': services, 'topics': topics,
                 'replicas': {'a': '/fogros2/a', 'b': '/fogros2/b'},
-                'hedge_after': hedge_after, 'folder': str(self.folder)})],
+                'hedge_after': hedge_after, 'folder': str(self.folder), **more})],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env={
                 **os.environ, 'PYTHONPATH': os.pathsep.join(
                     filter(None, [*first, str(ROOT), os.environ.get('PYTHONPATH', '')]))})
@@ -270,3 +270,80 @@ def test_action_is_refused_with_a_reason(bench):
         Trigger, '/go/_action/send_goal', lambda request, response: response)
     bench.start(['/go'])
     bench.said('/go is a ROS action, which has goals')
+
+
+# -- the robot is the last replica: here it is b ---------------------------------------------------
+
+LAST = {'last': 'b', 'deadline': 0.3}
+
+
+def test_robot_answers_from_when_its_machine_is_cut_off(bench):
+    cut, over, own = threading.Event(), threading.Event(), []
+
+    def machine(request, response):
+        if cut.is_set():
+            over.wait(60)  # as behind a cut link: no answer, and no end
+        response.success, response.message = True, 'a'
+        return response
+
+    def robot(request, response):
+        own.append(request)
+        response.success, response.message = len(own) % 2 == 0, 'b'
+        return response
+
+    bench.serve('a', Trigger, machine)
+    bench.serve('b', Trigger, robot)
+    bench.start(services=['/plan'], **LAST)
+    bench.all_live()
+    client = bench.client.create_client(Trigger, '/plan')
+    assert client.wait_for_service(60.0)
+    try:
+        answers = []
+        for number in range(100):
+            if number == 50:
+                cut.set()
+                before = len(own)
+            answers.append(bench.answer(client.call_async(Trigger.Request())).message)
+        # a busy computer may miss the deadline before, too
+        assert answers[50:] == ['b'] * 50 and before == answers[:50].count('b') < 25
+    finally:
+        over.set()
+
+
+def test_robot_gets_the_inputs_that_a_machine_leaves_out(bench):
+    inputs = bench.client.create_publisher(CameraInfo, '/image', 10)
+    cut, heard, came = threading.Event(), [], []
+    for name in 'ab':
+        output = bench.replicas[name].create_publisher(
+            CameraInfo, f'/fogros2/{name}/seen', 10)
+
+        def work(message, name=name, output=output):
+            if name == 'b':
+                heard.append(message.header.stamp.sec)
+            if name == 'b' or not cut.is_set():
+                message.distortion_model = name
+                output.publish(message)
+
+        bench.replicas[name].create_subscription(
+            CameraInfo, f'/fogros2/{name}/image', work, 10)
+    bench.client.create_subscription(
+        CameraInfo, '/seen', lambda message: came.append(
+            (message.header.stamp.sec, message.distortion_model)), 10)
+    bench.start(topics=[['/image', '/seen', False]], **LAST)
+    bench.all_live()
+
+    def send(stamp):
+        message = CameraInfo()
+        message.header.stamp.sec = stamp
+        inputs.publish(message)
+        bench.until(lambda: any(one == stamp for one, _ in came), f'the output of {stamp}')
+
+    bench.until(lambda: inputs.get_subscription_count() > 0, 'a subscription of the input')
+    for stamp in range(1, 30):
+        send(stamp)
+    assert [by for _, by in came].count('a') > 15
+    cut.set()
+    for stamp in range(30, 60):
+        send(stamp)
+    assert [by for stamp, by in came if stamp >= 30] == ['b'] * 30
+    assert {*range(30, 60)} <= {*heard}

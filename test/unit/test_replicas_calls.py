@@ -223,6 +223,13 @@ def test_failure_of_all_machines_is_not_the_last_word(robot):
     assert robot.answered(1.2, 1, 'robot', 'yes') == [Answer(1, 'yes')]
 
 
+def test_failure_of_the_robot_is_an_answer(robot):
+    robot.ask(1.0, 1)
+    robot.due(1.2)
+    assert robot.answered(1.3, 1, 'robot', 'no', failed=True) == [Answer(1, 'no')]
+    assert robot.answered(1.4, 1, 'a', 'x') == []
+
+
 def test_robot_without_its_copy_waits_for_a_machine():
     calls = Calls(['a', 'robot'], last='robot', deadline=0.2)
     calls.ready(0.0, ['a'])
