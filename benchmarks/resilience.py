@@ -42,6 +42,8 @@ REPLAYED = f'recorded planning times slept at {FASTER}x speed'
 HEDGE, LOSSES = 50.0, 10
 #: Nodes that die.
 DEATHS = 10
+#: Calls in whose midst all machines are cut off, and seconds after which the robot's copy is asked.
+CUT, DEADLINE = 1000, 0.2
 
 
 def record(number: int) -> None:
@@ -119,7 +121,9 @@ def relay() -> None:
 class Bench:
     """Replicas, ``first_answer`` and a client."""
 
-    def __init__(self, hedge_after: object, stack: contextlib.ExitStack) -> None:
+    def __init__(
+        self, hedge_after: object, stack: contextlib.ExitStack, **settings: object,
+    ) -> None:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
         self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -130,7 +134,7 @@ class Bench:
         self._start(str(FIRST), json.dumps({
             'name': 'first_answer', 'services': ['/plan'], 'topics': [],
             'replicas': {name: f'/fogros2/{name}' for name in NAMES},
-            'hedge_after': hedge_after, 'folder': str(self.folder)}))
+            'hedge_after': hedge_after, 'folder': str(self.folder), **settings}))
         rclpy.init()
         stack.callback(rclpy.try_shutdown)
         self._node = rclpy.create_node('bench')
@@ -179,26 +183,26 @@ class Bench:
         """Write an event, as the launch does."""
         (self.folder / 'first_answer.events').write_text(event + '\n')
 
+    def won(self) -> dict[str, int]:
+        """Return how many answers each replica gave, by the figures that are written."""
+        time.sleep(2.5)
+        return {row['machine']: row['won'] for row in json.loads(
+            (self.folder / 'first_answer.json').read_text())}
+
     def nearest(self) -> str:
         """Return the replica that answers the next call, by the figures of two looks."""
-        def won() -> dict[str, int]:
-            return {row['machine']: row['won'] for row in json.loads(
-                (self.folder / 'first_answer.json').read_text())}
-
-        time.sleep(2.5)
-        before = won()
+        before = self.won()
         for number in range(5):
             self.call('/plan', number)
-        time.sleep(2.5)
-        after = won()
+        after = self.won()
         return max(after, key=lambda name: after[name] - before[name])
 
 
 @contextlib.contextmanager
-def bench(hedge_after: object = None) -> Iterator[Bench]:
+def bench(hedge_after: object = None, **settings: object) -> Iterator[Bench]:
     """Start a bench, and end all of its processes."""
     with contextlib.ExitStack() as stack:
-        yield Bench(hedge_after, stack)
+        yield Bench(hedge_after, stack, **settings)
 
 
 def percentile(times: list[float], share: float = 0.99) -> float:
@@ -290,6 +294,29 @@ def losses() -> list[Row]:
             HEDGE + 20, runs=LOSSES)]
 
 
+def robot() -> list[Row]:
+    """Stop both machines in the midst of calls, as if they were cut off; c is the robot's copy."""
+    with bench(last='c', deadline=DEADLINE) as there:
+        own = [there.call('/fogros2/c/plan', number) for number in range(CUT)]
+        begin = there.won()['c']
+        times = [there.call('/plan', number) for number in range(CUT // 2)]
+        before = there.won()['c'] - begin
+        for name in 'ab':
+            there.replicas[name].send_signal(signal.SIGSTOP)
+        after = [there.call('/plan', number) for number in range(CUT // 2)]
+        for name in 'ab':
+            there.replicas[name].send_signal(signal.SIGCONT)
+    what = f'{CUT} calls, both machines stopped in the midst, the robot answers last'
+    kept = [one for one in times + after if one < float('inf')]
+    return [
+        Row(f'{what}: lost', CUT - len(kept), 'calls', 0),
+        Row('the same: answers of the robot before the stop', before, 'calls', 0),
+        Row('the same: the slowest call', 1e3 * max(kept), 'ms',
+            1e3 * (DEADLINE + max(own)) + 10),
+        Row("the same: median after the stop, over the robot's copy asked directly",
+            statistics.median(after) / statistics.median(own), 'times')]
+
+
 def deaths() -> list[Row]:
     """Let nodes on container machines die in the middle of a call; their agents report it."""
     from rigs import replicated
@@ -316,7 +343,7 @@ def main(parts: list[str]) -> None:
     """Measure all rows, or those of some parts; the rows of other parts stay."""
     known: dict[str, Callable[[], list[Row]]] = {
         'failures': failures, 'planning': planning, 'hops': hops, 'losses': losses,
-        'deaths': deaths}
+        'robot': robot, 'deaths': deaths}
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     os.environ.setdefault('ROS_DOMAIN_ID', str(os.getpid() % 90 + 1))
     rows: list[Row] = []

@@ -52,7 +52,9 @@ class IdleTimeout(Feature):
             'idle',
             ['python3', '-IS', '-c', Path(program.__file__).read_text(), running.interface.name,
              running.directory, str(own), secrets.token_hex(4)],
-            program.interval(own), running.give_up)
+            # not what the machine says, which may be anything
+            program.interval(own),
+            lambda reason: running.give_up(f'nobody has used it for {own:g} s'))
         return nodes
 
 

@@ -269,7 +269,7 @@ class Machine:
 
     def watch(self, name, argv, interval, then):
         self.watched.append((name, argv[:3], argv[4:-1], interval))
-        then('nobody has used it')
+        then('\x1b[2J forged')
 
     def give_up(self, reason):
         self.reasons.append(reason)
@@ -281,7 +281,7 @@ def test_each_start_of_nodes_lets_the_time_begin_anew():
         assert IdleTimeout().starting(machine, [node], 60.0) == [node]
     assert machine.watched == [
         ('idle', ['python3', '-IS', '-c'], ['foga', '/var/lib/agent', '60.0'], 6.0)] * 2
-    assert machine.reasons == ['nobody has used it'] * 2
+    assert machine.reasons == ['nobody has used it for 60 s'] * 2
 
 
 @pytest.mark.parametrize('how', [
