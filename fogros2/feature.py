@@ -69,7 +69,7 @@ class RunningMachine(Protocol):
         Run a program there, as root, every ``interval`` seconds until it exits with 0.
 
         :param name: of the watch; an earlier one of this name ends.
-        :param argv: its files are ``/run/INTERFACE.*``, which go with the VPN.
+        :param argv: its files are ``/run/INTERFACE.watch*``, which go with the VPN.
         :param then: called once, in a thread that must not wait, with what it has printed: text of a
             machine, which is not trusted.
         """
@@ -98,15 +98,18 @@ class Feature:
         """
 
     def lifetime(
-        self, spec: MachineSpec, price: Optional[Decimal], spent: Decimal, own: Any,
+        self, spec: MachineSpec, price: Optional[Decimal], spent: Decimal, own: Any, *,
+        made: bool,
     ) -> float:
         """
-        Return the most seconds that a machine may have, when its choices are made.
+        Return the most seconds that a machine may have from now on.
 
-        Called before the machine is created, and once more when its provider confirms the price.
+        Called when its choices are made, when its provider confirms the price, and before its
+        first node starts.
 
         :param price: US dollars per hour, None if the provider tells none.
         :param spent: what the launch has spent on machines of this name so far, in US dollars.
+        :param made: whether the machine exists.
         :raises FogError: there is no such time.
         """
         return spec.lifetime

@@ -43,7 +43,8 @@ class Budget(Feature):
         return Decimal(match[1] or match[2])
 
     def lifetime(
-        self, spec: MachineSpec, price: Optional[Decimal], spent: Decimal, own: Decimal,
+        self, spec: MachineSpec, price: Optional[Decimal], spent: Decimal, own: Decimal, *,
+        made: bool,
     ) -> float:
         """Return the seconds that the rest of the budget pays for."""
         if price is None:
@@ -53,7 +54,7 @@ class Budget(Feature):
         if not price:
             return spec.lifetime
         seconds = float((own - spent) / price) * 3600
-        if seconds < LEAST:
+        if seconds < (1.0 if made else LEAST):
             raise ConfigurationError(
                 f"'{spec.name}' has {_dollars(max(own - spent, Decimal(0)))} of its budget of "
                 f'{_dollars(own)} left, which pays for {max(seconds, 0.0):.0f} s: less than the '
@@ -81,10 +82,10 @@ class Budget(Feature):
             timer.join()
 
     def status(self, shown: Mapping[str, Any], own: Decimal) -> Iterator[tuple[str, str]]:
-        """Yield what is left."""
+        """Yield what the machine may still cost."""
         if shown['cost_per_hour'] is not None and shown['time_left'] is not None:
             left = Decimal(shown['cost_per_hour']) * Decimal(shown['time_left']) / 3600
-            yield 'budget', f'{_dollars(min(left, own))} of {_dollars(own)} left'
+            yield 'budget', f'{_dollars(min(left, own))} more at most, of {_dollars(own)}'
 
 
 def _dollars(value: Decimal) -> str:

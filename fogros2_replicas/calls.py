@@ -105,7 +105,8 @@ class Calls:
         if begin is None:
             return []
         replica.took(now - begin)
-        replica.late, replica.died = False, replica.died and begin < replica.died_at
+        replica.late = replica.late and now - begin > self._deadline
+        replica.died = replica.died and begin < replica.died_at
         # A server answers in order, so requests before this one were lost.
         replica.sent = {other: at for other, at in replica.sent.items()
                         if other > call or other in self._calls}
@@ -160,8 +161,8 @@ class Calls:
                 actions += self._send_to_any(now, call, one)
                 continue
             over = now >= one.deadline
-            for name in one.asked - one.failed:
-                self.replicas[name].late = over or self._hedge_after is not None
+            for name in one.asked - one.failed if over or self._hedge_after is not None else ():
+                self.replicas[name].late = True
             last = self._at_last(one) if over else []
             if over:  # a last replica that is not there yet is looked for again
                 asked = last or self._last is None or self._last.name in one.asked

@@ -62,7 +62,7 @@ class Pair:
         self._last = last
         self._deadline = deadline
         #: Inputs that the last replica may get: when, their stamps, and themselves.
-        self._held: deque[tuple[float, int, bytes]] = deque(maxlen=HELD)
+        self._held: deque[tuple[float, int, bytes]] = deque()
         #: Whether the others have missed a deadline, and made no output in time since.
         self._late = False
         #: Whether stamps of outputs match inputs; until then one replica is forwarded.
@@ -86,7 +86,9 @@ class Pair:
                      if replica.name != self._last)
         if self._late or not others:
             return [data]
-        self._held.append((now + self._deadline, header[0] if header is not None else 0, data))
+        if len(self._held) < HELD:  # the first ones, so that one becomes due
+            stamp = header[0] if header is not None else 0
+            self._held.append((now + self._deadline, stamp, data))
         return []
 
     def next_due(self) -> float:

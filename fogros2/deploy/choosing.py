@@ -31,7 +31,9 @@ class Choices:
         self._lock = threading.Lock()
         self._resolved: dict[str, MachineSpec] = {}
         self._places: dict[str, list[MachineSpec]] = {}
+        #: Of each machine that exists, and of those that have ended.
         self._costs: dict[str, tuple[Decimal, float, Optional[float]]] = {}
+        self._ended: list[tuple[str, Decimal, float]] = []
 
     def resolved(self, spec: MachineSpec) -> MachineSpec:
         """
@@ -80,23 +82,32 @@ class Choices:
         except FogError:
             return None  # the price is only displayed; a price limit was checked before
 
-    def limited(self, spec: MachineSpec, price: Optional[Decimal]) -> MachineSpec:
+    def limited(
+        self, spec: MachineSpec, price: Optional[Decimal], *, made: bool = False,
+    ) -> MachineSpec:
         """
         Return a spec with the lifetime that its features allow.
 
         :param price: US dollars per hour, None if unknown.
+        :param made: whether the machine exists.
         :raises FogError: they allow none.
         """
         _, spent = self.spent(spec.name)
         return dataclasses.replace(spec, lifetime=min([spec.lifetime, *(
-            each.lifetime(spec, price, spent, own) for each, own in feature.used(spec))]))
+            each.lifetime(spec, price, spent, own, made=made) for each, own in feature.used(spec))]))
 
     def begin(self, name: str, price: Optional[Decimal]) -> None:
         """Start to count a machine's cost; a later call changes the price, not the start."""
         if price is None:
             return
         with self._lock:
-            begin = self._costs[name][1] if name in self._costs else time.monotonic()
+            begin = time.monotonic()
+            if name in self._costs:
+                before, since, end = self._costs[name]
+                if end is None:
+                    begin = since
+                else:
+                    self._ended.append((name, before, end - since))
             self._costs[name] = (price, begin, None)
 
     def end(self, name: str) -> None:
@@ -108,14 +119,14 @@ class Choices:
 
     def spent(self, name: str) -> tuple[Optional[Decimal], Decimal]:
         """Return a machine's US dollars per hour, None if unknown, and its cost so far."""
-        for each, price, seconds in self.cost():
-            if each == name:
-                return price, price * Decimal(seconds) / 3600
-        return None, Decimal(0)
+        costs = [(price, price * Decimal(seconds) / 3600)
+                 for each, price, seconds in self.cost() if each == name]
+        return (costs[-1][0] if costs else None), sum((cost for _, cost in costs), Decimal(0))
 
     def cost(self) -> list[tuple[str, Decimal, float]]:
         """Return (name, US dollars per hour, seconds) of each machine with a known price."""
         now = time.monotonic()
         with self._lock:
-            return [(name, price, (now if end is None else end) - begin)
-                    for name, (price, begin, end) in sorted(self._costs.items())]
+            return sorted([*self._ended, *(
+                (name, price, (now if end is None else end) - begin)
+                for name, (price, begin, end) in self._costs.items())], key=lambda one: one[0])

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 import contextlib
 import dataclasses
+from decimal import Decimal
 import threading
 from typing import Any, Optional
 
@@ -46,6 +47,8 @@ class MachineJob(Site):
     def __init__(self, context: Context, spec: MachineSpec) -> None:
         self._context = context
         self.spec = spec
+        #: The lifetime that the launch asks for, in seconds.
+        self._lifetime = spec.lifetime
         self.name = spec.name
         self.record = Record(spec.name, spec.provider, spec, asked=spec.options)
         self._saving = threading.Lock()
@@ -76,6 +79,15 @@ class MachineJob(Site):
     def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
         """Report a step of this machine around a block; see :func:`fogros2.report.step`."""
         return step(self._context.report, self.name, name)
+
+    def limit(self, price: Optional[Decimal], *, made: bool = False) -> None:
+        """
+        Let features limit the lifetime, from now on; see :meth:`fogros2.feature.Feature.lifetime`.
+
+        :param price: US dollars per hour, None if unknown.
+        """
+        self.spec = self._context.choices.limited(
+            dataclasses.replace(self.spec, lifetime=self._lifetime), price, made=made)
 
     def makes(self, kind: str, port: int = 0, **changes: Any) -> None:
         """Push the undo of what the next step makes, and record it with other changes."""

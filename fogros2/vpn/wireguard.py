@@ -192,7 +192,7 @@ class WireGuard(Vpn):
         if not interface.firewall:
             clear = shlex.join(guest_request(interface, 'clear').argv)
             undos.insert(0, f'[ ! -e {_guests(interface)}.json ] || {clear}')
-            files += f' /run/{_name(interface)}.*'
+            files += f' {_guests(interface)}* {_left(interface)} /run/{_name(interface)}.watch*'
         lines = [_PATH, 'failed=0', *(f'{{ {undo}\n}} || failed=1' for undo in undos)]
         lines += [f'rm -f {files} || failed=1', 'exit $failed']
         yield Command.script('\n'.join(lines), sudo=True, what=_what('take', interface, 'down'))

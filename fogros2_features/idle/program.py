@@ -6,7 +6,7 @@ Runs on the machine as root, as python3 -c SOURCE INTERFACE FOLDER TIMEOUT TOKEN
 anew. INTERFACE is the VPN's, FOLDER the agent's; a new TOKEN starts the time anew. Prints a reason
 and exits with 0 when the machine has been idle for TIMEOUT seconds. Imports nothing of fogros2.
 
-``/run/INTERFACE.idle.json`` is the state, and belongs to root. Times are of the monotonic clock,
+``/run/INTERFACE.watch.json`` is the state, and belongs to root. Times are of the monotonic clock,
 which all processes of a machine share.
 """
 
@@ -164,7 +164,7 @@ def has_terminal(user: int) -> bool:
 
 def main(interface: str, folder: str, timeout: float, token: str, run: str = '/run') -> bool:
     """Take one sample; return whether the machine is idle."""
-    path, idle = Path(run, f'{interface}.idle.json'), Idle(timeout)
+    path, idle = Path(run, f'{interface}.watch.json'), Idle(timeout)
     with contextlib.suppress(FileNotFoundError):
         before, since, last, old_threads = json.loads(path.read_text())
         if before == token:

@@ -57,13 +57,23 @@ def test_nobody_is_warned_before(lifetime: float, cost: tuple[Any, Any]) -> None
 
 def test_free_machine_keeps_its_lifetime() -> None:
     spec: Any = SimpleNamespace(name='a', lifetime=60.0)
-    assert Budget().lifetime(spec, Decimal(0), Decimal(0), Decimal(5)) == 60.0
+    assert Budget().lifetime(spec, Decimal(0), Decimal(0), Decimal(5), made=False) == 60.0
 
 
 @pytest.mark.parametrize(('shown', 'rows'), [
-    ({'cost_per_hour': '2', 'time_left': 5400.0}, [('budget', '$3.00 of $5.00 left')]),
-    ({'cost_per_hour': '2', 'time_left': 90000.0}, [('budget', '$5.00 of $5.00 left')]),
+    ({'cost_per_hour': '2', 'time_left': 5400.0}, [('budget', '$3.00 more at most, of $5.00')]),
+    ({'cost_per_hour': '2', 'time_left': 90000.0}, [('budget', '$5.00 more at most, of $5.00')]),
     ({'cost_per_hour': None, 'time_left': 5400.0}, []),
     ({'cost_per_hour': '2', 'time_left': None}, [])])
-def test_status_shows_what_is_left(shown: dict[str, Any], rows: Any) -> None:
+def test_status_shows_what_it_may_still_cost(shown: dict[str, Any], rows: Any) -> None:
     assert list(Budget().status(shown, Decimal(5))) == rows
+
+
+def test_machine_that_exists_may_use_the_rest() -> None:
+    spec: Any = SimpleNamespace(name='a', lifetime=9e9)
+    arguments = spec, Decimal(1), Decimal('4.9'), Decimal(5)
+    assert Budget().lifetime(*arguments, made=True) == pytest.approx(360.0)
+    with pytest.raises(ConfigurationError, match='pays for 360 s: less than the 600 s'):
+        Budget().lifetime(*arguments, made=False)
+    with pytest.raises(ConfigurationError, match='pays for 0 s'):
+        Budget().lifetime(spec, Decimal(1), Decimal(6), Decimal(5), made=True)

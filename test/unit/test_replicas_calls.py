@@ -203,7 +203,18 @@ def test_answer_of_a_machine_wins_after_the_deadline_too(robot):
     robot.due(1.2)
     assert robot.answered(1.21, 1, 'a', 'x') == [Answer(1, 'x')]
     assert robot.answered(1.3, 1, 'robot', 'own') == []
-    assert sent(robot.ask(2.0, 2)) == ['a']  # b still owes it
+    # and yet it was late; the next answer in time counts
+    assert sent(robot.ask(2.0, 2)) == ['robot']
+    assert sent(robot.ask(1.0 + PROBE, 3)) == ['robot', 'a', 'b']
+    robot.answered(1.1 + PROBE, 3, 'a', 'x')
+    assert sent(robot.ask(1.2 + PROBE, 4)) == ['a']
+
+
+def test_silent_machine_stays_late_while_the_robot_works(robot):
+    robot.ask(1.0, 1)
+    assert sent(robot.due(1.2)) == ['robot']
+    robot.due(1.2 + PROBE)
+    assert robot.replicas['a'].late and robot.replicas['b'].late
 
 
 def test_machines_are_hedged_before_the_robot():

@@ -165,7 +165,16 @@ def test_outputs_without_stamps_answer_all_inputs(robot):
 def test_few_inputs_are_held_for_the_robot(robot):
     for stamp in range(1, 200):
         robot.input(1.0, (stamp, ''), b'%d' % stamp)
-    assert robot.due(2.0) == [b'%d' % stamp for stamp in range(200 - HELD, 200)]
+    assert robot.due(2.0) == [b'%d' % stamp for stamp in range(1, HELD + 1)]
+
+
+def test_robot_gets_inputs_that_come_faster_than_it_holds_them(robot):
+    got = []
+    for number in range(200):
+        now = 0.001 * number
+        got += robot.due(1.0 + now) + robot.input(1.0 + now, (number + 1, ''), b'%d' % number)
+    assert got == [] and len(robot.due(1.25)) == HELD
+    assert robot.input(1.3, (999, ''), b'x') == [b'x']
 
 
 def test_replicas_without_a_last_one_hold_nothing(pair):

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from decimal import Decimal
 import json
 import time
 from typing import Any, Optional
@@ -13,8 +12,7 @@ import uuid
 
 from fogros2 import model, monitor_addresses, plan, process
 from fogros2.deploy import requests
-from fogros2.deploy.context import Context
-from fogros2.deploy.machine_job import MachineJob, Step
+from fogros2.deploy.machine_job import Step
 from fogros2.deploy.undo import close_ports
 from fogros2.errors import (
     ConfigurationError,
@@ -43,11 +41,6 @@ class Creation(Step):
     #: whether it did not answer.
     _asked = _refused = _unanswered = False
 
-    def __init__(self, context: Context, job: MachineJob) -> None:
-        super().__init__(context, job)
-        #: As the launch asks for it.
-        self._lifetime = job.spec.lifetime
-
     def run(self) -> None:
         """
         Create or reuse the machine; return when a connection can be tried.
@@ -70,7 +63,7 @@ class Creation(Step):
             if machine.cost_per_hour is not None:
                 price = machine.cost_per_hour
                 context.choices.begin(job.name, price)
-            self._limit(price)
+            job.limit(price, made=True)
             if price is not None:
                 detail.append(plan.price(price))
             job.save(shell=machine.shell, spec=job.spec)
@@ -78,12 +71,6 @@ class Creation(Step):
             if machine.note:
                 detail.append(machine.note)
             job.machine = machine
-
-    def _limit(self, price: Optional[Decimal]) -> None:
-        """Let features limit the lifetime that the launch asks for."""
-        job = self._job
-        job.spec = self._context.choices.limited(
-            dataclasses.replace(job.spec, lifetime=self._lifetime), price)
 
     # -- a kept machine -------------------------------------------------------------------------
 
@@ -120,7 +107,7 @@ class Creation(Step):
         self._check_alike(before.asked, machine)
         # the earlier choices still hold; everything else comes from this launch
         job.spec = dataclasses.replace(job.spec, options=before.spec.options)
-        self._limit(context.choices.price(job.spec))
+        job.limit(context.choices.price(job.spec), made=True)
         job.record = dataclasses.replace(before, spec=job.spec)
         job.former = before.last or before.launch
         return machine
@@ -161,7 +148,7 @@ class Creation(Step):
     def _create(self) -> None:
         context, job = self._context, self._job
         job.spec = context.choices.resolved(job.spec)
-        self._limit(context.choices.price(job.spec))
+        job.limit(context.choices.price(job.spec))
         token = str(uuid.uuid4())
         context.store.delete(job.name)
         job.record = dataclasses.replace(job.record, spec=job.spec)
