@@ -113,9 +113,6 @@ def test_brings_our_packages_without_the_rigs(
                if name.startswith(f'{SITE}/') and name.endswith('.py')}
     assert {path.parts[0] for path in modules} == set(OWN_PACKAGES)
     assert f'{SITE}/fogros2_monitor/dashboard/page.html' in files
-    assert {path.name for path in modules if path.parts[:2] == ('fogros2', 'testing')} == {
-        '__init__.py', 'fakes.py', 'plugins.py', 'provider_contract.py', 'shell_contract.py',
-        'vm_contract.py'}
 
 
 def test_refuses_a_key_it_has_no_version_for(deb: ModuleType, tmp_path: Path) -> None:

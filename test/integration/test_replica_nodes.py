@@ -272,7 +272,7 @@ def test_action_is_refused_with_a_reason(bench):
     bench.said('/go is a ROS action, which has goals')
 
 
-# -- the robot is the last replica: here it is b ---------------------------------------------------
+# -- the robot is the last replica: here it is b --------------------------------------------------
 
 LAST = {'last': 'b', 'deadline': 0.3}
 
