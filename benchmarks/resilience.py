@@ -42,7 +42,7 @@ REPLAYED = f'recorded planning times slept at {FASTER}x speed'
 HEDGE, LOSSES = 50.0, 10
 #: Nodes that die.
 DEATHS = 10
-#: Calls in whose midst all machines are cut off, and seconds after which the robot's copy is asked.
+#: Calls in whose midst all machines are cut off; seconds after which the robot's copy is asked.
 CUT, DEADLINE = 1000, 0.2
 
 

@@ -70,8 +70,8 @@ class RunningMachine(Protocol):
 
         :param name: of the watch; an earlier one of this name ends.
         :param argv: its files are ``/run/INTERFACE.watch*``, which go with the VPN.
-        :param then: called once, in a thread that must not wait, with what it has printed: text of a
-            machine, which is not trusted.
+        :param then: called once, in a thread that must not wait, with what it has printed: text of
+            a machine, which is not trusted.
         """
 
     def give_up(self, reason: str) -> None:

@@ -94,7 +94,8 @@ class Choices:
         """
         _, spent = self.spent(spec.name)
         return dataclasses.replace(spec, lifetime=min([spec.lifetime, *(
-            each.lifetime(spec, price, spent, own, made=made) for each, own in feature.used(spec))]))
+            each.lifetime(spec, price, spent, own, made=made)
+            for each, own in feature.used(spec))]))
 
     def begin(self, name: str, price: Optional[Decimal]) -> None:
         """Start to count a machine's cost; a later call changes the price, not the start."""
