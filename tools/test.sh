@@ -20,11 +20,11 @@ trap 'rm -rf "$TMPDIR"' EXIT
 trap 'exit 130' INT
 trap 'exit 143' TERM
 keep_ticket
-part=test again=
+part=test again= paths=
 if [ "${1:-}" = kubernetes ]; then
     part=$1; shift
     [ $# != 0 ] || again=yes
-    set -- test/integration/kubernetes "$@"
+    paths=test/integration/kubernetes
 elif [ $# = 0 ]; then
     # Three at a time: much of what tests with machines take is waiting. Tests named by hand run in
     # turn, so that their output is seen as it comes.
@@ -48,7 +48,8 @@ ros=$(ros_setup)
 suite() {
     name=$1 report=$2; shift 2
     say "Tests on $name"
-    tools/run.sh "$@" --junit-xml=.cache/"$report" && return
+    # shellcheck disable=SC2086  # none, or one path
+    tools/run.sh "$@" $paths --junit-xml=.cache/"$report" && return
     if [ $? = 1 ] && [ -n "$again" ]; then
         say 'What failed, once more and alone'
         tools/run.sh "$@" -n 0 --maxfail=3 --junit-xml=.cache/again-"$report" \

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import json
+import math
 import os
 import queue
 import socket
@@ -58,6 +59,9 @@ class Api:
     :param context: name of a context of the kubeconfig; '': the current one.
     :raises PrerequisiteError: no kubeconfig, no such context, or no valid credentials.
     """
+
+    #: When ``doubt`` has last asked the server.
+    _doubted = -math.inf
 
     def __init__(self, context: str = '') -> None:
         self.context, self.namespace, self._client = kubeconfig.load(context)
@@ -120,6 +124,22 @@ class Api:
         """Return whether the cause of an error may be a restart of the API server."""
         return error.status in (429, 500, 502, 503, 504) or (
             error.status == 403 and time.monotonic() - self._lost < DOUBT)
+
+    def doubt(self, error: ApiError, path: str) -> None:
+        """
+        After a refusal, find out whether the API server has just started.
+
+        :param path: of an object that this user may read; a new server refuses that, too.
+        """
+        now = time.monotonic()
+        # once in a while: the user may really have no rights
+        if error.status == 403 and now - self._doubted > 4 * DOUBT:
+            self._doubted = now
+            try:
+                self.request('GET', path)
+            except ApiError as other:
+                if other.status == 403:
+                    self.lost()
 
     def lost(self) -> None:
         """Record that a connection to the API server was lost or could not be opened."""

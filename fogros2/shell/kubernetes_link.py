@@ -89,6 +89,7 @@ class Link(multiplexed.Link):
                 {'container': 'machine', 'command': words, 'stdin': 'true', 'stdout': 'true',
                  'stderr': 'true', 'tty': 'false'}, timeout=timeout)
         except ApiError as error:
+            api.doubt(error, kubernetes_client.path('pods', self._namespace, self._pod))
             raise self._refused(error, passing=api.passing(error)) from error
         except Unreachable as error:
             raise ConnectError(f"'{self._name}' can't be reached: {error.args[0]}", error.hint) \

@@ -89,6 +89,13 @@ class FakeApi(kubernetes_client.Api):
         self._lost = -kubernetes_client.DOUBT
         self.links: list[Pipe] = []
         self.refusals: list[Exception] = []
+        self.forbidden = False
+
+    def request(self, method: str, path: str, *rest, **more) -> dict:
+        assert (method, path) == ('GET', '/api/v1/namespaces/robots/pods/a-pod')
+        if self.forbidden:
+            raise ApiError('cannot get resource "pods"', status=403)
+        return {}
 
     def websocket(self, path: str, query: dict, *, timeout: float) -> Pipe:
         assert path == '/api/v1/namespaces/robots/pods/a-pod/exec'
@@ -243,6 +250,12 @@ def test_missing_pod_is_reported_at_once(api, shell):
 def test_refusal_after_a_restart_is_retried(api, shell):
     """Its list of who may what is empty at first."""
     api.lost()
+    api.refusals = [ApiError('cannot create resource "pods/exec"', status=403)] * 2
+    assert shell.run(Command(('echo', 'x')), timeout=20.0).stdout == 'x\n'
+
+
+def test_refusal_after_a_restart_that_nobody_saw_is_retried(api, shell):
+    api.forbidden = True
     api.refusals = [ApiError('cannot create resource "pods/exec"', status=403)] * 2
     assert shell.run(Command(('echo', 'x')), timeout=20.0).stdout == 'x\n'
 
