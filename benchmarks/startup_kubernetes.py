@@ -3,7 +3,7 @@
 How long a launch with pods takes from ``ros2 launch`` to the first message, on a real cluster.
 
 The cluster is one node on this computer (``rigs.cluster``), whose image is there already and has
-the embedded default. Requests are counted from the API server's audit log, for a user who has the
+ROS 2's wheels. Requests are counted from the API server's audit log, for a user who has the
 sample role and no other right.
 
     python benchmarks/startup.py --provider kubernetes [--runs 3]

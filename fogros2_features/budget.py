@@ -71,7 +71,7 @@ class Budget(Feature):
             yield
             return
         timer = threading.Timer(min(seconds, threading.TIMEOUT_MAX), running.warn, (
-            f'{WARNING:.0%} of its budget of {_dollars(own)} are spent',
+            f'{WARNING:.0%} of its budget of {_dollars(own)} is spent',
             f"it ends when the rest is spent, as on_exit='{running.spec.on_exit}' says"))
         timer.daemon = True
         timer.start()

@@ -44,7 +44,7 @@ def warned(own: str, lifetime: float, cost: tuple[Any, Any], wait: bool) -> list
 def test_user_is_warned_when_most_is_spent() -> None:
     # 0.0001 dollars, at 1 dollar an hour, are 0.36 s
     assert warned('1', 900.0, (Decimal(1), Decimal('0.7999')), wait=True) == [
-        "80% of its budget of $1.00 are spent; it ends when the rest is spent, as "
+        "80% of its budget of $1.00 is spent; it ends when the rest is spent, as "
         "on_exit='stop' says"]
 
 
