@@ -39,8 +39,8 @@ if TYPE_CHECKING:
         KubeInstance,
     )
     from fogros2.errors import FogError
-    from fogros2.image_transport.streams import StreamTopic
     from fogros2.runtime.interruption import MachineInterrupted
+    from fogros2_features.streams.entries import StreamTopic
 
 #: Written out for type checkers, which do not run the module.
 __all__ = [
@@ -68,11 +68,10 @@ _NAMES = {
         'AWSCloudInstance AzureCloudInstance CheapestInstance GCPCloudInstance KubeInstance '
         'cheapest',
     'errors': 'FogError',
-    'image_transport.streams': 'StreamTopic',
     'runtime.interruption': 'MachineInterrupted',
 }
-_MODULES = {name: f'fogros2.{module}' for module, names in _NAMES.items()
-            for name in names.split()}
+_MODULES = {'StreamTopic': 'fogros2_features.streams.entries', **{
+    name: f'fogros2.{module}' for module, names in _NAMES.items() for name in names.split()}}
 #: Modules that FogROS2 has in a package ``utils``: ``from fogros2 import region_ami_selection``.
 _FORMERLY_UTILS = ('ec2_instance_type_selection', 'region_ami_selection')
 

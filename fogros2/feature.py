@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What a package can add to machines: keywords, a check, and steps with their undo.
+What a package can add to machines and their nodes: keywords, a check, and steps with their undo.
 
 A feature is an entry point in the group ``fogros2.feature``. doc/developers/features.md shows how
 to write one.
@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import contextlib
+import dataclasses
 from decimal import Decimal
+import threading
 from typing import Any, ClassVar, Optional, Protocol
 
 from fogros2 import plugin_system
@@ -78,6 +80,129 @@ class RunningMachine(Protocol):
         """Let the launch end machine and nodes as ``on_exit`` says, and go on without them."""
 
 
+class LaunchedMachine(Protocol):
+    """A machine that some node of a launch needs, as features see it."""
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether the provider reclaims the machine, which may still run, or it is gone."""
+
+    @property
+    def sent(self) -> Sequence[NodeSpec]:
+        """Its nodes that have started, or are about to, as they were before ``starting``."""
+
+
+class RunningLaunch(Protocol):
+    """
+    A launch with machines, as features see it.
+
+    :ivar ended: set when the launch ends.
+    """
+
+    ended: threading.Event
+
+    @property
+    def context(self) -> Any:
+        """The ``launch.LaunchContext`` in which launch runs."""
+
+    @property
+    def machines(self) -> Mapping[str, LaunchedMachine]:
+        """The machines that nodes need so far, by name."""
+
+    @property
+    def interface(self) -> str:
+        """The name of the robot's VPN interface."""
+
+    @property
+    def environment(self) -> Mapping[str, str]:
+        """The variables of the robot's nodes."""
+
+    def name_of(self, machine: Any) -> Optional[str]:
+        """Return the name of a machine, or of a name's substitutions, None for the robot."""
+
+    def spec(self, name: str) -> MachineSpec:
+        """
+        Return a machine as the launch file requests it.
+
+        :raises ConfigurationError: there is none of this name.
+        """
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """
+    A program that runs beside the nodes of a launch, and does not keep the launch alive.
+
+    :param machine: where it runs, None for the robot.
+    :param after: on the robot, the machine for which the program waits, None for none.
+    """
+
+    node: NodeSpec
+    machine: Optional[str]
+    after: Optional[str] = None
+
+
+class LaunchPart:
+    """
+    What a feature does in one launch; by default, each method does nothing.
+
+    All methods but ``watch`` are called on launch's event loop, and must not wait. ``items`` are
+    those of the feature's ``node_list``, ``own`` is what ``resolve`` returned for them.
+    """
+
+    def check(self, items: Sequence[Any]) -> None:
+        """
+        Check items as far as they are known before substitutions are resolved.
+
+        :raises FogError: one is wrong.
+        """
+
+    def everywhere(self, items: Sequence[Any], namespace: str) -> None:
+        """
+        Take items for every machine of the launch.
+
+        :raises FogError: one is wrong.
+        """
+
+    def resolve(self, items: Sequence[Any], namespace: str) -> Any:
+        """
+        Return the items of a node or a group with their substitutions resolved.
+
+        :param namespace: of relative names.
+        :raises FogError: one is wrong.
+        """
+        return ()
+
+    def beside(self, own: Any, machine: Optional[str]) -> Iterable[Program]:
+        """
+        Return the programs that a process needs and no earlier process did; called for each.
+
+        :param own: () if the process has no items of its own.
+        :param machine: where the process runs, None for the robot.
+        :raises FogError: they can't run together.
+        """
+        return ()
+
+    def starting(self, machine: str, nodes: Sequence[NodeSpec]) -> Sequence[NodeSpec]:
+        """Return nodes as they start on a machine."""
+        return nodes
+
+    def names(self, machine: str) -> Mapping[str, str]:
+        """Return new names of topics for components that load on a machine now."""
+        return {}
+
+    def topics(self, own: Any) -> Mapping[str, bool]:
+        """Return the topics that have other names on machines, and whether the robot has each."""
+        return {}
+
+    def moved(self, machine: str) -> tuple[Sequence[str], Iterable[Program]]:
+        """Return ids of nodes to end, and new programs: a machine's nodes move to the robot."""
+        return (), ()
+
+    def watch(self) -> None:
+        """Watch the launch in a thread, from its first machines on until ``ended`` is set."""
+
+
 class Feature:
     """
     A feature of machines; by default, each method does nothing.
@@ -89,6 +214,13 @@ class Feature:
     """
 
     options: ClassVar[Callable[..., Any]] = staticmethod(lambda: None)
+    #: A keyword of nodes, groups and launch descriptions that takes a list, and the element of XML
+    #: and YAML that is one item; it parses to a :class:`fogros2.actions.frontend.actions.Item`.
+    node_list: ClassVar[tuple[str, str]] = ('', '')
+
+    def in_launch(self, launch: RunningLaunch) -> LaunchPart:
+        """Return what the feature does in a launch; called once in each launch with machines."""
+        return LaunchPart()
 
     def check(self, spec: MachineSpec, own: Any) -> None:
         """

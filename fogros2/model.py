@@ -63,8 +63,6 @@ class MachineSpec:
     :param checkpoint: a folder that a replacement takes over, '' for none.
     :param checkpoint_interval: seconds between two copies of that folder to the robot.
     :param monitor_allow: networks (CIDR) that may reach its Foxglove bridge, besides the robot.
-    :param bandwidth: bits per second of its link that streams may use in each direction, 0 for
-        no limit.
     :param apt: Debian packages to install; ``pip`` Python packages, in pip's syntax.
     :param share: topics that it has in common with machines of other robots on its host.
     :param features: the values of features' keywords, by feature; JSON types only.
@@ -91,7 +89,6 @@ class MachineSpec:
     checkpoint: str = ''
     checkpoint_interval: float = DEFAULT_CHECKPOINT_INTERVAL
     monitor_allow: tuple[str, ...] = ()
-    bandwidth: float = 0.0
     apt: tuple[str, ...] = ()
     pip: tuple[str, ...] = ()
     share: tuple[str, ...] = ()
@@ -334,27 +331,6 @@ class DdsInterface:
     priority: int = 0
     required: bool = True
     multicast: bool = False
-
-
-@dataclasses.dataclass(frozen=True)
-class Stream:
-    """
-    A topic that crosses the VPN encoded.
-
-    :param topic: full topic name, which publisher and subscriber use.
-    :param transport: name of an entry point in the group ``fogros2.image_transport``.
-    :param source: machine name of the publisher's side, None for the robot.
-    :param target: machine name of the subscriber's side, None for the robot.
-    :param links: topics of the links with a limited bandwidth that it crosses, and their bits per
-        second.
-    """
-
-    topic: str
-    transport: str
-    source: Optional[str] = None
-    target: Optional[str] = None
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    links: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
 def host_port(host: str, port: int) -> str:

@@ -11,17 +11,8 @@ from fogros2.errors import ConfigurationError, did_you_mean, PrerequisiteError
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-#: What messages call the plugins of a group.
-GROUPS = {
-    'fogros2.provider': 'provider',
-    'fogros2.machine': 'provider',
-    'fogros2.shell': 'shell',
-    'fogros2.vpn': 'VPN',
-    'fogros2.dds': 'DDS vendor',
-    'fogros2.feature': 'feature',
-    'fogros2.image_transport': 'image transport',
-    'fogros2.monitor': 'monitor',
-}
+#: What messages call the plugins of a group whose name does not end so.
+_KINDS = {'fogros2.machine': 'provider', 'fogros2.vpn': 'VPN', 'fogros2.dds': 'DDS vendor'}
 #: All packages that setup.py installs; a package index may have unrelated projects of these names.
 OWN_PACKAGES = (
     'fogros2', 'fogros2_examples', 'fogros2_features', 'fogros2_monitor', 'fogros2_replicas',
@@ -37,6 +28,7 @@ def _all() -> Any:
     return metadata.entry_points()
 
 
+@functools.cache
 def _entry_points(group: str) -> dict[str, EntryPoint]:
     return {point.name: point for point in _all().select(group=group)}
 
@@ -55,7 +47,7 @@ def load(group: str, name: str) -> Any:
     """
     points = _entry_points(group)
     if name not in points:
-        raise ConfigurationError(f"there is no {GROUPS.get(group, group)} '{name}'",
+        raise ConfigurationError(f"there is no {_kind(group)} '{name}'",
                                  did_you_mean(name, sorted(points)))
     try:
         return points[name].load()
@@ -63,6 +55,10 @@ def load(group: str, name: str) -> Any:
         module = error.name or name
         ours = module.partition('.')[0] in OWN_PACKAGES
         raise PrerequisiteError(
-            f"the {GROUPS.get(group, group)} '{name}' can't be loaded: {error}",
+            f"the {_kind(group)} '{name}' can't be loaded: {error}",
             'install FogROS2 again from the folder that it came from' if ours else
             f'python3 -m pip install {module}') from error
+
+
+def _kind(group: str) -> str:
+    return _KINDS.get(group, group.rpartition('.')[2].replace('_', ' '))

@@ -17,8 +17,8 @@ from fogros2 import untrusted
 from fogros2.errors import ConfigurationError, ConnectError, FogError, ShellError
 from fogros2.feature import Feature, RunningMachine
 from fogros2.host.checkpoint import check_folder
-from fogros2.image_transport import topics
 from fogros2.model import Command, MachineSpec, NodeSpec
+from fogros2.ros_names import check_name
 from fogros2.shell.command_line import remote_path
 from fogros2.store import check_owner
 
@@ -81,7 +81,7 @@ class Results(Feature):
                                      "such as '~/fogros2'")
         return Wanted(
             folders, target, LIMIT if fetch_limit is None else _bytes(str(fetch_limit)),
-            tuple(dict.fromkeys(topics.check_name(str(topic)) for topic in record or ())))
+            tuple(dict.fromkeys(check_name(str(topic)) for topic in record or ())))
 
     def check(self, spec: MachineSpec, own: Wanted) -> None:
         """Check that this user may write to the folder on the robot."""

@@ -3,22 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, Optional, TYPE_CHECKING
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal, GroupAction
 
-from fogros2.describe import keywords
+from fogros2.describe import features, keywords
 from fogros2.describe.machines import checked
 from fogros2.launch_internals.wrapping import wrap
+from fogros2.runtime.added_process import AddedProcess
 from fogros2.runtime.coordinator import Coordinator
 from fogros2.runtime.remote_process import remote_of, send, send_components
-from fogros2.runtime.republishers import AddedProcess
 
 if TYPE_CHECKING:
     from fogros2.describe.machines import SomeMachine
-    from fogros2.image_transport.streams import Entry
 
 
 class CloudGroup(GroupAction):
@@ -33,17 +32,16 @@ class CloudGroup(GroupAction):
 
     :param machine: the machine, or the name of one that the launch mentions elsewhere.
     :param actions: the content.
-    :param stream_topics: image topics that cross the VPN encoded, as for Node.
+    :param kwargs: also lists of features, as for Node.
     """
 
     def __init__(
-        self, machine: SomeMachine, actions: Iterable[Action], *,
-        stream_topics: Sequence[Entry] = (), **kwargs: Any,
+        self, machine: SomeMachine, actions: Iterable[Action], **kwargs: Any,
     ) -> None:
+        self.lists = features.take_lists(kwargs)
         with keywords.refused(type(self)):
             super().__init__(list(actions), **kwargs)
         self.machine = checked(machine)
-        self.stream_topics = list(stream_topics)
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Execute the group: return its content, with remote processes in place of local ones."""
@@ -52,8 +50,8 @@ class CloudGroup(GroupAction):
         coordinator = Coordinator.of(context)
         coordinator.know(self.machine)
         self._resolved = coordinator.resolve(self.machine)
-        self._streams = coordinator.resolve_streams(
-            self.stream_topics, context.launch_configurations.get('ros_namespace', '/'))
+        self._own = coordinator.parts.resolve(
+            self.lists, context.launch_configurations.get('ros_namespace', '/'))
         return wrap(super().execute(context), self._send)
 
     def _send(self, entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
@@ -62,6 +60,6 @@ class CloudGroup(GroupAction):
             return  # launch skips it
         if isinstance(entity, ExecuteLocal) and remote_of(entity) is None and not isinstance(
                 entity, AddedProcess):
-            send(entity, self._resolved, self._streams)
+            send(entity, self._resolved, self._own)
         else:
-            send_components(entity, self._resolved, self._streams, context)
+            send_components(entity, self._resolved, self._own, context)

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 import functools
 import inspect
-from typing import get_args, Optional, TYPE_CHECKING, Union
+from typing import Any, get_args, Optional, Union
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import (
@@ -25,17 +25,14 @@ from launch.actions import (
 
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.fog_machine import FogMachine
-from fogros2.describe import keywords
+from fogros2.describe import features, keywords
 from fogros2.errors import ConfigurationError
 from fogros2.launch_internals import private
 from fogros2.launch_internals.wrapping import below, wrap
 from fogros2.model import RobotNodes
-from fogros2.runtime import node_spec, streaming
+from fogros2.runtime import node_spec
 from fogros2.runtime.coordinator import Coordinator, Planned
 from fogros2.runtime.remote_process import remote_of, RemoteProcess
-
-if TYPE_CHECKING:
-    from fogros2.image_transport.streams import Entry
 
 #: Entities that only set something for the entities after them.
 _SETTINGS = (
@@ -56,26 +53,25 @@ class FogROSLaunchDescription(LaunchDescription):
     :param robot_nodes: 'after_cloud' starts the robot's processes and timers when the machines
         are up and their nodes run; 'immediately' starts them at once. In both cases launch
         executes all actions in their order: only the start of a process waits.
-    :param stream_topics: image topics that cross the VPN encoded, as for Node, between the
-        robot and every machine of the launch.
     :param dds: the middleware of all nodes, such as 'fastdds'; replaces RMW_IMPLEMENTATION.
+    :param lists: lists of features, as for Node, for every machine of the launch.
     """
 
     def __init__(
         self, initial_entities: Optional[Iterable[LaunchDescriptionEntity]] = None, *,
         deprecated_reason: Optional[str] = None, robot_nodes: RobotNodes = 'after_cloud',
-        stream_topics: Sequence[Entry] = (), dds: Optional[str] = None,
-        **unknown: object,
+        dds: Optional[str] = None, **lists: Any,
     ) -> None:
-        for name in unknown:
-            parameters = set(inspect.signature(FogROSLaunchDescription).parameters) - {'unknown'}
-            raise keywords.unknown('a FogROSLaunchDescription', name, parameters)
+        self.lists = features.take_lists(lists)
+        for name in lists:
+            parameters = set(inspect.signature(FogROSLaunchDescription).parameters) - {'lists'}
+            raise keywords.unknown('a FogROSLaunchDescription', name,
+                                   parameters | features.node_lists().keys())
         super().__init__(initial_entities, deprecated_reason=deprecated_reason)
         if robot_nodes not in get_args(RobotNodes):
             raise ConfigurationError(
                 f'robot_nodes={robot_nodes!r} is unknown', f'use one of {get_args(RobotNodes)}')
         self.robot_nodes = robot_nodes
-        self.stream_topics = list(stream_topics)
         self.dds = dds
 
     def visit(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
@@ -86,8 +82,8 @@ class FogROSLaunchDescription(LaunchDescription):
         coordinator = Coordinator.of(context)
         if self.dds is not None:
             coordinator.use_dds(self.dds)
-        coordinator.stream_everywhere(
-            self.stream_topics, context.launch_configurations.get('ros_namespace', '/'))
+        coordinator.parts.everywhere(
+            self.lists, context.launch_configurations.get('ros_namespace', '/'))
         planned: list[Planned] = []
         for entity, certain in cloud_entities(self.entities):
             if isinstance(entity, FogMachine):
@@ -95,8 +91,8 @@ class FogROSLaunchDescription(LaunchDescription):
                 coordinator.know(entity.machine if certain else None)
                 continue
             coordinator.know(entity.machine)
-            # streams of a process that executes late are checked before a machine is created
-            streaming.check(entity.stream_topics)
+            # items of a process that executes late are checked before a machine is created
+            coordinator.parts.check(entity.lists)
             if certain:
                 planned += _planned(entity)
         if planned:

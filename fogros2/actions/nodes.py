@@ -9,7 +9,7 @@ from typing import Any, Optional, TYPE_CHECKING, Union
 from launch import LaunchContext, LaunchDescriptionEntity
 import launch_ros.actions
 
-from fogros2.describe import keywords, values
+from fogros2.describe import features, keywords, values
 from fogros2.describe.machines import checked, CloudInstance
 from fogros2.errors import ConfigurationError
 from fogros2.host import containers
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from launch import SomeSubstitutionsType, Substitution
 
     from fogros2.describe.machines import SomeMachine
-    from fogros2.image_transport.streams import Entry
 
 
 class Node(launch_ros.actions.Node):
@@ -33,14 +32,13 @@ class Node(launch_ros.actions.Node):
 
     :param machine: the machine, or the name of one that the launch mentions elsewhere; None for
         the robot, or for the machine of an enclosing CloudGroup.
-    :param stream_topics: image topics that cross the VPN encoded: ``(topic, transport)`` pairs for
-        topics that the robot publishes and the machine reads, or StreamTopic.
     :param image: container image that the node runs in on the machine, such as
         'ros:jazzy-perception', with the machine's network, DDS configuration and workspace.
     :param image_options: more options for ``docker run``, such as ['--gpus=all']; a substitution
         separates them by commas.
     :param checkpoint: folder of the node on the machine, such as '$HOME/map', that a replacement
         of the machine takes over; see ``checkpoint`` of machines.
+    :param kwargs: also lists of features, see doc/howto/streaming.md for one.
     :raises ConfigurationError: ``machine`` is no machine, or another option needs one.
     """
 
@@ -48,11 +46,12 @@ class Node(launch_ros.actions.Node):
     _remote: Optional[RemoteProcess] = None
 
     def __init__(
-        self, *, machine: Optional[SomeMachine] = None, stream_topics: Sequence[Entry] = (),
+        self, *, machine: Optional[SomeMachine] = None,
         image: Optional[SomeSubstitutionsType] = None,
         image_options: Union[Sequence[SomeSubstitutionsType], Substitution] = (),
         checkpoint: Optional[SomeSubstitutionsType] = None, **kwargs: Any,
     ) -> None:
+        self.lists = features.take_lists(kwargs)
         with keywords.refused(type(self)):
             super().__init__(**kwargs)
         if isinstance(image_options, str) or image_options and image is None:
@@ -60,14 +59,12 @@ class Node(launch_ros.actions.Node):
                 f'image_options={image_options!r} is no list of options for an image',
                 "such as image='ros:jazzy-perception', image_options=['--gpus=all']")
         if machine is None:
-            keyword = ('image' if image is not None else 'checkpoint' if checkpoint is not None
-                       else 'stream_topics')
-            if image is not None or checkpoint is not None or stream_topics:
+            needing = {'image': image, 'checkpoint': checkpoint, **self.lists}
+            for keyword in (name for name, value in needing.items() if value is not None):
                 raise ConfigurationError(
                     f'{keyword}= of a node is for a machine, and this node has none',
                     f'add machine=, or leave {keyword}= out')
             return
-        self.stream_topics = list(stream_topics)
         self._image = image
         self._checkpoint = checkpoint
         self._image_options = values.items(image_options)
@@ -77,7 +74,7 @@ class Node(launch_ros.actions.Node):
         self._remote.has_image = image is not None
 
     def prepare(self, context: LaunchContext) -> None:
-        """Resolve the action and its streams; relative topics are in the node's namespace."""
+        """Resolve the action and its lists; relative topics are in the node's namespace."""
         remote = self._remote
         if remote is not None and self._image is not None:
             self._use_image(context, remote)
@@ -86,8 +83,7 @@ class Node(launch_ros.actions.Node):
             namespace = self.expanded_node_namespace
             if namespace == self.UNSPECIFIED_NODE_NAMESPACE:
                 namespace = '/'
-            remote.streams = Coordinator.of(context).resolve_streams(
-                self.stream_topics, namespace)
+            remote.own = Coordinator.of(context).parts.resolve(self.lists, namespace)
             remote.add_checkpoint(values.resolve(context, self._checkpoint))
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
@@ -95,7 +91,7 @@ class Node(launch_ros.actions.Node):
         entities: Optional[list[LaunchDescriptionEntity]] = super().execute(context)
         if self._remote is not None:
             for entity in entities or ():
-                send_components(entity, self._remote.machine, self._remote.streams, context)
+                send_components(entity, self._remote.machine, self._remote.own, context)
         return entities
 
     def _use_image(self, context: LaunchContext, remote: RemoteProcess) -> None:
@@ -126,9 +122,15 @@ class ComposableNodeContainer(Node, launch_ros.actions.ComposableNodeContainer):
 
 
 class CloudNode(Node):
-    """A Node that always has a machine."""
+    """
+    A Node that always has a machine.
 
-    def __init__(
-        self, machine: SomeMachine, stream_topics: Sequence[Entry] = (), **kwargs: Any,
-    ) -> None:
-        super().__init__(machine=checked(machine), stream_topics=stream_topics, **kwargs)
+    :param lists: features' lists, which launch files of FogROS2 give without a keyword.
+    """
+
+    def __init__(self, machine: SomeMachine, *lists: Sequence[Any], **kwargs: Any) -> None:
+        names = [*features.node_lists()]
+        if len(lists) > len(names):
+            raise ConfigurationError('a CloudNode takes one machine, and the rest by keywords',
+                                     'CloudNode(machine, package=..., executable=...)')
+        super().__init__(machine=checked(machine), **dict(zip(names, lists)), **kwargs)

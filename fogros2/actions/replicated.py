@@ -11,23 +11,22 @@ from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal, GroupAction
 
 from fogros2.actions.cloud_group import CloudGroup
-from fogros2.describe import values
+from fogros2.describe import features, values
 from fogros2.describe.keywords import ROBOT
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport.topics import absolute, local_topic
 from fogros2.launch_internals import components, private
 from fogros2.launch_internals.wrapping import wrap
 from fogros2.model import NodeSpec
-from fogros2.runtime import replicas, streaming
+from fogros2.ros_names import absolute, local_topic, remapped
+from fogros2.runtime import replicas
+from fogros2.runtime.added_process import AddedProcess
 from fogros2.runtime.coordinator import Coordinator
 from fogros2.runtime.remote_process import remote_of
-from fogros2.runtime.republishers import AddedProcess
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
 
     from fogros2.describe.machines import SomeMachine
-    from fogros2.image_transport.streams import Entry
 
 
 class Replicated(Action):
@@ -44,7 +43,7 @@ class Replicated(Action):
     :param hedge_after: milliseconds after which a request goes to the next machine, or 'p95', the
         learned 95th percentile; None: each request goes to all machines at once.
     :param deadline: seconds without an answer of a machine after which the robot's copy is asked.
-    :param stream_topics: image topics that cross the VPN encoded, as for Node.
+    :param kwargs: also lists of features, as for Node.
     :raises ConfigurationError: too few machines, invalid or repeated names.
     """
 
@@ -56,13 +55,13 @@ class Replicated(Action):
                       values.List] = (),
         hedge_after: Union[float, SomeSubstitutionsType, None] = None,
         deadline: Union[float, SomeSubstitutionsType, None] = None,
-        stream_topics: Sequence[Entry] = (), **kwargs: Any,
+        **kwargs: Any,
     ) -> None:
+        self._lists = features.take_lists(kwargs)
         super().__init__(**kwargs)
         self._machines, self._actions = machines, list(actions)
         self._services, self._topics = services, topics
         self._hedge_after, self._deadline = hedge_after, deadline
-        self._stream_topics = list(stream_topics)
         self._groups = [] if isinstance(machines, values.List) else [
             self._group(machine) for machine in machines]
 
@@ -103,13 +102,13 @@ class Replicated(Action):
                                      'those of the first answer',
                                      'give all of them machines, or write None for the robot')
         sessions = {session.spec.name: session for session in map(coordinator.session, others)}
-        streamed = self._streamed(coordinator, namespace, [output for _, output in pairs])
+        forwarded = self._forwarded(coordinator, namespace, [output for _, output in pairs])
         public = [*services, *(name for pair in pairs for name in pair)]
         for name, session in sessions.items():
             session.replicate({one: local_topic(one, name) for one in public})
         first = replicas.first_answer(
             coordinator.launch.store.launch(coordinator.launch.id), sessions, services,
-            [(*pair, pair[0] in streamed) for pair in pairs], hedge_after, deadline, context)
+            [(*pair, pair[0] in forwarded) for pair in pairs], hedge_after, deadline, context)
         for group in groups:
             if isinstance(group, _Last):
                 group.names = {one: local_topic(one, ROBOT) for one in public}
@@ -119,20 +118,19 @@ class Replicated(Action):
         actions = copy.deepcopy(self._actions)
         if machine is None:
             return _Last(actions)
-        return _Replica(machine, actions, stream_topics=self._stream_topics)
+        return _Replica(machine, actions, **self._lists)
 
-    def _streamed(
+    def _forwarded(
         self, coordinator: Coordinator, namespace: str, outputs: Sequence[str],
     ) -> set[str]:
-        """Return the topics that reach the machines as streams from the robot."""
-        entries = coordinator.all_streams(self._stream_topics, namespace)
-        for entry in entries:
-            if entry.topic in outputs:
+        """Return the topics that a feature brings from the robot to the machines."""
+        topics = coordinator.parts.topics(coordinator.parts.resolve(self._lists, namespace))
+        for topic, (keyword, _) in topics.items():
+            if topic in outputs:
                 raise ConfigurationError(
-                    f'{entry.topic} is an output of replicas and a stream',
-                    'leave it out of stream_topics: the first answer forwards it')
-        return {entry.topic for entry in entries
-                if entry.direction == 'to_cloud' and entry.source is None}
+                    f'{topic} is an output of replicas and in {keyword}=',
+                    f'leave it out of {keyword}: the first answer forwards it')
+        return {topic for topic, (_, from_robot) in topics.items() if from_robot}
 
 
 class _Replica(CloudGroup):
@@ -161,7 +159,7 @@ class _Last(GroupAction):
             private.change_command(entity, self._renamed)
 
     def _renamed(self, command: Sequence[str]) -> Sequence[str]:
-        node = streaming.remapped(NodeSpec('', '', arguments=tuple(command)), self.names)
+        node = remapped(NodeSpec('', '', arguments=tuple(command)), self.names)
         return [str(word) for word in node.arguments]
 
 

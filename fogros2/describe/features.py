@@ -33,6 +33,18 @@ def _keywords(feature: str) -> Mapping[str, Keyword]:
     return parameters_of(plugin_system.load(GROUP, feature).options)
 
 
+def node_lists() -> Mapping[str, str]:
+    """Return the keywords of nodes and groups that take a list, each with its element's name."""
+    lists = (plugin_system.load(GROUP, name).node_list for name in plugin_system.names(GROUP))
+    return {keyword: element for keyword, element in lists if keyword}
+
+
+def take_lists(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Remove the features' lists from a node's arguments; return those with items by keyword."""
+    return {keyword: list(items) for keyword in node_lists()
+            if (items := arguments.pop(keyword, ()))}
+
+
 def own(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     Return those of some values by name that are of features, marked by their kinds.

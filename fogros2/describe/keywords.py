@@ -147,7 +147,8 @@ def refused(cls: type[Any]) -> Iterator[None]:
             raise
         names = {name for each in cls.__mro__ if '__init__' in vars(each)
                  for name in inspect.signature(vars(each)['__init__']).parameters}
-        raise unknown(f'a {cls.__name__}', match[1], names - {'self', 'args', 'kwargs'}) from None
+        names = names - {'self', 'args', 'kwargs', 'lists'} | features.node_lists().keys()
+        raise unknown(f'a {cls.__name__}', match[1], names) from None
 
 
 def unknown(what: str, name: str, names: Iterable[str]) -> ConfigurationError:

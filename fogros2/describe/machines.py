@@ -6,17 +6,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import inspect
 import os
-import re
 import shlex
 from typing import Any, cast, get_args, NoReturn, Optional, TYPE_CHECKING, Union
 
+from fogros2 import ros_names
 from fogros2.describe import features, names, networks, values, variables
 from fogros2.describe.kinds import check, options_of, parameters_of
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.host import containers, dependencies
 from fogros2.host.checkpoint import check_folder
 from fogros2.host.workspace import find_workspaces, underlays
-from fogros2.image_transport import topics
 from fogros2.model import (
     Bootstrap,
     MachineSpec,
@@ -34,8 +33,6 @@ if TYPE_CHECKING:
     Bool = Union[bool, SomeSubstitutionsType]
     #: A machine in a launch file; a name may be of a machine that is mentioned elsewhere.
     SomeMachine = Union['CloudInstance', SomeSubstitutionsType]
-
-_PREFIXES = {'': 1.0, 'k': 1e3, 'M': 1e6, 'G': 1e9}
 
 
 class CloudInstance:
@@ -77,8 +74,6 @@ class CloudInstance:
     :param max_replacements: how often on_interrupt='replace' replaces the machine in a launch; 3.
     :param checkpoint: folder of its nodes, such as '$HOME/map', that a replacement takes over.
     :param checkpoint_interval: time between two copies of the folder to the robot.
-    :param bandwidth: what its streams may use of the link in each direction, such as '10Mbit/s';
-        they share it by need and priority.
     :param monitor_allow: networks (CIDR) from which external clients may connect to the Foxglove
         bridge, by TLS and with a token.
     :param share: topics, such as '/map', that pass between this launch and those of other robots
@@ -106,7 +101,6 @@ class CloudInstance:
         max_replacements: Optional[Value] = None,
         checkpoint: Optional[SomeSubstitutionsType] = None,
         checkpoint_interval: Optional[Value] = None,
-        bandwidth: Optional[Value] = None,
         monitor_allow: Optional[Sequence[SomeSubstitutionsType]] = None,
         apt: Optional[Sequence[SomeSubstitutionsType]] = None,
         pip: Optional[Sequence[SomeSubstitutionsType]] = None,
@@ -455,20 +449,6 @@ def checked(machine: SomeMachine) -> SomeMachine:
     return machine
 
 
-def parse_bandwidth(what: str, value: Union[str, int, float]) -> float:
-    """
-    Convert text such as '10Mbit/s', or a number of bits per second, to bits per second.
-
-    :raises ConfigurationError: no bandwidth, or less than 100 kbit/s.
-    """
-    match = re.fullmatch(r'(\d+(?:\.\d+)?) ?([kMG]?)bit/s|(\d+(?:\.\d+)?)', str(value).strip())
-    bits = 0.0 if match is None else float(match[1] or match[3]) * _PREFIXES[match[2] or '']
-    if not 1e5 <= bits <= 1e12:
-        raise ConfigurationError(f'{what}={value!r} is no bandwidth from 100 kbit/s to 1 Tbit/s',
-                                 "write '500kbit/s', '10Mbit/s' or '1Gbit/s'")
-    return bits
-
-
 def check_loss(spec: MachineSpec) -> None:
     """
     Check that a lost machine has stopped its nodes before they start elsewhere.
@@ -502,7 +482,7 @@ def _choice(kind: Any) -> Any:
 
 
 _LIST_CHECKS = {'apt': dependencies.check_apt, 'pip': dependencies.check_pip,
-                'share': topics.check_name}
+                'share': ros_names.check_name}
 
 
 def _listed(program: str, content: Any) -> list[Union[values.Items, values.List]]:
@@ -525,7 +505,6 @@ _CHECKS: dict[str, Any] = {
     'max_replacements': _count,
     'checkpoint': check_folder,
     'checkpoint_interval': values.parse_duration,
-    'bandwidth': parse_bandwidth,
 }
 #: Keywords of every machine that a file of defaults may have.
 SETTINGS = tuple(name for name in _CHECKS if name not in ('on_exit', 'checkpoint'))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rename streamed topics for components that are loaded into a container on a machine."""
+"""Rename topics for components that are loaded into a container on a machine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Optional
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 
-from fogros2.image_transport.topics import absolute, rewrite
+from fogros2.ros_names import absolute, rewrite
 
 #: Launch configurations in which launch_ros keeps remappings (SetRemap) and the namespace.
 _REMAPS, _NAMESPACE = 'ros_remaps', 'ros_namespace'
@@ -36,20 +36,20 @@ def are_loaded_by(entity: LaunchDescriptionEntity) -> bool:
 
 def rename_topics(
     action: Action, names: Callable[[], Mapping[str, str]],
-    republishers: Callable[[], Sequence[LaunchDescriptionEntity]],
+    beside: Callable[[], Sequence[LaunchDescriptionEntity]],
 ) -> None:
     """
-    Make an action that loads components rename the streamed topics for them.
+    Make an action that loads components rename topics for them.
 
     :param names: returns new topic names by full old names, when the action is executed.
-    :param republishers: called before that; adds the components' streams, returns republishers.
+    :param beside: called before that; returns processes that run beside the components.
     """
     if 'execute' in vars(action):
         return  # an earlier visit has replaced it
     execute = action.execute
 
     def renaming(context: LaunchContext) -> list[LaunchDescriptionEntity]:
-        added = republishers()
+        added = beside()
         with _renamed(action, context, names()):
             entities = execute(context)
         return [*(entities or ()), *added]

@@ -11,7 +11,7 @@ coordinator keeps it alive until all processes have ended and the machines are t
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import copy
@@ -19,7 +19,7 @@ import functools
 import threading
 from typing import Any, Optional, TYPE_CHECKING, Union
 
-from launch import Action, Event, EventHandler, LaunchContext
+from launch import Event, EventHandler, LaunchContext
 from launch.actions import (
     ExecuteLocal,
     OpaqueFunction,
@@ -28,6 +28,7 @@ from launch.actions import (
     ResetEnvironment,
 )
 from launch.event_handlers import OnShutdown
+from launch.events.process import ShutdownProcess
 import launch.logging
 from launch.substitutions import SubstitutionFailure
 
@@ -37,10 +38,11 @@ from fogros2.describe.machines import CloudInstance
 from fogros2.errors import Cancelled, ConfigurationError, did_you_mean, FogError
 from fogros2.launch_internals import private
 from fogros2.model import NodeSpec
-from fogros2.runtime import cost, interruption, republishers, signals, streaming, uncompressed
+from fogros2.runtime import added_process, cost, interruption, signals
 from fogros2.runtime.checkpoints import Checkpoints
 from fogros2.runtime.console import Console
 from fogros2.runtime.interruption import MachineInterrupted
+from fogros2.runtime.parts import Lists, Parts
 from fogros2.runtime.replacer import Replacer
 from fogros2.runtime.session import Session
 
@@ -50,7 +52,7 @@ if TYPE_CHECKING:
     from fogros2.deploy import Launch
     from fogros2.describe.machines import SomeMachine
     from fogros2.describe.overrides import Overrides
-    from fogros2.image_transport.streams import Entry, StreamTopic
+    from fogros2.feature import Program
     from fogros2.model import MachineSpec
 
 #: Returns the process of a node on a machine, by the machine's name.
@@ -103,7 +105,7 @@ class Coordinator:
         self._context = context
         self._make_launch = make_launch or _make_launch
         self._launch: Optional[Launch] = None
-        self._cancel = threading.Event()
+        self._cancel = self.ended = threading.Event()
         self._console: Optional[Console] = None
         self._instances: dict[str, CloudInstance] = {}
         self._overrides: Optional[Overrides] = None
@@ -114,15 +116,15 @@ class Coordinator:
         self._deployments: list[asyncio.Task[None]] = []
         self._begun = True
         self._late: set[str] = set()
-        self._streams = streaming.Streams()
-        self._stream_everywhere: list[tuple[Sequence[Entry], str]] = []
         self._on_machine: OnMachine
         self._dds: Optional[str] = None
         self._down: Optional[asyncio.Task[None]] = None
-        #: The watch for uncompressed images, which ends with the launch.
-        self._watched: Optional[asyncio.Future[None]] = None
+        #: The watches of features, which end with the launch.
+        self._watches: list[asyncio.Future[None]] = []
         self._restore_signals: Callable[[], None] = lambda: None
         self._logger = launch.logging.get_logger('fogros2')
+        #: What features do in the launch.
+        self.parts = Parts(self)
         context.extend_globals({_LOCAL: self})
         # launch asks the handlers that were registered last first: those of launch files
         for kind, function in ((Begin, self._on_begin), (Failed, self._on_failed),
@@ -308,6 +310,7 @@ class Coordinator:
             session = Session(
                 spec, self._context.asyncio_loop, in_thread=self._in_thread, fail=self._fail,
                 changed=self._open_gate, preempted=self._preempted,
+                starting=functools.partial(self.parts.starting, spec.name),
                 busy=functools.partial(private.waiting_events, self._context))
             if spec.on_interrupt == 'replace':
                 session.replacer = Replacer(
@@ -327,8 +330,6 @@ class Coordinator:
                 raise ConfigurationError(
                     f"'{spec.name}' is the second machine of this launch with share=",
                     'one machine shares topics for all nodes of a launch')
-            self._streams.bandwidths[spec.name] = spec.bandwidth
-            session.rename(self._streams.remappings(spec.name))
             self._sessions[spec.name] = session
             self._new.append(session)
             self.launch.expect([spec.name])
@@ -341,72 +342,63 @@ class Coordinator:
         session.add(machine)
         return session
 
-    def stream_everywhere(self, entries: Sequence[Entry], namespace: str) -> None:
-        """
-        Stream topics between the robot and every machine of the launch.
+    # -- what features see of the launch; :class:`fogros2.feature.RunningLaunch` ------------------
 
-        :param entries: streams, resolved when a machine's process executes.
-        :param namespace: namespace of relative names.
-        :raises ConfigurationError: an unknown transport, or an invalid topic.
-        """
-        streaming.check(entries)
-        if entries:
-            self._stream_everywhere.append((entries, namespace))
+    @property
+    def context(self) -> LaunchContext:
+        """The context in which launch runs."""
+        return self._context
 
-    def resolve_streams(self, entries: Sequence[Entry], namespace: str) -> list[StreamTopic]:
-        """
-        Resolve streams; relative names are in the namespace.
+    @property
+    def machines(self) -> Mapping[str, Session]:
+        """The sessions by the machines' names."""
+        return self._sessions
 
-        :raises ConfigurationError: an unknown transport, or an invalid topic.
-        """
-        resolved = streaming.resolve(self._context, entries, namespace, self._source)
-        streaming.check(resolved)
-        return resolved
+    @property
+    def interface(self) -> str:
+        """The name of the robot's VPN interface."""
+        return f'fog{self.launch.id}'
 
-    def all_streams(
-        self, entries: Iterable[Entry] = (), namespace: str = '/',
-    ) -> list[StreamTopic]:
-        """Return the streams of all machines, and further ones, all resolved."""
-        streams: list[StreamTopic] = []
-        for everywhere, of in (*self._stream_everywhere, (list(entries), namespace)):
-            streams += self.resolve_streams(everywhere, of)
-        return streams
+    @property
+    def environment(self) -> Mapping[str, str]:
+        """The variables of the robot's nodes."""
+        return {**self._context.environment, **self.launch.robot_environment()}
 
-    def _source(self, source: Optional[SomeMachine]) -> Optional[str]:
-        """Return the name of the machine that publishes, None for the robot."""
-        if source is None:
+    def name_of(self, machine: Optional[SomeMachine]) -> Optional[str]:
+        """Return the name of a machine, None for the robot."""
+        if machine is None:
             return None
         # perhaps the launch runs nothing else there
-        self.know(source)
-        machine = self.resolve(source)
+        self.know(machine)
+        machine = self.resolve(machine)
         name = machine if isinstance(machine, str) else machine.spec(self._context).name
         return None if self.on_robot(name) else name
 
-    def stream(
-        self, entries: Iterable[StreamTopic], session: Session, on_machine: OnMachine,
+    def spec(self, name: str) -> MachineSpec:
+        """Return a machine as the launch file requests it."""
+        return self._spec(self._by_name(name))
+
+    def beside(
+        self, own: Lists, session: Optional[Session], on_machine: OnMachine,
     ) -> list[ExecuteLocal]:
         """
-        Stream topics to and from a machine, in addition to the streams of all machines.
+        Return the processes of features that a process needs and no earlier process did.
 
-        :param on_machine: returns the process of a stream's node on a machine, by its name.
-        :return: the processes that this needs and no earlier stream did.
-        :raises ConfigurationError: an unknown transport, or contradictory streams.
+        :param own: the resolved items of the process.
+        :param session: of the process's machine, None for the robot.
+        :param on_machine: returns the process of a node on a machine, by its name.
+        :raises FogError: they can't run together.
         """
-        streams = [*self.all_streams(), *entries]
-        if not streams:
-            return []
-        away = [name for name, one in self._sessions.items() if one.interrupted]
-        streams = [streaming.from_robot(entry, away) for entry in streams]
-        new = self._streams.add(streams, session.spec.name)
         self._on_machine = on_machine
-        # another machine may be the source
-        self._rename_topics()
-        return [republishers.AddedProcess(spec, session.came_up) if machine is None else
-                on_machine(spec, machine) for machine, spec in new]
+        return self._processes(self.parts.beside(
+            own, None if session is None or session.interrupted else session.spec.name))
 
-    def _rename_topics(self) -> None:
-        for session in self._sessions.values():
-            session.rename(self._streams.remappings(session.spec.name))
+    def _processes(self, programs: Iterable[Program]) -> list[ExecuteLocal]:
+        return [
+            self._on_machine(one.node, one.machine) if one.machine is not None
+            else added_process.AddedProcess(
+                one.node, self.session(one.after).came_up if one.after is not None else None)
+            for one in programs]
 
     def begin(self) -> None:
         """Emit :class:`Begin`; launch handles it after everything that is due has executed."""
@@ -481,18 +473,8 @@ class Coordinator:
             self._fail(error)
             return
         await asyncio.gather(*(self._up(session) for session in sessions))
-        if self._watched is None and not self._cancel.is_set():
-            self._watched = self._in_thread(
-                uncompressed.watch, functools.partial(
-                    uncompressed.carried, f'fog{self.launch.id}'),
-                self._crossing_images, self._logger.warning, self._cancel)
-
-    def _crossing_images(self) -> list[str]:
-        # copied, because this runs in a thread and the launch may add machines
-        machines = {name: session.node_names() for name, session in list(self._sessions.items())}
-        return uncompressed.crossing_images(
-            machines, {**self._context.environment, **self.launch.robot_environment()},
-            self._cancel)
+        if not self._watches and not self._cancel.is_set():
+            self._watches = [self._in_thread(part.watch) for part in self.parts]
 
     async def _up(self, session: Session) -> None:
         try:
@@ -522,16 +504,23 @@ class Coordinator:
             self._context.emit_event_sync(
                 MachineInterrupted(session.spec.name, reason, session.lost))
 
-    def _on_interrupted(self, context: LaunchContext) -> list[Action]:
+    def _on_interrupted(self, context: LaunchContext) -> list[ExecuteLocal]:
         session = self._sessions.get(context.locals.event.machine)
         if session is None or context.is_shutdown:
             return []
-        new = interruption.react(
-            context.locals.event, session, self._streams, context, self._logger)
-        self._rename_topics()
-        return [
-            republishers.AddedProcess(spec) if name is None else
-            self._on_machine(spec, name) for name, spec in new]
+        return interruption.react(
+            context.locals.event, session, self.take_over, self._logger)
+
+    def take_over(self, machine: str) -> list[ExecuteLocal]:
+        """Let features use the robot in a machine's place; return the processes that they need."""
+        processes: list[ExecuteLocal] = []
+        for part in self.parts:
+            ended, programs = part.moved(machine)
+            for node in ended:
+                self._context.emit_event_sync(
+                    ShutdownProcess(process_matcher=functools.partial(_runs, node)))
+            processes += self._processes(programs)
+        return processes
 
     # -- going down -----------------------------------------------------------------------------
 
@@ -561,7 +550,7 @@ class Coordinator:
         # the VPN interface must stay while a node runs
         sessions = self._sessions.values()
         futures = [private.completed(action) for action in private.processes(self._context)]
-        await _all_done({*futures, *self._deployments, self._watched})
+        await _all_done({*futures, *self._deployments, *self._watches})
         await _all_done({request for session in sessions for request in session.requests})
         for error in await self._in_thread(self.launch.down):
             self._fail(error)
@@ -589,6 +578,10 @@ async def _all_done(futures: set[Optional[asyncio.Future[Any]]]) -> None:
 
 def _is(kind: type[Event], event: Event) -> bool:
     return isinstance(event, kind)
+
+
+def _runs(node: str, action: ExecuteLocal) -> bool:
+    return isinstance(action, added_process.AddedProcess) and action.node == node
 
 
 def _make_launch(**arguments: Any) -> Launch:

@@ -19,8 +19,8 @@ from fogros2 import monitor_addresses as addresses
 from fogros2 import plugin_system
 from fogros2.errors import Unsupported
 from fogros2.model import host_port, NodeSpec
+from fogros2.runtime.added_process import AddedProcess
 from fogros2.runtime.coordinator import Coordinator
-from fogros2.runtime.republishers import AddedProcess
 from fogros2.store import Store
 
 if TYPE_CHECKING:

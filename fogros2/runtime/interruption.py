@@ -3,21 +3,17 @@
 
 from __future__ import annotations
 
-import functools
+from collections.abc import Callable
 import logging
-from typing import Optional, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
-from launch import Event, LaunchContext
+from launch import Event
 from launch.actions import ExecuteLocal
-from launch.events.process import ShutdownProcess
 
 from fogros2.errors import ProviderError
-from fogros2.model import NodeSpec
-from fogros2.runtime.republishers import AddedProcess
 
 if TYPE_CHECKING:
     from fogros2.runtime.session import Session
-    from fogros2.runtime.streaming import Streams
 
 
 class MachineInterrupted(Event):
@@ -45,14 +41,14 @@ class MachineInterrupted(Event):
 
 
 def react(
-    event: MachineInterrupted, session: Session, streams: Streams, context: LaunchContext,
-    logger: logging.Logger,
-) -> list[tuple[Optional[str], NodeSpec]]:
+    event: MachineInterrupted, session: Session,
+    take_over: Callable[[str], list[ExecuteLocal]], logger: logging.Logger,
+) -> list[ExecuteLocal]:
     """
     Apply the machine's ``on_interrupt``.
 
-    :param streams: the launch's streams; those of this machine end or move to the robot.
-    :returns: nodes of streams to start, each with its machine, None for the robot.
+    :param take_over: see :meth:`fogros2.runtime.coordinator.Coordinator.take_over`.
+    :returns: processes to start.
     :raises ProviderError: ends the launch.
     """
     what = (f"the machine '{event.machine}' "
@@ -63,13 +59,7 @@ def react(
         return []
     if session.spec.on_interrupt == 'robot':
         logger.warning(f'{what}; its nodes continue on the robot')
-        ended, new, lost = streams.take_over(event.machine)
-        for node in ended:
-            context.emit_event_sync(
-                ShutdownProcess(process_matcher=functools.partial(_runs, node)))
-        if lost:
-            logger.warning(f"{', '.join(lost)} of '{event.machine}' no longer reaches other "
-                           'machines: the robot streams it in another way')
+        new = take_over(event.machine)
         session.move_all()
         return new
     if event.lost:
@@ -78,7 +68,3 @@ def react(
         logger.warning(f'{what}; the other replicas go on')
         return []
     raise ProviderError(what, "on_interrupt='robot' continues its nodes on the robot")
-
-
-def _runs(node: str, action: ExecuteLocal) -> bool:
-    return isinstance(action, AddedProcess) and action.node == node

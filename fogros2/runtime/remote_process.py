@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import contextlib
+import functools
 import json
 from typing import cast, Optional, TYPE_CHECKING
 
@@ -17,13 +18,13 @@ from fogros2.host.checkpoint import check_folder
 from fogros2.launch_internals import components, private
 from fogros2.model import NodeSpec
 from fogros2.runtime import foxglove, node_spec
+from fogros2.runtime.added_process import AddedProcess
 from fogros2.runtime.coordinator import Coordinator, Planned
 from fogros2.runtime.remote_run import RemoteRun
-from fogros2.runtime.republishers import AddedProcess
 
 if TYPE_CHECKING:
     from fogros2.describe.machines import SomeMachine
-    from fogros2.image_transport.streams import Entry, StreamTopic
+    from fogros2.runtime.parts import Lists
     from fogros2.runtime.session import Session
 
 #: The attribute of an action that has its RemoteProcess.
@@ -37,7 +38,7 @@ class RemoteProcess:
     The action stays the same object, so handlers that have it as their target still match; launch
     calls this object's methods instead of four of its own.
 
-    :param streams: topics to stream between the robot and the machine, resolved.
+    :param own: the process's items of features' lists, resolved.
     """
 
     #: Container image that the process runs in, and more options for its ``docker run``; whether
@@ -57,19 +58,19 @@ class RemoteProcess:
     _stay: Optional[private.Stay] = None
 
     def __init__(
-        self, action: ExecuteLocal, machine: SomeMachine, streams: Sequence[StreamTopic],
+        self, action: ExecuteLocal, machine: SomeMachine, own: Lists,
     ) -> None:
         self.action = action
         self.machine = machine
-        self.streams = streams
+        self.own = own
         self._own = private.replace_methods(action, private.Methods(
             self.execute, self.prepare, self.start, self.shut_down))
         vars(action)[_REMOTE] = self
 
     @property
-    def stream_topics(self) -> Sequence[Entry]:
-        """The streams of the action, as the launch file gives them."""
-        return getattr(self.action, 'stream_topics', ())
+    def lists(self) -> Lists:
+        """The action's items of features' lists, as the launch file gives them."""
+        return getattr(self.action, 'lists', {})
 
     @property
     def planned(self) -> Planned:
@@ -139,20 +140,15 @@ class RemoteProcess:
         with node_spec.packages_of(folder):
             entities = self._own.execute(context) or []
         if self.session is None:
-            return [*entities, *_streams_to_robot(self.streams, coordinator)]
+            return [*entities, *coordinator.beside(self.own, None, process_on)]
         run = RemoteRun(
             self.action, context, self.session, self._node,
             self._come_here if self._command is not None else None, self._go_back)
         private.set_transport(self.action, run)
         self.session.submit(run)
-        return [*entities, *self._republishers(coordinator, self.session),
-                *self._helpers(coordinator, self.session)]
-
-    def _republishers(self, coordinator: Coordinator, session: Session) -> list[ExecuteLocal]:
-        """Return the republishers of this process's streams that no earlier process needed."""
-        if isinstance(self.action, AddedProcess):
-            return []
-        return _streams_to_machine(self.streams, coordinator, session)
+        beside = [] if isinstance(self.action, AddedProcess) else coordinator.beside(
+            self.own, self.session, process_on)
+        return [*entities, *beside, *self._helpers(coordinator, self.session)]
 
     def _helpers(
         self, coordinator: Coordinator, session: Session,
@@ -225,14 +221,14 @@ class RemoteProcess:
 
 
 def send(
-    action: ExecuteLocal, machine: SomeMachine, streams: Sequence[StreamTopic] = (),
+    action: ExecuteLocal, machine: SomeMachine, own: Optional[Lists] = None,
 ) -> RemoteProcess:
     """
     Make the process of an action that has not been executed run on ``machine``.
 
-    :param streams: topics to stream between the robot and the machine, resolved.
+    :param own: the process's items of features' lists, resolved.
     """
-    return RemoteProcess(action, machine, streams)
+    return RemoteProcess(action, machine, own or {})
 
 
 def remote_of(entity: object) -> Optional[RemoteProcess]:
@@ -249,44 +245,19 @@ def process_on(spec: NodeSpec, machine: str) -> ExecuteLocal:
 
 
 def send_components(
-    entity: LaunchDescriptionEntity, machine: SomeMachine, streams: Sequence[StreamTopic],
-    context: LaunchContext,
+    entity: LaunchDescriptionEntity, machine: SomeMachine, own: Lists, context: LaunchContext,
 ) -> None:
     """
-    Make the components that an entity loads on a machine use the machine's streams.
+    Make the components that an entity loads on a machine use the topic names there.
 
     :param entity: changed only if it loads components.
+    :param own: its items of features' lists, resolved.
     """
     if not (isinstance(entity, Action) and components.are_loaded_by(entity)):
         return
     coordinator = Coordinator.of(context)
-    if coordinator.on_robot(machine):
-        components.rename_topics(
-            entity, dict, lambda: _streams_to_robot(streams, coordinator))
-    else:
-        session = coordinator.session(machine)
-        components.rename_topics(
-            entity, session.names_for_components,
-            lambda: _streams_to_machine(streams, coordinator, session))
-
-
-def _streams_to_machine(
-    streams: Sequence[StreamTopic], coordinator: Coordinator, session: Session,
-) -> list[ExecuteLocal]:
-    """Return the republishers that a process on a machine needs and no earlier one needed."""
-    if session.interrupted:
-        return _streams_to_robot(streams, coordinator)
-    return coordinator.stream(streams, session, process_on)
-
-
-def _streams_to_robot(
-    streams: Sequence[StreamTopic], coordinator: Coordinator,
-) -> list[ExecuteLocal]:
-    """Return the republishers that bring other machines' topics to a process on the robot."""
-    actions: list[ExecuteLocal] = []
-    for entry in streams:
-        if entry.source is not None:
-            actions += coordinator.stream(
-                [entry.but(direction='to_robot', source=None)],
-                coordinator.session(entry.source), process_on)
-    return actions
+    session = None if coordinator.on_robot(machine) else coordinator.session(machine)
+    components.rename_topics(
+        entity, dict if session is None else functools.partial(
+            coordinator.parts.names, session.spec.name),
+        lambda: coordinator.beside(own, session, process_on))

@@ -17,14 +17,14 @@ from launch import Event, EventHandler, LaunchContext
 from launch.actions import OpaqueFunction
 from launch.events.process import ProcessExited, ProcessStarted
 
+from fogros2 import ros_names as names
 from fogros2.describe.keywords import ROBOT
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport import topics as names
 from fogros2.launch_internals import private
 from fogros2.model import NodeSpec
+from fogros2.runtime.added_process import AddedProcess
 from fogros2.runtime.interruption import MachineInterrupted
 from fogros2.runtime.remote_process import remote_of
-from fogros2.runtime.republishers import AddedProcess
 from fogros2.runtime.session import Session
 
 

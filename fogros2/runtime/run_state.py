@@ -35,7 +35,7 @@ class RunState:
     """
     The state of a process.
 
-    :param movable: whether it can run on the robot; others, such as republishers, end there.
+    :param movable: whether it can run on the robot; others, such as those of features, end there.
     :param stopping: whether launch wants its end.
     """
 

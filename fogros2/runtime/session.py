@@ -22,12 +22,12 @@ from fogros2.errors import (
 )
 from fogros2.events import Event
 from fogros2.model import MachineSpec, NodeSpec
-from fogros2.runtime import machine_state, streaming
+from fogros2.ros_names import remapped
+from fogros2.runtime import machine_state
 from fogros2.runtime.backlog import Backlog
 from fogros2.runtime.checkpoints import Checkpoints
 from fogros2.runtime.log_files import LogFiles
 from fogros2.runtime.machine_state import MachineState
-from fogros2.runtime.node_spec import full_name
 from fogros2.runtime.remote_run import RemoteRun
 from fogros2.runtime.replacer import Replacer
 from fogros2.shell import Shell
@@ -70,6 +70,7 @@ class Session:
     :param preempted: called with the session and a reason when the provider reclaims the
         machine, or has done so.
     :param busy: returns the number of events that launch has to process.
+    :param starting: returns nodes as they start on the machine.
     """
 
     def __init__(
@@ -77,6 +78,7 @@ class Session:
         in_thread: Callable[..., asyncio.Future[Any]],
         fail: Callable[[BaseException], None], changed: Callable[[], None],
         preempted: Callable[[Session, str], None], busy: Callable[[], int] = lambda: 0,
+        starting: Callable[[Sequence[NodeSpec]], Sequence[NodeSpec]] = lambda nodes: nodes,
     ) -> None:
         #: The spec as the launch file gives it, with open choices.
         self.requested = spec
@@ -88,8 +90,6 @@ class Session:
         self.came_up: asyncio.Future[bool] = loop.create_future()
         #: Whether containers and monitor of the machine have been requested.
         self.has_helpers = False
-        #: New names of topics for its nodes, because of streams.
-        self.names: dict[str, str] = {}
         #: New names of topics and services that the node ``first_answer`` serves on the robot.
         self.replicated: dict[str, str] = {}
         self._loop = loop
@@ -97,6 +97,7 @@ class Session:
         self._fail = fail
         self._changed = changed
         self._preempted = preempted
+        self._starting = starting
         self.state = MachineState(survivable=spec.on_interrupt != 'shutdown')
         self._backlog = Backlog(loop, self._on_event, busy, self._dropped)
         self._held: list[tuple[RemoteRun, Event]] = []
@@ -108,8 +109,6 @@ class Session:
         self.checkpoints: Optional[Checkpoints] = None
         #: Processes that have left a machine that is being replaced.
         self._away: list[RemoteRun] = []
-        #: Topic names that the first loaded components got; None if none was loaded.
-        self._component_names: Optional[dict[str, str]] = None
         #: Paths of the robot that its nodes get, and of which the user knows.
         self._paths: set[str] = set()
         #: Requests to the agent that are not answered yet.
@@ -157,19 +156,6 @@ class Session:
             if self.running is not None:
                 instance.is_up(self.running)
 
-    def rename(self, names: dict[str, str]) -> None:
-        """Rename topics for nodes that start from now on; warn of nodes that started before."""
-        new = [name for name in names if name not in self.names]
-        self.names = dict(names)
-        early = [run.node.name for run in self._runs.values()
-                 if run not in self._waiting and '--ros-args' in run.node.arguments]
-        if new and early:
-            self._logger.warning(
-                f"{self.spec.name}: {', '.join(early)} started before {', '.join(new)} became a "
-                'stream and get it unencoded; use a FogROSLaunchDescription, or add the stream to '
-                'the first node of the machine')
-        self._warn_of_components()
-
     def replicate(self, names: dict[str, str]) -> None:
         """
         Rename the topics and services of replicated nodes.
@@ -186,21 +172,6 @@ class Session:
                 f"replicas cannot move to the robot, as on_interrupt='robot' of "
                 f"'{self.spec.name}' wants it", 'leave on_interrupt= out: the others go on')
         self.replicated.update(names)
-
-    def names_for_components(self) -> dict[str, str]:
-        """Return the new topic names for components that are about to be loaded."""
-        self._component_names = dict(self.names) if self._component_names is None else {
-            name: new for name, new in self._component_names.items() if name in self.names}
-        return dict(self.names)
-
-    def _warn_of_components(self) -> None:
-        before = self._component_names
-        late = [name for name in self.names if before is not None and name not in before]
-        if late:
-            self._logger.warning(
-                f"{self.spec.name}: components were loaded before {', '.join(late)} became a "
-                'stream and get it unencoded; add the stream to the container')
-            self._component_names = None
 
     def warn_of_paths(self, node: NodeSpec, paths: Sequence[str]) -> None:
         """Warn once of each path of the robot that a node gets."""
@@ -219,9 +190,10 @@ class Session:
 
     # -- processes ------------------------------------------------------------------------------
 
-    def node_names(self) -> list[str]:
-        """Return the ROS names of the machine's nodes."""
-        return [full_name(run.node).rpartition('/')[2] for run in list(self._runs.values())]
+    @property
+    def sent(self) -> list[NodeSpec]:
+        """The nodes that have started, or are about to."""
+        return [run.node for run in list(self._runs.values()) if run not in self._waiting]
 
     @property
     def shell(self) -> Optional[Shell]:
@@ -335,19 +307,11 @@ class Session:
         runs, self._waiting = self._waiting, []
         if not runs or self.running is None:
             return
-        without_arguments = [
-            run.node.name for run in runs if '--ros-args' not in run.node.arguments]
-        if self.names and without_arguments:
-            self._logger.warning(
-                f"{self.spec.name}: {', '.join(without_arguments)} takes no ROS arguments and so "
-                f"does not use the stream of {', '.join(self.names)}; if it is a ROS node that "
-                "uses the topic, add '--ros-args' to its command")
         try:
             async with self._order:
                 await self._in_thread(
                     self.running.start,
-                    [streaming.remapped(run.node, {**self.names, **self.replicated})
-                     for run in runs])
+                    self._starting([remapped(run.node, self.replicated) for run in runs]))
         except (AgentError, ConnectError, DeadlineExceeded) as error:
             # the machine's doing: the nodes of the robot go on
             for run in runs:

@@ -8,9 +8,9 @@ import dataclasses
 import re
 from typing import Optional
 
-from fogros2.image_transport.topics import identifier
+from fogros2.ros_names import identifier
 
-#: Node names of :func:`fogros2.image_transport.topics.names_of`.
+#: Node names of :func:`fogros2_features.streams.topics.names_of`.
 _ENCODER = re.compile(r'(?P<topic>\w+)_(?P<transport>[a-z0-9]+)_encoder(?:_on_(?P<host>\w+))?')
 _DECODER = re.compile(r'(?P<topic>\w+)_(?P<transport>[a-z0-9]+)_decoder'
                       r'(?:_from_(?P<source>\w+?))?(?:_on_(?P<host>\w+))?')

@@ -9,8 +9,8 @@ import threading
 
 import pytest
 
-from fogros2.runtime import uncompressed
 from fogros2.waiting import wait_until
+from fogros2_features.streams import uncompressed
 from rigs.domains import taken
 
 rclpy = pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is here')

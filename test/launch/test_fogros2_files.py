@@ -73,7 +73,7 @@ def test_launch_file_of_fogros2_is_read(tmp_path, kind):
 
 def test_streams_of_fogros2_may_be_positional():
     node = fogros2.CloudNode('planner', [('/image', 'h264')], package='p', executable='e')
-    assert node.stream_topics == [('/image', 'h264')]
+    assert node.lists == {'stream_topics': [('/image', 'h264')]}
 
 
 @pytest.mark.parametrize('option', ['-it', '-d'])

@@ -400,7 +400,8 @@ def test_fogros_launch_has_settings_of_the_whole_launch(run, fake):
         'exited', node, returncode=0, respawns=False)
     assert run(description) == 0
     (coordinator,) = coordinators
-    assert [entries for entries, _ in coordinator._stream_everywhere] == [
+    streams = coordinator.parts._parts['stream_topics']
+    assert [entries for entries, _ in streams._everywhere] == [
         [StreamTopic('/camera')], [StreamTopic('/third')]]
     assert coordinator.gate is None, 'robot nodes wait'
     assert ('dds', 'cyclonedds') in fake.notes
@@ -490,5 +491,5 @@ def test_the_documentation_names_every_element():
     Parser.load_launch_extensions()
     from launch.frontend.expose import action_parse_methods
     assert {name for name, parse in action_parse_methods.items()
-            if parse.__module__.startswith('fogros2.')} == set(
+            if parse.__module__.startswith('fogros2')} == set(
                 re.findall(r'^\| `(\w+)` \| `', DOCUMENT, re.MULTILINE))

@@ -205,7 +205,7 @@ def test_streamed_output_is_refused(run, caplog, monkeypatch):
     assert run(FogROSLaunchDescription([Replicated(
         machines('one', 'two'), [talker()], topics=[('/image', '/seen')],
         stream_topics=[StreamTopic('/seen', 'h264', 'to_robot')])])) == 1
-    assert '/seen is an output of replicas and a stream' in caplog.text
+    assert '/seen is an output of replicas and in stream_topics=' in caplog.text
 
 
 def test_on_the_robot_the_nodes_run_once_with_their_own_names(run, fake, first):

@@ -40,6 +40,7 @@ from fogros2 import (
 )
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
+from fogros2.errors import ConfigurationError
 from fogros2_testing.plugins import instead
 from rigs.launching import Harmless
 
@@ -420,6 +421,17 @@ def test_components_loaded_before_a_stream_are_named(
     said = [record.getMessage() for record in caplog.records
             if 'components were loaded before /camera, /camera_info' in record.getMessage()]
     assert len(said) == (condition == 'true')
+
+
+def test_without_the_feature_its_keyword_is_unknown(run, fake, planner, monkeypatch):
+    instead(monkeypatch, 'fogros2.feature', {})
+    topics = [('/camera', 'h264')]
+    with pytest.raises(ConfigurationError, match="a CloudNode has no 'stream_topics'"):
+        talker(planner, stream_topics=topics)
+    with pytest.raises(ConfigurationError, match='one machine, and the rest by keywords'):
+        CloudNode(planner, topics, package='demo', executable='talker')
+    fake.on_start = own_ends
+    assert run(LaunchDescription([talker(planner)])) == 0
 
 
 def test_group_without_processes_creates_no_machine(run, fake, planner):

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from fogros2.launch_internals import private
-from fogros2.runtime import republishers
+from fogros2.runtime import added_process
 from fogros2.runtime.coordinator import Coordinator
 
 FOLDER = Path(__file__).parents[2] / 'fogros2_examples' / 'launch'
@@ -42,7 +42,7 @@ def plan(run, fake, monkeypatch):
     waited = []
 
     async def stay(action, context):
-        if not isinstance(action, republishers.AddedProcess):
+        if not isinstance(action, added_process.AddedProcess):
             found.robot.append((*words(action.process_details['cmd']), required(action)))
         private.completed(action).set_result(None)
 
@@ -61,7 +61,7 @@ def plan(run, fake, monkeypatch):
                                      launch_arguments=list(arguments.items())),
             OpaqueFunction(function=look)])) == 0
         found.machines = {name: machine.spec for name, machine in fake.machines.items()}
-        found.streams = waited[0]._streams._streams
+        found.streams = waited[0].parts._parts['stream_topics']._streams._streams
         found.nodes.sort(key=repr)
         found.robot.sort(key=repr)
         return found

@@ -6,8 +6,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from fogros2.image_transport.nodes import H264
-from fogros2.model import NodeSpec, Stream
+from fogros2.model import NodeSpec
+from fogros2_features.streams.nodes import H264
+from fogros2_features.streams.transport import Stream
 
 
 class Harmless(H264):

@@ -13,8 +13,8 @@ pytest.importorskip('cv2', reason='the extra "video" is not installed')
 import cv2
 import numpy
 
-from fogros2.image_transport import streams as transports
-from fogros2.image_transport.streams import StreamTopic
+from fogros2_features.streams import entries as transports
+from fogros2_features.streams.entries import StreamTopic
 from fogros2_monitor.dashboard import shots
 from fogros2_monitor.dashboard.meter import LARGE, Meter, ROUND
 from fogros2_monitor.dashboard.ways import (

@@ -134,13 +134,6 @@ def test_substitutions_are_resolved_when_executed(context):
     (lambda: ContainerInstance(on_exit='keep'), "a machine with on_exit='keep' needs a name"),
     (lambda: ContainerInstance(lifetime='soon'), 'is no duration'),
     (lambda: ContainerInstance(robot_timeout=0), 'is no duration'),
-    (lambda: ContainerInstance(bandwidth=0), 'bandwidth=0 is no bandwidth from 100 kbit/s'),
-    (lambda: ContainerInstance(bandwidth=-1e6), 'is no bandwidth'),
-    (lambda: ContainerInstance(bandwidth='-1Mbit/s'), 'is no bandwidth'),
-    (lambda: ContainerInstance(bandwidth='fast'), "write '500kbit/s', '10Mbit/s' or '1Gbit/s'"),
-    (lambda: ContainerInstance(bandwidth='10MB/s'), "bandwidth='10MB/s' is no bandwidth"),
-    (lambda: ContainerInstance(bandwidth='10'), "bandwidth='10' is no bandwidth"),
-    (lambda: ContainerInstance(bandwidth='nan'), 'is no bandwidth'),
     (lambda: ContainerInstance(idle_timeout='soon'), "idle_timeout='soon' is no duration"),
     (lambda: CloudInstance(), 'CloudInstance is no machine yet'),
     (lambda: ContainerInstance(apt='libzbar0'), "apt='libzbar0' is no list (apt=['libzbar0'])"),
@@ -166,13 +159,6 @@ def test_mistakes_are_found_where_they_are_written(make, message):
     with pytest.raises(ConfigurationError) as caught:
         make()
     assert message in str(caught.value)
-
-
-@pytest.mark.parametrize(('given', 'bits'), [
-    (None, 0.0), ('10Mbit/s', 10e6), ('2.5 Mbit/s', 2.5e6), ('500kbit/s', 500e3),
-    ('1Gbit/s', 1e9), ('250000bit/s', 250e3), (10_000_000, 10e6), ('1000000', 1e6)])
-def test_bandwidth_is_read_as_bits_per_second(context, given, bits):
-    assert ContainerInstance(bandwidth=given).spec(context).bandwidth == bits
 
 
 def test_packages_of_fogros2s_methods_are_the_keywords(context):

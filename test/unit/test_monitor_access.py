@@ -19,7 +19,7 @@ from launch import LaunchContext
 from launch.substitutions import TextSubstitution
 import pytest
 
-from fogros2 import ContainerInstance, Foxglove, monitor_addresses
+from fogros2 import ContainerInstance, Foxglove, monitor_addresses, ros_names
 from fogros2.actions import foxglove
 from fogros2.deploy import RunningMachine, undo
 from fogros2.deploy.steps.creating import Creation
@@ -28,8 +28,8 @@ from fogros2.errors import AgentError, ConfigurationError, ProviderError
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState, Result, VpnInterface
 from fogros2.provider.kubernetes import manifests, ways
 from fogros2.provider.kubernetes.names import MachineId
+from fogros2.runtime import added_process
 from fogros2.runtime import foxglove as runtime_foxglove
-from fogros2.runtime import republishers, streaming
 from fogros2.store import Made, process_start, Record, Store
 from fogros2_monitor import credentials
 from fogros2_testing.fakes import FakeProvider, FakeShell
@@ -225,7 +225,7 @@ def made(monkeypatch):
     """Return the specs of the processes that actions make."""
     found = []
 
-    class Added(republishers.AddedProcess):
+    class Added(added_process.AddedProcess):
         def __init__(self, spec):
             found.append(spec)
             super().__init__(spec)
@@ -265,7 +265,7 @@ def test_bridge_gets_the_options_of_the_machine(monkeypatch, made, runs, on_robo
     assert words[:4] == ['--name', name, '--listen', '127.0.0.1:9000']
     assert words[-5:] == ['--topic', '/a', '--topic', '/b*', '--ros-args']
     # a stream's images are looked at where they have come to, not fetched once more
-    told = streaming.remapped(made[0], {'/camera': '/fogros2/planner/camera'}).arguments
+    told = ros_names.remapped(made[0], {'/camera': '/fogros2/planner/camera'}).arguments
     assert told[-2:] == ('-r', '/camera:=/fogros2/planner/camera')
     # the robot's own has neither others nor an application
     if on_robot:

@@ -1,40 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Actions of XML and YAML for what Python has as objects: a stream, a launch description."""
+"""Actions of XML and YAML for what Python has as objects: items of lists, a launch description."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, cast, Optional, TYPE_CHECKING, Union
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 
 from fogros2.actions.launch_description import FogROSLaunchDescription
-from fogros2.describe import values
+from fogros2.describe import features, values
 from fogros2.errors import ConfigurationError
 from fogros2.runtime.coordinator import Coordinator
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
 
-    from fogros2.image_transport.streams import StreamTopic
     from fogros2.model import RobotNodes
 
 
-class StreamTopicEverywhere(Action):
+class Item(Action):
     """
-    Stream a topic between the robot and every machine of the launch.
+    An item of a feature's list (:attr:`fogros2.feature.Feature.node_list`).
 
-    Inside a node or a CloudGroup the stream belongs to that one only, which reads ``entry``.
+    Inside a node or a group the item is for that one only, which reads ``item``. Elsewhere it is
+    for every machine of the launch.
     """
 
-    def __init__(self, entry: StreamTopic, **kwargs: Any) -> None:
+    def __init__(self, keyword: str, item: object, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.entry = entry
+        self.keyword = keyword
+        self.item = item
 
     def execute(self, context: LaunchContext) -> None:
-        """Execute the action: processes that execute later use the stream."""
-        Coordinator.of(context).stream_everywhere(
-            [self.entry], context.launch_configurations.get('ros_namespace', '/'))
+        """Execute the action: processes that execute later use the item."""
+        Coordinator.of(context).parts.everywhere(
+            {self.keyword: [self.item]}, context.launch_configurations.get('ros_namespace', '/'))
 
 
 class FogROSLaunch(Action):
@@ -48,13 +49,12 @@ class FogROSLaunch(Action):
     def __init__(
         self, actions: Iterable[Action], *,
         robot_nodes: SomeSubstitutionsType = 'after_cloud',
-        stream_topics: Sequence[StreamTopic] = (),
         dds: Optional[SomeSubstitutionsType] = None, **kwargs: Any,
     ) -> None:
+        self._lists = features.take_lists(kwargs)
         super().__init__(**kwargs)
         self._actions = list(actions)
         self._robot_nodes: Union[SomeSubstitutionsType, RobotNodes] = robot_nodes
-        self._stream_topics = list(stream_topics)
         self._dds = dds
         if isinstance(robot_nodes, str):
             self._description(robot_nodes, None)
@@ -70,25 +70,25 @@ class FogROSLaunch(Action):
 
     def _description(self, robot_nodes: str, dds: Optional[str]) -> FogROSLaunchDescription:
         return FogROSLaunchDescription(
-            self._actions, robot_nodes=cast('RobotNodes', robot_nodes),
-            stream_topics=self._stream_topics, dds=dds)
+            self._actions, robot_nodes=cast('RobotNodes', robot_nodes), dds=dds,
+            **self._lists)
 
 
-def instead_of(actions: Iterable[Action]) -> tuple[list[Action], list[StreamTopic]]:
+def separate(actions: Iterable[Action]) -> tuple[list[Action], dict[str, list[Any]]]:
     """
-    Separate streams from other actions; return both.
+    Separate items of features' lists from other actions; return both, the items by keyword.
 
-    :raises ConfigurationError: a stream has a condition, which only a stream of the launch may.
+    :raises ConfigurationError: an item has a condition, which only one of the launch may.
     """
     others: list[Action] = []
-    entries: list[StreamTopic] = []
+    lists: dict[str, list[Any]] = {}
     for action in actions:
-        if not isinstance(action, StreamTopicEverywhere):
+        if not isinstance(action, Item):
             others.append(action)
         elif action.condition is None:
-            entries.append(action.entry)
+            lists.setdefault(action.keyword, []).append(action.item)
         else:
             raise ConfigurationError(
-                f'{values.describe(action.entry.topic)}: a stream of a node or a group takes no '
+                f'{action.item}: an element of {action.keyword} in a node or a group takes no '
                 'condition', 'set the condition of the node or the group')
-    return others, entries
+    return others, lists

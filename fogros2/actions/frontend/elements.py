@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Add machines, cloud nodes, cloud groups and streams to launch files of XML and YAML.
+Add machines, cloud nodes and cloud groups to launch files of XML and YAML.
 
 launch imports this module for every such file (``launch.frontend.launch_extension``), so the
 parsers are imported only when needed. doc/launch_xml_yaml.md describes all elements.
@@ -30,6 +30,5 @@ def _expose(name: str) -> None:
 
 
 hints.of_elements()
-for _name in ('fog_machine', 'cloud_node', 'cloud_group', 'replicated', 'stream_topic',
-              'fogros_launch'):
+for _name in ('fog_machine', 'cloud_node', 'cloud_group', 'replicated', 'fogros_launch'):
     _expose(_name)

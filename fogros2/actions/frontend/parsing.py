@@ -10,7 +10,7 @@ from launch.actions import GroupAction
 
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.fog_machine import FogMachine
-from fogros2.actions.frontend.actions import FogROSLaunch, instead_of, StreamTopicEverywhere
+from fogros2.actions.frontend.actions import FogROSLaunch, separate
 from fogros2.actions.frontend.entity import (
     attribute,
     children,
@@ -21,11 +21,10 @@ from fogros2.actions.frontend.entity import (
 )
 from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, LifecycleNode, Node
 from fogros2.actions.replicated import Replicated
-from fogros2.describe import keywords, kinds, values
+from fogros2.describe import features, keywords, kinds, values
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.host import docker_lines
 from fogros2.host.containers import described, parse
-from fogros2.image_transport.streams import StreamTopic
 from fogros2.launch_internals.parsers import scoped
 
 if TYPE_CHECKING:
@@ -40,7 +39,6 @@ _NODE = (
     'param', 'pkg', 'remap', 'respawn', 'respawn_delay', 'respawn_max_retries', 'ros_args',
     'shell', 'sigkill_timeout', 'sigterm_timeout')
 _GROUP = ('forwarding', 'keep', 'scoped')
-_STREAM = ('topic', 'transport', 'direction', 'source')
 
 
 def fog_machine(entity: Entity, parser: Parser) -> Parsed:
@@ -108,9 +106,11 @@ def node(entity: Entity, parser: Parser, cls: type[Node]) -> Parsed:
     contents = {name: value(entity, parser, keyword) for name, keyword in parameters.items()}
     kwargs.update({name: values.items(content) if name == 'image_options' else content
                    for name, content in contents.items() if content is not None})
-    streams = [stream_topic(child, parser)[1] for child in children(entity, 'stream_topic')]
-    _, kwargs['stream_topics'] = instead_of(StreamTopicEverywhere(**each) for each in streams)
-    complete(entity, ('machine', 'stream_topic', *parameters, *_NODE, *CONDITIONS))
+    items = features.node_lists().values()
+    _, lists = separate(
+        parser.parse_action(child) for item in items for child in children(entity, item))
+    kwargs.update(lists)
+    complete(entity, ('machine', *items, *parameters, *_NODE, *CONDITIONS))
     return cls, kwargs
 
 
@@ -131,8 +131,9 @@ def cloud_group(entity: Entity, parser: Parser) -> Parsed:
     """Read ``<cloud_group machine="planner">``, like ``<group>``."""
     _, kwargs = GroupAction.parse(entity, parser)
     kwargs['machine'] = _machine(entity, parser)
-    kwargs['actions'], kwargs['stream_topics'] = instead_of(kwargs['actions'])
-    complete(entity, ('machine', 'stream_topic', *_GROUP, *CONDITIONS))
+    kwargs['actions'], lists = separate(kwargs['actions'])
+    kwargs.update(lists)
+    complete(entity, ('machine', *features.node_lists().values(), *_GROUP, *CONDITIONS))
     return CloudGroup, kwargs
 
 
@@ -147,9 +148,9 @@ def replicated(entity: Entity, parser: Parser) -> Parsed:
         if content is not None:
             kwargs[name] = content
     kwargs.setdefault('machines', [])
-    kwargs['actions'], kwargs['stream_topics'] = instead_of(
-        parser.parse_action(child) for child in entity.children)
-    complete(entity, (*parameters, 'stream_topic', *CONDITIONS))
+    kwargs['actions'], lists = separate(map(parser.parse_action, entity.children))
+    kwargs.update(lists)
+    complete(entity, (*parameters, *features.node_lists().values(), *CONDITIONS))
     return Replicated, kwargs
 
 
@@ -161,30 +162,6 @@ def _machine(entity: Entity, parser: Parser) -> Any:
     return machine
 
 
-def stream_topic(entity: Entity, parser: Parser) -> Parsed:
-    """Read ``<stream_topic topic="/camera" transport="h264"><param name= value=/>``."""
-    _, kwargs = Action.parse(entity, parser)
-    topic: Any = attribute(entity, parser, 'topic')
-    if not topic:
-        raise ConfigurationError('a stream_topic needs a topic', 'topic="/camera"')
-    parameters: dict[str, Any] = {}
-    for child in children(entity, 'param'):
-        name = attribute(child, parser, 'name')
-        content = value(child, parser, kinds.Keyword('value', 'scalar'))
-        complete(child, ('name', 'value'))
-        if not name or not isinstance(name, str) or content is None or name in _STREAM:
-            raise ConfigurationError('a param of a stream_topic takes a name, written out, and a '
-                                     'value', '<param name="bitrate" value="2000000"/>')
-        parameters[name] = content
-    attributes: dict[str, Any] = {
-        name: attribute(entity, parser, name) for name in _STREAM if name != 'topic'}
-    complete(entity, ('param', *_STREAM, *CONDITIONS))
-    kwargs['entry'] = StreamTopic(
-        topic, **{name: content for name, content in attributes.items() if content is not None},
-        **parameters)
-    return StreamTopicEverywhere, kwargs
-
-
 def fogros_launch(entity: Entity, parser: Parser) -> Parsed:
     """Read ``<fogros_launch robot_nodes="after_cloud" dds="fastdds">`` with its content."""
     _, kwargs = Action.parse(entity, parser)
@@ -193,7 +170,7 @@ def fogros_launch(entity: Entity, parser: Parser) -> Parsed:
         if value is not None:
             kwargs[name] = text(parser, value)
     below = scoped(parser, _node_with_machine)
-    kwargs['actions'], kwargs['stream_topics'] = instead_of(
-        below.parse_action(child) for child in entity.children)
+    kwargs['actions'], lists = separate(map(below.parse_action, entity.children))
+    kwargs.update(lists)
     complete(entity, ('robot_nodes', 'dds', *CONDITIONS))
     return FogROSLaunch, kwargs

@@ -13,34 +13,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 import json
-import re
 import shlex
 from typing import Any, Optional
 
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.host import modules
-from fogros2.model import NodeSpec, Stream
+from fogros2.model import NodeSpec
+from fogros2.ros_names import check_name, identifier, local_topic
+from fogros2_features.streams.transport import Stream
 
-#: The full name of a topic or a service.
-TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 #: Options of a Stream that are parameters of the decoder, not of the encoder.
 DECODER_PARAMETERS = ('show_damage', 'encoding')
-#: Suffix that FogROS2 appends to the name of a streamed topic on machines.
-_CLOUD = '/cloud'
 #: Options of all streams that use this project's nodes.
 OPTIONS = frozenset({'camera_info', 'priority', *DECODER_PARAMETERS})
-
-
-def check_name(topic: str) -> str:
-    """
-    Check that ``topic`` is the full name of a topic; return it.
-
-    :raises ConfigurationError: it is not.
-    """
-    if not TOPIC.fullmatch(topic) or '__' in topic:
-        raise ConfigurationError(f"'{topic}' is not the full name of a topic",
-                                 "write it as ros2 topic list does, such as '/camera/image_raw'")
-    return topic
 
 
 def check(stream: Stream) -> None:
@@ -59,13 +44,6 @@ def check(stream: Stream) -> None:
         where = stream.source or 'the robot'
         raise ConfigurationError(f'{stream.topic} would be streamed from {where} to itself',
                                  'source= names another machine; leave it out for the robot')
-
-
-def local_topic(topic: str, machine: Optional[str]) -> str:
-    """Return a topic's name on a host: its own name on the robot (None)."""
-    if machine is None:
-        return topic
-    return f'/fogros2/{identifier(machine)}{topic}'
 
 
 def camera_info_topic(topic: str) -> str:
@@ -135,37 +113,6 @@ def remappings(
     return names
 
 
-def rewrite(
-    pairs: Iterable[tuple[str, str]], names: Mapping[str, str], namespace: str = '/',
-) -> list[tuple[str, str]]:
-    """
-    Rewrite a node's remappings so that they lead to the new names.
-
-    ROS applies only one rule to a name, so ``image:=/camera`` has to name the new place of
-    ``/camera``. Rules for nodes that use the topic's own name follow at the end, because the
-    first matching rule wins. A rule that leads to ``/camera/cloud`` means the machine's side of
-    ``/camera``, as in FogROS2's README.
-
-    :param pairs: the node's rules, in order: from its group, SetRemap, or itself.
-    :param names: see ``remappings``.
-    :param namespace: the node's namespace, for relative names.
-    """
-    def renamed(name: str) -> str:
-        full = absolute(name, namespace)
-        return names.get(full) or names.get(full.removesuffix(_CLOUD), name)
-
-    changed = [(old, renamed(new)) for old, new in pairs]
-    old_names = {absolute(old, namespace) for old, _ in pairs}
-    return [*changed, *((old, new) for old, new in names.items() if old not in old_names)]
-
-
-def absolute(name: str, namespace: str) -> str:
-    """Return a topic's full name; private names (``~/x``) are unchanged."""
-    if name.startswith(('/', '~', 'rostopic://', 'rosservice://')):
-        return name
-    return f"/{namespace.strip('/')}/{name}".replace('//', '/')
-
-
 def node(
     stream: Stream, *, role: str, name: str, package: str, topic: str,
     options: Iterable[str], parameters: Mapping[str, Any],
@@ -198,12 +145,6 @@ def node(
     return NodeSpec(
         id=f"{machine or 'robot'}/{label}", name=label, package=package,
         executable=role, arguments=tuple(words), respawn=True, respawn_delay=1.0)
-
-
-def identifier(text: str) -> str:
-    """Convert a name to a part of a ROS name: letters, digits, underscores, no leading digit."""
-    plain = re.sub('_+', '_', re.sub('[^A-Za-z0-9]', '_', text)).strip('_')
-    return plain if plain[:1].isalpha() else f'm_{plain}'
 
 
 def _yaml(key: str, value: Any) -> str:

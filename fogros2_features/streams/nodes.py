@@ -12,15 +12,15 @@ from typing import ClassVar
 
 from fogros2.errors import ConfigurationError
 from fogros2.host import modules
-from fogros2.image_transport import ImageTransport
-from fogros2.image_transport.topics import (
+from fogros2.model import NodeSpec
+from fogros2_features.streams.topics import (
     carries_info,
     check_modules,
     DECODER_PARAMETERS,
     node,
     OPTIONS,
 )
-from fogros2.model import NodeSpec, Stream
+from fogros2_features.streams.transport import ImageTransport, Stream
 
 
 class Raw(ImageTransport):

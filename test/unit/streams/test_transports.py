@@ -6,10 +6,11 @@ from __future__ import annotations
 import pytest
 
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport.nodes import Compressed, H264, PointCloud, Raw
-from fogros2.image_transport.republish import Draco, Theora
-from fogros2.image_transport.topics import identifier, local_topic, remappings, rewrite
-from fogros2.model import Stream, to_json
+from fogros2.model import to_json
+from fogros2_features.streams.nodes import Compressed, H264, PointCloud, Raw
+from fogros2_features.streams.republish import Draco, Theora
+from fogros2_features.streams.topics import remappings
+from fogros2_features.streams.transport import Stream
 
 TO_CLOUD = Stream('/front/image_raw', 'h264', target='planner-1',
                   options={'bitrate': 2_000_000, 'quality': 21.5, 'lossless': False,
@@ -134,12 +135,6 @@ def test_an_unknown_format_is_refused() -> None:
         Compressed().encoder(Stream('/c', 'compressed', target='m', options={'format': 'webp'}))
 
 
-def test_names_on_a_machine() -> None:
-    assert local_topic('/camera', None) == '/camera'
-    assert local_topic('/a/b', 'my-cloud') == '/fogros2/my_cloud/a/b'
-    assert identifier('2nd--machine') == 'm_2nd_machine'
-
-
 def test_remappings_are_of_the_machines_that_take_part() -> None:
     streams = [(one, True) for one in (
         TO_CLOUD, FROM_CLOUD, Stream('/other', 'h264', target='elsewhere'))]
@@ -156,30 +151,3 @@ def test_camera_info_comes_back_only_when_asked_for() -> None:
     asked = Stream('/left/annotated', 'h264', source='m', options={'camera_info': True})
     assert words(H264().encoder(asked).arguments)['camera_info'] == 'true'
     assert remappings([(asked, True)], 'm')['/left/camera_info'] == '/fogros2/m/left/camera_info'
-
-
-@pytest.mark.parametrize(('own', 'namespace', 'expected'), [
-    ([], '/', [('/camera', '/f/camera')]),
-    # a user's rule leads to the topic: it leads to the new name instead
-    ([('image', '/camera')], '/', [('image', '/f/camera'), ('/camera', '/f/camera')]),
-    ([('image', 'camera')], '/', [('image', '/f/camera'), ('/camera', '/f/camera')]),
-    # in a namespace, the relative name is another topic
-    ([('image', 'camera')], '/left', [('image', 'camera'), ('/camera', '/f/camera')]),
-    # FogROS2's name for the topic on a machine
-    ([('image', '/camera/cloud')], '/', [('image', '/f/camera'), ('/camera', '/f/camera')]),
-    ([('/camera', 'camera/cloud')], '/', [('/camera', '/f/camera')]),
-    ([('image', '/lidar/cloud')], '/', [('image', '/lidar/cloud'), ('/camera', '/f/camera')]),
-    # the user has led the topic elsewhere: that stands
-    ([('/camera', '/other')], '/', [('/camera', '/other')]),
-    ([('camera', 'other')], '/', [('camera', 'other')]),
-    ([('__node', 'x')], '/', [('__node', 'x'), ('/camera', '/f/camera')]),
-])
-def test_rules_do_not_chain_so_they_are_rewritten(
-    own: list[tuple[str, str]], namespace: str, expected: list[tuple[str, str]],
-) -> None:
-    assert rewrite(own, {'/camera': '/f/camera'}, namespace) == expected
-
-
-def test_a_streamed_topic_that_ends_in_cloud_keeps_its_name() -> None:
-    names = {'/camera': '/f/camera', '/camera/cloud': '/f/camera/cloud'}
-    assert rewrite([('image', '/camera/cloud')], names)[0] == ('image', '/f/camera/cloud')

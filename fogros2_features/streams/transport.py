@@ -4,9 +4,35 @@
 from __future__ import annotations
 
 import abc
-from typing import ClassVar, Optional
+from collections.abc import Mapping
+import dataclasses
+from typing import Any, ClassVar, Optional
 
-from fogros2.model import NodeSpec, Stream
+from fogros2.model import NodeSpec
+
+#: The group of entry points.
+GROUP = 'fogros2.image_transport'
+
+
+@dataclasses.dataclass(frozen=True)
+class Stream:
+    """
+    A topic that crosses the VPN encoded.
+
+    :param topic: full topic name, which publisher and subscriber use.
+    :param transport: name of an entry point in the group ``fogros2.image_transport``.
+    :param source: machine name of the publisher's side, None for the robot.
+    :param target: machine name of the subscriber's side, None for the robot.
+    :param links: topics of the links with a limited bandwidth that it crosses, and their bits per
+        second.
+    """
+
+    topic: str
+    transport: str
+    source: Optional[str] = None
+    target: Optional[str] = None
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    links: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
 class ImageTransport(abc.ABC):

@@ -10,8 +10,8 @@ import pytest
 
 from fogros2.errors import Cancelled, DeadlineExceeded
 from fogros2.model import NodeSpec
-from fogros2.runtime import uncompressed
 from fogros2.runtime.node_spec import full_name
+from fogros2_features.streams import uncompressed
 
 INTERVAL = 5.0
 

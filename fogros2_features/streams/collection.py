@@ -3,30 +3,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 import dataclasses
 from typing import Any, Optional, TYPE_CHECKING
 
 from fogros2.describe import keywords, kinds, values
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport import streams, topics
-from fogros2.image_transport.streams import Entry, StreamTopic
-from fogros2.image_transport.topics import absolute, rewrite
-from fogros2.model import NodeSpec, Stream, Text
+from fogros2.model import NodeSpec
+from fogros2.ros_names import absolute, local_topic
+from fogros2_features.streams import entries as streams
+from fogros2_features.streams import topics
+from fogros2_features.streams.entries import Entry, StreamTopic
+from fogros2_features.streams.transport import Stream
 
 if TYPE_CHECKING:
     from launch import LaunchContext
-
-
-_RULE = ('-r', '--remap')
-_NAMESPACE = '__ns:='
 
 
 def check(entries: Iterable[Entry]) -> None:
     """
     Check entries, as far as they are plain texts already.
 
-    :raises ConfigurationError: see :func:`fogros2.image_transport.streams.stream`.
+    :raises ConfigurationError: see :func:`fogros2_features.streams.entries.stream`.
     """
     for entry in map(streams.topic_of, entries):
         if all(isinstance(part, str) for part in (entry.topic, entry.transport, entry.direction)):
@@ -71,7 +69,7 @@ class Streams:
 
         :return: the nodes that these streams need and no earlier stream did, each with the machine
             that it runs on, None for the robot.
-        :raises ConfigurationError: see :mod:`fogros2.image_transport.streams`; or images would
+        :raises ConfigurationError: see :mod:`fogros2_features.streams.entries`; or images would
             return to their source, or reach a host in two ways. Nothing is added then.
         """
         several = list(self._streams)
@@ -125,7 +123,7 @@ class Streams:
     def _linked(self, one: Stream) -> Stream:
         """Return the stream with the limited links that it crosses."""
         return dataclasses.replace(one, links={
-            topics.local_topic(f'/link_{way}', machine): bits
+            local_topic(f'/link_{way}', machine): bits
             for machine, way in ((one.source, 'out'), (one.target, 'in'))
             if machine is not None and (bits := self.bandwidths.get(machine))})
 
@@ -143,44 +141,6 @@ class Streams:
     def remappings(self, machine: str) -> dict[str, str]:
         """Return the new names of streamed topics for nodes on a machine."""
         return streams.remappings(self._streams, machine)
-
-
-def remapped(node: NodeSpec, names: Mapping[str, str]) -> NodeSpec:
-    """
-    Rename topics for a process, even if it remaps them itself.
-
-    A program without ROS arguments is returned unchanged.
-
-    :param names: new topic names by full old names.
-    """
-    arguments = node.arguments
-    if not names or '--ros-args' not in arguments:
-        return node
-    indices: list[int] = []
-    namespace = '/'
-    ours = False
-    for index, argument in enumerate(arguments):
-        if argument in ('--ros-args', '--'):
-            ours = argument == '--ros-args'
-        elif ours and isinstance(argument, str) and ':=' in argument and index and (
-                arguments[index - 1] in _RULE):
-            if argument.startswith(_NAMESPACE):
-                namespace = argument[len(_NAMESPACE):]
-            elif not argument.startswith('__') and ':__' not in argument.partition(':=')[0]:
-                indices.append(index)
-    pairs: list[tuple[str, str]] = []
-    for index in indices:
-        rule = arguments[index]
-        assert isinstance(rule, str)
-        old, _, new = rule.partition(':=')
-        pairs.append((old, new))
-    rules = [f'{old}:={new}' for old, new in rewrite(pairs, names, namespace)]
-    rewritten: list[Text] = list(arguments)
-    for index, rule in zip(indices, rules):
-        rewritten[index] = rule
-    more = [argument for rule in rules[len(indices):] for argument in ('-r', rule)]
-    return dataclasses.replace(
-        node, arguments=(*rewritten, *(('--ros-args', *more) if more else ())))
 
 
 def _compare(one: Stream, other: Stream) -> None:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Remappings of nodes whose topics are streamed, and streams that contradict each other."""
+"""The streams of a launch, and streams that contradict each other."""
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import pytest
@@ -14,14 +13,11 @@ from launch.substitutions import LaunchConfiguration
 
 from fogros2 import plugin_system, StreamTopic
 from fogros2.errors import ConfigurationError
-from fogros2.image_transport.nodes import Compressed, H264
 from fogros2.model import NodeSpec
-from fogros2.runtime import streaming
+from fogros2_features.streams import collection
+from fogros2_features.streams.nodes import Compressed, H264
 
 PLUGINS: dict[str, Any] = {'h264': H264, 'compressed': Compressed}
-NAMES = {'/camera': '/fogros2/m/camera', '/arm/camera': '/fogros2/m/arm/camera'}
-OURS = ('--ros-args', '-r', '/camera:=/fogros2/m/camera',
-        '-r', '/arm/camera:=/fogros2/m/arm/camera')
 
 
 @pytest.fixture(autouse=True)
@@ -31,57 +27,8 @@ def plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plugin_system, 'load', lambda group, name: PLUGINS[name])
 
 
-def remapped(*arguments: Any) -> tuple[Any, ...]:
-    node = NodeSpec('id', 'name', 'p', 'e', arguments)
-    result = streaming.remapped(node, NAMES)
-    assert dataclasses.replace(result, arguments=arguments) == node
-    return result.arguments
-
-
-def test_topics_of_their_own_name() -> None:
-    assert remapped('--ros-args') == ('--ros-args', *OURS)
-
-
-def test_programs_that_are_no_nodes() -> None:
-    for arguments in ((), ('sleep', '60'), ('-r', 'image:=/camera')):
-        assert remapped(*arguments) == arguments
-
-
-def test_what_the_user_remapped_is_rewritten_in_its_place() -> None:
-    assert remapped('--ros-args', '-r', 'image:=/camera', '--remap', 'x:=/y') == (
-        '--ros-args', '-r', 'image:=/fogros2/m/camera', '--remap', 'x:=/y', *OURS)
-
-
-def test_relative_names_are_in_the_node_s_namespace() -> None:
-    assert remapped('--ros-args', '-r', '__ns:=/arm', '-r', 'image:=camera', '-r', 'x:=/camera') \
-        == ('--ros-args', '-r', '__ns:=/arm', '-r', 'image:=/fogros2/m/arm/camera',
-            '-r', 'x:=/fogros2/m/camera', *OURS)
-    # the namespace counts wherever it stands
-    assert remapped('--ros-args', '-r', 'image:=camera', '-r', '__ns:=/arm')[2] == (
-        'image:=/fogros2/m/arm/camera')
-
-
-def test_a_topic_that_the_node_calls_otherwise_already_stays_so() -> None:
-    assert remapped('--ros-args', '-r', '/camera:=/other') == (
-        '--ros-args', '-r', '/camera:=/other', '--ros-args', '-r',
-        '/arm/camera:=/fogros2/m/arm/camera')
-    assert remapped('--ros-args', '-r', '__ns:=/arm', '-r', 'camera:=/other')[-1] == (
-        '/camera:=/fogros2/m/camera')
-
-
-def test_what_is_no_remapping_stays() -> None:
-    words = ('-r', 'a:=/camera', '--ros-args', '-r', '__node:=camera', '-p', 'topic:=/camera',
-             '--params-file', ({'file': '0-x.yaml'},), '--', '-r', 'b:=/camera')
-    assert remapped(*words) == (*words, *OURS)
-
-
-def test_a_rule_for_one_node_of_several() -> None:
-    assert remapped('--ros-args', '-r', 'one:image:=/camera')[2] == (
-        'one:image:=/fogros2/m/camera')
-
-
 def test_nodes_are_handed_out_once() -> None:
-    streams = streaming.Streams()
+    streams = collection.Streams()
     names = [(machine, spec.name) for machine, spec in streams.add([('/camera', 'h264')], 'a')]
     assert names == [(None, 'camera_h264_encoder'), ('a', 'camera_h264_decoder')]
     assert streams.add([('/camera', 'h264')], 'a') == []
@@ -103,7 +50,7 @@ def test_nodes_are_handed_out_once() -> None:
 def test_streams_that_contradict_each_other(
     first: Any, second: Any, machine: str, said: str,
 ) -> None:
-    streams = streaming.Streams()
+    streams = collection.Streams()
     streams.add([first], 'one')
     with pytest.raises(ConfigurationError, match=said):
         streams.add([second], machine)
@@ -112,7 +59,7 @@ def test_streams_that_contradict_each_other(
 
 
 def test_the_robot_stands_for_a_machine_that_is_taken_away() -> None:
-    streams = streaming.Streams()
+    streams = collection.Streams()
     streams.add([('/a', 'h264'), StreamTopic('/back', 'h264', 'to_robot'),
                  StreamTopic('/map', 'h264', source='other', camera_info=True)], 'gone')
     streams.add([('/a', 'h264'), StreamTopic('/seen', 'h264', source='gone')], 'other')
@@ -134,7 +81,7 @@ def test_the_robot_stands_for_a_machine_that_is_taken_away() -> None:
 
 
 def test_stream_with_another_transport_is_not_reused() -> None:
-    streams = streaming.Streams()
+    streams = collection.Streams()
     streams.add([StreamTopic('/a', 'h264', source='gone')], 'other')
     streams.add([StreamTopic('/a', 'h264', bitrate=1_000_000)], 'third')
     ended, new, left = streams.take_over('gone')
@@ -148,8 +95,8 @@ def test_entries_are_resolved_when_executed() -> None:
         (LaunchConfiguration('topic'), LaunchConfiguration('transport')),
         StreamTopic('/b', LaunchConfiguration('transport'),  # type: ignore[arg-type]
                     bitrate=LaunchConfiguration('rate'), lossless=True, preset='fast')]
-    streaming.check(entries)  # type: ignore[arg-type]
-    assert streaming.resolve(context, entries, '/arm', lambda _: None) == [  # type: ignore[arg-type]
+    collection.check(entries)  # type: ignore[arg-type]
+    assert collection.resolve(context, entries, '/arm', lambda _: None) == [  # type: ignore[arg-type]
         StreamTopic('/arm/camera', 'h264'),
         StreamTopic('/b', 'h264', bitrate=1_000_000, lossless=True, preset='fast')]
 
@@ -160,7 +107,7 @@ def test_entries_are_resolved_when_executed() -> None:
 def test_substituted_parameter_has_the_type_that_rcl_gives(text: str, value: Any) -> None:
     context = LaunchContext()
     context.launch_configurations['p'] = text
-    [entry] = streaming.resolve(
+    [entry] = collection.resolve(
         context, [StreamTopic('/b', 'h264', p=LaunchConfiguration('p'))], '/', lambda _: None)
     assert (entry.parameters['p'], type(entry.parameters['p'])) == (value, type(value))
 
@@ -169,13 +116,13 @@ def test_substituted_parameter_has_the_type_that_rcl_gives(text: str, value: Any
                                    StreamTopic('/camera', 'h264', 'up')])  # type: ignore
 def test_plain_nonsense_is_found_at_once(entry: Any) -> None:
     with pytest.raises(ConfigurationError):
-        streaming.check([entry])
+        collection.check([entry])
 
 
 @pytest.mark.parametrize('priority', [0, -1, 101, float('nan'), 'high'])
 def test_invalid_priority_is_found_at_once(priority: Any) -> None:
     with pytest.raises(ConfigurationError, match='priority'):
-        streaming.check([StreamTopic('/camera', priority=priority)])
+        collection.check([StreamTopic('/camera', priority=priority)])
 
 
 def parameters(node: NodeSpec) -> list[str]:
@@ -185,7 +132,7 @@ def parameters(node: NodeSpec) -> list[str]:
 
 def test_decoder_knows_the_links_that_have_a_bandwidth() -> None:
     """The encoder is the same for all machines, so only decoders differ."""
-    several = streaming.Streams()
+    several = collection.Streams()
     several.bandwidths.update({'m': 10e6, 'n': 5e6, 'other': 0.0})
     found = {(host, node.name): parameters(node) for host, node in [
         *several.add([StreamTopic('/camera', priority=2)], 'm'),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes that FogROS2 adds to a launch: republishers of streams, helpers of machines."""
+"""A process that FogROS2 adds to a launch: a helper of a machine, a program of a feature."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _PACKAGE_PATHS = {'share': FindPackageShare, 'prefix': FindPackagePrefix}
 
 class AddedProcess(ExecuteProcess):
     """
-    A process that FogROS2 adds to the launch, such as an encoder of a stream.
+    A process that FogROS2 adds to the launch.
 
     It is a process action and not a :class:`launch_ros.actions.Node`: the namespaces, remappings
     and parameters that a group sets for its nodes must not change it.
@@ -60,7 +60,7 @@ def _substitutions(text: Text) -> list[Substitution]:
         (kind, package), = part.items()
         if kind not in _PACKAGE_PATHS:
             raise ConfigurationError(
-                f"an image transport's node uses a {kind}, which can't be sent to a machine",
+                f"a program of a feature uses a {kind}, which can't be sent to a machine",
                 'pass its settings as parameters')
         substitutions.append(_PACKAGE_PATHS[kind](package))
     return substitutions

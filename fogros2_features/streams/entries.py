@@ -8,12 +8,13 @@ import dataclasses
 from typing import Any, Literal, Optional, Union
 
 from fogros2 import plugin_system
+from fogros2.describe import values
 from fogros2.errors import ConfigurationError, did_you_mean
-from fogros2.image_transport import ImageTransport, topics
-from fogros2.image_transport.topics import camera_info_topic, carries_info, check
-from fogros2.model import NodeSpec, Stream
+from fogros2.model import NodeSpec
+from fogros2_features.streams import topics
+from fogros2_features.streams.topics import camera_info_topic, carries_info, check
+from fogros2_features.streams.transport import GROUP, ImageTransport, Stream
 
-GROUP = 'fogros2.image_transport'
 Direction = Literal['to_cloud', 'to_robot']
 
 
@@ -21,6 +22,10 @@ Direction = Literal['to_cloud', 'to_robot']
 class StreamTopic:
     """
     A topic that crosses the VPN encoded.
+
+    ``stream_topics=`` of nodes with a machine, of CloudGroup and of Replicated takes a list of
+    them. A pair ``(topic, transport)`` is one that the robot publishes and the machine reads.
+    Those of a FogROSLaunchDescription are between the robot and every machine of the launch.
 
     ::
 
@@ -49,6 +54,9 @@ class StreamTopic:
         for name, value in (('topic', topic), ('transport', transport), ('source', source),
                             ('direction', direction), ('parameters', parameters)):
             object.__setattr__(self, name, value)
+
+    def __str__(self) -> str:
+        return values.describe(self.topic)
 
     def but(self, **changes: Any) -> StreamTopic:
         """Return the topic with other values."""

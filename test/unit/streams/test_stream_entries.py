@@ -11,10 +11,10 @@ import pytest
 
 from fogros2 import plugin_system
 from fogros2.errors import ConfigurationError, PrerequisiteError
-from fogros2.image_transport.nodes import Compressed, H264
-from fogros2.image_transport.republish import Theora
-from fogros2.image_transport.streams import nodes, remappings, stream, StreamTopic
-from fogros2.model import Stream
+from fogros2_features.streams.entries import nodes, remappings, stream, StreamTopic
+from fogros2_features.streams.nodes import Compressed, H264
+from fogros2_features.streams.republish import Theora
+from fogros2_features.streams.transport import Stream
 
 PLUGINS: dict[str, Any] = {'h264': H264, 'compressed': Compressed, 'theora': Theora}
 
@@ -161,7 +161,7 @@ def test_an_unknown_parameter_gets_the_nearest_name(entry, said):
 
 def test_parameters_are_those_that_the_nodes_declare():
     pytest.importorskip('rclpy', reason='rclpy is not installed')
-    from fogros2.image_transport.nodes import H264
-    from fogros2.image_transport.topics import OPTIONS
+    from fogros2_features.streams.nodes import H264
+    from fogros2_features.streams.topics import OPTIONS
     from image_transport_h264.senders import PARAMETERS
     assert H264.options == OPTIONS | {name for name, _, _ in PARAMETERS}

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import ClassVar, Optional
 
 from fogros2.errors import PrerequisiteError
-from fogros2.image_transport import ImageTransport
-from fogros2.image_transport.topics import check, local_topic, names_of
-from fogros2.model import NodeSpec, Stream
+from fogros2.model import NodeSpec
+from fogros2.ros_names import local_topic
+from fogros2_features.streams.topics import check, names_of
+from fogros2_features.streams.transport import ImageTransport, Stream
 
 
 class Republish(ImageTransport):
