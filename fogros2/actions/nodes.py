@@ -60,10 +60,11 @@ class Node(launch_ros.actions.Node):
                 "such as image='ros:jazzy-perception', image_options=['--gpus=all']")
         if machine is None:
             needing = {'image': image, 'checkpoint': checkpoint, **self.lists}
-            for keyword in (name for name, value in needing.items() if value is not None):
-                raise ConfigurationError(
-                    f'{keyword}= of a node is for a machine, and this node has none',
-                    f'add machine=, or leave {keyword}= out')
+            for keyword, value in needing.items():
+                if value is not None:
+                    raise ConfigurationError(
+                        f'{keyword}= of a node is for a machine, and this node has none',
+                        f'add machine=, or leave {keyword}= out')
             return
         self._image = image
         self._checkpoint = checkpoint

@@ -79,7 +79,7 @@ def first_answer(
     Return the process that serves the public names, from when the first machine is up.
 
     :param folder: the launch's folder, for figures of the replicas.
-    :param topics: input, output, and whether the input is a stream.
+    :param topics: input, output, and whether a feature brings the input to the machines.
     :param deadline: seconds after which the robot's own replica is asked, None without it.
     """
     label = f'first_answer_{names.identifier([*services, *(pair[1] for pair in topics)][0])}'

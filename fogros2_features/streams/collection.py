@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Collect the streams of a launch, and remap the topics of nodes that use them."""
+"""Collect the streams of a launch, and their nodes."""
 
 from __future__ import annotations
 
