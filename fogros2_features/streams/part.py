@@ -115,8 +115,10 @@ class Part(LaunchPart):
 
     def topics(self, own: Sequence[StreamTopic]) -> dict[str, bool]:
         """Return the streamed topics, and whether the robot publishes each."""
-        return {entry.topic: entry.direction == 'to_cloud' and entry.source is None
-                for entry in self._all(own)}
+        entries = self._all(own)
+        here = {entry.topic for entry in entries
+                if entry.direction == 'to_cloud' and entry.source is None}
+        return {entry.topic: entry.topic in here for entry in entries}
 
     def moved(self, machine: str) -> tuple[list[str], list[Program]]:
         """Let the robot take the machine's place in streams."""
