@@ -9,7 +9,7 @@ from typing import Any, Optional, TYPE_CHECKING, Union
 from launch import LaunchContext, LaunchDescriptionEntity
 import launch_ros.actions
 
-from fogros2.describe import keywords, values
+from fogros2.describe import features, keywords, values
 from fogros2.describe.machines import checked, CloudInstance
 from fogros2.errors import ConfigurationError
 from fogros2.host import containers
@@ -39,8 +39,7 @@ class Node(launch_ros.actions.Node):
         'ros:jazzy-perception', with the machine's network, DDS configuration and workspace.
     :param image_options: more options for ``docker run``, such as ['--gpus=all']; a substitution
         separates them by commas.
-    :param checkpoint: folder of the node on the machine, such as '$HOME/map', that a replacement
-        of the machine takes over; see ``checkpoint`` of machines.
+    :param kwargs: also keywords of features, see doc/developers/features.md.
     :raises ConfigurationError: ``machine`` is no machine, or another option needs one.
     """
 
@@ -51,8 +50,10 @@ class Node(launch_ros.actions.Node):
         self, *, machine: Optional[SomeMachine] = None, stream_topics: Sequence[Entry] = (),
         image: Optional[SomeSubstitutionsType] = None,
         image_options: Union[Sequence[SomeSubstitutionsType], Substitution] = (),
-        checkpoint: Optional[SomeSubstitutionsType] = None, **kwargs: Any,
+        **kwargs: Any,
     ) -> None:
+        own = {name: kwargs.pop(name) for name in features.keywords('node_options')
+               if name in kwargs}
         with keywords.refused(type(self)):
             super().__init__(**kwargs)
         if isinstance(image_options, str) or image_options and image is None:
@@ -60,16 +61,15 @@ class Node(launch_ros.actions.Node):
                 f'image_options={image_options!r} is no list of options for an image',
                 "such as image='ros:jazzy-perception', image_options=['--gpus=all']")
         if machine is None:
-            keyword = ('image' if image is not None else 'checkpoint' if checkpoint is not None
-                       else 'stream_topics')
-            if image is not None or checkpoint is not None or stream_topics:
+            keyword = 'image' if image is not None else next(iter(own), 'stream_topics')
+            if image is not None or own or stream_topics:
                 raise ConfigurationError(
                     f'{keyword}= of a node is for a machine, and this node has none',
                     f'add machine=, or leave {keyword}= out')
             return
         self.stream_topics = list(stream_topics)
         self._image = image
-        self._checkpoint = checkpoint
+        self._features = features.own(own, 'node_options')
         self._image_options = values.items(image_options)
         if image is not None and isinstance(machine, CloudInstance):
             machine.takes_containers()
@@ -81,6 +81,10 @@ class Node(launch_ros.actions.Node):
         remote = self._remote
         if remote is not None and self._image is not None:
             self._use_image(context, remote)
+        if remote is not None:
+            remote.features = features.by_feature({
+                name: values.resolve(context, value) for name, value in self._features.items()},
+                'node_options')
         super().prepare(context)
         if remote is not None:
             namespace = self.expanded_node_namespace
@@ -88,7 +92,6 @@ class Node(launch_ros.actions.Node):
                 namespace = '/'
             remote.streams = Coordinator.of(context).resolve_streams(
                 self.stream_topics, namespace)
-            remote.add_checkpoint(values.resolve(context, self._checkpoint))
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Execute the action; components that it loads use the topic names of its machine."""

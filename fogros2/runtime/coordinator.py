@@ -28,20 +28,20 @@ from launch.actions import (
     ResetEnvironment,
 )
 from launch.event_handlers import OnShutdown
+from launch.events.process import ShutdownProcess
 import launch.logging
 from launch.substitutions import SubstitutionFailure
 
+from fogros2 import feature
 from fogros2.describe import defaults, values
 from fogros2.describe.keywords import ROBOT
 from fogros2.describe.machines import CloudInstance
 from fogros2.errors import Cancelled, ConfigurationError, did_you_mean, FogError
 from fogros2.launch_internals import private
 from fogros2.model import NodeSpec
-from fogros2.runtime import cost, interruption, republishers, signals, streaming, uncompressed
-from fogros2.runtime.checkpoints import Checkpoints
+from fogros2.runtime import cost, republishers, signals, streaming, uncompressed
 from fogros2.runtime.console import Console
 from fogros2.runtime.interruption import MachineInterrupted
-from fogros2.runtime.replacer import Replacer
 from fogros2.runtime.session import Session
 
 if TYPE_CHECKING:
@@ -139,6 +139,11 @@ class Coordinator:
         return cls(context) if known is None else known
 
     # -- what actions call ----------------------------------------------------------------------
+
+    @property
+    def context(self) -> LaunchContext:
+        """The context in which launch runs."""
+        return self._context
 
     @property
     def launch(self) -> Launch:
@@ -305,23 +310,12 @@ class Coordinator:
         self._instances[spec.name] = machine
         session = self._sessions.get(spec.name)
         if session is None:
-            session = Session(
+            make = next((made for each, own in feature.used(spec)
+                         if (made := each.session(own)) is not None), Session)
+            session = make(
                 spec, self._context.asyncio_loop, in_thread=self._in_thread, fail=self._fail,
                 changed=self._open_gate, preempted=self._preempted,
-                busy=functools.partial(private.waiting_events, self._context))
-            if spec.on_interrupt == 'replace':
-                session.replacer = Replacer(
-                    session, self.launch, self._context.asyncio_loop, in_thread=self._in_thread,
-                    fail=self._fail, is_over=lambda: self._context.is_shutdown,
-                    logger=self._logger)
-                session.checkpoints = Checkpoints(
-                    session, self._context, self.launch.checkpoints(spec.name),
-                    f'.before-{self.launch.id}', self._cancel, in_thread=self._in_thread,
-                    logger=self._logger)
-            elif spec.checkpoint:
-                raise ConfigurationError(
-                    f"'{spec.name}' has a checkpoint, and nothing would restore it",
-                    "add on_interrupt='replace', or leave checkpoint= out")
+                busy=functools.partial(private.waiting_events, self._context), robot=self)
             if spec.share and any(one.spec.share for one in self._sessions.values()):
                 # two relays would send each other's messages round and round
                 raise ConfigurationError(
@@ -515,7 +509,7 @@ class Coordinator:
         if not self._new and all(session.ready for session in self._sessions.values()):
             self.gate.set_result(True)
 
-    # -- a machine is preempted -----------------------------------------------------------------
+    # -- a machine is lost -----------------------------------------------------------------
 
     def _preempted(self, session: Session, reason: str) -> None:
         if not self._context.is_shutdown:
@@ -523,11 +517,25 @@ class Coordinator:
                 MachineInterrupted(session.spec.name, reason, session.lost))
 
     def _on_interrupted(self, context: LaunchContext) -> list[Action]:
-        session = self._sessions.get(context.locals.event.machine)
+        event = context.locals.event
+        session = self._sessions.get(event.machine)
         if session is None or context.is_shutdown:
             return []
-        new = interruption.react(
-            context.locals.event, session, self._streams, context, self._logger)
+        return session.go_on(event)
+
+    def stream_here(self, machine: str) -> list[Action]:
+        """
+        Replace a machine by the robot in all streams, because its nodes move there.
+
+        :returns: nodes of streams to start.
+        """
+        ended, new, lost = self._streams.take_over(machine)
+        for node in ended:
+            self._context.emit_event_sync(
+                ShutdownProcess(process_matcher=functools.partial(_runs, node)))
+        if lost:
+            self._logger.warning(f"{', '.join(lost)} of '{machine}' no longer reaches other "
+                                 'machines: the robot streams it in another way')
         self._rename_topics()
         return [
             republishers.AddedProcess(spec) if name is None else
@@ -589,6 +597,10 @@ async def _all_done(futures: set[Optional[asyncio.Future[Any]]]) -> None:
 
 def _is(kind: type[Event], event: Event) -> bool:
     return isinstance(event, kind)
+
+
+def _runs(node: str, action: ExecuteLocal) -> bool:
+    return isinstance(action, republishers.AddedProcess) and action.node == node
 
 
 def _make_launch(**arguments: Any) -> Launch:

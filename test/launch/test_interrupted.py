@@ -34,7 +34,7 @@ from fogros2 import (
     StreamTopic,
 )
 from fogros2.errors import AgentError, ProviderError
-from fogros2.runtime import session
+from fogros2_features.replacement import session
 from fogros2_testing.plugins import instead
 from rigs.launching import Harmless
 
@@ -335,7 +335,7 @@ def test_missing_program_of_the_robot_is_found_first(run, fake, planner, capfd):
     assert run(LaunchDescription([CloudNode(
         machine=machine, package='there_only', executable='mapper')])) == 1
     said = capfd.readouterr().out
-    assert "can't run on the robot, as on_interrupt='robot' wants it to" in said
+    assert "can't run on the robot: " in said and "on_interrupt='robot' moves it there" in said
     assert "say on_interrupt='shutdown'" in said and not fake.noted('up')
 
 

@@ -21,7 +21,7 @@ from fogros2.actions.frontend.entity import (
 )
 from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, LifecycleNode, Node
 from fogros2.actions.replicated import Replicated
-from fogros2.describe import keywords, kinds, values
+from fogros2.describe import features, keywords, kinds, values
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.host import docker_lines
 from fogros2.host.containers import described, parse
@@ -104,7 +104,7 @@ def node(entity: Entity, parser: Parser, cls: type[Node]) -> Parsed:
     kwargs['machine'] = _machine(entity, parser)
     parameters = {'image': kinds.Keyword('image', 'text'),
                   'image_options': kinds.Keyword('image_options', 'list'),
-                  'checkpoint': kinds.Keyword('checkpoint', 'text')}
+                  **features.keywords('node_options')}
     contents = {name: value(entity, parser, keyword) for name, keyword in parameters.items()}
     kwargs.update({name: values.items(content) if name == 'image_options' else content
                    for name, content in contents.items() if content is not None})
