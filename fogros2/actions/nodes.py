@@ -52,9 +52,9 @@ class Node(launch_ros.actions.Node):
         image_options: Union[Sequence[SomeSubstitutionsType], Substitution] = (),
         **kwargs: Any,
     ) -> None:
-        own = {name: kwargs.pop(name) for name in features.keywords('node_options')
-               if name in kwargs}
-        with keywords.refused(type(self)):
+        of_features = features.keywords('node_options')
+        own = {name: kwargs.pop(name) for name in of_features if name in kwargs}
+        with keywords.refused(type(self), of_features):
             super().__init__(**kwargs)
         if isinstance(image_options, str) or image_options and image is None:
             raise ConfigurationError(
@@ -79,12 +79,11 @@ class Node(launch_ros.actions.Node):
     def prepare(self, context: LaunchContext) -> None:
         """Resolve the action and its streams; relative topics are in the node's namespace."""
         remote = self._remote
-        if remote is not None and self._image is not None:
-            self._use_image(context, remote)
         if remote is not None:
-            remote.features = features.by_feature({
-                name: values.resolve(context, value) for name, value in self._features.items()},
-                'node_options')
+            if self._image is not None:
+                self._use_image(context, remote)
+            remote.features = features.by_feature(
+                values.resolve(context, self._features), 'node_options')
         super().prepare(context)
         if remote is not None:
             namespace = self.expanded_node_namespace

@@ -198,11 +198,21 @@ def test_package_imports_nothing_above_it(folder: str, above: tuple[str, ...]) -
 
 
 def test_core_names_no_keyword_of_a_feature() -> None:
-    for keyword in features.keywords():
+    for keyword in {*features.keywords(), *features.keywords('node_options')}:
         # words such as fetch have other uses
         pattern = rf'\b{keyword}\b' if '_' in keyword else rf'\b{keyword}='
         for path in python_files(CORE):
             assert not re.search(pattern, path.read_text()), f'{path} names {keyword}'
+
+
+#: Words for what features do.
+FEATURES = ('[Cc]heckpoint', '[Rr]eplacer', 'Replacement', 'drained')
+
+
+@pytest.mark.parametrize('word', FEATURES)
+def test_core_names_nothing_that_a_feature_does(word: str) -> None:
+    for path in python_files(CORE):
+        assert not re.search(word, path.read_text()), f'{path} names {word}'
 
 
 def plugin(module: str) -> str:
