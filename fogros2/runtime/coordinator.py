@@ -509,7 +509,7 @@ class Coordinator:
         if not self._new and all(session.ready for session in self._sessions.values()):
             self.gate.set_result(True)
 
-    # -- a machine is lost -----------------------------------------------------------------
+    # -- a machine is lost ----------------------------------------------------------------------
 
     def _preempted(self, session: Session, reason: str) -> None:
         if not self._context.is_shutdown:

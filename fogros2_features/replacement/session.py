@@ -77,11 +77,11 @@ class Interruptible(Session):
 
     def replicate(self, names: dict[str, str]) -> None:
         """Rename the topics and services of replicated nodes; see the base class."""
-        super().replicate(names)
         if self.own.on_interrupt == 'robot':
             raise ConfigurationError(
                 f"replicas cannot move to the robot, as on_interrupt='robot' of "
                 f"'{self.spec.name}' wants it", 'leave on_interrupt= out: the others go on')
+        super().replicate(names)
 
     def command_here(self, resolve: Callable[[], list[str]]) -> Optional[list[str]]:
         """Return the command of a process on the robot, None if it stays on machines."""

@@ -205,6 +205,18 @@ def test_lost_machine_ends_the_launch_by_default(run, fake, talker, watch, capfd
     assert len(errors) == 1
 
 
+def test_without_features_a_lost_machine_ends_the_launch(
+        run, fake, talker, watch, monkeypatch):
+    """A notice alone ends nothing there."""
+    instead(monkeypatch, 'fogros2.feature', {})
+    machine = ContainerInstance(name='planner', ros_workspace='')
+    watch.at_start = {1: lambda event: [
+        *says(fake, 'notice', reason=REASON)(), *says(fake, 'lost', reason='it was deleted')()]}
+    assert run(LaunchDescription([*watch(), talker(machine=machine)])) == 1
+    assert "the machine 'planner' is gone: it was deleted" in watch.shutdowns[0]
+    assert watch.interrupted == [('planner', 'it was deleted', True)]
+
+
 def test_nodes_of_a_lost_machine_continue_on_the_robot(run, fake, package, planner, talker, watch):
     watch.at_start = {1: says(fake, 'lost', reason='evicted'), 2: end}
     assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
