@@ -13,23 +13,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 import contextlib
 import functools
-from typing import Any, Optional, TYPE_CHECKING
+from typing import Optional, TYPE_CHECKING
 
 from fogros2 import plugin_system
-from fogros2.describe.values import check_folder
 from fogros2.errors import ConfigurationError
 from fogros2.feature import Feature, RunningMachine
 from fogros2.model import MachineSpec, NodeSpec
-from fogros2_features.replacement.options import Options, read
+from fogros2_features.replacement.options import folder_of, Options, read, read_folder
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
 
     from fogros2.describe.machines import Scalar
     from fogros2_features.replacement.session import Interruptible
-
-#: The name of the entry point.
-NAME = 'replacement'
 
 
 class Replacement(Feature):
@@ -71,7 +67,7 @@ class Replacement(Feature):
 
         :param checkpoint: such as '$HOME/map'.
         """
-        return '' if checkpoint is None else check_folder('checkpoint', checkpoint)
+        return read_folder(checkpoint)
 
     def check(self, spec: MachineSpec, own: Options) -> None:
         """Check that the machine can be replaced, and has stopped its nodes by then."""
@@ -107,10 +103,5 @@ class Replacement(Feature):
     def session(self, own: Options) -> functools.partial[Interruptible]:
         """Return what makes the session of a machine that may be interrupted."""
         from fogros2_features.replacement.session import Interruptible
-        return functools.partial(Interruptible, own, folder_of)
+        return functools.partial(Interruptible, own)
 
-
-def folder_of(node: NodeSpec) -> str:
-    """Return the folder of a node that a replacement takes over, '' for none."""
-    own: dict[str, Any] = dict(node.features.get(NAME, {}))
-    return Replacement.node_options(**own)

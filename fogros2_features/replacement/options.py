@@ -9,7 +9,10 @@ from typing import Any, Literal
 
 from fogros2.describe.values import check_folder, choice, parse_duration
 from fogros2.errors import ConfigurationError
+from fogros2.model import NodeSpec
 
+#: The name of the entry point.
+NAME = 'replacement'
 OnInterrupt = Literal['shutdown', 'robot', 'replace']
 
 
@@ -59,3 +62,17 @@ def read(given: Mapping[str, Any]) -> Options:
     :raises ConfigurationError: a value is wrong.
     """
     return Options(**{name: _CHECKS[name](name, value) for name, value in given.items()})
+
+
+def read_folder(checkpoint: object) -> str:
+    """
+    Read the keyword of a node, '' for none.
+
+    :raises ConfigurationError: it is no folder.
+    """
+    return check_folder('checkpoint', checkpoint) if checkpoint else ''
+
+
+def folder_of(node: NodeSpec) -> str:
+    """Return the folder of a node that a replacement takes over, '' for none."""
+    return read_folder(node.features.get(NAME, {}).get('checkpoint'))

@@ -18,7 +18,7 @@ from fogros2.shell import Shell
 from fogros2_features.replacement import machine_state
 from fogros2_features.replacement.checkpoints import Checkpoints
 from fogros2_features.replacement.machine_state import MachineState
-from fogros2_features.replacement.options import Options
+from fogros2_features.replacement.options import folder_of, Options
 from fogros2_features.replacement.replacer import Replacer
 
 if TYPE_CHECKING:
@@ -39,16 +39,12 @@ class Interruptible(Session):
     One machine of a launch, on the event loop.
 
     :param own: what the launch file says of its interruption.
-    :param folder_of: returns the folder of a node that a replacement takes over, '' for none.
     """
 
-    def __init__(
-        self, own: Options, folder_of: Callable[[NodeSpec], str], *words: Any, **named: Any,
-    ) -> None:
+    def __init__(self, own: Options, *words: Any, **named: Any) -> None:
         super().__init__(*words, **named)
         self.own = own
         self.fenced = own.replaces
-        self._folder_of = folder_of
         self.state = MachineState(survivable=own.on_interrupt != 'shutdown')
         self._held: list[tuple[RemoteRun, Event]] = []
         self.replacer: Optional[Replacer] = None
@@ -110,8 +106,7 @@ class Interruptible(Session):
         if self.replacer is None or self.state.phase == 'over':
             super().submit(run)
             return
-        folder = self._folder_of(run.node)
-        if folder and self.checkpoints is not None:
+        if self.checkpoints is not None and (folder := folder_of(run.node)):
             self.checkpoints.add(folder)
         self.replacer.allow(run.node)
         if self.interrupted:

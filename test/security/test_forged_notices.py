@@ -128,9 +128,8 @@ def launched(
         robot = SimpleNamespace(context=SimpleNamespace(asyncio_loop=loop), launch=SimpleNamespace(
             store=Store(folder), id='abc123', cancel=None))
         session = Interruptible(
-            read({'on_interrupt': on_interrupt}), lambda node: '',
-            MachineSpec('planner', 'container'), loop, robot=robot, in_thread=in_thread,
-            fail=failed.append, changed=lambda: None,
+            read({'on_interrupt': on_interrupt}), MachineSpec('planner', 'container'), loop,
+            robot=robot, in_thread=in_thread, fail=failed.append, changed=lambda: None,
             preempted=lambda one, why: interrupted.append((why, one.lost)))
         said: list[Callable[[Any], None]] = []
         session.up(SimpleNamespace(  # type: ignore[arg-type]
