@@ -136,6 +136,7 @@ setup(
         'fogros2.feature': [
             'budget = fogros2_features.budget:Budget',
             'idle = fogros2_features.idle:IdleTimeout',
+            'replacement = fogros2_features.replacement:Replacement',
             'results = fogros2_features.results:Results',
             'streams = fogros2_features.streams:Streaming',
         ],

@@ -31,9 +31,10 @@ from launch import LaunchContext
 from startup import robot
 
 from fogros2.model import Endpoint, MachineSpec
-from fogros2.runtime.checkpoints import Checkpoints
 from fogros2.shell import connect
 from fogros2.waiting import wait_until
+from fogros2_features.replacement.checkpoints import Checkpoints
+from fogros2_features.replacement.options import Options
 from rigs.launched import launching
 
 INTERVAL, SIDE_BY_SIDE = 10.0, 5
@@ -71,7 +72,7 @@ def serve(folder: str, store: str) -> None:
     context: Any = LaunchContext()
     context._set_asyncio_loop(loop)
     session: Any = SimpleNamespace(
-        spec=MachineSpec('bench', 'container', checkpoint_interval=INTERVAL),
+        spec=MachineSpec('bench', 'container'), own=Options(checkpoint_interval=INTERVAL),
         shell=connect(Endpoint('local'), name='bench'), nodes=list,
         request=lambda function: loop.create_task(function()))
     kept = Writer(session, context, Path(store), '', None, logger=logging.getLogger(),

@@ -79,6 +79,9 @@ class RunningMachine(Protocol):
     def give_up(self, reason: str) -> None:
         """Let the launch end machine and nodes as ``on_exit`` says, and go on without them."""
 
+    def lose_after(self, seconds: float) -> None:
+        """Count a silent machine as lost after this time, even if its provider says it runs."""
+
 
 class LaunchedMachine(Protocol):
     """A machine that some node of a launch needs, as features see it."""
@@ -210,10 +213,14 @@ class Feature:
     ``options`` is a static method whose parameters are the feature's keywords in launch files, on
     the command line and in files of defaults. Their annotations give the kinds of the values, and
     each has a default. It raises ConfigurationError for a wrong value, and returns what the other
-    methods get as ``own``.
+    methods get as ``own``. ``node_options`` is the same for nodes of machines; its values are in
+    ``NodeSpec.features``.
     """
 
     options: ClassVar[Callable[..., Any]] = staticmethod(lambda: None)
+    node_options: ClassVar[Callable[..., Any]] = staticmethod(lambda: None)
+    #: Whether each machine uses the feature, even without its keywords.
+    always: ClassVar[bool] = False
     #: A keyword of nodes, groups and launch descriptions that takes a list, and the element of XML
     #: and YAML that is one item; it parses to a :class:`fogros2.actions.frontend.actions.Item`.
     node_list: ClassVar[tuple[str, str]] = ('', '')
@@ -276,6 +283,14 @@ class Feature:
         """
         return nodes
 
+    def session(self, own: Any) -> Optional[Callable[..., Any]]:
+        """
+        Return what makes the machine's :class:`~fogros2.runtime.session.Session`, None for that.
+
+        A subclass of Session may move the nodes when the machine ends.
+        """
+        return None
+
     def status(self, shown: Mapping[str, Any], own: Any) -> Iterable[tuple[str, str]]:
         """
         Return rows, each a name and a text, for ``ros2 fog status`` of a machine.
@@ -295,13 +310,14 @@ def load(name: str) -> Feature:
     return feature
 
 
-def options(name: str, given: Mapping[str, Any]) -> Any:
+def options(name: str, given: Mapping[str, Any], of: str = 'options') -> Any:
     """
     Return a feature's options from the values of its keywords.
 
+    :param of: ``options``, or ``node_options``.
     :raises ConfigurationError: a value is wrong.
     """
-    return plugin_system.load(GROUP, name).options(**given)
+    return getattr(plugin_system.load(GROUP, name), of)(**given)
 
 
 def used(spec: MachineSpec) -> Iterator[tuple[Feature, Any]]:
@@ -310,5 +326,15 @@ def used(spec: MachineSpec) -> Iterator[tuple[Feature, Any]]:
 
     :raises ConfigurationError: one is not installed.
     """
-    for name, given in spec.features.items():
-        yield load(name), options(name, given)
+    for name in names(spec):
+        yield load(name), options(name, spec.features.get(name, {}))
+
+
+def names(spec: MachineSpec) -> Sequence[str]:
+    """
+    Return the names of the features that a machine uses.
+
+    :raises ConfigurationError: one is not installed.
+    """
+    return list(dict.fromkeys([*spec.features, *(
+        name for name in plugin_system.names(GROUP) if load(name).always)]))

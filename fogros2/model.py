@@ -15,14 +15,9 @@ Bootstrap = Literal['auto', 'apt', 'pip', 'none']
 #: Prefix length of the largest network of a launch.
 NETWORK_PREFIX = 24
 RobotNodes = Literal['after_cloud', 'immediately']
-OnInterrupt = Literal['shutdown', 'robot', 'replace']
 
 #: Maximum lifetime of a machine in seconds, unless its launch file sets another.
 DEFAULT_LIFETIME = 8 * 3600.0
-#: Default interval of the copies of a checkpoint in seconds.
-DEFAULT_CHECKPOINT_INTERVAL = 30.0
-#: Default number of replacements of one machine in a launch.
-DEFAULT_REPLACEMENTS = 3
 #: Default time in seconds without a heartbeat after which the launch counts as gone.
 DEFAULT_ROBOT_TIMEOUT = 120.0
 
@@ -55,13 +50,6 @@ class MachineSpec:
     :param robot_timeout: seconds without the launch's heartbeat after which the nodes stop.
     :param environment: variables of every node on the machine.
     :param containers: ``docker run`` command lines that start before the nodes.
-    :param on_interrupt: when the provider reclaims the machine while its nodes run: end the
-        launch, run the nodes on the robot, or run them on a replacement of the machine.
-    :param on_loss_after: seconds of silence after which a machine is replaced; at least
-        ``robot_timeout``, 0 for as long as that.
-    :param max_replacements: the number of replacements in one launch.
-    :param checkpoint: a folder that a replacement takes over, '' for none.
-    :param checkpoint_interval: seconds between two copies of that folder to the robot.
     :param monitor_allow: networks (CIDR) that may reach its Foxglove bridge, besides the robot.
     :param apt: Debian packages to install; ``pip`` Python packages, in pip's syntax.
     :param share: topics that it has in common with machines of other robots on its host.
@@ -83,11 +71,6 @@ class MachineSpec:
     containers: tuple[str, ...] = ()
     launch_foxglove: bool = False
     vpn: str = 'wireguard'
-    on_interrupt: OnInterrupt = 'shutdown'
-    on_loss_after: float = 0.0
-    max_replacements: int = DEFAULT_REPLACEMENTS
-    checkpoint: str = ''
-    checkpoint_interval: float = DEFAULT_CHECKPOINT_INTERVAL
     monitor_allow: tuple[str, ...] = ()
     apt: tuple[str, ...] = ()
     pip: tuple[str, ...] = ()
@@ -360,6 +343,7 @@ class NodeSpec:
     :param respawn_delay: seconds.
     :param image: container image that the process runs in, '' for the machine itself.
     :param image_options: options of ``docker run`` for that image.
+    :param features: the values of features' keywords of nodes, by feature; JSON types only.
     """
 
     id: str
@@ -380,6 +364,7 @@ class NodeSpec:
     sigkill_timeout: float = 5.0
     image: str = ''
     image_options: tuple[str, ...] = ()
+    features: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
 
 
 def to_json(data: Any) -> str:

@@ -446,7 +446,7 @@ def delete_folder(path: Path) -> None:
     """
     Delete a folder with its content, also with folders inside that nobody may write.
 
-    Nodes may have made such folders, of which a checkpoint is a copy.
+    Nodes may have made such folders, of which a copy is here.
     """
     shutil.rmtree(path, ignore_errors=True)
     if path.is_dir():

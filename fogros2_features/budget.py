@@ -15,7 +15,7 @@ from fogros2.feature import Feature, RunningMachine
 from fogros2.model import MachineSpec
 
 if TYPE_CHECKING:
-    from launch import SomeSubstitutionsType
+    from fogros2.describe.machines import Scalar
 
 #: The share of a budget at which the user is warned.
 WARNING = Decimal('0.8')
@@ -27,7 +27,7 @@ class Budget(Feature):
     """``budget='5 USD'``: the most that a launch spends on a machine and its replacements."""
 
     @staticmethod
-    def options(budget: Optional[SomeSubstitutionsType] = None) -> Optional[Decimal]:
+    def options(budget: Optional[Scalar] = None) -> Optional[Decimal]:
         """
         Return the budget in US dollars.
 

@@ -14,9 +14,9 @@ import time
 from typing import Optional, TYPE_CHECKING
 
 from fogros2 import untrusted
+from fogros2.describe.values import check_folder
 from fogros2.errors import ConfigurationError, ConnectError, FogError, ShellError
 from fogros2.feature import Feature, RunningMachine
-from fogros2.host.checkpoint import check_folder
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.ros_names import check_name
 from fogros2.shell.command_line import remote_path

@@ -36,9 +36,7 @@ class Node(launch_ros.actions.Node):
         'ros:jazzy-perception', with the machine's network, DDS configuration and workspace.
     :param image_options: more options for ``docker run``, such as ['--gpus=all']; a substitution
         separates them by commas.
-    :param checkpoint: folder of the node on the machine, such as '$HOME/map', that a replacement
-        of the machine takes over; see ``checkpoint`` of machines.
-    :param kwargs: also lists of features, see doc/howto/streaming.md for one.
+    :param kwargs: also keywords and lists of features, see doc/developers/features.md.
     :raises ConfigurationError: ``machine`` is no machine, or another option needs one.
     """
 
@@ -49,17 +47,19 @@ class Node(launch_ros.actions.Node):
         self, *, machine: Optional[SomeMachine] = None,
         image: Optional[SomeSubstitutionsType] = None,
         image_options: Union[Sequence[SomeSubstitutionsType], Substitution] = (),
-        checkpoint: Optional[SomeSubstitutionsType] = None, **kwargs: Any,
+        **kwargs: Any,
     ) -> None:
         self.lists = features.take_lists(kwargs)
-        with keywords.refused(type(self)):
+        of_features = features.keywords('node_options')
+        own = {name: kwargs.pop(name) for name in of_features if name in kwargs}
+        with keywords.refused(type(self), of_features):
             super().__init__(**kwargs)
         if isinstance(image_options, str) or image_options and image is None:
             raise ConfigurationError(
                 f'image_options={image_options!r} is no list of options for an image',
                 "such as image='ros:jazzy-perception', image_options=['--gpus=all']")
         if machine is None:
-            needing = {'image': image, 'checkpoint': checkpoint, **self.lists}
+            needing = {'image': image, **own, **self.lists}
             for keyword, value in needing.items():
                 if value is not None:
                     raise ConfigurationError(
@@ -67,7 +67,7 @@ class Node(launch_ros.actions.Node):
                         f'add machine=, or leave {keyword}= out')
             return
         self._image = image
-        self._checkpoint = checkpoint
+        self._features = features.own(own, 'node_options')
         self._image_options = values.items(image_options)
         if image is not None and isinstance(machine, CloudInstance):
             machine.takes_containers()
@@ -77,15 +77,17 @@ class Node(launch_ros.actions.Node):
     def prepare(self, context: LaunchContext) -> None:
         """Resolve the action and its lists; relative topics are in the node's namespace."""
         remote = self._remote
-        if remote is not None and self._image is not None:
-            self._use_image(context, remote)
+        if remote is not None:
+            if self._image is not None:
+                self._use_image(context, remote)
+            remote.features = features.by_feature(
+                values.resolve(context, self._features), 'node_options')
         super().prepare(context)
         if remote is not None:
             namespace = self.expanded_node_namespace
             if namespace == self.UNSPECIFIED_NODE_NAMESPACE:
                 namespace = '/'
             remote.own = Coordinator.of(context).parts.resolve(self.lists, namespace)
-            remote.add_checkpoint(values.resolve(context, self._checkpoint))
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Execute the action; components that it loads use the topic names of its machine."""

@@ -69,10 +69,6 @@ def check(
         raise ConfigurationError(
             f"'{spec.name}' is a computer that exists already: no launch switches it off",
             "use on_exit='delete' to leave nothing there, or 'keep'")
-    if spec.on_interrupt == 'replace' and not provider.capabilities.owned:
-        raise ConfigurationError(
-            f"'{spec.name}' is a computer that exists already: no launch can replace it",
-            "use on_interrupt='robot' or 'shutdown'")
     if spec.share and not provider.capabilities.share_folders:
         raise Unsupported(
             f"'{spec.name}' can't share topics: it has no host with machines of other robots",

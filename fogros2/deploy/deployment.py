@@ -90,7 +90,7 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
         arming.start_heartbeat(ros, dds_step.result())
         detail.append(f'VPN round trip {(job.heartbeat.round_trip or 0) * 1e3:.2f} ms')
     # pushed now, so that they end after the nodes and before the machine
-    features = {name: contextlib.ExitStack() for name in job.spec.features}
+    features = {name: contextlib.ExitStack() for name in feature.names(job.spec)}
     for name, ending in features.items():
         job.undo.add(name, ending.close)
     # a second time, so that the nodes stop first on the way down
@@ -101,7 +101,7 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
     running = RunningMachine(context, job, modules, containers, joining.redial)
     for name, ending in features.items():
         ending.enter_context(feature.load(name).machine(
-            running, feature.options(name, job.spec.features[name])))
+            running, feature.options(name, job.spec.features.get(name, {}))))
     job.failed = False
     return running
 

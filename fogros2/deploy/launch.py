@@ -10,7 +10,6 @@ import dataclasses
 from decimal import Decimal
 import functools
 import os
-from pathlib import Path
 import secrets
 import threading
 from typing import Optional
@@ -338,10 +337,6 @@ class Launch:
         """Return the VPN address of the ``index``-th machine."""
         network = self.robot_vpn().interface.network
         return plan.machine_interface('', network, index, 0, '').address
-
-    def checkpoints(self, name: str) -> Path:
-        """Return the folder for a machine's checkpoints, which end with the launch."""
-        return self.store.launch(self.id) / 'checkpoints' / name
 
     # -- up -------------------------------------------------------------------------------------
 

@@ -56,8 +56,8 @@ class RunningMachine(Step):
         self._ending = False
         self._published: dict[int, tuple[str, int]] = {}
         self._watches: dict[str, Callable[[str], None]] = {}
-        job.undo.callback(Watch(
-            context, job, gone=self._gone, found=found, lost=self._is_lost).close)
+        self._watch = Watch(context, job, gone=self._gone, found=found, lost=self._is_lost)
+        job.undo.callback(self._watch.close)
         job.undo.callback(self._undo_begins)
 
     @property
@@ -237,6 +237,10 @@ class RunningMachine(Step):
             callback = self._callback
         if callback is not None:
             callback({'event': 'given_up', 'reason': reason})
+
+    def lose_after(self, seconds: float) -> None:
+        """Count a silent machine as lost after this time, even if its provider says it runs."""
+        self._watch.limit = seconds
 
     def end(self, reason: str) -> None:
         """End the machine as its ``on_exit`` says; its further events are ignored."""

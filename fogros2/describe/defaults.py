@@ -15,7 +15,7 @@ from typing import Any, Optional, TYPE_CHECKING
 
 from fogros2.describe import features, keywords, values
 from fogros2.describe.kinds import Kind
-from fogros2.describe.machines import check_loss, check_setting, CloudInstance, SETTINGS
+from fogros2.describe.machines import check_setting, CloudInstance, SETTINGS
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.host.workspace import find_workspaces
 from fogros2.model import MachineSpec
@@ -145,12 +145,10 @@ def apply(
     more = {name: wanted.pop(name) for name in [*wanted] if name in features.keywords()}
     options = {name: value for name, value in wanted.items()
                if name not in SETTINGS and spec.options.get(name, '') == ''}
-    result = dataclasses.replace(
+    return dataclasses.replace(
         spec, options={**spec.options, **options},
         features=features.merged(features.by_feature(features.known(features.own(more))),
                                  spec.features), **settings)
-    check_loss(result)
-    return result
 
 
 def resolved(

@@ -13,15 +13,16 @@ from fogros2.errors import ConfigurationError
 from fogros2.feature import GROUP, options
 
 
-def keywords() -> Mapping[str, Keyword]:
+def keywords(of: str = 'options') -> Mapping[str, Keyword]:
     """
     Return the keywords of all features.
 
+    :param of: ``options``, or ``node_options`` for those of nodes.
     :raises ConfigurationError: two features have the same.
     """
     result: dict[str, Keyword] = {}
     for feature in plugin_system.names(GROUP):
-        for name, keyword in _keywords(feature).items():
+        for name, keyword in _keywords(feature, of).items():
             if name in result:
                 raise ConfigurationError(f"the feature '{feature}' and another have the same "
                                          f"keyword '{name}'", 'uninstall one of them')
@@ -29,8 +30,8 @@ def keywords() -> Mapping[str, Keyword]:
     return result
 
 
-def _keywords(feature: str) -> Mapping[str, Keyword]:
-    return parameters_of(plugin_system.load(GROUP, feature).options)
+def _keywords(feature: str, of: str) -> Mapping[str, Keyword]:
+    return parameters_of(getattr(plugin_system.load(GROUP, feature), of))
 
 
 def node_lists() -> Mapping[str, str]:
@@ -45,15 +46,15 @@ def take_lists(arguments: dict[str, Any]) -> dict[str, Any]:
             if (items := arguments.pop(keyword, ()))}
 
 
-def own(given: Mapping[str, Any]) -> dict[str, Any]:
+def own(given: Mapping[str, Any], of: str = 'options') -> dict[str, Any]:
     """
     Return those of some values by name that are of features, marked by their kinds.
 
     :raises ConfigurationError: a value has a wrong type, or is known already and wrong.
     """
-    mine = {name: keyword for name, keyword in keywords().items() if name in given}
+    mine = {name: keyword for name, keyword in keywords(of).items() if name in given}
     result = marked(mine, given)
-    by_feature(known({name: value for name, value in result.items() if _is_plain(value)}))
+    by_feature(known({name: value for name, value in result.items() if _is_plain(value)}), of)
     return result
 
 
@@ -78,7 +79,7 @@ def _is_plain(value: Any) -> bool:
     return isinstance(value, (str, int, float))
 
 
-def by_feature(given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def by_feature(given: Mapping[str, Any], of: str = 'options') -> dict[str, dict[str, Any]]:
     """
     Return the values of keywords by feature, as a MachineSpec has them; check them.
 
@@ -89,9 +90,9 @@ def by_feature(given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     result = {}
     given = {name: value for name, value in given.items() if value is not None and value != ''}
     for feature in plugin_system.names(GROUP) if given else ():
-        mine = {name: given[name] for name in _keywords(feature) if name in given}
+        mine = {name: given[name] for name in _keywords(feature, of) if name in given}
         if mine:
-            options(feature, mine)
+            options(feature, mine, of)
             result[feature] = mine
     return result
 

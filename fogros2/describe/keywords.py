@@ -133,11 +133,12 @@ def make(provider: str, arguments: Mapping[str, Any]) -> CloudInstance:
 
 
 @contextlib.contextmanager
-def refused(cls: type[Any]) -> Iterator[None]:
+def refused(cls: type[Any], more: Iterable[str] = ()) -> Iterator[None]:
     """
     Replace the error of an unexpected keyword by one that names the nearest keyword.
 
     :param cls: the class; launch's actions pass keywords on to their base classes.
+    :param more: keywords of features.
     """
     try:
         yield
@@ -145,10 +146,11 @@ def refused(cls: type[Any]) -> Iterator[None]:
         match = re.search(r"got an unexpected keyword argument '(\w+)'", str(error))
         if match is None:
             raise
-        names = {name for each in cls.__mro__ if '__init__' in vars(each)
-                 for name in inspect.signature(vars(each)['__init__']).parameters}
-        names = names - {'self', 'args', 'kwargs', 'lists'} | features.node_lists().keys()
-        raise unknown(f'a {cls.__name__}', match[1], names) from None
+        names = {*more, *features.node_lists(), *(
+            name for each in cls.__mro__ if '__init__' in vars(each)
+            for name in inspect.signature(vars(each)['__init__']).parameters)}
+        raise unknown(f'a {cls.__name__}', match[1],
+                      names - {'self', 'args', 'kwargs', 'lists'}) from None
 
 
 def unknown(what: str, name: str, names: Iterable[str]) -> ConfigurationError:

@@ -25,6 +25,7 @@ Kind = Literal[
 #: Names in annotations that exist only for type checkers.
 _NAMES: dict[str, Any] = {
     'SomeSubstitutionsType': str, 'Value': Union[str, int, float], 'Bool': Union[bool, str],
+    'Scalar': Union[str, int, float, bool],
     'ByRegion': Union[str, Mapping[str, str]],
 }
 #: Parameters that launch files cannot set.

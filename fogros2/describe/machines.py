@@ -7,21 +7,15 @@ from collections.abc import Mapping, Sequence
 import inspect
 import os
 import shlex
-from typing import Any, cast, get_args, NoReturn, Optional, TYPE_CHECKING, Union
+from typing import Any, NoReturn, Optional, TYPE_CHECKING, Union
 
 from fogros2 import ros_names
 from fogros2.describe import features, names, networks, values, variables
 from fogros2.describe.kinds import check, options_of, parameters_of
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.host import containers, dependencies
-from fogros2.host.checkpoint import check_folder
 from fogros2.host.workspace import find_workspaces, underlays
-from fogros2.model import (
-    Bootstrap,
-    MachineSpec,
-    OnExit,
-    OnInterrupt,
-)
+from fogros2.model import Bootstrap, MachineSpec, OnExit
 from fogros2.store import check_name
 
 if TYPE_CHECKING:
@@ -31,6 +25,7 @@ if TYPE_CHECKING:
 
     Value = Union[SomeSubstitutionsType, int, float]
     Bool = Union[bool, SomeSubstitutionsType]
+    Scalar = Union[Value, bool]
     #: A machine in a launch file; a name may be of a machine that is mentioned elsewhere.
     SomeMachine = Union['CloudInstance', SomeSubstitutionsType]
 
@@ -62,18 +57,6 @@ class CloudInstance:
     :param apt: Debian packages that the machine needs, such as 'libzbar0'.
     :param pip: Python packages that the machine needs, in pip's syntax ('pyzbar>=0.1.9'). If the
         system has the same package, the system's version is used.
-    :param on_interrupt: what to do when the provider reclaims the machine while its nodes run, or
-        when neither the machine nor its provider has answered for 37 s.
-        'shutdown', the default, ends the launch with a nonzero exit status. 'robot' restarts the
-        nodes on the robot, where their programs must be installed. They keep names and
-        parameters, and lose their memory: lifecycle states and loaded components. 'replace'
-        creates a new machine; until it is up, nodes whose programs are installed on the robot run
-        there.
-    :param on_loss_after: silence after which on_interrupt='replace' replaces the machine, in
-        seconds or as above; at least ``robot_timeout``, which is the default.
-    :param max_replacements: how often on_interrupt='replace' replaces the machine in a launch; 3.
-    :param checkpoint: folder of its nodes, such as '$HOME/map', that a replacement takes over.
-    :param checkpoint_interval: time between two copies of the folder to the robot.
     :param monitor_allow: networks (CIDR) from which external clients may connect to the Foxglove
         bridge, by TLS and with a token.
     :param share: topics, such as '/map', that pass between this launch and those of other robots
@@ -96,11 +79,6 @@ class CloudInstance:
         robot_timeout: Optional[Value] = None,
         bootstrap: Optional[SomeSubstitutionsType] = None,
         environment: Optional[Mapping[str, SomeSubstitutionsType]] = None,
-        on_interrupt: Optional[SomeSubstitutionsType] = None,
-        on_loss_after: Optional[Value] = None,
-        max_replacements: Optional[Value] = None,
-        checkpoint: Optional[SomeSubstitutionsType] = None,
-        checkpoint_interval: Optional[Value] = None,
         monitor_allow: Optional[Sequence[SomeSubstitutionsType]] = None,
         apt: Optional[Sequence[SomeSubstitutionsType]] = None,
         pip: Optional[Sequence[SomeSubstitutionsType]] = None,
@@ -311,7 +289,6 @@ class CloudInstance:
                     key: self._converted(context, key, value)
                     for key, value in self._features.items()}), **settings)
             self._check_findable(spec.on_exit)
-            check_loss(spec)
             self._spec = spec
         return self._spec
 
@@ -449,36 +426,6 @@ def checked(machine: SomeMachine) -> SomeMachine:
     return machine
 
 
-def check_loss(spec: MachineSpec) -> None:
-    """
-    Check that a lost machine has stopped its nodes before they start elsewhere.
-
-    :raises ConfigurationError: ``on_loss_after`` is too short.
-    """
-    if 0 < spec.on_loss_after < spec.robot_timeout:
-        raise ConfigurationError(
-            f'on_loss_after={spec.on_loss_after:g} s is shorter than robot_timeout='
-            f'{spec.robot_timeout:g} s: nodes may still run on a machine that is cut off',
-            'raise on_loss_after, or lower robot_timeout')
-
-
-def _count(what: str, value: Union[str, int, float]) -> int:
-    text = str(value)
-    if not text.isdecimal() or not 0 < int(text) < 1000:
-        raise ConfigurationError(f'{what}={value!r} is no number of machines',
-                                 'use a whole number from 1')
-    return int(text)
-
-
-def _choice(kind: Any) -> Any:
-    def check(what: str, value: object) -> str:
-        if value not in get_args(kind):
-            raise ConfigurationError(
-                f'{what}={value!r} is unknown',
-                did_you_mean(str(value), get_args(kind),
-                             f"use one of {', '.join(get_args(kind))}"))
-        return cast(str, value)
-    return check
 
 
 _LIST_CHECKS = {'apt': dependencies.check_apt, 'pip': dependencies.check_pip,
@@ -496,18 +443,13 @@ def _listed(program: str, content: Any) -> list[Union[values.Items, values.List]
 
 
 _CHECKS: dict[str, Any] = {
-    'on_exit': _choice(OnExit),
-    'bootstrap': _choice(Bootstrap),
-    'on_interrupt': _choice(OnInterrupt),
+    'on_exit': values.choice(OnExit),
+    'bootstrap': values.choice(Bootstrap),
     'lifetime': values.parse_duration,
     'robot_timeout': values.parse_duration,
-    'on_loss_after': values.parse_duration,
-    'max_replacements': _count,
-    'checkpoint': check_folder,
-    'checkpoint_interval': values.parse_duration,
 }
 #: Keywords of every machine that a file of defaults may have.
-SETTINGS = tuple(name for name in _CHECKS if name not in ('on_exit', 'checkpoint'))
+SETTINGS = tuple(name for name in _CHECKS if name != 'on_exit')
 
 
 def check_setting(name: str, value: Any) -> Any:

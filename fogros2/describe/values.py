@@ -9,9 +9,9 @@ import contextlib
 from decimal import Decimal
 import os
 import re
-from typing import Any, TYPE_CHECKING, Union
+from typing import Any, get_args, TYPE_CHECKING, Union
 
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, did_you_mean
 
 if TYPE_CHECKING:
     from launch import LaunchContext, SomeSubstitutionsType, Substitution
@@ -220,6 +220,32 @@ def parse_duration(what: str, value: Union[str, int, float]) -> float:
         raise ConfigurationError(
             f'{what}={value!r} is no duration', "use seconds, or text such as '8h' or '1h30m'")
     return float(seconds)
+
+
+def choice(kind: Any) -> Callable[[str, object], str]:
+    """Return a check for a text that is one of those in a Literal."""
+    def check(what: str, value: object) -> str:
+        if value not in get_args(kind):
+            raise ConfigurationError(
+                f'{what}={value!r} is unknown',
+                did_you_mean(str(value), get_args(kind),
+                             f"use one of {', '.join(get_args(kind))}"))
+        return str(value)
+    return check
+
+
+def check_folder(what: str, value: object) -> str:
+    """
+    Return a folder in the form ``~/map`` or ``/var/map``; ``$HOME`` stands for ``~``.
+
+    :raises ConfigurationError: it is no folder below the home or the root.
+    """
+    path = re.sub(r'^\$HOME/', '~/', str(value)).rstrip('/')
+    parts = path.split('/')
+    if len(parts) < 2 or parts[0] not in ('~', '') or {'', '.', '..'} & {*parts[1:]}:
+        raise ConfigurationError(f'{what}={value!r} is no folder that can be copied',
+                                 "use a folder below the home, such as '$HOME/map'")
+    return path
 
 
 def read_bool(value: Any) -> bool:

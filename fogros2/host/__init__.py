@@ -9,5 +9,4 @@ What a machine needs, and how the machine gets it.
 not declare. ``bootstrap`` installs ROS 2, ``relocation`` sets up the libraries of its wheels.
 ``container_scripts`` has the scripts that run containers, ``docker_lines`` reads the lines that
 describe them, ``containers`` has the commands.
-``checkpoint`` has the snapshots of a folder.
 """

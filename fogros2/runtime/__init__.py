@@ -6,11 +6,9 @@ In reading order: ``log_files`` limits launch's log files and survives a full di
 shows steps, ``cost`` formats prices, ``signals`` makes SIGTERM an orderly shutdown, ``node_spec``
 converts a process action to a NodeSpec, ``parts`` has what features do in the launch,
 ``added_process`` the processes that FogROS2 adds, ``backlog`` holds a machine's events until
-launch takes them, ``replacement`` decides how a new machine replaces another one, ``checkpoints``
-saves folders of its nodes, ``replacer`` carries the decisions out, ``run_state`` decides what
-follows for one process on a machine, ``remote_run`` connects it with launch, ``machine_state``
-decides what follows for one machine of the launch, ``session`` is that machine, ``interruption``
-handles its preemption, ``coordinator`` connects the launch with its machines, ``foxglove`` runs
-the bridge, ``remote_process`` is the action of a remote process, and ``replicas`` starts the node
-that serves the public names of replicated nodes.
+launch takes them, ``run_state`` decides what follows for one process on a machine, ``remote_run``
+connects it with launch, ``interruption`` has the event of a machine that ends early, ``session``
+is a machine of the launch, ``coordinator`` connects the launch with its machines, ``foxglove``
+runs the bridge, ``remote_process`` is the action of a remote process, and ``replicas`` starts the
+node that serves the public names of replicated nodes.
 """

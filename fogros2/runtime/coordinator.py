@@ -19,7 +19,7 @@ import functools
 import threading
 from typing import Any, Optional, TYPE_CHECKING, Union
 
-from launch import Event, EventHandler, LaunchContext
+from launch import Action, Event, EventHandler, LaunchContext
 from launch.actions import (
     ExecuteLocal,
     OpaqueFunction,
@@ -32,18 +32,17 @@ from launch.events.process import ShutdownProcess
 import launch.logging
 from launch.substitutions import SubstitutionFailure
 
+from fogros2 import feature
 from fogros2.describe import defaults, values
 from fogros2.describe.keywords import ROBOT
 from fogros2.describe.machines import CloudInstance
 from fogros2.errors import Cancelled, ConfigurationError, did_you_mean, FogError
 from fogros2.launch_internals import private
 from fogros2.model import NodeSpec
-from fogros2.runtime import added_process, cost, interruption, signals
-from fogros2.runtime.checkpoints import Checkpoints
+from fogros2.runtime import added_process, cost, signals
 from fogros2.runtime.console import Console
 from fogros2.runtime.interruption import MachineInterrupted
 from fogros2.runtime.parts import Lists, Parts
-from fogros2.runtime.replacer import Replacer
 from fogros2.runtime.session import Session
 
 if TYPE_CHECKING:
@@ -141,6 +140,11 @@ class Coordinator:
         return cls(context) if known is None else known
 
     # -- what actions call ----------------------------------------------------------------------
+
+    @property
+    def context(self) -> LaunchContext:
+        """The context in which launch runs."""
+        return self._context
 
     @property
     def launch(self) -> Launch:
@@ -307,24 +311,13 @@ class Coordinator:
         self._instances[spec.name] = machine
         session = self._sessions.get(spec.name)
         if session is None:
-            session = Session(
+            make = next((made for each, own in feature.used(spec)
+                         if (made := each.session(own)) is not None), Session)
+            session = make(
                 spec, self._context.asyncio_loop, in_thread=self._in_thread, fail=self._fail,
                 changed=self._open_gate, preempted=self._preempted,
-                starting=functools.partial(self.parts.starting, spec.name),
-                busy=functools.partial(private.waiting_events, self._context))
-            if spec.on_interrupt == 'replace':
-                session.replacer = Replacer(
-                    session, self.launch, self._context.asyncio_loop, in_thread=self._in_thread,
-                    fail=self._fail, is_over=lambda: self._context.is_shutdown,
-                    logger=self._logger)
-                session.checkpoints = Checkpoints(
-                    session, self._context, self.launch.checkpoints(spec.name),
-                    f'.before-{self.launch.id}', self._cancel, in_thread=self._in_thread,
-                    logger=self._logger)
-            elif spec.checkpoint:
-                raise ConfigurationError(
-                    f"'{spec.name}' has a checkpoint, and nothing would restore it",
-                    "add on_interrupt='replace', or leave checkpoint= out")
+                busy=functools.partial(private.waiting_events, self._context),
+                starting=functools.partial(self.parts.starting, spec.name), robot=self)
             if spec.share and any(one.spec.share for one in self._sessions.values()):
                 # two relays would send each other's messages round and round
                 raise ConfigurationError(
@@ -343,11 +336,6 @@ class Coordinator:
         return session
 
     # -- what features see of the launch; :class:`fogros2.feature.RunningLaunch` ------------------
-
-    @property
-    def context(self) -> LaunchContext:
-        """The context in which launch runs."""
-        return self._context
 
     @property
     def machines(self) -> Mapping[str, Session]:
@@ -497,23 +485,23 @@ class Coordinator:
         if not self._new and all(session.ready for session in self._sessions.values()):
             self.gate.set_result(True)
 
-    # -- a machine is preempted -----------------------------------------------------------------
+    # -- a machine is lost ----------------------------------------------------------------------
 
     def _preempted(self, session: Session, reason: str) -> None:
         if not self._context.is_shutdown:
             self._context.emit_event_sync(
                 MachineInterrupted(session.spec.name, reason, session.lost))
 
-    def _on_interrupted(self, context: LaunchContext) -> list[ExecuteLocal]:
-        session = self._sessions.get(context.locals.event.machine)
+    def _on_interrupted(self, context: LaunchContext) -> list[Action]:
+        event = context.locals.event
+        session = self._sessions.get(event.machine)
         if session is None or context.is_shutdown:
             return []
-        return interruption.react(
-            context.locals.event, session, self.take_over, self._logger)
+        return session.go_on(event)
 
-    def take_over(self, machine: str) -> list[ExecuteLocal]:
+    def take_over(self, machine: str) -> list[Action]:
         """Let features use the robot in a machine's place; return the processes that they need."""
-        processes: list[ExecuteLocal] = []
+        processes: list[Action] = []
         for part in self.parts:
             ended, programs = part.moved(machine)
             for node in ended:

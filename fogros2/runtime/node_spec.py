@@ -94,9 +94,8 @@ def robot_command(action: ExecuteLocal, context: LaunchContext) -> list[str]:
                     part.here if isinstance(part, ProgramName) else part for part in argument])
             except (LookupError, SubstitutionFailure) as error:
                 raise ConfigurationError(
-                    f"{description.final_name} can't run on the robot, as on_interrupt='robot' "
-                    f'wants it to: {error}',
-                    "install it here too, or say on_interrupt='shutdown'") from error
+                    f"{description.final_name} can't run on the robot: {error}",
+                    'install it here too') from error
     return command
 
 

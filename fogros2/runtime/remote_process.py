@@ -3,18 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-import contextlib
+from collections.abc import Mapping, Sequence
+import dataclasses
 import functools
 import json
-from typing import cast, Optional, TYPE_CHECKING
+from typing import Any, cast, Optional, TYPE_CHECKING
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal
 
 from fogros2 import feature, plan
-from fogros2.errors import ConfigurationError
-from fogros2.host.checkpoint import check_folder
 from fogros2.launch_internals import components, private
 from fogros2.model import NodeSpec
 from fogros2.runtime import foxglove, node_spec
@@ -46,12 +44,14 @@ class RemoteProcess:
     image = ''
     image_options: Sequence[str] = ()
     has_image = False
+    #: The values of features' keywords, by feature.
+    features: Mapping[str, Mapping[str, Any]] = {}
     #: Of the action's machine; set by ``prepare`` unless the process runs on the robot.
     session: Optional[Session] = None
-    #: Whether the process runs on the robot, for example after a preemption.
+    #: Whether the process runs on the robot.
     here = False
     _node: NodeSpec
-    #: The command on the robot, if ``on_interrupt`` may move the process there.
+    #: The command on the robot, if the process may move there.
     _command: Optional[list[str]] = None
     #: Whether launch has reached the point at which it starts a local process.
     _began = False
@@ -90,10 +90,11 @@ class RemoteProcess:
         self._own.prepare(context)
         private.prefix_output(action, session.spec.name)
         provider = coordinator.launch.provider(session.spec.provider)
-        self._node = node_spec.from_action(
+        self._node = dataclasses.replace(node_spec.from_action(
             action, context, coordinator.base_environment, session.spec, coordinator.launch.id,
             self.image, self.image_options,
-            provider.has_own_packages(session.spec), bool(provider.invitation(session.spec)))
+            provider.has_own_packages(session.spec), bool(provider.invitation(session.spec))),
+            features=self.features)
         if not isinstance(action, AddedProcess):
             paths = node_spec.robot_paths(
                 self._node, [context.environment.get('HOME', ''), *(plan.ament_prefixes(
@@ -104,27 +105,9 @@ class RemoteProcess:
                 self._node, [path for path in paths if not plan.below(path, shared)])
         for each, own in feature.used(session.spec):
             each.check_node(session.spec, self._node, own)
-        how = session.spec.on_interrupt
-        if how != 'shutdown' and not session.replicated and not (
-                self.image or isinstance(action, AddedProcess)):
-            # until a replacement is up, only some nodes may be able to run on the robot
-            with contextlib.suppress(*([ConfigurationError] if how == 'replace' else [])):
-                self._command = node_spec.robot_command(action, context)
-
-    def add_checkpoint(self, folder: Optional[str]) -> None:
-        """
-        Add a folder of the process to the checkpoints of its machine.
-
-        :raises ConfigurationError: no such folder, or the machine is not replaced.
-        """
-        if not folder or self.session is None:
-            return
-        if self.session.checkpoints is None:
-            raise ConfigurationError(
-                f"a node of '{self.session.spec.name}' has a checkpoint, and nothing would "
-                'restore it',
-                "add on_interrupt='replace' to the machine, or leave checkpoint= out")
-        self.session.checkpoints.add(check_folder('checkpoint', folder))
+        if not (self.image or isinstance(action, AddedProcess)):
+            self._command = session.command_here(
+                functools.partial(node_spec.robot_command, action, context))
 
     def execute(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Execute the action; its process starts when its machine is up."""

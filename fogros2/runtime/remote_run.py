@@ -18,7 +18,6 @@ from fogros2.events import Event, NodeExited, NodeOutput, NodeStarted
 from fogros2.launch_internals import private
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2.runtime import run_state
-from fogros2.runtime.replacer import Replacer
 from fogros2.runtime.run_state import RunState
 
 #: Texts of a process that a signal interrupted while it started: NumPy, for one, turns Python's
@@ -39,7 +38,8 @@ class Home(Protocol):
     """The machine of a process; the event loop makes all calls."""
 
     spec: MachineSpec
-    replacer: Optional[Replacer]
+    #: Whether only agent, provider or time confirms that a process has left it.
+    fenced: bool
 
     def signal(self, run: RemoteRun, name: str) -> None:
         """Send a process a signal."""
@@ -129,8 +129,7 @@ class RemoteRun:
 
     def unreported(self) -> None:
         """Stop waiting for the remote process: the agent will not report its exit."""
-        # of a machine that is replaced, only the agent, the provider or time confirms the end
-        if self.state.phase != 'leaving' or self._session.replacer is None:
+        if self.state.phase != 'leaving' or not self._session.fenced:
             self.on('absent')
 
     async def come_back(self) -> bool:

@@ -3,7 +3,7 @@
 Decide what follows for one process of a machine: from its request to its end, or to its move.
 
 A process that leaves its machine starts elsewhere only after its machine has confirmed its end, or
-is gone: see :mod:`fogros2.runtime.replacement`.
+is gone.
 """
 
 from __future__ import annotations

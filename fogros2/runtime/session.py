@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import dataclasses
 import functools
 import logging
-from typing import Any, Optional, TYPE_CHECKING
+from typing import Any, Optional, Protocol, TYPE_CHECKING
 
 import launch.logging
 
@@ -19,22 +19,21 @@ from fogros2.errors import (
     ConnectError,
     DeadlineExceeded,
     FogError,
+    ProviderError,
 )
 from fogros2.events import Event
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2.ros_names import remapped
-from fogros2.runtime import machine_state
 from fogros2.runtime.backlog import Backlog
-from fogros2.runtime.checkpoints import Checkpoints
 from fogros2.runtime.log_files import LogFiles
-from fogros2.runtime.machine_state import MachineState
 from fogros2.runtime.remote_run import RemoteRun
-from fogros2.runtime.replacer import Replacer
-from fogros2.shell import Shell
 
 if TYPE_CHECKING:
-    from fogros2.deploy import RunningMachine
+    from launch import Action, LaunchContext
+
+    from fogros2.deploy import Launch, RunningMachine
     from fogros2.describe.machines import CloudInstance
+    from fogros2.runtime.interruption import MachineInterrupted
 
 #: Events of the agent about the machine, not about one process: log level and message.
 _NOTICES = {
@@ -50,27 +49,38 @@ _NOTICES = {
 }
 #: Exit status of processes whose end was not reported.
 _UNREPORTED = -9
-#: Events after which processes end because their machine ends. A session with on_interrupt
-#: 'robot' then holds exits back for so many seconds, until it knows whether the machine is gone.
-_LAST_EVENTS = ('watchdog', 'ending')
-_HOLD = 60.0
-#: Seconds in which the provider may confirm a notice; EC2 gives two minutes' notice.
-_CONFIRM = 150.0
 #: Seconds, at least, before nodes with respawn start again because their agent died.
 _RESPAWN_DELAY = 1.0
+
+
+class Robot(Protocol):
+    """The robot's side of the launch."""
+
+    @property
+    def context(self) -> LaunchContext:
+        """The context in which launch runs."""
+
+    @property
+    def launch(self) -> Launch:
+        """The deployment."""
+
+    def take_over(self, machine: str) -> list[Action]:
+        """Let features use the robot in a machine's place; return processes to start."""
 
 
 class Session:
     """
     One machine of a launch, on the event loop.
 
+    The launch ends with it, unless a feature's subclass moves its processes elsewhere.
+
     :param in_thread: runs a blocking function in a thread.
     :param fail: ends the launch because of an error.
     :param changed: called when the machine came up or a process started or ended.
-    :param preempted: called with the session and a reason when the provider reclaims the
-        machine, or has done so.
+    :param preempted: called with the session and a reason when the machine is gone.
     :param busy: returns the number of events that launch has to process.
     :param starting: returns nodes as they start on the machine.
+    :param robot: what subclasses use of the launch.
     """
 
     def __init__(
@@ -79,6 +89,7 @@ class Session:
         fail: Callable[[BaseException], None], changed: Callable[[], None],
         preempted: Callable[[Session, str], None], busy: Callable[[], int] = lambda: 0,
         starting: Callable[[Sequence[NodeSpec]], Sequence[NodeSpec]] = lambda nodes: nodes,
+        robot: Optional[Robot] = None,
     ) -> None:
         #: The spec as the launch file gives it, with open choices.
         self.requested = spec
@@ -98,25 +109,21 @@ class Session:
         self._changed = changed
         self._preempted = preempted
         self._starting = starting
-        self.state = MachineState(survivable=spec.on_interrupt != 'shutdown')
+        self._robot = robot
+        #: Whether the machine is gone.
+        self.lost = False
+        #: Whether only agent, provider or time confirms that a process has left it.
+        self.fenced = False
         self._backlog = Backlog(loop, self._on_event, busy, self._dropped)
-        self._held: list[tuple[RemoteRun, Event]] = []
         self._runs: dict[str, RemoteRun] = {}
         self._waiting: list[RemoteRun] = []
         self._to_stop: list[RemoteRun] = []
-        #: Replaces the machine, if its ``on_interrupt`` says so.
-        self.replacer: Optional[Replacer] = None
-        self.checkpoints: Optional[Checkpoints] = None
-        #: Processes that have left a machine that is being replaced.
-        self._away: list[RemoteRun] = []
         #: Paths of the robot that its nodes get, and of which the user knows.
         self._paths: set[str] = set()
         #: Requests to the agent that are not answered yet.
         self.requests: set[asyncio.Task[None]] = set()
         # keeps requests to the agent in order
         self._order = asyncio.Lock()
-        # keeps moves between robot and machines in order
-        self._moves = asyncio.Lock()
         self._logger = launch.logging.get_logger('fogros2')
         self._logs = LogFiles()
         #: Why the machine was given up.
@@ -124,13 +131,8 @@ class Session:
 
     @property
     def interrupted(self) -> bool:
-        """Whether the provider reclaims the machine, which may still run, or it is gone."""
-        return self.state.interrupted
-
-    @property
-    def lost(self) -> bool:
-        """Whether the machine is gone."""
-        return self.state.phase == 'gone'
+        """Whether no process may start on the machine any more."""
+        return self.lost
 
     @property
     def ready(self) -> bool:
@@ -160,17 +162,13 @@ class Session:
         """
         Rename the topics and services of replicated nodes.
 
-        :raises ConfigurationError: another group of replicas has one of them, or the nodes would
+        :raises ConfigurationError: another group of replicas has one of them, or the nodes may
             move to the robot, where ``first_answer`` has these names.
         """
         for name in names:
             if name in self.replicated:
                 raise ConfigurationError(f"two groups of replicas have '{name}' on the machine "
                                          f"'{self.spec.name}'", 'name it in one of them')
-        if self.spec.on_interrupt == 'robot':
-            raise ConfigurationError(
-                f"replicas cannot move to the robot, as on_interrupt='robot' of "
-                f"'{self.spec.name}' wants it", 'leave on_interrupt= out: the others go on')
         self.replicated.update(names)
 
     def warn_of_paths(self, node: NodeSpec, paths: Sequence[str]) -> None:
@@ -195,31 +193,26 @@ class Session:
         """The nodes that have started, or are about to."""
         return [run.node for run in list(self._runs.values()) if run not in self._waiting]
 
-    @property
-    def shell(self) -> Optional[Shell]:
-        """The shell of the machine, None while the machine does not run the nodes."""
-        return None if self.running is None or self.interrupted else self.running.shell
+    def command_here(self, resolve: Callable[[], list[str]]) -> Optional[list[str]]:
+        """
+        Return the command of a process on the robot, None if it stays on the machine.
 
-    def nodes(self) -> list[NodeSpec]:
-        """Return the machine's nodes that have started."""
-        return [run.node for run in self._runs.values() if run.state.started]
+        :param resolve: returns it.
+        :raises ConfigurationError: it has to run on the robot, and can't.
+        """
+        return None
 
     def submit(self, run: RemoteRun) -> None:
         """Start a process when the machine is up."""
-        if self.state.phase == 'over':
+        if self._reason:
             self._logger.error(
                 f'{self.spec.name}: {run.node.name} does not start: the machine has ended, '
                 f'because {self._reason} (launch again)')
             run.on('over')
             return
         self._runs[run.node.id] = run
-        if self.replacer is not None:
-            self.replacer.allow(run.node)
         if self.interrupted:
-            if self.replacer is None:
-                run.on('move_gone')
-            else:
-                run.on('halt_gone')
+            run.on('move_gone')
             return
         self._waiting.append(run)
         if self.running is not None:
@@ -227,15 +220,10 @@ class Session:
 
     def stop(self, run: RemoteRun) -> bool:
         """Stop a process; return False if it does not run there and never will."""
-        if run in [*self._waiting, *self._away] or self.running is None or self.lost:
+        if run in self._waiting or self.running is None or self.lost:
             if run in self._waiting:
                 self._waiting.remove(run)
             return False
-        for held in self._held:
-            if held[0] is run:
-                self._held.remove(held)
-                run.on_event(held[1])
-                return True
         self._to_stop.append(run)
         if len(self._to_stop) == 1:
             self.request(self._stop_collected)
@@ -248,8 +236,11 @@ class Session:
     def forget(self, run: RemoteRun) -> None:
         """Remove a process that has ended."""
         self._runs.pop(run.node.id, None)
-        self._check_drained()
         self._changed()
+
+    def halted(self, run: RemoteRun) -> bool:
+        """Note that a process has left its machine; return whether it must not start elsewhere."""
+        return False
 
     def open_port(
         self, port: int, sources: Sequence[str], opened: Callable[[str, int], None],
@@ -276,7 +267,6 @@ class Session:
     def up(self, running: RunningMachine) -> None:
         """Start the waiting processes: the machine is up."""
         self.running = running
-        self._on('up')
         if not self.came_up.done():
             self.came_up.set_result(True)
         for instance in self.instances:
@@ -352,24 +342,13 @@ class Session:
         self._logs.add(sum(len(str(value)) for value in event.values()))
         run = self._runs.get(str(event.get('node', '')))
         if run is not None:
-            if event['event'] == 'exited' and self.state.phase == 'ending' and (
-                    not run.state.stopping):
-                self._held.append((run, event))
-                return
-            run.on_event(event)
-            if event['event'] == 'started':
-                self._changed()
+            self._on_process_event(run, event)
             return
         if event['event'] == 'given_up':
             self.request(functools.partial(self._give_up, event['reason']))
             return
         if event['event'] == 'lost':
-            self._on('gone', event['reason'] or 'no reason')
-            return
-        if event['event'] == 'notice':
-            # of a machine whose nodes move to the robot, nothing ends: the notice may be forged
-            self._on('reclaimed' if self.spec.on_interrupt == 'robot' else 'claim',
-                     event['reason'] or 'no reason')
+            self._gone(event['reason'] or 'no reason')
             return
         kind: str = event['event']
         if event['event'] == 'connection':
@@ -377,85 +356,54 @@ class Session:
         if kind in _NOTICES:
             level, text = _NOTICES[kind]
             self._logger.log(level, f'{self.spec.name}: {text.format_map(event)}')
-        if kind in _LAST_EVENTS:
-            self._on('last_words')
-        elif kind == 'restarted' and self.state.phase != 'ending':
-            respawning = self._respawning()
-            self._end_unreported(respawning)
-            self._start_again(respawning)
-        elif kind == 'connection absent' and self.state.phase != 'ending' and not (
-                self.interrupted and self.replacer):
-            respawning = self._respawning()
-            self._end_unreported([])
-            if respawning and not self.replicated:
-                self._fail(AgentError(
-                    f"{', '.join(run.node.name for run in respawning)} can't respawn: the agent "
-                    f"of '{self.spec.name}' is gone", 'launch again'))
+        if kind == 'restarted':
+            self._restarted()
+        elif kind == 'connection absent':
+            self._agent_gone()
 
-    def _on(self, event: machine_state.Event, reason: str = '') -> None:
+    def _on_process_event(self, run: RemoteRun, event: Event) -> None:
+        run.on_event(event)
+        if event['event'] == 'started':
+            self._changed()
+
+    def _gone(self, reason: str) -> None:
+        """Note that the machine is gone."""
+        if not (self.lost or self._reason):
+            self.lost = True
+            self._preempted(self, reason)
+
+    def _restarted(self) -> None:
+        """Start nodes with respawn again: the agent has died, and the nodes with it."""
+        respawning = self._respawning()
+        self._end_unreported(respawning)
+        self._start_again(respawning)
+
+    def _agent_gone(self) -> None:
+        """End all processes: nobody knows of them any more."""
+        respawning = self._respawning()
+        self._end_unreported([])
+        if respawning and not self.replicated:
+            self._fail(AgentError(
+                f"{', '.join(run.node.name for run in respawning)} can't respawn: the agent "
+                f"of '{self.spec.name}' is gone", 'launch again'))
+
+    def go_on(self, event: MachineInterrupted, remedy: str = '') -> list[Action]:
         """
-        Change the machine's state, and do what follows.
+        Go on without the machine; return what this needs.
 
-        :param reason: of an interruption, for the user.
+        :param remedy: how the launch would have gone on.
+        :raises ProviderError: ends the launch.
         """
-        self.state, commands = machine_state.decide(self.state, event)
-        for command in commands:
-            if command == 'hold':
-                self._loop.call_later(_HOLD, self._on, 'spared')
-            elif command == 'release':
-                held, self._held = self._held, []
-                for run, exited in held:
-                    run.on_event(exited)
-            elif command == 'save':
-                self.request(self._last_checkpoint)
-            elif command == 'announce':
-                self._preempted(self, reason)
-            elif command == 'bury':
-                self._bury(reason)
-            else:
-                self._logger.warning(
-                    f'{self.spec.name}: the machine reports that its provider reclaims it: '
-                    f'{reason}; its nodes go on until the provider confirms that, or the machine '
-                    'is gone')
-                self.request(functools.partial(self._confirm, reason))
-
-    async def _confirm(self, reason: str) -> None:
-        running = self.running
-        assert running is not None
-        try:
-            confirmed = await self._in_thread(running.reclaimed, 0.0)
-            if not confirmed:
-                if self.checkpoints:
-                    self.request(self.checkpoints.take)
-                confirmed = await self._in_thread(running.reclaimed, _CONFIRM)
-            if running is not self.running or self.interrupted:
-                return
-            if confirmed:
-                self._on('reclaimed', reason)
-            else:
-                self._logger.info(
-                    f'{self.spec.name}: its provider has not confirmed that it reclaims it')
-        finally:
-            self._on('refuted')
-
-    def _bury(self, reason: str) -> None:
-        if self.replacer is not None:
-            self.replacer.on('lost')
-        else:
-            self._logger.info(f'{self.spec.name}: the machine is gone: {reason}')
-            self.move_all()
-
-    def move_all(self) -> None:
-        """Move all of the machine's processes to the robot."""
-        ended = [run for run, _ in self._held]
-        self._held.clear()
-        for run in list(self._runs.values()):
-            run.on('move_gone' if self.lost or run in ended else 'move')
+        if event.lost:
+            self.end_all()
+        if self.replicated:
+            self._logger.warning(f'{event}; the other replicas go on')
+            return []
+        raise ProviderError(str(event), remedy)
 
     async def _give_up(self, reason: str) -> None:
         """End the machine and its processes, while the launch goes on."""
-        self._on('given_up')
-        if self.state.phase != 'over' or self.running is None:
+        if self.interrupted or self._reason or self.running is None:
             return
         self._reason = reason
         self._logger.info(f"{self.spec.name}: {reason}; on_exit='{self.spec.on_exit}'")
@@ -465,80 +413,6 @@ class Session:
         await asyncio.gather(*(run.complete for run in runs))
         await self._in_thread(self.running.end, reason)
         self._logger.info(f'{self.spec.name}: the machine has ended')
-
-    # -- a new machine ---------------------------------------------------------------------------
-
-    async def halt_all(self) -> None:
-        """Let the machine end all of its processes, because another machine continues them."""
-        if self.checkpoints:
-            await self.checkpoints.ask()
-        ended = [run for run, _ in self._held]
-        self._held.clear()
-        for run in list(self._runs.values()):
-            run.on('halt_gone' if self.lost or run in ended else 'halt')
-        self._check_drained()
-
-    def halted(self, run: RemoteRun) -> bool:
-        """Note that a process has left its machine; return whether it must not start elsewhere."""
-        if self.replacer is None:
-            return False
-        self._runs.pop(run.node.id, None)
-        if run not in self._away:
-            self._away.append(run)
-        self._check_drained()
-        return not self.replacer.state.moved
-
-    def _check_drained(self) -> None:
-        if self.replacer is not None and not self._runs:
-            self._on('empty')
-
-    async def _last_checkpoint(self) -> None:
-        assert self.running is not None and self.replacer is not None
-        if self.checkpoints:
-            # nothing writes any more
-            await self.checkpoints.save(self.running.shell, still=True)
-        self.replacer.on('drained')
-
-    async def move_halted(self) -> None:
-        """Let processes start on the robot: the machine no longer runs them."""
-        self._held.clear()
-        async with self._moves:
-            if self.checkpoints:
-                await self.checkpoints.restore(self.checkpoints.robot)
-            for run in [*self._away, *self._runs.values()]:
-                run.on('left')
-
-    def homeless(self) -> list[str]:
-        """Return the names of processes that cannot run on the robot."""
-        return [run.node.name for run in self._away if run.state.phase == 'away']
-
-    def replace(self, running: RunningMachine) -> None:
-        """Use another machine from now on."""
-        self.running = running
-        self._on('replaced')
-        for instance in self.instances:
-            instance.is_up(running)
-
-    async def come_back(self) -> None:
-        """Move all processes to the new machine."""
-        back: dict[RemoteRun, bool] = {}
-        async with self._moves:
-            was_here = len(self.homeless()) < len(self._away)
-            # processes that execute meanwhile join
-            while new := [run for run in self._away if run not in back]:
-                back.update(zip(new, await asyncio.gather(*(run.come_back() for run in new))))
-                if self.checkpoints and self.running is not None:
-                    if was_here:
-                        await self.checkpoints.save(self.checkpoints.robot, still=True)
-                    await self.checkpoints.restore(self.running.shell)
-        self._away.clear()
-        self._on('returned')
-        for run in [run for run, alive in back.items() if alive]:
-            self._runs[run.node.id] = run
-            self._waiting.append(run)
-        self._logger.info(f'{self.spec.name}: a new machine runs the nodes')
-        await self._subscribe()
-        await self._start_waiting()
 
     def end_all(self) -> None:
         """End all processes of a machine that is gone, for launch."""

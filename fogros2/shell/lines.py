@@ -127,7 +127,6 @@ class LineStream:
             data = b''
             with contextlib.suppress(OSError, FogError):
                 data = self._channel.recv(_CHUNK)
-                take_errors(self._channel)
             if not data:
                 self._buffer = b''
                 return b''.join(parts)

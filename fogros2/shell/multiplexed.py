@@ -15,6 +15,7 @@ from typing import Optional
 
 from fogros2.errors import ConnectError, FogError
 from fogros2.model import Command
+from fogros2.shell import flow
 from fogros2.shell import multiplexer as mux
 from fogros2.shell.remote import RemoteShell
 
@@ -41,9 +42,9 @@ class Channel:
         self._status = -1
         self._timeout: Optional[float] = None
         self._credit = mux.CREDIT
-        self._owed = 0
+        self._window = flow.Window()
         #: Bytes that the machine may still send; each of two threads there exceeds by a chunk.
-        self._room = mux.CREDIT + 2 * mux.CHUNK
+        self._room = self._window.size + 2 * mux.CHUNK
         #: Set when the exit status is known, or will never be known.
         self.status_event = threading.Event()
 
@@ -112,9 +113,7 @@ class Channel:
                 raise TimeoutError
             data = bytes(self._waiting[kind][:size])
             del self._waiting[kind][:size]
-            self._owed += len(data)
-            owed = self._owed if self._owed >= mux.CREDIT // 4 else 0
-            self._owed -= owed
+            owed = self._window.read(len(data), time.monotonic())
             self._room += owed
         if owed:
             with contextlib.suppress(ConnectError):  # what has arrived can be read
@@ -176,9 +175,10 @@ class Link:
 
     def __init__(self, connection: socket.socket, name: str, user: str) -> None:
         self._socket = connection
+        flow.keep_prompt(connection)
         self._name = name
         self._user = user
-        self._lock = threading.Lock()
+        self._lock = flow.Turns()
         self._channels: dict[int, Channel] = {}
         self._next = 1
         self._incoming = bytearray()
@@ -229,7 +229,7 @@ class Link:
         """
         command = command or Command(())
         what = {'argv': list(command.argv), 'env': dict(command.environment),
-                'root': command.sudo, 'user': self._user, 'pty': terminal}
+                'root': command.sudo, 'user': self._user, 'pty': terminal, 'credit': flow.LEAST}
         with self._lock:
             number, self._next = self._next, self._next + 1
             channel = Channel(self, number)

@@ -35,9 +35,9 @@ HEADER = struct.Struct('>BII')
 OUT, ERR, EXIT, OPEN, IN, CLOSE, WINDOW, RESIZE = range(1, 9)
 #: Frames of the connection, without a channel.
 HELLO, PING, PONG, GONE = range(64, 68)
-#: Maximum unacknowledged bytes of a channel in each direction.
+#: Maximum unacknowledged bytes of a channel's input.
 CREDIT = 4 << 20
-CHUNK = 1 << 15
+CHUNK = 1 << 14
 #: Maximum size of a frame's payload, so that the other side cannot fill the memory.
 LARGEST = 16 << 20
 #: Seconds of silence after which the connection counts as lost.
@@ -54,7 +54,7 @@ class Process:
 
     def __init__(
         self, number: int, child: subprocess.Popen[bytes], stdin: IO[Any],
-        streams: dict[IO[Any], int], terminal: bool,
+        streams: dict[IO[Any], int], credit: int, terminal: bool,
     ) -> None:
         self.number = number
         self.child = child
@@ -63,7 +63,8 @@ class Process:
         self.terminal = terminal
         #: Input to write; None closes the command's standard input.
         self.input: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-        self.credit = CREDIT
+        #: Bytes of output that the robot takes.
+        self.credit = credit
         self.closed = False
         self.changed = threading.Condition()
 
@@ -257,7 +258,8 @@ def begin(number: int, what: dict[str, Any]) -> Process:
             argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
         assert child.stdin and child.stdout and child.stderr
         return Process(
-            number, child, child.stdin, {child.stdout: OUT, child.stderr: ERR}, terminal=False)
+            number, child, child.stdin, {child.stdout: OUT, child.stderr: ERR}, what['credit'],
+            terminal=False)
     outer, inner = os.openpty()
     with open(inner, 'rb', buffering=0), contextlib.ExitStack() as undo:
         undo.callback(os.close, outer)
@@ -269,7 +271,8 @@ def begin(number: int, what: dict[str, Any]) -> Process:
             preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0), **options)
         undo.pop_all()
     screen = open(os.dup(outer), 'rb', buffering=0)
-    return Process(number, child, open(outer, 'wb', buffering=0), {screen: OUT}, terminal=True)
+    return Process(number, child, open(outer, 'wb', buffering=0), {screen: OUT}, what['credit'],
+                   terminal=True)
 
 
 if __name__ == '__main__':

@@ -6,6 +6,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable
 import contextlib
+import dataclasses
 import getpass
 import threading
 import time
@@ -238,7 +239,9 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
 
     def open(self, command: Command) -> Stream:
         """Start a program on the machine; closing the returned stream ends the program."""
-        channel = self.start(command)
+        # nobody reads its errors, which would stop it
+        channel = self.start(dataclasses.replace(
+            command, argv=('sh', '-c', 'exec "$@" 2>/dev/null', 'sh', *command.argv)))
         _feed(channel, command.input, end=False)
         channel.settimeout(None)
         return LineStream(channel, self.name)

@@ -11,7 +11,7 @@ from typing import Optional, TYPE_CHECKING
 
 from fogros2.errors import ConnectError, FogError, ShellError
 from fogros2.model import Command
-from fogros2.shell import command_line, ssh_connection
+from fogros2.shell import command_line, flow, ssh_connection
 from fogros2.shell.lines import Channel, Output, take_errors
 from fogros2.shell.remote import RemoteShell
 from fogros2.untrusted import clean
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 #: Time-out of one attempt to connect or to open a session, in seconds.
 _ATTEMPT = 10.0
-#: Bytes that a server may send before they are read.
-_WINDOW = 1 << 22
 
 
 class SSHShell(RemoteShell['paramiko.Transport']):
@@ -64,7 +62,7 @@ class SSHShell(RemoteShell['paramiko.Transport']):
             limit = min(timeout, _ATTEMPT)
             try:
                 return ssh_connection.limited(
-                    transport.open_session(window_size=_WINDOW, timeout=limit), _WINDOW)
+                    transport.open_session(window_size=flow.LEAST, timeout=limit))
             except (paramiko.SSHException, EOFError, OSError) as error:
                 # Either the connection was lost before. Or the server allows no more sessions,
                 # and one of ours will end. Neither the exception (paramiko keeps one for all

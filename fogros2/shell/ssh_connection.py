@@ -12,12 +12,13 @@ import os
 from pathlib import Path
 import socket
 import threading
+import time
 from typing import TYPE_CHECKING
 import warnings
 
 from fogros2.errors import AuthenticationError, ConnectError, HostKeyError, PrerequisiteError
 from fogros2.model import Endpoint
-from fogros2.shell import known_hosts, proxy, ssh_config
+from fogros2.shell import flow, known_hosts, proxy, ssh_config
 from fogros2.shell.known_hosts import Known
 from fogros2.shell.ssh_config import Settings
 
@@ -160,9 +161,9 @@ def _dial(settings: Settings, name: str, timeout: float) -> PromptSocket:
                            "check the robot's network") from error
     sock = PromptSocket(plain.family, plain.type, plain.proto, fileno=plain.detach())
     sock.settimeout(timeout)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, USER_TIMEOUT * 1000)
+    flow.keep_prompt(sock)
     return sock
 
 
@@ -190,10 +191,13 @@ def transport_over(sock: socket.socket) -> paramiko.Transport:
     """
     import paramiko
 
+    turns = flow.Turns()
+
     class Transport(paramiko.Transport):
         def _send_user_message(self, data: paramiko.Message) -> None:
             try:
-                super()._send_user_message(data)  # type: ignore[misc]
+                with turns:
+                    super()._send_user_message(data)  # type: ignore[misc]
             except EOFError as error:
                 # paramiko's own thread shows number and text of an error of a socket
                 raise ConnectionResetError(
@@ -204,18 +208,32 @@ def transport_over(sock: socket.socket) -> paramiko.Transport:
     return Transport(sock)
 
 
-def limited(channel: paramiko.Channel, window: int) -> paramiko.Channel:
-    """Let a channel close its connection if the server sends more than its window."""
+def limited(channel: paramiko.Channel) -> paramiko.Channel:
+    """
+    Let the link's rate set a channel's window, and a server that exceeds it lose its connection.
+
+    :param channel: opened with a window of ``flow.LEAST``.
+    """
     import paramiko
     from paramiko.buffered_pipe import BufferedPipe
 
+    window = flow.Window()
+
+    def read(count: int) -> int:
+        with channel.lock:
+            if channel.closed or channel.eof_received or not channel.active:
+                return 0
+            return window.read(count, time.monotonic())
+
     class Limited(BufferedPipe):  # type: ignore[type-arg]
         def feed(self, data: bytes) -> None:
-            if len(self) + len(data) > window:
+            if len(self) + len(data) > window.size:
                 raise paramiko.SSHException('the server sends more than its window')
             super().feed(data)
 
     channel.in_buffer, channel.in_stderr_buffer = Limited(), Limited()
+    vars(channel)['_check_add_window'] = read
+    channel.out_max_packet_size = min(channel.out_max_packet_size, flow.PIECE)
     return channel
 
 

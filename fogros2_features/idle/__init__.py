@@ -15,14 +15,14 @@ from fogros2.model import MachineSpec, NodeSpec
 from fogros2_features.idle import program
 
 if TYPE_CHECKING:
-    from launch import SomeSubstitutionsType
+    from fogros2.describe.machines import Scalar
 
 
 class IdleTimeout(Feature):
     """``idle_timeout='10m'``: the time without use after which a machine ends."""
 
     @staticmethod
-    def options(idle_timeout: Optional[SomeSubstitutionsType] = None) -> Optional[float]:
+    def options(idle_timeout: Optional[Scalar] = None) -> Optional[float]:
         """
         Return the time in seconds.
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 import stat
 import tempfile
 import threading
@@ -99,8 +98,6 @@ class FakeLaunch:
         #: Names of machines whose ``up`` waits until the event is set, or the launch ends.
         self.waits = {}
         self.errors = {}
-        #: Folder for snapshots.
-        self.folder = Path('/nonexistent')
         #: Errors of the next calls of ``retire``, one for each call.
         self.retire_errors = []
         self.here_error = None
@@ -163,9 +160,6 @@ class FakeLaunch:
         machine = self.machines[spec.name] = FakeMachine(self, spec)
         self.note('is up', spec.name)
         return machine
-
-    def checkpoints(self, name):
-        return self.folder / name
 
     def retire(self, name):
         self.note('retire', name)

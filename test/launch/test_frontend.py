@@ -19,6 +19,7 @@ from fogros2 import (
     AWSCloudInstance,
     CloudInstance,
     ContainerInstance,
+    feature,
     JoinedMachine,
     KubeInstance,
     SSHInstance,
@@ -170,7 +171,8 @@ EXAMPLES = {'text': ('nearest', 'nearest'), 'number': ('2', 2), 'bool': ('true',
             'text or mapping': ('ami-1', 'ami-1')}
 #: Where not every value will do.
 CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'on_loss_after': '5m',
-           'checkpoint': '$HOME/map', 'bandwidth': '10Mbit/s',
+           'checkpoint': '$HOME/map', 'checkpoint_interval': '5m', 'max_replacements': '2',
+           'bandwidth': '10Mbit/s',
            'name': 'planner', 'budget': '5 USD', 'idle_timeout': '5m',
            'fetch_to': '/results', 'fetch_limit': '2GB'}
 LISTS = {'fetch': ('~/bags, /var/map', ['~/bags', '/var/map']),
@@ -202,7 +204,10 @@ def test_keywords_are_attributes_and_take_substitutions(provider):
                 spec.options.update({
                     name: option if isinstance(option, list) else str(option).lower()
                     for name, option in spec.options.items()})
-            assert found == expected, keyword.name
+            plain, wanted = ([(name, feature.options(name, given)) for name, given in
+                              spec.features.items()] for spec in (found, expected))
+            assert plain == wanted, keyword.name
+            assert dataclasses.replace(found, features=expected.features) == expected, keyword.name
 
 
 def test_container_on_another_computer():

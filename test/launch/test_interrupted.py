@@ -34,7 +34,7 @@ from fogros2 import (
     StreamTopic,
 )
 from fogros2.errors import AgentError, ProviderError
-from fogros2.runtime import session
+from fogros2_features.replacement import session
 from fogros2_testing.plugins import instead
 from rigs.launching import Harmless
 
@@ -205,6 +205,18 @@ def test_lost_machine_ends_the_launch_by_default(run, fake, talker, watch, capfd
     assert len(errors) == 1
 
 
+def test_without_features_a_lost_machine_ends_the_launch(
+        run, fake, talker, watch, monkeypatch):
+    """A notice alone ends nothing there."""
+    instead(monkeypatch, 'fogros2.feature', {})
+    machine = ContainerInstance(name='planner', ros_workspace='')
+    watch.at_start = {1: lambda event: [
+        *says(fake, 'notice', reason=REASON)(), *says(fake, 'lost', reason='it was deleted')()]}
+    assert run(LaunchDescription([*watch(), talker(machine=machine)])) == 1
+    assert "the machine 'planner' is gone: it was deleted" in watch.shutdowns[0]
+    assert watch.interrupted == [('planner', 'it was deleted', True)]
+
+
 def test_nodes_of_a_lost_machine_continue_on_the_robot(run, fake, package, planner, talker, watch):
     watch.at_start = {1: says(fake, 'lost', reason='evicted'), 2: end}
     assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
@@ -335,7 +347,7 @@ def test_missing_program_of_the_robot_is_found_first(run, fake, planner, capfd):
     assert run(LaunchDescription([CloudNode(
         machine=machine, package='there_only', executable='mapper')])) == 1
     said = capfd.readouterr().out
-    assert "can't run on the robot, as on_interrupt='robot' wants it to" in said
+    assert "can't run on the robot: " in said and "on_interrupt='robot' moves it there" in said
     assert "say on_interrupt='shutdown'" in said and not fake.noted('up')
 
 

@@ -267,6 +267,18 @@ def test_xml_node_takes_the_settings_of_a_cloud_node(run, fake, streams):
     assert '/map:=/fogros2/planner/map' in spec.arguments
 
 
+def test_node_in_a_launch_file_takes_keywords_of_features(run, fake):
+    fake.on_start = ends
+    assert run(load('''
+launch:
+- fog_machine: {name: planner, provider: container, ros_workspace: '', on_interrupt: replace,
+                max_replacements: 2}
+- cloud_node: {machine: planner, pkg: demo, exec: talker, checkpoint: $HOME/map}
+''', 'test.launch.yaml')) == 0
+    (spec,) = fake.machines['planner'].all
+    assert spec.features == {'replacement': {'checkpoint': '$HOME/map'}}
+
+
 @pytest.mark.parametrize('where', ['xml', 'yaml', 'xml in xml', 'xml in python'])
 def test_included_files_take_machine_on_a_node(run, fake, tmp_path, where):
     fake.on_start = ends

@@ -14,14 +14,14 @@ from launch.event_handlers import OnProcessExit, OnProcessIO, OnProcessStart
 from launch.events import Shutdown as ShutdownEvent
 import pytest
 
-from fogros2 import CloudNode, ContainerInstance
+from fogros2 import CloudNode, ContainerInstance, feature, Node
 from fogros2.errors import ConfigurationError, ConnectError, ProviderError
-from fogros2.host import checkpoint
-from fogros2.model import Endpoint
+from fogros2.model import Endpoint, MachineSpec
 from fogros2.process import which
-from fogros2.runtime import replacer
 from fogros2.shell.local import LocalShell
+from fogros2.store import Store
 from fogros2.waiting import wait_until
+from fogros2_features.replacement import Replacement, replacer, snapshots
 
 HERE = """#!/bin/sh
 echo "here: $*"
@@ -217,7 +217,7 @@ class There(LocalShell):
 def test_files_go_along_to_the_robot_and_to_the_new_machine(
         run, fake, package, talker, watch, tmp_path, monkeypatch, whose):
     """What the node wrote before its end, and what it wrote on the robot."""
-    fake.folder = tmp_path / 'snapshots'
+    fake.store = Store(tmp_path / 'state')
     folder = tmp_path / 'map'
     folder.mkdir()
     (folder / 'old').write_text("the robot's own")
@@ -259,7 +259,7 @@ def test_files_go_along_to_the_robot_and_to_the_new_machine(
 @pytest.mark.skipif(which('rsync') is None, reason='needs rsync')
 def test_folder_is_copied_at_intervals(run, fake, watch, tmp_path, capfd, monkeypatch):
     """Until then it may be missing; a folder that is too large is reported once."""
-    fake.folder = tmp_path / 'snapshots'
+    fake.store = Store(tmp_path / 'state')
     folder = tmp_path / 'map'
     up = fake.up
 
@@ -276,9 +276,9 @@ def test_folder_is_copied_at_intervals(run, fake, watch, tmp_path, capfd, monkey
     node = CloudNode(machine=machine, package='absent', executable='says')
 
     tries = []
-    save = checkpoint.Checkpoint.save
-    monkeypatch.setattr(checkpoint.Checkpoint, 'save', lambda kept, shell, **words: (
-        tries.append(checkpoint.LIMIT), save(kept, shell, **words))[1])
+    save = snapshots.Checkpoint.save
+    monkeypatch.setattr(snapshots.Checkpoint, 'save', lambda kept, shell, **words: (
+        tries.append(snapshots.LIMIT), save(kept, shell, **words))[1])
 
     def wait_for(what):
         wait_until(what, timeout=60, what='a snapshot', longest=0.05)
@@ -288,12 +288,12 @@ def test_folder_is_copied_at_intervals(run, fake, watch, tmp_path, capfd, monkey
             try:
                 folder.mkdir()
                 (folder / 'state').write_text('one')
-                wait_for(lambda: [*fake.folder.rglob('0*1/state')] or None)
-                monkeypatch.setattr(checkpoint, 'LIMIT', 1)
+                wait_for(lambda: [*fake.store.root.rglob('0*1/state')] or None)
+                monkeypatch.setattr(snapshots, 'LIMIT', 1)
                 (folder / 'state').write_text('two')
                 wait_for(lambda: tries.count(1) > 3)
-                monkeypatch.setattr(checkpoint, 'LIMIT', 1 << 20)
-                wait_for(lambda: [*fake.folder.rglob('0*2/state')] or None)
+                monkeypatch.setattr(snapshots, 'LIMIT', 1 << 20)
+                wait_for(lambda: [*fake.store.root.rglob('0*2/state')] or None)
             finally:
                 run.context.asyncio_loop.call_soon_threadsafe(
                     run.context.emit_event_sync, ShutdownEvent(reason='over'))
@@ -307,21 +307,32 @@ def test_folder_is_copied_at_intervals(run, fake, watch, tmp_path, capfd, monkey
     assert (said.out + said.err).count('a checkpoint at most') == 1
 
 
-@pytest.mark.parametrize('words', [{'checkpoint': '$HOME/map'}, {}])
-def test_checkpoint_needs_a_replacement(run, fake, package, words):
-    node = {} if words else {'checkpoint': '$HOME/map'}
-    machine = ContainerInstance(name='planner', ros_workspace='', **words)
+@pytest.mark.parametrize('how', ['robot', 'shutdown'])
+def test_checkpoint_of_a_node_needs_a_replacement(run, fake, package, how, capfd):
+    machine = ContainerInstance(name='planner', ros_workspace='', on_interrupt=how)
     assert run(LaunchDescription([CloudNode(
-        machine=machine, package='demo', executable='talker', **node)])) == 1
+        machine=machine, package='demo', executable='talker', checkpoint='$HOME/map')])) == 1
     assert fake.noted('up') == []
+    assert "a node of 'planner' has a checkpoint, and nothing" in capfd.readouterr().out
+
+
+def test_checkpoint_of_a_node_needs_a_machine():
+    with pytest.raises(ConfigurationError, match='checkpoint= of a node is for a machine'):
+        Node(package='demo', executable='talker', checkpoint='$HOME/map')
 
 
 @pytest.mark.parametrize('words, message', [
+    ({'on_interrupt': 'shutdown', 'checkpoint': '~/map'}, 'nothing would restore it'),
     ({'on_loss_after': 60}, 'on_loss_after=60 s is shorter than robot_timeout=120 s'),
-    ({'max_replacements': 0}, 'max_replacements=0 is no number of machines'),
-])
-def test_wrong_limits_are_refused(words, message):
-    from launch import LaunchContext
+    ({'provider': 'ssh'}, 'exists already: no launch can replace it')])
+def test_what_can_replace_nothing_is_refused(words, message):
+    own = {'on_interrupt': 'replace', **words}
+    spec = MachineSpec('planner', own.pop('provider', 'container'), features={'replacement': own})
+    found = next(one for one in feature.used(spec) if isinstance(one[0], Replacement))
     with pytest.raises(ConfigurationError, match=message):
-        ContainerInstance(name='planner', **{'on_interrupt': 'replace', **words}).spec(
-            LaunchContext())
+        found[0].check(spec, found[1])
+
+
+def test_wrong_limit_is_refused():
+    with pytest.raises(ConfigurationError, match='max_replacements=0 is no number of machines'):
+        ContainerInstance(name='planner', max_replacements=0)

@@ -30,7 +30,7 @@ from fogros2.model import Command, Endpoint
 {connect}
 # attack
 stream = shell.open(Command(('agent',), input=b'x'))
-print(stream.readline())
+print(stream.readline().endswith(b'\\n'))
 """
 BY_LINK = """\
 import socket
@@ -72,7 +72,7 @@ def test_pod_that_ignores_its_window_fills_no_memory(kind: int, tmp_path: Path) 
 
     with serving(flood) as port:
         taken, said = measure(READS.format(connect=BY_LINK.format(port=port)), tmp_path)
-    assert said == ["b''"] and taken < LIMIT
+    assert said == ['False'] and taken < LIMIT
 
 
 class Server(paramiko.ServerInterface):
@@ -122,7 +122,7 @@ def test_ssh_server_that_ignores_its_window_fills_no_memory(kind: int, tmp_path:
         taken, said = measure(READS.format(connect=BY_SSH.format(
             port=port, key=str(tmp_path / 'key'),
             host_key=f'{key.get_name()} {key.get_base64()}')), tmp_path)
-    assert said == ["b''"] and taken < LIMIT
+    assert said == ['False'] and taken < LIMIT
 
 
 def test_packet_that_an_ssh_server_announces_takes_no_memory(tmp_path: Path) -> None:

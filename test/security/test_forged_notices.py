@@ -21,8 +21,10 @@ from fogros2.agent_client import joined
 from fogros2.errors import MachineNotFound
 from fogros2.model import Machine, MachineSpec, MachineState
 from fogros2.provider.ssh import SSHProvider
-from fogros2.runtime.session import Session
+from fogros2.store import Store
 from fogros2.waiting import wait_until
+from fogros2_features.replacement.options import read
+from fogros2_features.replacement.session import Interruptible
 from rigs import loops
 
 FORGED = ['echo', 'forged']
@@ -106,7 +108,9 @@ def test_next_launch_sets_its_own_command(serve: Callable[..., Agent]) -> None:
     wait_until(lambda: agent.notices() == ['new'], timeout=60, what='the notice')
 
 
-def launched(on_interrupt: str, confirms: list[bool]) -> tuple[list[Any], list[Any]]:
+def launched(
+    on_interrupt: str, confirms: list[bool], folder: Path,
+) -> tuple[list[Any], list[Any]]:
     """
     Return what the launch did after a forged notice: failures, and interruptions.
 
@@ -121,10 +125,12 @@ def launched(on_interrupt: str, confirms: list[bool]) -> tuple[list[Any], list[A
         async def in_thread(function: Callable[..., Any], *args: Any) -> Any:
             return function(*args)
 
-        session = Session(
-            MachineSpec('planner', 'container', on_interrupt=on_interrupt),  # type: ignore
-            loop, in_thread=in_thread, fail=failed.append,  # type: ignore[arg-type]
-            changed=lambda: None, preempted=lambda one, why: interrupted.append((why, one.lost)))
+        robot = SimpleNamespace(context=SimpleNamespace(asyncio_loop=loop), launch=SimpleNamespace(
+            store=Store(folder), id='abc123', cancel=None))
+        session = Interruptible(
+            read({'on_interrupt': on_interrupt}), MachineSpec('planner', 'container'), loop,
+            robot=robot, in_thread=in_thread, fail=failed.append, changed=lambda: None,
+            preempted=lambda one, why: interrupted.append((why, one.lost)))
         said: list[Callable[[Any], None]] = []
         session.up(SimpleNamespace(  # type: ignore[arg-type]
             subscribe=said.append, start=lambda nodes: None,
@@ -144,11 +150,11 @@ def launched(on_interrupt: str, confirms: list[bool]) -> tuple[list[Any], list[A
 
 
 @pytest.mark.parametrize('how', ['shutdown', 'replace'])
-def test_notice_alone_interrupts_no_machine(how: str) -> None:
-    assert launched(how, [False, False]) == ([], [('it was deleted', True)])
+def test_notice_alone_interrupts_no_machine(how: str, tmp_path: Path) -> None:
+    assert launched(how, [False, False], tmp_path) == ([], [('it was deleted', True)])
     # the provider says so itself, at once or later
-    assert launched(how, [True]) == ([], [('forged', False)])
-    assert launched(how, [False, True]) == ([], [('forged', False)])
+    assert launched(how, [True], tmp_path) == ([], [('forged', False)])
+    assert launched(how, [False, True], tmp_path) == ([], [('forged', False)])
 
 
 @pytest.mark.parametrize(('state', 'reclaims'), [

@@ -13,11 +13,12 @@ import pytest
 from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.deploy.steps.containers import Containers
 from fogros2.errors import FogError
-from fogros2.host import checkpoint, dependencies, inspection, modules, wheels
+from fogros2.host import dependencies, inspection, modules, wheels
 from fogros2.model import Result, SyncReport
 from fogros2.shell import host_key, sync
 from fogros2.untrusted import InvalidMessage
 from fogros2.vpn import addresses
+from fogros2_features.replacement import snapshots
 from fogros2_testing import FakeShell
 from ros2fog_cli.api import monitor
 
@@ -50,7 +51,7 @@ def facts(answer: str, _: Path) -> None:
 
 
 def checkpoints(answer: str, folder: Path) -> None:
-    checkpoint.Checkpoint('~/map', folder).save(Machine(answer), still=True)
+    snapshots.Checkpoint('~/map', folder).save(Machine(answer), still=True)
 
 
 def images(answer: str, _: Path) -> None:

@@ -14,11 +14,11 @@ import pytest
 
 from fogros2 import process
 from fogros2.errors import ShellError
-from fogros2.host import checkpoint
-from fogros2.host.checkpoint import Checkpoint
 from fogros2.model import Endpoint, Result
 from fogros2.shell.local import LocalShell
 from fogros2.store import delete_folder
+from fogros2_features.replacement import snapshots
+from fogros2_features.replacement.snapshots import Checkpoint
 from rigs.stranger import NOBODY
 
 pytestmark = pytest.mark.skipif(process.which('rsync') is None, reason='needs rsync')
@@ -43,7 +43,7 @@ def used(folder: Path) -> int:
 def test_machine_cannot_send_more_than_it_says(
     shell: Lying, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(checkpoint, 'LIMIT', 1 << 20)
+    monkeypatch.setattr(snapshots, 'LIMIT', 1 << 20)
     (tmp_path / 'map').mkdir()
     (tmp_path / 'map/large').write_bytes(bytes(4 << 20))
     with pytest.raises(ShellError, match='this computer has sent more than 0.0 GB in place of'):
@@ -110,7 +110,7 @@ def home() -> Iterator[Path]:
 SIX = f"""\
 import os, sys
 from pathlib import Path
-from fogros2.host.checkpoint import Checkpoint
+from fogros2_features.replacement.snapshots import Checkpoint
 from fogros2.model import Endpoint
 from fogros2.shell.local import LocalShell
 from fogros2.store import Store

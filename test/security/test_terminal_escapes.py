@@ -20,10 +20,10 @@ import pytest
 from fogros2 import report
 from fogros2.agent_client import AgentClient
 from fogros2.errors import CommandError, FogError, ShellError
-from fogros2.host.checkpoint import Checkpoint
 from fogros2.model import Command, Result
 from fogros2.shell import command_line, sync
 from fogros2.waiting import wait_until
+from fogros2_features.replacement.snapshots import Checkpoint
 from fogros2_testing import FakeShell
 from ros2fog_cli.api import output, progress, table
 from ros2fog_cli.api.log import Lines

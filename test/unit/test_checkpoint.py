@@ -13,12 +13,13 @@ import sys
 
 import pytest
 
+from fogros2.describe.values import check_folder
 from fogros2.errors import ConfigurationError, ConnectError, ShellError
-from fogros2.host import checkpoint
-from fogros2.host.checkpoint import check_folder, Checkpoint
 from fogros2.model import Endpoint, Result
 from fogros2.process import which
 from fogros2.shell.local import LocalShell
+from fogros2_features.replacement import snapshots
+from fogros2_features.replacement.snapshots import Checkpoint
 from fogros2_testing.fakes import FakeShell
 
 pytestmark = pytest.mark.skipif(which('rsync') is None, reason='needs rsync')
@@ -117,7 +118,7 @@ def test_missing_folder_has_no_snapshot(shell, tmp_path):
 
 
 def test_too_large_folder_is_refused(kept, shell, monkeypatch):
-    monkeypatch.setattr(checkpoint, 'LIMIT', 1)
+    monkeypatch.setattr(snapshots, 'LIMIT', 1)
     with pytest.raises(ShellError, match=r'has 0.0 GB, and a checkpoint at most 0.0 GB'):
         kept.save(shell, still=False)
 
@@ -135,7 +136,7 @@ def test_robot_whose_disk_is_full_keeps_the_last_snapshot(kept, folder, shell, t
     program = ('import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20,) * 2)\n'
                'import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n'
                'from pathlib import Path\n'
-               'from fogros2.host.checkpoint import Checkpoint\n'
+               'from fogros2_features.replacement.snapshots import Checkpoint\n'
                'from fogros2.model import Endpoint\n'
                'from fogros2.shell.local import LocalShell\n'
                'Checkpoint(sys.argv[1], Path(sys.argv[2])).save(\n'
@@ -153,7 +154,7 @@ def test_killed_copies_leave_complete_snapshots(tmp_path):
     folder.mkdir()
     dice = random.Random(21)
     program = ('import sys\nfrom pathlib import Path\n'
-               'from fogros2.host.checkpoint import Checkpoint\n'
+               'from fogros2_features.replacement.snapshots import Checkpoint\n'
                'from fogros2.model import Endpoint\n'
                'from fogros2.shell.local import LocalShell\n'
                'kept = Checkpoint(sys.argv[1], Path(sys.argv[2]))\n'

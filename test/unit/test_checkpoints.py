@@ -14,7 +14,8 @@ import pytest
 from rclpy.exceptions import InvalidHandle
 
 from fogros2.model import MachineSpec, NodeSpec
-from fogros2.runtime.checkpoints import Checkpoints
+from fogros2_features.replacement.checkpoints import Checkpoints
+from fogros2_features.replacement.options import Options
 from rigs import loops
 
 
@@ -30,7 +31,7 @@ def test_ending_launch_counts_as_no_consent(
 ) -> None:
     monkeypatch.setattr('launch_ros.ros_adapters.get_ros_node', lambda context: Destroyed())
     session: Any = SimpleNamespace(
-        spec=MachineSpec('planner', 'container', checkpoint=str(tmp_path / 'map')),
+        spec=MachineSpec('planner', 'container'), own=Options(checkpoint=str(tmp_path / 'map')),
         nodes=lambda: [NodeSpec('planner/talker', name='talker', package='demo')])
 
     async def ask() -> Optional[bool]:

@@ -60,6 +60,7 @@ from fogros2.shell import host_key
 from fogros2.store import Made, Store
 from fogros2.vpn import addresses
 from fogros2.waiting import Periodic, Timeouts, wait_until
+from fogros2_features.replacement import Replacement
 from fogros2_testing.fakes import FakeProvider, FakeShell, FakeStream, FakeVpn
 from fogros2_testing.plugins import instead
 
@@ -763,16 +764,18 @@ def test_machine_without_any_word_is_lost(cut, provider, monkeypatch):
     assert 'it is lost: no answer for ' in events[0]['reason'] and link.asked == ['stop']
 
 
-@pytest.mark.parametrize('on_loss_after, limit', [(0.0, 120.0), (300.0, 300.0)])
-def test_a_machine_is_replaced_after_longer_silence(launch, provider, on_loss_after, limit):
+@pytest.mark.parametrize('own, limit', [({}, 120.0), ({'on_loss_after': 300}, 300.0)])
+def test_a_machine_is_replaced_after_longer_silence(launch, provider, own, limit):
     """Never before its robot_timeout, so a cut of 30 s replaces nothing."""
     provider.machines['fake-1'] = Machine('fake-1', 'planner', 'fake', MachineState.RUNNING)
-    context, mine = begun(launch, dataclasses.replace(
-        SPEC, on_interrupt='replace', on_loss_after=on_loss_after))
+    context, mine = begun(launch)
     mine.record = dataclasses.replace(mine.record, machine_id='fake-1')
     mine.agent, mine.heartbeat = SimpleNamespace(silent_for=60.0), SimpleNamespace(age=limit)
     lost = []
     watch = Watch(context, mine, gone=lost.append, found=print, lost=lost.append)
+    running = SimpleNamespace(spec=SPEC, lose_after=lambda limit: setattr(watch, 'limit', limit))
+    with Replacement().machine(running, Replacement.options(on_interrupt='replace', **own)):
+        pass
     wait_until(lambda: provider.calls.count('describe') > 0, timeout=60, what='a question')
     assert lost == []
     mine.heartbeat.age = limit + 0.1

@@ -32,7 +32,7 @@ def options(machine, context):
 def test_unset_options_are_left_out(context):
     for kind, provider in ((AWSCloudInstance, 'aws'), (KubeInstance, 'kubernetes')):
         spec = kind(name='cloud', ros_workspace='').spec(context)
-        assert (spec.provider, spec.options, spec.on_interrupt) == (provider, {}, 'shutdown')
+        assert (spec.provider, spec.options, spec.features) == (provider, {}, {})
     assert options(AWSCloudInstance(
         name='cloud', ami_image=None, ec2_instance_type=None), context) == {}
 
@@ -48,7 +48,8 @@ def test_everything_that_an_instance_takes(context):
     spec = AWSCloudInstance(
         name='cloud', on_interrupt='robot', on_exit='keep', lifetime='2h', **said).spec(context)
     assert spec.options == said
-    assert (spec.on_interrupt, spec.on_exit, spec.lifetime) == ('robot', 'keep', 7200)
+    assert (spec.features, spec.on_exit, spec.lifetime) == (
+        {'replacement': {'on_interrupt': 'robot'}}, 'keep', 7200)
     # the provider takes them all
     from fogros2.provider.aws.options import Options
     Options.parse({key: value for key, value in said.items()

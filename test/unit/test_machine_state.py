@@ -8,7 +8,7 @@ from typing import get_args
 
 import pytest
 
-from fogros2.runtime.machine_state import Command, decide, Event, MachineState, Phase
+from fogros2_features.replacement.machine_state import Command, decide, Event, MachineState, Phase
 
 
 def after(*events: Event, survivable: bool = True) -> tuple[MachineState, list[Command]]:

@@ -9,7 +9,7 @@ import random
 
 import pytest
 
-from fogros2.runtime.replacement import decide, Replacement
+from fogros2_features.replacement.steps import decide, Replacement
 
 UP = Replacement(limit=2, drain=20.0, fence=140.0)
 

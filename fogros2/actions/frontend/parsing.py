@@ -102,7 +102,7 @@ def node(entity: Entity, parser: Parser, cls: type[Node]) -> Parsed:
     kwargs['machine'] = _machine(entity, parser)
     parameters = {'image': kinds.Keyword('image', 'text'),
                   'image_options': kinds.Keyword('image_options', 'list'),
-                  'checkpoint': kinds.Keyword('checkpoint', 'text')}
+                  **features.keywords('node_options')}
     contents = {name: value(entity, parser, keyword) for name, keyword in parameters.items()}
     kwargs.update({name: values.items(content) if name == 'image_options' else content
                    for name, content in contents.items() if content is not None})

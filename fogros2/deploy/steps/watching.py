@@ -98,7 +98,7 @@ class Watch(Step):
 
     A machine that exists but is out of reach is not gone. It is lost if neither it nor its
     provider answers for ``LOSS`` seconds; a computer that FogROS2 does not own has no provider.
-    A machine that will be replaced is lost after its ``on_loss_after``.
+    With a ``limit``, it is lost after so many seconds of silence, whatever its provider reports.
     An unknown exception is a defect of FogROS2 or of a plugin: it ends the watch and is reported
     at once, and ``close`` raises it, so that the nodes continue until then.
 
@@ -117,9 +117,7 @@ class Watch(Step):
         self._found = found
         self._lost = lost
         self._alarm = SilenceAlarm()
-        #: Silence of a machine that will be replaced, even if its provider says that it runs.
-        self._limit = (job.spec.on_loss_after or job.spec.robot_timeout) \
-            if job.spec.on_interrupt == 'replace' else None
+        self.limit: Optional[float] = None
         self._closed = threading.Event()
         self._ending = threading.Lock()
         self._fault: Optional[BaseException] = None
@@ -159,8 +157,8 @@ class Watch(Step):
         due = self._alarm.due(age, time.monotonic())
         if due is not None:
             self._context.report(Silence(self._job.name, *due))
-        if self._limit is not None:
-            if age > self._limit:
+        if self.limit is not None:
+            if age > self.limit:
                 self._end(self._lost, f'it is lost: no answer for {age:.0f} s')
         elif min(age, time.monotonic() - self._word_at) > LOSS:
             self._end(self._lost, f'it is lost: no answer for {age:.0f} s, and no word of its '

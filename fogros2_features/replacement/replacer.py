@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Replace a machine of a launch: carry out the commands of :mod:`fogros2.runtime.replacement`."""
+"""Replace a machine of a launch: carry out the commands of ``steps``."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any, Optional, Protocol, TYPE_CHECKING
 
 from fogros2.errors import Cancelled, FogError, ProviderError
 from fogros2.model import NodeSpec
-from fogros2.runtime.checkpoints import Checkpoints, Nodes
-from fogros2.runtime.replacement import decide, Event, Replacement
+from fogros2_features.replacement.checkpoints import Checkpoints, Nodes
+from fogros2_features.replacement.steps import decide, Event, Replacement
 
 if TYPE_CHECKING:
     from fogros2.deploy import Launch, RunningMachine
@@ -60,8 +60,8 @@ class Replacer:
         in_thread: Callable[..., asyncio.Future[Any]], fail: Callable[[BaseException], None],
         is_over: Callable[[], bool], logger: logging.Logger,
     ) -> None:
-        spec = session.spec
-        self.state = Replacement(spec.max_replacements, GRACE, spec.robot_timeout + GRACE)
+        self.state = Replacement(
+            session.own.max_replacements, GRACE, session.spec.robot_timeout + GRACE)
         self._session = session
         self._launch = launch
         self._loop = loop

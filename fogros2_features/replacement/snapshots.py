@@ -15,7 +15,7 @@ import threading
 from typing import Optional
 
 from fogros2 import untrusted
-from fogros2.errors import ConfigurationError, ConnectError, FogError, ShellError
+from fogros2.errors import ConnectError, FogError, ShellError
 from fogros2.model import Command
 from fogros2.shell import Shell
 from fogros2.shell.command_line import remote_path
@@ -42,25 +42,11 @@ find . -printf '%P %y %s %T@ %C@\\n' | LC_ALL=C sort | sha256sum
 _ASIDE = 'if [ -e {0} ] && [ ! -e {1} ]; then mv -T -- {0} {1}; echo moved; fi'
 
 
-def check_folder(what: str, value: object) -> str:
-    """
-    Return a folder in the form ``~/map`` or ``/var/map``; ``$HOME`` stands for ``~``.
-
-    :raises ConfigurationError: it is no folder below the home or the root.
-    """
-    path = re.sub(r'^\$HOME/', '~/', str(value)).rstrip('/')
-    parts = path.split('/')
-    if len(parts) < 2 or parts[0] not in ('~', '') or {'', '.', '..'} & {*parts[1:]}:
-        raise ConfigurationError(f'{what}={value!r} is no folder that can be copied',
-                                 "use a folder below the home, such as '$HOME/map'")
-    return path
-
-
 class Checkpoint:
     """
     The snapshots of one folder; the caller makes one call at a time.
 
-    :param folder: as :func:`check_folder` returns it.
+    :param folder: as ``check_folder`` returns it.
     :param store: the folder of the snapshots on the robot.
     :param cancel: when set, a copy raises Cancelled.
     """

@@ -14,10 +14,11 @@ import zlib
 from launch import LaunchContext
 
 from fogros2.errors import FogError
-from fogros2.host.checkpoint import Checkpoint
 from fogros2.model import Endpoint, MachineSpec, NodeSpec
 from fogros2.runtime.node_spec import full_name
 from fogros2.shell import connect, Shell
+from fogros2_features.replacement.options import Options
+from fogros2_features.replacement.snapshots import Checkpoint
 
 #: Seconds that a node has to answer ``~/checkpoint``.
 ANSWER = 5.0
@@ -27,6 +28,7 @@ class Nodes(Protocol):
     """The nodes of one machine, as a session has them."""
 
     spec: MachineSpec
+    own: Options
 
     @property
     def shell(self) -> Optional[Shell]:
@@ -65,8 +67,8 @@ class Checkpoints:
         self._clients: dict[str, Any] = {}
         self._order = asyncio.Lock()
         self._said = ''
-        if session.spec.checkpoint:
-            self.add(session.spec.checkpoint)
+        if session.own.checkpoint:
+            self.add(session.own.checkpoint)
 
     def __bool__(self) -> bool:
         return bool(self._folders)
@@ -80,7 +82,7 @@ class Checkpoints:
             folder, self._store / f'{zlib.crc32(folder.encode()):08x}', self._cancel)
 
     def _later(self, duration: float = 0.0) -> None:
-        interval = self._session.spec.checkpoint_interval
+        interval = self._session.own.checkpoint_interval
         # a state is as old as the begin of its copy, until the next copy, which may take longer
         self._context.asyncio_loop.call_later(
             max(interval - 3 * duration, interval / 10), self._due)

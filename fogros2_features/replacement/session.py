@@ -1,0 +1,319 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A machine of a launch whose processes go on when it ends: on the robot, or on a new machine."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+import functools
+from typing import Any, Optional, TYPE_CHECKING
+
+from fogros2.errors import ConfigurationError
+from fogros2.events import Event
+from fogros2.model import NodeSpec
+from fogros2.runtime.interruption import MachineInterrupted
+from fogros2.runtime.remote_run import RemoteRun
+from fogros2.runtime.session import Session
+from fogros2.shell import Shell
+from fogros2_features.replacement import machine_state
+from fogros2_features.replacement.checkpoints import Checkpoints
+from fogros2_features.replacement.machine_state import MachineState
+from fogros2_features.replacement.options import folder_of, Options
+from fogros2_features.replacement.replacer import Replacer
+
+if TYPE_CHECKING:
+    from launch import Action
+
+    from fogros2.deploy import RunningMachine
+
+#: Events after which processes end because their machine ends. With on_interrupt='robot', exits
+#: are then held back for so many seconds, until it is known whether the machine is gone.
+_LAST_EVENTS = ('watchdog', 'ending')
+_HOLD = 60.0
+#: Seconds in which the provider may confirm a notice; EC2 gives two minutes' notice.
+_CONFIRM = 150.0
+
+
+class Interruptible(Session):
+    """
+    One machine of a launch, on the event loop.
+
+    :param own: what the launch file says of its interruption.
+    """
+
+    def __init__(self, own: Options, *words: Any, **named: Any) -> None:
+        super().__init__(*words, **named)
+        self.own = own
+        self.fenced = own.replaces
+        self.state = MachineState(survivable=own.on_interrupt != 'shutdown')
+        self._held: list[tuple[RemoteRun, Event]] = []
+        self.replacer: Optional[Replacer] = None
+        self.checkpoints: Optional[Checkpoints] = None
+        #: Processes that have left a machine that is being replaced.
+        self._away: list[RemoteRun] = []
+        # keeps moves between robot and machines in order
+        self._moves = asyncio.Lock()
+        if own.replaces:
+            assert self._robot is not None
+            context, launch = self._robot.context, self._robot.launch
+            self.replacer = Replacer(
+                self, launch, self._loop, in_thread=self._in_thread, fail=self._fail,
+                is_over=lambda: context.is_shutdown, logger=self._logger)
+            self.checkpoints = Checkpoints(
+                self, context, launch.store.launch(launch.id) / 'checkpoints' / self.spec.name,
+                f'.before-{launch.id}', launch.cancel, in_thread=self._in_thread,
+                logger=self._logger)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether the provider reclaims the machine, which may still run, or it is gone."""
+        return self.state.interrupted
+
+    # -- processes ------------------------------------------------------------------------------
+
+    def replicate(self, names: dict[str, str]) -> None:
+        """Rename the topics and services of replicated nodes; see the base class."""
+        if self.own.on_interrupt == 'robot':
+            raise ConfigurationError(
+                f"replicas cannot move to the robot, as on_interrupt='robot' of "
+                f"'{self.spec.name}' wants it", 'leave on_interrupt= out: the others go on')
+        super().replicate(names)
+
+    def command_here(self, resolve: Callable[[], list[str]]) -> Optional[list[str]]:
+        """Return the command of a process on the robot, None if it stays on machines."""
+        if self.own.on_interrupt == 'shutdown' or self.replicated:
+            return None
+        try:
+            return resolve()
+        except ConfigurationError as error:
+            if self.own.replaces:
+                return None  # it waits for the new machine
+            raise ConfigurationError(
+                str(error.args[0]), "on_interrupt='robot' moves it there: "
+                f"{error.hint}, or say on_interrupt='shutdown'") from error
+
+    @property
+    def shell(self) -> Optional[Shell]:
+        """The shell of the machine, None while the machine does not run the nodes."""
+        return None if self.running is None or self.interrupted else self.running.shell
+
+    def nodes(self) -> list[NodeSpec]:
+        """Return the machine's nodes that have started."""
+        return [run.node for run in self._runs.values() if run.state.started]
+
+    def submit(self, run: RemoteRun) -> None:
+        """Start a process when the machine is up; elsewhere, if the machine is interrupted."""
+        if self.replacer is None or self.state.phase == 'over':
+            super().submit(run)
+            return
+        if self.checkpoints is not None and (folder := folder_of(run.node)):
+            self.checkpoints.add(folder)
+        self.replacer.allow(run.node)
+        if self.interrupted:
+            self._runs[run.node.id] = run
+            run.on('halt_gone')
+        else:
+            super().submit(run)
+
+    def stop(self, run: RemoteRun) -> bool:
+        """Stop a process; return False if it does not run there and never will."""
+        if run in self._away:
+            return False
+        for held in [] if self.lost else self._held:
+            if held[0] is run:
+                self._held.remove(held)
+                run.on_event(held[1])
+                return True
+        return super().stop(run)
+
+    def forget(self, run: RemoteRun) -> None:
+        """Remove a process that has ended."""
+        super().forget(run)
+        self._check_drained()
+
+    def halted(self, run: RemoteRun) -> bool:
+        """Note that a process has left its machine; return whether it must not start elsewhere."""
+        if self.replacer is None:
+            return False
+        self._runs.pop(run.node.id, None)
+        if run not in self._away:
+            self._away.append(run)
+        self._check_drained()
+        return not self.replacer.state.moved
+
+    def _check_drained(self) -> None:
+        if self.replacer is not None and not self._runs:
+            self._on('empty')
+
+    # -- events ---------------------------------------------------------------------------------
+
+    def up(self, running: RunningMachine) -> None:
+        """Start the waiting processes: the machine is up."""
+        self._on('up')
+        super().up(running)
+
+    def _on_process_event(self, run: RemoteRun, event: Event) -> None:
+        if event['event'] == 'exited' and self.state.phase == 'ending' and not run.state.stopping:
+            self._held.append((run, event))
+        else:
+            super()._on_process_event(run, event)
+
+    def _on_event(self, event: Event) -> None:
+        super()._on_event(event)
+        if event['event'] == 'notice':
+            # where nodes move to the robot, nothing ends: the notice may be forged
+            self._on('reclaimed' if self.own.on_interrupt == 'robot' else 'claim',
+                     event['reason'] or 'no reason')
+        elif event['event'] in _LAST_EVENTS:
+            self._on('last_words')
+
+    def _gone(self, reason: str) -> None:
+        self._on('gone', reason)
+
+    def _restarted(self) -> None:
+        if self.state.phase != 'ending':
+            super()._restarted()
+
+    def _agent_gone(self) -> None:
+        if self.state.phase != 'ending' and not (self.interrupted and self.fenced):
+            super()._agent_gone()
+
+    def _on(self, event: machine_state.Event, reason: str = '') -> None:
+        """
+        Change the machine's state, and do what follows.
+
+        :param reason: of an interruption, for the user.
+        """
+        self.state, commands = machine_state.decide(self.state, event)
+        self.lost = self.state.phase == 'gone'
+        for command in commands:
+            if command == 'hold':
+                self._loop.call_later(_HOLD, self._on, 'spared')
+            elif command == 'release':
+                held, self._held = self._held, []
+                for run, exited in held:
+                    run.on_event(exited)
+            elif command == 'save':
+                self.request(self._last_checkpoint)
+            elif command == 'announce':
+                self._preempted(self, reason)
+            elif command == 'bury':
+                self._bury(reason)
+            else:
+                self._logger.warning(
+                    f'{self.spec.name}: the machine reports that its provider reclaims it: '
+                    f'{reason}; its nodes go on until the provider confirms that, or the machine '
+                    'is gone')
+                self.request(functools.partial(self._confirm, reason))
+
+    async def _confirm(self, reason: str) -> None:
+        running = self.running
+        assert running is not None
+        try:
+            confirmed = await self._in_thread(running.reclaimed, 0.0)
+            if not confirmed:
+                if self.checkpoints:
+                    self.request(self.checkpoints.take)
+                confirmed = await self._in_thread(running.reclaimed, _CONFIRM)
+            if running is not self.running or self.interrupted:
+                return
+            if confirmed:
+                self._on('reclaimed', reason)
+            else:
+                self._logger.info(
+                    f'{self.spec.name}: its provider has not confirmed that it reclaims it')
+        finally:
+            self._on('refuted')
+
+    def go_on(self, event: MachineInterrupted, remedy: str = '') -> list[Action]:
+        """Apply ``on_interrupt``; return what this needs; see the base class."""
+        if self.replacer is not None:
+            self._logger.warning(f'{event}; a new machine will continue its nodes')
+            self.replacer.on('lost' if event.lost else 'notice')
+            return []
+        if self.own.on_interrupt == 'robot':
+            assert self._robot is not None
+            self._logger.warning(f'{event}; its nodes continue on the robot')
+            actions = self._robot.take_over(self.spec.name)
+            self.move_all()
+            return actions
+        return super().go_on(event, "on_interrupt='robot' continues its nodes on the robot")
+
+    def _bury(self, reason: str) -> None:
+        if self.replacer is not None:
+            self.replacer.on('lost')
+        else:
+            self._logger.info(f'{self.spec.name}: the machine is gone: {reason}')
+            self.move_all()
+
+    def move_all(self) -> None:
+        """Move all of the machine's processes to the robot."""
+        ended = [run for run, _ in self._held]
+        self._held.clear()
+        for run in list(self._runs.values()):
+            run.on('move_gone' if self.lost or run in ended else 'move')
+
+    async def _give_up(self, reason: str) -> None:
+        self._on('given_up')
+        if self.state.phase == 'over':
+            await super()._give_up(reason)
+
+    # -- a new machine --------------------------------------------------------------------------
+
+    async def halt_all(self) -> None:
+        """Let the machine end all of its processes, because another machine continues them."""
+        if self.checkpoints:
+            await self.checkpoints.ask()
+        ended = [run for run, _ in self._held]
+        self._held.clear()
+        for run in list(self._runs.values()):
+            run.on('halt_gone' if self.lost or run in ended else 'halt')
+        self._check_drained()
+
+    async def _last_checkpoint(self) -> None:
+        assert self.running is not None and self.replacer is not None
+        if self.checkpoints:
+            # nothing writes any more
+            await self.checkpoints.save(self.running.shell, still=True)
+        self.replacer.on('drained')
+
+    async def move_halted(self) -> None:
+        """Let processes start on the robot: the machine no longer runs them."""
+        self._held.clear()
+        async with self._moves:
+            if self.checkpoints:
+                await self.checkpoints.restore(self.checkpoints.robot)
+            for run in [*self._away, *self._runs.values()]:
+                run.on('left')
+
+    def homeless(self) -> list[str]:
+        """Return the names of processes that cannot run on the robot."""
+        return [run.node.name for run in self._away if run.state.phase == 'away']
+
+    def replace(self, running: RunningMachine) -> None:
+        """Use another machine from now on."""
+        self.running = running
+        self._on('replaced')
+        for instance in self.instances:
+            instance.is_up(running)
+
+    async def come_back(self) -> None:
+        """Move all processes to the new machine."""
+        back: dict[RemoteRun, bool] = {}
+        async with self._moves:
+            was_here = len(self.homeless()) < len(self._away)
+            # processes that execute meanwhile join
+            while new := [run for run in self._away if run not in back]:
+                back.update(zip(new, await asyncio.gather(*(run.come_back() for run in new))))
+                if self.checkpoints and self.running is not None:
+                    if was_here:
+                        await self.checkpoints.save(self.checkpoints.robot, still=True)
+                    await self.checkpoints.restore(self.running.shell)
+        self._away.clear()
+        self._on('returned')
+        for run in [run for run, alive in back.items() if alive]:
+            self._runs[run.node.id] = run
+            self._waiting.append(run)
+        self._logger.info(f'{self.spec.name}: a new machine runs the nodes')
+        await self._subscribe()
+        await self._start_waiting()
