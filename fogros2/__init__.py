@@ -9,7 +9,7 @@ alone loads neither launch nor an SDK.
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from fogros2.actions.cloud_group import CloudGroup
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from fogros2.describe.machines import (
         CloudInstance,
         ContainerInstance,
-        JoinedMachine,
         SSHInstance,
     )
     from fogros2.describe.machines_cloud import (
@@ -46,8 +45,8 @@ if TYPE_CHECKING:
 __all__ = [
     'AWSCloudInstance', 'AzureCloudInstance', 'CheapestInstance', 'CloudGroup',
     'CloudInstance', 'CloudNode', 'ComposableNodeContainer', 'ContainerInstance', 'FogError',
-    'FogMachine', 'FogROSLaunchDescription', 'Foxglove', 'GCPCloudInstance', 'JoinedMachine',
-    'KubeInstance', 'LifecycleNode', 'MachineInterrupted', 'Node', 'Replicated', 'SSHInstance',
+    'FogMachine', 'FogROSLaunchDescription', 'Foxglove', 'GCPCloudInstance', 'KubeInstance',
+    'LifecycleNode', 'MachineInterrupted', 'Node', 'Replicated', 'SSHInstance',
     'StreamTopic', 'cheapest', 'ec2_instance_type_selection', 'find_cheapest',
     'find_cheapest_ec2_instance_type', 'find_nearest_aws_region', 'nearest_aws_region_now',
     'region_ami_selection',
@@ -63,7 +62,7 @@ _NAMES = {
     'describe.choices':
         'find_cheapest find_cheapest_ec2_instance_type find_nearest_aws_region '
         'nearest_aws_region_now',
-    'describe.machines': 'CloudInstance ContainerInstance JoinedMachine SSHInstance',
+    'describe.machines': 'CloudInstance ContainerInstance SSHInstance',
     'describe.machines_cloud':
         'AWSCloudInstance AzureCloudInstance CheapestInstance GCPCloudInstance KubeInstance '
         'cheapest',
@@ -77,16 +76,24 @@ _MODULES = {name: f'fogros2.{module}' for module, names in _NAMES.items()
 _FORMERLY_UTILS = ('ec2_instance_type_selection', 'region_ami_selection')
 
 
-def __getattr__(name: str) -> object:
+def __getattr__(name: str) -> Any:
     if name in _FORMERLY_UTILS:
         value = importlib.import_module('fogros2.describe.choices')
     elif name in _MODULES:
         value = getattr(importlib.import_module(_MODULES[name]), name)
+    elif name[:1].isupper() and name in _machines():
+        value = _machines()[name].load()
     else:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
     globals()[name] = value
     return value
 
 
+def _machines() -> Any:
+    """Return the entry points of the classes of machines, those of plugins too, by class."""
+    from importlib.metadata import entry_points
+    return {point.attr: point for point in entry_points(group='fogros2.machine')}
+
+
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, *_machines()})

@@ -327,6 +327,23 @@ class VpnInterface:
 
 
 @dataclasses.dataclass(frozen=True)
+class OtherVpn:
+    """
+    A VPN of another robot, by which this computer reaches one machine of that robot.
+
+    :param machine: the machine's name there; ``interface`` its end, and ``key`` its public key.
+    :param own: this computer's end.
+    :param heartbeats: UDP port of the machine's address for the heartbeats of this computer.
+    """
+
+    machine: str
+    interface: VpnInterface
+    key: str
+    own: VpnInterface
+    heartbeats: int
+
+
+@dataclasses.dataclass(frozen=True)
 class DdsInterface:
     """A network interface for DDS, by name or address; a larger ``priority`` is preferred."""
 

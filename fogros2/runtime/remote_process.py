@@ -92,7 +92,7 @@ class RemoteProcess:
         self._node = node_spec.from_action(
             action, context, coordinator.base_environment, session.spec, coordinator.launch.id,
             self.image, self.image_options,
-            provider.has_own_packages(session.spec), bool(provider.invitation(session.spec)))
+            provider.has_own_packages(session.spec), provider.capabilities.account)
         if not isinstance(action, AddedProcess):
             paths = node_spec.robot_paths(
                 self._node, [context.environment.get('HOME', ''), *(plan.ament_prefixes(

@@ -9,8 +9,8 @@ host keys, and ``proxy`` leads through other computers; ``ssh_connection`` opens
 ``sync`` calls rsync. ``local`` is the shell of this computer. ``remote`` is the base of the shells
 with a connection. ``ssh`` is one of them. ``multiplexer`` is a program on a machine that runs many
 commands over one connection, and ``multiplexed`` the robot's end of it. So do pods by
-``kubernetes_link`` and ``kubernetes``, the connection and the shell, and machines of other robots
-by ``guest``. ``movable`` replaces a shell in use, ``host_key`` a machine's host key.
+``kubernetes_link`` and ``kubernetes``, the connection and the shell. ``movable`` replaces a shell
+in use, ``host_key`` a machine's host key.
 """
 
 from __future__ import annotations

@@ -7,9 +7,9 @@ from pathlib import Path
 import sys
 
 from fogros2.model import Command
-from fogros2.vpn import guests
-from fogros2.vpn.addresses import guest_heartbeats, GUEST_PORT
 from fogros2.waiting import wait_until
+from fogros2_features.guests import network
+from fogros2_features.guests import program as guests
 from rigs.container_machines import Cloud, cloud, cloud_network, engine, key
 from rigs.vpn_guest import GUEST, Guest, guest
 from rigs.vpn_lab import Child, Lab, MACHINE, ROBOT
@@ -47,10 +47,10 @@ for word in sys.argv[1:]:
 '''
 #: The last one is for the heartbeats of another guest.
 PORTS = ['tcp:0.0.0.0:22', 'tcp:0.0.0.0:8765', 'udp:0.0.0.0:7399', 'udp:0.0.0.0:53',
-         f"udp:0.0.0.0:{guest_heartbeats('198.18.7.225')}"]
+         f"udp:0.0.0.0:{network.heartbeats('198.18.7.225')}"]
 DDS = 'udp:0.0.0.0:7410'
 #: What a guest reaches besides DDS: the door, and the port for its heartbeats.
-OWN = [f'tcp:0.0.0.0:{GUEST_PORT}', f'udp:0.0.0.0:{guest_heartbeats(GUEST)}']
+OWN = [f'tcp:0.0.0.0:{network.PORT}', f'udp:0.0.0.0:{network.heartbeats(GUEST)}']
 #: Gives a guest an account, whose program leaves files; ends it, and gives another one. Prints
 #: the ids of both, and what System V keeps of the first.
 ACCOUNTS = """

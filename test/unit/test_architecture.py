@@ -29,7 +29,7 @@ ORDER = """
     model untrusted errors events clock
     waiting report process
     agent ros_types
-    plugin_system store journal ros2_daemon monitor_addresses sealing invitation
+    plugin_system store journal ros2_daemon monitor_addresses
     kubernetes_client
     shell vpn dds
     agent_client
@@ -45,14 +45,13 @@ ORDER = """
 UPWARD: set[tuple[str, str]] = set()
 #: Plugins that are named by others: (importing module, plugin). Only ever remove lines.
 NAMED_PLUGINS = {
-    ('fogros2.deploy.membership', 'fogros2.vpn.helped'),
     ('fogros2.deploy.robot', 'fogros2.vpn.helped'),
     ('fogros2.deploy.robot_vpn', 'fogros2.vpn.helped'),
+    ('fogros2_features.guests.membership', 'fogros2.vpn.helped'),
     ('fogros2_monitor.application', 'fogros2.provider.container'),
     ('ros2fog_cli.api.doctor', 'fogros2.dds.cyclonedds'),
     ('ros2fog_cli.api.doctor', 'fogros2.provider.container'),
     ('ros2fog_cli.api.doctor', 'fogros2.vpn.helped'),
-    ('ros2fog_cli.api.reach', 'fogros2.vpn.helped'),
     ('ros2fog_cli.api.pod_image', 'fogros2.provider.kubernetes'),
 }
 #: Packages with a circle of imports inside. Only ever remove names.
@@ -74,6 +73,9 @@ SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_c
 #: Found by their entry points, or started by the user: the core imports none of them.
 ABOVE = ('fogros2_features', 'fogros2_monitor', 'fogros2_replicas', 'fogros2_share',
          'fogros2_testing', 'ros2fog_cli', 'rigs')
+#: Words by which the core would name a feature. Features of clouds have some of them, too.
+WORDS = {'guests': r'(?i)guest|\binvit(e|ation)|JoinedMachine|GuestShell'}
+CLOUDS = {'aws', 'azure', 'gcp', 'kubernetes'}
 #: All of the core but the import of types.
 BUT_TYPES = r'fogros2(?! import ros_types$)'
 
@@ -186,7 +188,9 @@ def test_exceptions_name_what_exists() -> None:
 
 @pytest.mark.parametrize(('folder', 'above'), [
     ('fogros2', ABOVE), ('fogros2_monitor', tuple(n for n in ABOVE if n != 'fogros2_monitor')),
-    ('fogros2_features', ABOVE[1:]),
+    # a feature may have verbs
+    ('fogros2_features', tuple(n for n in ABOVE[1:] if n != 'ros2fog_cli')),
+    ('ros2fog_cli', ('fogros2_features', 'fogros2_testing', 'rigs')),
     ('fogros2_replicas', (BUT_TYPES, 'fogros2_monitor', 'ros2fog_cli', 'rigs')),
     ('fogros2_share', (BUT_TYPES, 'fogros2_monitor', 'ros2fog_cli', 'rigs')),
     ('point_cloud_stream', (*ABOVE, 'fogros2')),
@@ -203,6 +207,14 @@ def test_core_names_no_keyword_of_a_feature() -> None:
         pattern = rf'\b{keyword}\b' if '_' in keyword else rf'\b{keyword}='
         for path in python_files(CORE):
             assert not re.search(pattern, path.read_text()), f'{path} names {keyword}'
+
+
+@pytest.mark.parametrize('feature', WORDS)
+def test_core_names_no_feature(feature: str) -> None:
+    for path in (*python_files(CORE), *python_files(ROOT / 'ros2fog_cli')):
+        if not CLOUDS & {*path.parts}:
+            named = re.search(WORDS[feature], path.read_text())
+            assert not named, f'{path.relative_to(ROOT)} names {named and named[0]}'
 
 
 def plugin(module: str) -> str:
@@ -231,7 +243,8 @@ def test_ros_and_sdks_are_imported_by_their_parts(path: Path) -> None:
 
 def test_verb_imports_nothing_slow_before_it_runs() -> None:
     """``ros2 fog -h`` loads all verbs; one of them must not bring an SDK or the core with it."""
-    for path in python_files(ROOT / 'ros2fog_cli' / 'verb'):
+    for path in (*python_files(ROOT / 'ros2fog_cli' / 'verb'),
+                 *(ROOT / 'fogros2_features').glob('*/verbs.py')):
         for name, early in imports(path):
             if early:
                 assert name.split('.')[0] in (

@@ -26,8 +26,8 @@ from fogros2.model import NETWORK_PREFIX, to_json
 from fogros2.store import check_name, robot_name, Store, write_private
 
 _PREFIX = 'fog1.'
-#: File with the invitation in the folder of a joined machine, which is like a launch's folder;
-#: and the file there with the secret for ``GuestShell``.
+#: File with the invitation in the folder of a machine's VPN (``Store.other_vpns``); and the file
+#: there with the secret for ``GuestShell``.
 JOINED, SECRET = 'joined.json', 'door.key'
 #: Private address space (RFC 1918), shared address space (RFC 6598), and the default pool.
 _PRIVATE = tuple(map(ipaddress.IPv4Network, (
@@ -91,13 +91,6 @@ class Invitation:
         return hashlib.sha256(f'{self.key} {self.joiner}'.encode()).hexdigest()[:6]
 
 
-def joined(store: Store) -> dict[str, Path]:
-    """Return the folders of the machines that this computer has joined, by machine."""
-    return {invitation.machine: path.parent
-            for path in sorted((store.root / 'launches').glob(f'*/{JOINED}'))
-            if (invitation := read(path.parent)) is not None}
-
-
 def read(folder: Path) -> Optional[Invitation]:
     """Return the invitation by which this computer has joined a machine, None if there is none."""
     with contextlib.suppress(OSError, ValueError, TypeError, ConfigurationError):
@@ -111,7 +104,7 @@ def own_key(store: Store) -> bytes:
 
     :raises ConfigurationError: its file is damaged.
     """
-    from fogros2 import sealing
+    from fogros2_features.guests import sealing
     path = store.root / 'key'
     if not path.exists():
         write_private(path, base64.b64encode(sealing.private_key()) + b'\n')
@@ -125,7 +118,7 @@ def own_key(store: Store) -> bytes:
 
 def public_text(key: bytes) -> str:
     """Return the public key of a private one as ``wg`` writes it."""
-    from fogros2 import sealing
+    from fogros2_features.guests import sealing
     return base64.b64encode(sealing.public_key(key)).decode()
 
 
@@ -154,7 +147,7 @@ def seal(invitation: Invitation, key: str) -> str:
 
     :param key: the invited computer's public key, in base64.
     """
-    from fogros2 import sealing
+    from fogros2_features.guests import sealing
     sealed = sealing.seal(to_json(invitation).encode(), base64.b64decode(key), _PREFIX.encode())
     return _PREFIX + base64.urlsafe_b64encode(sealed).decode()
 
@@ -165,7 +158,7 @@ def unseal(text: str, key: bytes) -> Invitation:
 
     :raises ConfigurationError: the text is for another computer, changed, or expired.
     """
-    from fogros2 import sealing
+    from fogros2_features.guests import sealing
     text = ''.join(text.split())
     try:
         data = base64.b64decode(text.removeprefix(_PREFIX), b'-_', validate=True)
