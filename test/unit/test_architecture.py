@@ -292,8 +292,8 @@ def test_forbidden_words(pattern: str) -> None:
 
 def test_only_one_module_starts_processes() -> None:
     """A command that is waited for goes through ``process``; streams and daemons are few."""
-    # guests and relocation are programs for machines
-    allowed = {'process.py', 'guests.py', 'relocation.py', 'serve.py'}
+    # relocation is a program for machines
+    allowed = {'process.py', 'relocation.py', 'serve.py'}
     for path in (*python_files(CORE), *python_files(ROOT / 'fogros2_monitor')):
         if path.name not in allowed and 'subprocess' in path.read_text():
             names = {name for name, _ in imports(path)}
