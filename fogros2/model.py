@@ -104,14 +104,6 @@ class MachineSpec:
         return (self.workspace, *self.underlays) if self.workspace else ()
 
     @property
-    def fleet_networks(self) -> tuple[str, ...]:
-        """The networks that reach the SSH port at any time: those of the robots of ``fleet=``."""
-        named = self.options.get('ssh_from') or ()
-        if not self.options.get('fleet'):
-            return ()
-        return (named,) if isinstance(named, str) else tuple(named)
-
-    @property
     def monitored(self) -> bool:
         """Whether a Foxglove bridge starts with the first node."""
         return self.launch_foxglove or bool(self.monitor_allow)

@@ -128,7 +128,8 @@ def _take_vpn_down(site: Site, made: Made) -> None:
 
 
 def _close_ssh(site: Site, made: Made) -> None:
-    site.provider.allow(site.machine.id, made.port, site.record.spec.fleet_networks)
+    site.provider.allow(
+        site.machine.id, made.port, site.provider.ssh_networks(site.record.spec))
 
 
 #: Kinds of what a launch makes; reports name them.

@@ -374,6 +374,10 @@ class Provider(abc.ABC):
         """
         raise Unsupported(f"provider '{self.name}' has no firewall")
 
+    def ssh_networks(self, spec: MachineSpec) -> Sequence[str]:
+        """Return the networks (CIDR) that always reach the SSH port, beside the robot."""
+        return ()
+
     def open_port(
         self, machine: Machine, port: int, sources: Sequence[str],
     ) -> tuple[str, int]:

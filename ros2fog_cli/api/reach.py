@@ -127,7 +127,8 @@ def _open(entry: Entry, port: int, undo: contextlib.ExitStack) -> None:
                 record = Store().load(entry.name)
         if record is None or not record.launch_alive:
             try:
-                provider.allow(machine_id, port, record.spec.fleet_networks if record else ())
+                provider.allow(
+                    machine_id, port, provider.ssh_networks(record.spec) if record else ())
             except MachineNotFound:
                 pass  # the machine is gone, with its firewall
             except FogError as error:

@@ -99,7 +99,8 @@ class Connection(Step):
             self._allow([])
             job.forget(Made(SSH_PORT, outside.port))
             detail.append(
-                'SSH through the VPN, and open to the fleet' if self._job.spec.fleet_networks
+                'SSH through the VPN, and open to the fleet'
+                if self._context.provider.ssh_networks(job.spec)
                 else f'SSH through the VPN alone, port {outside.port} closed')
 
     def _leave_vpn(self) -> None:
@@ -119,8 +120,9 @@ class Connection(Step):
     def _allow(self, sources: Sequence[str]) -> None:
         outside = self._job.record.shell
         assert outside is not None
-        self._context.provider.allow(
-            self._job.machine_id, outside.port, [*sources, *self._job.spec.fleet_networks])
+        provider = self._context.provider
+        provider.allow(self._job.machine_id, outside.port,
+                       [*sources, *provider.ssh_networks(self._job.spec)])
 
     def _shell_to(self, endpoint: Endpoint) -> Shell:
         return shells.connect(
