@@ -139,9 +139,10 @@ class WireGuard(Vpn):
         else:
             lines.append(f'found=$(wg show {name} endpoints) && '
                          f'printf "%s\\n" "$found" >{_noted(interface)} || :')
-            lines.append(f'[ ! -e {more(interface)}.due ] || {{ read -r due; '
-                         'read -r up _ </proc/uptime; [ "${up%.*}" -lt "$due" ] || '
-                         f'{_more(interface, "look")} >/dev/null || :; }} <{more(interface)}.due')
+            due = f'{more(interface)}.due'
+            lines.append(f'[ ! -e {due} ] || {{ read -r due; read -r up _ </proc/uptime; '
+                         '[ "${up%.*}" -lt "$due" ] || '
+                         f'{_more(interface, "look")} >/dev/null; }} <{due} || :')
         return Command.script(
             '\n'.join(lines), sudo=not interface.firewall, what=_what('look at', interface))
 

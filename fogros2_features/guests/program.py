@@ -437,7 +437,8 @@ def serve(guests: Guests, request: dict[str, Any]) -> None:
 def main(name: str, verb: str, folder: Path = Path('/run')) -> None:
     """Run one request."""
     guests = Guests(name, folder)
-    os.environ['PATH'] += ':/usr/sbin:/sbin'  # a login user's may lack them
+    # a login user's may lack the folders of nft
+    os.environ['PATH'] = f"{os.environ.get('PATH', os.defpath)}:/usr/sbin:/sbin"
     if verb == 'serve':
         serve(guests, json.load(sys.stdin))
         return
