@@ -10,6 +10,7 @@ import json
 import os
 from pathlib import Path
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -34,6 +35,7 @@ from fogros2_features.guests import invitation, listing, membership, program
 from fogros2_testing.fakes import FakeProvider, FakeShell
 from fogros2_testing.plugins import instead
 from ros2fog_cli.api import endings, reach
+from ros2fog_cli.api.reach import Link
 
 OTHER = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
 MACHINE = Machine('id', 'planner', 'memory', MachineState.RUNNING, time.time(),
@@ -160,6 +162,27 @@ def test_nobody_is_revoked_where_the_vpn_has_ended(
     assert fog('revoke', 'planner') == 0
     assert capsys.readouterr().out == "'planner' has no guests\n"
     assert "'planner' has no guest robot2" in fog('revoke', 'planner', 'robot2')
+
+
+def test_status_shows_guests_while_the_feature_is_installed(
+    asked: list[tuple[str, Any]], capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    status = {'since': 0.0, 'rss_kb': 9, 'heartbeat_age': None, 'nodes': []}
+    monkeypatch.setattr(reach, 'agent', lambda *_: SimpleNamespace(
+        status=lambda timeout: status, close=lambda: None))
+    monkeypatch.setattr(reach, 'link', lambda record: Link('198.18.7.2', 'fogabc123'))
+    assert fog('status', 'planner', '--json') == 0
+    (guest,) = json.loads(capsys.readouterr().out)['guests']
+    assert (guest['label'], guest['left'], guest['heard']) == ('robot2', 60.0, None)
+    assert fog('status', 'planner') == 0
+    table = [line.split() for line in capsys.readouterr().out.splitlines()[-2:]]
+    assert table == [['GUEST', 'ADDRESS', 'HEARD', 'MAY', 'JOIN', 'KEY'],
+                     ['robot2', '198.18.7.224', 'never', '60', 's', 'more', OTHER]]
+    instead(monkeypatch, 'fogros2.feature', {})
+    assert fog('status', 'planner', '--json') == 0
+    assert 'guests' not in json.loads(capsys.readouterr().out)
+    assert asked == [('look', None)] * 2
 
 
 @pytest.mark.parametrize('change', [
