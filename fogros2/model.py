@@ -323,14 +323,13 @@ class OtherVpn:
     """
     A VPN of another robot, by which this computer reaches one machine of that robot.
 
-    :param machine: the machine's name there; ``interface`` its end, and ``key`` its public key.
+    :param machine: the machine, by its name there; ``interface`` is its end.
     :param own: this computer's end.
     :param heartbeats: UDP port of the machine's address for the heartbeats of this computer.
     """
 
-    machine: str
+    machine: Peer
     interface: VpnInterface
-    key: str
     own: VpnInterface
     heartbeats: int
 

@@ -26,7 +26,7 @@ from typing import Any, Optional
 
 from fogros2 import model
 from fogros2.errors import ConfigurationError, did_you_mean, NameTaken, StoreError
-from fogros2.model import Endpoint, MachineSpec, OtherVpn, VpnInterface
+from fogros2.model import Endpoint, MachineSpec, OtherVpn, Peer, VpnInterface
 
 #: Name of a file or folder that only one process uses, with that process.
 _UNFINISHED = re.compile(r'\..+\.([0-9]+)\.[a-z0-9_]{8}')
@@ -325,7 +325,7 @@ class Store:
 
     def other_vpns(self) -> dict[str, Path]:
         """Return the folders of other robots' VPNs that this computer has joined, by machine."""
-        return {other.machine: path.parent
+        return {other.machine.name: path.parent
                 for path in sorted((self.root / 'launches').glob(f'*/{OTHER_VPN}'))
                 if (other := other_vpn(path.parent)) is not None}
 
@@ -502,8 +502,8 @@ def other_vpn(folder: Path) -> Optional[OtherVpn]:
     """Return the VPN of another robot that a folder belongs to, None if it belongs to none."""
     with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
         data = json.loads((folder / OTHER_VPN).read_text())
-        return OtherVpn(**{**data, **{
-            key: VpnInterface(**data[key]) for key in ('interface', 'own')}})
+        return OtherVpn(Peer(**data['machine']), VpnInterface(**data['interface']),
+                        VpnInterface(**data['own']), data['heartbeats'])
     return None
 
 

@@ -15,10 +15,9 @@ import contextlib
 import dataclasses
 import hashlib
 import ipaddress
-from pathlib import Path
 import re
 import time
-from typing import get_type_hints, Optional
+from typing import get_type_hints
 
 from fogros2 import untrusted
 from fogros2.errors import ConfigurationError
@@ -26,9 +25,8 @@ from fogros2.model import NETWORK_PREFIX, to_json
 from fogros2.store import check_name, robot_name, Store, write_private
 
 _PREFIX = 'fog1.'
-#: File with the invitation in the folder of a machine's VPN (``Store.other_vpns``); and the file
-#: there with the secret for ``GuestShell``.
-JOINED, SECRET = 'joined.json', 'door.key'
+#: File with the secret for ``GuestShell`` in the folder of a machine's VPN (``Store.other_vpns``).
+DOOR_KEY = 'door.key'
 #: Private address space (RFC 1918), shared address space (RFC 6598), and the default pool.
 _PRIVATE = tuple(map(ipaddress.IPv4Network, (
     '10.0.0.0/8', '172.16.0.0/12', '192.168.0.0/16', '100.64.0.0/10', '198.18.0.0/15')))
@@ -89,13 +87,6 @@ class Invitation:
     def number(self) -> str:
         """The name of the folder of the joined machine; digits of the interface's name too."""
         return hashlib.sha256(f'{self.key} {self.joiner}'.encode()).hexdigest()[:6]
-
-
-def read(folder: Path) -> Optional[Invitation]:
-    """Return the invitation by which this computer has joined a machine, None if there is none."""
-    with contextlib.suppress(OSError, ValueError, TypeError, ConfigurationError):
-        return Invitation(**untrusted.parsed((folder / JOINED).read_text()))
-    return None
 
 
 def own_key(store: Store) -> bytes:

@@ -16,17 +16,11 @@ from fogros2.deploy.robot import check_robot, clear, run
 from fogros2.errors import ConfigurationError, DdsError, did_you_mean, VpnError
 from fogros2.model import OtherVpn, Peer, to_json, VpnInterface
 from fogros2.store import boot_id, OTHER_VPN, process_start, Store, write_private
+from fogros2.store import other_vpn as stored_vpn
 from fogros2.vpn import addresses, helped, Vpn
 from fogros2.waiting import Timeouts
 from fogros2_features.guests import network
-from fogros2_features.guests.invitation import (
-    Invitation,
-    JOINED,
-    own_key,
-    read,
-    SECRET,
-    unseal,
-)
+from fogros2_features.guests.invitation import DOOR_KEY, Invitation, own_key, unseal
 
 
 def join(
@@ -51,7 +45,8 @@ def join(
     vendor = _vendor(invitation, environment)
     folder = store.root / 'launches' / invitation.number
     up = is_up(invitation)
-    if up and read(folder) == invitation:
+    other = other_vpn(invitation, store)
+    if up and stored_vpn(folder) == other and secret_of(folder) == invitation.secret:
         return folder
     if not invitation.private and not agreed(
             f'{invitation.network} has public addresses. Send what is for them to the computer '
@@ -66,7 +61,6 @@ def join(
         clear(before)  # of a launch with this machine that has ended
     if not up:
         _check_free(invitation)
-    other = other_vpn(invitation, store)
     interface = dataclasses.replace(other.own, port=addresses.choose_port(environment))
     vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
         domain=invitation.domain, ports=vendor.ports,
@@ -80,8 +74,7 @@ def join(
             process.run(helped.lend(interface, private), timeout=Timeouts().vpn)
         else:
             write_private(Path(interface.key_file), f'{private}\n'.encode())
-        run(vpn.up(interface, [Peer(invitation.machine, invitation.key, invitation.address,
-                                    invitation.endpoint)]), timeout=Timeouts().vpn)
+        run(vpn.up(interface, [other.machine]), timeout=Timeouts().vpn)
     except BaseException:
         clear(folder)
         raise
@@ -92,13 +85,18 @@ def other_vpn(invitation: Invitation, store: Store) -> OtherVpn:
     """Return the VPN that an invitation leads to."""
     name = f'fog{invitation.number}'
     return OtherVpn(
-        invitation.machine, VpnInterface(
-            invitation.interface, invitation.address, invitation.network, 0, ''),
-        invitation.key, VpnInterface(
+        Peer(invitation.machine, invitation.key, invitation.address, invitation.endpoint),
+        VpnInterface(invitation.interface, invitation.address, invitation.network, 0, ''),
+        VpnInterface(
             name, invitation.joiner, invitation.network, 0,
             helped.key_file(name) if helped.permitted()
             else str(store.root / 'launches' / invitation.number / 'vpn.key'), firewall=True),
         network.heartbeats(invitation.joiner))
+
+
+def secret_of(folder: Path) -> str:
+    """Return the secret of the invitation by which this computer has joined, '' for none."""
+    return path.read_text() if (path := folder / DOOR_KEY).exists() else ''
 
 
 def is_up(invitation: Invitation) -> bool:
@@ -153,8 +151,8 @@ def _write(
                 interfaces, [invitation.address] if vendor.asks_machines else [], environment,
                 quiet=True),
             'domain': str(invitation.domain), 'rmw': vendor.rmw,
-            'process.json': to_json(owner), SECRET: invitation.secret,
-            JOINED: to_json(invitation), OTHER_VPN: to_json(other)}.items():
+            'process.json': to_json(owner), DOOR_KEY: invitation.secret,
+            OTHER_VPN: to_json(other)}.items():
         write_private(folder / name, content.encode())
 
 

@@ -13,9 +13,9 @@ from fogros2.errors import ConfigurationError, DdsError, MachineNotFound, Unsupp
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState, OtherVpn
 from fogros2.provider import Capabilities, Provider
 from fogros2.provider.options import parsed
-from fogros2.store import Store, this_process
+from fogros2.store import other_vpn, Store, this_process
 from fogros2_features.guests import membership, network, program
-from fogros2_features.guests.invitation import Invitation, own_key, read, SECRET, unseal
+from fogros2_features.guests.invitation import DOOR_KEY, Invitation, own_key, unseal
 
 _SCHEME = 'joined:'
 
@@ -84,15 +84,15 @@ class JoinedProvider(Provider):
         """Return the machine while this computer has joined it."""
         number, _, name = machine_id.removeprefix(_SCHEME).partition(':')
         folder = Store().root / 'launches' / number
-        invitation = read(folder) if number.isalnum() else None
-        if invitation is None:
+        other = other_vpn(folder) if number.isalnum() else None
+        if other is None:
             raise MachineNotFound(f"this computer has left the machine '{name}'")
         return Machine(
             machine_id, name, self.name, MachineState.RUNNING, owned=False,
-            region=invitation.machine, shell=Endpoint(
-                'guest', invitation.address, network.PORT,
-                program.account(invitation.interface, invitation.joiner),
-                key_file=str(folder / SECRET)))
+            region=other.machine.name, shell=Endpoint(
+                'guest', other.interface.address, network.PORT,
+                program.account(other.interface.name, other.own.address),
+                key_file=str(folder / DOOR_KEY)))
 
     def capabilities_of(self, machine: Machine) -> Capabilities:
         """Return the capabilities with the place of the agent, which each guest has."""

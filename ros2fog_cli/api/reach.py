@@ -304,4 +304,5 @@ def link_of(other: OtherVpn) -> Link:
 
     :raises FogError: the status of the interface cannot be read.
     """
-    return measure(other.interface.address, other.own, other.key, 'wireguard')
+    return measure(
+        other.interface.address, other.own, other.machine.public_key, 'wireguard')

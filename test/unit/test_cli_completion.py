@@ -13,7 +13,7 @@ import time
 
 import pytest
 
-from fogros2.model import MachineSpec, OtherVpn, to_json, VpnInterface
+from fogros2.model import MachineSpec, OtherVpn, Peer, to_json, VpnInterface
 from fogros2.store import OTHER_VPN, Record, Store, write_private
 from fogros2.waiting import wait_until
 
@@ -33,7 +33,7 @@ def complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Complete:
         Store().save(Record(name, 'container', MachineSpec(name, 'container')))
     own = VpnInterface('foga1b2c3', '198.18.7.224', '198.18.7.0/24', 0, '')
     write_private(Store().launch('a1b2c3') / OTHER_VPN, to_json(
-        OtherVpn('slam', own, '', own, 7224)).encode())
+        OtherVpn(Peer('slam', '', '198.18.7.2'), own, own, 7224)).encode())
 
     def complete(line: str) -> list[str]:
         answer = tmp_path / 'answer'

@@ -24,6 +24,7 @@ from fogros2.model import (
     MachineSpec,
     MachineState,
     OtherVpn,
+    Peer,
     Result,
     to_json,
     VpnInterface,
@@ -249,7 +250,7 @@ def test_published_port_is_part_of_the_machines_filter() -> None:
 def test_leave_names_the_nearest_machine() -> None:
     own = VpnInterface('foga1b2c3', '198.18.7.224', '198.18.7.0/24', 0, '')
     write_private(Store().launch('a1b2c3') / OTHER_VPN, to_json(
-        OtherVpn('slam', own, '', own, 7224)).encode())
+        OtherVpn(Peer('slam', '', '198.18.7.2'), own, own, 7224)).encode())
     assert main(argv=['fog', 'leave', 'slan']) == (
         "this computer has not joined a machine 'slan' (did you mean 'slam'?)")
     assert 'ros2 fog join' in main(argv=['fog', 'leave', 'planner'])
