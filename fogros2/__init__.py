@@ -9,7 +9,7 @@ alone loads neither launch nor an SDK.
 from __future__ import annotations
 
 import importlib
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from fogros2.actions.cloud_group import CloudGroup
@@ -40,13 +40,14 @@ if TYPE_CHECKING:
     from fogros2.errors import FogError
     from fogros2.image_transport.streams import StreamTopic
     from fogros2.runtime.interruption import MachineInterrupted
+    from fogros2_features.guests.machine import JoinedMachine
 
 #: Written out for type checkers, which do not run the module.
 __all__ = [
     'AWSCloudInstance', 'AzureCloudInstance', 'CheapestInstance', 'CloudGroup',
     'CloudInstance', 'CloudNode', 'ComposableNodeContainer', 'ContainerInstance', 'FogError',
-    'FogMachine', 'FogROSLaunchDescription', 'Foxglove', 'GCPCloudInstance', 'KubeInstance',
-    'LifecycleNode', 'MachineInterrupted', 'Node', 'Replicated', 'SSHInstance',
+    'FogMachine', 'FogROSLaunchDescription', 'Foxglove', 'GCPCloudInstance', 'JoinedMachine',
+    'KubeInstance', 'LifecycleNode', 'MachineInterrupted', 'Node', 'Replicated', 'SSHInstance',
     'StreamTopic', 'cheapest', 'ec2_instance_type_selection', 'find_cheapest',
     'find_cheapest_ec2_instance_type', 'find_nearest_aws_region', 'nearest_aws_region_now',
     'region_ami_selection',
@@ -70,30 +71,22 @@ _NAMES = {
     'image_transport.streams': 'StreamTopic',
     'runtime.interruption': 'MachineInterrupted',
 }
-_MODULES = {name: f'fogros2.{module}' for module, names in _NAMES.items()
-            for name in names.split()}
+_MODULES = {'JoinedMachine': 'fogros2_features.guests.machine', **{
+    name: f'fogros2.{module}' for module, names in _NAMES.items() for name in names.split()}}
 #: Modules that FogROS2 has in a package ``utils``: ``from fogros2 import region_ami_selection``.
 _FORMERLY_UTILS = ('ec2_instance_type_selection', 'region_ami_selection')
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name in _FORMERLY_UTILS:
         value = importlib.import_module('fogros2.describe.choices')
     elif name in _MODULES:
         value = getattr(importlib.import_module(_MODULES[name]), name)
-    elif name[:1].isupper() and name in _machines():
-        value = _machines()[name].load()
     else:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
     globals()[name] = value
     return value
 
 
-def _machines() -> Any:
-    """Return the entry points of the classes of machines, those of plugins too, by class."""
-    from importlib.metadata import entry_points
-    return {point.attr: point for point in entry_points(group='fogros2.machine')}
-
-
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, *_machines()})
+    return sorted({*globals(), *__all__})
