@@ -30,12 +30,12 @@ from figures import markdown, Row, write
 from rclpy.executors import ExternalShutdownException
 from rclpy.serialization import serialize_message
 
-from fogros2 import invitation
-from fogros2.invitation import Invitation
 from fogros2.model import Command
 from fogros2.plan import DEFAULT_RMW
 from fogros2.process import run
 from fogros2.store import Store
+from fogros2_features.guests import invitation
+from fogros2_features.guests.invitation import Invitation
 from fogros2_share.node import OWN, TOPICS
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))

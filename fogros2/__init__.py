@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from fogros2.describe.machines import (
         CloudInstance,
         ContainerInstance,
-        JoinedMachine,
         SSHInstance,
     )
     from fogros2.describe.machines_cloud import (
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
     )
     from fogros2.errors import FogError
     from fogros2.runtime.interruption import MachineInterrupted
+    from fogros2_features.guests.machine import JoinedMachine
     from fogros2_features.streams.entries import StreamTopic
 
 #: Written out for type checkers, which do not run the module.
@@ -63,15 +63,17 @@ _NAMES = {
     'describe.choices':
         'find_cheapest find_cheapest_ec2_instance_type find_nearest_aws_region '
         'nearest_aws_region_now',
-    'describe.machines': 'CloudInstance ContainerInstance JoinedMachine SSHInstance',
+    'describe.machines': 'CloudInstance ContainerInstance SSHInstance',
     'describe.machines_cloud':
         'AWSCloudInstance AzureCloudInstance CheapestInstance GCPCloudInstance KubeInstance '
         'cheapest',
     'errors': 'FogError',
     'runtime.interruption': 'MachineInterrupted',
 }
-_MODULES = {'StreamTopic': 'fogros2_features.streams.entries', **{
-    name: f'fogros2.{module}' for module, names in _NAMES.items() for name in names.split()}}
+_MODULES = {
+    'JoinedMachine': 'fogros2_features.guests.machine',
+    'StreamTopic': 'fogros2_features.streams.entries',
+    **{name: f'fogros2.{module}' for module, names in _NAMES.items() for name in names.split()}}
 #: Modules that FogROS2 has in a package ``utils``: ``from fogros2 import region_ami_selection``.
 _FORMERLY_UTILS = ('ec2_instance_type_selection', 'region_ami_selection')
 

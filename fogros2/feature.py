@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Optional, Protocol
 from fogros2 import plugin_system
 from fogros2.model import Command, Machine, MachineSpec, NodeSpec, VpnInterface
 from fogros2.shell import Shell
+from fogros2.store import Record
 
 #: The group of entry points.
 GROUP = 'fogros2.feature'
@@ -291,6 +292,23 @@ class Feature:
         """
         return None
 
+    #: The headings of its table in ``ros2 fog status``; none for no table.
+    headings: ClassVar[Sequence[str]] = ()
+
+    def entries(self, record: Record, shell: Shell) -> Sequence[Mapping[str, Any]]:
+        """
+        Return the rows of the table, as ``ros2 fog status --json`` prints them by its name.
+
+        They are of a machine in a launch's VPN, whether or not its launch file uses the feature.
+
+        :raises FogError: the machine does not tell them.
+        """
+        return ()
+
+    def row(self, entry: Mapping[str, Any]) -> Sequence[str]:
+        """Return a row of the table for people."""
+        return ()
+
     def status(self, shown: Mapping[str, Any], own: Any) -> Iterable[tuple[str, str]]:
         """
         Return rows, each a name and a text, for ``ros2 fog status`` of a machine.
@@ -308,6 +326,15 @@ def load(name: str) -> Feature:
     """
     feature: Feature = plugin_system.load(GROUP, name)()
     return feature
+
+
+def with_tables() -> dict[str, Feature]:
+    """
+    Return the features that have a table, by name.
+
+    :raises PrerequisiteError: a feature cannot be loaded.
+    """
+    return {name: each for name in plugin_system.names(GROUP) if (each := load(name)).headings}
 
 
 def options(name: str, given: Mapping[str, Any], of: str = 'options') -> Any:

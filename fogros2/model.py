@@ -84,14 +84,6 @@ class MachineSpec:
         return (self.workspace, *self.underlays) if self.workspace else ()
 
     @property
-    def fleet_networks(self) -> tuple[str, ...]:
-        """The networks that reach the SSH port at any time: those of the robots of ``fleet=``."""
-        named = self.options.get('ssh_from') or ()
-        if not self.options.get('fleet'):
-            return ()
-        return (named,) if isinstance(named, str) else tuple(named)
-
-    @property
     def monitored(self) -> bool:
         """Whether a Foxglove bridge starts with the first node."""
         return self.launch_foxglove or bool(self.monitor_allow)
@@ -304,6 +296,22 @@ class VpnInterface:
     firewall: bool = False
     host_routes: bool = False
     process: str = ''
+
+
+@dataclasses.dataclass(frozen=True)
+class OtherVpn:
+    """
+    A VPN of another robot, by which this computer reaches one machine of that robot.
+
+    :param machine: the machine, by its name there; ``interface`` is its end.
+    :param own: this computer's end.
+    :param heartbeats: UDP port of the machine's address for the heartbeats of this computer.
+    """
+
+    machine: Peer
+    interface: VpnInterface
+    own: VpnInterface
+    heartbeats: int
 
 
 @dataclasses.dataclass(frozen=True)

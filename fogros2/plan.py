@@ -14,7 +14,7 @@ from typing import Any, Optional
 
 from fogros2.errors import ConfigurationError, DdsError, VpnError
 from fogros2.model import host_port, Machine, MachineSpec, Peer, VpnInterface
-from fogros2.vpn.addresses import FIRST_GUEST
+from fogros2.vpn.addresses import FIRST_FREE
 
 #: Number of the first machine's address; .0 is the network, .1 the robot.
 FIRST_MACHINE = 2
@@ -142,10 +142,10 @@ def machine_interface(
 
 def _host(network: str, number: int) -> str:
     subnet = ipaddress.ip_network(network)
-    if number >= FIRST_GUEST:
+    if number >= FIRST_FREE:
         raise ConfigurationError(
             f'{network} has no free address for another machine',
-            f'a launch can have {FIRST_GUEST - FIRST_MACHINE} machines')
+            f'a launch can have {FIRST_FREE - FIRST_MACHINE} machines')
     return str(subnet[number])
 
 

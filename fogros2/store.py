@@ -26,12 +26,14 @@ from typing import Any, Optional
 
 from fogros2 import model
 from fogros2.errors import ConfigurationError, did_you_mean, NameTaken, StoreError
-from fogros2.model import Endpoint, MachineSpec, VpnInterface
+from fogros2.model import Endpoint, MachineSpec, OtherVpn, Peer, VpnInterface
 
 #: Name of a file or folder that only one process uses, with that process.
 _UNFINISHED = re.compile(r'\..+\.([0-9]+)\.[a-z0-9_]{8}')
-#: File in a machine's folder: guests were invited, and may have stayed when their launch ended.
-GUESTS = 'guests'
+#: File in a machine's folder: its VPN may have stayed when its launch ended; see ``Vpn.leave``.
+VPN_LEFT = 'vpn_left'
+#: File in the folder of another robot's VPN, which is like a launch's folder; see ``OtherVpn``.
+OTHER_VPN = 'other_vpn.json'
 _NAME = re.compile(r'[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?')
 
 
@@ -321,6 +323,12 @@ class Store:
                 records.append(Record(path.name, '', spec, damage=str(error)))
         return records
 
+    def other_vpns(self) -> dict[str, Path]:
+        """Return the folders of other robots' VPNs that this computer has joined, by machine."""
+        return {other.machine.name: path.parent
+                for path in sorted((self.root / 'launches').glob(f'*/{OTHER_VPN}'))
+                if (other := other_vpn(path.parent)) is not None}
+
     def sweep(self) -> None:
         """Remove the locks, unfinished files and folders that killed launches left."""
         for path in list(self.root.rglob('.*')):
@@ -488,6 +496,15 @@ def _make_folder(path: Path) -> Path:
 def _not_written(path: Path, error: OSError) -> StoreError:
     return StoreError(f"{path} can't be written: {error.strerror}",
                       'FOGROS2_STATE_HOME names another folder for it')
+
+
+def other_vpn(folder: Path) -> Optional[OtherVpn]:
+    """Return the VPN of another robot that a folder belongs to, None if it belongs to none."""
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+        data = json.loads((folder / OTHER_VPN).read_text())
+        return OtherVpn(Peer(**data['machine']), VpnInterface(**data['interface']),
+                        VpnInterface(**data['own']), data['heartbeats'])
+    return None
 
 
 def record_from_json(data: Mapping[str, Any]) -> Record:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Check text that a machine, a host, a guest or a tag supplied, where it enters this computer.
+Check text that a machine, a host, another robot or a tag supplied, where it enters this computer.
 
 A hijacked machine may send anything. So such text becomes a value only here: names by
 :func:`matched`, numbers by :func:`number`, JSON by :func:`parsed`, its fields by :func:`checked`.

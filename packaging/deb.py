@@ -63,7 +63,7 @@ HELPER_FILES = {
     HELPER / 'vpn.py': ('usr/libexec/fogros2/vpn', 0o755),
     **{ROOT / f'fogros2/{name}.py': (f'usr/libexec/fogros2/fogros2/{name}.py', 0o644)
        for name in ('__init__', 'errors', 'model', 'untrusted', 'vpn/__init__', 'vpn/addresses',
-                    'vpn/guests', 'vpn/wireguard')},
+                    'vpn/wireguard')},
     HELPER / 'sudoers': ('etc/sudoers.d/fogros2-vpn', 0o440),
     **{HELPER / f'fogros2-vpn-tidy.{kind}': (f'usr/lib/systemd/system/fogros2-vpn-tidy.{kind}',
                                             0o644) for kind in ('service', 'timer')}}

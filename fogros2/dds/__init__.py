@@ -93,7 +93,7 @@ class DdsVendor(abc.ABC):
     @abc.abstractmethod
     def render(
         self, interfaces: Sequence[DdsInterface], peers: Sequence[str],
-        user: Mapping[str, str] = MappingProxyType({}), *, guest: bool = False,
+        user: Mapping[str, str] = MappingProxyType({}), *, quiet: bool = False,
     ) -> str:
         """
         Return the text of the configuration file.
@@ -102,7 +102,7 @@ class DdsVendor(abc.ABC):
         :param peers: addresses of hosts to ask for participants, without 127.0.0.1.
         :param user: the user's environment variables, for middlewares that read only one file: the
             user's configuration is merged into that file.
-        :param guest: the nodes are on a robot that has joined a machine of another robot.
+        :param quiet: the nodes may be in VPNs of several robots: announce no multicast group.
         """
 
     @abc.abstractmethod

@@ -160,7 +160,7 @@ class CycloneDds(DdsVendor):
 
     def render(
         self, interfaces: Sequence[DdsInterface], peers: Sequence[str],
-        user: Mapping[str, str] = MappingProxyType({}), *, guest: bool = False,
+        user: Mapping[str, str] = MappingProxyType({}), *, quiet: bool = False,
     ) -> str:
         """
         Return the XML; the user's own configuration stays separate, see :meth:`environment`.

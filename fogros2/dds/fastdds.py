@@ -13,9 +13,9 @@ Discovery uses multicast. WireGuard sends a packet to the one peer that its dest
 so each host has a group of its own (``vpn.addresses``), to which the others send announcements and
 descriptions of topics. One packet is for all processes of the host. By unicast each process would
 send each of them to each process: the traffic of 100 processes would be ten times as much. Only
-the robot also listens to the common group, for its LAN, unless it is limited to itself. A guest
-announces no group: it may have several VPNs, and addresses of each. Processes that use the default
-announce none either.
+the robot also listens to the common group, for its LAN, unless it is limited to itself. In
+another robot's VPN it announces no group: it may be in several, with an address in each. Processes
+that use the default announce none either.
 
 Nodes use UDP only. Shared memory, which Fast DDS uses by default, carries nothing between two
 accounts, or between containers with a common network, and reports no error: the segments of one
@@ -128,7 +128,7 @@ class FastDds(DdsVendor):
 
     def render(
         self, interfaces: Sequence[DdsInterface], peers: Sequence[str],
-        user: Mapping[str, str] = MappingProxyType({}), *, guest: bool = False,
+        user: Mapping[str, str] = MappingProxyType({}), *, quiet: bool = False,
     ) -> str:
         """
         Return the XML: the user's profiles, with our settings in the default participant.
@@ -137,7 +137,7 @@ class FastDds(DdsVendor):
         :param peers: VPN addresses of other hosts.
         :param user: the user's environment variables: the profiles of
             FASTRTPS_DEFAULT_PROFILES_FILE are included, and ROS_STATIC_PEERS are asked too.
-        :param guest: announce no group.
+        :param quiet: announce no group.
         :raises DdsError: the user's profiles cannot be read, or configure transports.
         """
         root, profiles = _profiles(user.get(VARIABLE, ''))
@@ -159,7 +159,7 @@ class FastDds(DdsVendor):
         # a socket hears its groups on each interface on which any process has joined them.
         heard, found_by = (group + common, []) if ANY in names else (group, group)
         groups = dict.fromkeys([*common, *found_by, *map(multicast_group, peers)])
-        if not guest:
+        if not quiet:
             # the first group is announced, see max_multicast_locators
             _child(builtin, 'avoid_builtin_multicast').text = 'false'
             _child(builtin, 'metatrafficMulticastLocatorList')[:0] = map(self._group, heard)

@@ -70,7 +70,7 @@ class Zenoh(DdsVendor):
 
     def render(
         self, interfaces: Sequence[DdsInterface], peers: Sequence[str],
-        user: Mapping[str, str] = MappingProxyType({}), *, guest: bool = False,
+        user: Mapping[str, str] = MappingProxyType({}), *, quiet: bool = False,
     ) -> str:
         """
         Return the configuration of the nodes' sessions as JSON.

@@ -8,7 +8,6 @@ Each step pushes its undo before it runs. The modules, each imports only those b
 
 ``undo``          undo steps; one that fails does not stop the others
 ``robot``         programs and rights that this computer needs
-``membership``    the VPN of another robot's machine, by an invitation
 ``robot_vpn``     the robot's VPN interface; ``robot_router``: the router beside its nodes
 ``choosing``      choices of the providers before anything is created, and prices
 ``checks``        checks before anything is created

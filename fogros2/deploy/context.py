@@ -15,7 +15,7 @@ from fogros2.deploy.choosing import Choices
 from fogros2.deploy.robot_vpn import RobotVpn
 from fogros2.errors import FogError, PrerequisiteError
 from fogros2.host import workspace
-from fogros2.invitation import Invitation
+from fogros2.model import OtherVpn
 from fogros2.provider import Capabilities, Provider
 from fogros2.report import Reporter
 from fogros2.store import Store
@@ -37,7 +37,7 @@ class Context:
     :param others: returns the VPN addresses of the other machines that are known now.
     :param programs: the (package, executable) pairs that are known to run on the machine.
     :param images: the container images that nodes on the machine are known to run in.
-    :param invitation: how the launch has joined the machine of another robot; None for its own.
+    :param other_vpn: the VPN of another robot in which the machine is; None: the launch's.
     """
 
     launch: str
@@ -56,7 +56,7 @@ class Context:
     others: Callable[[], Sequence[str]] = tuple
     programs: Sequence[tuple[str, str]] = ()
     images: Sequence[str] = ()
-    invitation: Optional[Invitation] = None
+    other_vpn: Optional[OtherVpn] = None
 
     @property
     def capabilities(self) -> Capabilities:

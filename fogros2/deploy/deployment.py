@@ -46,7 +46,7 @@ def bring_up(context: Context, spec: MachineSpec) -> RunningMachine:
 def _run(context: Context, job: MachineJob) -> RunningMachine:
     job.undo.enter_context(context.store.lock(job.name))
     connection, arming = Connection(context, job), Arming(context, job)
-    joining = (Joining if context.invitation is None else Joined)(context, job)
+    joining = (Joining if context.other_vpn is None else Joined)(context, job)
     # the robot's VPN interface needs nothing from the machine: it comes up in parallel
     with ThreadPoolExecutor(6, f'fog-{job.name}') as pool:
         robot = pool.submit(context.vpn.ensure)

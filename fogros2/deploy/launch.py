@@ -16,7 +16,7 @@ from typing import Optional
 
 from fogros2 import model, plan, plugin_system
 from fogros2.dds import addresses_of, DdsVendor
-from fogros2.deploy import membership, robot_router
+from fogros2.deploy import robot_router
 from fogros2.deploy.checks import check, check_architecture, check_here, check_names
 from fogros2.deploy.choosing import Choices
 from fogros2.deploy.context import Context
@@ -26,9 +26,8 @@ from fogros2.deploy.robot_vpn import choose_interface, RobotVpn
 from fogros2.deploy.running import RunningMachine
 from fogros2.deploy.undo import UndoStack
 from fogros2.errors import Cancelled, ConfigurationError, DdsError, FogError, StoreError
-from fogros2.invitation import Invitation, own_key, unseal
 from fogros2.journal import Journal
-from fogros2.model import DdsInterface, MachineSpec
+from fogros2.model import DdsInterface, MachineSpec, OtherVpn
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent, step, StepFailed, Warned
 from fogros2.store import delete_folder, Record, Store, this_process, write_private
@@ -76,8 +75,8 @@ class Launch:
         self._robot_environment: Optional[dict[str, str]] = None
         #: Networks of the VPNs that this launch will join.
         self._others: list[str] = []
-        #: How this launch has joined machines of other robots, by their names here.
-        self._invitations: dict[str, Invitation] = {}
+        #: The VPNs of other robots that this launch has joined, by the names of machines here.
+        self._joined: dict[str, OtherVpn] = {}
 
     # -- before anything is created -------------------------------------------------------------
 
@@ -99,8 +98,8 @@ class Launch:
             if answer in done:
                 answer.result()
         self._others = [
-            unseal(text, own_key(self.store)).network
-            for text in (self.provider(spec.provider).invitation(spec) for spec in specs) if text]
+            other.interface.network for spec in specs
+            if (other := self.provider(spec.provider).other_vpn(spec)) is not None]
 
     def prepare(
         self, specs: Sequence[MachineSpec],
@@ -272,37 +271,30 @@ class Launch:
         # of all interfaces, the last is the launch's
         more = [dataclasses.replace(
             self._interfaces[-1],
-            name=invitation.joiner if vendor.by_address else f'fog{invitation.number}')
-            for invitation in self._invitations.values()]
-        peers = [invitation.address for invitation in self._invitations.values()] + [
+            name=other.own.address if vendor.by_address else other.own.name)
+            for other in self._joined.values()]
+        peers = [other.interface.address for other in self._joined.values()] + [
             self._address(index) for name, index in self._indices.items()
-            if name not in self._invitations] if vendor.asks_machines else []
+            if name not in self._joined] if vendor.asks_machines else []
         write_private(self.store.launch(self.id) / vendor.file_name, vendor.render(
-            [*self._interfaces, *more], peers, self.user_environment, guest=bool(more)).encode())
+            [*self._interfaces, *more], peers, self.user_environment, quiet=bool(more)).encode())
 
-    def join(self, spec: MachineSpec) -> Optional[Invitation]:
+    def join(self, spec: MachineSpec) -> Optional[OtherVpn]:
         """
         Join the VPN of another robot's machine, before the first node that needs it; once.
 
         :returns: None for a machine of this launch's own.
-        :raises FogError: the invitation is not valid, or does not fit this launch.
+        :raises FogError: it does not fit this launch, or cannot be joined.
         """
-        text = self.provider(spec.provider).invitation(spec)
+        provider = self.provider(spec.provider)
         with self._lock:
-            if text and spec.name not in self._invitations:
-                invitation = unseal(text, own_key(self.store))
-                if (invitation.rmw, invitation.domain) != (self.dds().rmw, self.domain):
-                    raise DdsError(
-                        f"'{spec.name}' has RMW_IMPLEMENTATION={invitation.rmw} and ROS_DOMAIN_ID="
-                        f'{invitation.domain}, this launch {self.dds().rmw} and {self.domain}',
-                        'launch with the same')
-                if not membership.is_up(invitation):  # else joined by hand, and left by hand
-                    self.undo.callback(clear, self.store.root / 'launches' / invitation.number)
-                membership.join(text, self.store, self.user_environment, owner=this_process())
-                self._invitations[spec.name] = invitation
+            if spec.name not in self._joined and (other := provider.other_vpn(spec)) is not None:
+                self.undo.enter_context(provider.join(
+                    spec, self.dds().rmw, self.domain, self.user_environment))
+                self._joined[spec.name] = other
                 if self._robot_environment is not None:
                     self._write_interfaces()
-            return self._invitations.get(spec.name)
+            return self._joined.get(spec.name)
 
     def robot_vpn(self) -> RobotVpn:
         """Return the robot's VPN; its interface need not be up yet."""
@@ -359,7 +351,7 @@ class Launch:
         def others() -> list[str]:
             with self._lock:
                 return [self._address(index) for name, index in self._indices.items()
-                        if name != spec.name and not {name, spec.name} & {*self._invitations}]
+                        if name != spec.name and not {name, spec.name} & {*self._joined}]
 
         self.expect([spec.name])
         return Context(
@@ -367,7 +359,7 @@ class Launch:
             report=self.report, failures=self._failures, timeouts=self.timeouts,
             cancel=self.cancel, ending=self._ending, provider=self.provider(spec.provider),
             choices=self._choices, vpn=self.robot_vpn(), dds=self.dds(),
-            index=self._indices[spec.name], others=others, invitation=self.join(spec),
+            index=self._indices[spec.name], others=others, other_vpn=self.join(spec),
             programs=self._programs.get(spec.name, ()), images=self._images.get(spec.name, ()))
 
     def up(self, spec: MachineSpec) -> RunningMachine:

@@ -107,7 +107,7 @@ def first_config(record: Record) -> str:
 
 
 def vpn_down(record: Record) -> Iterator[Command]:
-    """Yield the commands that take a machine's interface down, or leave it to guests."""
+    """Yield the commands that take a machine's interface down, or leave it to others."""
     assert record.vpn is not None
     vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
     return (vpn.leave if record.spec.on_exit == 'keep' else vpn.down)(record.vpn)
@@ -128,7 +128,8 @@ def _take_vpn_down(site: Site, made: Made) -> None:
 
 
 def _close_ssh(site: Site, made: Made) -> None:
-    site.provider.allow(site.machine.id, made.port, site.record.spec.fleet_networks)
+    site.provider.allow(
+        site.machine.id, made.port, site.provider.ssh_networks(site.record.spec))
 
 
 #: Kinds of what a launch makes; reports name them.

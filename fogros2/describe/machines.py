@@ -397,22 +397,6 @@ class SSHInstance(CloudInstance):
         super().__init__(options=options_of(SSHInstance.__init__, locals()), **common)
 
 
-class JoinedMachine(CloudInstance):
-    """
-    A machine of another robot, on which this launch has an account of its own.
-
-    The account ends with the invitation; what the launch's nodes need besides the workspace has
-    to be on the machine.
-
-    :param invitation: what ``ros2 fog invite`` printed on the other robot for this computer.
-    """
-
-    provider = 'joined'
-
-    def __init__(self, invitation: SomeSubstitutionsType, **common: Any) -> None:
-        super().__init__(options=options_of(JoinedMachine.__init__, locals()), **common)
-
-
 def checked(machine: SomeMachine) -> SomeMachine:
     """
     Check that a value is a machine, or the name of one; return it.

@@ -159,7 +159,7 @@ def ensure(
     shell: Shell, under: Underlay, spec: MachineSpec, *, timeout: float,
     cancel: Optional[threading.Event] = None,
     on_plan: Callable[[RosInstall], object] = lambda install: None, elsewhere: bool = False,
-    packages: Sequence[str] = (), guest: bool = False,
+    packages: Sequence[str] = (), at_home: bool = False,
     warn: Callable[[str, str], object] = lambda text, hint: None,
 ) -> tuple[RosInstall, str]:
     """
@@ -171,7 +171,7 @@ def ensure(
         steps need not wait for the slowest ones.
     :param elsewhere: refuse a machine with this computer's network, see ``check_elsewhere``.
     :param packages: packages of the nodes that will run there.
-    :param guest: send workspaces to the login user's home; other users may have the same paths.
+    :param at_home: send workspaces to the login user's home; other users may have the same paths.
     :param warn: takes a warning and its remedy.
     :returns: how ROS programs run there, and what was done in a few words.
     :raises ConfigurationError: the machine has this computer's network.
@@ -210,7 +210,7 @@ def ensure(
             # The machine gets a copy of this environment.
             keys = needs.outside(keys, [sys.prefix])
     install = todo.install
-    if guest:
+    if at_home:
         ways, variables = workspaces.moved(
             install.workspaces, install.environment, f'{facts.home}/ws', spec.name)
         install = dataclasses.replace(install, workspaces=ways, environment=variables)

@@ -251,7 +251,7 @@ def moved(
         if way.commands or way.includes or way.linked:
             why = way.reason or 'its install space was built with --symlink-install'
             raise WorkspaceError(f"{way.source} can't go to machine '{name}' as it is: {why}",
-                                 "a guest's has to be complete: colcon build, without links")
+                                 'there it has to be complete: colcon build, without links')
 
     def there(entry: str) -> str:
         return f'{folder}{entry}' if any(

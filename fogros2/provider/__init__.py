@@ -4,7 +4,7 @@ The plugin interface to computers: a cloud, a cluster, a container engine, an ex
 
 In reading order: ``offers`` (types of machines and their prices), ``options`` (reading a launch
 file's options), this module, then a module or package for each provider:
-``ssh``, ``joined``, ``container``, ``kubernetes``, ``vm`` (shared by virtual machines), ``aws``,
+``ssh``, ``container``, ``kubernetes``, ``vm`` (shared by virtual machines), ``aws``,
 ``gcp``, ``azure``, ``clouds`` (the offers of all), ``cheapest`` (a machine of any cloud).
 """
 
@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Collection, Iterable, Mapping, Sequence
+import contextlib
 import dataclasses
 from decimal import Decimal
 import threading
 from typing import ClassVar, Optional
 
 from fogros2.errors import MachineNotFound, ProviderError, Unsupported
-from fogros2.model import CreateRequest, Image, Machine, MachineSpec, MachineState
+from fogros2.model import CreateRequest, Image, Machine, MachineSpec, MachineState, OtherVpn
 from fogros2.provider.offers import Offer, Offers, Region, Wants
 from fogros2.waiting import wait_until
 
@@ -43,6 +44,8 @@ class Capabilities:
 
     :param shell_kind: name of the shell plugin that reaches its machines.
     :param owned: it creates machines for a launch; False for computers that exist already.
+    :param account: a launch has a login there that another robot gave and may take away, and
+        nothing beside it; ``other_vpn`` and ``join`` lead to the machine.
     :param containers: a container engine can run on its machines, without an option for it.
     :param firewall: ``allow`` and ``robot_address`` decide who reaches a machine. The launch then
         closes the SSH port as soon as the VPN works.
@@ -69,6 +72,7 @@ class Capabilities:
 
     shell_kind: str = 'ssh'
     owned: bool = True
+    account: bool = False
     containers: bool = True
     firewall: bool = False
     one_time_host_key: bool = False
@@ -166,9 +170,26 @@ class Provider(abc.ABC):
         """
         return spec
 
-    def invitation(self, spec: MachineSpec) -> str:
-        """Return the text of the invitation by which a launch joins a machine; '' for none."""
-        return ''
+    def other_vpn(self, spec: MachineSpec) -> Optional[OtherVpn]:
+        """
+        Return the VPN of another robot in which a machine is; None: it joins the launch's.
+
+        :raises ConfigurationError: an option has a wrong value.
+        """
+        return None
+
+    def join(
+        self, spec: MachineSpec, rmw: str, domain: int, environment: Mapping[str, str],
+    ) -> contextlib.AbstractContextManager[object]:
+        """
+        Return a context in which this computer is in the VPN of ``other_vpn``.
+
+        It is entered before the first node that needs it, and left after the last.
+
+        :param rmw: the launch's RMW_IMPLEMENTATION; ``domain`` its ROS_DOMAIN_ID.
+        :raises FogError: the launch and the VPN do not fit, or it cannot be joined.
+        """
+        return contextlib.nullcontext()
 
     def choices(self, spec: MachineSpec, chosen: MachineSpec) -> list[str]:
         """Describe for people what ``resolve`` has changed."""
@@ -352,6 +373,10 @@ class Provider(abc.ABC):
         :raises Unsupported: the provider has no firewall.
         """
         raise Unsupported(f"provider '{self.name}' has no firewall")
+
+    def ssh_networks(self, spec: MachineSpec) -> Sequence[str]:
+        """Return the networks (CIDR) that always reach the SSH port, beside the robot."""
+        return ()
 
     def open_port(
         self, machine: Machine, port: int, sources: Sequence[str],

@@ -93,7 +93,7 @@ class RemoteProcess:
         self._node = dataclasses.replace(node_spec.from_action(
             action, context, coordinator.base_environment, session.spec, coordinator.launch.id,
             self.image, self.image_options,
-            provider.has_own_packages(session.spec), bool(provider.invitation(session.spec))),
+            provider.has_own_packages(session.spec), provider.capabilities.account),
             features=self.features)
         if not isinstance(action, AddedProcess):
             paths = node_spec.robot_paths(

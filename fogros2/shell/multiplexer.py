@@ -3,9 +3,9 @@
 Run on a machine, and multiplex many commands over one connection: its standard streams.
 
 In a pod it runs as root: each ``exec`` takes a tenth of a second, and cannot end a command's
-input, so one ``exec`` runs this program. For a guest it runs as the guest's account. It runs
-commands on request, and ends with the connection. It uses only the standard library; the robot
-sends its source.
+input, so one ``exec`` runs this program. On another robot's machine it runs as an account there.
+It runs commands on request, and ends with the connection. It uses only the standard library; the
+robot sends its source.
 
 Frames in both directions: type, channel, length, payload.
 """

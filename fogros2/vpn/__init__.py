@@ -2,9 +2,17 @@
 """
 The plugin interface of VPNs: pure functions from interfaces and peers to commands.
 
-``addresses`` chooses the subnet of a launch. ``guests`` is a program that the commands of
-``wireguard`` run; it admits computers to a machine's interface. ``owner`` tells whose an interface
-is. ``helped`` is the plugin: on the robot it may use the root helper.
+``addresses`` chooses the subnet of a launch. ``wireguard`` has the commands, and ``owner`` tells
+whose an interface is. ``helped`` is the plugin: on the robot it may use the root helper.
+
+A machine's interface NAME may have further peers. Then root has a Python program at
+``/run/NAME.more``. The plugin's commands run it with NAME and
+
+- ``peers`` to print the peers, as a configuration of ``wg``;
+- ``look`` when the time in ``/run/NAME.more.due`` has come, in seconds since boot;
+- ``stay`` before a launch that keeps its machine takes the interface down. If it succeeds, the
+  program takes it down later;
+- ``clear`` before the interface ends. Its files ``/run/NAME.more.*`` go with the interface.
 """
 
 from __future__ import annotations
@@ -60,5 +68,5 @@ class Vpn(abc.ABC):
         """Yield the commands that undo ``up`` and delete the key file."""
 
     def leave(self, interface: VpnInterface) -> Iterator[Command]:
-        """Yield the commands of ``down`` for a machine that is kept; guests may need more time."""
+        """Yield the commands of ``down`` for a machine that is kept; further peers may stay."""
         return self.down(interface)

@@ -21,13 +21,9 @@ POOL_VARIABLE = 'FOGROS2_VPN_POOL'
 #: Variable with the robot's UDP port, for robots behind a router that forwards a port. Machines
 #: that have to dial the robot, such as pods that cannot be dialled from outside, use that port.
 PORT_VARIABLE = 'FOGROS2_VPN_PORT'
-#: A launch's subnet has one robot, up to 222 machines, and guests.
-#: The last addresses of the subnet belong to computers that an invitation admits to a machine.
-FIRST_GUEST, GUEST_PREFIX = 224, 27
-#: TCP port of a machine on its VPN address at which guests' robots reach their accounts.
-GUEST_PORT = 7399
-#: Number of a guest's UDP port for heartbeats, beside DDS's, less the last byte of its address.
-GUEST_HEARTBEATS = 7000
+#: A launch's subnet has one robot and up to 222 machines. From this number on, its addresses are
+#: free for further peers of the machines.
+FIRST_FREE = 224
 #: Networks with a shorter prefix mean "everything" in some VPN (two halves, four quarters). They
 #: do not collide: the more specific route wins.
 EVERYTHING = 8
@@ -78,16 +74,6 @@ def multicast_group(address: str) -> str:
     :param address: the host's VPN address; the VPN's subnet for the range of all groups.
     """
     return f"239.{address.partition('.')[2]}"
-
-
-def guests(subnet: str) -> str:
-    """Return the range of a launch's subnet that is for guests, in CIDR form."""
-    return str(_Network((int(_Network(subnet)[FIRST_GUEST]), GUEST_PREFIX)))
-
-
-def guest_heartbeats(address: str) -> int:
-    """Return the UDP port of a machine's VPN address for the heartbeats of one guest."""
-    return GUEST_HEARTBEATS + ipaddress.IPv4Address(address).packed[3]
 
 
 def overlapping(subnet: str, used: Iterable[str]) -> list[str]:

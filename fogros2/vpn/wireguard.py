@@ -16,14 +16,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import dataclasses
 import ipaddress
-import json
-from pathlib import Path
 import re
 import shlex
 
 from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
-from fogros2.vpn import addresses, guests, Vpn
+from fogros2.vpn import addresses, Vpn
 
 #: Programs that each host needs, and their Debian and Ubuntu packages. ``wireguard-go`` is only
 #: for kernels without the module.
@@ -141,10 +139,10 @@ class WireGuard(Vpn):
         else:
             lines.append(f'found=$(wg show {name} endpoints) && '
                          f'printf "%s\\n" "$found" >{_noted(interface)} || :')
-            look = shlex.join(guest_request(interface, 'look').argv)
-            lines.append(f'[ ! -s {_guests(interface)} ] || {{ read -r _ due; '
-                         'read -r up _ </proc/uptime; [ "${up%.*}" -lt "$due" ] || '
-                         f'{look} >/dev/null || :; }} <{_guests(interface)}')
+            due = f'{more(interface)}.due'
+            lines.append(f'[ ! -e {due} ] || {{ read -r due; read -r up _ </proc/uptime; '
+                         '[ "${up%.*}" -lt "$due" ] || '
+                         f'{_more(interface, "look")} >/dev/null; }} <{due} || :')
         return Command.script(
             '\n'.join(lines), sudo=not interface.firewall, what=_what('look at', interface))
 
@@ -190,20 +188,17 @@ class WireGuard(Vpn):
         undos = [step.undo for step in reversed(self._steps(interface, ())) if step.undo]
         files = f'{shlex.quote(interface.key_file)} {_noted(interface)}'
         if not interface.firewall:
-            clear = shlex.join(guest_request(interface, 'clear').argv)
-            undos.insert(0, f'[ ! -e {_guests(interface)}.json ] || {clear}')
-            files += f' {_guests(interface)}* {_left(interface)} /run/{_name(interface)}.watch*'
+            undos.insert(0, f'[ ! -e {more(interface)} ] || {_more(interface, "clear")}')
+            files += f' {more(interface)} {more(interface)}.* /run/{_name(interface)}.watch*'
         lines = [_PATH, 'failed=0', *(f'{{ {undo}\n}} || failed=1' for undo in undos)]
         lines += [f'rm -f {files} || failed=1', 'exit $failed']
         yield Command.script('\n'.join(lines), sudo=True, what=_what('take', interface, 'down'))
 
     def leave(self, interface: VpnInterface) -> Iterator[Command]:
-        """Yield the script of ``down``; while there are guests it leaves that to their door."""
-        look = shlex.join(guest_request(interface, 'look').argv)
+        """Yield the script of ``down``, unless further peers stay."""
         for command in self.down(interface):
             yield dataclasses.replace(command, argv=(*command.argv[:-1], (
-                f'if [ -e {_guests(interface)}.json ] && found=$({look}) && '
-                f'[ "$found" != "[]" ]; then\n  : >{_left(interface)}\n  exit 0\nfi\n'
+                f'[ ! -e {more(interface)} ] || ! {_more(interface, "stay")} || exit 0\n'
                 f'{command.argv[-1]}')))
 
     def _script(
@@ -252,7 +247,7 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
     No host accepts packets for its VPN address from another interface, as Linux does, nor for its
     group, as Linux does if any process has joined the group there. On the robot, the filter admits
     only DDS and ping from a machine, which may be hijacked. A machine of a launch accepts DDS from
-    the VPN and from itself only; guests reach its DDS, ping and door (``guests``) alone.
+    the VPN and from itself only.
 
     It uses one table, so that one delete is its undo. One transaction replaces the whole table,
     so there is no moment without it. An accept in another table does not override a drop here,
@@ -295,26 +290,8 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
             f'    oifname "{name}" accept',
             f'    ip daddr {group} ip ttl set 0 accept',
             f'    ip daddr {addresses.multicast_group(interface.network)} drop']
-    else:
-        own = addresses.guests(interface.network)
-        admitted = f'iifname "{name}" ip saddr {own}'
-        heartbeats = [f'{guest} . {addresses.guest_heartbeats(str(guest))}'
-                      for guest in ipaddress.IPv4Network(own)]
-        rules[3:3] = [
-            '  chain guests {',
-            f'    ip daddr != {destinations} drop',
-            f'    udp dport {_set(ports)} accept',
-            '    icmp type echo-request accept',
-            f'    tcp dport {addresses.GUEST_PORT} accept',
-            f'    ip saddr . udp dport {{ {", ".join(heartbeats)} }} accept',
-            '    drop',
-            '  }',
-            '  chain forward {',
-            '    type filter hook forward priority filter; policy accept;',
-            f'    {admitted} drop',
-            '  }']
-        rules.append(f'    {admitted} goto guests')
-        rules += [] if interface.process else [f'    {outside} {RTPS} drop']
+    elif not interface.process:
+        rules.append(f'    {outside} {RTPS} drop')
     rules += ['  }', '}']
     # the first line creates the table if missing, so that the second cannot fail
     return _Step(
@@ -497,7 +474,7 @@ def _configure(
             config = []
     lines += [_print(config)] if config else []
     if not interface.firewall:
-        lines.append(f'cat {_guests(interface)} 2>/dev/null || :')
+        lines.append(f'[ ! -e {more(interface)} ] || {_more(interface, "peers")} || :')
     lines.append(f'}} | wg syncconf {_name(interface)} /dev/stdin')
     if interface.firewall:
         # for the health check, which runs without root
@@ -525,23 +502,13 @@ def _noted(interface: VpnInterface) -> str:
     return f'/run/{_name(interface)}.noted'
 
 
-def _guests(interface: VpnInterface) -> str:
-    return f'/run/{_name(interface)}.guests'
+def more(interface: VpnInterface) -> str:
+    """Return the path of the program for further peers of a machine's interface."""
+    return f'/run/{_name(interface)}.more'
 
 
-def _left(interface: VpnInterface) -> str:
-    return f'/run/{_name(interface)}.left'
-
-
-def guest_request(interface: VpnInterface, verb: str, request: object = None) -> Command:
-    """
-    Return the command that changes or lists the guests of a machine's interface.
-
-    :param verb: with ``request``, see ``fogros2.vpn.guests``.
-    """
-    source = Path(guests.__file__).read_text()
-    return Command(('python3', '-IS', '-c', source, _name(interface), verb), sudo=True,
-                   input=json.dumps(request).encode(), what='look at the guests of the VPN')
+def _more(interface: VpnInterface, verb: str) -> str:
+    return f'python3 -IS {more(interface)} {_name(interface)} {verb}'
 
 
 def _print(lines: Sequence[str]) -> str:

@@ -235,7 +235,7 @@ def _leave(record: Record, machine: Machine, *, force: bool) -> None:
     """Undo what a launch has made on a computer that FogROS2 does not own."""
     if record.shell is None:
         return
-    joined = bool(machines.load(record.provider).invitation(record.spec))
+    account = machines.load(record.provider).capabilities.account
     shell = shells.connect(record.shell, name=record.name, timeout=10.0)
     try:
         with _agent(record, shell) as client, contextlib.suppress(AgentError):
@@ -245,9 +245,9 @@ def _leave(record: Record, machine: Machine, *, force: bool) -> None:
                     return  # our agent is gone, and another robot uses the computer now
                 if not force and not _sure(record) and _hears_launch(client):
                     raise _used(record)
-        # guests may have kept the VPN after the launch's own end, which is not in ``made`` then
+        # the VPN may have stayed after the launch's own end, and is not in ``made`` then
         always = []
-        if record.agent and not joined:
+        if record.agent and not account:
             always.append(Made(WATCHDOG))
         if record.vpn is not None:
             always.append(Made(VPN))
@@ -256,7 +256,7 @@ def _leave(record: Record, machine: Machine, *, force: bool) -> None:
         if failures:
             raise failures[0]
     except (ShellError, DeadlineExceeded):
-        if not force and not joined:  # another robot's machine may have forgotten this computer
+        if not force and not account:  # another robot may have taken the account away
             raise
     finally:
         shell.close()

@@ -12,7 +12,7 @@ import signal
 import sys
 from typing import NoReturn, Optional
 
-from fogros2 import invitation, ros2_daemon
+from fogros2 import ros2_daemon
 from fogros2.errors import ConfigurationError
 from fogros2.store import Store, write_private
 from ros2fog_cli.api import reach
@@ -25,7 +25,7 @@ def launch_of(name: str, store: Store) -> tuple[Path, dict[str, str]]:
     :raises ConfigurationError: no running launch uses the machine, and this computer has not
         joined it.
     """
-    folder = invitation.joined(store).get(name)
+    folder = store.other_vpns().get(name)
     if folder is not None and not store.exists(name):
         return folder, reach.variables_of(folder)
     record = store.load(name)

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses
-import json
 import os
 from pathlib import Path
 import re
@@ -16,16 +15,16 @@ import threading
 import time
 from typing import cast, Optional
 
-from fogros2 import invitation, journal, plugin_system, process
+from fogros2 import journal, plugin_system, process
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
 from fogros2.clock import ClockOffset
 from fogros2.errors import AgentError, ConnectError, DdsError, FogError, MachineNotFound
 from fogros2.events import Event
-from fogros2.model import Command, Endpoint, MachineState, VpnInterface
+from fogros2.model import Command, Endpoint, MachineState, OtherVpn, VpnInterface
 from fogros2.shell import Shell
 from fogros2.store import Record, Store
-from fogros2.vpn import helped, Vpn
+from fogros2.vpn import Vpn
 from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Entry
 
@@ -128,7 +127,8 @@ def _open(entry: Entry, port: int, undo: contextlib.ExitStack) -> None:
                 record = Store().load(entry.name)
         if record is None or not record.launch_alive:
             try:
-                provider.allow(machine_id, port, record.spec.fleet_networks if record else ())
+                provider.allow(
+                    machine_id, port, provider.ssh_networks(record.spec) if record else ())
             except MachineNotFound:
                 pass  # the machine is gone, with its firewall
             except FogError as error:
@@ -298,14 +298,11 @@ def variables_of(folder: Path) -> dict[str, str]:
             'ROS_DOMAIN_ID': (folder / 'domain').read_text()}
 
 
-def link_of_joined(folder: Path) -> Link:
+def link_of(other: OtherVpn) -> Link:
     """
-    Measure the link of this computer to a machine that it has joined.
+    Measure the link of this computer to the machine of another robot.
 
     :raises FogError: the status of the interface cannot be read.
     """
-    name = f'fog{folder.name}'
-    joined = json.loads((folder / invitation.JOINED).read_text())
-    interface = VpnInterface(name, joined['joiner'], joined['network'], 0,
-                             helped.key_of(name) or str(folder / 'vpn.key'), firewall=True)
-    return measure(joined['address'], interface, joined['key'], 'wireguard')
+    return measure(
+        other.interface.address, other.own, other.machine.public_key, 'wireguard')

@@ -11,6 +11,9 @@ from typing import Any, TYPE_CHECKING
 from ros2fog_cli.verb import add_json, add_name, add_region, print_json, VerbExtension, warn
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from fogros2.feature import Feature
     from ros2fog_cli.api.reach import Link
 
 
@@ -32,11 +35,10 @@ class StatusVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the status; return 1 if there are problems or no expected agent answers."""
-        from fogros2 import invitation
         from fogros2.errors import ConfigurationError, FogError
-        from fogros2.feature import used
-        from fogros2.store import Store
-        from ros2fog_cli.api import guests, reach, replicas
+        from fogros2.feature import used, with_tables
+        from fogros2.store import other_vpn, Store
+        from ros2fog_cli.api import reach, replicas
         if args.watch:
             from ros2fog_cli.api.watching import watch
             if not 0.1 <= args.interval <= 3600:
@@ -48,13 +50,15 @@ class StatusVerb(VerbExtension):
             raise ConfigurationError('--topics is for --watch: a rate takes a while',
                                      'add --watch')
         store = Store()
-        folder = invitation.joined(store).get(args.name)
-        if folder is not None and not store.exists(args.name):
-            return show_joined(reach.link_of_joined(folder), as_json=args.json)
+        folder = store.other_vpns().get(args.name)
+        other = other_vpn(folder) if folder is not None else None
+        if other is not None and not store.exists(args.name):
+            return show_link(reach.link_of(other), as_json=args.json)
         entry = reach.find(args.name, warn, regions=args.region)
+        tables = with_tables()
         status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'clock': None, 'agent': None,
-                                  'streams': [], 'guests': [], 'replicas': [],
-                                  'features': []}
+                                  'streams': [], 'replicas': [], 'features': [],
+                                  **{name: [] for name in tables}}
         problems: list[str] = []
         idle = reach.let_go(entry) and not entry.gone
         if idle:
@@ -78,7 +82,8 @@ class StatusVerb(VerbExtension):
                         status['agent'] = {
                             key: value for key, value in reply.items() if key not in ('id', 'ok')}
                         if status['vpn'] is not None:
-                            status['guests'] = guests.ask(shell, entry.record, 'look')
+                            for name, each in tables.items():
+                                status[name] = each.entries(entry.record, shell)
                     finally:
                         client.close()
             except FogError as error:
@@ -99,16 +104,19 @@ class StatusVerb(VerbExtension):
         if args.json:
             print_json(**status, problems=problems)
         else:
-            show(status, idle=idle)
+            show(status, tables, idle=idle)
         for problem in problems:
             warn(problem)
         return 0 if (status['agent'] is not None or idle) and not problems else 1
 
 
-def show(status: dict[str, Any], *, idle: bool = False) -> None:
+def show(
+    status: dict[str, Any], tables: Mapping[str, Feature] = {}, *, idle: bool = False,
+) -> None:
     """
     Print a status for users.
 
+    :param tables: the features that have a table, by name.
     :param idle: the machine is kept, and no launch uses it.
     """
     from decimal import Decimal
@@ -161,13 +169,10 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
     if status['replicas']:
         print()
         print(table(replicas.HEADER, list(map(replicas.row, status['replicas']))))
-    if status['guests']:
-        print()
-        print(table(('GUEST', 'ADDRESS', 'HEARD', 'MAY JOIN', 'KEY'), [
-            (guest['label'] or '-', guest['address'],
-             'never' if guest['heard'] is None else f"{duration(guest['heard'])} ago",
-             f"{duration(guest['left'])} more" if guest['left'] > 0 else 'no more', guest['key'])
-            for guest in status['guests']]))
+    for name, feature in tables.items():
+        if status[name]:
+            print()
+            print(table(feature.headings, list(map(feature.row, status[name]))))
     if status['streams']:
         print()
         print(table(('STREAM', 'BY', 'FROM', 'TO', 'RATE', 'TRAFFIC', 'SHARE', 'LATENCY'), [
@@ -177,8 +182,8 @@ def show(status: dict[str, Any], *, idle: bool = False) -> None:
             for one in status['streams']]))
 
 
-def show_joined(link: Link, *, as_json: bool) -> int:
-    """Print a guest's link to a machine; return 0 if the machine answers."""
+def show_link(link: Link, *, as_json: bool) -> int:
+    """Print the link to another robot's machine; return 0 if the machine answers."""
     from ros2fog_cli.api.table import duration
     if as_json:
         print_json(**dataclasses.asdict(link))

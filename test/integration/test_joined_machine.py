@@ -123,7 +123,7 @@ def test_nodes_of_a_second_robot_end_with_its_heartbeat(
     host.launched.wait_for('I heard')  # the first robot's node there hears the second's too
     (account,) = {name for name in host.accounts() if ':' not in name}
     for script in ('cat /{0}/config.json', 'sudo -n true', 'kill -0 1', 'ls /home/*',
-                   'cat /run/fog*.guests.json', 'touch /var/lib/fogros2-guests/x'):
+                   'cat /run/fog*.more.json', 'touch /var/lib/fogros2-guests/x'):
         said = host.there(f"su -s /bin/sh -c '{script.format(AGENT_DIRECTORY)}' {account} "
                           '2>/dev/null && echo may')
         assert 'may' not in said, (script, said)

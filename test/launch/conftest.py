@@ -13,6 +13,7 @@ import pytest
 
 from fogros2 import ContainerInstance, events
 from fogros2.errors import Cancelled
+from fogros2.provider import Capabilities
 from fogros2.report import step
 from fogros2.store import Store
 
@@ -125,7 +126,7 @@ class FakeLaunch:
     def provider(self, name):
         return SimpleNamespace(has_own_packages=lambda spec: 'image' in spec.options,
                                shared_folders=lambda spec: ['/shared'],
-                               invitation=lambda spec: spec.options.get('invitation', ''))
+                               capabilities=Capabilities())
 
     def expect(self, names):
         self.note('expect', *names)

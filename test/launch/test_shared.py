@@ -22,7 +22,7 @@ from fogros2_testing import FakeProvider
 def sharing(fake):
     """Return the fake with folders in which relays meet."""
     fake.provider = lambda name: SimpleNamespace(
-        has_own_packages=lambda spec: True, invitation=lambda spec: '',
+        has_own_packages=lambda spec: True,
         capabilities=Capabilities(share_folders=('/own', '/all')))
     return fake
 

@@ -28,9 +28,9 @@ from fogros2.agent_client import connection
 from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.dds.fastdds import FastDds, VARIABLE
 from fogros2.errors import FogError
-from fogros2.vpn import guests
 from fogros2_examples.city import City
 from fogros2_examples.lidar import message
+from fogros2_features.guests import program as guests
 from fogros2_monitor import request as gate
 from fogros2_monitor.dashboard import server as dashboard
 from fogros2_replicas.pairs import header_of

@@ -19,7 +19,6 @@ import subprocess
 
 import pytest
 
-from fogros2 import invitation
 from fogros2.model import Command
 from fogros2.process import argv, run
 from fogros2.store import Store
@@ -89,7 +88,7 @@ class SecondRobot:
         return str(shown[0]['addr_info'][0]['local'])
 
     def close(self) -> None:
-        for name in invitation.joined(Store(Path(self.environment['FOGROS2_STATE_HOME']))):
+        for name in Store(Path(self.environment['FOGROS2_STATE_HOME'])).other_vpns():
             self.run('ros2', 'fog', 'leave', name)
         for words in (('link', 'delete', self.spaces[0]),
                       *(('netns', 'delete', space) for space in self.spaces)):

@@ -15,8 +15,9 @@ from typing import Any
 import pytest
 
 from fogros2.model import Command, Peer, VpnInterface
-from fogros2.vpn.wireguard import guest_request
+from fogros2.vpn.wireguard import dds_ports
 from fogros2.waiting import wait_until
+from fogros2_features.guests import listing, network
 from rigs.second_robot import NAT
 from rigs.vpn_lab import Lab, MACHINE, NETWORK, PORT
 
@@ -55,13 +56,16 @@ class Guest:
         return self.key
 
     def ask(self, verb: str, **request: Any) -> list[dict[str, Any]]:
-        found: list[dict[str, Any]] = json.loads(self.lab.run('machine', guest_request(
+        found: list[dict[str, Any]] = json.loads(self.lab.run('machine', listing.request(
             self.lab.interfaces['machine'], verb, request)).stdout)
         return found
 
     def admit(self, seconds: float = 60.0, patience: float = 180.0) -> None:
+        interface, dds = self.lab.interfaces['machine'], self.lab.dds
+        self.lab.run('machine', listing.install(interface))
         (own,) = self.ask('admit', key=self.key, label='second', seconds=seconds,
-                          patience=patience, addresses=[GUEST])
+                          patience=patience, addresses=[GUEST], rules=network.rules(
+                              interface, [dds_ports(dds.domain), *dds.ports]))
         assert own['address'] == GUEST and own['heard'] is None
 
     def up(self, *, answered: bool = True) -> None:

@@ -325,7 +325,7 @@ class Lab:
         if interface.firewall:
             text = self.dds.render(
                 self.dds.robot_interfaces(used, self.lan_name, self.user),
-                machines if self.dds.asks_machines else [], self.user, guest=host == 'guest')
+                machines if self.dds.asks_machines else [], self.user, quiet=host == 'guest')
         else:
             text = self.dds.render(self.dds.machine_interfaces(used), machines)
         path = self.folder / f'{host} {self.dds.file_name}'

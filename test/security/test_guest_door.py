@@ -16,9 +16,9 @@ import pytest
 
 from fogros2.errors import AuthenticationError, ConnectError
 from fogros2.model import Command, Endpoint
-from fogros2.shell.guest import GuestShell
-from fogros2.vpn import guests
 from fogros2.waiting import wait_until
+from fogros2_features.guests import program as guests
+from fogros2_features.guests.shell import GuestShell
 
 SECRET, OTHER = '5a' * 32, 'b7' * 32
 ME = '127.0.0.1'

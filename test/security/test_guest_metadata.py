@@ -13,7 +13,7 @@ import pytest
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2.vpn import guests
+from fogros2_features.guests import program as guests
 from rigs.stranger import NOBODY
 
 #: The metadata services of AWS, Google and Azure; AWS's for containers; Azure's agent; by IPv6.

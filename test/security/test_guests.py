@@ -7,9 +7,9 @@ from pathlib import Path
 import sys
 
 from fogros2.model import Command
-from fogros2.vpn import guests
-from fogros2.vpn.addresses import guest_heartbeats, GUEST_PORT
 from fogros2.waiting import wait_until
+from fogros2_features.guests import network
+from fogros2_features.guests import program as guests
 from rigs.container_machines import Cloud, cloud, cloud_network, engine, key
 from rigs.vpn_guest import GUEST, Guest, guest
 from rigs.vpn_lab import Child, Lab, MACHINE, ROBOT
@@ -47,10 +47,10 @@ for word in sys.argv[1:]:
 '''
 #: The last one is for the heartbeats of another guest.
 PORTS = ['tcp:0.0.0.0:22', 'tcp:0.0.0.0:8765', 'udp:0.0.0.0:7399', 'udp:0.0.0.0:53',
-         f"udp:0.0.0.0:{guest_heartbeats('198.18.7.225')}"]
+         f"udp:0.0.0.0:{network.heartbeats('198.18.7.225')}"]
 DDS = 'udp:0.0.0.0:7410'
 #: What a guest reaches besides DDS: the door, and the port for its heartbeats.
-OWN = [f'tcp:0.0.0.0:{GUEST_PORT}', f'udp:0.0.0.0:{guest_heartbeats(GUEST)}']
+OWN = [f'tcp:0.0.0.0:{network.PORT}', f'udp:0.0.0.0:{network.heartbeats(GUEST)}']
 #: Gives a guest an account, whose program leaves files; ends it, and gives another one. Prints
 #: the ids of both, and what System V keeps of the first.
 ACCOUNTS = """
@@ -140,6 +140,7 @@ def test_revoked_guest_gets_no_answer(guest: Guest) -> None:
 def test_expired_invitation_gets_no_answer(guest: Guest) -> None:
     guest.admit(seconds=1.0)
     wait_until(lambda: not looked(guest), timeout=60.0, what='the end of the invitation')
+    assert '.due' not in guest.lab.shell('machine', 'ls /run'), 'nothing is looked at any more'
     assert silent(guest)
 
 
@@ -167,8 +168,21 @@ def test_changed_peers_and_repairs_keep_the_guest(vpn: Lab, guest: Guest) -> Non
     for commands in (vpn.vpn.peers(interface, peers), vpn.vpn.repair(interface, peers)):
         vpn.do('machine', commands)
         assert vpn.ping('guest', MACHINE, timeout=60.0)
+    vpn.shell('machine', 'nft flush ruleset')
+    vpn.do('machine', vpn.vpn.repair(interface, peers))
+    assert f'table inet {interface.name}g' in vpn.shell('machine', 'nft list tables')
     vpn.do('machine', vpn.vpn.down(interface))
     assert vpn.shell('machine', f'ls /run/{interface.name}.* || :') == ''
+    assert interface.name not in vpn.shell('machine', 'nft list tables')
+
+
+def test_guest_without_its_filter_gets_no_answer(vpn: Lab, guest: Guest) -> None:
+    guest.admit()
+    guest.up()
+    interface, peers = vpn.interfaces['machine'], vpn.peers()['machine']
+    vpn.shell('machine', f'rm /run/{interface.name}.more.rules')
+    vpn.do('machine', vpn.vpn.repair(interface, peers))
+    assert guest.key not in vpn.shell('machine', 'wg show all peers')
 
 
 def test_next_guest_owns_no_file_of_a_former_one(cloud: Cloud) -> None:

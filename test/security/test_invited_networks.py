@@ -11,12 +11,11 @@ from typing import Any
 
 import pytest
 
-from fogros2 import invitation
-from fogros2.deploy import membership
 from fogros2.errors import ConfigurationError
-from fogros2.invitation import Invitation
 from fogros2.model import Command
 from fogros2.store import Store
+from fogros2_features.guests import invitation, membership
+from fogros2_features.guests.invitation import Invitation
 from ros2fog_cli import verb
 
 KEY = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
@@ -64,10 +63,10 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Robot:
 def test_public_addresses_are_taken_only_after_a_question(robot: Robot, network: str) -> None:
     with pytest.raises(ConfigurationError, match=f'take the public addresses {network}'):
         robot.join(network)
-    assert robot.ran == [] and invitation.joined(robot.store) == {}
+    assert robot.ran == [] and robot.store.other_vpns() == {}
     robot.join(network, agreed=robot.agree)
     assert network in robot.asked[0] and 'public addresses' in robot.asked[0]
-    assert 'planner' in invitation.joined(robot.store)
+    assert 'planner' in robot.store.other_vpns()
 
 
 @pytest.mark.parametrize('network', [

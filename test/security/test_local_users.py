@@ -27,8 +27,8 @@ import pytest
 from fogros2 import process
 from fogros2.model import Command
 from fogros2.shell import relay
-from fogros2.vpn.guests import Door
 from fogros2.waiting import wait_until
+from fogros2_features.guests.program import Door
 from fogros2_monitor import accounts, request
 from fogros2_monitor.dashboard.server import Dashboard
 from fogros2_monitor.gate import Gate

@@ -13,9 +13,8 @@ import time
 
 import pytest
 
-from fogros2.invitation import Invitation
-from fogros2.model import MachineSpec, to_json
-from fogros2.store import Record, Store, write_private
+from fogros2.model import MachineSpec, OtherVpn, Peer, to_json, VpnInterface
+from fogros2.store import OTHER_VPN, Record, Store, write_private
 from fogros2.waiting import wait_until
 
 pytestmark = [
@@ -32,8 +31,9 @@ def complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Complete:
     monkeypatch.setenv('FOGROS2_STATE_HOME', str(tmp_path / 'state'))
     for name in ('planner', 'mapper'):
         Store().save(Record(name, 'container', MachineSpec(name, 'container')))
-    write_private(Store().launch('a1b2c3') / 'joined.json', to_json(Invitation(
-        'slam', '', '198.18.7.2', '', '198.18.7.224', '198.18.7.0/24', '', 0, 0.0)).encode())
+    own = VpnInterface('foga1b2c3', '198.18.7.224', '198.18.7.0/24', 0, '')
+    write_private(Store().launch('a1b2c3') / OTHER_VPN, to_json(
+        OtherVpn(Peer('slam', '', '198.18.7.2'), own, own, 7224)).encode())
 
     def complete(line: str) -> list[str]:
         answer = tmp_path / 'answer'

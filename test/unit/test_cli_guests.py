@@ -10,13 +10,12 @@ import json
 import os
 from pathlib import Path
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from ros2cli.cli import main
 
-from fogros2 import invitation
-from fogros2.deploy import membership
 from fogros2.errors import CommandError, VpnError
 from fogros2.model import (
     Command,
@@ -24,16 +23,20 @@ from fogros2.model import (
     Machine,
     MachineSpec,
     MachineState,
+    OtherVpn,
+    Peer,
     Result,
     to_json,
     VpnInterface,
 )
 from fogros2.provider import Capabilities
 from fogros2.provider.container import packet_filter
-from fogros2.store import process_start, Record, Store, write_private
+from fogros2.store import OTHER_VPN, process_start, Record, Store, write_private
+from fogros2_features.guests import invitation, listing, membership, program
 from fogros2_testing.fakes import FakeProvider, FakeShell
 from fogros2_testing.plugins import instead
-from ros2fog_cli.api import endings, guests, reach
+from ros2fog_cli.api import endings, reach
+from ros2fog_cli.api.reach import Link
 
 OTHER = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
 MACHINE = Machine('id', 'planner', 'memory', MachineState.RUNNING, time.time(),
@@ -65,17 +68,20 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Any]]:
     found: list[tuple[str, Any]] = []
 
     def answer(command: Command) -> Result:
-        assert command.sudo and command.argv[:3] == ('python3', '-IS', '-c')
-        assert command.argv[4] == 'fogabc123m0'
+        assert command.sudo and command.argv[4] == '/run/fogabc123m0.more'
+        if len(command.argv) == 5:
+            assert command.input == Path(program.__file__).read_bytes()
+            return Result(0, '', '')
+        assert command.argv[5] == 'fogabc123m0'
         request = json.loads(command.input)
-        found.append((command.argv[5], request))
+        found.append((command.argv[6], request))
         own = {'key': (request or {}).get('key', OTHER), 'label': 'robot2',
                'address': '198.18.7.224', 'left': 60.0, 'heard': None}
-        return Result(0, json.dumps([own] if command.argv[5] != 'remove' else []), '')
+        return Result(0, json.dumps([own] if command.argv[6] != 'remove' else []), '')
 
     @contextlib.contextmanager
     def session(*arguments: object, **more: object) -> Iterator[FakeShell]:
-        yield FakeShell(handlers={'python3': answer})
+        yield FakeShell(handlers={'sh': answer})
 
     monkeypatch.setattr(reach, 'session', session)
     return found
@@ -153,10 +159,31 @@ def test_nobody_is_revoked_where_the_vpn_has_ended(
         raise CommandError(Command(('python3',)), Result(
             1, '', 'Unable to access interface: No such device\nTraceback ...'), "'planner'")
 
-    monkeypatch.setattr(guests, 'ask', ended)
+    monkeypatch.setattr(listing, 'ask', ended)
     assert fog('revoke', 'planner') == 0
     assert capsys.readouterr().out == "'planner' has no guests\n"
     assert "'planner' has no guest robot2" in fog('revoke', 'planner', 'robot2')
+
+
+def test_status_shows_guests_while_the_feature_is_installed(
+    asked: list[tuple[str, Any]], capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    status = {'since': 0.0, 'rss_kb': 9, 'heartbeat_age': None, 'nodes': []}
+    monkeypatch.setattr(reach, 'agent', lambda *_: SimpleNamespace(
+        status=lambda timeout: status, close=lambda: None))
+    monkeypatch.setattr(reach, 'link', lambda record: Link('198.18.7.2', 'fogabc123'))
+    assert fog('status', 'planner', '--json') == 0
+    (guest,) = json.loads(capsys.readouterr().out)['guests']
+    assert (guest['label'], guest['left'], guest['heard']) == ('robot2', 60.0, None)
+    assert fog('status', 'planner') == 0
+    table = [line.split() for line in capsys.readouterr().out.splitlines()[-2:]]
+    assert table == [['GUEST', 'ADDRESS', 'HEARD', 'MAY', 'JOIN', 'KEY'],
+                     ['robot2', '198.18.7.224', 'never', '60', 's', 'more', OTHER]]
+    instead(monkeypatch, 'fogros2.feature', {})
+    assert fog('status', 'planner', '--json') == 0
+    assert 'guests' not in json.loads(capsys.readouterr().out)
+    assert asked == [('look', None)] * 2
 
 
 @pytest.mark.parametrize('change', [
@@ -168,9 +195,9 @@ def test_machine_that_lies_about_its_guests_is_reported(
     guest = {'key': OTHER, 'label': 'a', 'address': '198.18.7.224', 'left': 1.0, 'heard': None}
     for answer in ([{**guest, **change}], [{}], 7):
         text = json.dumps(answer)
-        shell = FakeShell(handlers={'python3': lambda c, text=text: Result(0, text, '')})
+        shell = FakeShell(handlers={'sh': lambda c, text=text: Result(0, text, '')})
         with pytest.raises(VpnError, match='invalid list of guests'):
-            guests.ask(shell, Store().load('planner'), 'look')
+            listing.ask(shell, Store().load('planner'), 'look')
 
 
 def test_folder_of_a_joined_machine_stays_until_a_reboot(
@@ -191,7 +218,7 @@ def test_folder_of_a_joined_machine_stays_until_a_reboot(
     assert 'Endpoint = 203.0.113.9:30000' in ran[-1].argv[-1]
     key = (store.root / 'key').read_text().strip()
     assert not [word for command in ran for word in command.argv if key in word]
-    assert invitation.joined(store) == {'planner': folder} and endings.leftovers(store) == []
+    assert store.other_vpns() == {'planner': folder} and endings.leftovers(store) == []
     process = json.loads((folder / 'process.json').read_text())
     (folder / 'process.json').write_text(json.dumps({**process, 'boot': 'before'}))
     assert endings.leftovers(store) == [folder]
@@ -210,7 +237,7 @@ def test_range_of_the_joiners_own_is_one_clear_error(
         [{'dst': '198.18.0.0/16', 'dev': 'eth1'}]))
     with pytest.raises(VpnError, match='uses 198.18.0.0/16'):
         membership.join(text, store, {})
-    assert invitation.joined(store) == {}
+    assert store.other_vpns() == {}
 
 
 def test_published_port_is_part_of_the_machines_filter() -> None:
@@ -221,8 +248,9 @@ def test_published_port_is_part_of_the_machines_filter() -> None:
 
 
 def test_leave_names_the_nearest_machine() -> None:
-    write_private(Store().launch('a1b2c3') / 'joined.json', to_json(invitation.Invitation(
-        'slam', '', '198.18.7.2', '', '198.18.7.224', '198.18.7.0/24', '', 0, 0.0)).encode())
+    own = VpnInterface('foga1b2c3', '198.18.7.224', '198.18.7.0/24', 0, '')
+    write_private(Store().launch('a1b2c3') / OTHER_VPN, to_json(
+        OtherVpn(Peer('slam', '', '198.18.7.2'), own, own, 7224)).encode())
     assert main(argv=['fog', 'leave', 'slan']) == (
         "this computer has not joined a machine 'slan' (did you mean 'slam'?)")
     assert 'ros2 fog join' in main(argv=['fog', 'leave', 'planner'])

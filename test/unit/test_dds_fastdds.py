@@ -50,7 +50,7 @@ def test_robot_keeps_all_its_interfaces_and_its_lan() -> None:
 
 
 def test_guest_listens_to_its_lan_and_announces_no_group() -> None:
-    text = robot(FastDds(), guest=True)
+    text = robot(FastDds(), quiet=True)
     root = parsed(text)
     assert root.find('.//avoid_builtin_multicast', NS) is None
     assert root.find('.//metatrafficMulticastLocatorList', NS) is None
@@ -58,7 +58,7 @@ def test_guest_listens_to_its_lan_and_announces_no_group() -> None:
 
 
 @pytest.mark.parametrize('text', [
-    robot(FastDds()), robot(FastDds(), {'ROS_LOCALHOST_ONLY': '1'}), robot(FastDds(), guest=True),
+    robot(FastDds()), robot(FastDds(), {'ROS_LOCALHOST_ONLY': '1'}), robot(FastDds(), quiet=True),
     machine(FastDds())], ids=['robot', 'local', 'guest', 'machine'])
 def test_nodes_use_udp_only_with_large_buffers(text: str) -> None:
     root = parsed(text)

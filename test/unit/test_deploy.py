@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from fogros2 import invitation, plan, process
+from fogros2 import plan, process
 from fogros2.agent_client import AgentClient
 from fogros2.deploy import Launch, robot_vpn, undo
 from fogros2.deploy import launch as deployed
@@ -60,6 +60,7 @@ from fogros2.shell import host_key
 from fogros2.store import Made, Store
 from fogros2.vpn import addresses
 from fogros2.waiting import Periodic, Timeouts, wait_until
+from fogros2_features.guests import invitation
 from fogros2_features.replacement import Replacement
 from fogros2_testing.fakes import FakeProvider, FakeShell, FakeStream, FakeVpn
 from fogros2_testing.plugins import instead

@@ -11,10 +11,10 @@ import time
 
 import pytest
 
-from fogros2 import invitation
 from fogros2.errors import ConfigurationError
-from fogros2.invitation import Invitation
 from fogros2.store import Store
+from fogros2_features.guests import invitation
+from fogros2_features.guests.invitation import Invitation
 
 KEY = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
 

@@ -23,12 +23,12 @@ from fogros2.model import Image, MachineSpec
 from fogros2.provider import Capabilities
 from fogros2.provider.offers import MachineType, Offer
 from fogros2.store import Record, Store
+from fogros2_features.guests.listing import Guest
 from fogros2_replicas import figures
 from fogros2_testing.fakes import FakeProvider
 from fogros2_testing.plugins import instead
 from ros2fog_cli.api import images, output, shown, watching
 from ros2fog_cli.api.doctor import Check
-from ros2fog_cli.api.guests import Guest
 from ros2fog_cli.api.machines import Entry
 from ros2fog_cli.api.reach import Link
 from ros2fog_cli.verb import price

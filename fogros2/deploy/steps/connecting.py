@@ -34,8 +34,8 @@ from fogros2.waiting import wait_until
 #: Time-out of one login attempt in seconds: a cancel takes effect only at its end. An existing
 #: computer, which does not boot, gets no more time than this.
 LOGIN_TIMEOUT = 10.0
-#: Login time-out of a guest in seconds: WireGuard repeats a lost handshake after 5 s.
-GUEST_TIMEOUT = 30.0
+#: Login time-out in another robot's VPN: WireGuard repeats a lost handshake after 5 s.
+VPN_TIMEOUT = 30.0
 #: Seconds between two checks of the machine's state and of the robot's public address.
 POLL_INTERVAL = 10.0
 #: Errors of a machine that is still booting.
@@ -99,7 +99,8 @@ class Connection(Step):
             self._allow([])
             job.forget(Made(SSH_PORT, outside.port))
             detail.append(
-                'SSH through the VPN, and open to the fleet' if self._job.spec.fleet_networks
+                'SSH through the VPN, and open to the fleet'
+                if self._context.provider.ssh_networks(job.spec)
                 else f'SSH through the VPN alone, port {outside.port} closed')
 
     def _leave_vpn(self) -> None:
@@ -119,8 +120,9 @@ class Connection(Step):
     def _allow(self, sources: Sequence[str]) -> None:
         outside = self._job.record.shell
         assert outside is not None
-        self._context.provider.allow(
-            self._job.machine_id, outside.port, [*sources, *self._job.spec.fleet_networks])
+        provider = self._context.provider
+        provider.allow(self._job.machine_id, outside.port,
+                       [*sources, *provider.ssh_networks(self._job.spec)])
 
     def _shell_to(self, endpoint: Endpoint) -> Shell:
         return shells.connect(
@@ -159,8 +161,8 @@ class Connection(Step):
         """Return the login time-out in seconds; a machine that may still boot gets more."""
         timeouts, provider, record = self._context.timeouts, self._context.provider, \
             self._job.record
-        if self._context.invitation is not None:
-            return min(timeouts.ssh, GUEST_TIMEOUT)
+        if self._context.other_vpn is not None:
+            return min(timeouts.ssh, VPN_TIMEOUT)
         if not provider.capabilities.owned:
             return min(timeouts.ssh, LOGIN_TIMEOUT)
         boots = provider.capabilities.one_time_host_key and not record.host_key

@@ -27,7 +27,7 @@ def install_ros(
         ros, note = bootstrap.ensure(
             job.shell, context.underlay(job.spec.workspaces), job.spec,
             timeout=context.timeouts.install, cancel=job.cancel, on_plan=on_plan,
-            elsewhere=True, packages=context.packages, guest=context.invitation is not None,
+            elsewhere=True, packages=context.packages, at_home=context.capabilities.account,
             warn=lambda text, hint: context.report(Warned(job.name, text, hint)))
         detail.append(note)
         return ros

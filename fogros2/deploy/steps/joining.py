@@ -16,7 +16,7 @@ from fogros2.deploy.undo import VPN, vpn_down
 from fogros2.errors import CommandError, FogError, VpnError
 from fogros2.model import Command, host_port, Machine, Peer, VpnInterface
 from fogros2.report import step
-from fogros2.store import GUESTS
+from fogros2.store import VPN_LEFT
 from fogros2.vpn import addresses
 
 #: Sends a packet to an address and port, from which the peer learns this end's endpoint.
@@ -69,9 +69,9 @@ class Joining(Step):
         with job.step('VPN') as detail:
             job.makes(VPN)
             job.undoing(VPN, lambda: robot.remove(job.name))
-            noted = self._context.store.machine(job.name) / GUESTS
+            noted = self._context.store.machine(job.name) / VPN_LEFT
             if self._former is not None and noted.exists():
-                # an earlier launch has left it to guests, and its port is needed
+                # others still use that of an earlier launch, and its port is needed
                 job.run(*robot.vpn.down(self._former))
             noted.unlink(missing_ok=True)
             public_key = job.run(robot.vpn.keys(interface)).strip()
@@ -143,16 +143,14 @@ class Joining(Step):
 
 
 class Joined(Joining):
-    """Use the machine of another robot, in whose VPN this computer is a guest."""
+    """Use a machine in the VPN of another robot, which the launch has joined."""
 
     def choose_interface(self) -> None:
-        """Take the interface of the invitation; the machine's own robot has made it."""
-        invitation, job = self._context.invitation, self._job
-        assert invitation is not None
-        job.interface = VpnInterface(
-            invitation.interface, invitation.address, invitation.network, 0, '')
-        job.heartbeats = (
-            addresses.guest_heartbeats(invitation.joiner), invitation.joiner)
+        """Take the interface that the other robot has made."""
+        other, job = self._context.other_vpn, self._job
+        assert other is not None
+        job.interface = other.interface
+        job.heartbeats = (other.heartbeats, other.own.address)
 
     def avoid(self, routes: Sequence[str]) -> None:
         """Do nothing: the interface exists."""

@@ -17,7 +17,7 @@ import pwd
 from fogros2.errors import PrerequisiteError
 
 #: Ids that systemd's list of ranges (UIDS-GIDS) leaves free, without those of sssd's id mapping,
-#: and of guests (``vpn.guests``); and ids for a computer in a namespace of users that lacks them.
+#: and of accounts of features; and ids for a computer in a namespace of users that lacks them.
 IDS, FEW_IDS = range(0x78000000, 0x7c000000), range(20000, 60000)
 #: Ranges of ids that accounts may use in containers of their own.
 SUBORDINATE = (Path('/etc/subuid'), Path('/etc/subgid'))

@@ -114,6 +114,12 @@ class VmProvider(Provider):
         for one in (*((region,) if region != NEAREST else ()), *options.regions):
             options.in_region(one)
 
+    def ssh_networks(self, spec: MachineSpec) -> Sequence[str]:
+        named = spec.options.get('ssh_from') or ()
+        if not spec.options.get('fleet'):
+            return ()
+        return (named,) if isinstance(named, str) else tuple(named)
+
     def resolve(self, spec: MachineSpec) -> MachineSpec:
         options = self._cloud.options.of(spec)
         chosen: dict[str, Any] = {}

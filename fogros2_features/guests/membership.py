@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Mapping
+import dataclasses
 import os
 from pathlib import Path
 from typing import Optional
@@ -13,11 +14,13 @@ from fogros2 import plugin_system, process
 from fogros2.dds import addresses_of, DdsVendor
 from fogros2.deploy.robot import check_robot, clear, run
 from fogros2.errors import ConfigurationError, DdsError, did_you_mean, VpnError
-from fogros2.invitation import Invitation, JOINED, joined, own_key, read, SECRET, unseal
-from fogros2.model import Peer, to_json, VpnInterface
-from fogros2.store import boot_id, process_start, Store, write_private
+from fogros2.model import OtherVpn, Peer, to_json, VpnInterface
+from fogros2.store import boot_id, OTHER_VPN, process_start, Store, write_private
+from fogros2.store import other_vpn as stored_vpn
 from fogros2.vpn import addresses, helped, Vpn
 from fogros2.waiting import Timeouts
+from fogros2_features.guests import network
+from fogros2_features.guests.invitation import DOOR_KEY, Invitation, own_key, unseal
 
 
 def join(
@@ -41,9 +44,9 @@ def join(
     invitation = unseal(text, key)
     vendor = _vendor(invitation, environment)
     folder = store.root / 'launches' / invitation.number
-    name = f'fog{invitation.number}'
     up = is_up(invitation)
-    if up and read(folder) == invitation:
+    other = other_vpn(invitation, store)
+    if up and stored_vpn(folder) == other and secret_of(folder) == invitation.secret:
         return folder
     if not invitation.private and not agreed(
             f'{invitation.network} has public addresses. Send what is for them to the computer '
@@ -53,32 +56,47 @@ def join(
             f'{invitation.network}',
             'ros2 fog join in a terminal asks whether you want that; a launch does not')
     check_robot()
-    before = joined(store).get(invitation.machine, folder)
+    before = store.other_vpns().get(invitation.machine, folder)
     if before != folder:
         clear(before)  # of a launch with this machine that has ended
     if not up:
         _check_free(invitation)
-    interface = VpnInterface(
-        name, invitation.joiner, invitation.network, addresses.choose_port(environment),
-        helped.key_file(name) if helped.permitted() else str(folder / 'vpn.key'), firewall=True)
+    interface = dataclasses.replace(other.own, port=addresses.choose_port(environment))
     vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
         domain=invitation.domain, ports=vendor.ports,
         asked=addresses_of(vendor.asked(environment)))
     private = base64.b64encode(key).decode()
     store.launch(invitation.number)
     try:
-        _write(folder, invitation, interface, vendor, environment, owner or {
+        _write(folder, invitation, other, vendor, environment, owner or {
             'pid': 1, 'pid_start': process_start(1) or 0, 'boot': boot_id()})
         if helped.made(interface):
             process.run(helped.lend(interface, private), timeout=Timeouts().vpn)
         else:
             write_private(Path(interface.key_file), f'{private}\n'.encode())
-        run(vpn.up(interface, [Peer(invitation.machine, invitation.key, invitation.address,
-                                    invitation.endpoint)]), timeout=Timeouts().vpn)
+        run(vpn.up(interface, [other.machine]), timeout=Timeouts().vpn)
     except BaseException:
         clear(folder)
         raise
     return folder
+
+
+def other_vpn(invitation: Invitation, store: Store) -> OtherVpn:
+    """Return the VPN that an invitation leads to."""
+    name = f'fog{invitation.number}'
+    return OtherVpn(
+        Peer(invitation.machine, invitation.key, invitation.address, invitation.endpoint),
+        VpnInterface(invitation.interface, invitation.address, invitation.network, 0, ''),
+        VpnInterface(
+            name, invitation.joiner, invitation.network, 0,
+            helped.key_file(name) if helped.permitted()
+            else str(store.root / 'launches' / invitation.number / 'vpn.key'), firewall=True),
+        network.heartbeats(invitation.joiner))
+
+
+def secret_of(folder: Path) -> str:
+    """Return the secret of the invitation by which this computer has joined, '' for none."""
+    return path.read_text() if (path := folder / DOOR_KEY).exists() else ''
 
 
 def is_up(invitation: Invitation) -> bool:
@@ -121,20 +139,20 @@ def _check_free(invitation: Invitation) -> None:
 
 
 def _write(
-    folder: Path, invitation: Invitation, interface: VpnInterface, vendor: DdsVendor,
+    folder: Path, invitation: Invitation, other: OtherVpn, vendor: DdsVendor,
     environment: Mapping[str, str], owner: Mapping[str, object],
 ) -> None:
     """Write the files of a launch's folder that terminals read, and the invitation."""
     lan = vendor.parse_lan(run([vendor.ask_lan()], timeout=Timeouts().vpn))
     interfaces = vendor.robot_interfaces(
-        interface.address if vendor.by_address else interface.name, lan, environment)
+        other.own.address if vendor.by_address else other.own.name, lan, environment)
     for name, content in {
             vendor.file_name: vendor.render(
                 interfaces, [invitation.address] if vendor.asks_machines else [], environment,
-                guest=True),
+                quiet=True),
             'domain': str(invitation.domain), 'rmw': vendor.rmw,
-            'process.json': to_json(owner), SECRET: invitation.secret,
-            JOINED: to_json(invitation)}.items():
+            'process.json': to_json(owner), DOOR_KEY: invitation.secret,
+            OTHER_VPN: to_json(other)}.items():
         write_private(folder / name, content.encode())
 
 
@@ -144,7 +162,7 @@ def leave(name: str, store: Store) -> None:
 
     :raises ConfigurationError: this computer has not joined the machine.
     """
-    folders = joined(store)
+    folders = store.other_vpns()
     if name not in folders:
         raise ConfigurationError(
             f"this computer has not joined a machine '{name}'",

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from fogros2.vpn import addresses, guests
-from fogros2.vpn.guests import Guest
+from fogros2.model import VpnInterface
+from fogros2_features.guests import network
+from fogros2_features.guests import program as guests
+from fogros2_features.guests.program import Guest
 
 KEY, OTHER = 'first=', 'second='
 
@@ -57,16 +59,19 @@ def test_guest_ends_with_the_lifetime_of_the_machine() -> None:
     assert guests.account('fogabc123m0', '198.18.7.224') == 'fogabc123m0g224'
 
 
-def test_wg_reads_the_guests_and_the_time_to_look() -> None:
+def test_wg_reads_the_guests_until_the_next_look() -> None:
     found = guests.admitted([], asked(), 100.0)
-    assert guests.rendered(found, 100.0) == (
-        '# 161\n[Peer]\nPublicKey = first=\nAllowedIPs = 198.18.7.224/32\n')
-    assert guests.rendered(found, 200.0).startswith('# 211\n')
-    assert guests.rendered([], 100.0) == '# 1\n'
+    assert guests.rendered(found) == (
+        '[Peer]\nPublicKey = first=\nAllowedIPs = 198.18.7.224/32')
+    assert guests.again(found, 100.0) == 161 and guests.again(found, 200.0) == 211
 
 
 def test_guests_have_the_end_of_the_subnet() -> None:
-    assert addresses.guests('198.18.7.0/24') == '198.18.7.224/27'
+    assert str(network.guests('198.18.7.0/24')) == '198.18.7.224/27'
+    interface = VpnInterface('fogabc123m0', '198.18.7.2', '198.18.7.0/24', 50000, '/run/key')
+    text = network.rules(interface, [(7400, 7649), (7650, 7651)])
+    assert 'iifname "fogabc123m0" ip saddr 198.18.7.224/27 goto guests' in text
+    assert 'udp dport { 7400-7649, 7650-7651 } accept' in text
 
 
 def test_list_is_private_and_replaces_no_file_of_others(tmp_path: Path) -> None:

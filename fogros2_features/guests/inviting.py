@@ -1,45 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Admit other computers to a machine of this robot: invite, list, revoke."""
+"""Admit other computers to a machine of this robot: invite, revoke."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-import ipaddress
 from pathlib import Path
 import secrets
 import time
-from typing import Optional, TypedDict
+from typing import Optional
 
-from fogros2 import invitation, plugin_system, untrusted
-from fogros2.deploy import membership
-from fogros2.errors import CommandError, ConfigurationError, VpnError
+from fogros2 import plugin_system
+from fogros2.errors import CommandError, ConfigurationError
 from fogros2.model import host_port
-from fogros2.shell import multiplexer, Shell
-from fogros2.store import GUESTS, Record, Store
+from fogros2.shell import multiplexer
+from fogros2.store import Record, Store, VPN_LEFT
 from fogros2.vpn import addresses, Vpn
-from fogros2.vpn import guests as guest_program
-from fogros2.vpn.wireguard import guest_request
+from fogros2.vpn.wireguard import dds_ports
+from fogros2_features.guests import invitation, listing, membership, network
 from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry
 
 #: Seconds without a handshake after which a guest whose invitation has expired is removed: a
 #: connected WireGuard peer makes a handshake at least each 2 minutes.
 PATIENCE = 180.0
-
-
-class Guest(TypedDict):
-    """
-    A computer that an invitation admits to a machine.
-
-    :param left: seconds until the invitation expires; negative for one that stays connected.
-    :param heard: seconds since the machine noticed its last handshake, None before the first.
-    """
-
-    key: str
-    label: str
-    address: str
-    left: float
-    heard: Optional[float]
 
 
 def invite(
@@ -60,36 +43,38 @@ def invite(
     record = held(entry)
     assert entry.machine is not None and record.vpn is not None and record.robot_vpn is not None
     folder = store.root / 'launches' / record.launch
-    rmw = (folder / 'rmw').read_text()
+    rmw, domain = (folder / 'rmw').read_text(), int((folder / 'domain').read_text())
     membership.check_rmw(rmw)
     server, port = machines.load(entry.provider).dialled_at(entry.machine, record.vpn.port, host)
     server = server or addresses.own_address()
     secret = secrets.token_hex(32)
-    (store.machine(name) / GUESTS).touch()
+    (store.machine(name) / VPN_LEFT).touch()
+    dds = plugin_system.load('fogros2.dds', rmw)(domain=domain)
     with reach.session(entry) as shell:
-        guests = ask(shell, record, 'admit', {
+        shell.run(listing.install(record.vpn), timeout=15.0)
+        guests = listing.ask(shell, record, 'admit', {
             'key': public, 'label': label, 'seconds': seconds, 'secret': secret,
             'left': (record.armed or time.time()) + record.spec.lifetime - time.time(),
+            'rules': network.rules(record.vpn, (dds_ports(domain), *dds.ports)),
             'door': door(record),
             'patience': max(PATIENCE, record.spec.robot_timeout),
-            'addresses': [str(address) for address in ipaddress.IPv4Network(
-                addresses.guests(record.vpn.network)) if int(address) & 255 != 255]})
+            'addresses': [str(address) for address in network.guests(record.vpn.network)
+                          if int(address) & 255 != 255]})
     address = next((guest['address'] for guest in guests if guest['key'] == public), '')
     return invitation.seal(invitation.Invitation(
         machine=name, key=record.public_key, address=record.vpn.address,
         endpoint=host_port(server, port), joiner=address, network=record.vpn.network,
-        rmw=rmw, domain=int((folder / 'domain').read_text()), expires=time.time() + seconds,
+        rmw=rmw, domain=domain, expires=time.time() + seconds,
         interface=record.vpn.name, secret=secret), public)
 
 
 def door(record: Record) -> dict[str, object]:
-    """Return what starts the door of a machine's guests; see ``fogros2.vpn.guests``."""
+    """Return what starts the door of a machine's guests; see ``program``."""
     assert record.vpn is not None
     vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
     return {
-        'source': Path(guest_program.__file__).read_text(),
         'shell': Path(multiplexer.__file__).read_text(), 'machine': record.name,
-        'address': record.vpn.address, 'port': addresses.GUEST_PORT,
+        'address': record.vpn.address, 'port': network.PORT,
         'agent': record.agent_program, 'process': record.vpn.process,
         'down': '\n'.join(command.argv[-1] for command in vpn.down(record.vpn))}
 
@@ -110,33 +95,6 @@ def held(entry: Entry, *, kept: bool = False) -> Record:
     return record
 
 
-def ask(shell: Shell, record: Record, verb: str, request: object = None) -> list[Guest]:
-    """
-    Send a request to the machine's list of guests; return the list (``fogros2.vpn.guests``).
-
-    :raises FogError: the machine cannot be reached, has no address left, or lies.
-    """
-    assert record.vpn is not None
-    output = shell.run(guest_request(record.vpn, verb, request), timeout=15.0).stdout
-    try:
-        return [_checked(guest, record.vpn.network)
-                for guest in untrusted.parsed(output, list[Guest])]
-    except (ValueError, ConfigurationError) as error:
-        raise VpnError(f"'{record.name}' sent an invalid list of guests",
-                       'the machine may be hijacked: delete it') from error
-
-
-def _checked(guest: Guest, network: str) -> Guest:
-    """Return a guest as a machine describes it, without anything that is not expected."""
-    label, key = invitation.parse_key(
-        f"{guest['label']}:{guest['key']}" if guest['label'] else guest['key'])
-    address = ipaddress.IPv4Address(guest['address'])
-    if address not in ipaddress.IPv4Network(addresses.guests(network)):
-        raise ValueError
-    return Guest(key=key, label=label, address=str(address), left=guest['left'],
-                 heard=guest['heard'])
-
-
 def revoke(name: str, who: Optional[str], warn: Callable[[str], None]) -> list[str]:
     """
     Remove guests from a machine; return their names or keys.
@@ -148,7 +106,7 @@ def revoke(name: str, who: Optional[str], warn: Callable[[str], None]) -> list[s
     record = held(entry, kept=True)
     with reach.session(entry) as shell:
         try:
-            guests = ask(shell, record, 'look')
+            guests = listing.ask(shell, record, 'look')
         except CommandError as error:
             if 'Unable to access interface' not in error.result.stderr:
                 raise
@@ -160,5 +118,5 @@ def revoke(name: str, who: Optional[str], warn: Callable[[str], None]) -> list[s
             raise ConfigurationError(f"'{name}' has no guest {who}",
                                      f'ros2 fog status {name} shows its guests')
         if matches:
-            ask(shell, record, 'remove', {'keys': [guest['key'] for guest in matches]})
+            listing.ask(shell, record, 'remove', {'keys': [guest['key'] for guest in matches]})
     return [guest['label'] or guest['key'] for guest in matches]

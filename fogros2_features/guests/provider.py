@@ -3,17 +3,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+import contextlib
 import dataclasses
 from typing import ClassVar
 
-from fogros2.errors import ConfigurationError, MachineNotFound, Unsupported
-from fogros2.invitation import Invitation, own_key, read, SECRET, unseal
-from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
+from fogros2.deploy.robot import clear
+from fogros2.errors import ConfigurationError, DdsError, MachineNotFound, Unsupported
+from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState, OtherVpn
 from fogros2.provider import Capabilities, Provider
 from fogros2.provider.options import parsed
-from fogros2.store import Store
-from fogros2.vpn import addresses, guests
+from fogros2.store import other_vpn, Store, this_process
+from fogros2_features.guests import membership, network, program
+from fogros2_features.guests.invitation import DOOR_KEY, Invitation, own_key, unseal
 
 _SCHEME = 'joined:'
 
@@ -34,7 +36,7 @@ class JoinedProvider(Provider):
 
     name: ClassVar[str] = 'joined'
     capabilities: ClassVar[Capabilities] = Capabilities(
-        shell_kind='guest', owned=False, containers=False)
+        shell_kind='guest', owned=False, account=True, containers=False)
     poll_interval: ClassVar[float] = 0.1
 
     def check(self, spec: MachineSpec) -> None:
@@ -46,12 +48,33 @@ class JoinedProvider(Provider):
             raise Unsupported(f"'{spec.name}' is another robot's, and serves no viewer",
                               'leave launch_foxglove and monitor_allow out')
 
-    def invitation(self, spec: MachineSpec) -> str:
-        """Return the text of the invitation."""
+    def _text(self, spec: MachineSpec) -> str:
         return parsed(Options, spec.options, 'a joined machine').invitation
 
     def _unsealed(self, spec: MachineSpec) -> Invitation:
-        return unseal(self.invitation(spec), own_key(Store()))
+        return unseal(self._text(spec), own_key(Store()))
+
+    def other_vpn(self, spec: MachineSpec) -> OtherVpn:
+        """Return the VPN that the invitation leads to."""
+        return membership.other_vpn(self._unsealed(spec), Store())
+
+    @contextlib.contextmanager
+    def join(
+        self, spec: MachineSpec, rmw: str, domain: int, environment: Mapping[str, str],
+    ) -> Iterator[None]:
+        """Be in that VPN, unless ``ros2 fog join`` has joined it already."""
+        invitation = self._unsealed(spec)
+        if (invitation.rmw, invitation.domain) != (rmw, domain):
+            raise DdsError(
+                f"'{spec.name}' has RMW_IMPLEMENTATION={invitation.rmw} and ROS_DOMAIN_ID="
+                f'{invitation.domain}, this launch {rmw} and {domain}', 'launch with the same')
+        by_hand = membership.is_up(invitation)
+        folder = membership.join(self._text(spec), Store(), environment, owner=this_process())
+        try:
+            yield
+        finally:
+            if not by_hand:
+                clear(folder)
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Return the id of the machine, which the launch has joined."""
@@ -61,20 +84,20 @@ class JoinedProvider(Provider):
         """Return the machine while this computer has joined it."""
         number, _, name = machine_id.removeprefix(_SCHEME).partition(':')
         folder = Store().root / 'launches' / number
-        invitation = read(folder) if number.isalnum() else None
-        if invitation is None:
+        other = other_vpn(folder) if number.isalnum() else None
+        if other is None:
             raise MachineNotFound(f"this computer has left the machine '{name}'")
         return Machine(
             machine_id, name, self.name, MachineState.RUNNING, owned=False,
-            region=invitation.machine, shell=Endpoint(
-                'guest', invitation.address, addresses.GUEST_PORT,
-                guests.account(invitation.interface, invitation.joiner),
-                key_file=str(folder / SECRET)))
+            region=other.machine.name, shell=Endpoint(
+                'guest', other.interface.address, network.PORT,
+                program.account(other.interface.name, other.own.address),
+                key_file=str(folder / DOOR_KEY)))
 
     def capabilities_of(self, machine: Machine) -> Capabilities:
         """Return the capabilities with the place of the agent, which each guest has."""
         assert machine.shell is not None
-        home = guests.HOMES / machine.shell.user
+        home = program.HOMES / machine.shell.user
         return dataclasses.replace(self.capabilities, agent_directory=f'{home}/agent',
                                    agent_program=f'{home}/agent.py')
 

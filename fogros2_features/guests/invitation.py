@@ -15,10 +15,9 @@ import contextlib
 import dataclasses
 import hashlib
 import ipaddress
-from pathlib import Path
 import re
 import time
-from typing import get_type_hints, Optional
+from typing import get_type_hints
 
 from fogros2 import untrusted
 from fogros2.errors import ConfigurationError
@@ -26,9 +25,8 @@ from fogros2.model import NETWORK_PREFIX, to_json
 from fogros2.store import check_name, robot_name, Store, write_private
 
 _PREFIX = 'fog1.'
-#: File with the invitation in the folder of a joined machine, which is like a launch's folder;
-#: and the file there with the secret for ``GuestShell``.
-JOINED, SECRET = 'joined.json', 'door.key'
+#: File with the secret for ``GuestShell`` in the folder of a machine's VPN (``Store.other_vpns``).
+DOOR_KEY = 'door.key'
 #: Private address space (RFC 1918), shared address space (RFC 6598), and the default pool.
 _PRIVATE = tuple(map(ipaddress.IPv4Network, (
     '10.0.0.0/8', '172.16.0.0/12', '192.168.0.0/16', '100.64.0.0/10', '198.18.0.0/15')))
@@ -91,27 +89,13 @@ class Invitation:
         return hashlib.sha256(f'{self.key} {self.joiner}'.encode()).hexdigest()[:6]
 
 
-def joined(store: Store) -> dict[str, Path]:
-    """Return the folders of the machines that this computer has joined, by machine."""
-    return {invitation.machine: path.parent
-            for path in sorted((store.root / 'launches').glob(f'*/{JOINED}'))
-            if (invitation := read(path.parent)) is not None}
-
-
-def read(folder: Path) -> Optional[Invitation]:
-    """Return the invitation by which this computer has joined a machine, None if there is none."""
-    with contextlib.suppress(OSError, ValueError, TypeError, ConfigurationError):
-        return Invitation(**untrusted.parsed((folder / JOINED).read_text()))
-    return None
-
-
 def own_key(store: Store) -> bytes:
     """
     Return this computer's private key; make it if there is none.
 
     :raises ConfigurationError: its file is damaged.
     """
-    from fogros2 import sealing
+    from fogros2_features.guests import sealing
     path = store.root / 'key'
     if not path.exists():
         write_private(path, base64.b64encode(sealing.private_key()) + b'\n')
@@ -125,7 +109,7 @@ def own_key(store: Store) -> bytes:
 
 def public_text(key: bytes) -> str:
     """Return the public key of a private one as ``wg`` writes it."""
-    from fogros2 import sealing
+    from fogros2_features.guests import sealing
     return base64.b64encode(sealing.public_key(key)).decode()
 
 
@@ -154,7 +138,7 @@ def seal(invitation: Invitation, key: str) -> str:
 
     :param key: the invited computer's public key, in base64.
     """
-    from fogros2 import sealing
+    from fogros2_features.guests import sealing
     sealed = sealing.seal(to_json(invitation).encode(), base64.b64decode(key), _PREFIX.encode())
     return _PREFIX + base64.urlsafe_b64encode(sealed).decode()
 
@@ -165,7 +149,7 @@ def unseal(text: str, key: bytes) -> Invitation:
 
     :raises ConfigurationError: the text is for another computer, changed, or expired.
     """
-    from fogros2 import sealing
+    from fogros2_features.guests import sealing
     text = ''.join(text.split())
     try:
         data = base64.b64decode(text.removeprefix(_PREFIX), b'-_', validate=True)

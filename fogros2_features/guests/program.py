@@ -6,26 +6,26 @@ A guest whose invitation has expired stays while it is connected. It is removed 
 seconds without a handshake; a connected peer makes one at least each 2 minutes. Times are seconds
 since boot, because a machine's clock may be set while it runs.
 
-Two files in ``/run`` belong to root: ``NAME.guests.json`` is the list, ``NAME.guests`` the same as
-peers for ``wg``. The first line of the latter says when the list has to be looked at again. So the
-health check starts no Python before.
-
-Runs as python3 -c SOURCE NAME VERB, where NAME is the interface, with a request as JSON on the
-standard input; prints the list. Imports nothing of fogros2.
+This is the program for further peers of an interface, see ``fogros2.vpn``: ``/run/NAME.more``,
+where NAME is the interface. Runs as python3 /run/NAME.more NAME VERB, with a request as JSON on
+the standard input; prints the list, except for ``peers``. Imports nothing of fogros2.
 
 ``admit``   ``key``, ``label``, ``seconds``, ``patience``, ``addresses`` to choose from,
-            ``secret``, ``left``: seconds of the machine's lifetime, and ``door`` for ``serve``
+            ``secret``, ``left``: seconds of the machine's lifetime, ``rules`` for ``nft``, and
+            ``door`` for ``serve``
 ``remove``  ``keys``, or null for all
 ``look``    removes those whose time is over
+``peers``   prints them for ``wg``, after the rules are there
 ``serve``   is the door of the guests' nodes; ``admit`` starts it, in the background. It listens at
             ``address`` and ``port`` until there are no guests. A guest proves with its secret that
             it was invited, and gets a ``shell`` (a program's source) of an account of its own. The
             account has no rights, and ends with the guest: processes, files and agent included.
+``stay``    a launch that keeps its machine leaves the interface to guests: the door runs the
+            script ``down`` after the last one. Fails without guests.
 ``clear``   ends the accounts of all guests, because the interface ends
 
-A launch that keeps its machine leaves the interface to guests, with the file ``NAME.left``; then
-the door runs the script ``down`` after the last guest. All of this is for root; only the processes
-of a guest's account, its agent among them, read what the guest sends after its proof.
+All of this is for root; only the processes of a guest's account, its agent among them, read what
+the guest sends after its proof.
 """
 
 from __future__ import annotations
@@ -144,13 +144,17 @@ def due(guest: Guest) -> float:
     return until if guest.get('end') is None else min(until, guest['end'])
 
 
-def rendered(guests: list[Guest], now: float) -> str:
-    """Return the guests as peers for ``wg``; the first line says when to look at them again."""
-    again = min((guest['until'] if guest['until'] > now else now + INTERVAL for guest in guests),
-                default=0)
-    return '\n'.join([f'# {int(again) + 1}', *(
+def rendered(guests: list[Guest]) -> str:
+    """Return the guests as peers for ``wg``."""
+    return '\n'.join(
         f"[Peer]\nPublicKey = {guest['key']}\nAllowedIPs = {guest['address']}/32"
-        for guest in guests), ''])
+        for guest in guests)
+
+
+def again(guests: list[Guest], now: float) -> int:
+    """Return when to look at guests again, in seconds since boot."""
+    return int(min(guest['until'] if guest['until'] > now else now + INTERVAL
+                   for guest in guests)) + 1
 
 
 def write(path: Path, text: str) -> None:
@@ -176,9 +180,9 @@ class Guests:
 
     def __init__(self, name: str, folder: Path = Path('/run')) -> None:
         self.name = name
-        self.config, self.state = folder / f'{name}.guests', folder / f'{name}.guests.json'
-        self.left = folder / f'{name}.left'
-        self.lock, self.door = (folder / f'{name}.guests.{what}' for what in ('lock', 'door'))
+        self.due, self.state, self.rules, self.left, self.lock, self.door = (
+            folder / f'{name}.more.{what}'
+            for what in ('due', 'json', 'rules', 'left', 'lock', 'door'))
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[list[Guest]]:
@@ -198,11 +202,18 @@ class Guests:
             or request['keys'] is not None and guest['key'] not in request['keys']]
         after = [guest for guest in after if now < due(guest)]
         write(self.state, json.dumps(after))
-        write(self.config, rendered(after, now))
+        if after:
+            write(self.due, f'{again(after, now)}\n')
+        else:
+            self.due.unlink(missing_ok=True)
         for guest in [guest for guest in before if guest not in after and not any(
                 guest['key'] == other['key'] for other in after)]:
             subprocess.run(('wg', 'set', self.name, 'peer', guest['key'], 'remove'), check=True)
             evict(account(self.name, guest['address']))
+        if verb == 'admit':
+            write(self.rules, request['rules'])
+        if after:
+            self.confine()
         for guest in after if verb == 'admit' else ():
             subprocess.run(('wg', 'set', self.name, 'peer', guest['key'],
                             'allowed-ips', guest['address']), check=True)
@@ -210,6 +221,23 @@ class Guests:
             subprocess.run(('ip', 'route', 'replace', f"{guest['address']}/32", 'dev', self.name),
                            check=True)
         return after
+
+    def clear(self, guests: list[Guest]) -> None:
+        """End the accounts of all guests, and their rules."""
+        self.state.unlink(missing_ok=True)  # a door that runs admits nobody any more
+        self.left.unlink(missing_ok=True)
+        for guest in guests:
+            evict(account(self.name, guest['address']))
+        subprocess.run(('nft', 'delete', 'table', 'inet', f'{self.name}g'),
+                       stderr=subprocess.DEVNULL)
+
+    def confine(self) -> None:
+        """
+        Let guests reach only what the rules say; idempotent.
+
+        :raises OSError, SubprocessError: there are no rules, or the packet filter takes none.
+        """
+        subprocess.run(('nft', '-f', self.rules), check=True, stderr=subprocess.PIPE)
 
 
 def uptime() -> float:
@@ -390,40 +418,50 @@ class Door(socketserver.ThreadingTCPServer):
                 'LANG': 'C.UTF-8', 'PATH': '/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin'})
 
 
+def serve(guests: Guests, request: dict[str, Any]) -> None:
+    """Be the door, unless there is one; at the end take down an interface that was left to it."""
+    os.umask(0o022)
+    with open(guests.door, 'a') as own:
+        with guests.locked():
+            try:
+                fcntl.flock(own, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return  # there is a door
+        door = Door(guests, request)
+        door.follow()
+        door.serve(own)
+    if guests.left.exists():
+        os.execvp('sh', ('sh', '-c', request['down']))
+
+
 def main(name: str, verb: str, folder: Path = Path('/run')) -> None:
-    """Run one request, and print the guests that there are afterwards."""
+    """Run one request."""
     guests = Guests(name, folder)
-    if verb in ('look', 'clear') and not guests.state.exists():
-        print('[]')  # there never was one
-        return
-    request = {} if verb in ('look', 'clear') else json.load(sys.stdin)
+    # a login user's may lack the folders of nft
+    os.environ['PATH'] = f"{os.environ.get('PATH', os.defpath)}:/usr/sbin:/sbin"
     if verb == 'serve':
-        os.umask(0o022)
-        with open(guests.door, 'a') as own:
-            with guests.locked():
-                try:
-                    fcntl.flock(own, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    return  # there is a door
-            door = Door(guests, request)
-            door.follow()
-            door.serve(own)
-        if guests.left.exists():
-            os.execvp('sh', ('sh', '-c', request['down']))
+        serve(guests, json.load(sys.stdin))
         return
+    request = json.load(sys.stdin) if verb in ('admit', 'remove') else {}
     with guests.locked() as before:
         if verb == 'clear':
-            guests.state.unlink()  # a door that runs admits nobody any more
-            guests.left.unlink(missing_ok=True)
-            for guest in before:
-                evict(account(name, guest['address']))
+            guests.clear(before)
             return
-        after = guests.change(before, verb, request)
+        if verb == 'peers':
+            if before:
+                guests.confine()
+                print(rendered(before))
+            return
+        after = guests.change(before, verb, request) if before or verb == 'admit' else []
+        if verb == 'stay':
+            if not after:
+                sys.exit(1)
+            guests.left.touch()
+            return
     if 'door' in request:
         started = subprocess.Popen(
-            (sys.executable, '-IS', '-c', request['door'].pop('source'), name, 'serve'),
-            stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            cwd='/', start_new_session=True)
+            (sys.executable, '-IS', __file__, name, 'serve'), stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd='/', start_new_session=True)
         assert started.stdin is not None
         with started.stdin as stdin:
             stdin.write(json.dumps(request['door']).encode())

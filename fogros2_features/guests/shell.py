@@ -3,7 +3,7 @@
 Run commands in a guest's account of another robot's machine, inside the VPN.
 
 WireGuard encrypts the connection, and shows the machine whose address this is. The door there
-(``fogros2.vpn.guests``) sends a challenge. This end answers with an HMAC, by the secret of the
+(``program``) sends a challenge. This end answers with an HMAC, by the secret of the
 invitation, so that another account of this computer is not the guest.
 """
 
