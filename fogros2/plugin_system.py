@@ -37,6 +37,7 @@ def _all() -> Any:
     return metadata.entry_points()
 
 
+@functools.cache
 def _entry_points(group: str) -> dict[str, EntryPoint]:
     return {point.name: point for point in _all().select(group=group)}
 
