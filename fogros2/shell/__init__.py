@@ -10,8 +10,7 @@ computers; ``ssh_connection`` opens SSH connections. ``sync`` calls rsync. ``loc
 of this computer. ``remote`` is the base of the shells with a connection. ``ssh`` is one of them.
 ``multiplexer`` is a program on a machine that runs many commands over one connection, and
 ``multiplexed`` the robot's end of it. So do pods by ``kubernetes_link`` and ``kubernetes``, the
-connection and the shell. ``movable`` replaces a shell
-in use, ``host_key`` a machine's host key.
+connection and the shell. ``movable`` replaces a shell in use, ``host_key`` a machine's host key.
 """
 
 from __future__ import annotations
