@@ -8,6 +8,7 @@ the current folder, or a part of the standard library that acts when it is impor
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 import importlib
 import importlib.util
 import os
@@ -26,7 +27,16 @@ def topics(node: Any) -> dict[str, str]:
 
     Names and types that ROS 2 does not allow are left out: they may control a terminal.
     """
-    return {name: kinds[0] for name, kinds in node.get_topic_names_and_types()
+    return _allowed(node.get_topic_names_and_types())
+
+
+def services(node: Any) -> dict[str, str]:
+    """Return the services of a node's graph with the first type of each, like :func:`topics`."""
+    return _allowed(node.get_service_names_and_types())
+
+
+def _allowed(listed: Iterable[tuple[str, Sequence[str]]]) -> dict[str, str]:
+    return {name: kinds[0] for name, kinds in listed
             if _TOPIC.fullmatch(name) and kinds and _NAME.fullmatch(kinds[0])}
 
 

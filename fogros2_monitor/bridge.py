@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Serve a machine's topics to Foxglove, and publish the messages of viewers.
+Serve a machine's topics, services and parameters to Foxglove, and publish viewers' messages.
 
 The node subscribes to a topic only while a viewer shows it, and forwards messages without
 decoding them. A slow viewer loses its oldest messages, without effect on other viewers. An H.264
 stream of ``image_transport_h264`` is sent as ``foxglove.CompressedVideo``.
 
 Parameters: ``address``, ``port`` (0: any free port; the log has the port), ``topics`` (patterns of
-topics to show), ``client_publish`` (whether viewers may publish) and ``backlog`` (number of
-messages to keep for a slow viewer).
+the names of topics, services and parameters to show), ``client_publish`` (whether viewers may
+publish, call services and set parameters) and ``backlog`` (number of messages to keep for a slow
+viewer).
 
 Protocol: https://github.com/foxglove/ws-protocol, implemented by ``foxglove-sdk``.
 """
@@ -17,20 +18,34 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import functools
+from typing import Optional
 
 import foxglove
+from foxglove import MessageSchema, Parameter, Schema, Service, ServiceRequest, ServiceSchema
 from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, ServerListener
+from rcl_interfaces.msg import ParameterEvent
 import rclpy
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.publisher import Publisher
+from rclpy.qos import qos_profile_parameter_events
+from rclpy.subscription import Subscription
 
 from fogros2 import ros_types
+from fogros2.untrusted import clean
+from fogros2_monitor import assets
+from fogros2_monitor.definitions import definition
+from fogros2_monitor.parameters import Parameters, VERBS
+from fogros2_monitor.services import Services
 from fogros2_monitor.topics import GraphNode, LOOK, Topic
 from image_transport_h264 import memory
 
 #: Number of messages to keep for a slow viewer.
 BACKLOG = 64
+#: Types of the services by which nodes show their parameters and types; viewers need none.
+_NODES = ('rcl_interfaces/', 'type_description_interfaces/')
+#: End of the name of the service by which a node lists its parameters.
+_LIST = f'/{VERBS[0]}'
 
 
 class BridgeNode(GraphNode, ServerListener):
@@ -47,18 +62,28 @@ class BridgeNode(GraphNode, ServerListener):
         address = str(self.declare_parameter('address', '127.0.0.1').value)
         port = int(self.declare_parameter('port', 8765).value)
         self._patterns = list(self.declare_parameter('topics', ['*']).value)
-        publish = bool(self.declare_parameter('client_publish', True).value)
+        self._publish = bool(self.declare_parameter('client_publish', True).value)
         backlog = int(self.declare_parameter('backlog', BACKLOG).value)
-        self._look()
+        self._offered: dict[str, str] = {}
+        self._changes: Optional[Subscription] = None
+        self._service_calls = Services(self)
+        self._node_parameters = Parameters(
+            self._service_calls, self._shows,
+            lambda changed: self._server.publish_parameter_values(changed), self._refuse)
         self._server = foxglove.start_server(
             name=self.get_name(), host=address, port=port, server_listener=self,
-            capabilities=[Capability.ClientPublish] if publish else [],
-            supported_encodings=['cdr'], context=self.viewers, message_backlog_size=backlog)
+            capabilities=[Capability.Parameters, *(
+                [Capability.ClientPublish, Capability.Services] if self._publish else [])],
+            supported_encodings=['cdr'], asset_handler=assets.read, context=self.viewers,
+            message_backlog_size=backlog)
+        self._look()
         self.create_timer(LOOK, self._look)
         self.get_logger().info(f'serving ws://{address}:{self._server.port}')
 
     def destroy_node(self) -> None:
         """Disconnect the viewers, then destroy the node."""
+        self._service_calls.close()
+        self._node_parameters.close()
         self._server.stop()
         super().destroy_node()
 
@@ -87,6 +112,29 @@ class BridgeNode(GraphNode, ServerListener):
         self._with_publisher(client, client_channel_id,
                              lambda key: self._published[key].publish(data))
 
+    def on_get_parameters(
+        self, client: Client, param_names: list[str], request_id: Optional[str] = None,
+    ) -> list[Parameter]:
+        """Return the parameters of nodes."""
+        self.on_parameters_subscribe(param_names)
+        return self._node_parameters.get(param_names)
+
+    def on_set_parameters(
+        self, client: Client, parameters: list[Parameter], request_id: Optional[str] = None,
+    ) -> list[Parameter]:
+        """Set parameters of nodes."""
+        if not self._publish:
+            self._refuse('this bridge sets no parameters')
+            return []
+        self.on_parameters_subscribe([])
+        return self._node_parameters.set(parameters)
+
+    def on_parameters_subscribe(self, param_names: list[str]) -> None:
+        """Read the parameters of nodes from now on."""
+        if not self._node_parameters.wanted.is_set():
+            self._node_parameters.wanted.set()
+            self._work.create_task(self._look)
+
     # -- in the executor's thread ---------------------------------------------------------------
 
     def _with_topic(self, channel: int, action: Callable[[Topic], None]) -> None:
@@ -104,6 +152,59 @@ class BridgeNode(GraphNode, ServerListener):
         key = client.id, channel
         self._work.create_task(lambda: action(key) if key in self._published else None)
 
+    def _look(self) -> None:
+        """Offer new topics and services; remove those that are gone; follow the parameters."""
+        super()._look()
+        kinds = ros_types.services(self)
+        wanted = self._node_parameters.wanted.is_set()
+        nodes = {name.removesuffix(_LIST) for name in kinds
+                 if wanted and name.endswith(_LIST) and '/_' not in name and self._served(name)}
+        nodes.discard(self.get_fully_qualified_name())
+        offered = {name: kind for name, kind in kinds.items() if self._publish
+                   and kind not in self._unknown and not kind.startswith(_NODES)
+                   and self._shows(name) and self._served(name)}
+        gone = {name for name, kind in self._offered.items() if offered.get(name) != kind}
+        self._service_calls.keep([*(self._offered.keys() - gone), *(
+            f'{node}/{verb}' for node in nodes for verb in VERBS)])
+        self._server.remove_services([*gone])
+        self._offered = {name: offered[name] for name in self._offered.keys() - gone}
+        for name in offered.keys() - self._offered.keys():
+            try:
+                self._server.add_services([self._service(name, offered[name])])
+                self._offered[name] = offered[name]
+            except LookupError as error:
+                self._unknown.add(offered[name])
+                self.get_logger().warning(f'service {name} is not shown: {error}')
+        if wanted and self._changes is None:
+            self._changes = self.create_subscription(
+                ParameterEvent, '/parameter_events',
+                lambda event: self._node_parameters.changed(event.node),
+                qos_profile_parameter_events)
+        self._node_parameters.look(nodes)
+
+    def _served(self, name: str) -> bool:
+        # clients alone make a service appear in the graph
+        return int(self.count_services(name)) > 0
+
+    def _service(self, name: str, kind: str) -> Service:
+        """
+        Return a service as viewers see it.
+
+        :raises LookupError: its type is not installed here.
+        """
+        cls = ros_types.service(kind)
+        request, response = (
+            MessageSchema(encoding='cdr', schema=Schema(
+                name=f'{kind}_{end}', encoding='ros2msg',
+                data=definition(f'{kind}_{end}', getattr(cls, end)).encode()))
+            for end in ('Request', 'Response'))
+
+        def call(given: ServiceRequest) -> bytes:
+            return self._service_calls.call_serialized(name, cls, given.payload)
+
+        return Service(name, schema=ServiceSchema(kind, request=request, response=response),
+                       handler=call)
+
     def _unadvertise(self, key: tuple[int, int]) -> None:
         self.destroy_publisher(self._published.pop(key))
 
@@ -118,6 +219,7 @@ class BridgeNode(GraphNode, ServerListener):
             self._refuse(f'{topic}: {error}')
 
     def _refuse(self, why: str) -> None:
+        why = clean(why)
         self.get_logger().warning(why)
         self._server.publish_status(why, foxglove.StatusLevel.Warning)
 
