@@ -8,7 +8,6 @@ the current folder, or a part of the standard library that acts when it is impor
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 import importlib
 import importlib.util
 import os
@@ -35,7 +34,7 @@ def services(node: Any) -> dict[str, str]:
     return _allowed(node.get_service_names_and_types())
 
 
-def _allowed(listed: Iterable[tuple[str, Sequence[str]]]) -> dict[str, str]:
+def _allowed(listed: list[tuple[str, list[str]]]) -> dict[str, str]:
     return {name: kinds[0] for name, kinds in listed
             if _TOPIC.fullmatch(name) and kinds and _NAME.fullmatch(kinds[0])}
 

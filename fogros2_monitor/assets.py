@@ -15,21 +15,18 @@ import re
 import stat
 from urllib.parse import unquote
 
-from ament_index_python.packages import get_package_prefix, PackageNotFoundError
+from ament_index_python.packages import get_package_prefix
+
+from fogros2.errors import FogError
 
 #: Endings of the files that viewers may read.
 KINDS = {f'.{kind}' for kind in (
-    'dae', 'fbx', 'glb', 'gltf', 'jpeg', 'jpg', 'mtl', 'obj', 'png', 'stl', 'tif', 'tiff', 'urdf',
-    'webp')}
+    'dae fbx glb gltf jpeg jpg mtl obj png stl tif tiff urdf webp'.split())}
 #: Largest file in bytes, and longest URI in characters.
 LARGEST, LONGEST = 32_000_000, 1024
 _URI = re.compile(r'package://([A-Za-z][\w-]*)/(.+)', re.ASCII)
 #: File that colcon writes into an install space.
 _COLCON = '.colcon_install_layout'
-
-
-class AssetError(Exception):
-    """An asset that viewers cannot have."""
 
 
 def parse(uri: str) -> tuple[str, str]:
@@ -39,15 +36,15 @@ def parse(uri: str) -> tuple[str, str]:
     The path is percent-decoded once. It has only names: no '..', no empty name, no backslash and
     no control character.
 
-    :raises AssetError: the URI has another form, or the file is of another kind.
+    :raises FogError: the URI has another form, or the file is of another kind.
     """
     match = _URI.fullmatch(uri) if len(uri) <= LONGEST else None
     path = unquote(match[2]) if match else ''
-    names = path.split('/')
-    if match is None or not path.isprintable() or '\\' in path or {'', '.', '..'} & {*names}:
-        raise AssetError('an asset is package://PACKAGE/PATH')
+    odd = {'', '.', '..'} & {*path.split('/')} or '\\' in path or not path.isprintable()
+    if match is None or odd:
+        raise FogError('an asset is package://PACKAGE/PATH')
     if os.path.splitext(path)[1].lower() not in KINDS:
-        raise AssetError(f"an asset ends with one of {' '.join(sorted(KINDS))}")
+        raise FogError(f"an asset ends with one of {' '.join(sorted(KINDS))}")
     return match[1], path
 
 
@@ -56,7 +53,7 @@ def locate(prefix: Path, package: str, path: str) -> Path:
     Return the real path of an asset.
 
     :param prefix: where the package is installed.
-    :raises AssetError: the real path is elsewhere, or of another kind.
+    :raises FogError: the real path is elsewhere, or of another kind.
     """
     roots = [prefix / 'share' / package]
     # an install space has a folder for each package, or the packages side by side
@@ -64,7 +61,7 @@ def locate(prefix: Path, package: str, path: str) -> Path:
     real = Path(os.path.realpath(roots[0] / path))
     if real.suffix.lower() not in KINDS or not any(
             real.is_relative_to(os.path.realpath(root)) for root in roots):
-        raise AssetError(f'{path} leads out of package {package} and its workspace')
+        raise FogError(f'{path} leads out of package {package} and its workspace')
     return real
 
 
@@ -72,7 +69,7 @@ def read(uri: str) -> bytes:
     """
     Return the content of an asset.
 
-    :raises AssetError: viewers cannot have it.
+    :raises FogError: viewers cannot have it.
     """
     package, path = parse(uri)
     try:
@@ -81,9 +78,7 @@ def read(uri: str) -> bytes:
         with open(os.open(real, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), 'rb') as file:
             status = os.fstat(file.fileno())
             if not stat.S_ISREG(status.st_mode) or status.st_size > LARGEST:
-                raise AssetError(f'{path} is no file of at most {LARGEST / 1e6:g} MB')
+                raise FogError(f'{path} is no file of at most {LARGEST / 1e6:g} MB')
             return file.read(LARGEST)
-    except PackageNotFoundError as error:
-        raise AssetError(f'no package {package} is installed on this computer') from error
-    except (OSError, ValueError) as error:
-        raise AssetError(f'package {package} has no {path}') from error
+    except (LookupError, OSError, ValueError) as error:
+        raise FogError(f'there is no package {package} with {path}') from error

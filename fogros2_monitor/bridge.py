@@ -18,24 +18,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import functools
+import os
+import threading
 from typing import Optional
 
 import foxglove
-from foxglove import MessageSchema, Parameter, Schema, Service, ServiceRequest, ServiceSchema
+from foxglove import MessageSchema, Parameter, Schema, Service, ServiceSchema
 from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, ServerListener
 from rcl_interfaces.msg import ParameterEvent
 import rclpy
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.publisher import Publisher
-from rclpy.qos import qos_profile_parameter_events
-from rclpy.subscription import Subscription
 
 from fogros2 import ros_types
 from fogros2.untrusted import clean
 from fogros2_monitor import assets
 from fogros2_monitor.definitions import definition
-from fogros2_monitor.parameters import Parameters, VERBS
+from fogros2_monitor.parameters import Parameters, shown
 from fogros2_monitor.services import Services
 from fogros2_monitor.topics import GraphNode, LOOK, Topic
 from image_transport_h264 import memory
@@ -44,8 +44,9 @@ from image_transport_h264 import memory
 BACKLOG = 64
 #: Types of the services by which nodes show their parameters and types; viewers need none.
 _NODES = ('rcl_interfaces/', 'type_description_interfaces/')
-#: End of the name of the service by which a node lists its parameters.
-_LIST = f'/{VERBS[0]}'
+#: Number of viewers that may wait for parameters at once. The SDK waits in a thread that serves
+#: viewers, and gets twice as many.
+WAITING = 4
 
 
 class BridgeNode(GraphNode, ServerListener):
@@ -65,11 +66,9 @@ class BridgeNode(GraphNode, ServerListener):
         self._publish = bool(self.declare_parameter('client_publish', True).value)
         backlog = int(self.declare_parameter('backlog', BACKLOG).value)
         self._offered: dict[str, str] = {}
-        self._changes: Optional[Subscription] = None
         self._service_calls = Services(self)
-        self._node_parameters = Parameters(
-            self._service_calls, self._shows,
-            lambda changed: self._server.publish_parameter_values(changed), self._refuse)
+        self._node_parameters = Parameters(self._service_calls, self._shows, self._refuse)
+        self._free = threading.Semaphore(WAITING)
         self._server = foxglove.start_server(
             name=self.get_name(), host=address, port=port, server_listener=self,
             capabilities=[Capability.Parameters, *(
@@ -77,13 +76,13 @@ class BridgeNode(GraphNode, ServerListener):
             supported_encodings=['cdr'], asset_handler=assets.read, context=self.viewers,
             message_backlog_size=backlog)
         self._look()
+        self.create_subscription(ParameterEvent, '/parameter_events', self._tell_change, 1000)
         self.create_timer(LOOK, self._look)
         self.get_logger().info(f'serving ws://{address}:{self._server.port}')
 
     def destroy_node(self) -> None:
         """Disconnect the viewers, then destroy the node."""
         self._service_calls.close()
-        self._node_parameters.close()
         self._server.stop()
         super().destroy_node()
 
@@ -112,28 +111,32 @@ class BridgeNode(GraphNode, ServerListener):
         self._with_publisher(client, client_channel_id,
                              lambda key: self._published[key].publish(data))
 
-    def on_get_parameters(
-        self, client: Client, param_names: list[str], request_id: Optional[str] = None,
-    ) -> list[Parameter]:
+    def on_get_parameters(self, client: Client, param_names: list[str],
+                          request_id: Optional[str] = None) -> list[Parameter]:
         """Return the parameters of nodes."""
-        self.on_parameters_subscribe(param_names)
-        return self._node_parameters.get(param_names)
+        return self._with_parameters(param_names, [])
 
-    def on_set_parameters(
-        self, client: Client, parameters: list[Parameter], request_id: Optional[str] = None,
-    ) -> list[Parameter]:
-        """Set parameters of nodes."""
-        if not self._publish:
-            self._refuse('this bridge sets no parameters')
+    def on_set_parameters(self, client: Client, parameters: list[Parameter],
+                          request_id: Optional[str] = None) -> list[Parameter]:
+        """Set parameters of nodes; return their values."""
+        if self._publish and parameters:
+            return self._with_parameters([each.name for each in parameters], parameters)
+        self._refuse('this bridge sets no parameters')
+        return []
+
+    def _with_parameters(self, names: list[str], changes: list[Parameter]) -> list[Parameter]:
+        if not self._free.acquire(blocking=False):
+            self._refuse(f'{WAITING} viewers wait for parameters')
             return []
-        self.on_parameters_subscribe([])
-        return self._node_parameters.set(parameters)
-
-    def on_parameters_subscribe(self, param_names: list[str]) -> None:
-        """Read the parameters of nodes from now on."""
-        if not self._node_parameters.wanted.is_set():
-            self._node_parameters.wanted.set()
-            self._work.create_task(self._look)
+        try:
+            nodes = {name.rpartition('/')[0] for name in ros_types.services(self)
+                     if name.endswith('/list_parameters') and '/_' not in name
+                     and self._served(name)} - {self.get_fully_qualified_name()}
+            if changes:
+                self._node_parameters.set(changes, nodes)
+            return shown(self._node_parameters.get(names, nodes))
+        finally:
+            self._free.release()
 
     # -- in the executor's thread ---------------------------------------------------------------
 
@@ -142,49 +145,41 @@ class BridgeNode(GraphNode, ServerListener):
             for topic in self._topics.values():
                 if topic.id == channel:
                     action(topic)
-                    break
 
         self._work.create_task(act)
 
-    def _with_publisher(
-        self, client: Client, channel: int, action: Callable[[tuple[int, int]], None],
-    ) -> None:
+    def _with_publisher(self, client: Client, channel: int,
+                        action: Callable[[tuple[int, int]], None]) -> None:
         key = client.id, channel
         self._work.create_task(lambda: action(key) if key in self._published else None)
 
     def _look(self) -> None:
-        """Offer new topics and services; remove those that are gone; follow the parameters."""
+        """Offer new topics and services; remove those that are gone."""
         super()._look()
-        kinds = ros_types.services(self)
-        wanted = self._node_parameters.wanted.is_set()
-        nodes = {name.removesuffix(_LIST) for name in kinds
-                 if wanted and name.endswith(_LIST) and '/_' not in name and self._served(name)}
-        nodes.discard(self.get_fully_qualified_name())
-        offered = {name: kind for name, kind in kinds.items() if self._publish
-                   and kind not in self._unknown and not kind.startswith(_NODES)
-                   and self._shows(name) and self._served(name)}
-        gone = {name for name, kind in self._offered.items() if offered.get(name) != kind}
-        self._service_calls.keep([*(self._offered.keys() - gone), *(
-            f'{node}/{verb}' for node in nodes for verb in VERBS)])
-        self._server.remove_services([*gone])
-        self._offered = {name: offered[name] for name in self._offered.keys() - gone}
-        for name in offered.keys() - self._offered.keys():
+        kinds = {name: kind for name, kind in ros_types.services(self).items() if self._publish
+                 and kind not in self._unknown and not kind.startswith(_NODES)
+                 and self._shows(name) and self._served(name)}
+        gone = [name for name, kind in self._offered.items() if kinds.get(name) != kind]
+        self._service_calls.prune(lambda name: name not in gone and self._served(name))
+        self._server.remove_services(gone)
+        self._offered = {name: kinds[name] for name in self._offered if name not in gone}
+        for name in kinds.keys() - self._offered.keys():
             try:
-                self._server.add_services([self._service(name, offered[name])])
-                self._offered[name] = offered[name]
+                self._server.add_services([self._service(name, kinds[name])])
+                self._offered[name] = kinds[name]
             except LookupError as error:
-                self._unknown.add(offered[name])
+                self._unknown.add(kinds[name])
                 self.get_logger().warning(f'service {name} is not shown: {error}')
-        if wanted and self._changes is None:
-            self._changes = self.create_subscription(
-                ParameterEvent, '/parameter_events',
-                lambda event: self._node_parameters.changed(event.node),
-                qos_profile_parameter_events)
-        self._node_parameters.look(nodes)
 
     def _served(self, name: str) -> bool:
         # clients alone make a service appear in the graph
         return int(self.count_services(name)) > 0
+
+    def _tell_change(self, event: ParameterEvent) -> None:
+        """Send changes of parameters to the viewers that subscribed to them."""
+        self._server.publish_parameter_values(shown({
+            name: each.value for each in (*event.new_parameters, *event.changed_parameters)
+            if self._shows(name := f'{event.node}.{each.name}')}))
 
     def _service(self, name: str, kind: str) -> Service:
         """
@@ -193,17 +188,12 @@ class BridgeNode(GraphNode, ServerListener):
         :raises LookupError: its type is not installed here.
         """
         cls = ros_types.service(kind)
-        request, response = (
-            MessageSchema(encoding='cdr', schema=Schema(
-                name=f'{kind}_{end}', encoding='ros2msg',
-                data=definition(f'{kind}_{end}', getattr(cls, end)).encode()))
+        request, response = (MessageSchema(encoding='cdr', schema=Schema(
+            name=f'{kind}_{end}', encoding='ros2msg',
+            data=definition(f'{kind}_{end}', getattr(cls, end)).encode()))
             for end in ('Request', 'Response'))
-
-        def call(given: ServiceRequest) -> bytes:
-            return self._service_calls.call_serialized(name, cls, given.payload)
-
         return Service(name, schema=ServiceSchema(kind, request=request, response=response),
-                       handler=call)
+                       handler=functools.partial(self._service_calls.answer, cls))
 
     def _unadvertise(self, key: tuple[int, int]) -> None:
         self.destroy_publisher(self._published.pop(key))
@@ -219,13 +209,14 @@ class BridgeNode(GraphNode, ServerListener):
             self._refuse(f'{topic}: {error}')
 
     def _refuse(self, why: str) -> None:
-        why = clean(why)
+        why = clean(why[:1000])
         self.get_logger().warning(why)
         self._server.publish_status(why, foxglove.StatusLevel.Warning)
 
 
 def main() -> None:
     """Run the bridge until a signal."""
+    os.environ['TOKIO_WORKER_THREADS'] = str(2 * WAITING)  # read by the SDK
     memory.keep()
     rclpy.init()
     executor = SingleThreadedExecutor()

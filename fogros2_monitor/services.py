@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Mapping
+import contextlib
 import threading
 from typing import Any
 
+from foxglove import ServiceRequest
 from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
@@ -15,16 +17,10 @@ from rclpy.task import Future
 from fogros2.errors import FogError
 from fogros2.waiting import wait_until
 
-#: Number of calls without an answer, of all viewers together.
-CALLS = 64
-#: Largest request of a viewer in bytes.
-REQUEST = 4_000_000
-#: Time-out of the discovery of a service, and of its answer to a viewer, in seconds.
-READY, ANSWER = 2.0, 60.0
-
-
-class CallError(FogError):
-    """A call without an answer."""
+#: Number of calls of all viewers without an answer, and largest request in bytes.
+CALLS, REQUEST = 64, 4_000_000
+#: Time-out of the answer to a viewer's call, in seconds.
+ANSWER = 60.0
 
 
 class Services:
@@ -38,78 +34,63 @@ class Services:
         self._node = node
         self._lock = threading.Lock()
         self._clients: dict[str, Client] = {}
-        self._pending: dict[Future, str] = {}
         self._free = threading.Semaphore(CALLS)
         self._ended = threading.Event()
 
-    def call(self, name: str, cls: Any, request: Any, timeout: float) -> Any:
+    def call(self, requests: Mapping[str, tuple[Any, Any]], timeout: float) -> dict[str, Any]:
         """
-        Call a service; return its response.
+        Call services at once; return the responses that come in time, by the services' names.
 
-        :param cls: class of the service.
-        :param timeout: of the answer, in seconds.
-        :raises CallError: there is no answer.
+        :param requests: class and request of each service.
+        :param timeout: in seconds.
         """
-        answered = threading.Event()
-        try:
-            with self._lock:
-                if self._ended.is_set():
-                    raise CallError('the bridge ends')
-                if name not in self._clients:
-                    self._clients[name] = self._node.create_client(cls, name)
-                client = self._clients[name]
-            wait_until(client.service_is_ready, timeout=READY, what=f'service {name}',
-                       cancel=self._ended)
-            with self._lock:
-                if client not in self._clients.values():
-                    raise CallError('it is gone')
-                future = client.call_async(request)
-                self._pending[future] = name
-        except RuntimeError as error:  # ours, or of a client that is gone
-            raise CallError(f'{name} cannot be called: {error}') from error
-        future.add_done_callback(lambda _: answered.set())
-        answered.wait(timeout)
         with self._lock:
-            del self._pending[future]
-        if not future.done():
-            client.remove_pending_request(future)
-            raise CallError(f'{name} is gone' if future.cancelled() else
-                            f'{name} did not answer within {timeout:g} s')
-        if future.exception() is not None:
-            raise CallError(f'{name}: {future.exception()}')
-        return future.result()
+            for name in requests.keys() - self._clients.keys():
+                self._clients[name] = self._node.create_client(requests[name][0], name)
+            clients = {name: self._clients[name] for name in requests}
+        sent: dict[str, Future] = {}
 
-    def call_serialized(self, name: str, cls: Any, payload: bytes) -> bytes:
+        def complete() -> bool:
+            waiting = {name: client for name, client in clients.items()
+                       if self._clients.get(name) == client  # else it is gone
+                       and not (name in sent and sent[name].done())}
+            for name, client in waiting.items():
+                if name not in sent and client.service_is_ready():
+                    sent[name] = client.call_async(requests[name][1])
+            return not waiting
+
+        with contextlib.suppress(RuntimeError):  # ours, or of a client that is just destroyed
+            wait_until(complete, timeout=timeout, what='services', cancel=self._ended,
+                       interval=0.002, longest=0.05)
+        for name, future in sent.items():
+            clients[name].remove_pending_request(future)
+        return {name: future.result() for name, future in sent.items()
+                if future.done() and future.exception() is None}
+
+    def answer(self, cls: Any, given: ServiceRequest) -> bytes:
         """
         Call a service with a viewer's request, which may be any bytes.
 
-        :raises CallError: the bytes are no request, or there is no answer.
+        :param cls: class of the service.
+        :raises RuntimeError: the bytes are no request, or there is no answer.
         """
-        if len(payload) > REQUEST:
-            raise CallError(f'{name}: the request has more than {REQUEST / 1e6:g} MB')
+        if len(given.payload) > REQUEST or not self._free.acquire(blocking=False):
+            raise FogError(f'services take {REQUEST / 1e6:g} MB, and {CALLS} calls at once')
         try:
-            request = deserialize_message(payload, cls.Request)
-        except (RuntimeError, ValueError) as error:  # of the middleware, or of a string
-            raise CallError(f'{name}: the bytes are no request: {error}') from error
-        if not self._free.acquire(blocking=False):
-            raise CallError(f'{name}: {CALLS} calls have no answer yet')
-        try:
-            answer: bytes = serialize_message(self.call(name, cls, request, ANSWER))
+            name, request = given.service_name, deserialize_message(given.payload, cls.Request)
+            for answer in self.call({name: (cls, request)}, ANSWER).values():
+                return bytes(serialize_message(answer))
+            raise FogError(f'{name} is gone, or did not answer within {ANSWER:g} s')
         finally:
             self._free.release()
-        return answer
 
-    def keep(self, names: Collection[str]) -> None:
-        """End the calls of other services than these, which are gone; destroy their clients."""
+    def prune(self, served: Callable[[str], bool]) -> None:
+        """Destroy the clients of services that nobody serves any more, which ends their calls."""
         with self._lock:
-            clients = [self._clients.pop(name) for name in self._clients.keys() - {*names}]
-            futures = [future for future, name in self._pending.items() if name not in names]
-        for future in futures:
-            future.cancel()
+            clients = [self._clients.pop(name) for name in [*self._clients] if not served(name)]
         for client in clients:
             self._node.destroy_client(client)
 
     def close(self) -> None:
         """End all calls: viewers' threads wait for them."""
         self._ended.set()
-        self.keep(())

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from fogros2.errors import FogError
+
 assets = pytest.importorskip('fogros2_monitor.assets', reason='rclpy is not installed')
 SECRET, MESH = b'secret', b'solid arm'
 
@@ -69,19 +71,19 @@ def test_mesh_of_a_package_is_read(workspace: Path, uri: str) -> None:
     'package://ament_index/resource_index/packages/arm.stl',
 ], ids=lambda uri: repr(uri)[:40])
 def test_no_other_file_is_read(workspace: Path, uri: str) -> None:
-    with pytest.raises(assets.AssetError):
+    with pytest.raises(FogError):
         assets.read(uri)
 
 
 def test_link_is_followed_in_a_workspace_of_colcon_alone(workspace: Path) -> None:
     """``colcon build --symlink-install`` links installed files to the sources."""
     uri = 'package://arm/meshes/linked.dae'
-    with pytest.raises(assets.AssetError, match='leads out of'):
+    with pytest.raises(FogError, match='leads out of'):
         assets.read(uri)
     (workspace / 'install/.colcon_install_layout').write_text('isolated\n')
     assert assets.read(uri) == MESH
     for name in ('out', 'key', 'root/etc/other'):
-        with pytest.raises(assets.AssetError):
+        with pytest.raises(FogError):
             assets.read(f'package://arm/meshes/{name}.stl')
 
 
@@ -89,5 +91,5 @@ def test_large_file_is_refused(workspace: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(assets, 'LARGEST', len(MESH))
     assert assets.read('package://arm/meshes/upper%20arm.STL') == MESH
     monkeypatch.setattr(assets, 'LARGEST', len(MESH) - 1)
-    with pytest.raises(assets.AssetError, match='at most'):
+    with pytest.raises(FogError, match='at most'):
         assets.read('package://arm/meshes/upper%20arm.STL')
