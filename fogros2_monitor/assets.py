@@ -20,8 +20,7 @@ from ament_index_python.packages import get_package_prefix
 from fogros2.errors import FogError
 
 #: Endings of the files that viewers may read.
-KINDS = {f'.{kind}' for kind in (
-    'dae fbx glb gltf jpeg jpg mtl obj png stl tif tiff urdf webp'.split())}
+KINDS = {*'.dae .fbx .glb .gltf .jpeg .jpg .mtl .obj .png .stl .tif .tiff .urdf .webp'.split()}
 #: Largest file in bytes, and longest URI in characters.
 LARGEST, LONGEST = 32_000_000, 1024
 _URI = re.compile(r'package://([A-Za-z][\w-]*)/(.+)', re.ASCII)

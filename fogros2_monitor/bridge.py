@@ -128,6 +128,8 @@ class BridgeNode(GraphNode, ServerListener):
         if not self._free.acquire(blocking=False):
             self._refuse(f'{WAITING} viewers wait for parameters')
             return []
+        # this thread of the SDK waits; a message, even about nothing, wakes one for other viewers
+        self._work.create_task(lambda: self._server.remove_status(['']))
         try:
             nodes = {name.rpartition('/')[0] for name in ros_types.services(self)
                      if name.endswith('/list_parameters') and '/_' not in name

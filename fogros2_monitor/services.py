@@ -78,8 +78,8 @@ class Services:
             raise FogError(f'services take {REQUEST / 1e6:g} MB, and {CALLS} calls at once')
         try:
             name, request = given.service_name, deserialize_message(given.payload, cls.Request)
-            for answer in self.call({name: (cls, request)}, ANSWER).values():
-                return bytes(serialize_message(answer))
+            if answers := self.call({name: (cls, request)}, ANSWER):
+                return bytes(serialize_message(answers[name]))
             raise FogError(f'{name} is gone, or did not answer within {ANSWER:g} s')
         finally:
             self._free.release()

@@ -38,6 +38,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from fogros2.errors import DeadlineExceeded
 from fogros2.waiting import wait_until
+from fogros2_monitor.bridge import WAITING
 from fogros2_monitor.services import REQUEST
 from rigs import viewer as viewers
 from rigs.domains import taken
@@ -522,7 +523,10 @@ def test_node_that_does_not_answer_blocks_no_viewer(robot, bench):
     assert parameters(bench, patient, '/bench.speed') == {'/bench.speed': 0.5}
     patient.wish(set=[{'name': '/bench.speed', 'value': 1.5}])
     patient.until('id', 'set')
-    patient.wish(get=[])  # waits for the node
+    crowd = [patient, *(bench.viewer() for _ in range(WAITING))]
+    for viewer in crowd:  # which wait for the node, but one
+        viewer.wish(get=[])
+    assert 'viewers wait' in other.until('status')['status']
     words.publish(String(data='on'))
     assert other.message('/words') == {'data': 'on'}
     other.until('service', '/stop')
