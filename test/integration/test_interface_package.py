@@ -165,7 +165,7 @@ def test_viewer_calls_a_service_of_an_own_type(environment: dict[str, str]) -> N
             ('-m', 'fogros2_monitor.bridge', '--ros-args', '-p', 'port:=0'))]
     assert processes[1].stdout is not None
     try:
-        line = processes[1].stdout.readline()
+        line = next(line for line in processes[1].stdout if 'serving ws://' in line)
         with contextlib.closing(viewers.Viewer(CACHE, line.split()[-1])) as viewer:
             assert 'MSG: geometry_msgs/Point' in viewer.until('service', '/weigh')['request']
             viewer.wish(call='/weigh', request={'goods': {'name': 'box', 'corners': [{'x': 1}]}})
