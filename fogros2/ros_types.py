@@ -26,7 +26,16 @@ def topics(node: Any) -> dict[str, str]:
 
     Names and types that ROS 2 does not allow are left out: they may control a terminal.
     """
-    return {name: kinds[0] for name, kinds in node.get_topic_names_and_types()
+    return _allowed(node.get_topic_names_and_types())
+
+
+def services(node: Any) -> dict[str, str]:
+    """Return the services of a node's graph with the first type of each, like :func:`topics`."""
+    return _allowed(node.get_service_names_and_types())
+
+
+def _allowed(listed: list[tuple[str, list[str]]]) -> dict[str, str]:
+    return {name: kinds[0] for name, kinds in listed
             if _TOPIC.fullmatch(name) and kinds and _NAME.fullmatch(kinds[0])}
 
 

@@ -8,7 +8,9 @@ requests that have the token (:mod:`~fogros2_monitor.request`, :mod:`~fogros2_mo
 (:mod:`~fogros2_monitor.accounts`). :mod:`~fogros2_monitor.bridge` implements Foxglove's
 WebSocket protocol, :mod:`~fogros2_monitor.recorder` writes a file; both take messages from the
 graph (:mod:`~fogros2_monitor.topics`), with the definitions of
-:mod:`~fogros2_monitor.definitions`.
+:mod:`~fogros2_monitor.definitions`. For viewers, the bridge also calls services
+(:mod:`~fogros2_monitor.services`), sets parameters (:mod:`~fogros2_monitor.parameters`) and reads
+files of robot models (:mod:`~fogros2_monitor.assets`).
 :mod:`~fogros2_monitor.application` runs the web application in a container.
 :mod:`~fogros2_monitor.tunnel` and :mod:`~fogros2_monitor.urls` open the bridge on the robot.
 :mod:`~fogros2_monitor.dashboard` is the page of ``ros2 fog dashboard``.

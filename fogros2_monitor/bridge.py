@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Serve a machine's topics to Foxglove, and publish the messages of viewers.
+Serve a machine's topics, services and parameters to Foxglove, and publish viewers' messages.
 
 The node subscribes to a topic only while a viewer shows it, and forwards messages without
 decoding them. A slow viewer loses its oldest messages, without effect on other viewers. An H.264
 stream of ``image_transport_h264`` is sent as ``foxglove.CompressedVideo``.
 
 Parameters: ``address``, ``port`` (0: any free port; the log has the port), ``topics`` (patterns of
-topics to show), ``client_publish`` (whether viewers may publish) and ``backlog`` (number of
-messages to keep for a slow viewer).
+the names of topics, services and parameters to show), ``client_publish`` (whether viewers may
+publish, call services and set parameters) and ``backlog`` (number of messages to keep for a slow
+viewer).
 
 Protocol: https://github.com/foxglove/ws-protocol, implemented by ``foxglove-sdk``.
 """
@@ -17,20 +18,35 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import functools
+import os
+import threading
+from typing import Optional
 
 import foxglove
+from foxglove import MessageSchema, Parameter, Schema, Service, ServiceSchema
 from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, ServerListener
+from rcl_interfaces.msg import ParameterEvent
 import rclpy
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.publisher import Publisher
 
 from fogros2 import ros_types
+from fogros2.untrusted import clean
+from fogros2_monitor import assets
+from fogros2_monitor.definitions import definition
+from fogros2_monitor.parameters import Parameters, shown
+from fogros2_monitor.services import Services
 from fogros2_monitor.topics import GraphNode, LOOK, Topic
 from image_transport_h264 import memory
 
 #: Number of messages to keep for a slow viewer.
 BACKLOG = 64
+#: Types of the services by which nodes show their parameters and types; viewers need none.
+_NODES = ('rcl_interfaces/', 'type_description_interfaces/')
+#: Number of viewers that may wait for parameters at once. The SDK waits in a thread that serves
+#: viewers, and gets twice as many.
+WAITING = 4
 
 
 class BridgeNode(GraphNode, ServerListener):
@@ -47,18 +63,26 @@ class BridgeNode(GraphNode, ServerListener):
         address = str(self.declare_parameter('address', '127.0.0.1').value)
         port = int(self.declare_parameter('port', 8765).value)
         self._patterns = list(self.declare_parameter('topics', ['*']).value)
-        publish = bool(self.declare_parameter('client_publish', True).value)
+        self._publish = bool(self.declare_parameter('client_publish', True).value)
         backlog = int(self.declare_parameter('backlog', BACKLOG).value)
-        self._look()
+        self._offered: dict[str, str] = {}
+        self._service_calls = Services(self)
+        self._node_parameters = Parameters(self._service_calls, self._shows, self._refuse)
+        self._free = threading.Semaphore(WAITING)
         self._server = foxglove.start_server(
             name=self.get_name(), host=address, port=port, server_listener=self,
-            capabilities=[Capability.ClientPublish] if publish else [],
-            supported_encodings=['cdr'], context=self.viewers, message_backlog_size=backlog)
+            capabilities=[Capability.Parameters, *(
+                [Capability.ClientPublish, Capability.Services] if self._publish else [])],
+            supported_encodings=['cdr'], asset_handler=assets.read, context=self.viewers,
+            message_backlog_size=backlog)
+        self._look()
+        self.create_subscription(ParameterEvent, '/parameter_events', self._tell_change, 1000)
         self.create_timer(LOOK, self._look)
         self.get_logger().info(f'serving ws://{address}:{self._server.port}')
 
     def destroy_node(self) -> None:
         """Disconnect the viewers, then destroy the node."""
+        self._service_calls.close()
         self._server.stop()
         super().destroy_node()
 
@@ -87,6 +111,35 @@ class BridgeNode(GraphNode, ServerListener):
         self._with_publisher(client, client_channel_id,
                              lambda key: self._published[key].publish(data))
 
+    def on_get_parameters(self, client: Client, param_names: list[str],
+                          request_id: Optional[str] = None) -> list[Parameter]:
+        """Return the parameters of nodes."""
+        return self._with_parameters(param_names, [])
+
+    def on_set_parameters(self, client: Client, parameters: list[Parameter],
+                          request_id: Optional[str] = None) -> list[Parameter]:
+        """Set parameters of nodes; return their values."""
+        if self._publish and parameters:
+            return self._with_parameters([each.name for each in parameters], parameters)
+        self._refuse('this bridge sets no parameters')
+        return []
+
+    def _with_parameters(self, names: list[str], changes: list[Parameter]) -> list[Parameter]:
+        if not self._free.acquire(blocking=False):
+            self._refuse(f'{WAITING} viewers wait for parameters')
+            return []
+        # this thread of the SDK waits; a message, even about nothing, wakes one for other viewers
+        self._work.create_task(lambda: self._server.remove_status(['']))
+        try:
+            nodes = {name.rpartition('/')[0] for name in ros_types.services(self)
+                     if name.endswith('/list_parameters') and '/_' not in name
+                     and self._served(name)} - {self.get_fully_qualified_name()}
+            if changes:
+                self._node_parameters.set(changes, nodes)
+            return shown(self._node_parameters.get(names, nodes))
+        finally:
+            self._free.release()
+
     # -- in the executor's thread ---------------------------------------------------------------
 
     def _with_topic(self, channel: int, action: Callable[[Topic], None]) -> None:
@@ -94,15 +147,55 @@ class BridgeNode(GraphNode, ServerListener):
             for topic in self._topics.values():
                 if topic.id == channel:
                     action(topic)
-                    break
 
         self._work.create_task(act)
 
-    def _with_publisher(
-        self, client: Client, channel: int, action: Callable[[tuple[int, int]], None],
-    ) -> None:
+    def _with_publisher(self, client: Client, channel: int,
+                        action: Callable[[tuple[int, int]], None]) -> None:
         key = client.id, channel
         self._work.create_task(lambda: action(key) if key in self._published else None)
+
+    def _look(self) -> None:
+        """Offer new topics and services; remove those that are gone."""
+        super()._look()
+        kinds = {name: kind for name, kind in ros_types.services(self).items() if self._publish
+                 and kind not in self._unknown and not kind.startswith(_NODES)
+                 and self._shows(name) and self._served(name)}
+        gone = [name for name, kind in self._offered.items() if kinds.get(name) != kind]
+        self._service_calls.prune(lambda name: name not in gone and self._served(name))
+        self._server.remove_services(gone)
+        self._offered = {name: kinds[name] for name in self._offered if name not in gone}
+        for name in kinds.keys() - self._offered.keys():
+            try:
+                self._server.add_services([self._service(name, kinds[name])])
+                self._offered[name] = kinds[name]
+            except LookupError as error:
+                self._unknown.add(kinds[name])
+                self.get_logger().warning(f'service {name} is not shown: {error}')
+
+    def _served(self, name: str) -> bool:
+        # clients alone make a service appear in the graph
+        return int(self.count_services(name)) > 0
+
+    def _tell_change(self, event: ParameterEvent) -> None:
+        """Send changes of parameters to the viewers that subscribed to them."""
+        self._server.publish_parameter_values(shown({
+            name: each.value for each in (*event.new_parameters, *event.changed_parameters)
+            if self._shows(name := f'{event.node}.{each.name}')}))
+
+    def _service(self, name: str, kind: str) -> Service:
+        """
+        Return a service as viewers see it.
+
+        :raises LookupError: its type is not installed here.
+        """
+        cls = ros_types.service(kind)
+        request, response = (MessageSchema(encoding='cdr', schema=Schema(
+            name=f'{kind}_{end}', encoding='ros2msg',
+            data=definition(f'{kind}_{end}', getattr(cls, end)).encode()))
+            for end in ('Request', 'Response'))
+        return Service(name, schema=ServiceSchema(kind, request=request, response=response),
+                       handler=functools.partial(self._service_calls.answer, cls))
 
     def _unadvertise(self, key: tuple[int, int]) -> None:
         self.destroy_publisher(self._published.pop(key))
@@ -118,12 +211,14 @@ class BridgeNode(GraphNode, ServerListener):
             self._refuse(f'{topic}: {error}')
 
     def _refuse(self, why: str) -> None:
+        why = clean(why[:1000])
         self.get_logger().warning(why)
         self._server.publish_status(why, foxglove.StatusLevel.Warning)
 
 
 def main() -> None:
     """Run the bridge until a signal."""
+    os.environ['TOKIO_WORKER_THREADS'] = str(2 * WAITING)  # read by the SDK
     memory.keep()
     rclpy.init()
     executor = SingleThreadedExecutor()

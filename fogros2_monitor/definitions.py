@@ -9,6 +9,7 @@ interfaces and need no ``.msg`` file.
 from __future__ import annotations
 
 import re
+from typing import Any
 
 from fogros2 import ros_types
 
@@ -25,7 +26,7 @@ _ARRAY = re.compile(r'(?P<item>.+)\[(?P<size>\d+)\]$')
 _BOUNDED = re.compile(r'(?P<kind>w?string)<(?P<bound>\d+)>$')
 
 
-def definition(name: str) -> str:
+def definition(name: str, cls: Any = None) -> str:
     """
     Return a message's fields, followed by the fields of all nested messages.
 
@@ -33,6 +34,7 @@ def definition(name: str) -> str:
     ``MSG: package/Name``, as ``ros2msg`` requires.
 
     :param name: type name, such as ``std_msgs/msg/String``.
+    :param cls: the class, for the request or response of a service.
     :raises LookupError: the message or a nested message is not installed here.
     """
     waiting = [name]
@@ -43,7 +45,8 @@ def definition(name: str) -> str:
         if short in seen:
             continue
         lines = []
-        for field, kind in ros_types.message(this).get_fields_and_field_types().items():
+        kinds = (cls if this == name and cls else ros_types.message(this))
+        for field, kind in kinds.get_fields_and_field_types().items():
             written, inner = _written(kind)
             if '/' in inner:
                 waiting.append(inner)

@@ -4,7 +4,7 @@ Start the bridge on a machine, with its gate and the web application.
 
     ros2 run fogros2 bridge [these options, and the gate's] --ros-args [the bridge's parameters]
 
-``--topic PATTERN``     topics to show; default: all
+``--topic PATTERN``     topics, services and parameters to show; default: all
 ``--secrets FOLDER``    folder of the token and the TLS files, created if missing
 ``--public PORT``       also open this port to other computers, over TLS
 ``--image IMAGE``       image of the web application, '' for none
@@ -35,7 +35,7 @@ from fogros2_monitor import credentials
 from fogros2_monitor.application import say
 
 #: The parameter ``topics`` of ``foxglove_bridge``, which takes regular expressions.
-_WHITELIST = 'topic_whitelist'
+_WHITELISTS = ('topic_whitelist', 'service_whitelist', 'param_whitelist')
 #: Address of the web application; it is no secret, as the application has no data and no token.
 _LOOPBACK = '127.0.0.1'
 
@@ -69,14 +69,15 @@ def command(
 
     :param address: loopback address to listen on, with ``port``.
     :param theirs: path of ``foxglove_bridge``; '': use our own bridge.
-    :param patterns: patterns of the topics to show.
+    :param patterns: patterns of the names to show.
     :param ros_arguments: further arguments after ``--ros-args``.
     """
     program = [theirs] if theirs else [sys.executable, '-m', 'fogros2_monitor.bridge']
-    name, values = ('topics', list(patterns)) if not theirs else (
-        _WHITELIST, [regular_expression(pattern) for pattern in patterns])
+    names, values = (('topics',), list(patterns)) if not theirs else (
+        _WHITELISTS, [regular_expression(pattern) for pattern in patterns])
     return [*program, '--ros-args', *ros_arguments, '-p', f'address:={address}',
-            '-p', f'port:={port}', '-p', f'{name}:={json.dumps(values)}']
+            '-p', f'port:={port}', *(word for name in names for word in (
+                '-p', f'{name}:={json.dumps(values)}'))]
 
 
 def hidden_place() -> tuple[str, int]:

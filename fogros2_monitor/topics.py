@@ -130,9 +130,7 @@ class GraphNode(Node):
     def _look(self) -> None:
         """Add new topics and remove topics that are gone."""
         everything = ros_types.topics(self)
-        kinds = {name: kind for name, kind in everything.items()
-                 if '/_' not in name  # hidden by ROS 2's naming convention
-                 and any(fnmatch.fnmatchcase(name, pattern) for pattern in self._patterns)}
+        kinds = {name: kind for name, kind in everything.items() if self._shows(name)}
         for name in self._topics.keys() - kinds.keys():
             self._topics.pop(name).close()
         for name, kind in kinds.items():
@@ -150,6 +148,10 @@ class GraphNode(Node):
             except LookupError as error:
                 self._unknown.add(kind)
                 self.get_logger().warning(f'{name} is not shown: {error}')
+
+    def _shows(self, name: str) -> bool:
+        return '/_' not in name and any(  # hidden by ROS 2's naming convention
+            fnmatch.fnmatchcase(name, pattern) for pattern in self._patterns)
 
     def _added(self, topic: Topic) -> Topic:
         """Note a new topic; return it."""

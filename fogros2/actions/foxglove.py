@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
 class Foxglove(Action):
     """
-    Serve the topics that a machine sees to Foxglove or Lichtblick in a browser.
+    Serve the ROS graph that a machine sees to Foxglove or Lichtblick in a browser.
 
     The bridge listens on the machine's loopback interface and in the VPN, and admits clients with
     its token. ``ros2 fog monitor`` prints the token, on the robot and for users who may log in to
     the machine. If the machine is the robot itself, the bridge listens on its loopback only.
 
     :param machine: the machine, or the name of one that the launch mentions elsewhere.
-    :param topics: patterns (``*``, ``?``) of the topics to show.
+    :param topics: patterns (``*``, ``?``) of the topics, services and parameters to show.
     :param port: TCP port; the next two ports serve external clients and the web application.
     :param monitor_allow: networks (CIDR) of external clients, which connect to the port after
         that one by TLS and with the token. The launch opens the port in the provider's firewall,

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import contextlib
 import os
 from pathlib import Path
 import shutil
@@ -14,8 +15,11 @@ import textwrap
 
 import pytest
 
+from rigs import viewer as viewers
 from rigs.domains import taken
 
+ROOT = Path(__file__).parents[2]
+CACHE = ROOT / '.cache/node'
 PREFIXES = [sys.prefix, *os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)]
 NO_TOOLS = Path(sys.prefix, 'ament_cmake/share/cmake/ament_cmake')
 FILES = {
@@ -108,11 +112,12 @@ def lacking() -> str:
     return '' if found else 'rosidl_default_generators'
 
 
-@pytest.fixture
-def environment(tmp_path: Path) -> Iterator[dict[str, str]]:
+@pytest.fixture(scope='module')
+def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     """Build the workspace; return variables for its nodes."""
     if lacking():
         pytest.skip(f'{lacking()} is not installed')
+    tmp_path = tmp_path_factory.mktemp('workspace')
     for name, text in FILES.items():
         file = tmp_path / 'src/fogt_cargo' / name
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -142,6 +147,29 @@ def test_own_message_service_and_action_work_between_nodes(environment: dict[str
             ['ros2', 'service', 'call', '/weigh', 'fogt_cargo/srv/Weigh',
              '{goods: {corners: [{x: 1}]}}'], env=environment, capture_output=True, text=True)
         assert 'Weigh_Response(kilograms=2.5)' in called.stdout, called.stderr
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
+
+
+def test_viewer_calls_a_service_of_an_own_type(environment: dict[str, str]) -> None:
+    pytest.importorskip('foxglove', reason='the extra "monitor" is not installed')
+    why_not = viewers.install(ROOT / 'test/node', CACHE)
+    if why_not:
+        pytest.skip(why_not)
+    processes = [subprocess.Popen(
+        [sys.executable, *words], env=environment, text=True, cwd=ROOT,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT) for words in (
+            ('-c', SERVER),
+            ('-m', 'fogros2_monitor.bridge', '--ros-args', '-p', 'port:=0'))]
+    assert processes[1].stdout is not None
+    try:
+        line = next(line for line in processes[1].stdout if 'serving ws://' in line)
+        with contextlib.closing(viewers.Viewer(CACHE, line.split()[-1])) as viewer:
+            assert 'MSG: geometry_msgs/Point' in viewer.until('service', '/weigh')['request']
+            viewer.wish(call='/weigh', request={'goods': {'name': 'box', 'corners': [{'x': 1}]}})
+            assert viewer.until('called', '/weigh')['response'] == {'kilograms': 2.5}
     finally:
         for process in processes:
             process.kill()

@@ -26,6 +26,7 @@ from geometry_msgs.msg import Twist
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 import numpy
+from rcl_interfaces.msg import ParameterDescriptor
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -33,9 +34,12 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CompressedImage, Image, Imu
 from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
+from std_srvs.srv import SetBool, Trigger
 
 from fogros2.errors import DeadlineExceeded
 from fogros2.waiting import wait_until
+from fogros2_monitor.bridge import WAITING
+from fogros2_monitor.services import REQUEST
 from rigs import viewer as viewers
 from rigs.domains import taken
 
@@ -61,8 +65,7 @@ class Bench:
         self._spinning = threading.Thread(target=self.executor.spin)
         self._spinning.start()
         self.bridge = self.run('-m', 'fogros2_monitor.bridge', '--ros-args', '-p', 'port:=0')
-        self.url = self.until(
-            lambda: re.search(r'serving (ws://\S+)', ''.join(self.lines)), 'a bridge')[1]
+        self.url = self.serving()
 
     def run(self, *words: str) -> subprocess.Popen[str]:
         path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))
@@ -75,8 +78,21 @@ class Bench:
         self.processes.append(process)
         return process
 
-    def viewer(self) -> viewers.Viewer:
-        made = viewers.Viewer(CACHE, self.url)
+    def serving(self) -> str:
+        """Return the address of the first bridge whose line is there."""
+        return self.until(
+            lambda: re.search(r'serving (ws://\S+)', ''.join(self.lines)), 'a bridge')[1]
+
+    def gate(self, token: Path) -> tuple[subprocess.Popen[str], str]:
+        """Run a gate before the bridge; return it, and the address for viewers."""
+        gate = self.run('-m', 'fogros2_monitor.gate', '--to', self.url.rpartition('/')[2],
+                        '--listen', '127.0.0.1:0', '--token-file', str(token))
+        port = self.until(lambda: re.search(
+            r'listening on 127.0.0.1:(\d+)', ''.join(self.lines)), 'a gate')[1]
+        return gate, f'ws://127.0.0.1:{port}/'
+
+    def viewer(self, url: str = '') -> viewers.Viewer:
+        made = viewers.Viewer(CACHE, url or self.url)
         self.viewers.append(made)
         made.until('open')
         return made
@@ -292,14 +308,10 @@ def test_twenty_viewers_do_not_slow_down_the_robot(
         bench, seconds, tmp_path):
     token = tmp_path / 'token'
     token.write_text('sesame\n')
-    gate = bench.run('-m', 'fogros2_monitor.gate', '--to', bench.url.rpartition('/')[2],
-                     '--listen', '127.0.0.1:0', '--token-file', str(token))
-    port = bench.until(lambda: re.search(
-        r'listening on 127.0.0.1:(\d+)', ''.join(bench.lines)), 'a gate')[1]
+    gate, url = bench.gate(token)
     publishing = Publishing(bench)
     try:
-        crowd = bench.run_node('crowd.mjs', f'ws://127.0.0.1:{port}/?token=sesame', '20',
-                               '/small', '/big')
+        crowd = bench.run_node('crowd.mjs', f'{url}?token=sesame', '20', '/small', '/big')
         assert crowd.stdout.readline() == 'ready\n'
         # what is kept for the one that doesn't read is full by then
         publishing.undisturbed(seconds / 2)
@@ -360,6 +372,205 @@ def test_stream_is_sent_as_video(bench):
             with contextlib.suppress(av.error.InvalidDataError):  # one before the picture
                 frames += decoder.decode(av.Packet(fields[3]))
         assert (frames[0].width, frames[0].height) == (64, 48)
+
+
+# -- services, parameters and assets --------------------------------------------------------------
+
+#: Bytes of a mesh, no text.
+MESH = bytes(range(256)) * 1000
+
+
+class Robot:
+    """Services and parameters of the bench's node, and a node that answers nobody."""
+
+    def __init__(self, bench: Bench) -> None:
+        self.enabled: list[bool] = []
+        bench.node.create_service(SetBool, '/enable', self._enable)
+        bench.node.create_service(Trigger, '/stop', self._stop)
+        bench.node.declare_parameter('speed', 0.5)
+        bench.node.declare_parameter('names', ['a', 'b'])
+        bench.node.declare_parameter('fixed', 1, ParameterDescriptor(read_only=True))
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=int(os.environ['ROS_DOMAIN_ID']))
+        self.silent = Node('silent', context=self._context)
+        self.silent.create_service(Trigger, '/never', self._stop)
+
+    def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self.enabled.append(request.data)
+        response.success, response.message = request.data, 'Grüße'
+        return response
+
+    def _stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.message = 'stopped'
+        return response
+
+    def close(self) -> None:
+        self.silent.destroy_node()
+        self._context.try_shutdown()
+
+
+@pytest.fixture
+def model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Install a package with a mesh, for a bridge that starts later; return its share folder."""
+    index = tmp_path / 'share/ament_index/resource_index/packages'
+    index.mkdir(parents=True)
+    (index / 'arm_description').touch()
+    share = tmp_path / 'share/arm_description'
+    (share / 'meshes').mkdir(parents=True)
+    (share / 'meshes/arm.STL').write_bytes(MESH)
+    others = os.environ.get('AMENT_PREFIX_PATH', '')
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{tmp_path}{os.pathsep}{others}')
+    return share
+
+
+@pytest.fixture
+def robot(model: Path, bench: Bench) -> Iterator[Robot]:
+    made = Robot(bench)
+    yield made
+    made.close()
+
+
+def values(told: dict[str, Any]) -> dict[str, Any]:
+    return {each['name']: each['value'] for each in told['parameters']}
+
+
+def parameters(bench: Bench, viewer: viewers.Viewer, *names: str) -> dict[str, Any]:
+    """Return parameters once the bridge knows those of the bench's node."""
+    def known() -> dict[str, Any]:
+        viewer.wish(get=names)
+        return values(viewer.until('id', 'get'))
+
+    return bench.until(known, 'parameters')
+
+
+def test_viewer_with_the_token_uses_all_of_a_robot(robot, bench, tmp_path):
+    (tmp_path / 'token').write_text('sesame\n')
+    _, url = bench.gate(tmp_path / 'token')
+    for wrong in ('', '?token=sesam'):
+        stranger = viewers.Viewer(CACHE, url + wrong)
+        bench.viewers.append(stranger)
+        assert stranger.until('error')['error'] == 'status 401'
+    viewer = bench.viewer(f'{url}?token=sesame')
+    assert {'clientPublish', 'services', 'parameters', 'parametersSubscribe', 'assets'} <= {
+        *viewer.until('capabilities')['capabilities']}
+
+    assert viewer.until('service', '/enable')['request'] == 'bool data\n'
+    viewer.wish(call='/enable', request={'data': True})
+    assert viewer.until('called', '/enable')['response'] == {'success': True, 'message': 'Grüße'}
+    assert robot.enabled == [True]
+    viewer.until('service', '/stop')
+    viewer.wish(call='/stop', request={})
+    assert viewer.until('called', '/stop')['response'] == {'success': False, 'message': 'stopped'}
+
+    told = parameters(bench, viewer)
+    assert (told['/bench.speed'], told['/bench.names']) == (0.5, ['a', 'b'])
+    assert not [name for name in told if name.startswith('/fogros2_bridge')]
+    # JSON has no floating point of its own
+    viewer.wish(set=[{'name': '/bench.speed', 'value': 2}])
+    assert values(viewer.until('id', 'set')) == {'/bench.speed': 2}
+    assert bench.node.get_parameter('speed').value == 2.0
+
+    uri = 'package://arm_description/meshes/arm.STL'
+    viewer.wish(fetch=uri)
+    told = viewer.until('asset', uri)
+    assert (told['status'], base64.b64decode(told['data'])) == (0, MESH)
+    for uri in ('package://arm_description/meshes/no.stl', 'file:///etc/passwd'):
+        viewer.wish(fetch=uri)
+        told = viewer.until('asset', uri)
+        assert told['status'] == 1 and told['error']
+
+
+def test_values_that_a_node_refuses_are_reported(robot, bench):
+    viewer = bench.viewer()
+    assert parameters(bench, viewer, '/bench.speed') == {'/bench.speed': 0.5}
+    for name, value, why in (
+            ('fixed', 2, 'read-only'), ('speed', 'fast', 'another type'), ('x', 1, 'unknown')):
+        viewer.wish(set=[{'name': f'/bench.{name}', 'value': value}])
+        assert why in viewer.until('status')['status']
+    assert bench.node.get_parameter('fixed').value == 1
+
+
+def test_viewer_follows_parameters(robot, bench):
+    viewer = bench.viewer()
+    viewer.wish(follow=['/bench.speed', '/late.rate'])
+    assert parameters(bench, viewer, '/bench.speed') == {'/bench.speed': 0.5}
+    bench.node.set_parameters([rclpy.Parameter('speed', value=3.5)])
+    assert values(viewer.until('parameters')) == {'/bench.speed': 3.5}
+    late = Node('late', context=bench.context)
+    bench.executor.add_node(late)
+    late.declare_parameter('rate', 7)
+    assert parameters(bench, viewer, '/late.rate') == {'/late.rate': 7}
+    bench.executor.remove_node(late)
+    late.destroy_node()
+
+    def forgotten() -> bool:
+        viewer.wish(get=['/late.rate'])
+        return not viewer.until('id', 'get')['parameters']
+
+    bench.until(forgotten, 'the end of a node')
+
+
+def test_node_that_does_not_answer_blocks_no_viewer(robot, bench):
+    words = bench.node.create_publisher(String, '/words', 10)
+    patient, other = bench.viewer(), bench.viewer()
+    other.look('/words')
+    bench.listeners('/words', 1)
+    patient.until('service', '/never')
+    # 32 calls of one viewer may wait
+    for _ in range(33):
+        patient.wish(call='/never', request={})
+    assert patient.until('called', '/never')['failure'] == 'Too many requests'
+    assert parameters(bench, patient, '/bench.speed') == {'/bench.speed': 0.5}
+    patient.wish(set=[{'name': '/bench.speed', 'value': 1.5}])
+    patient.until('id', 'set')
+    crowd = [patient, *(bench.viewer() for _ in range(WAITING))]
+    for viewer in crowd:  # which wait for the node, but one
+        viewer.wish(get=[])
+    assert 'viewers wait' in other.until('status')['status']
+    words.publish(String(data='on'))
+    assert other.message('/words') == {'data': 'on'}
+    other.until('service', '/stop')
+    other.wish(call='/stop', request={})
+    assert other.until('called', '/stop')['response']['message'] == 'stopped'
+    robot.silent.destroy_node()
+    assert '/never' in patient.until('called', '/never')['failure']
+    patient.until('withdrawn', '/never')
+
+
+def test_bridge_ends_while_calls_wait(robot, bench):
+    viewer = bench.viewer()
+    viewer.until('service', '/never')
+    viewer.wish(call='/never', request={})
+    parameters(bench, viewer, '/bench.speed')
+    bench.bridge.send_signal(signal.SIGINT)
+    assert bench.bridge.wait(20) == 0
+
+
+@pytest.mark.parametrize('payload', [
+    b'', b'\0\1\0\0', b'\xff' * 40, bytes(REQUEST + 1)], ids=['empty', 'head', 'junk', 'large'])
+def test_bytes_that_are_no_request_are_refused(robot, bench, payload):
+    viewer = bench.viewer()
+    for name in ('/stop', '/enable'):
+        viewer.until('service', name)
+        viewer.wish(call=name, payload=base64.b64encode(payload).decode())
+        assert viewer.until('called', name)['failure']
+    assert robot.enabled == []
+
+
+def test_bridge_that_takes_no_messages_changes_nothing(robot, bench):
+    bench.lines.clear()
+    bench.run('-m', 'fogros2_monitor.bridge', '--ros-args', '-p', 'port:=0',
+              '-p', 'client_publish:=false', '-p', 'topics:=["/bench.*", "/words"]',
+              '-r', '__node:=looker')
+    viewer = bench.viewer(bench.serving())
+    capabilities = viewer.until('capabilities')['capabilities']
+    assert not {'clientPublish', 'services'} & {*capabilities}
+    told = parameters(bench, viewer)
+    assert told['/bench.speed'] == 0.5 and not [
+        name for name in told if not name.startswith('/bench.')]
+    viewer.wish(set=[{'name': '/bench.speed', 'value': 9.0}])
+    assert 'sets no parameters' in viewer.until('status')['status']
+    assert bench.node.get_parameter('speed').value == 0.5
 
 
 # -- a recording ---------------------------------------------------------------------------------

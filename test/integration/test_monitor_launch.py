@@ -63,8 +63,16 @@ def sees_the_talker(url: str) -> None:
     try:
         viewer.look('/chatter')
         assert viewer.message('/chatter')['data'].startswith('Hello World')
+        wait_until(lambda: parameters(viewer) == [{'name': '/talker.use_sim_time',
+                                                   'value': False}],
+                   timeout=60.0, what='a parameter')
     finally:
         viewer.close()
+
+
+def parameters(viewer: viewers.Viewer) -> list[dict[str, object]]:
+    viewer.wish(get=['/talker.use_sim_time'])
+    return viewer.until('id', 'get')['parameters']
 
 
 @contextlib.contextmanager

@@ -4,9 +4,11 @@
 //
 //   node viewer.mjs URL
 //
-// Takes {subscribe: TOPIC}, {unsubscribe: TOPIC}, {publish: TOPIC, schemaName, definition, message}
-// and {pause: true}, after which it reads nothing more. Tells {open}, {channel}, {gone}, {message},
-// {status} and {error}.
+// Takes {subscribe: TOPIC}, {unsubscribe: TOPIC}, {publish: TOPIC, schemaName, definition, message},
+// {call: SERVICE, request} or with {payload: BASE64}, {get: PARAMETERS}, {set: [{name, value}]},
+// {follow: PARAMETERS}, {fetch: URI} and {pause: true}, after which it reads nothing more. Tells
+// {open}, {channel}, {gone}, {message}, {service}, {withdrawn}, {called, response}, {parameters},
+// {asset}, {capabilities}, {status} and {error}.
 import protocol from '@foxglove/ws-protocol';
 import rosmsg from '@foxglove/rosmsg';
 import serialization from '@foxglove/rosmsg2-serialization';
@@ -24,6 +26,8 @@ const socket = new WebSocket(
 socket.on('unexpected-response', (_, response) => tell({ error: `status ${response.statusCode}` }));
 const client = new FoxgloveClient({ ws: socket });
 const channels = new Map(), subscriptions = new Map(), advertised = new Map();
+const services = new Map(), calls = new Map(), assets = new Map();
+const parsed = ({ schema }) => rosmsg.parse(schema, { ros2: true });
 
 client.on('open', () => tell({ open: true }));
 client.on('error', (error) => tell({ error: String(error?.message ?? error) }));
@@ -59,6 +63,30 @@ client.on('message', ({ subscriptionId, data }) => {
       data.buffer, data.byteOffset, data.byteLength).toString('base64') });
 });
 
+client.on('serverInfo', ({ capabilities }) => tell({ capabilities }));
+client.on('advertiseServices', (list) => {
+  for (const service of list) {
+    services.set(service.name, service);
+    tell({ service: service.name, type: service.type, request: service.request.schema });
+  }
+});
+client.on('unadvertiseServices', (ids) => {
+  for (const [name, { id }] of services) {
+    if (ids.includes(id)) { services.delete(name); tell({ withdrawn: name }); }
+  }
+});
+client.on('serviceCallResponse', ({ callId, data }) => {
+  const name = calls.get(callId);
+  tell({ called: name, response: new serialization.MessageReader(
+    parsed(services.get(name).response)).readMessage(data) });
+});
+client.on('serviceCallFailure', ({ callId, message }) =>
+  tell({ called: calls.get(callId), failure: message }));
+client.on('parameterValues', ({ parameters, id }) => tell({ parameters, id }));
+client.on('fetchAssetResponse', ({ requestId, status, error, data }) => tell({
+  asset: assets.get(requestId), status, error,
+  data: data && Buffer.from(data.buffer, data.byteOffset, data.byteLength).toString('base64') }));
+
 readline.createInterface({ input: process.stdin }).on('line', (line) => {
   const wish = JSON.parse(line);
   if (wish.subscribe) {
@@ -77,6 +105,22 @@ readline.createInterface({ input: process.stdin }).on('line', (line) => {
     }
     const writer = new serialization.MessageWriter(rosmsg.parse(wish.definition, { ros2: true }));
     client.sendMessage(advertised.get(wish.publish), writer.writeMessage(wish.message));
+  } else if (wish.call) {
+    const { id, request } = services.get(wish.call);
+    const data = wish.payload !== undefined ? Buffer.from(wish.payload, 'base64')
+      : new serialization.MessageWriter(parsed(request)).writeMessage(wish.request);
+    calls.set(calls.size + 1, wish.call);
+    client.sendServiceCallRequest({ serviceId: id, callId: calls.size, encoding: 'cdr',
+      data: new DataView(data.buffer, data.byteOffset, data.byteLength) });
+  } else if (wish.get) {
+    client.getParameters(wish.get, 'get');
+  } else if (wish.set) {
+    client.setParameters(wish.set, 'set');
+  } else if (wish.follow) {
+    client.subscribeParameterUpdates(wish.follow);
+  } else if (wish.fetch) {
+    assets.set(assets.size + 1, wish.fetch);
+    client.fetchAsset(wish.fetch, assets.size);
   } else if (wish.pause) {
     socket._socket.pause();
   }

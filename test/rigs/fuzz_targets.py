@@ -31,6 +31,7 @@ from fogros2.errors import FogError
 from fogros2_examples.city import City
 from fogros2_examples.lidar import message
 from fogros2_features.guests import program as guests
+from fogros2_monitor import assets
 from fogros2_monitor import request as gate
 from fogros2_monitor.dashboard import server as dashboard
 from fogros2_replicas.pairs import header_of
@@ -148,6 +149,27 @@ def _messages() -> Iterator[Target]:
     yield Target([bytes([kind]) + data for kind, each in enumerate(valid) for data in each],
                  lambda data: data and read[data[0] % len(read)](data[1:]),
                  (CdrError, CloudError))
+
+
+@contextlib.contextmanager
+def _calls() -> Iterator[Target]:
+    """Read the requests of services that viewers send, and the files that they name."""
+    from rcl_interfaces.msg import Parameter, ParameterValue
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.serialization import deserialize_message, serialize_message
+    from std_srvs.srv import Trigger
+
+    value = ParameterValue(type=9, string_array_value=['a', 'bc'], double_array_value=[1.0])
+    request = SetParameters.Request(parameters=[Parameter(name='speed', value=value)] * 2)
+    valid = [b'\0' + serialize_message(request), b'\1' + serialize_message(Trigger.Request()),
+             b'\2package://arm/meshes/upper%20arm.stl']
+
+    def read(data: bytes) -> object:
+        if data[:1] == b'\2':
+            return assets.parse(data[1:].decode('utf-8', 'replace'))
+        cls = SetParameters if data[:1] == b'\0' else Trigger
+        return deserialize_message(data[1:], cls.Request)
+    yield Target(valid, read, (RuntimeError, ValueError))
 
 
 @contextlib.contextmanager
@@ -381,9 +403,9 @@ def _dds() -> Iterator[Target]:
 
 TARGETS: dict[str, Callable[[], contextlib.AbstractContextManager[Target]]] = {
     'decoder': _decoder, 'stills': _stills, 'clouds': _clouds, 'parts': _parts,
-    'messages': _messages, 'agent messages': _agent_messages, 'heartbeats': _heartbeats,
-    'agent': _agent, 'door': _door, 'gate': _gate, 'dashboard': _dashboard,
-    'VPN helper': _vpn_helper, 'DDS configuration': _dds}
+    'messages': _messages, 'calls': _calls, 'agent messages': _agent_messages,
+    'heartbeats': _heartbeats, 'agent': _agent, 'door': _door, 'gate': _gate,
+    'dashboard': _dashboard, 'VPN helper': _vpn_helper, 'DDS configuration': _dds}
 #: Targets whose readers are Python code in the process that feeds them.
 PYTHON = {'parts', 'messages', 'agent messages', 'heartbeats', 'door', 'gate', 'dashboard',
           'VPN helper', 'DDS configuration'}

@@ -36,13 +36,14 @@ def test_names_that_ros_does_not_allow_are_left_out() -> None:
         (f'/camera{ATTACK}', ['sensor_msgs/msg/Image']), ('/x', [f'std_msgs/msg/String{ATTACK}']),
         ('/a b', ['std_msgs/msg/String']), ('//x', ['std_msgs/msg/String']),
         ('/x\n', ['std_msgs/msg/String']), ('/\u0430', ['std_msgs/msg/String']), ('/none', [])])
-    assert ros_types.topics(node) == {
-        '/camera': 'sensor_msgs/msg/Image', '/a/b_1': 'std_msgs/msg/String'}
+    node.get_service_names_and_types = node.get_topic_names_and_types
+    for listed in (ros_types.topics(node), ros_types.services(node)):
+        assert listed == {'/camera': 'sensor_msgs/msg/Image', '/a/b_1': 'std_msgs/msg/String'}
 
 
-def test_programs_read_topics_by_the_filter_alone() -> None:
+def test_programs_read_the_graph_by_the_filter_alone() -> None:
     for path in (ROOT / 'fogros2_monitor').rglob('*.py'):
-        assert not re.search(r'\bget_topic_names_and_types\b', path.read_text()), path
+        assert not re.search(r'\bget_(topic|service)_names_and_types\b', path.read_text()), path
 
 
 def test_first_answer_logs_no_control_characters() -> None:

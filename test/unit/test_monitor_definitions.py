@@ -41,6 +41,17 @@ def test_types_of_fields_are_those_of_message_files(name, line):
     assert line in definition(name).splitlines()
 
 
+def test_definition_of_a_service_has_its_request_and_response():
+    srv = pytest.importorskip('nav_msgs.srv')
+    kind = 'nav_msgs/srv/LoadMap'
+    assert definition(f'{kind}_Request', srv.LoadMap.Request) == 'string map_url\n'
+    first, *parts = definition(f'{kind}_Response', srv.LoadMap.Response).split(f'{RULE}\n')
+    assert first == 'nav_msgs/OccupancyGrid map\nuint8 result\n'
+    assert parts[0].splitlines()[0] == 'MSG: nav_msgs/OccupancyGrid'
+    trigger = pytest.importorskip('std_srvs.srv').Trigger
+    assert definition('std_srvs/srv/Trigger_Request', trigger.Request) == ''
+
+
 @pytest.mark.parametrize('name', [
     'std_msgs/msg/Nothing', 'no_such_msgs/msg/String', 'std_msgs/srv/String', 'String',
     'std_msgs/msg/a/b'])

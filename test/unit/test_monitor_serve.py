@@ -21,7 +21,8 @@ def test_patterns_become_regular_expressions():
     assert serve.regular_expression('/a.b?[c]') == r'/a\.b.\[c\]'
     assert serve.command('127.9.9.9', 5, '/x', ['/a*'], ['-r', 'b:=c'])[1:] == [
         '--ros-args', '-r', 'b:=c', '-p', 'address:=127.9.9.9', '-p', 'port:=5',
-        '-p', 'topic_whitelist:=["/a.*"]']
+        *(word for name in ('topic', 'service', 'param') for word in (
+            '-p', f'{name}_whitelist:=["/a.*"]'))]
     assert serve.command('127.9.9.9', 5, '', ['/a*'], [])[1:3] == ['-m', 'fogros2_monitor.bridge']
 
 
@@ -46,7 +47,7 @@ def test_foxglove_bridge_of_ros_runs_if_installed(tmp_path):
         lines = sorted(process.stdout.readline().strip() for _ in range(2))
         assert lines[0] == f'listening on 127.0.0.1:{port}'
         assert lines[1].startswith('theirs --ros-args -p address:=127.')
-        assert lines[1].endswith('-p topic_whitelist:=["/camera/.*"]')
+        assert lines[1].endswith('-p param_whitelist:=["/camera/.*"]')
     finally:
         process.send_signal(signal.SIGTERM)
         # the gate has our pipe too: its end is what this waits for
