@@ -19,10 +19,12 @@ MOST = 8
 #: Acknowledgements of a full window per decision; chance delays some of them, a queue all.
 ROUND = 4
 #: Number of images that wait in the link's queue: below FEW the window grows, above MANY it
-#: shrinks.
+#: shrinks, by default.
 FEW, MANY = 0.25, 0.75
 #: Seconds for which the quickest acknowledgement counts.
 MEMORY = 10.0
+#: Factor by which the quickest one of the others must be slower to send one image at a time again.
+FORGOTTEN = 1.25
 #: Seconds until a window that was too large is tried again; the pause doubles up to
 #: MOST_PATIENCE if it is too large several times in a row.
 PATIENCE, MOST_PATIENCE = 5.0, 60.0
@@ -37,9 +39,14 @@ class Sent:
 
 
 class Pace:
-    """The window of images in flight; times are seconds of one monotonic clock."""
+    """
+    The window of images in flight; times are seconds of one monotonic clock.
 
-    def __init__(self) -> None:
+    :param many: images in the link's queue above which the window shrinks.
+    """
+
+    def __init__(self, many: float = MANY) -> None:
+        self._many = many
         self.window = 1
         self._under_way = 0
         self._trips: deque[tuple[float, float]] = deque()
@@ -66,8 +73,14 @@ class Pace:
         self._under_way -= 1
         trip = max(now - sent.when, 1e-6)
         self._trips.append((now, trip))
+        known = self.quickest
         while self._trips[0][0] < now - MEMORY:
             self._trips.popleft()
+        if self.window > 1 and self.quickest > FORGOTTEN * known:
+            # only times with a queue are left: measure one without
+            self.window = 1
+            self._queued.clear()
+            return
         if sent.place < self.window:
             return  # the window did not delay this image, so it says nothing about its size
         self._queued.append(self.window * (1 - self.quickest / trip))
@@ -76,7 +89,7 @@ class Pace:
         # A repeated fragment or a busy processor delays some images, a queue delays all.
         queued = min(self._queued)
         self._queued.clear()
-        if queued > MANY:
+        if queued > self._many:
             self._shrink(self.window - 1, now)
         elif queued < FEW and self.window < MOST and now - self._tried >= self._patience:
             self.window += 1

@@ -28,12 +28,14 @@ from image_transport_h264.message import ACKNOWLEDGED, SLICES
 from image_transport_h264.pacing import Pace, Sent
 from image_transport_h264.rate import MOST_RECEIVERS
 
-#: Bytes of a slice at first and at the least; 10 Mbit/s carry 38 of them in a second.
-LEAST = 1 << 15
+#: Bytes of a slice at first and at the least; 10 Mbit/s carry 76 of them in a second.
+LEAST = 1 << 14
 #: Bytes of the largest image.
 LARGEST = 1 << 28
 #: Seconds that a slice takes: below QUICK the next image has larger ones, above SLOW smaller ones.
 QUICK, SLOW = 0.004, 0.1
+#: Slices in the link's queue above which fewer are sent; while one waits, the link has no pause.
+QUEUED = 1.25
 #: Factor from one size of slices to the next.
 STEP = 4
 #: Sender's identity, number of the slice, size of the image, place of the slice in it.
@@ -57,7 +59,7 @@ class SliceSender:
         self._identity = secrets.randbits(63)
         self._number = 0
         self._size = LEAST
-        self._pace = Pace()
+        self._pace = Pace(QUEUED)
         self._under_way: deque[tuple[int, Sent]] = deque()
         #: The last acknowledgement of each receiver: number of the slice, and when it came (s).
         self._heard_of: dict[int, tuple[int, float]] = {}
@@ -90,7 +92,7 @@ class SliceSender:
                 if not self._pace.may_send():
                     # the link is cut, or nobody listens any more
                     self._under_way.clear()
-                    self._pace = Pace()
+                    self._pace = Pace(QUEUED)
                     return
         self._adapt((time.monotonic() - begin) * size / len(data))
 
@@ -101,7 +103,7 @@ class SliceSender:
             return
         with self._news:
             # times of slices of another size say nothing about these
-            self._size, self._pace = size, Pace()
+            self._size, self._pace = size, Pace(QUEUED)
             self._under_way.clear()
 
     def _heard(self, feedback: UInt64MultiArray) -> None:

@@ -11,7 +11,8 @@ import random
 import pytest
 
 from image_transport_h264.lazy import STREAM_QOS
-from image_transport_h264.pacing import MEMORY, MOST, Pace, Sent
+from image_transport_h264.pacing import MANY, MEMORY, MOST, Pace, Sent
+from image_transport_h264.slices import QUEUED
 
 CAMERA = 30.0
 #: Seconds that an image of 40 kB is on a wire of 10 Mbit/s.
@@ -36,6 +37,7 @@ class Outcome:
 def drive(
     seconds: float, *, wire: Callable[[float], float] = lambda now: WIRE, trip: float = 0.002,
     rate: float = CAMERA, late: Callable[[random.Random], float] = lambda chance: 0.0,
+    many: float = MANY,
 ) -> Outcome:
     """
     Send a camera's images over a link; the newest one leaves when there is room for it.
@@ -43,8 +45,9 @@ def drive(
     :param wire: seconds that an image takes on the wire, at a time.
     :param trip: seconds of the round trip of an empty message.
     :param late: seconds that an acknowledgement is late by chance.
+    :param many: as of ``Pace``.
     """
-    pace, chance = Pace(), random.Random(1)
+    pace, chance = Pace(many), random.Random(1)
     outcome = Outcome([0.0] * int(seconds), [], [])
     acknowledgements: list[tuple[float, int, Sent]] = []
     free = 0.0
@@ -84,6 +87,13 @@ def test_short_link_is_filled_by_one_image(wire: float) -> None:
     assert max(outcome.windows) == 2
     assert outcome.windows.count(2) < 0.05 * len(outcome.windows)
     assert max(outcome.waits) <= wire + 1e-6
+
+
+def test_slices_leave_a_short_link_no_pause() -> None:
+    outcome = drive(100, wire=lambda now: 0.012, rate=1000.0, trip=0.004, many=QUEUED)
+    assert mean(outcome.rates) >= 0.98 / 0.012
+    assert outcome.windows.count(2) > 0.9 * len(outcome.windows)
+    assert mean(outcome.waits) <= 0.012
 
 
 @pytest.mark.parametrize('trip', [0.03, 0.1, 0.2])
