@@ -60,7 +60,9 @@ def ask(shell: Shell, record: Record, verb: str, content: object = None) -> list
     :raises FogError: the machine cannot be reached, has no address left, or lies.
     """
     assert record.vpn is not None
-    output = shell.run(request(record.vpn, verb, content), timeout=15.0).stdout
+    # a busy disk takes a while to delete the wheels in a guest's home
+    output = shell.run(request(record.vpn, verb, content),
+                       timeout=60.0 if verb == 'remove' else 15.0).stdout
     try:
         return [_checked(guest, record.vpn.network)
                 for guest in untrusted.parsed(output, list[Guest])]
