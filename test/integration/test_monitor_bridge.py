@@ -321,7 +321,7 @@ def test_twenty_viewers_do_not_slow_down_the_robot(
         got = json.loads(crowd.communicate()[0])
     finally:
         publishing.close()
-    assert max(after[0] - before[0], after[1] - before[1]) < 15
+    assert max(after[0] - before[0], after[1] - before[1]) < 30
     assert max(after) < 150
     assert got[0] < min(got[1:])
     # the other nineteen have all but what was on its way, and a busy computer drops some
