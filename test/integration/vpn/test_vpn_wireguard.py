@@ -90,6 +90,38 @@ def test_up_carries_and_down_leaves_nothing(vpn: Lab) -> None:
         assert traces(vpn, host) == []
 
 
+@pytest.mark.parametrize('host', ['robot', 'machine'])
+def test_down_ends_a_wireguard_go_that_does_not_end_itself(vpn: Lab, host: str) -> None:
+    """It normally does when its socket goes, which hides whether ``down`` has found it."""
+    running = vpn.wireguard_go(host)
+    if not running:
+        pytest.skip('this kernel has WireGuard itself')
+    process.run(Command(('kill', '-STOP', str(running)), sudo=True), timeout=60.0)
+    try:
+        vpn.do(host, vpn.vpn.down(vpn.interfaces[host]))
+        wait_until(lambda: not vpn.wireguard_go(host), timeout=10.0,
+                   what='the end of the stopped wireguard-go')
+    finally:
+        process.run(Command(('kill', '-CONT', str(running)), sudo=True), timeout=60.0,
+                    check=False)
+    assert traces(vpn, host) == []
+
+
+def test_down_leaves_a_wireguard_go_of_another_network(vpn: Lab, tmp_path: Path) -> None:
+    interface = vpn.interfaces['robot']
+    program = tmp_path / 'wireguard-go'
+    program.write_text('#!/bin/sh\necho "{\\"ready\\": true}"\nread -r end\n')
+    program.chmod(0o755)
+    others = {host: vpn.start(host, [str(program), interface.name]) for host in ('lan', 'robot')}
+    for other in others.values():
+        other.wait('ready')
+    vpn.do('robot', vpn.vpn.down(interface))
+    # the one beside it is ended, or this test would prove nothing
+    wait_until(lambda: others['robot'].process.poll() is not None, timeout=10.0,
+               what='the end of the wireguard-go in the same network')
+    assert others['lan'].process.poll() is None
+
+
 def test_up_again_changes_nothing_and_keeps_the_session(vpn: Lab) -> None:
     def handshakes() -> list[object]:
         status = vpn.run('robot', vpn.vpn.status(vpn.interfaces['robot'])).stdout
