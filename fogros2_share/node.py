@@ -186,7 +186,8 @@ class Relay(Node):
                     link.shutdown(socket.SHUT_RDWR)
             for reader in self._readers.values():
                 reader.close()
-            threads = list(self._robots.values())
+            # a signal may have come before the start of one
+            threads = [thread for thread in self._robots.values() if thread.is_alive()]
         for thread in threads:
             thread.join(2 * CHANGE)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Replicas on three machines: a node that dies, and a machine that is lost."""
+"""Replicas on machines: a node that dies, machines that are lost, the robot as the last one."""
 
 from __future__ import annotations
 
@@ -32,6 +32,12 @@ def calls(run):
     return [(int(number), int(by), float(taken)) for number, by, taken in CALL.findall(run.text)]
 
 
+def take_away(engine, *names):
+    subprocess.run(argv(Command((
+        engine, 'rm', '-f', '-t', '0', *(f'fogros2-{name}' for name in names)), sudo=True)),
+        check=True, capture_output=True, timeout=60)
+
+
 def test_calls_go_on_when_a_node_dies_and_a_machine_is_lost(
     cloud_network, engine, tmp_path, monkeypatch,
 ):
@@ -48,9 +54,7 @@ def test_calls_go_on_when_a_node_dies_and_a_machine_is_lost(
         before = calls(run)
         wait_until(lambda: len(calls(run)) > len(before) + 10, timeout=60.0, what='calls')
         gone = calls(run)[-1][1]
-        subprocess.run(argv(Command((
-            engine, 'rm', '-f', '-t', '0', f'fogros2-{names[gone]}'), sudo=True)),
-            check=True, capture_output=True, timeout=60)
+        take_away(engine, names[gone])
         begin = time.monotonic()
         run.wait_for(f"the machine '{names[gone]}' is gone")
         run.wait_for('the other replicas go on')
@@ -64,5 +68,23 @@ def test_calls_go_on_when_a_node_dies_and_a_machine_is_lost(
             r'REPLICA OF +STATE.*\n/plan +live',
             ros2('fog', 'status', names[calls(run)[-1][1]]).stdout),
             timeout=60.0, what='a live replica')
+        run.interrupt()
+        assert run.ended() == 0, run.text
+
+
+def test_robot_answers_when_all_machines_are_lost(cloud_network, engine, tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    names = [f'last-{RUN}-{number}' for number in range(2)]
+    path = replicated.write(tmp_path / 'last.launch.py', names, cloud_network, deadline=1.0)
+    with launching() as launch:
+        run = launch(str(path))
+        run.wait_for('process started with pid', times=5)
+        wait_until(lambda: {by for _, by, _ in calls(run)} & {0, 1}, timeout=60.0,
+                   what='the answer of a machine')
+        take_away(engine, *names)
+        run.wait_for(f' by {replicated.ROBOT}: ', times=20)
+        for name in names:
+            run.wait_for(f"the machine '{name}' is gone")
+        assert not re.search(r'call \d+ is lost', run.text)
         run.interrupt()
         assert run.ended() == 0, run.text

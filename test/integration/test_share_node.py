@@ -8,6 +8,7 @@ import contextlib
 from pathlib import Path
 import socket
 import threading
+from types import SimpleNamespace
 
 import pytest
 
@@ -17,7 +18,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int32, String
 
 from fogros2.waiting import wait_until
-from fogros2_share.node import NAME, OWN
+from fogros2_share.node import NAME, OWN, Relay
 from fogros2_share.wire import encode, Form
 from rigs.sharing import BEST_EFFORT, LATCHED, repeated, Robot, robot
 
@@ -209,6 +210,13 @@ def test_relay_without_its_folder_says_why(robot: Callable[[str], Robot]) -> Non
     assert one.relay is not None and one.relay.wait(60) == 1
     wait_until(lambda: any('made without share=' in line for line in one.lines), timeout=60,
                what='the reason')
+
+
+def test_relay_closes_before_a_thread_has_started() -> None:
+    with socket.socket() as server:
+        Relay.close(SimpleNamespace(  # type: ignore[arg-type]
+            _lock=threading.Lock(), _server=server, _links=(), _readers={},
+            _robots={Path('other'): threading.Thread()}))
 
 
 def test_relay_that_was_killed_starts_again(robot: Callable[[str], Robot]) -> None:

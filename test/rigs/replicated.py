@@ -16,6 +16,8 @@ from typing import Optional
 TAKES, HEDGE = 0.02, 300.0
 #: Calls between two deaths; the first calls measure the latency of each replica.
 BETWEEN = 60
+#: The number of the robot's own copy.
+ROBOT = 9
 
 SERVER = f"""
 import os, sys, time
@@ -33,7 +35,8 @@ def answer(request, response):
 
 rclpy.init()
 node = rclpy.create_node('planner')
-number = int(os.uname().nodename.rpartition('-')[2])
+robot = any('/fogros2/robot/' in word for word in sys.argv)
+number = {ROBOT} if robot else int(os.uname().nodename.rpartition('-')[2])
 node.create_service(ListParameters, 'plan', answer)
 rclpy.spin(node)
 """
@@ -75,10 +78,11 @@ from launch.actions import ExecuteProcess
 def generate_launch_description():
     return FogROSLaunchDescription([
         Replicated(
-            [ContainerInstance(name=name, network={network!r}) for name in {names!r}],
+            [*(ContainerInstance(name=name, network={network!r}) for name in {names!r}),
+             *{robot!r}],
             [ExecuteProcess(cmd=['python3', '-c', {server!r}, '--ros-args'], name='planner',
                             respawn=True, respawn_delay=0.5, output='screen')],
-            services=['/plan'], hedge_after={hedge}),
+            services=['/plan'], {when}),
         ExecuteProcess(cmd=['python3', '-u', '-c', {client!r}], name='client', output='screen'),
     ])
 """
@@ -86,8 +90,15 @@ def generate_launch_description():
 
 def write(
     path: Path, names: Sequence[str], network: Optional[str], hedge: float = HEDGE,
+    deadline: Optional[float] = None,
 ) -> Path:
-    """Write the launch file; names of machines end with ``-`` and a number."""
+    """
+    Write the launch file; names of machines end with ``-`` and a number.
+
+    :param deadline: seconds until the robot's copy answers; without, the robot has none.
+    """
+    robot, when = ([], f'hedge_after={hedge}') if deadline is None else (
+        [None], f'deadline={deadline}')
     path.write_text(LAUNCH.format(names=list(names), network=network, server=SERVER,
-                                  client=CLIENT, hedge=hedge))
+                                  client=CLIENT, robot=robot, when=when))
     return path
