@@ -21,6 +21,7 @@ import itertools
 import json
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 import threading
@@ -130,6 +131,13 @@ class Child:
                 pipe.close()
 
 
+def abandoned(listed: str) -> list[str]:
+    """Return the hosts of killed runs of the tests, from the output of ``ip netns list``."""
+    alive = {int(name) % 100000 for name in os.listdir('/proc') if name.isdigit()}
+    return [name for name in (line.split()[0] for line in listed.splitlines() if line)
+            if (mark := re.match(r'fogt(\d+)x\d+[a-z]$', name)) and int(mark[1]) not in alive]
+
+
 class Lab:
     """
     The namespaces, and what runs in them.
@@ -160,6 +168,9 @@ class Lab:
     # the network
 
     def open(self) -> None:
+        for space in abandoned(process.run(Command(('ip', 'netns', 'list')), timeout=60.0).stdout):
+            self.remove(space, VpnInterface(space, ROBOT, NETWORK, PORT, str(self.folder / 'none'),
+                                            firewall=True))
         for space in self.spaces.values():
             self.ip('netns', 'add', space)
             self.ip('-n', space, 'link', 'set', 'lo', 'up')
@@ -204,12 +215,17 @@ class Lab:
     def close(self) -> None:
         for child in reversed(self.children):
             child.stop()
-        for host in self.interfaces:
-            for command in self.vpn.down(self.interfaces[host]):
-                self.run(host, command, check=False)
-        for space in self.spaces.values():
-            process.run(Command(('ip', 'netns', 'delete', space), sudo=True),
-                        timeout=60.0, check=False)
+        for host, space in self.spaces.items():
+            self.remove(space, self.interfaces.get(host))
+
+    def remove(self, space: str, interface: VpnInterface | None) -> None:
+        """Remove a host, with its end of the VPN."""
+        for command in self.vpn.down(interface) if interface else ():
+            process.run(dataclasses.replace(
+                command, argv=('ip', 'netns', 'exec', space, 'sh', '-c', ENTER, 'sh', '',
+                               *command.argv), sudo=True), timeout=60.0, check=False)
+        process.run(Command(('ip', 'netns', 'delete', space), sudo=True),
+                    timeout=60.0, check=False)
 
     def ip(self, *words: str) -> None:
         process.run(Command(('ip', *words), sudo=True), timeout=60.0)

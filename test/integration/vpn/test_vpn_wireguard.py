@@ -7,6 +7,7 @@ import dataclasses
 import os
 from pathlib import Path
 import stat
+import subprocess
 import sys
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from fogros2 import process
 from fogros2.errors import CommandError
 from fogros2.model import Command, Peer
 from fogros2.waiting import wait_until
+from rigs.vpn_lab import abandoned
 
 if TYPE_CHECKING:
     from rigs.vpn_lab import Lab
@@ -282,3 +284,11 @@ def test_machine_with_an_address_of_the_vpn_is_reported(lab: Lab, taken: str) ->
     lab.interfaces['machine'] = dataclasses.replace(lab.interfaces['machine'], host_routes=True)
     with pytest.raises(CommandError, match=f'in use already: local {taken} dev own0'):
         lab.connect()
+
+
+def test_only_hosts_of_killed_test_runs_are_removed() -> None:
+    ended = subprocess.Popen(['true'])
+    ended.wait()
+    own = f'fogt{os.getpid() % 100000}x1r'
+    gone = f'fogt{ended.pid % 100000}x12m'
+    assert abandoned(f'{own}\n{gone} (id: 3)\nfogt1r\nmine\n') == [gone]
