@@ -16,7 +16,7 @@ import pytest
 from fogros2 import process
 from fogros2.host import workspace
 from fogros2.host.inspection import HostFacts
-from rigs.launched import launching
+from rigs.launched import launching, VPN_TRAFFIC
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left', 'engine'),
@@ -104,10 +104,8 @@ def generate_launch_description():
     ])
 """
 
-VIEWER = """
+VIEWER = VPN_TRAFFIC + """
 import json
-import os
-import re
 
 import rclpy
 from rclpy.qos import qos_profile_sensor_data
@@ -128,13 +126,7 @@ node.create_subscription(Image, '/seen', look, qos_profile_sensor_data)
 try:
     rclpy.spin(node)
 finally:
-    traffic = 0
-    # .../launches/ID/dds.xml
-    interface = 'fog' + os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'].split('/')[-2]
-    for way in ('rx', 'tx'):
-        with open(f'/sys/class/net/{interface}/statistics/{way}_bytes') as file:
-            traffic += int(file.read())
-    print('viewer says', json.dumps({'seen': seen, 'traffic': traffic}), flush=True)
+    print('viewer says', json.dumps({'seen': seen, 'traffic': vpn_traffic()}), flush=True)
 """
 
 

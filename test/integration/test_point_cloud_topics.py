@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip('zstandard', reason='the extra "point-clouds" is not installed')
 from fogros2 import process
 from point_cloud_stream.control import COARSEST
-from rigs.launched import launching
+from rigs.launched import launching, VPN_TRAFFIC
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left', 'engine'),
@@ -43,10 +43,8 @@ def generate_launch_description():
 """
 
 #: Sees both topics under their own names, and counts what crosses the VPN.
-VIEWER = """
+VIEWER = VPN_TRAFFIC + """
 import json
-import os
-import re
 
 import numpy
 import rclpy
@@ -89,14 +87,8 @@ finally:
         near = near[numpy.isfinite(near[:, 0])]
         errors.append(max(numpy.abs(near - obstacle).max(1).min()
                           for obstacle in points(obstacles[one])[::50]))
-    traffic = 0
-    # .../launches/ID/dds.xml
-    interface = 'fog' + os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'].split('/')[-2]
-    for way in ('rx', 'tx'):
-        with open(f'/sys/class/net/{interface}/statistics/{way}_bytes') as file:
-            traffic += int(file.read())
     print('viewer says', json.dumps({
-        'obstacles': len(obstacles), 'both': len(both), 'traffic': traffic,
+        'obstacles': len(obstacles), 'both': len(both), 'traffic': vpn_traffic(),
         'near': min(errors), 'far': max(errors),
         'fields': [field.name for field in obstacles[both[0]].fields],
         'points': min(cloud.width for cloud in obstacles.values())}), flush=True)

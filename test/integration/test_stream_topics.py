@@ -16,7 +16,7 @@ import pytest
 from fogros2 import process
 from fogros2.model import Command
 from fogros2.waiting import wait_until
-from rigs.launched import Launched, launching, ros2
+from rigs.launched import Launched, launching, ros2, VPN_TRAFFIC
 
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
 
@@ -53,10 +53,8 @@ def generate_launch_description():
 """
 
 #: Sees both topics under their own names, as a viewer that knows nothing of streams does.
-VIEWER = """
+VIEWER = VPN_TRAFFIC + """
 import json
-import os
-import re
 
 import rclpy
 from rclpy.qos import qos_profile_sensor_data
@@ -89,14 +87,8 @@ try:
     rclpy.spin(node)
 finally:
     both = [one for one in seen if one in taken]
-    traffic = 0
-    # .../launches/ID/dds.xml
-    interface = 'fog' + os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'].split('/')[-2]
-    for way in ('rx', 'tx'):
-        with open(f'/sys/class/net/{interface}/statistics/{way}_bytes') as file:
-            traffic += int(file.read())
     print('viewer says', json.dumps({
-        'seen': len(seen), 'both': len(both), 'traffic': traffic,
+        'seen': len(seen), 'both': len(both), 'traffic': vpn_traffic(),
         'same': all(seen[one] == taken[one] for one in both),
         'kinds': sorted(set(seen.values()))}), flush=True)
 """

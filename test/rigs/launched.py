@@ -17,6 +17,20 @@ from typing import Optional
 from fogros2.waiting import wait_until
 
 ROS2 = 'ros2'
+#: Part of a script that is a node: the bytes that the launch's VPN has carried.
+VPN_TRAFFIC = """
+import os
+from pathlib import Path
+
+
+def vpn_traffic():
+    # .../launches/ID/dds.xml
+    launch = next(os.environ[name] for name in (
+        'FASTRTPS_DEFAULT_PROFILES_FILE', 'CYCLONEDDS_URI', 'ZENOH_SESSION_CONFIG_URI')
+        if name in os.environ).split('/')[-2]
+    return sum(int(path.read_text()) for path in Path(
+        f'/sys/class/net/fog{launch}/statistics').glob('[rt]x_bytes'))
+"""
 
 
 def embedded() -> bool:
