@@ -53,6 +53,8 @@ class Check:
 _LOOKED_AT = ('container', 'hosted', 'joined', 'ssh')
 #: Receive buffer in bytes that releases of wireguard-go since 2023 request: several raw images.
 WIREGUARD_BUFFER = 7 << 20
+#: DDS participants that know each other within 10 s: see doc/developers/dds_network.md.
+PARTICIPANTS = 50
 #: Time-out of a provider's answer, in seconds.
 TIMEOUT = 8.0
 
@@ -377,6 +379,11 @@ def lan_peers(seconds: float) -> Check:
         counts = lan.participants(domain, seconds)
     except (ValueError, OSError) as error:
         return Check(name, 'warning', f'can not be looked for: {error}')
+    if (total := sum(counts.values())) > PARTICIPANTS:
+        return Check(name, 'warning', f'{total} participants answer in domain {domain}: more than '
+                     f'{PARTICIPANTS} of DDS find each other slowly',
+                     'put several nodes into one process (components), or use rmw_zenoh_cpp')
+    counts.pop(lan.HERE, None)
     if not counts:
         return Check(name, 'ok', f'no other computer answers in domain {domain}')
     hosts = ', '.join(f'{host} ({count})' for host, count in sorted(counts.items()))

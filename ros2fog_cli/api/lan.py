@@ -19,6 +19,7 @@ from fogros2 import process
 from fogros2.model import Command
 
 GROUP = '239.255.0.1'
+HERE = 'this computer'
 PORT_BASE, PORTS_PER_DOMAIN = 7400, 250
 #: Vendor id of the specification for an unknown vendor.
 _VENDOR = b'\x00\x00'
@@ -28,7 +29,7 @@ _SPDP_WRITER, _SPDP_READER = b'\x00\x01\x00\xc2', b'\x00\x01\x00\xc7'
 
 def participants(domain: int, seconds: float) -> dict[str, int]:
     """
-    Return the number of DDS participants of a domain at each other address.
+    Return the number of DDS participants of a domain at each address, of this computer at HERE.
 
     :param domain: ROS domain id.
     :param seconds: how long to wait for answers.
@@ -53,8 +54,8 @@ def participants(domain: int, seconds: float) -> dict[str, int]:
             except TimeoutError:
                 continue
             # The header is RTPS, version, vendor, then the sender's GUID prefix.
-            if data[:4] == b'RTPS' and len(data) >= 20 and host not in own:
-                prefixes_of.setdefault(host, set()).add(data[8:20])
+            if data[:4] == b'RTPS' and len(data) >= 20:
+                prefixes_of.setdefault(HERE if host in own else host, set()).add(data[8:20])
     return {host: len(prefixes) for host, prefixes in prefixes_of.items()}
 
 

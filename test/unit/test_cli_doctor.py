@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 from pathlib import Path
@@ -181,6 +182,19 @@ def test_participants_are_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     check = doctor.lan_peers(1)
     assert check.verdict == 'warning' and '10.1.2.3 (2)' in check.detail
+    monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE')
+    monkeypatch.setattr(lan, 'participants', lambda *_: {lan.HERE: doctor.PARTICIPANTS})
+    check = doctor.lan_peers(1)
+    assert check.verdict == 'ok' and 'no other computer' in check.detail
+
+
+def test_more_participants_than_find_each_other_soon_are_reported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(lan, 'participants', lambda domain, seconds: {
+        lan.HERE: doctor.PARTICIPANTS, '10.1.2.3': 1})
+    check = doctor.lan_peers(1)
+    assert check.verdict == 'warning' and f'{doctor.PARTICIPANTS + 1} participants' in check.detail
 
 
 _PEER = """
@@ -192,8 +206,8 @@ sys.stdin.read()
 """
 
 
-def test_participant_on_another_computer_is_found(tmp_path: Path) -> None:
-    """Two network namespaces on one wire: Cyclone DDS as it is out of the box in one of them."""
+def test_participants_here_and_on_another_computer_are_found(tmp_path: Path) -> None:
+    """Two network namespaces on one wire: Cyclone DDS as it is out of the box in both."""
     pytest.importorskip('cyclonedds', reason='this interpreter has no Cyclone DDS of its own')
     if os.geteuid() != 0:
         pytest.skip('network namespaces need root')
@@ -206,7 +220,7 @@ def test_participant_on_another_computer_is_found(tmp_path: Path) -> None:
 set -e
 ip link set lo up
 unshare -n sleep 60 & other=$!
-trap 'kill $other $peer 2>/dev/null || true' EXIT
+trap 'kill $other $peer $own 2>/dev/null || true' EXIT
 until [ "$(readlink /proc/$other/ns/net)" != "$(readlink /proc/self/ns/net)" ]; do :; done
 ip link add here type veth peer name there netns $other
 ip addr add 198.51.100.1/24 dev here
@@ -218,15 +232,18 @@ mkfifo {tmp_path}/hold {tmp_path}/up
 exec 3<>{tmp_path}/hold
 nsenter -t $other -n {sys.executable} -c "$1" <{tmp_path}/hold >{tmp_path}/up & peer=$!
 read -r _ <{tmp_path}/up
+{sys.executable} -c "$1" <{tmp_path}/hold >{tmp_path}/up & own=$!
+read -r _ <{tmp_path}/up
 {sys.executable} -c "$2"
 """)
     environment = {key: value for key, value in os.environ.items()
                    if key not in ('CYCLONEDDS_URI', 'ROS_DOMAIN_ID')}
     ask = ('from fogros2.waiting import wait_until; from ros2fog_cli.api import lan; '
-           'print(wait_until(lambda: lan.participants(0, 0.6) or None, timeout=60.0, what="it"))')
+           'print(wait_until(lambda: len(both := lan.participants(0, 0.6)) == 2 and both, '
+           'timeout=60.0, what="both"))')
     done = subprocess.run(['unshare', '-n', 'sh', str(script), _PEER, ask], text=True, timeout=60,
                           capture_output=True, env=environment, cwd=tmp_path)
-    assert done.stdout.strip() == "{'198.51.100.2': 1}", done.stderr
+    assert ast.literal_eval(done.stdout) == {'198.51.100.2': 1, lan.HERE: 1}, done.stderr
 
 
 def test_doctor_runs_in_any_thread() -> None:
