@@ -40,8 +40,8 @@ def captured(source: str, width: int, height: int) -> Iterator[Pixels]:
         read = 0
         try:
             while True:
-                there, picture = capture.read()
-                if not there:
+                readable, picture = capture.read()
+                if not readable:
                     break
                 frame = numpy.asarray(picture, numpy.uint8)
                 if device and not read:
@@ -65,8 +65,8 @@ class Camera(Node):
         width = int(self.declare_parameter('width', 640).value)
         height = int(self.declare_parameter('height', 480).value)
         rate = float(self.declare_parameter('rate', 30.0).value)
-        self.left = int(self.declare_parameter('count', 0).value)
-        self.counted = self.left > 0
+        self.remaining = int(self.declare_parameter('count', 0).value)
+        self.counted = self.remaining > 0
         self.frame_id = str(self.declare_parameter('frame_id', 'camera').value)
         self.frames = (synthetic(width, height, rate) if source == 'synthetic'
                        else captured(source, width, height))
@@ -92,8 +92,8 @@ class Camera(Node):
         self.images.publish(image)
         self.infos.publish(self.info)
         if self.counted:
-            self.left -= 1
-            if not self.left:
+            self.remaining -= 1
+            if not self.remaining:
                 raise SystemExit(0)
         self.next = next(self.frames)
 

@@ -29,7 +29,7 @@ def arguments(machine: str, name: str, second: str = '') -> list[DeclareLaunchAr
     :param name: default name of the machine.
     :param second: default name of the second machine; '': there is none.
     """
-    found = [
+    arguments = [
         DeclareLaunchArgument(
             'machine', default_value=machine, choices=['container', 'ssh', 'local'],
             description='where the cloud nodes run'),
@@ -45,12 +45,12 @@ def arguments(machine: str, name: str, second: str = '') -> list[DeclareLaunchAr
                  'machine:=ssh: how ROS 2 gets there: auto, apt, pip or none'),
     ]
     if second:
-        found += [
+        arguments += [
             argument(f'{SECOND}name', second, 'what the second machine is called'),
             argument(f'{SECOND}host', '', 'machine:=ssh: the second computer'),
             argument(f'{SECOND}host_key', '', 'machine:=ssh: its public host key'),
         ]
-    return found
+    return arguments
 
 
 def node(executable: str, *, which: str = '', **kwargs: Any) -> list[LaunchDescriptionEntity]:

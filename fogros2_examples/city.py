@@ -52,12 +52,12 @@ class City:
         start = numpy.array([1.0 + STRIDE * number, 2.0, HEIGHT])
         distance, brightness = self._hits(start, rays)
         distance += rng.normal(0, NOISE, distance.shape)
-        there = (distance < RANGE) & (rng.random(distance.shape) > LOST)
+        hit = (distance < RANGE) & (rng.random(distance.shape) > LOST)
         cloud = numpy.zeros(distance.shape, POINT)
         for name, ray in zip('xyz', rays):
-            cloud[name] = numpy.where(there, distance * ray, numpy.nan)
+            cloud[name] = numpy.where(hit, distance * ray, numpy.nan)
         shimmer = numpy.rint(brightness + rng.normal(0, SHIMMER, brightness.shape))
-        cloud['intensity'] = numpy.where(there, numpy.clip(shimmer, 0, 255), 0)
+        cloud['intensity'] = numpy.where(hit, numpy.clip(shimmer, 0, 255), 0)
         cloud['ring'] = numpy.arange(self.rows)[:, None]
         cloud['time'] = numpy.arange(self.columns) * (TURN / self.columns)
         return cloud

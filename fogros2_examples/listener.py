@@ -14,15 +14,15 @@ class Listener(Node):
 
     def __init__(self) -> None:
         super().__init__('listener')
-        self.left = self.declare_parameter('count', 0).value
+        self.remaining = self.declare_parameter('count', 0).value
         self.create_subscription(String, 'chatter', self.hear, 10)
 
     def hear(self, message: String) -> None:
         """Print a message."""
         self.get_logger().info(f'I heard: [{message.data}]')
-        if self.left:
-            self.left -= 1
-            if not self.left:
+        if self.remaining:
+            self.remaining -= 1
+            if not self.remaining:
                 raise SystemExit(0)
 
 

@@ -28,8 +28,8 @@ class Mesh:
     @property
     def corners(self) -> Floats:
         """The corners of the triangles, array (m, 3, 3)."""
-        found: Floats = self.vertices[self.triangles]
-        return found
+        corners: Floats = self.vertices[self.triangles]
+        return corners
 
     def moved(self, rotation: ArrayLike, translation: ArrayLike) -> Mesh:
         """Return the mesh rotated by a matrix (3, 3), then translated."""
@@ -112,8 +112,8 @@ def quaternion(matrix: Floats) -> Floats:
         [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], squares[2], m[1, 0] - m[0, 1]],
         [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], squares[3]]])
     row = rows[int(numpy.argmax(squares))]
-    found: Floats = row / numpy.linalg.norm(row)
-    return found
+    quaternion: Floats = row / numpy.linalg.norm(row)
+    return quaternion
 
 
 def turned(axis: Sequence[float], angle: float) -> Floats:

@@ -29,11 +29,11 @@ class Camera:
 
     def seen(self, points: Floats) -> tuple[Floats, Floats]:
         """Project points (..., 3) to pixels (..., 2), with integer centres; also return depths."""
-        there = (points - self.centre) @ self.rotation
-        depth = there[..., 2]
+        turned = (points - self.centre) @ self.rotation
+        depth = turned[..., 2]
         middle = numpy.array([(self.width - 1) / 2, (self.height - 1) / 2])
         with numpy.errstate(divide='ignore', invalid='ignore'):
-            return there[..., :2] / depth[..., None] * self.focal + middle, depth
+            return turned[..., :2] / depth[..., None] * self.focal + middle, depth
 
 
 def looking(at: ArrayLike, centre: ArrayLike, *, width: int, height: int, focal: float,
@@ -61,9 +61,9 @@ def drawn(camera: Camera, corners: Floats, nearest: float = 0.01,
     buffer = numpy.zeros((camera.height, camera.width), numpy.float64)  # 1 / depth
     index = numpy.full(buffer.shape, -1, numpy.int32)
     pixels, depths = camera.seen(corners)
-    there = numpy.asarray((depths > nearest).all(axis=1), bool)
-    low = numpy.ceil(numpy.where(there[:, None], pixels.min(axis=1), 0)).astype(int)
-    high = numpy.floor(numpy.where(there[:, None], pixels.max(axis=1), -1)).astype(int)
+    visible = numpy.asarray((depths > nearest).all(axis=1), bool)
+    low = numpy.ceil(numpy.where(visible[:, None], pixels.min(axis=1), 0)).astype(int)
+    high = numpy.floor(numpy.where(visible[:, None], pixels.max(axis=1), -1)).astype(int)
     low = numpy.maximum(low, 0)
     high = numpy.minimum(high, [camera.width - 1, camera.height - 1])
     for number in numpy.flatnonzero((high >= low).all(axis=1)):

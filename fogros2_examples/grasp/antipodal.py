@@ -164,7 +164,7 @@ def closed(seen: Surface, gripper: Gripper, centres: Floats, angles: Floats, tip
     for shift in (-breadth, 0.0, breadth):
         touched |= seen.at(seen.smooth, line + shift * side[:, None]) > tips[:, None]
     middle = seen.at(seen.smooth, line) > tips[:, None]
-    there = middle.any(axis=1)
+    touching = middle.any(axis=1)
     first = middle.argmax(axis=1)
     last = len(ways) - 1 - middle[:, ::-1].argmax(axis=1)
     # An obstacle outside the contacts blocks a finger on its way down or while it closes.
@@ -172,7 +172,7 @@ def closed(seen: Surface, gripper: Gripper, centres: Floats, angles: Floats, tip
     outside = touched & ((index < first[:, None] - 3) | (index > last[:, None] + 3))
     free = ~outside.any(axis=1) & (first * _STEP > CLEAR / 2) & (
         (len(ways) - 1 - last) * _STEP > CLEAR / 2)
-    return ways[first], ways[last], there & free & (last > first + 2)
+    return ways[first], ways[last], touching & free & (last > first + 2)
 
 
 def margin(seen: Surface, centres: Floats, angles: Floats, first: Floats, second: Floats,
@@ -200,8 +200,8 @@ def _steepest(seen: Surface, points: Floats, inward: Floats) -> Floats:
     ways = numpy.array([-0.003, -0.0015, 0.0, 0.0015, 0.003])
     slopes = seen.at(seen.slopes, points[:, None] + ways[:, None] * inward[:, None])
     chosen = (slopes * inward[:, None]).sum(axis=2).argmax(axis=1)
-    found: Floats = slopes[numpy.arange(len(points)), chosen].astype(float)
-    return found
+    steepest: Floats = slopes[numpy.arange(len(points)), chosen].astype(float)
+    return steepest
 
 
 def robust(seen: Surface, gripper: Gripper, centres: Floats, angles: Floats, tips: Floats,
@@ -214,8 +214,8 @@ def robust(seen: Surface, gripper: Gripper, centres: Floats, angles: Floats, tip
     friction = gripper.friction + random.normal(0, FRICTION, len(many))
     first, second, held = closed(seen, gripper, moved, turned_by, lowered)
     margins = held * margin(seen, moved, turned_by, first, second, friction)
-    found: Floats = margins.reshape(-1, perturbed).mean(axis=1)
-    return found
+    qualities: Floats = margins.reshape(-1, perturbed).mean(axis=1)
+    return qualities
 
 
 class Obstacle:

@@ -94,7 +94,7 @@ class GraspCamera(Node):
         if not self._warm_up(self._bin(self.seed)):
             self.get_logger().fatal(f'no depth image was answered in {self.wait:g} s')
             return 2
-        found, pictures = 0, []
+        solved, pictures = 0, []
         for number in range(self.trials) if self.trials else itertools.count():
             depth = self._bin(self.seed + number)
             begin = time.monotonic()
@@ -104,7 +104,7 @@ class GraspCamera(Node):
                 self.get_logger().error(f'bin {number}: no answer in {self.wait:g} s')
                 continue
             grasps = grasps_of(self.answers.pop(key))
-            found += bool(grasps)
+            solved += bool(grasps)
             best = f'q {grasps[0].quality:.2f}' if grasps else 'no grasp'
             self.get_logger().info(
                 f'bin {number}: {len(grasps)} grasps, {best}; {total:.3f} s, '
@@ -124,7 +124,7 @@ class GraspCamera(Node):
             else:
                 self.get_logger().error(f'{self.picture} can not be written')
                 return 1
-        return 0 if found == self.trials else 1
+        return 0 if solved == self.trials else 1
 
     def _bin(self, seed: int) -> NDArray[numpy.float32]:
         return depth_image(thrown(seed), self.eye, seed)

@@ -76,14 +76,14 @@ class GraspPlanner(Node):
             seen = surface(depth, (k[0], k[4]), (k[2], k[5]))
             grasps = plan(seen, self.gripper, samples=self.samples, perturbed=self.perturbed,
                           count=self.count)
-            said = f'{len(grasps)} grasps, the best of quality {grasps[0].quality:.2f}'
+            text = f'{len(grasps)} grasps, the best of quality {grasps[0].quality:.2f}'
             level = DiagnosticStatus.OK
         except (BadImage, NothingThere) as error:
-            said, level = f'no grasp: {error}', DiagnosticStatus.WARN
+            text, level = f'no grasp: {error}', DiagnosticStatus.WARN
         seconds = time.monotonic() - begin
         poses, markers = grasp_messages(grasps, image.header)
         stamp = image.header.stamp
-        self.tell(level, f'{said}; {seconds:.2f} s', {
+        self.tell(level, f'{text}; {seconds:.2f} s', {
             'stamp': f'{stamp.sec}.{stamp.nanosec:09d}', 'seconds': f'{seconds:.6f}'})
         self.markers.publish(markers)
         self.poses.publish(poses)

@@ -90,11 +90,11 @@ def _triangles(path: Path) -> tuple[Floats, Floats]:
             return triangles.astype(float) @ turn.T, counted @ turn.T
         import trimesh
 
-        found: Any = trimesh.load(path, force='mesh', process=False)
+        mesh: Any = trimesh.load(path, force='mesh', process=False)
     except ImportError as error:
         raise BadFile(f"{path} can't be read: {error}; pip install trimesh pycollada") from error
-    vertices = numpy.array(found.vertices, float)
-    return vertices[numpy.array(found.faces, int)].reshape(-1, 3, 3), vertices
+    vertices = numpy.array(mesh.vertices, float)
+    return vertices[numpy.array(mesh.faces, int)].reshape(-1, 3, 3), vertices
 
 
 def _mesh(path: Path, *, centred: bool) -> Mesh:

@@ -47,9 +47,9 @@ def spaced(path: Floats, apart: float) -> Floats:
     way = numpy.concatenate([[0.0], numpy.cumsum(
         numpy.linalg.norm(numpy.diff(fine[:, :3], axis=0), axis=1))])
     count = max(2, round(way[-1] / apart) + 1)
-    found: Floats = fine[[int(numpy.searchsorted(way, at))
+    poses: Floats = fine[[int(numpy.searchsorted(way, at))
                           for at in numpy.linspace(0, way[-1] - 1e-9, count)]]
-    return found
+    return poses
 
 
 def camera_of(scene: Scene, width: int, height: int) -> Camera:
@@ -112,14 +112,14 @@ def _covers(scene: Scene, corners: Floats) -> NDArray[numpy.bool_]:
     extent = scene.high - scene.low
     level = numpy.abs(normals[:, 2]) > 1.98 * area
     lowest = corners[:, :, 2].min(axis=1)
-    found = numpy.asarray(level & (lowest > scene.low[2] + 0.2 * extent[2]), bool)
+    covering = numpy.asarray(level & (lowest > scene.low[2] + 0.2 * extent[2]), bool)
     # The tops of walls are level too, but cover a small area.
     heights = numpy.rint(lowest / extent[2] * 1000)
-    for height in numpy.unique(heights[found]):
-        same = found & (heights == height)
+    for height in numpy.unique(heights[covering]):
+        same = covering & (heights == height)
         if area[same].sum() < 0.3 * extent[0] * extent[1]:
-            found &= ~same
-    return found
+            covering &= ~same
+    return covering
 
 
 def _draw_way(image: NDArray[numpy.uint8], depth: NDArray[numpy.float32], camera: Camera,

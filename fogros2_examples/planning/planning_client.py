@@ -88,16 +88,16 @@ class PlanningClient(Node):
         if not self._until(lambda: self.told is not None and self.told.hardware_id == scene.name):
             self.get_logger().fatal(f'no planner took the environment in {self.wait:g} s')
             return 2
-        found, path = 0, numpy.empty((0, 7))
+        solved, path = 0, numpy.empty((0, 7))
         for number in range(self.count) if self.count else itertools.count():
             answer = self._plan(scene, number)
             if len(answer):
-                found, path = found + 1, answer
+                solved, path = solved + 1, answer
                 if not self.count:
                     self._show(scene, path)
-        if found and not self._show(scene, path):
+        if solved and not self._show(scene, path):
             return 1
-        return 0 if found == self.count else 1
+        return 0 if solved == self.count else 1
 
     def _plan(self, scene: Scene, number: int) -> Floats:
         request = GetPlan.Request()

@@ -110,24 +110,24 @@ class Space:
         setup.setStartAndGoalStates(self._state(start), self._state(goal))
         space = setup.getSpaceInformation()
         setup.setPlanner(getattr(ompl.geometric, planner)(space))
-        asked = 0
+        calls = 0
 
         def give_up() -> bool:
-            nonlocal asked
-            asked += 1
-            return asked % 32 == 0 and time.monotonic() - begin > seconds
+            nonlocal calls
+            calls += 1
+            return calls % 32 == 0 and time.monotonic() - begin > seconds
 
         setup.solve(ompl.base.PlannerTerminationCondition(give_up))
         if not setup.haveExactSolutionPath():
             return ended('time')
-        found = setup.getSolutionPath()
+        path = setup.getSolutionPath()
         simplifier = ompl.geometric.PathSimplifier(space)
         # Limited by steps instead of time, so that a seed always finds the same path.
-        simplifier.reduceVertices(found)
-        simplifier.collapseCloseVertices(found)
-        simplifier.partialShortcutPath(found)
-        simplifier.reduceVertices(found)
-        return ended('found', numpy.array([_pose(state) for state in found.getStates()]))
+        simplifier.reduceVertices(path)
+        simplifier.collapseCloseVertices(path)
+        simplifier.partialShortcutPath(path)
+        simplifier.reduceVertices(path)
+        return ended('found', numpy.array([_pose(state) for state in path.getStates()]))
 
     def _valid(self, state: Any) -> bool:
         # Plain numbers, because arrays of three would take as long as FCL.

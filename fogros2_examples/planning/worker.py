@@ -52,7 +52,7 @@ def decoded(given: Mapping[str, Any]) -> Scene:
                  low, high, start, goal)
 
 
-def race(space: Space, asked: Mapping[str, Any]) -> Outcome:
+def race(space: Space, request: Mapping[str, Any]) -> Outcome:
     """
     Run a search per seed; return the first motion found, or a reason if none was found.
 
@@ -62,14 +62,14 @@ def race(space: Space, asked: Mapping[str, Any]) -> Outcome:
     """
     from fogros2_examples.planning.search import Outcome
 
-    start, goal = numpy.array(asked['start'], float), numpy.array(asked['goal'], float)
+    start, goal = numpy.array(request['start'], float), numpy.array(request['goal'], float)
     pipes: dict[int, int] = {}
-    for number, seed in enumerate(asked['seeds']):
-        planner = asked['planners'][number % len(asked['planners'])]
+    for number, seed in enumerate(request['seeds']):
+        planner = request['planners'][number % len(request['planners'])]
         read, write = os.pipe()
         child = os.fork()
         if not child:
-            _search(space, write, start, goal, asked['seconds'], seed, planner)
+            _search(space, write, start, goal, request['seconds'], seed, planner)
         os.close(write)
         pipes[read] = child
     texts = dict.fromkeys(pipes, b'')
@@ -89,10 +89,10 @@ def race(space: Space, asked: Mapping[str, Any]) -> Outcome:
                 _, status = os.waitpid(pipes.pop(read), 0)
                 if not texts[read]:
                     raise RuntimeError(f'a search ended with status {status} and no answer')
-                said = json.loads(texts[read])
-                found = Outcome(**{**said, 'path': numpy.array(said['path']).reshape(-1, 7)})
-                if best is None or found.end != 'time':
-                    best = found
+                fields = json.loads(texts[read])
+                outcome = Outcome(**{**fields, 'path': numpy.array(fields['path']).reshape(-1, 7)})
+                if best is None or outcome.end != 'time':
+                    best = outcome
     finally:
         for read, child in pipes.items():
             os.close(read)
@@ -122,14 +122,14 @@ def main() -> None:
     space: Optional[Space] = None
     with contextlib.suppress(BrokenPipeError, SystemExit):
         for line in sys.stdin:
-            asked = json.loads(line)
-            if 'scene' in asked:
-                space = Space(decoded(asked['scene']))
+            request = json.loads(line)
+            if 'scene' in request:
+                space = Space(decoded(request['scene']))
                 print(json.dumps({'ready': True}), flush=True)
                 continue
             if space is None:
                 raise RuntimeError('asked for a motion before there was a scene')
-            outcome = race(space, asked)
+            outcome = race(space, request)
             print(json.dumps({**dataclasses.asdict(outcome), 'path': outcome.path.tolist()}),
                   flush=True)
     os._exit(0)

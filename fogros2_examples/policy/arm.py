@@ -58,10 +58,10 @@ def expert(joints: Floats, target: Floats, times: Floats) -> Floats:
     far = numpy.maximum(numpy.linalg.norm(way, axis=-1), 1e-9)[..., None]
     brake = SLOWING * FASTEST
     cruise = numpy.maximum(far - brake, 0) / FASTEST
-    left = numpy.where(times < cruise, far - FASTEST * times,
-                       numpy.minimum(far, brake)
-                       * numpy.exp(-numpy.maximum(times - cruise, 0) / SLOWING))
-    turned: Floats = joints[..., None, :] + (1 - left / far)[..., None] * way[..., None, :]
+    remaining = numpy.where(times < cruise, far - FASTEST * times,
+                            numpy.minimum(far, brake)
+                            * numpy.exp(-numpy.maximum(times - cruise, 0) / SLOWING))
+    turned: Floats = joints[..., None, :] + (1 - remaining / far)[..., None] * way[..., None, :]
     return turned
 
 

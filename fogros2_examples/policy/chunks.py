@@ -96,8 +96,8 @@ class Queue:
             f'it lasts for more than {self.longest / SECOND:g} s': chunk.times[-1] > self.longest,
             'it is of the future': chunk.stamp > now,
             'all its actions are over': chunk.horizon < now}
-        for problem, found in problems.items():
-            if found:
+        for problem, present in problems.items():
+            if present:
                 raise ValueError(problem)
         self._newest = chunk.stamp
         self._chunks = [*self._chunks[1 - CHUNKS:], (chunk, now)]

@@ -81,12 +81,12 @@ class Onnx(Policy):
         # its releases send records of use to Microsoft unless this is set before the import
         os.environ.setdefault('ORT_DISABLE_TELEMETRY', '1')
         import onnxruntime
-        there = [name for name in providers if name in onnxruntime.get_available_providers()]
+        available = [name for name in providers if name in onnxruntime.get_available_providers()]
         options = onnxruntime.SessionOptions()
         # the decoders of the streams need the processor between two observations
         options.add_session_config_entry('session.intra_op.allow_spinning', '0')
         try:
-            self._session = onnxruntime.InferenceSession(model, options, providers=there)
+            self._session = onnxruntime.InferenceSession(model, options, providers=available)
         except Exception as error:
             raise BadPolicy(f'the ONNX model cannot be loaded: {error}') from error
         self._inputs = {one.name: one.shape for one in self._session.get_inputs()}

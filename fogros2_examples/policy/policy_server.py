@@ -110,12 +110,12 @@ class PolicyServer(Node):
 
     def answer(self) -> None:
         """Answer the newest observation, if there is a new one."""
-        if self.policy is None or (found := self.matcher.newest()) is None:
+        if self.policy is None or (observation := self.matcher.newest()) is None:
             return
-        state = found[STATE]
+        state = observation[STATE]
         try:
             actions = self.policy.infer({
-                **{name: self._seen(name, found[name]) for name in self.images},
+                **{name: self._seen(name, observation[name]) for name in self.images},
                 **{name: angles_of(state, joints) for name, joints in self.states.items()},
                 PROMPT: self.task})
             if actions.shape[1] != len(self.joints):

@@ -79,10 +79,10 @@ class Extractor:
 
     def extract(self, grey: Pixels) -> Features:
         """Return the features of an image (height, width), without depths."""
-        found = self._strong.detect(grey, None)
-        if len(found) < self._count // 2:
-            found = self._weak.detect(grey, None)
-        chosen, descriptors = self._strong.compute(grey, self._spread(found))
+        keypoints = self._strong.detect(grey, None)
+        if len(keypoints) < self._count // 2:
+            keypoints = self._weak.detect(grey, None)
+        chosen, descriptors = self._strong.compute(grey, self._spread(keypoints))
         if descriptors is None:
             return Features(numpy.empty((0, 2)), numpy.empty(0, numpy.int32),
                             numpy.empty((0, 32), numpy.uint8), numpy.empty(0))
@@ -91,10 +91,10 @@ class Extractor:
             numpy.array([point.octave for point in chosen], numpy.int32),
             numpy.asarray(descriptors, numpy.uint8), numpy.full(len(chosen), numpy.nan))
 
-    def _spread(self, found: Sequence[cv2.KeyPoint]) -> list[cv2.KeyPoint]:
+    def _spread(self, keypoints: Sequence[cv2.KeyPoint]) -> list[cv2.KeyPoint]:
         """Return the best features of each cell, at most ``count`` in total."""
-        places = numpy.array([point.pt for point in found]).reshape(-1, 2)
-        strength = numpy.array([point.response for point in found])
+        places = numpy.array([point.pt for point in keypoints]).reshape(-1, 2)
+        strength = numpy.array([point.response for point in keypoints])
         columns, rows = CELLS
         cell = (places[:, 0] * columns // self._camera.width
                 + columns * (places[:, 1] * rows // self._camera.height)).astype(int)
@@ -102,7 +102,8 @@ class Extractor:
         begins = numpy.searchsorted(cell[order], cell[order])
         rank = numpy.arange(len(order)) - begins
         # First the best of each cell, then the second best of each, and so on.
-        return [found[index] for index in order[numpy.argsort(rank, kind='stable')][:self._count]]
+        best = order[numpy.argsort(rank, kind='stable')][:self._count]
+        return [keypoints[index] for index in best]
 
 
 def with_depth(features: Features, image: NDArray[numpy.generic], camera: Camera) -> Features:
@@ -126,14 +127,14 @@ def with_pair(features: Features, left: Pixels, right: Pixels, camera: Camera) -
     begin = features.pixels.astype(numpy.float32)
     options: dict[str, Any] = {'winSize': WINDOW, 'criteria': (
         cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.02)}
-    there, found, _ = cv2.calcOpticalFlowPyrLK(
+    matched, status, _ = cv2.calcOpticalFlowPyrLK(
         left, right, begin, begin.copy(), maxLevel=COARSEST, **options)
     # For a correct match, tracking back ends within a pixel of the start.
     back, again, _ = cv2.calcOpticalFlowPyrLK(
-        right, left, there, begin.copy(), maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        right, left, matched, begin.copy(), maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         **options)
-    shift = begin - there
-    good = (found.ravel() > 0) & (again.ravel() > 0) & (numpy.abs(shift[:, 1]) < OFF_ROW) & (
+    shift = begin - matched
+    good = (status.ravel() > 0) & (again.ravel() > 0) & (numpy.abs(shift[:, 1]) < OFF_ROW) & (
         numpy.abs(back - begin).max(1) < 0.7) & (shift[:, 0] > 0.1)
     depths = numpy.full(len(features), numpy.nan)
     depths[good] = camera.fx * camera.baseline / shift[good, 0]

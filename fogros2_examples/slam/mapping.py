@@ -113,12 +113,12 @@ class Map:
 
     def around(self, keyframe: Keyframe) -> list[Keyframe]:
         """Return a keyframe and its neighbours in the graph, nearest first, at most ``LOCAL``."""
-        found, edge = {keyframe.number: None}, [keyframe.number]
-        while edge and len(found) < LOCAL:
+        nearby, edge = {keyframe.number: None}, [keyframe.number]
+        while edge and len(nearby) < LOCAL:
             edge = [other for number in edge for other in sorted(
-                self.keyframes[number].links, reverse=True) if other not in found]
-            found.update(dict.fromkeys(edge))
-        return [self.keyframes[number] for number in list(found)[:LOCAL]]
+                self.keyframes[number].links, reverse=True) if other not in nearby]
+            nearby.update(dict.fromkeys(edge))
+        return [self.keyframes[number] for number in list(nearby)[:LOCAL]]
 
     @staticmethod
     def points(keyframes: list[Keyframe]) -> Points:
@@ -153,9 +153,9 @@ class Map:
             return []
         known = numpy.concatenate([k.features.descriptors[k.telling] for k in candidates])
         owner = numpy.repeat(range(len(candidates)), [len(k.telling) for k in candidates])
-        asked = features.descriptors[::max(1, len(features) // TELLING)]
-        found = cv2.BFMatcher(cv2.NORM_HAMMING).match(asked, known)
-        votes = numpy.bincount([owner[f.trainIdx] for f in found
+        sample = features.descriptors[::max(1, len(features) // TELLING)]
+        matches = cv2.BFMatcher(cv2.NORM_HAMMING).match(sample, known)
+        votes = numpy.bincount([owner[f.trainIdx] for f in matches
                                 if f.distance <= matching.ALIKE], minlength=len(candidates))
         best = numpy.argsort(-votes, kind='stable')[:most]
         return [candidates[i] for i in best if votes[i] >= VOTES]

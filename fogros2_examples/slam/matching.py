@@ -27,10 +27,10 @@ def match(one: Pixels, two: Pixels) -> tuple[Indices, Indices]:
     """
     if not len(one) or len(two) < 2:
         return _chosen(*numpy.empty((3, 0), int))
-    found = numpy.array([(best.queryIdx, best.trainIdx, best.distance) for best, second
-                         in cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(one, two, 2)
-                         if best.distance < RATIO * second.distance]).reshape(-1, 3).astype(int)
-    return _chosen(*found.T)
+    matches = numpy.array([(best.queryIdx, best.trainIdx, best.distance) for best, second
+                            in cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(one, two, 2)
+                            if best.distance < RATIO * second.distance]).reshape(-1, 3).astype(int)
+    return _chosen(*matches.T)
 
 
 def match_near(one: Pixels, places: Array, two: Pixels, others: Array,

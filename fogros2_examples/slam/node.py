@@ -68,7 +68,7 @@ class SlamNode(Node):
         self.infos: dict[str, CameraInfo] = {}
         self.halves: dict[str, dict[int, Image]] = {'image': {}, 'depth': {}, 'right': {}}
         self.alone = 0
-        self.said = ''
+        self.reported = ''
         self.changed = False
         self.frame = ''
         self.poses = self.create_publisher(PoseStamped, 'pose', 10)
@@ -164,10 +164,10 @@ class SlamNode(Node):
         self._say(tracked.state, tracked.why)
         if tracked.pose is None:
             return
-        there = Header(stamp=header.stamp, frame_id=self.map_frame)
+        map_header = Header(stamp=header.stamp, frame_id=self.map_frame)
         pose = messages.pose(tracked.pose)
-        self.poses.publish(PoseStamped(header=there, pose=pose))
-        transform = TransformStamped(header=there, child_frame_id=header.frame_id)
+        self.poses.publish(PoseStamped(header=map_header, pose=pose))
+        transform = TransformStamped(header=map_header, child_frame_id=header.frame_id)
         at, to = pose.position, transform.transform.translation
         to.x, to.y, to.z = at.x, at.y, at.z
         transform.transform.rotation = pose.orientation
@@ -177,15 +177,15 @@ class SlamNode(Node):
     def _say(self, state: State, why: str) -> None:
         """Publish and log the state if it changed."""
         # Ignore numbers, which change with each image.
-        said = f'{state.value}: {why}' if why else state.value
-        kind = ''.join(letter for letter in said if not letter.isdigit())
-        if kind != self.said:
-            self.said = kind
-            self.states.publish(String(data=said))
+        text = f'{state.value}: {why}' if why else state.value
+        kind = ''.join(letter for letter in text if not letter.isdigit())
+        if kind != self.reported:
+            self.reported = kind
+            self.states.publish(String(data=text))
             if why and self.infos:
-                self.get_logger().warning(said)
+                self.get_logger().warning(text)
             else:
-                self.get_logger().info(said)
+                self.get_logger().info(text)
 
     def _show_map(self) -> None:
         """Publish path and points if they changed; points only if there is a subscriber."""

@@ -39,10 +39,10 @@ def draw(path: Path, result: Accuracy, trips: Sequence[float], furnished: bool) 
         for low, high, _ in FURNITURE:
             plan.add_patch(Rectangle(low[:2], high[0] - low[0], high[1] - low[1],
                                      facecolor='#edf0f4', edgecolor=FAINT, lw=0.8))
-    truth, found = result.truth[:, [a, b]], result.aligned[:, [a, b]]
+    truth, estimate = result.truth[:, [a, b]], result.aligned[:, [a, b]]
     plan.plot(*truth.T, color=FAINT, lw=5, solid_capstyle='round', label='ground truth')
     coloured = plan.add_collection(LineCollection(
-        numpy.stack([found[:-1], found[1:]], 1).tolist(), array=100 * result.errors[1:],
+        numpy.stack([estimate[:-1], estimate[1:]], 1).tolist(), array=100 * result.errors[1:],
         cmap='plasma', linewidths=2))
     coloured.set_clim(0, 100 * float(result.errors.max()))
     figure.colorbar(coloured, ax=plan, shrink=0.7, label='SLAM: distance from it (cm)')

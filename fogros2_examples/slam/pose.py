@@ -60,10 +60,10 @@ def solve(camera: Camera, points: Array, features: Features, least: int,
         vectors = {'rvec': cv2.Rodrigues(world[:3, :3])[0], 'tvec': world[:3, 3:].copy(),
                    'useExtrinsicGuess': True}
     cv2.setRNGSeed(1)
-    found, rotation, translation, inliers = cv2.solvePnPRansac(
+    solved, rotation, translation, inliers = cv2.solvePnPRansac(
         points, features.pixels, camera.matrix, None, iterationsCount=200,
         reprojectionError=LOOSE, confidence=0.999, flags=cv2.SOLVEPNP_EPNP, **vectors)
-    if not found or inliers is None or len(inliers) < least:
+    if not solved or inliers is None or len(inliers) < least:
         return None
     solution = refined(camera, points, features, inverse(from_vectors(rotation, translation)))
     return solution if solution.support >= least else None

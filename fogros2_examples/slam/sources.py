@@ -69,18 +69,18 @@ def dataset(folder: Path, count: int = 0) -> Source:
     :param count: maximum number of images, 0: all.
     :raises DatasetError: the folder is invalid; ``shots`` raises it for a missing image.
     """
-    found = tum.read(folder)
-    pairs = found.pairs[:count or None]
-    found = dataclasses.replace(found, pairs=pairs)
-    times = numpy.array([time for time, _ in found.truth])
+    sequence = tum.read(folder)
+    pairs = sequence.pairs[:count or None]
+    sequence = dataclasses.replace(sequence, pairs=pairs)
+    times = numpy.array([time for time, _ in sequence.truth])
 
     def shots() -> Iterator[Shot]:
-        for time, image, depth in found.frames():
+        for time, image, depth in sequence.frames():
             truth = None
             if len(times):
                 nearest = int(numpy.argmin(numpy.abs(times - time)))
                 if abs(times[nearest] - time) <= tum.APART:
-                    truth = found.truth[nearest][1]
+                    truth = sequence.truth[nearest][1]
             yield Shot(image, depth=depth, truth=truth)
 
-    return Source(found.camera, shots(), len(pairs))
+    return Source(sequence.camera, shots(), len(pairs))

@@ -91,19 +91,19 @@ class Slam:
             if image is not None and image.shape != size:
                 raise ValueError(f'an image of {image.shape[1]}x{image.shape[0]} from a camera '
                                  f'of {size[1]}x{size[0]}')
-        found = self._extractor.extract(grey)
+        features = self._extractor.extract(grey)
         if depth is not None:
-            found = front.with_depth(found, depth, self.camera)
+            features = front.with_depth(features, depth, self.camera)
         elif right is not None:
-            found = front.with_pair(found, grey, right, self.camera)
+            features = front.with_pair(features, grey, right, self.camera)
         if self._reference is None:
-            return self._start(stamp, found)
-        tracked = self._follow(stamp, found) if self.state is State.TRACKING else None
-        tracked = tracked or self._find(stamp, found)
+            return self._start(stamp, features)
+        tracked = self._follow(stamp, features) if self.state is State.TRACKING else None
+        tracked = tracked or self._find(stamp, features)
         if tracked is None:
             self.state, self._motion = State.LOST, numpy.eye(4)
-            return Tracked(stamp, State.LOST, found, why=(
-                f'{len(found)} features in the image' if len(found) < 2 * LEAST
+            return Tracked(stamp, State.LOST, features, why=(
+                f'{len(features)} features in the image' if len(features) < 2 * LEAST
                 else 'nothing known is in view'))
         self._track.append((stamp, self._reference, self._last))
         return tracked
@@ -130,41 +130,43 @@ class Slam:
         self._reference, self._last = keyframe, numpy.eye(4)
         return True
 
-    def _start(self, stamp: int, found: Features) -> Tracked:
-        deep = int(found.deep.sum())
+    def _start(self, stamp: int, features: Features) -> Tracked:
+        deep = int(features.deep.sum())
         if deep < DEEP:
-            return Tracked(stamp, State.STARTING, found, why=(
-                f'{len(found)} features in the image' if len(found) < DEEP
-                else f'{deep} of {len(found)} features have a depth'))
-        none = numpy.zeros(len(found), bool)
-        self._reference = self.map.add(stamp, numpy.eye(4), found, none)
+            return Tracked(stamp, State.STARTING, features, why=(
+                f'{len(features)} features in the image' if len(features) < DEEP
+                else f'{deep} of {len(features)} features have a depth'))
+        none = numpy.zeros(len(features), bool)
+        self._reference = self.map.add(stamp, numpy.eye(4), features, none)
         self.state = State.TRACKING
         self._track.append((stamp, self._reference, self._last))
         # The frame is a keyframe already, so all its features are known.
-        return Tracked(stamp, State.TRACKING, found, numpy.eye(4), known=~none)
+        return Tracked(stamp, State.TRACKING, features, numpy.eye(4), known=~none)
 
-    def _follow(self, stamp: int, found: Features) -> Optional[Tracked]:
+    def _follow(self, stamp: int, features: Features) -> Optional[Tracked]:
         """Search for the points near their predicted positions, then near their last ones."""
         assert self._reference is not None
         last = self._reference.pose @ self._last
         for guess, radius in ((last @ self._motion, RADIUS), (last, WIDE)):
-            tracked = self._at(stamp, found, guess, radius)
+            tracked = self._at(stamp, features, guess, radius)
             if tracked is not None and tracked.pose is not None:
                 self._motion = inverse(last) @ tracked.pose
                 return tracked
         return None
 
-    def _find(self, stamp: int, found: Features) -> Optional[Tracked]:
+    def _find(self, stamp: int, features: Features) -> Optional[Tracked]:
         """Search for the camera's place among all keyframes."""
-        for place in self.map.similar(found, set(), 3):
-            between = self.map.seen_from(place, found)
+        for place in self.map.similar(features, set(), 3):
+            between = self.map.seen_from(place, features)
             if between is not None:
                 self._reference = place
                 self._motion = numpy.eye(4)
-                return self._at(stamp, found, place.pose @ between, RADIUS)
+                return self._at(stamp, features, place.pose @ between, RADIUS)
         return None
 
-    def _at(self, stamp: int, found: Features, guess: Array, radius: float) -> Optional[Tracked]:
+    def _at(
+        self, stamp: int, features: Features, guess: Array, radius: float,
+    ) -> Optional[Tracked]:
         """Compute the camera's pose from an approximate one."""
         assert self._reference is not None
         around = self.map.around(self._reference)
@@ -175,18 +177,19 @@ class Slam:
         inside = ((pixels > -radius) & (
             pixels < numpy.array([self.camera.width, self.camera.height]) + radius)).all(1)
         ahead, pixels = ahead[inside], pixels[inside]
-        one, two = matching.match_near(points.descriptors[ahead], pixels, found.descriptors,
-                                       found.pixels, radius)
-        solution = solve(self.camera, points.places[ahead[one]], found.chosen(two), LEAST, guess)
+        one, two = matching.match_near(points.descriptors[ahead], pixels, features.descriptors,
+                                       features.pixels, radius)
+        solution = solve(self.camera, points.places[ahead[one]], features.chosen(two), LEAST,
+                         guess)
         if solution is None:
             return None
-        known = numpy.zeros(len(found), bool)
+        known = numpy.zeros(len(features), bool)
         known[two[solution.inliers]] = True
-        right = solution.inliers & found.deep[two]
-        depths = found.depths[two[right]]
+        right = solution.inliers & features.deep[two]
+        depths = features.depths[two[right]]
         self.map.refine(points, ahead[one[right]], moved(solution.pose, self.camera.lift(
-            found.pixels[two[right]], depths)), depths)
+            features.pixels[two[right]], depths)), depths)
         self._reference = min(around, key=lambda k: apart(k.pose, solution.pose))
         self._last = inverse(self._reference.pose) @ solution.pose
         self.state = State.TRACKING
-        return Tracked(stamp, State.TRACKING, found, solution.pose, known=known)
+        return Tracked(stamp, State.TRACKING, features, solution.pose, known=known)

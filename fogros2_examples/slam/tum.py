@@ -146,7 +146,7 @@ def _lines(path: Path, words: int) -> list[Line]:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f'{path}: {getattr(error, "strerror", None) or error}') from error
-    found = []
+    lines = []
     for number, line in enumerate(text.splitlines(), 1):
         parts = line.replace(',', ' ').split()
         if not parts or parts[0].startswith('#'):
@@ -154,10 +154,10 @@ def _lines(path: Path, words: int) -> list[Line]:
         where = f'{path}:{number}'
         if len(parts) < 1 + words:
             raise DatasetError(f'{where}: {len(parts)} words where {1 + words} belong')
-        found.append(Line(_number(parts[0], where), tuple(parts[1:]), where))
-    if not found:
+        lines.append(Line(_number(parts[0], where), tuple(parts[1:]), where))
+    if not lines:
         raise DatasetError(f'{path}: nothing in it')
-    return sorted(found, key=lambda line: line.time)
+    return sorted(lines, key=lambda line: line.time)
 
 
 def _number(word: str, where: str) -> float:
