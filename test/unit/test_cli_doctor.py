@@ -188,7 +188,7 @@ def test_participants_are_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert check.verdict == 'ok' and 'no other computer' in check.detail
 
 
-def test_more_participants_than_find_each_other_soon_are_reported(
+def test_more_participants_than_find_each_other_are_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(lan, 'participants', lambda domain, seconds: {
