@@ -33,6 +33,25 @@ def _remove(name: str) -> None:
 
 
 @contextlib.contextmanager
+def without_udp(name: str) -> Iterator[None]:
+    """Drop UDP between this computer and the containers of a test's own network."""
+    subnet = run(Command((
+        'podman', 'network', 'inspect', '--format', '{{range .Subnets}}{{.Subnet}}{{end}}', name),
+        sudo=True), timeout=30.0).stdout.strip()
+    table = f'inet {name}-udp'
+    rules = '\n'.join(
+        f'add chain {table} {hook} {{ type filter hook {hook} priority 0; }}\n'
+        f'add rule {table} {hook} ip {end} {subnet} meta l4proto udp drop'
+        for hook, end in (('output', 'daddr'), ('input', 'saddr')))
+    run(Command(('nft', '-f', '-'), sudo=True, input=f'add table {table}\n{rules}\n'.encode()),
+        timeout=30.0)
+    try:
+        yield
+    finally:
+        run(Command(('nft', 'delete', 'table', *table.split()), sudo=True), timeout=30.0)
+
+
+@contextlib.contextmanager
 def network(
     subnets: Sequence[str], options: Callable[[str], Sequence[str]] = lambda subnet: (),
 ) -> Iterator[tuple[str, str]]:

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches whose UDP is blocked: their VPN goes by the connection of the machine's shell."""
+
+from __future__ import annotations
+
+import shutil
+import uuid
+
+import pytest
+
+from fogros2.deploy import Launch
+from fogros2.errors import VpnError
+from fogros2.model import MachineSpec
+from fogros2.report import StepDone
+from fogros2.waiting import Timeouts, wait_until
+from fogros2_features.vpn_path import feature
+from rigs.bare_computer import bare_computer
+from rigs.launched import launching, ros2
+from rigs.networks import without_udp
+
+pytestmark = [
+    pytest.mark.usefixtures('nothing_left'),
+    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
+]
+
+#: Other runs of these tests may be under way on the same computer.
+RUN = uuid.uuid4().hex[:6]
+
+
+@pytest.fixture
+def spec(cloud_network):
+    def make(path='auto'):
+        return MachineSpec(f'path-{RUN}', 'container', {'network': cloud_network},
+                           features={'vpn_path': {'vpn_path': path}})
+    return make
+
+
+def test_vpn_leaves_udp_and_returns(cloud_network, spec, monkeypatch):
+    # nobody here has the time of a network
+    for name in ('MISSING', 'WORKING', 'SHORTEST'):
+        monkeypatch.setattr(feature, name, 3.0)
+    events = []
+    launch = Launch(report=events.append)
+
+    def paths():
+        return [event.detail for event in events
+                if isinstance(event, StepDone) and event.step == 'VPN path']
+
+    def answers(path):
+        wait_until(lambda: paths() == path and machine.heartbeat.age < 1.0, timeout=60.0,
+                   what=f'the path {path}')
+        return ros2('fog', 'status', machine.spec.name).stdout
+
+    try:
+        with without_udp(cloud_network):
+            machine = launch.up(spec())
+            assert 'VPN path    stream\n' in answers(['stream'])
+        assert 'VPN path    udp\n' in answers(['stream', 'udp'])
+        with without_udp(cloud_network):
+            assert 'VPN path    stream\n' in answers(['stream', 'udp', 'stream'])
+    finally:
+        assert launch.down() == []
+
+
+def test_udp_alone_fails_and_names_the_remedy(cloud_network, spec):
+    launch = Launch(timeouts=Timeouts(vpn=5.0))
+    try:
+        with without_udp(cloud_network), pytest.raises(VpnError, match="vpn_path='auto'"):
+            launch.up(spec('udp'))
+    finally:
+        assert launch.down() == []
+
+
+def test_nodes_on_a_host_hear_each_other(cloud_network, tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    with bare_computer(f'fogt-path-{RUN}', tmp_path / 'computer', cloud_network) as computer, \
+            without_udp(cloud_network), launching() as start:
+        run = start('fogros2_examples', 'talker.ssh.launch.py', *(
+            f'{name}:={value}' for name, value in {
+                'host': computer.address, 'user': computer.user, 'key': computer.key,
+                'host_key': computer.host_key, 'name': f'path-{RUN}', 'bootstrap': 'pip',
+                'count': 2}.items()))
+        assert run.ended() == 0, run.text
+    assert f'I heard: [Hello World from {computer.name}' in run.text
+    assert 'VPN path' in run.text and run.clean, run.text
