@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 import contextlib
 from pathlib import Path
 import socket
@@ -67,13 +67,16 @@ class Trial:
 
     :param endpoint: ``host:port`` of the machine's WireGuard, None if the robot can't dial it.
     :param answer: called with what came by UDP.
+    :param pause: seconds before the first attempt; each further pause is twice as long.
     """
 
-    def __init__(self, endpoint: Optional[str], answer: Any) -> None:
+    def __init__(
+        self, endpoint: Optional[str], answer: Callable[[bytes], object], pause: float,
+    ) -> None:
         self._answer = answer
         self._link: Optional[socket.socket] = None
-        self._pause = SHORTEST
-        self._next = time.monotonic() + SHORTEST
+        self._pause = pause
+        self._next = time.monotonic() + pause
         self._began: Optional[float] = None
         self._last = 0.0
         with contextlib.suppress(OSError):  # a name that is unknown without a network
@@ -97,8 +100,8 @@ class Trial:
             return 0.0
         if now - max(self._next, self._last) > TRIAL:
             self._began = None
-            self._next = now + self._pause
             self._pause = min(2 * self._pause, LONGEST)
+            self._next = now + self._pause
         return now - self._began if self._began is not None else 0.0
 
     def _listen(self) -> None:
@@ -139,6 +142,8 @@ class Way:
         self._carrier: Optional[Carrier] = None
         self._trial: Optional[Trial] = None
         self._path = UDP
+        #: Longer after each return to UDP, which may work for a while only.
+        self._pause = SHORTEST
         self._stop = threading.Event()
         self._lock = threading.Lock()
         self._looking = threading.Lock()
@@ -177,8 +182,9 @@ class Way:
             if target == STREAM and self._carrier is None:
                 self._open()
             elif target != self._path:
-                self._use(target, '')
+                self._use(UDP, '')
                 self._end()
+                self._pause = min(2 * self._pause, LONGEST)
         except FogError as error:
             self._link.advise(f'the stream in place of UDP failed: {error}')
             self._end()
@@ -218,7 +224,7 @@ class Way:
         if stream.readline() != carrier.READY:
             raise ShellError(f"'{link.spec.name}' does not run the program that carries the VPN")
         trial = Trial(link.direct if self._own == AUTO else None,
-                      lambda data: carried.deliver(data))
+                      lambda data: carried.deliver(data), self._pause)
         self._push(trial.close)
         carried = Carrier(link.robot_port, stream.write, stream.readline, trial.copy, (FogError,))
         self._push(carried.close)
@@ -226,7 +232,7 @@ class Way:
         self._carrier, self._trial = carried, trial
         self._use(STREAM, host_port(*carried.address))
 
-    def _push(self, undo: Any) -> None:
+    def _push(self, undo: Callable[[], object]) -> None:
         with self._lock:
             self._undo.callback(undo)
             if self._stop.is_set():

@@ -11,6 +11,7 @@ import pytest
 from fogros2.deploy import Launch
 from fogros2.errors import VpnError
 from fogros2.model import MachineSpec
+from fogros2.provider.container import root as container_root
 from fogros2.report import StepDone
 from fogros2.waiting import Timeouts, wait_until
 from fogros2_features.vpn_path import feature
@@ -25,6 +26,18 @@ pytestmark = [
 
 #: Other runs of these tests may be under way on the same computer.
 RUN = uuid.uuid4().hex[:6]
+
+LAUNCH = """
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    return FogROSLaunchDescription([
+        CloudNode(machine=ContainerInstance(name='{name}', network='{network}'),
+                  package='fogros2_examples', executable='talker'),
+        Node(package='fogros2_examples', executable='listener', output='screen')])
+"""
 
 
 @pytest.fixture
@@ -71,15 +84,28 @@ def test_udp_alone_fails_and_names_the_remedy(cloud_network, spec):
         assert launch.down() == []
 
 
-def test_nodes_on_a_host_hear_each_other(cloud_network, tmp_path, monkeypatch):
+def test_nodes_of_a_machine_are_heard(cloud_network, tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-    with bare_computer(f'fogt-path-{RUN}', tmp_path / 'computer', cloud_network) as computer, \
-            without_udp(cloud_network), launching() as start:
-        run = start('fogros2_examples', 'talker.ssh.launch.py', *(
-            f'{name}:={value}' for name, value in {
-                'host': computer.address, 'user': computer.user, 'key': computer.key,
-                'host_key': computer.host_key, 'name': f'path-{RUN}', 'bootstrap': 'pip',
-                'count': 2}.items()))
+    path = tmp_path / 'nodes.launch.py'
+    path.write_text(LAUNCH.format(name=f'path-{RUN}', network=cloud_network))
+    with without_udp(cloud_network), launching() as start:
+        run = start(str(path))
+        run.wait_for(f'I heard: [Hello World from path-{RUN} ', times=2)
+        run.interrupt()
         assert run.ended() == 0, run.text
-    assert f'I heard: [Hello World from {computer.name}' in run.text
     assert 'VPN path' in run.text and run.clean, run.text
+
+
+def test_host_of_a_user_is_reached(cloud_network, tmp_path):
+    with bare_computer(
+            f'fogt-path-{RUN}', tmp_path / 'computer', cloud_network,
+            mounts=container_root.environment_mounts(None)) as computer, \
+            without_udp(cloud_network):
+        launch = Launch()
+        try:
+            machine = launch.up(MachineSpec(f'path-{RUN}', 'ssh', {
+                'host': computer.address, 'user': computer.user, 'key': str(computer.key),
+                'host_key': computer.host_key}, bootstrap='none'))
+            assert launch.store.load(machine.spec.name).carried == 'stream'
+        finally:
+            assert launch.down() == []
