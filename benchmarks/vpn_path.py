@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-H.264 images over 10 Mbit/s to a container machine whose VPN goes by UDP, and by its SSH connection.
+H.264 images over 10 Mbit/s to a container machine whose VPN goes by UDP, and by SSH.
 
 All packets between the two hosts go through a program, which limits the rate both ways, and in two
 cases delays and loses packets of both protocols. ``--count`` is the number of images of a case.

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
+r"""
 Carry the datagrams of a WireGuard interface in a stream of bytes, at both of its ends.
 
 The robot has one end, and sends the source to the machine, which runs it as the other. So it uses
-only the standard library. Each end exchanges datagrams with the interface of its host, at loopback.
+only the standard library. At its host's loopback, each end exchanges datagrams with the interface.
 
-A line of the stream is a letter and a text, in which ``\\\\e`` is a backslash and ``\\\\n`` a
-newline: about 1 % more bytes. ``d`` has a datagram, ``c`` the number of bytes of lines with
-datagrams that have arrived so far. An end sends no more than its :class:`Window` admits before it
-gets these numbers. Its datagrams wait in a :class:`Queue`, where new ones displace the oldest.
+A line of the stream is a letter and a text, in which ``\e`` is a backslash and ``\n`` a newline:
+about 1 % more bytes. ``d`` has a datagram, ``c`` the number of bytes of lines with datagrams that
+have arrived so far. An end sends no more than its :class:`Window` admits before it gets these
+numbers. Its datagrams wait in a :class:`Queue`, where new ones displace the oldest.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ class Carrier:
         errors: tuple[type[BaseException], ...] = (),
     ) -> None:
         self._write, self._readline, self._copy = write, readline, copy
-        self._errors = (OSError, ValueError, *errors)
+        self._errors: tuple[type[BaseException], ...] = (OSError, ValueError, *errors)
         self.window = Window()
         self.queue = Queue()
         self._changed = threading.Condition()

@@ -548,6 +548,7 @@ class Members:
         member.up(self.robot)
         self.robot.admit(member)
         self.robot.spread(member)
+        return member
 
 
 @pytest.fixture
@@ -575,6 +576,30 @@ def test_everybody_knows_of_a_new_machine_when_it_is_up(members):
     assert members.told[-2:] in (
         [('m2', ['m3', 'm4', 'robot']), ('m3', ['m2', 'm4', 'robot'])],
         [('m3', ['m2', 'm4', 'robot']), ('m2', ['m3', 'm4', 'robot'])])
+
+
+def test_robot_alone_uses_a_relay(members, monkeypatch):
+    dialled = []
+    peers = FakeVpn.peers
+
+    def recorded(self, interface, to):
+        dialled.append([peer.endpoint for peer in to])
+        return peers(self, interface, to)
+
+    first = members.add(2)
+    monkeypatch.setattr(FakeVpn, 'peers', recorded)
+    members.robot.dial(first, '127.0.0.1:4', anew=True)
+    # without the machine, its handshake begins again at once
+    assert dialled == [[], ['127.0.0.1:4']]
+    second = members.add(3)
+    assert dialled[2] == ['127.0.0.1:4', 'm3:1']
+    assert [peer.endpoint for peer in members.robot.peers_of(second)] == [None, 'm2:1']
+    members.robot.dial(first, '', anew=False)
+    assert dialled[-1] == ['m2:1', 'm3:1']
+    members.robot.remove('m2')
+    before = len(dialled)
+    members.robot.dial(first, '127.0.0.1:5', anew=False)
+    assert len(dialled) == before
 
 
 def test_port_without_ssh_is_reported_soon(launch, provider, monkeypatch):
