@@ -30,7 +30,7 @@ FIRST, MISSING = 3.0, 10.0
 WORKING = 10.0
 #: Seconds for which packets are sent by both paths until UDP answers: a heartbeat is among them.
 #: Seconds until the next attempt, at first and at the most.
-TRIAL, SHORTEST, LONGEST = 2.5, 5.0, 300.0
+TRIAL, SHORTEST, LONGEST = 2.5, 5.0, 60.0
 #: Seconds without progress after which a stream is opened anew.
 STALLED = 5.0
 #: Seconds for an attempt to open it, and between two attempts.
@@ -185,7 +185,7 @@ class Way:
                 self._use(UDP, '')
                 self._end()
                 self._pause = min(2 * self._pause, LONGEST)
-        except FogError as error:
+        except (FogError, OSError) as error:
             self._link.advise(f'the stream in place of UDP failed: {error}')
             self._end()
             if self._own == AUTO and self._path == STREAM:

@@ -193,6 +193,6 @@ class Arming(Step):
             raise VpnError(
                 f"nothing comes back from '{job.name}' through the VPN",
                 '; '.join([f'is UDP port {job.interface.port} open on the way there?',
-                           *dict.fromkeys(job.advice)])) from error
+                           *job.advice])) from error
         if job.rearming is not None:
             job.rearming.close()

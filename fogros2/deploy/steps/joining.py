@@ -158,7 +158,6 @@ class RobotLink(Step):
         self.robot_port = context.vpn.interface.port
         self.direct = member.route.peer.endpoint
         self.step = job.step
-        self.advise = job.advice.append
 
     @property
     def outside(self) -> Optional[Endpoint]:
@@ -174,6 +173,11 @@ class RobotLink(Step):
         """Seconds since the last answer through the VPN, None before the first."""
         heartbeat = getattr(self._job, 'heartbeat', None)
         return heartbeat.age if heartbeat is not None else None
+
+    def advise(self, remedy: str) -> None:
+        """Add to the error for a machine from which nothing has come back."""
+        if remedy not in self._job.advice:
+            self._job.advice.append(remedy)
 
     def dial(self, relay: str, carried: str) -> None:
         """Let the robot's end send to a relay on this computer, '' for the machine itself."""
