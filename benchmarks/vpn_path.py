@@ -163,7 +163,8 @@ def main() -> None:
     if os.geteuid():
         print('not measured: the link between two hosts needs root')
         return None
-    from figures import Row, write
+    from figures import machine as computer
+    from figures import RESULTS, Row, write
 
     outcomes = {path: measure(path, arguments.count) for path in NAMES}
     rows = []
@@ -177,7 +178,8 @@ def main() -> None:
             f"{NAMES['stream']} over UDP{name}: median",
             outcomes['stream'][name].median / outcomes['udp'][name].median, '',
             None if name else 2.0))
-    write('vpn_path', 'H.264 over 10 Mbit/s, the VPN by UDP and by the SSH connection', rows)
+    write('vpn_path', 'H.264 over 10 Mbit/s, the VPN by UDP and by the SSH connection', rows, RESULTS,
+          f'{computer()}, {arguments.count} images of each')
     return None
 
 
