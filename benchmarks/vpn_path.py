@@ -178,8 +178,8 @@ def main() -> None:
             f"{NAMES['stream']} over UDP{name}: median",
             outcomes['stream'][name].median / outcomes['udp'][name].median, '',
             None if name else 2.0))
-    write('vpn_path', 'H.264 over 10 Mbit/s, the VPN by UDP and by the SSH connection', rows, RESULTS,
-          f'{computer()}, {arguments.count} images of each')
+    write('vpn_path', 'H.264 over 10 Mbit/s, the VPN by UDP and by the SSH connection', rows,
+          RESULTS, f'{computer()}, {arguments.count} images of each')
     return None
 
 
