@@ -37,8 +37,8 @@ STALLED = 5.0
 OPENING, PAUSE = 10.0, 2.0
 #: Seconds that the end waits for an attempt to open a stream.
 ENDING = 2.0
-#: Seconds between two decisions.
-INTERVAL = 0.1
+#: Seconds between two decisions, and while UDP works.
+INTERVAL, STEADY = 0.1, 1.0
 
 
 def choose(own: str, path: str, *, answered: bool, silence: float, working: float) -> str:
@@ -192,7 +192,7 @@ class Way:
                 with contextlib.suppress(FogError):  # tried again
                     self._use(UDP, '')
             return PAUSE
-        return None
+        return STEADY if self._path == UDP and age is not None else None
 
     def _use(self, path: str, relay: str) -> None:
         with self._link.step('VPN path') as detail:
