@@ -102,6 +102,15 @@ def test_low_traffic_does_not_lower_the_rate():
     assert link.window.rate > 1e6
 
 
+def test_other_end_frees_no_more_than_was_sent():
+    window = Window()
+    for number in range(10):
+        window.sent(1000, float(number), more=True)
+    for total, under_way in ((-1, 10_000), (999, 10_000), (2500, 8000), (10 ** 30, 0), (0, 0)):
+        window.arrived(total, 20.0)
+        assert window.under_way == under_way
+
+
 @pytest.mark.parametrize(('own', 'path', 'answered', 'silence', 'working', 'expected'), [
     ('auto', 'udp', False, 2.9, 0.0, 'udp'),
     ('auto', 'udp', False, 3.1, 0.0, 'stream'),
