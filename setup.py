@@ -140,6 +140,7 @@ setup(
             'replacement = fogros2_features.replacement:Replacement',
             'results = fogros2_features.results:Results',
             'streams = fogros2_features.streams:Streaming',
+            'vpn_path = fogros2_features.vpn_path:VpnPath',
         ],
         'fogros2.monitor': [
             'foxglove = fogros2_monitor:FOXGLOVE',

@@ -563,7 +563,7 @@ def main() -> None:
     scenarios = SCENARIOS + (app_scenarios(arguments.ompl_app) if arguments.ompl_app else [])
     from figures import machine as computer
     from figures import today
-    from streaming import Link
+    from streaming import Link, UDP
 
     from fogros2.deploy import Launch
     from fogros2.model import MachineSpec
@@ -576,7 +576,8 @@ def main() -> None:
     launch = Launch()
     link: Optional[Link] = None
     try:
-        machine = launch.up(MachineSpec(f'bench-applications-{os.getpid()}', 'container'))
+        machine = launch.up(MachineSpec(
+            f'bench-applications-{os.getpid()}', 'container', features=UDP))
         prepare(machine)
         link = Link(launch, machine)
         jobs = [measured(scenario, arguments.short, launch, machine, link)

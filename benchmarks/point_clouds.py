@@ -25,7 +25,7 @@ import tempfile
 import time
 from typing import Any
 
-from streaming import answer_of, end, FOLDER, Link, Output
+from streaming import answer_of, end, FOLDER, Link, Output, UDP
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
@@ -405,7 +405,7 @@ def main() -> None:
     launch = Launch()
     link = None
     try:
-        machine = launch.up(MachineSpec('bench-points', 'container'))
+        machine = launch.up(MachineSpec('bench-points', 'container', features=UDP))
         prepare(machine)
         output = Output()
         machine.subscribe(output.heard)

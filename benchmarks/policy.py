@@ -28,7 +28,18 @@ import time
 from typing import Any, Optional
 
 from applications import prepare, words
-from streaming import answer_of, codec_alone, end, FOLDER, frames, hop_alone, Link, Output, shown
+from streaming import (
+    answer_of,
+    codec_alone,
+    end,
+    FOLDER,
+    frames,
+    hop_alone,
+    Link,
+    Output,
+    shown,
+    UDP,
+)
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
@@ -361,7 +372,8 @@ def main() -> None:
     launch = Launch()
     link: Optional[Link] = None
     try:
-        machine = launch.up(MachineSpec(f'bench-policy-{os.getpid()}', 'container'))
+        machine = launch.up(MachineSpec(
+            f'bench-policy-{os.getpid()}', 'container', features=UDP))
         prepare(machine)
         for path in (HERE / 'policy.py', HERE / 'applications.py', HERE / 'streaming.py',
                      *sorted((HERE / 'figures').glob('*.py'))):

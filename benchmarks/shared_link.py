@@ -23,7 +23,7 @@ from figures import machine as computer
 from figures import RESULTS, Row, write
 import point_clouds
 import streaming
-from streaming import answer_of, end, FOLDER, HERE, Link, Output, ROOT
+from streaming import answer_of, end, FOLDER, HERE, Link, Output, ROOT, UDP
 
 LINK = 40e6
 LINK_TOPIC = '/fogros2/machine/link_in'
@@ -150,7 +150,7 @@ def main() -> None:
     launch = Launch()
     with contextlib.ExitStack() as stack:
         stack.callback(lambda: [print(error, file=sys.stderr) for error in launch.down()])
-        machine = launch.up(MachineSpec('bench-link', 'container'))
+        machine = launch.up(MachineSpec('bench-link', 'container', features=UDP))
         point_clouds.prepare(machine)
         output = Output()
         machine.subscribe(output.heard)

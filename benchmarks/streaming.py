@@ -39,6 +39,8 @@ FOLDER = '/tmp/fogros2-bench'
 VIDEO = f'{FOLDER}/video'
 RATE = 30.0
 LINK = 10e6
+#: The features of a machine behind a :class:`Link`, whose packets must not leave it.
+UDP = {'vpn_path': {'vpn_path': 'udp'}}
 #: Settings of DDS for nodes on this computer alone. A launch's own are for its domain.
 THIS_COMPUTER = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_DOMAIN_ID': '83'}
 #: Frames rendered, and of those that arrive, how many apart are held against the original.
@@ -674,7 +676,7 @@ def main() -> None:
     launch = Launch()
     link: Optional[Link] = None
     try:
-        machine = launch.up(MachineSpec('bench-streaming', 'container'))
+        machine = launch.up(MachineSpec('bench-streaming', 'container', features=UDP))
         prepare(machine, arguments.video)
         output = Output()
         machine.subscribe(output.heard)

@@ -16,7 +16,7 @@ import threading
 from typing import Any, ClassVar, Optional, Protocol
 
 from fogros2 import plugin_system
-from fogros2.model import Command, Machine, MachineSpec, NodeSpec, VpnInterface
+from fogros2.model import Command, Endpoint, Machine, MachineSpec, NodeSpec, VpnInterface
 from fogros2.shell import Shell
 from fogros2.store import Record
 
@@ -82,6 +82,43 @@ class RunningMachine(Protocol):
 
     def lose_after(self, seconds: float) -> None:
         """Count a silent machine as lost after this time, even if its provider says it runs."""
+
+
+class VpnLink(Protocol):
+    """
+    The robot's end of the VPN to a machine, and what it takes to carry packets between the two.
+
+    :ivar port: UDP port of the machine's end there; ``robot_port`` is the port of the robot's.
+    :ivar direct: ``host:port`` of the machine's end, None if the machine dials the robot.
+    """
+
+    spec: MachineSpec
+    port: int
+    robot_port: int
+    direct: Optional[str]
+
+    @property
+    def outside(self) -> Optional[Endpoint]:
+        """How a shell reaches the machine without the VPN, None if that is closed."""
+
+    @property
+    def silence(self) -> Optional[float]:
+        """Seconds since the last answer through the VPN, None before the first."""
+
+    def dial(self, relay: str, carried: str) -> None:
+        """
+        Let the robot's end send to a relay on this computer from now on.
+
+        :param relay: ``host:port``, '' for the machine's end itself.
+        :param carried: what carries the packets in place of UDP, for ``ros2 fog status``.
+        :raises FogError: the robot's end can't be changed.
+        """
+
+    def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
+        """Report a step around a block, which may append details to the list that it gets."""
+
+    def advise(self, remedy: str) -> None:
+        """Add to the error for a machine from which nothing has come back."""
 
 
 class LaunchedMachine(Protocol):
@@ -264,6 +301,15 @@ class Feature:
     def beside(self, spec: MachineSpec, own: Any) -> Sequence[NodeSpec]:
         """Return programs that run on the machine beside its nodes, from its first node on."""
         return ()
+
+    def vpn(self, link: VpnLink, own: Any) -> contextlib.AbstractContextManager[Any]:
+        """
+        Return a context that is entered before the first packet goes through a machine's VPN.
+
+        It is left when the machine's agent has released it. It is not entered for a machine in
+        another robot's VPN.
+        """
+        return contextlib.nullcontext()
 
     def machine(self, running: RunningMachine, own: Any) -> contextlib.AbstractContextManager[Any]:
         """

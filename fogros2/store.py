@@ -161,6 +161,7 @@ class Record:
     :param vpn: the machine's own VPN interface.
     :param public_key: the machine's VPN public key.
     :param robot_vpn: the robot's VPN interface.
+    :param carried: what carries the packets of its VPN in place of UDP, '' for nothing.
     :param agent: the agent's folder on the machine.
     :param monitor: TCP port of its Foxglove bridge, 0 for none.
     :param monitor_open: where external clients reach that bridge (``host:port``), '' if they
@@ -188,6 +189,7 @@ class Record:
     vpn: Optional[VpnInterface] = None
     public_key: str = ''
     robot_vpn: Optional[VpnInterface] = None
+    carried: str = ''
     agent: str = ''
     agent_program: str = ''
     monitor: int = 0

@@ -35,6 +35,7 @@ def arguments(machine: str, name: str, second: str = '') -> list[DeclareLaunchAr
             description='where the cloud nodes run'),
         argument('name', name, 'what the machine is called'),
         argument('on_exit', 'delete', 'what becomes of it: delete, stop or keep'),
+        argument('vpn_path', 'auto', "how the VPN's packets travel: auto, udp or stream"),
         argument('network', '', "machine:=container: its network; '' for the engine's own"),
         argument('host', '', 'machine:=ssh: name or address of the computer'),
         argument('user', '', 'machine:=ssh: login user there'),
@@ -66,7 +67,8 @@ def node(executable: str, *, which: str = '', **kwargs: Any) -> list[LaunchDescr
     def own(argument: str) -> LaunchConfiguration:
         return LaunchConfiguration(f'{which}{argument}')
 
-    common: dict[str, Any] = {'name': own('name'), 'on_exit': LaunchConfiguration('on_exit')}
+    common: dict[str, Any] = {'name': own('name'), **{
+        word: LaunchConfiguration(word) for word in ('on_exit', 'vpn_path')}}
     container = ContainerInstance(network=LaunchConfiguration('network'), **common)
     computer = SSHInstance(
         host=own('host'), user=LaunchConfiguration('user'), port=LaunchConfiguration('port'),

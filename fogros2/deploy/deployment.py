@@ -86,6 +86,12 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
             job, ros_step, vpn_step, dds_step,
             pool.submit(installing.send_workspaces, context, job, ros, ros_step.result),
             pool.submit(install_modules), pool.submit(start_containers))
+    for name in feature.names(job.spec):
+        for link in joining.links:
+            carrying = contextlib.ExitStack()
+            job.undo.add(name, carrying.close)
+            carrying.enter_context(feature.load(name).vpn(
+                link, feature.options(name, job.spec.features.get(name, {}))))
     with job.step('agent') as detail:
         arming.start_heartbeat(ros, dds_step.result())
         detail.append(f'VPN round trip {(job.heartbeat.round_trip or 0) * 1e3:.2f} ms')

@@ -73,6 +73,8 @@ class MachineJob(Site):
         self._released = False
         #: Makes the agent wait again for heartbeats, until these come through the VPN.
         self.rearming: Optional[Periodic] = None
+        #: What else may help if nothing comes back through the VPN.
+        self.advice: list[str] = []
         #: Set when the launch is cancelled, or when a step fails: parallel steps then end.
         self.cancel = Either(context.cancel)
 

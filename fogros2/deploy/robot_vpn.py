@@ -136,13 +136,31 @@ class RobotVpn:
         with self._lock:
             others = [other.route for name, other in sorted(self._members.items())
                       if name != member.name]
-        return plan.machine_peers(robot, member.route, others)
+        own = member.route
+        if member.relay:  # which the machine knows from its packets
+            own = dataclasses.replace(own, robot_endpoint=None)
+        return plan.machine_peers(robot, own, others)
 
     def admit(self, member: VpnMember) -> None:
         """Add a machine to the robot's peers."""
         with self._lock:
             self._members[member.name] = member
             self._run(self.vpn.peers(self.interface, self._peers()))
+
+    def dial(self, member: VpnMember, relay: str, *, anew: bool) -> None:
+        """
+        Send the packets for a machine to a relay; see :class:`fogros2.feature.VpnLink`.
+
+        :param anew: end a handshake that has begun: it would be repeated only after 5 s.
+        """
+        with self._lock:
+            if self._members.get(member.name) is not member or self._stop.is_set():
+                return
+            member.relay = relay
+            if anew:
+                self._run(self.vpn.peers(self.interface, [
+                    peer for peer in self._peers() if peer.name != member.name]), cancel=False)
+            self._run(self.vpn.peers(self.interface, self._peers()), cancel=False)
 
     def spread(self, new: VpnMember) -> None:
         """
@@ -184,7 +202,7 @@ class RobotVpn:
                 self._run(self.vpn.peers(self.interface, self._peers()), cancel=False)
 
     def _peers(self) -> list[Peer]:
-        return [self._members[name].route.peer for name in sorted(self._members)]
+        return [self._members[name].dialled for name in sorted(self._members)]
 
     def check_health(self) -> float:
         """
@@ -254,12 +272,20 @@ class VpnMember:
         self.route = route
         self.name = route.peer.name
         self.interface = interface
+        #: ``host:port`` of a relay on the robot that carries its packets, '' for none.
+        self.relay = ''
         self._run = run
         self._health_check = health_check
         self._lock = threading.Lock()
         #: Peers of the interface and of its health check; None until the interface is up.
         self._peers: Optional[list[Peer]] = None
         self._checked: Optional[list[Peer]] = None
+
+    @property
+    def dialled(self) -> Peer:
+        """The machine as the robot dials it."""
+        peer = self.route.peer
+        return dataclasses.replace(peer, endpoint=self.relay or peer.endpoint)
 
     def up(self, robot: RobotVpn) -> None:
         """Bring the machine's interface up with its current peers."""

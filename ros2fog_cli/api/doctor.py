@@ -69,7 +69,7 @@ def examine(*, lan_seconds: float = 1.5, providers: Sequence[str] = ()) -> list[
     checks: list[Callable[[], Check]] = [
         python, packages, programs, root, tun, wireguard, engine, overlay, firewall_program, ros,
         rmw, cyclone_uri, machine_defaults, receive_buffer, udp_port, ssh_keys, firewall, state,
-        clocks, lambda: lan_peers(lan_seconds)]
+        clocks, vpn_paths, lambda: lan_peers(lan_seconds)]
     others = [name for name in plugin_system.names('fogros2.provider') if name not in _LOOKED_AT]
     for name in dict.fromkeys([*others, *providers]):
         checks.append(functools.partial(provider, name, needed=name in providers))
@@ -367,6 +367,13 @@ def clocks() -> Check:
     if any(offset.exceeds for offset in offsets.values()):
         return Check(name, 'warning', detail, 'sudo apt-get install chrony, here and there')
     return Check(name, 'ok', detail or 'measured while a machine runs')
+
+
+def vpn_paths() -> Check:
+    """Show how the packets of the VPN get to the machines of running launches."""
+    paths = [f"{record.name}: {record.carried or 'UDP'}" for record in Store().machines()
+             if record.launch_alive]
+    return Check('VPN paths', 'ok', '; '.join(paths) or 'shown while a machine runs')
 
 
 def lan_peers(seconds: float) -> Check:

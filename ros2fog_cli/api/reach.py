@@ -172,6 +172,7 @@ class Link:
     :param handshake_age: seconds since the last handshake, None before the first one.
     :param received: bytes received from the machine; ``sent`` bytes were sent to it.
     :param latency: median round trip of a ping in milliseconds, None if no ping was answered.
+    :param carried: what carries its packets in place of UDP, '' for nothing.
     """
 
     address: str
@@ -180,6 +181,7 @@ class Link:
     received: float = 0.0
     sent: float = 0.0
     latency: Optional[float] = None
+    carried: str = ''
 
 
 def link(record: Record, *, pings: int = 5) -> Optional[Link]:
@@ -191,7 +193,9 @@ def link(record: Record, *, pings: int = 5) -> Optional[Link]:
     """
     if record.vpn is None or record.robot_vpn is None:
         return None
-    return measure(record.vpn.address, record.robot_vpn, record.public_key, record.spec.vpn, pings)
+    return dataclasses.replace(
+        measure(record.vpn.address, record.robot_vpn, record.public_key, record.spec.vpn, pings),
+        carried=record.carried)
 
 
 def measure(

@@ -86,7 +86,7 @@ class Relayed(ContainerInstance):
 
 
 def generate_launch_description():
-    machine = Relayed(name={name!r}, network={network!r})
+    machine = Relayed(name={name!r}, network={network!r}, vpn_path='udp')
     return FogROSLaunchDescription([
         CloudNode(machine=machine, package='fogros2_examples', executable='talker',
                   parameters=[{{'period': {period}}}]),

@@ -173,7 +173,7 @@ EXAMPLES = {'text': ('nearest', 'nearest'), 'number': ('2', 2), 'bool': ('true',
 CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'on_loss_after': '5m',
            'checkpoint': '$HOME/map', 'checkpoint_interval': '5m', 'max_replacements': '2',
            'bandwidth': '10Mbit/s',
-           'name': 'planner', 'budget': '5 USD', 'idle_timeout': '5m',
+           'name': 'planner', 'budget': '5 USD', 'idle_timeout': '5m', 'vpn_path': 'stream',
            'fetch_to': '/results', 'fetch_limit': '2GB'}
 LISTS = {'fetch': ('~/bags, /var/map', ['~/bags', '/var/map']),
          'record': ('/tf, /scan', ['/tf', '/scan']),

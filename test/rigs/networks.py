@@ -33,6 +33,31 @@ def _remove(name: str) -> None:
 
 
 @contextlib.contextmanager
+def without_udp(addresses: str) -> Iterator[None]:
+    """
+    Drop UDP between this computer and others of a test's own.
+
+    :param addresses: theirs, or the name of their container network.
+    """
+    if addresses.startswith('fogt'):
+        addresses = run(Command((
+            'podman', 'network', 'inspect', '--format',
+            '{{range .Subnets}}{{.Subnet}}{{end}}', addresses), sudo=True),
+            timeout=60.0).stdout.strip()
+    table = f'inet fogt{os.urandom(4).hex()}'
+    rules = '\n'.join(
+        f'add chain {table} {hook} {{ type filter hook {hook} priority 0; }}\n'
+        f'add rule {table} {hook} ip {end} {addresses} meta l4proto udp drop'
+        for hook, end in (('output', 'daddr'), ('input', 'saddr')))
+    run(Command(('nft', '-f', '-'), sudo=True, input=f'add table {table}\n{rules}\n'.encode()),
+        timeout=30.0)
+    try:
+        yield
+    finally:
+        run(Command(('nft', 'delete', 'table', *table.split()), sudo=True), timeout=30.0)
+
+
+@contextlib.contextmanager
 def network(
     subnets: Sequence[str], options: Callable[[str], Sequence[str]] = lambda subnet: (),
 ) -> Iterator[tuple[str, str]]:

@@ -26,7 +26,7 @@ from fogros2.deploy.steps import connecting, dds, installing, watching
 from fogros2.deploy.steps.arming import Arming
 from fogros2.deploy.steps.connecting import Connection
 from fogros2.deploy.steps.creating import Creation
-from fogros2.deploy.steps.joining import Joining
+from fogros2.deploy.steps.joining import Joining, RobotLink
 from fogros2.deploy.steps.watching import Watch
 from fogros2.errors import (
     AgentError,
@@ -62,7 +62,13 @@ from fogros2.vpn import addresses
 from fogros2.waiting import Periodic, Timeouts, wait_until
 from fogros2_features.guests import invitation
 from fogros2_features.replacement import Replacement
-from fogros2_testing.fakes import FakeProvider, FakeShell, FakeStream, FakeVpn
+from fogros2_testing.fakes import (
+    FAKE_ENDPOINT,
+    FakeProvider,
+    FakeShell,
+    FakeStream,
+    FakeVpn,
+)
 from fogros2_testing.plugins import instead
 
 SPEC = MachineSpec('planner', 'fake')
@@ -453,6 +459,23 @@ def test_wait_ends_when_a_booting_machine_ends(
         Connection(context, mine).open()
 
 
+def test_ssh_that_carries_the_vpn_stays_outside(launch, provider, members, monkeypatch):
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(firewall=True))
+    context, mine = begun(launch)
+    Creation(context, mine).run()
+    mine.save(shell=FAKE_ENDPOINT)
+    mine.note(undo.SSH_PORT, FAKE_ENDPOINT.port)
+    mine.interface = context.vpn.interface
+    link = RobotLink(context, mine, members.add(2))
+    link.dial('127.0.0.1:4', 'stream')
+    Connection(context, mine).enter_vpn()
+    assert link.outside == FAKE_ENDPOINT
+    assert launch.store.load('planner').carried == 'stream'
+    # closed, it leads nowhere
+    mine.forget(Made(undo.SSH_PORT, FAKE_ENDPOINT.port))
+    assert link.outside is None
+
+
 def test_a_machine_that_boots_slowly_has_the_time_of_its_boot(launch, provider, monkeypatch):
     context, mine = begun(launch, timeouts=Timeouts(boot=300.0, ssh=60.0))
     connection = Connection(context, mine)
@@ -548,6 +571,7 @@ class Members:
         member.up(self.robot)
         self.robot.admit(member)
         self.robot.spread(member)
+        return member
 
 
 @pytest.fixture
@@ -575,6 +599,30 @@ def test_everybody_knows_of_a_new_machine_when_it_is_up(members):
     assert members.told[-2:] in (
         [('m2', ['m3', 'm4', 'robot']), ('m3', ['m2', 'm4', 'robot'])],
         [('m3', ['m2', 'm4', 'robot']), ('m2', ['m3', 'm4', 'robot'])])
+
+
+def test_robot_alone_uses_a_relay(members, monkeypatch):
+    dialled = []
+    peers = FakeVpn.peers
+
+    def recorded(self, interface, to):
+        dialled.append([peer.endpoint for peer in to])
+        return peers(self, interface, to)
+
+    first = members.add(2)
+    monkeypatch.setattr(FakeVpn, 'peers', recorded)
+    members.robot.dial(first, '127.0.0.1:4', anew=True)
+    # without the machine, its handshake begins again at once
+    assert dialled == [[], ['127.0.0.1:4']]
+    second = members.add(3)
+    assert dialled[2] == ['127.0.0.1:4', 'm3:1']
+    assert [peer.endpoint for peer in members.robot.peers_of(second)] == [None, 'm2:1']
+    members.robot.dial(first, '', anew=False)
+    assert dialled[-1] == ['m2:1', 'm3:1']
+    members.robot.remove('m2')
+    before = len(dialled)
+    members.robot.dial(first, '127.0.0.1:5', anew=False)
+    assert len(dialled) == before
 
 
 def test_port_without_ssh_is_reported_soon(launch, provider, monkeypatch):

@@ -192,6 +192,7 @@ class Arming(Step):
                 raise
             raise VpnError(
                 f"nothing comes back from '{job.name}' through the VPN",
-                f'is UDP port {job.interface.port} open on the way there?') from error
+                '; '.join([f'is UDP port {job.interface.port} open on the way there?',
+                           *job.advice])) from error
         if job.rearming is not None:
             job.rearming.close()

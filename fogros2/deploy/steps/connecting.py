@@ -82,10 +82,10 @@ class Connection(Step):
         """
         Move SSH into the VPN, and close the SSH port to the outside.
 
-        Does nothing where the provider has no firewall.
+        Does nothing where the provider has no firewall, and where SSH may carry the VPN.
         """
         job, outside = self._job, self._job.record.shell
-        if not self._context.capabilities.firewall or outside is None:
+        if not self._context.capabilities.firewall or outside is None or job.record.carried:
             return
         with job.step('firewall') as detail:
             inside = self._shell_to(dataclasses.replace(outside, host=job.interface.address))

@@ -205,7 +205,7 @@ class Creation(Step):
         job.save(
             token=token, created=job.record.created or time.time(), armed=time.time(),
             launch=context.launch, last=context.launch, robot=robot_id(), **this_process(),
-            robot_vpn=context.vpn.interface, monitor=0, monitor_open='')
+            robot_vpn=context.vpn.interface, carried='', monitor=0, monitor_open='')
 
     def _login_key(self) -> str:
         context, job = self._context, self._job

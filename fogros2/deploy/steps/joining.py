@@ -12,9 +12,9 @@ from fogros2 import plan
 from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob, Step
 from fogros2.deploy.robot_vpn import VpnMember
-from fogros2.deploy.undo import VPN, vpn_down
+from fogros2.deploy.undo import SSH_PORT, VPN, vpn_down
 from fogros2.errors import CommandError, FogError, VpnError
-from fogros2.model import Command, host_port, Machine, Peer, VpnInterface
+from fogros2.model import Command, Endpoint, host_port, Machine, Peer, VpnInterface
 from fogros2.report import step
 from fogros2.store import VPN_LEFT
 from fogros2.vpn import addresses
@@ -120,6 +120,11 @@ class Joining(Step):
             repair=[list(c.argv) for c in vpn.repair(job.interface, peers)],
             down=[list(c.argv) for c in vpn_down(job.record)])
 
+    @property
+    def links(self) -> Sequence[RobotLink]:
+        """The link to the machine, for features that may carry its packets."""
+        return [RobotLink(self._context, self._job, self._member)] if self._member else []
+
     def redial(self, machine: Machine) -> None:
         """
         Update the robot's endpoint on a machine that dials the robot, if it has changed.
@@ -140,6 +145,44 @@ class Joining(Step):
                 job.run(Command(
                     ('python3', '-IS', '-c', _KNOCK, robot.interface.address,
                      str(plan.HEARTBEAT_PORT)), what='greet the robot'))
+
+
+class RobotLink(Step):
+    """The robot's end of the VPN to a machine; see :class:`fogros2.feature.VpnLink`."""
+
+    def __init__(self, context: Context, job: MachineJob, member: VpnMember) -> None:
+        super().__init__(context, job)
+        self._member = member
+        self.spec = job.spec
+        self.port = job.interface.port
+        self.robot_port = context.vpn.interface.port
+        self.direct = member.route.peer.endpoint
+        self.step = job.step
+
+    @property
+    def outside(self) -> Optional[Endpoint]:
+        """How a shell reaches the machine without the VPN, None if that is closed."""
+        job = self._job
+        if self._context.capabilities.firewall and all(
+                made.kind != SSH_PORT for made in job.record.made):
+            return None
+        return job.record.shell
+
+    @property
+    def silence(self) -> Optional[float]:
+        """Seconds since the last answer through the VPN, None before the first."""
+        heartbeat = getattr(self._job, 'heartbeat', None)
+        return heartbeat.age if heartbeat is not None else None
+
+    def advise(self, remedy: str) -> None:
+        """Add to the error for a machine from which nothing has come back."""
+        if remedy not in self._job.advice:
+            self._job.advice.append(remedy)
+
+    def dial(self, relay: str, carried: str) -> None:
+        """Let the robot's end send to a relay on this computer, '' for the machine itself."""
+        self._context.vpn.dial(self._member, relay, anew=self.silence is None)
+        self._job.save(carried=carried)
 
 
 class Joined(Joining):

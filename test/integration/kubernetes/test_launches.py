@@ -18,6 +18,7 @@ import pytest
 from fogros2.waiting import wait_until
 from rigs.cluster import APPLICATION, DEFAULT, READY
 from rigs.launched import launching, ros2
+from rigs.networks import without_udp
 
 pytestmark = pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH')
 
@@ -185,6 +186,18 @@ def test_a_pod_dials_the_robot(launch, namespace, kubernetes):
     assert namespace.all('services') == []
     run.interrupt()
     assert run.ended() == 0, run.text
+    assert clean(run), run.text
+    assert namespace.left() == []
+
+
+@pytest.mark.usefixtures('nothing_left')
+def test_a_pod_needs_no_udp(launch, namespace, kubernetes):
+    with without_udp(kubernetes.layout.node):
+        run = launch("talker(pod('narrow'))", 'listener()')
+        run.wait_for('I heard: [Hello World from narrow ', times=2, timeout=TIMEOUT)
+        assert re.search(r'VPN path .*stream', run.text), run.text
+        run.interrupt()
+        assert run.ended() == 0, run.text
     assert clean(run), run.text
     assert namespace.left() == []
 
