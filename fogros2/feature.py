@@ -71,7 +71,7 @@ class RunningMachine(Protocol):
         """
         Run a program there, as root, every ``interval`` seconds until it exits with 0.
 
-        :param name: of the watch; an earlier one of this name ends.
+        :param name: of the watch, not 'vpn' or 'notice'; an earlier one of this name ends.
         :param argv: its files are ``/run/INTERFACE.watch*``, which go with the VPN.
         :param then: called once, in a thread that must not wait, with what it has printed: text of
             a machine, which is not trusted.

@@ -10,7 +10,7 @@ modules, in this order:
 - ``journal``: the events on disk;
 - ``loop``: one thread that serves sockets and timers, and blocks on none of them;
 - ``watchdog``: when the machine has to end, and heartbeats;
-- ``processes``: commands as root, health checks and watches;
+- ``processes``: commands as root, and watches;
 - ``programs``: packages, executables and files that a node's spec names;
 - ``nodes``: the nodes' processes, from their start to their end;
 - ``server``: clients, their requests, and the command line.

@@ -11,17 +11,17 @@ import signal
 import subprocess
 import sys
 
-from fogros2.agent.loop import Loop, Timer
+from fogros2.agent.loop import Loop
 from fogros2.agent.protocol import Refused, say, words
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from typing import Any, Optional
+    from typing import Any
 
     from fogros2.agent.protocol import Json
     from fogros2.events import AgentEvent, HealthCheck
 
-#: Time-outs in seconds of commands, and of the commands of health checks and watches.
+#: Time-outs in seconds of commands, and of the commands of watches.
 COMMAND_TIMEOUT, CHECK_TIMEOUT = 30.0, 10.0
 #: (seconds, signal): when processes that the nodes left behind get each signal.
 SWEEP = ((0.0, signal.SIGINT), (3.0, signal.SIGTERM), (6.0, signal.SIGKILL))
@@ -207,24 +207,33 @@ class Processes:
         look()
 
 
-class Kept:
-    """A health check: a command that checks, commands that repair, and commands for the end."""
+class Watch:
+    """
+    A command that runs periodically.
+
+    :param request: see ``watch`` in the protocol.
+    :raises Refused: a value is invalid.
+    """
 
     def __init__(self, request: Json) -> None:
-        self.alive = words(request.get('alive', []))
-        self.repair = [words(argv) for argv in request.get('repair', [])]
+        self.what = request['what']
+        self.argv = words(request['argv'])
+        if not isinstance(self.what, str) or not self.argv:
+            raise Refused(f"'{self.what}' can't be watched")
+        repair = request.get('repair')
+        #: Commands for each failure; None for a watch that the first success ends.
+        self.repair = None if repair is None else [words(argv) for argv in repair]
         self.down = [words(argv) for argv in request.get('down', [])]
-        self.interval = max(0.05, float(request.get('interval', 1.0)))
+        self.interval = max(0.05, float(request.get('interval', WATCH_INTERVAL)))
         self.repairs = 0
         self.failures = 0
         self.ok = True
         self.since = 0.0
-        self.timer: Optional[Timer] = None
 
 
-class Checks:
+class Watches:
     """
-    Periodic commands: health checks with repair, and watches that wait for a command's success.
+    The watches of a launch.
 
     :param emit: sends an event to the robot.
     """
@@ -233,84 +242,61 @@ class Checks:
         self.processes = processes
         self.loop = processes.loop
         self.emit = emit
-        self.kept: dict[str, Kept] = {}
-        self.watched: dict[str, object] = {}
+        self.known: dict[str, Watch] = {}
 
-    def keep(self, request: Json) -> None:
-        """Start a health check, or replace the one with the same ``what``."""
-        what, kept = str(request['what']), Kept(request)
-        former = self.kept.get(what)
-        if former is not None and former.timer is not None:
-            former.timer.at = None
-        self.kept[what] = kept
-        if kept.alive:
-            self._check(what, kept)
-
-    def _check(self, what: str, kept: Kept) -> None:
-        """Run a health check, repair on failure, and schedule the next check."""
-        def later() -> None:
-            pause = min(30.0, kept.interval * 2 ** min(kept.failures, 10))
-            kept.timer = self.loop.at(pause, lambda: self._check(what, kept))
-
-        def checked(status: int) -> None:
-            if self.kept.get(what) is not kept:
-                return
-            if status == 0:
-                kept.ok, kept.failures = True, 0
-                later()
-                return
-            if kept.ok:
-                say(f'{what} is down')
-                kept.ok, kept.since = False, self.loop.clock()
-            self.processes.spawn_all(kept.repair, repaired)
-
-        def repaired(good: bool) -> None:
-            kept.failures = 0 if good else kept.failures + 1
-            if good:
-                kept.repairs += 1
-                kept.ok = True
-                self.emit({'event': 'vpn_repaired', 'what': what,
-                           'seconds': self.loop.clock() - kept.since})
-            later()
-
-        self.processes.spawn(kept.alive, checked, timeout=CHECK_TIMEOUT)
-
-    def watch(self, what: Any, argv: list[str], interval: float = WATCH_INTERVAL) -> None:
+    def start(self, watch: Watch) -> None:
         """Start a watch, or replace the one with the same ``what``."""
-        watch = self.watched[what] = object()
+        self.known[watch.what] = watch
+        self._look(watch)
 
-        def look() -> None:
-            if self.watched.get(what) is watch:
-                output = os.memfd_create('watch', os.MFD_CLOEXEC)
-                self.processes.spawn(
-                    argv, lambda status: ran(status, output), timeout=CHECK_TIMEOUT,
-                    output=output)
+    def _look(self, watch: Watch) -> None:
+        if self.known.get(watch.what) is watch:
+            output = os.memfd_create('watch', os.MFD_CLOEXEC)
+            self.processes.spawn(
+                watch.argv, lambda status: self._looked(watch, status, output),
+                timeout=CHECK_TIMEOUT, output=output)
 
-        def ran(status: int, output: int) -> None:
-            reason = os.pread(output, REASON, 0).decode(errors='replace').strip()
-            os.close(output)
-            if self.watched.get(what) is not watch:
-                return
-            if status == 0:
-                del self.watched[what]
-                say(f'{what}: {reason}')
-                if what == NOTICE:
-                    self.emit({'event': 'notice', 'reason': reason})
-                else:
-                    self.emit({'event': 'watched', 'what': what, 'reason': reason})
+    def _looked(self, watch: Watch, status: int, output: int) -> None:
+        reason = os.pread(output, REASON, 0).decode(errors='replace').strip()
+        os.close(output)
+        if self.known.get(watch.what) is not watch:
+            return
+        if watch.repair is not None and status != 0:
+            if watch.ok:
+                say(f'{watch.what} is down')
+                watch.ok, watch.since = False, self.loop.clock()
+            self.processes.spawn_all(watch.repair, lambda good: self._repaired(watch, good))
+        elif watch.repair is None and status == 0:
+            del self.known[watch.what]
+            say(f'{watch.what}: {reason}')
+            if watch.what == NOTICE:
+                self.emit({'event': 'notice', 'reason': reason})
             else:
-                self.loop.at(interval, look)
+                self.emit({'event': 'watched', 'what': watch.what, 'reason': reason})
+        else:
+            watch.ok, watch.failures = True, 0
+            self._look_later(watch)
 
-        look()
+    def _repaired(self, watch: Watch, good: bool) -> None:
+        watch.failures = 0 if good else watch.failures + 1
+        if good:
+            watch.repairs += 1
+            watch.ok = True
+            self.emit({'event': 'vpn_repaired', 'what': watch.what,
+                       'seconds': self.loop.clock() - watch.since})
+        self._look_later(watch)
+
+    def _look_later(self, watch: Watch) -> None:
+        pause = max(watch.interval, min(30.0, watch.interval * 2 ** min(watch.failures, 10)))
+        self.loop.at(pause, lambda: self._look(watch))
 
     def status(self) -> list[HealthCheck]:
-        """Return the state of each health check."""
-        return [{'what': what, 'ok': kept.ok, 'repairs': kept.repairs}
-                for what, kept in self.kept.items()]
+        """Return the state of each watch that repairs."""
+        return [{'what': watch.what, 'ok': watch.ok, 'repairs': watch.repairs}
+                for watch in self.known.values() if watch.repair is not None]
 
     def take_down(self, then: Callable[[], None]) -> None:
-        """End all checks, run the ``down`` commands of health checks, then call ``then``."""
-        commands = [argv for kept in self.kept.values() for argv in kept.down]
-        self.kept.clear()
-        self.watched.clear()
+        """End all watches, run their ``down`` commands, then call ``then``."""
+        commands = [argv for watch in self.known.values() for argv in watch.down]
+        self.known.clear()
         self.processes.spawn_all(commands, lambda good: then())

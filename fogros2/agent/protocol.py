@@ -7,17 +7,16 @@ A request is ``{"id": 1, "command": ..., ...}``. A reply is ``{"id": 1, "ok": tr
 
 ``configure``  any key of ``CONFIG``; restarts the lifetime and, with ``heartbeat``, the watchdog.
                With another ``launch`` than before, the former launch's nodes stop first, and
-               what was kept for that launch ends. Refused (kind ``busy``) while the former launch
-               sets the machine up or sends heartbeats, unless ``force`` names the former launch,
-               which the robot knows to be dead.
+               its watches end. Refused (kind ``busy``) while the former launch sets the machine up
+               or sends heartbeats, unless ``force`` names the former launch, which the robot knows
+               to be dead.
                With ``again`` it claims nothing: refused (kind ``released``) unless its ``launch``
                still has the machine; the request may have been delayed until after a release.
-``keep``       ``what``, ``alive`` argv, ``repair`` and ``down`` lists of argv, ``interval`` (s):
-               health check with repair
 ``watch``      ``what``, ``argv``, run as root every ``interval`` (s, default 5). When it exits
                with 0, the agent sends one event ``watched`` with ``what`` and, as ``reason``, the
-               output, and ends the watch. The watch ``notice`` is part of the configuration; its
-               event is named so.
+               output, and ends the watch. With ``repair``, a list of argv, it goes on instead, and
+               runs these after each failure; ``down`` is a list of argv for the end. The watch
+               ``notice`` is part of the configuration; its event is named so.
 ``start``      ``nodes``: list of NodeSpec; nodes with a known id are ignored. Replies when the
                setup files have been sourced and the processes started.
 ``stop``       ``nodes``: ids, or null for all; replies at once, ``exited`` events follow
@@ -25,9 +24,9 @@ A request is ``{"id": 1, "command": ..., ...}``. A reply is ``{"id": 1, "ok": tr
 ``status``     the agent's state; ``ping`` is cheaper and returns nothing
 ``log``        ``from`` seq: replies ``first`` and ``next`` (seqs that exist), then sends all
                events from there on; ``lost`` counts events that rotation has deleted
-``release``    stop the nodes, take down what was kept, disarm the heartbeat, reply when done;
-               with ``exit`` true the agent then exits. Does nothing if another launch has taken
-               the machine over from ``launch``.
+``release``    stop the nodes, end the watches, disarm the heartbeat, reply when done; with
+               ``exit`` true the agent then exits. Does nothing if another launch has taken the
+               machine over from ``launch``.
 
 Heartbeats are UDP datagrams from the robot's VPN address: ``BEAT`` and its HMAC-SHA256 by the key
 in ``heartbeat``, which a launch makes anew. The agent drops a datagram that has another HMAC, or a

@@ -25,14 +25,14 @@ from fogros2.agent.journal import BLOCK, Journal
 from fogros2.agent.loop import Channel, Loop
 from fogros2.agent.nodes import Node, Nodes
 from fogros2.agent.processes import (
-    Checks,
     Identity,
     NOTICE,
     Processes,
     remove_tree,
-    WATCH_INTERVAL,
+    Watch,
+    Watches,
 )
-from fogros2.agent.protocol import checked, CONFIG, dump, MAX_LINE, Refused, say, words
+from fogros2.agent.protocol import checked, CONFIG, dump, MAX_LINE, Refused, say
 from fogros2.agent.watchdog import Heartbeats, Watchdog
 
 TYPE_CHECKING = False
@@ -138,7 +138,7 @@ class Agent:
         self.config.update(user=account.pw_name, directory=self.directory)
         self.loop = Loop()
         self.processes = Processes(self.loop, self.identity)
-        self.checks = Checks(self.processes, self.emit)
+        self.watches = Watches(self.processes, self.emit)
         self.nodes = Nodes(self.processes, self.directory, self.config, self.write)
         self.watchdog = Watchdog(self.config, self.loop.clock())
         self.heartbeats = Heartbeats(
@@ -336,7 +336,7 @@ class Agent:
                 self.emit({'event': 'ending', 'reason': 'asked to end by a signal'})
             self.ending = True
             self.loop.at(1.8, self._leave)
-            self.nodes.stop_all(lambda: self.checks.take_down(self._leave), quickly=True)
+            self.nodes.stop_all(lambda: self.watches.take_down(self._leave), quickly=True)
 
     def emit(self, event: AgentEvent) -> None:
         """Append an event to the journal, and send it to the clients that follow."""
@@ -406,7 +406,7 @@ class Agent:
                 f"this machine belongs to launch '{owner}', whose last sign of life is "
                 f'{self.loop.clock() - heard_at:.0f} s old',
                 'end that launch, or choose another name', 'busy')
-        occupied = taken_over and (self.nodes.known or self.checks.kept or self.checks.watched)
+        occupied = taken_over and (self.nodes.known or self.watches.known)
         if not (self.nodes.stopping or occupied):
             return self._configure(new, taken_over)
         if taken_over:
@@ -423,7 +423,7 @@ class Agent:
 
         # the former launch's VPN uses the port that the new launch needs
         self.nodes.stop_all(
-            (lambda: self.checks.take_down(stopped)) if taken_over else stopped)
+            (lambda: self.watches.take_down(stopped)) if taken_over else stopped)
         return None
 
     def _configure(self, new: Json, taken_over: bool) -> Configured:
@@ -451,7 +451,7 @@ class Agent:
 
     def _watch_notice(self) -> None:
         if self.config['notice']:
-            self.checks.watch(NOTICE, self.config['notice'])
+            self.watches.start(Watch({'what': NOTICE, 'argv': self.config['notice']}))
 
     def _restart_watchdog(self) -> None:
         self.watchdog.configured(self.loop.clock(), heartbeat=bool(self.config['heartbeat']))
@@ -467,20 +467,13 @@ class Agent:
         if self.ending:
             raise Refused('the agent is stopping its nodes', kind='ending')
 
-    def do_keep(self, client: Client, request: Json) -> Empty:
-        """Start a health check, or replace the one with the same ``what``."""
-        self._check_held()
-        self.checks.keep(request)
-        return {}
-
     def do_watch(self, client: Client, request: Json) -> Empty:
         """Start a watch, or replace the one with the same ``what``."""
         self._check_held()
-        argv, interval = words(request['argv']), float(request.get('interval', WATCH_INTERVAL))
-        what = request['what']
-        if not isinstance(what, str) or what == NOTICE or not argv:
-            raise Refused(f"'{what}' can't be watched")
-        self.checks.watch(what, argv, max(0.05, interval))
+        watch = Watch(request)
+        if watch.what == NOTICE:
+            raise Refused(f"'{NOTICE}' is part of the configuration")
+        self.watches.start(watch)
         return {}
 
     def do_start(self, client: Client, request: Json) -> None:
@@ -526,7 +519,7 @@ class Agent:
             'heartbeat_age': None if dog.beat_at is None else now - dog.beat_at,
             'ending': self.ending,
             'nodes': [node.status for node in self.nodes.known.values()],
-            'kept': self.checks.status(), 'rss_kb': rss,
+            'kept': self.watches.status(), 'rss_kb': rss,
             'first': self.journal.first, 'next': self.journal.next,
         }
 
@@ -561,10 +554,10 @@ class Agent:
         def stopped() -> None:
             if request.get('exit'):
                 reply({})
-                self.checks.take_down(self._leave_for_good)
+                self.watches.take_down(self._leave_for_good)
             else:
                 # end the health check first: it would recreate the VPN interface
-                self.checks.take_down(lambda: reply({}))
+                self.watches.take_down(lambda: reply({}))
 
         if request.get('exit'):
             self._hurry()
@@ -599,7 +592,7 @@ class Agent:
         """End the machine, retrying until it works; exit where there is no end command."""
         command = self.config['end_command']
         if not command:
-            self.checks.take_down(self._leave_for_good)
+            self.watches.take_down(self._leave_for_good)
             return
 
         def ended(status: int) -> None:

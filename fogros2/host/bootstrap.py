@@ -8,16 +8,14 @@ carries the plan out: its ``tools``, then its wheels, then its ``commands``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-import contextlib
 import dataclasses
 import functools
 import hashlib
 import json
 import os
 from pathlib import Path
-import re
 import shlex
 import sys
 import threading
@@ -27,11 +25,11 @@ from fogros2 import process, untrusted
 from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError, WorkspaceError
 from fogros2.host import dependencies as needs
 from fogros2.host import inspection as host
-from fogros2.host import locked, modules
+from fogros2.host import installer, locked
 from fogros2.host import wheels as wheel_cache
 from fogros2.host import workspace as workspaces
 from fogros2.host.inspection import DISTRO, HostFacts, MIN_PYTHON, Python
-from fogros2.model import Bootstrap, Command, MachineSpec, Result
+from fogros2.model import Bootstrap, Command, MachineSpec
 from fogros2.plan import (
     DEFAULT_RMW,
     extended,
@@ -63,8 +61,7 @@ TOOLS: Mapping[str, str] = {
 #: Without the middleware's package, see :func:`apt_packages`.
 APT_PACKAGES = (
     f'ros-{DISTRO}-ros-base',
-    'python3-colcon-common-extensions', 'python3-rosdep', 'python3-venv',
-    'wireguard-tools', 'rsync', 'iproute2', 'nftables',
+    'python3-colcon-common-extensions', 'python3-rosdep', 'python3-venv', *TOOLS.values(),
     'sudo',  # for rosdep; images of ROS lack it
 )
 #: Variables that ROS's setup script sets.
@@ -142,7 +139,7 @@ def dependencies(spec: MachineSpec, under: Underlay, packages: Sequence[str] = (
         'distro': under.environment.get('ROS_DISTRO') or DISTRO,
         'bootstrap': spec.bootstrap,
         'kind': 'pip' if wheels else 'ros',
-        'packages': sorted({*apt_packages(under.rmw), *TOOLS.values()}),
+        'packages': sorted(apt_packages(under.rmw)),
         'workspace': workspaces.dependencies(*spec.workspaces),
         'apt': sorted(spec.apt), 'pip': sorted(spec.pip),
     }
@@ -178,10 +175,10 @@ def ensure(
     :raises PrerequisiteError: the machine cannot be prepared, or its answer is not valid.
     :raises WorkspaceError: the workspace can neither be used nor built there.
     """
-    question = host.probe(under.prefixes)
+    run = functools.partial(shell.run, timeout=timeout, cancel=cancel)
     with ThreadPoolExecutor(1, 'fog-probe') as pool:
         here = pool.submit(_robot_facts, under.prefixes, timeout)
-        reply = shell.run(question, timeout=timeout, cancel=cancel)
+        reply = run(host.probe(under.prefixes))
         robot = here.result()
     try:
         facts = host.parse_facts(reply.stdout)
@@ -193,12 +190,8 @@ def ensure(
     if elsewhere:
         check_elsewhere(spec, facts, robot)
     chain = [workspaces.inspect(path) for path in spec.workspaces]
-    keys = needs.keys(chain, packages)
-    todo = plan_alike(spec, facts, robot, under, chain)
-    if todo is not None:
-        # The machine has the same ROS packages.
-        keys = needs.outside(keys, under.prefixes)
-    else:
+    todo, prefixes = plan_alike(spec, facts, robot, under, chain), under.prefixes
+    if todo is None:
         try:
             wheels = wheel_cache.collect()
         except OSError as error:
@@ -206,29 +199,30 @@ def ensure(
                 f"the packages for '{spec.name}' can't be packed on this computer: {error}",
                 'XDG_CACHE_HOME names another folder for it') from error
         todo = plan(spec, facts, robot, under, wheels, chain)
-        if todo.install.kind == 'pip':
-            # The machine gets a copy of this environment.
-            keys = needs.outside(keys, [sys.prefix])
+        # with the wheels, the machine gets a copy of this environment
+        prefixes = (sys.prefix,) if todo.install.kind == 'pip' else ()
     install = todo.install
     if at_home:
         ways, variables = workspaces.moved(
             install.workspaces, install.environment, f'{facts.home}/ws', spec.name)
         install = dataclasses.replace(install, workspaces=ways, environment=variables)
-    folder = needs.pip_folder(spec, facts, keys)
-    if spec.pip or keys:
-        install = dataclasses.replace(
-            install, environment=needs.with_pip_folder(folder, install.environment))
+    keys = needs.keys(chain, packages, [way.source for way in install.workspaces if way.commands])
+    needed = installer.Needs(
+        spec.name, facts, installer.able(spec.bootstrap, facts), spec.apt, spec.pip,
+        needs.outside(keys, prefixes), extended(install.environment, spec.environment),
+        install.setup)
+    if needed.pip or needed.keys:
+        install = dataclasses.replace(install, environment=needed.with_folder(install.environment))
     for command in todo.tools:
-        shell.run(command, timeout=timeout, cancel=cancel)
+        run(command)
     on_plan(install)
     if todo.wheels_target:
-        shell.run(Command(('mkdir', '-p', todo.wheels_target), what='make a folder for ROS 2'),
-                  timeout=timeout, cancel=cancel)
+        run(Command(('mkdir', '-p', todo.wheels_target), what='make a folder for ROS 2'))
         shell.sync(Path(wheels.folder), todo.wheels_target, excludes=(), timeout=timeout,
                    cancel=cancel)
     for command in todo.commands:
         try:
-            shell.run(command, timeout=timeout, cancel=cancel)
+            run(command)
         except CommandError:
             if not todo.fetched:
                 raise
@@ -236,92 +230,11 @@ def ensure(
             fetched = wheel_cache.fetch(todo.fetched, todo.python, timeout=timeout)
             shell.sync(Path(fetched.folder), f'{todo.wheels_target}-fetched', excludes=(),
                        timeout=timeout, cancel=cancel)
-            shell.run(_install_wheels(facts, wheels, fetched.hashes), timeout=timeout,
-                      cancel=cancel)
+            run(_install_wheels(facts, wheels, fetched.hashes))
     notes = [todo.note]
-    if (spec.apt or spec.pip or keys) and os.path.basename(folder) not in facts.installed:
-        notes += _complete(spec, install, folder, keys, functools.partial(
-            shell.run, timeout=timeout, cancel=cancel), warn)
+    if needed.apt or needed.pip or needed.keys:
+        notes += installer.install(needed, run, warn, always=install.kind == 'pip')
     return install, ', '.join(notes)
-
-
-def _complete(
-    spec: MachineSpec, install: RosInstall, folder: str, keys: Sequence[str],
-    run: Callable[..., Result], warn: Callable[[str, str], object],
-) -> list[str]:
-    """
-    Install what nodes need besides ROS 2, and return what was done in a few words.
-
-    :param keys: rosdep keys. If a key cannot be resolved, or its package cannot be installed, the
-        result names it; the nodes may not need it.
-    :param run: function that runs a command on the machine.
-    :param warn: takes a warning and its remedy where rosdep cannot be asked; the next launch asks
-        again.
-    :raises PrerequisiteError: a package in the launch file cannot be installed.
-    """
-    facts = install.facts
-    environment = extended(install.environment, spec.environment)
-    apt, pip, notes, complete = spec.apt, spec.pip, [], True
-    named = {name.partition('=')[0] for name in apt}
-    keys = [key for key in keys if key not in named]
-    able = spec.bootstrap != 'none' and facts.root and 'apt-get' in facts.programs
-    rest = run(needs.unknown(keys, environment, install.setup)).stdout.split() if keys else []
-    if rest:
-        reply = run(needs.resolve(rest, environment, install.setup), check=False)
-        if reply.returncode == needs.NO_ROSDEP and able:
-            rosdep = 'python3-rosdep2' if facts.system == 'debian' else 'python3-rosdep'
-            run(apt_install([rosdep], 'install rosdep'), check=False)
-            reply = run(needs.resolve(rest, environment, install.setup), check=False)
-        if reply.returncode == 0:
-            more_apt, more_pip = needs.resolved(reply.stdout)
-            apt, pip = (*apt, *more_apt), (*pip, *more_pip)
-            rest = re.findall(r"no rosdep rule for '([^']+)'", reply.stderr)
-        elif able:
-            complete = False
-            why = ' / '.join(reply.stderr.strip().splitlines()[-3:]) or 'it is not installed'
-            warn(f"machine '{spec.name}' may lack {', '.join(rest)}, as rosdep gave no answer: "
-                 f'{why}', "apt=['...'] or pip=['...'] of the machine installs what it lacks")
-        if rest and complete:
-            notes.append(f"the machine may lack {', '.join(rest)}")
-    if pip and run(needs.able(environment, install.setup), check=False).returncode != 0:
-        if not able:
-            raise PrerequisiteError(
-                f"machine '{spec.name}' has no pip, which installs {', '.join(pip)}",
-                'on the machine: apt-get install python3-venv')
-        apt = (*apt, 'python3-venv')
-    if apt:
-        lacking = run(needs.missing(apt)).stdout.split()
-        asked_for = [name for name in lacking if name in spec.apt]
-        if asked_for and not able:
-            raise PrerequisiteError(
-                f"machine '{spec.name}' lacks the packages {', '.join(asked_for)}",
-                f"on the machine: apt-get install {' '.join(asked_for)}")
-        if lacking and not able:
-            notes.append(f"the machine lacks {', '.join(lacking)}")
-        elif lacking:
-            with _remedy('apt= of the machine and package.xml of the workspace name packages'):
-                run(apt_install(lacking, f"install {', '.join(lacking)}"))
-            notes.append(f"installed {', '.join(lacking)}")
-    if not (apt or pip) and install.kind == 'ros':
-        return notes
-    with _remedy('pip= of the machine and package.xml of the workspace name packages; the '
-                 'versions that the machine has stay'):
-        run(needs.fill(folder, pip, install.environment, spec.environment, install.setup,
-                       complete=complete))
-    if pip:
-        notes.append(f"installed {', '.join(pip)} by pip")
-    return notes
-
-
-@contextlib.contextmanager
-def _remedy(hint: str) -> Iterator[None]:
-    """Give a command that fails in this block a remedy."""
-    try:
-        yield
-    except CommandError as error:
-        raise CommandError(
-            error.command, error.result, error.where,
-            error.hint or modules.library_hint(str(error)) or hint) from error
 
 
 def check_elsewhere(spec: MachineSpec, facts: HostFacts, robot: HostFacts) -> None:
@@ -513,17 +426,13 @@ def _merged(
 def _tools(facts: HostFacts, mode: Bootstrap, machine: str) -> tuple[Command, ...]:
     """Return the commands that install the missing programs of ``TOOLS``."""
     packages = [package for program, package in TOOLS.items() if program not in facts.programs]
-    able = mode != 'none' and facts.root and 'apt-get' in facts.programs
+    able = installer.able(mode, facts)
     if packages and not able:
-        raise PrerequisiteError(
-            f"machine '{machine}' lacks {', '.join(packages)}",
-            f"on the machine: apt-get install {' '.join(packages)}")
+        raise installer.lacks(machine, packages)
     # A kernel module that is not loaded yet may be invisible; the VPN's step finds out.
     if able and not facts.kernel_wireguard and 'wireguard-go' not in facts.programs:
         packages.append('wireguard-go')
-    if not packages:
-        return ()
-    return (apt_install(packages, f"install {', '.join(packages)}"),)
+    return (installer.apt_install(packages),) if packages else ()
 
 
 def _why_not_pip(
@@ -695,9 +604,11 @@ def _apt(
 ) -> Preparation:
     """Return the plan that installs ROS 2's and the user's packages, and adds this package."""
     ours = _ros(facts, wheels, chain)
-    commands = [apt_install(packages, f'install ROS 2 {DISTRO}')]
+    commands = [installer.apt_install(packages, f'install ROS 2 {DISTRO}')]
     if DISTRO not in facts.ros:
-        commands.insert(0, Command.script(_APT_SOURCE, sudo=True, what="add ROS 2's packages"))
+        commands = [
+            installer.apt_install(('ca-certificates', 'curl', 'gpg')),
+            Command.script(_APT_SOURCE, sudo=True, what="add ROS 2's packages"), *commands]
     return dataclasses.replace(ours, mode='apt', commands=(*commands, *ours.commands))
 
 
@@ -706,9 +617,6 @@ ROS_KEY = 'C1CF6E31E6BADE8868B172B4F42ED6FBAB17C654'
 # ROS's package with the source list and its key is only the carrier of the key: its scripts do
 # not run, and another key is refused.
 _APT_SOURCE = f"""
-export DEBIAN_FRONTEND=noninteractive
-apt-get update -q
-apt-get install -qy -o DPkg::Lock::Timeout=300 --no-install-recommends ca-certificates curl gpg
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 base=https://github.com/ros-infrastructure/ros-apt-source/releases
@@ -733,15 +641,3 @@ Components: main
 Signed-By: /$keyring
 END
 """
-
-
-def apt_install(packages: Sequence[str], what: str) -> Command:
-    """Return the command that installs Debian packages."""
-    return Command.script(
-        'export DEBIAN_FRONTEND=noninteractive\n'
-        # a machine that has just booted runs apt by itself: wait for its lock
-        'apt-get -q -o DPkg::Lock::Timeout=300 update\n'
-        # repair an installation that was killed; apt waits for one that still runs
-        'dpkg --configure -a </dev/null || :\n'
-        'apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends '
-        f'{shlex.join(packages)}\n', sudo=True, what=what)

@@ -17,7 +17,7 @@ echo $engine
 # ones have only Fast DDS) gets a layer with it, once; not by 'build', which needs control groups.
 # The layer keeps the image's command and user; by default, a commit uses those of its container.
 IMAGE = ENGINE + """\
-image=$1 rmw=$3
+image=$1 rmw=$3 install=$4
 there() { $as_root $engine image inspect "$1" >/dev/null 2>&1; }
 if ! there "$image"; then
     image=$2
@@ -57,11 +57,9 @@ if [ -n "$rmw" ]; then
         $as_root $engine rm -f "$looking" >/dev/null
         if [ -n "$lacks" ]; then
             adding=fogros2-adding-$$
-            install='apt-get update -q; apt-get install -q -y --no-install-recommends "$0"'
             trap '$as_root $engine rm -f $adding >/dev/null 2>&1' EXIT
             $as_root $engine run --name $adding --user 0:0 --network host --log-driver none \\
-                "$image" sh -ec "export DEBIAN_FRONTEND=noninteractive; $install" \\
-                "ros-$distro-$(echo "$rmw" | tr _ -)" >&2
+                "$image" sh -ec "$install" "ros-$distro-$(echo "$rmw" | tr _ -)" >&2
             command=$($as_root $engine image inspect -f '{{json .Config.Cmd}}' "$image")
             user=$($as_root $engine image inspect -f '{{.Config.User}}' "$image")
             [ "$command" != null ] || command='[]'

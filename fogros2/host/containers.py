@@ -22,6 +22,7 @@ from typing import Any, Union
 from fogros2.errors import ConfigurationError, DdsError, did_you_mean
 from fogros2.host import container_scripts as scripts
 from fogros2.host import docker_lines
+from fogros2.host.installer import APT
 from fogros2.model import Command, NodeSpec, Text
 
 #: Program in the agent's folder that follows a container; its arguments are the container's name
@@ -305,8 +306,8 @@ def fetch(image: str, rmw: str = '') -> Command:
 
     :param rmw: middleware to add to an image with ROS 2, '' for none.
     """
-    return Command(('sh', '-ec', scripts.IMAGE, 'sh', image, qualified(image), rmw),
-                   what=f"get the image '{image}'")
+    return Command(('sh', '-ec', scripts.IMAGE, 'sh', image, qualified(image), rmw,
+                    APT.format(packages='"$0"')), what=f"get the image '{image}'")
 
 
 def run(

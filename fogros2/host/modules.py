@@ -25,6 +25,7 @@ from typing import Any, Optional
 from fogros2 import untrusted
 from fogros2.errors import PrerequisiteError
 from fogros2.host import locked
+from fogros2.host.installer import among_nodes
 from fogros2.host.wheels import libc_for, runs_on
 from fogros2.model import Command, NodeSpec
 
@@ -86,10 +87,6 @@ NEEDS: Mapping[tuple[str, str], tuple[str, ...]] = {
     ('fogros2', 'record'): ('foxglove',),
 }
 
-#: Debian packages of the shared libraries that the wheels of OpenCV and PyAV need.
-_LIBRARIES = {'libGL.so.1': 'libgl1', 'libglib-2.0.so.0': 'libglib2.0-0',
-              'libgthread-2.0.so.0': 'libglib2.0-0', 'libxcb.so.1': 'libxcb1'}
-
 #: Imports each module, because an installed module may lack a shared library.
 _ASK = """\
 import importlib, json, os, platform, re, sys
@@ -122,25 +119,6 @@ for name, names, oldest, package in json.loads(sys.argv[1]):
 libc = ' '.join(platform.libc_ver())
 print(json.dumps([sys.version_info[:2], platform.machine(), libc, missing]))
 """
-#: Creates an empty folder, and sets ``"$@"`` to the command of pip for the nodes' Python.
-PIP = """\
-set -e
-mkdir -p {folder}
-cd {folder}
-rm -rf site
-if python3 -m pip --version >/dev/null 2>&1; then
-    set -- python3 -m pip
-elif wheel=$(ls "$VIRTUAL_ENV"/../wheels/pip-*.whl 2>/dev/null); then
-    # the sent wheel: Debian's venv has no pip
-    set -- python3 "$wheel/pip"
-else
-    python3 -m venv --clear pip
-    set -- pip/bin/python -m pip
-fi
-set -- "$@" install --quiet --no-compile --disable-pip-version-check --target site
-"""
-
-
 @dataclasses.dataclass(frozen=True)
 class Answer:
     """
@@ -232,16 +210,6 @@ def answer(output: str) -> Answer:
             'is python3 there at least 3.10, and does a login there print nothing?') from error
 
 
-def library_hint(text: str) -> str:
-    """Return the remedy for a shared library that an import lacks, '' if it lacks none."""
-    library = re.search(r'(\S+\.so[.\d]*): cannot open shared object file', text)
-    if library is None:
-        return ''
-    package = _LIBRARIES.get(library[1])
-    return f"give the machine apt=['{package}']" if package else (
-        f'give the machine apt= with the package that has it: apt-file search {library[1]}')
-
-
 def copy(facts: Answer) -> Optional[Copy]:
     """Return the missing modules from this Python, None if they would not run there."""
     if facts.architecture != platform.machine():
@@ -304,17 +272,6 @@ def pinned(missing: Iterable[str]) -> list[str]:
     return locked.requirements(MODULES[name].distributions[0] for name in missing)
 
 
-def install(
-    environment: Mapping[str, str], setup: Sequence[str], target: str, missing: Sequence[str],
-) -> Command:
-    """Return the command that installs pinned modules from the index into ``target``/site."""
-    lines = shlex.join(pinned(missing))
-    return among_nodes(environment, setup, PIP.format(folder=shlex.quote(target)) + (
-        f"printf '%s\\n' {lines} >requirements.txt\n"
-        f'"$@" {shlex.join(locked.OPTIONS)} --requirement requirements.txt\nrm -rf pip\n'),
-        'install Python modules')
-
-
 def fitted(node: NodeSpec, places: Mapping[str, str]) -> NodeSpec:
     """
     Return a node whose Python finds the modules that it needs.
@@ -333,16 +290,3 @@ def fitted(node: NodeSpec, places: Mapping[str, str]) -> NodeSpec:
 def _path(sites: Iterable[str]) -> str:
     path = shlex.quote(':'.join(sites))
     return f'export PYTHONPATH={path}${{PYTHONPATH:+:$PYTHONPATH}}\n'
-
-
-def among_nodes(
-    environment: Mapping[str, str], setup: Sequence[str], script: str, what: str,
-) -> Command:
-    """Return a command that runs a script in the nodes' environment."""
-    # Variables of a launch file may be secrets, and every user can read command lines.
-    lines = [f'export {name}={shlex.quote(value)}' for name, value in environment.items()]
-    # A workspace may not be there yet.
-    lines += [f'[ ! -f {shlex.quote(path)} ] || . {shlex.quote(path)}' for path in setup]
-    # bash reads the whole group before it starts a program, which could read the rest.
-    text = '\n'.join(['{', *lines, script, '} </dev/null', ''])
-    return Command(('bash', '-s'), input=text.encode(), what=what)

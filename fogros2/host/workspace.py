@@ -20,7 +20,7 @@ from typing import Optional
 import xml.etree.ElementTree as ElementTree
 
 from fogros2 import process
-from fogros2.errors import CommandError, WorkspaceError
+from fogros2.errors import WorkspaceError
 from fogros2.host.inspection import DISTRO, HostFacts
 from fogros2.model import Command
 from fogros2.plugin_system import OWN_PACKAGES
@@ -43,8 +43,6 @@ _RUN = ('depend', 'exec_depend', 'run_depend')
 #: What rosdep installs.
 _ALL = (*_RUN, 'build_depend', 'build_export_depend', 'buildtool_depend',
         'buildtool_export_depend', 'test_depend')
-#: What rosdep reports of a key without a rule.
-_NO_RULE = re.compile(r'(?:rosdep definition for|No definition of) \[([^\]]+)\]')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -233,7 +231,7 @@ def plan(
             'with colcon and rosdep' if workspace.installed else 'run colcon build here first')
     return WorkspacePlan(
         root, str(root), (), (*EXCLUDES, *(f'/{top}' for top in BUILT)), workspace.linked_sources,
-        tuple(_build(workspace, ros_setup)), setup, reason)
+        (_build(workspace, ros_setup),), setup, reason)
 
 
 def moved(
@@ -298,20 +296,12 @@ def transfer(
         on_progress=on_progress) for folder in linked]
     if any(way.commands for way in ways):
         before_build()
-    unknown: dict[str, None] = {}
     for command in [command for way in ways for command in way.commands]:
-        try:
-            unknown |= dict.fromkeys(_NO_RULE.findall(
-                shell.run(command, timeout=timeouts.build, cancel=cancel).stderr))
-        except CommandError as error:
-            raise CommandError(
-                error.command, error.result, error.where, error.hint or unknown
-                and f"rosdep has no rule for {', '.join(unknown)}" or '') from error
+        shell.run(command, timeout=timeouts.build, cancel=cancel)
     sent = (f'{sum(report.files for report in reports)} files, '
             f'{size(sum(report.bytes for report in reports))}')
     return ', '.join([sent, *(
-        f'built there: {way.reason}' for way in ways if way.commands), *(
-        [f"the machine may lack {', '.join(unknown)}"] if unknown else [])])
+        f'built there: {way.reason}' for way in ways if way.commands)])
 
 
 def _why_build(workspace: Workspace, machine: HostFacts, robot: HostFacts) -> str:
@@ -340,22 +330,12 @@ def why_not_on(workspace: Workspace, architecture: str) -> str:
                  if built != architecture), '')
 
 
-def _build(workspace: Workspace, ros_setup: Sequence[str]) -> Iterator[Command]:
-    """Yield the commands of rosdep and colcon, for the login user on the machine."""
+def _build(workspace: Workspace, ros_setup: Sequence[str]) -> Command:
+    """Return the command of colcon, for the login user on the machine."""
     root = shlex.quote(str(workspace.root))
     below = 'src' if (workspace.root / 'src').is_dir() else '.'
     source = ''.join(f'. {shlex.quote(script)}\n' for script in ros_setup)
-    yield Command.script(
-        # rosdep finds packages of underlays, which have no rule, in the sourced environment
-        f'{source}'
-        '[ -n "${ROSDEP_SOURCE_PATH-}" ] || [ -e /etc/ros/rosdep/sources.list.d/20-default.list ]'
-        ' || sudo -n rosdep init\n'
-        f'rosdep update --rosdistro {DISTRO}\n'
-        f'cd {root}\n'
-        # -r: a key without a rule may be one that the build does not need
-        f'rosdep install --rosdistro {DISTRO} --from-paths {below} --ignore-src -y -r\n',
-        what="install the workspace's dependencies")
-    yield Command.script(
+    return Command.script(
         f'{source}cd {root}\n'
         # each compiler needs gigabytes of memory
         f'colcon build --base-paths {below} --parallel-workers "$(nproc)" '

@@ -11,13 +11,12 @@ from typing import Optional
 
 from fogros2 import plan
 from fogros2.errors import PrerequisiteError
-from fogros2.host import bootstrap, workspace
-from fogros2.host import inspection as host
+from fogros2.host import bootstrap, installer, workspace
 from fogros2.model import MachineSpec
 from fogros2.provider.kubernetes import image
 
-#: Packages that a pod needs if its Kubernetes node has no kernel module for the VPN.
-PACKAGES = ('wireguard-go', 'nftables')
+#: The package that a pod needs if its Kubernetes node has no kernel module for the VPN.
+PACKAGE = 'wireguard-go'
 
 
 def recipe(
@@ -46,9 +45,9 @@ def recipe(
     more = {'base': base} if base else {}
     return image.recipe(
         registry, dependencies=bootstrap.dependencies(spec, under),
-        packages=(*bootstrap.apt_packages(under.rmw), *PACKAGES),
-        keys=workspace.dependencies(*spec.workspaces),
-        distro=under.environment.get('ROS_DISTRO') or host.DISTRO, **more)
+        script=installer.image_script(
+            (*bootstrap.apt_packages(under.rmw), PACKAGE),
+            workspace.dependencies(*spec.workspaces)), **more)
 
 
 def build(

@@ -105,7 +105,7 @@ def _create(args: argparse.Namespace) -> int:
     from ros2fog_cli.api import pod_image
     recipe = pod_image.recipe(words.registry, base=words.base, folder=words.workspace)
     if words.dry_run or args.dry_run:
-        print(dict(recipe.files)['Containerfile'], end='')
+        print(recipe.containerfile, end='')
         return 0
     made = pod_image.build(recipe, Path(words.folder), engine=words.engine,
                            push=not words.no_push, say=warn)

@@ -491,7 +491,7 @@ BAD_REQUESTS = [
     (b'{"command": "configure", "heartbeat": {"port": 1}}\n', 'needs bind and peer'),
     (b'{"command": "configure", "heartbeat": {"bind": "x", "peer": "y", "port": 1}}\n',
      'needs bind and peer'),
-    (b'{"command": "keep", "what": "x", "alive": "ls"}\n', 'no list of words'),
+    (b'{"command": "watch", "what": "x", "argv": "ls"}\n', 'no list of words'),
     (b'{"command": "log", "from": "x"}\n', 'malformed request'),
 ]
 
@@ -836,7 +836,7 @@ def test_computer_without_end_command_is_cleaned_up(rig):
     (rig.directory / 'more').mkdir()
     (rig.directory / 'more' / 'file').write_text('')
     client = rig.client()
-    client.request('keep', what='vpn', alive=['true'], repair=[], down=[['touch', str(mark)]])
+    client.request('watch', what='vpn', argv=['true'], repair=[], down=[['touch', str(mark)]])
     client.request('configure', boot_timeout=0.5)
     assert rig.wait('watchdog')['action'] == 'leave'
     assert rig.ended(agent) == 0
@@ -970,7 +970,7 @@ def test_health_check_ends_with_its_launch(rig, how):
     thing = rig.folder / 'thing'
     rig.serve(on_exit='keep')
     client = rig.client()
-    client.request('keep', what='vpn', interval=0.05, alive=['test', '-e', str(thing)],
+    client.request('watch', what='vpn', interval=0.05, argv=['test', '-e', str(thing)],
                    repair=[['touch', str(thing)]], down=[['rm', '-f', str(thing)]])
     wait_until(thing.exists, timeout=60, what='the repair')
     client.request(**how)
@@ -998,18 +998,6 @@ def test_watch_reports_its_command_once(rig):
                   {'what': 'idle', 'argv': 'true'}, {'what': 'idle'}):
         with pytest.raises(AgentError):
             client.request('watch', **wrong)
-
-
-def test_watch_ends_with_its_launch(rig):
-    rig.serve(on_exit='keep')
-    client = rig.client()
-    unused = rig.folder / 'unused'
-    client.request('watch', what='idle', argv=['cat', str(unused)], interval=0.05)
-    client.request('release', on_exit='keep')
-    unused.write_text('too late')
-    client.request('configure', launch='def456')
-    client.request('watch', what='idle', argv=['echo', 'ours'], interval=0.05)
-    assert rig.wait('watched', what='idle')['reason'] == 'ours'
 
 
 def test_signalled_agent_reports_before_its_nodes_end(rig):
@@ -1074,7 +1062,7 @@ def test_health_check_repairs_and_takes_down(rig):
     agent = rig.serve()
     client = rig.client()
     client.request(
-        'keep', what='vpn', interval=0.05, alive=['test', '-e', str(thing)],
+        'watch', what='vpn', interval=0.05, argv=['test', '-e', str(thing)],
         repair=[['true'], ['touch', str(thing)]], down=[['rm', str(thing)]])
     for _ in range(2):
         wait_until(thing.exists, timeout=60, what='the repair')
@@ -1094,11 +1082,11 @@ def test_health_check_repairs_and_takes_down(rig):
 def test_failed_repair_is_tried_again(rig):
     rig.serve()
     client = rig.client()
-    client.request('keep', what='vpn', interval=0.05, alive=['false'],
+    client.request('watch', what='vpn', interval=0.05, argv=['false'],
                    repair=[['/no/such/program']])
     wait_until(lambda: client.request('status')['kept'][0]['ok'] is False, timeout=60,
                what='the failure')
-    client.request('keep', what='vpn', interval=0.05, alive=['true'])
+    client.request('watch', what='vpn', interval=0.05, argv=['true'], repair=[])
     wait_until(lambda: client.request('status')['kept'][0]['ok'] is True, timeout=60,
                what='its replacement')
     assert all(e['event'] != 'vpn_repaired' for e in rig.events)
@@ -1115,7 +1103,7 @@ def test_release_stops_the_nodes_before_it_answers(rig):
     assert status['on_exit'] == 'keep'
     # what comes too late starts nothing
     for late in ({'command': 'start', 'nodes': [rig.node('late', SLEEP)]},
-                 {'command': 'keep', 'what': 'vpn', 'alive': ['true'], 'repair': [['true']]}):
+                 {'command': 'watch', 'what': 'vpn', 'argv': ['true'], 'repair': [['true']]}):
         with pytest.raises(AgentError, match='no launch has this machine any more'):
             client.request(**late)
     # and it is ready for the next one
@@ -1230,7 +1218,7 @@ def test_root_agent_runs_nodes_as_the_login_user(login, tmp_path):
     assert lines[3] == f'nobody {nobody.pw_dir}'
     assert lines[4].split()[1:] == [str(nobody.pw_uid)] * 4
     assert lines[-1] == 'unset'
-    client.request('keep', what='vpn', alive=['sh', '-c', f'id -u > {record}/root'],
+    client.request('watch', what='vpn', argv=['sh', '-c', f'id -u > {record}/root'],
                    repair=[], interval=0.1)
     wait_until(lambda: (record / 'root').exists() and (record / 'root').read_text() == '0\n',
                timeout=60, what='a command as root')

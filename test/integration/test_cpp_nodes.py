@@ -235,7 +235,6 @@ def test_a_compiled_package_is_built_as_on_a_machine_and_travels(
     way = workspace.plan(workspace.inspect(root), here, here, ros_setup=(), can_build=True,
                          name=NAME)
     assert way.reason == 'it is not built'
-    # the last of a machine's commands; the one before asks rosdep, which asks the internet
     process.run(way.commands[-1], timeout=120.0)
     assert list(workspace.inspect(root).compiled) == [os.uname().machine]
     variables = dict(os.environ)

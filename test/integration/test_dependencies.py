@@ -22,7 +22,7 @@ import pytest
 
 from fogros2.deploy import Launch
 from fogros2.errors import CommandError
-from fogros2.host.bootstrap import apt_install
+from fogros2.host.installer import apt_install
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
 from fogros2.provider.container import debian_root
@@ -187,7 +187,7 @@ def test_apt_installs_after_a_dpkg_that_was_killed(packages, tmp_path):
         path.write_text(text)
     shutil.copy(packages / 'fogt-hello.deb', tmp_path / 'files/fogt')
     try:
-        shell.run(apt_install(['fogt-hello'], 'install a package'), timeout=60.0)
+        shell.run(apt_install(['fogt-hello']), timeout=60.0)
         assert os.listdir(tmp_path / 'files/var/lib/dpkg/updates') == []
         assert (tmp_path / 'files/usr/bin/fogt-hello').exists()
     finally:

@@ -25,7 +25,7 @@ import pytest
 
 from fogros2 import plan, process
 from fogros2.errors import PrerequisiteError
-from fogros2.host import bootstrap, locked, modules, wheels, workspace
+from fogros2.host import bootstrap, installer, locked, modules, wheels, workspace
 from fogros2.model import Command, MachineSpec
 from fogros2.provider.container import debian_root
 from fogros2.shell.ssh import SSHShell
@@ -249,7 +249,8 @@ def test_modules_are_those_for_its_processor(
     there = modules.answer(shell.run(modules.ask(['numpy'], {}, ()), timeout=60.0).stdout)
     assert (there.architecture, there.missing) == (ARCHITECTURE, ('numpy',))
     assert modules.copy(there) is None  # this computer's own does not run there
-    shell.run(modules.install(environment, (), '/tmp/modules', there.missing), timeout=300.0)
+    shell.run(installer.pinned_install(
+        modules.pinned(there.missing), '/tmp/modules', environment, ()), timeout=300.0)
     told = shell.run(Command(('python3', '-c', (
         'import sys; sys.path.insert(0, "/tmp/modules/site"); import numpy; print(numpy.tag)'))),
         timeout=60.0).stdout

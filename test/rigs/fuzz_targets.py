@@ -213,8 +213,8 @@ def _agent() -> Iterator[Target]:
         {'command': 'configure', 'launch': 'abc123', 'environment': {'A': 'b'},
          'heartbeat': {'bind': '127.0.0.1', 'port': 9, 'peer': '127.0.0.1', 'key': '5a' * 32}},
         {'command': 'configure', 'launch': 'abc124', 'again': True, 'setup': [], 'user': ''},
-        {'command': 'keep', 'what': 'x', 'alive': ['true'], 'repair': [], 'down': [],
-         'interval': 5}, {'command': 'watch', 'what': 'y', 'argv': ['true'], 'interval': 5},
+        {'command': 'watch', 'what': 'x', 'argv': ['true'], 'interval': 5, 'repair': [['true']],
+         'down': []},
         {'command': 'release', 'launch': 'abc123', 'on_exit': 'keep'}]
     with tempfile.TemporaryDirectory(prefix='fogt-fuzz-') as folder:
         if os.geteuid() == 0:

@@ -20,7 +20,7 @@ import zipfile
 import pytest
 
 from fogros2 import process
-from fogros2.host import bootstrap, locked, modules, wheels
+from fogros2.host import bootstrap, installer, locked, modules, wheels
 from fogros2.host import inspection as host
 from fogros2.host.inspection import Python
 from fogros2.host.wheels import Wheels
@@ -227,7 +227,8 @@ def test_modules_of_nodes_are_pinned(index: Index, tmp_path: Path) -> None:
         pins.write('av==17.0 --hash=sha256:' + 64 * '0' + '\n')
     machine = Machine(tmp_path / 'home', index)
     machine.home.mkdir()
-    done = machine.run(modules.install({}, (), str(machine.home / 'modules'), ['av']))
+    done = machine.run(installer.pinned_install(
+        modules.pinned(['av']), str(machine.home / 'modules'), {}, ()))
     site = machine.home / 'modules' / 'site'
     machine.run(Command((sys.executable, '-c', f'import site; site.addsitedir({str(site)!r})')))
     assert not site.exists() and done.returncode != 0, 'a version that is not pinned was taken'

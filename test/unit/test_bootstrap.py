@@ -14,7 +14,7 @@ import pytest
 
 from fogros2 import process
 from fogros2.errors import ConfigurationError, PrerequisiteError, WorkspaceError
-from fogros2.host import bootstrap
+from fogros2.host import bootstrap, installer
 from fogros2.host import inspection as host
 from fogros2.host.inspection import HostFacts, Python
 from fogros2.host.wheels import Wheels
@@ -361,7 +361,7 @@ def test_the_launchs_middleware_is_what_a_machine_gets() -> None:
 def test_apt_installs_ros_on_noble_alone() -> None:
     todo = plan(NOBLE, 'apt')
     assert todo.mode == 'apt'
-    source, install, _ = todo.commands
+    _, source, install, _ = todo.commands
     assert source.sudo and 'ros-apt-source' in source.argv[-1]
     for package in ('ros-jazzy-ros-base', 'ros-jazzy-rmw-fastrtps-cpp',
                     'python3-colcon-common-extensions', 'python3-rosdep'):
@@ -440,6 +440,28 @@ def test_unbuilt_workspace_is_reported(tmp_path: Path) -> None:
                        WHEELS, [space])
     assert '(it is not built), which has no colcon' in str(error.value)
     assert error.value.hint == 'run colcon build here first'
+
+
+def test_what_is_built_there_gets_all_that_it_declares(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    manifest = tmp_path / 'src/demo/package.xml'
+    manifest.parent.mkdir(parents=True)
+    manifest.write_text('<package><name>demo</name><build_depend>eigen</build_depend></package>')
+    equal = dataclasses.replace(ROS, environments={'/robot/.venv': '1-1'}, fogros2=True)
+    needed: list[installer.Needs] = []
+    monkeypatch.setattr(host, 'parse_facts', lambda output: equal)
+    monkeypatch.setattr(bootstrap, '_robot_facts', lambda prefixes, timeout: equal)
+    monkeypatch.setattr(installer, 'install', lambda needs, *_, **__: (
+        needed.append(needs), ['installed libeigen3-dev'])[1])
+    install, note = bootstrap.ensure(
+        FakeShell(handlers={'sh': lambda command: Result(0, '', '')}), UNDER,
+        MachineSpec('m', 'ssh', workspace=str(tmp_path)), timeout=30.0)
+    assert [needs.keys for needs in needed] == [('eigen',)] and needed[0].able
+    assert note == 'there already, installed libeigen3-dev'
+    assert install.environment['PYTHONPATH'] == f'{needed[0].folder}/last'
+    (way,) = install.workspaces
+    assert [command.what for command in way.commands] == ['build the workspace']
 
 
 def two_workspaces(tmp_path: Path) -> list[bootstrap.workspaces.Workspace]:

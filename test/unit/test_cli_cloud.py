@@ -570,7 +570,7 @@ def test_pod_image_has_what_a_launch_installs(
     assert run(*words, '--base', 'ubuntu:24.04', '--dry-run') == 0
     lines = capsys.readouterr().out.splitlines()
     assert 'FROM ubuntu:24.04' in lines
-    assert any(line.split() == ['wireguard-tools', '\\'] for line in lines)
+    assert any(' wireguard-tools ' in line for line in lines)
     assert "can't be a registry" in str(run(*words, '--registry', 'no registry', '--dry-run'))
     monkeypatch.setattr('fogros2.process.which', lambda program: None)
     assert 'podman, docker, buildah' in str(run(*words, '--folder', str(tmp_path / 'image')))

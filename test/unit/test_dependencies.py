@@ -16,12 +16,13 @@ import pytest
 
 from fogros2 import plan
 from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError
-from fogros2.host import bootstrap, dependencies, modules, workspace
-from fogros2.host.dependencies import able, fill, pip_folder, with_pip_folder
+from fogros2.host import bootstrap, dependencies, installer, workspace
 from fogros2.host.inspection import HostFacts
+from fogros2.host.installer import fill, find_pip, Needs
 from fogros2.model import Command, MachineSpec, Result
 from rigs.rosdep import rosdep_source
 
+FACTS = HostFacts(user='fog', home='/home/fog')
 RUNS_PIP = pytest.mark.skipif(
     importlib.util.find_spec('pip') is None, reason='needs pip in this environment')
 
@@ -63,7 +64,7 @@ def test_package_named_like_ours_is_refused(requirement: str) -> None:
 def test_missing_debian_packages_are_found() -> None:
     version = subprocess.run(['dpkg-query', '-W', '-f', '${Version}', 'dpkg'],
                              capture_output=True, text=True, check=True).stdout
-    command = dependencies.missing(
+    command = installer.missing(
         ['dpkg', 'fogt-none', 'fogt-none', f'dpkg={version}', 'dpkg=0.1', 'libc6:s390x'])
     said = subprocess.run(command.argv, capture_output=True, text=True, check=True)
     assert said.stdout.split() == ['fogt-none', 'dpkg=0.1', 'libc6:s390x']
@@ -73,7 +74,7 @@ def test_folder_follows_the_requirements_and_the_interpreters() -> None:
     def path(*pip: str, home: str = '/home/a', python: str = 'python 3 12 1 /usr/bin/python3',
              ) -> str:
         facts = bootstrap.host.parse_facts(f'home {home}\n{python}\n')
-        return pip_folder(MachineSpec('a', 'fake', pip=pip), facts)
+        return Needs('a', facts, True, pip=pip).folder
 
     assert path('x', 'y') == path('y', 'x') and path('x').startswith('/home/a/.local/share/')
     assert len({path('x'), path('y'), path('x', python='python 3 11 1 /usr/bin/python3')}) == 3
@@ -93,9 +94,9 @@ def completed(command: Command) -> subprocess.CompletedProcess[str]:
 
 
 def test_variables_of_a_launch_file_are_on_no_command_line() -> None:
-    command = fill('/none', ('x',), {'A': 'b'}, {'API_KEY': "it's secret"}, ())
+    command = fill(Needs('a', FACTS, True, environment={'API_KEY': "it's secret"}), ('x',))
     assert 'secret' not in ' '.join(command.argv)
-    shown = modules.among_nodes({'API_KEY': "it's secret"}, (), 'cat; echo "$API_KEY"', 'show')
+    shown = installer.among_nodes({'API_KEY': "it's secret"}, (), 'cat; echo "$API_KEY"', 'show')
     assert completed(shown).stdout == "it's secret\n"
 
 
@@ -121,12 +122,10 @@ def installed(
 
     :param system: a folder with packages that the machine has.
     """
-    folder = pip_folder(MachineSpec('a', 'fake', pip=names), HostFacts(home=str(tmp_path)))
-    command = fill(
-        folder, names, with_pip_folder(folder, {
-            'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}', 'PYTHONPATH': system}),
-        {'PIP_NO_INDEX': '1', 'PIP_FIND_LINKS': str(tmp_path)}, ())
-    return folder, completed(command)
+    needs = Needs('a', HostFacts(home=str(tmp_path)), True, pip=names, environment={
+        'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}', 'PYTHONPATH': system,
+        'PIP_NO_INDEX': '1', 'PIP_FIND_LINKS': str(tmp_path)})
+    return needs.folder, completed(fill(needs, names))
 
 
 @RUNS_PIP
@@ -189,7 +188,7 @@ def test_installed_packages_are_found_after_the_systems(tmp_path: Path) -> None:
             'print(fogt_one.name, before, sys.path[-1].endswith("/site"))')
     found = subprocess.run(
         [sys.executable, '-c', code], capture_output=True, text=True,
-        env={**with_pip_folder(folder, {}), 'PYTHONPATH': f'{folder}/last:{system}'})
+        env={'PYTHONPATH': f'{folder}/last:{system}'})
     assert found.stdout.split() == ['pip', 'True', 'True'], found.stderr
 
 
@@ -232,6 +231,9 @@ def test_keys_are_what_packages_and_nodes_run_with(tmp_path: Path) -> None:
     assert dependencies.keys([found], ['mine', 'slam_toolbox']) == (
         'python3-scipy', 'slam_toolbox', 'tf2_ros')
     assert dependencies.keys([], ['slam_toolbox']) == ('slam_toolbox',)
+    # what is built there needs all
+    assert dependencies.keys([found], [], [tmp_path]) == (
+        'eigen', 'gtest', 'python3-scipy', 'tf2_ros')
 
 
 def test_packages_of_an_equal_underlay_are_not_asked_for(tmp_path: Path) -> None:
@@ -240,12 +242,11 @@ def test_packages_of_an_equal_underlay_are_not_asked_for(tmp_path: Path) -> None
     (index / 'tf2_ros').touch()
     assert dependencies.outside(['python3-scipy', 'tf2_ros'], [str(tmp_path), '/none']) == (
         'python3-scipy',)
-    command = dependencies.unknown(
-        ['tf2_ros', 'fogt-none', 'dpkg'], {'AMENT_PREFIX_PATH': f'/none:{tmp_path}'}, ())
-    said = completed(command).stdout.split()
+    needs = Needs('a', FACTS, True, environment={'AMENT_PREFIX_PATH': f'/none:{tmp_path}'})
+    said = completed(
+        installer.unknown(needs, ['tf2_ros', 'fogt-none', 'dpkg'])).stdout.split()
     assert said == ['fogt-none', *([] if shutil.which('dpkg-query') else ['dpkg'])]
-    nothing = completed(dependencies.unknown(
-        ['tf2_ros'], {'AMENT_PREFIX_PATH': str(tmp_path)}, ()))
+    nothing = completed(installer.unknown(needs, ['tf2_ros']))
     assert (nothing.returncode, nothing.stdout) == (0, '')
 
 
@@ -256,20 +257,39 @@ def test_rosdep_resolves_keys_from_a_file(tmp_path: Path) -> None:
         **rosdep_source(tmp_path, {'fogt_key': '[fogt-hello]',
                                    'fogt_pip': '{pip: {packages: [fogt-one]}}'}),
         'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}'}
-    command = dependencies.resolve(
-        ['fogt_key', 'fogt_none', 'fogt_pip', 'slam_toolbox'], environment, ())
-    done = completed(command)
+    done = completed(installer.resolve(
+        Needs('a', FACTS, True, environment=environment),
+        ['fogt_key', 'fogt_none', 'fogt_pip', 'slam_toolbox']))
     assert done.returncode == 0, done.stderr
-    assert dependencies.resolved(done.stdout) == (
+    assert installer.resolved(done.stdout) == (
         ('fogt-hello', 'ros-jazzy-slam-toolbox'), ('fogt-one',))
     assert "no rosdep rule for 'fogt_none'" in done.stderr
 
 
+def test_image_gets_the_debian_packages_of_keys(tmp_path: Path) -> None:
+    if shutil.which('rosdep', path=str(Path(sys.executable).parent)) is None:
+        pytest.skip('needs rosdep in this environment')
+    for name in ('apt-get', 'dpkg'):
+        (tmp_path / name).write_text(f'#!/bin/sh\necho "$*" >>{tmp_path}/{name}.called\n')
+        (tmp_path / name).chmod(0o755)
+    environment = {
+        **rosdep_source(tmp_path, {'fogt_key': '[fogt-hello]',
+                                   'fogt_pip': '{pip: {packages: [fogt-one]}}'}),
+        'PATH': f'{tmp_path}:{Path(sys.executable).parent}:{os.environ["PATH"]}'}
+    script = installer.image_script(['rsync'], ['fogt_key', 'fogt_none', 'fogt_pip'])
+    done = subprocess.run(['sh', '-ec', script], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    installed = [line.partition(' --no-install-recommends ')[2] for line in
+                 (tmp_path / 'apt-get.called').read_text().splitlines() if ' install ' in line]
+    assert installed == ['rsync', 'fogt-hello']
+
+
 def test_machine_without_rosdep_says_so() -> None:
-    command = dependencies.resolve(['x'], {'PATH': '/usr/bin:/bin'}, ())
+    command = installer.resolve(
+        Needs('a', FACTS, True, environment={'PATH': '/usr/bin:/bin'}), ['x'])
     if shutil.which('rosdep', path='/usr/bin:/bin'):
         pytest.skip('this computer has rosdep')
-    assert completed(command).returncode == dependencies.NO_ROSDEP
+    assert completed(command).returncode == installer.NO_ROSDEP
 
 
 @pytest.mark.parametrize(('base', 'given', 'expected'), [
@@ -285,29 +305,23 @@ def test_a_users_paths_extend_the_machines(
 
 
 def test_missing_packages_of_keys_are_no_error() -> None:
-    facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=False)
-    install = bootstrap.RosInstall('ros', facts=facts, robot=facts)
-    spec = MachineSpec('lab', 'ssh')
     outputs = {'look for dependencies': 'python3-scipy\n',
                'resolve rosdep keys': '#apt\npython3-scipy\n',
                'look for apt packages': 'python3-scipy\n'}
 
-    def complete(spec: MachineSpec) -> list[str]:
-        folder = pip_folder(spec, facts, ['python3-scipy'])
-        return bootstrap._complete(
-            spec, install, folder, ['python3-scipy'],
-            lambda command, **_: Result(0, outputs.get(command.what, ''), ''),
+    def complete(needs: Needs) -> list[str]:
+        return installer.install(
+            needs, lambda command, **_: Result(0, outputs.get(command.what, ''), ''),
             lambda *warning: pytest.fail(f'{warning}'))
 
-    assert complete(spec) == ['the machine lacks python3-scipy']
-    with pytest.raises(PrerequisiteError, match="'lab' lacks the packages python3-scipy"):
-        complete(dataclasses.replace(spec, apt=('python3-scipy',)))
+    needs = Needs('lab', FACTS, False, keys=('python3-scipy',))
+    assert complete(needs) == ['the machine lacks python3-scipy']
+    with pytest.raises(PrerequisiteError, match="'lab' lacks python3-scipy"):
+        complete(dataclasses.replace(needs, apt=('python3-scipy',)))
 
 
 @pytest.mark.parametrize('pip', [(), ('x',)])
 def test_silent_rosdep_is_a_warning_and_asked_again(pip: tuple[str, ...]) -> None:
-    facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=True)
-    install = bootstrap.RosInstall('pip', facts=facts, robot=facts)
     ran: list[Command] = []
 
     def run(command: Command, **_: object) -> Result:
@@ -317,10 +331,10 @@ def test_silent_rosdep_is_a_warning_and_asked_again(pip: tuple[str, ...]) -> Non
                 }.get(command.what, Result(0, '', ''))
 
     warned: list[tuple[str, str]] = []
-    spec = MachineSpec('lab', 'ssh', apt=('python3-scipy=1.2',), pip=pip)
-    notes = bootstrap._complete(
-        spec, install, '/home/fog/pip', ['python3-humanize', 'python3-scipy'], run,
-        lambda text, hint: warned.append((text, hint)))
+    needs = Needs('lab', FACTS, True, ('python3-scipy=1.2',), pip,
+                  ('python3-humanize', 'python3-scipy'))
+    notes = installer.install(
+        needs, run, lambda text, hint: warned.append((text, hint)), always=True)
     assert notes == ['installed x by pip'] * len(pip)
     assert warned == [(
         "machine 'lab' may lack python3-humanize, as rosdep gave no answer: "
@@ -330,7 +344,9 @@ def test_silent_rosdep_is_a_warning_and_asked_again(pip: tuple[str, ...]) -> Non
     assert b'set -- python3-humanize\n' in ran[0].input
     assert b'sitecustomize' in ran[-1].input and b': >complete' not in ran[-1].input
     # with an answer, the next launch has nothing to do
-    assert b': >complete' in fill('/none', (), {}, {}, ()).input
+    assert b': >complete' in fill(needs, ()).input
+    done = dataclasses.replace(FACTS, installed=frozenset({needs.folder.rpartition('/')[2]}))
+    assert installer.install(dataclasses.replace(needs, facts=done), pytest.fail, print) == []
 
 
 @pytest.mark.parametrize(('option', 'reason', 'remedy'), [
@@ -343,25 +359,18 @@ def test_silent_rosdep_is_a_warning_and_asked_again(pip: tuple[str, ...]) -> Non
 def test_package_that_cannot_be_installed_has_a_remedy(
     option: dict[str, tuple[str, ...]], reason: str, remedy: str,
 ) -> None:
-    facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=True)
-    install = bootstrap.RosInstall('ros', facts=facts, robot=facts)
-    spec: MachineSpec = dataclasses.replace(MachineSpec('lab', 'ssh'), **option)
-
     def run(command: Command, **_: object) -> Result:
         if command.what.startswith('install'):
             raise CommandError(command, Result(100, '', reason), "'lab'")
         return Result(0, 'none', '')
 
     with pytest.raises(CommandError, match=f"on 'lab'.*{reason}") as raised:
-        bootstrap._complete(spec, install, '/home/fog/pip', [], run, lambda *warning: None)
+        installer.install(Needs('lab', FACTS, True, **option), run, print)
     assert raised.value.hint.startswith(remedy)
 
 
 @pytest.mark.parametrize('root', [True, False])
 def test_machine_without_pip_is_found_before_apt(root: bool) -> None:
-    facts = HostFacts(user='fog', home='/home/fog', programs=frozenset({'apt-get'}), root=root)
-    install = bootstrap.RosInstall('ros', facts=facts, robot=facts)
-    spec = MachineSpec('lab', 'ssh', apt=('slow',), pip=('scikit-learn',))
     ran: list[str] = []
 
     def run(command: Command, **_: object) -> Result:
@@ -370,7 +379,8 @@ def test_machine_without_pip_is_found_before_apt(root: bool) -> None:
                       'python3-venv slow' if 'apt' in command.what else '', '')
 
     def complete() -> list[str]:
-        return bootstrap._complete(spec, install, '/home/fog/pip', [], run, lambda *_: None)
+        return installer.install(
+            Needs('lab', FACTS, root, ('slow',), ('scikit-learn',)), run, print)
 
     if root:
         assert complete() == ['installed python3-venv, slow', 'installed scikit-learn by pip']
@@ -389,4 +399,5 @@ def test_pip_has_several_ways(tmp_path: Path, works: str, status: int) -> None:
     python.write_text(f'#!/bin/sh\n[ "$*" = "{works}" ]\n')
     python.chmod(0o755)
     environment = {'PATH': f'{tmp_path}:{os.environ["PATH"]}', 'VIRTUAL_ENV': '/nowhere'}
-    assert bool(completed(able(environment, ())).returncode) == bool(status)
+    needs = Needs('a', FACTS, True, environment=environment)
+    assert bool(completed(find_pip(needs)).returncode) == bool(status)

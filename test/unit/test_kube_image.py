@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-from xml.etree import ElementTree
 
 import pytest
 
@@ -21,7 +20,7 @@ HASH = '0123456789abcdef'
 def recipe(**changes):
     return image.recipe(**{
         'registry': 'registry.example/robots', 'dependencies': HASH,
-        'packages': ['rsync', 'wireguard-tools'], 'keys': ['nav2_msgs', 'tf2_ros'], **changes})
+        'script': 'true\n', **changes})
 
 
 def test_the_tag_is_the_hash_of_what_is_in_it():
@@ -36,27 +35,18 @@ def test_a_launch_takes_the_image_that_fits():
     assert CreateRequest('t', '', {}, 1, dependencies=HASH).dependencies == HASH
 
 
-def test_all_that_is_needed_is_in_the_containerfile():
-    files = dict(recipe().files)
-    text = files[image.CONTAINERFILE]
-    assert text.splitlines()[1] == 'FROM docker.io/library/ros:jazzy-ros-base'
-    for word in ('rsync', 'wireguard-tools', 'rosdep install', f'fogros2-dependencies={HASH}',
-                 'useradd -m -u 1729 fog'):
-        assert word in text
-    tree = ElementTree.fromstring(files[image.MANIFEST])
-    assert [each.text for each in tree.findall('depend')] == ['nav2_msgs', 'tf2_ros']
-
-
-def test_a_workspace_without_needs_takes_no_rosdep():
-    files = dict(recipe(keys=[], user='root').files)
-    assert list(files) == [image.CONTAINERFILE]
-    assert 'rosdep' not in files[image.CONTAINERFILE]
-    assert 'useradd' not in files[image.CONTAINERFILE]
+def test_the_containerfile_runs_the_script():
+    lines = recipe(script='echo "a"\ntrue\n').containerfile.splitlines()
+    assert lines[1] == 'FROM docker.io/library/ros:jazzy-ros-base'
+    assert f'LABEL fogros2-dependencies={HASH}' in lines
+    assert r'RUN ["sh", "-ec", "echo \"a\"\ntrue\n"]' in lines
+    assert lines[-1].endswith('useradd -m -u 1729 fog')
+    assert 'useradd' not in recipe(user='root').containerfile
 
 
 @pytest.mark.parametrize('changes', [
-    {'registry': 'Registry/x'}, {'registry': '--all'}, {'packages': ['rsync; true']},
-    {'keys': ['<a/>']}, {'base': 'a b'}, {'base': '-x'}, {'user': 'a b'}, {'dependencies': ''}])
+    {'registry': 'Registry/x'}, {'registry': '--all'}, {'base': 'a b'}, {'base': '-x'},
+    {'user': 'a b'}, {'dependencies': ''}])
 def test_words_that_would_do_something_else_are_refused(changes):
     raised(ConfigurationError, lambda: recipe(**changes))
 
@@ -90,8 +80,7 @@ def test_it_is_built_and_pushed(engine):
     assert image.build(what, engine / 'context', program='buildah') == what.reference
     told = (engine / 'told').read_text().splitlines()
     assert [line.split()[0] for line in told] == ['build', 'push']
-    assert sorted(p.name for p in (engine / 'context').iterdir()) == [
-        'Containerfile', 'package.xml']
+    assert (engine / 'context/Containerfile').read_text() == what.containerfile
 
 
 def test_registry_that_needs_a_login_is_reported(engine):

@@ -8,20 +8,17 @@ import os
 from pathlib import Path
 import shutil
 import subprocess
-import sys
 from typing import Any
 
 import pytest
 
-from fogros2 import process
-from fogros2.errors import CommandError, WorkspaceError
+from fogros2.errors import WorkspaceError
 from fogros2.host import workspace
 from fogros2.host.inspection import HostFacts, Python
 from fogros2.model import Command, Endpoint, Result, SyncReport
 from fogros2.shell.local import LocalShell
 from fogros2.waiting import Timeouts
 from fogros2_testing.fakes import FakeShell
-from rigs.rosdep import rosdep_source
 
 PYTHON = Python('/usr/bin/python3', (3, 12), True)
 ROBOT = HostFacts(system='ubuntu', release='24.04', architecture='x86_64', pythons=(PYTHON,),
@@ -162,10 +159,9 @@ def test_another_python_builds_there(root: Path) -> None:
     way = plan(workspace.inspect(root), machine)
     assert 'python3.12' in way.reason
     assert '/install' in way.excludes and '/build' in way.excludes
-    rosdep, colcon = way.commands
-    assert 'rosdep install' in rosdep.argv[-1] and '--from-paths src' in rosdep.argv[-1]
+    colcon, = way.commands
     assert colcon.argv[-1].startswith('. /opt/ros/jazzy/setup.sh\n')
-    assert 'colcon build' in colcon.argv[-1]
+    assert 'colcon build --base-paths src' in colcon.argv[-1]
     assert way.setup == f'{root}/install/local_setup.sh'
 
 
@@ -206,48 +202,6 @@ def test_condition_that_is_none_names_its_file(root: Path) -> None:
                      '<depend condition="$ROS_VERSION = 2">key</depend></package>')
     with pytest.raises(WorkspaceError, match=f"{manifest}: condition '.*' failed to parse"):
         workspace.run_dependencies(manifest)
-
-
-@pytest.mark.parametrize('compiles', [True, False])
-def test_keys_without_a_rule_are_listed_and_the_build_goes_on(root: Path, compiles: bool) -> None:
-    machine = dataclasses.replace(ARM, pythons=())
-    way = plan(workspace.inspect(root), machine)
-    results = {
-        "install the workspace's dependencies": Result(0, '', (
-            'ERROR: the following packages/stacks could not have their rosdep keys resolved\n'
-            'alpha: Cannot locate rosdep definition for [fogt_none]\n'
-            'beta: No definition of [fogt_old] for OS version [noble]\n'
-            'beta: Cannot locate rosdep definition for [fogt_none]\n')),
-        'build the workspace': Result(0 if compiles else 1, '', 'fatal error: none.h')}
-    shell = FakeShell(handlers={
-        'sh': lambda command: results.get(command.what, Result(0, '', ''))})
-    if compiles:
-        note = workspace.transfer(shell, [way], timeouts=Timeouts())
-        assert note.endswith(', the machine may lack fogt_none, fogt_old')
-    else:
-        with pytest.raises(CommandError, match='none.h') as error:
-            workspace.transfer(shell, [way], timeouts=Timeouts())
-        assert error.value.hint == 'rosdep has no rule for fogt_none, fogt_old'
-
-
-def test_real_rosdep_goes_on_without_a_rule(root: Path, tmp_path: Path) -> None:
-    if shutil.which('rosdep', path=str(Path(sys.executable).parent)) is None:
-        pytest.skip('needs rosdep in this environment')
-    write(root / 'src/alpha/package.xml', (
-        '<package format="3"><name>alpha</name><version>1.0.0</version><description>d'
-        '</description><maintainer email="a@example.org">a</maintainer><license>l</license>'
-        '<depend>fogt_none</depend></package>'))
-    shutil.rmtree(root / 'src/group')
-    command = plan(workspace.inspect(root), dataclasses.replace(ROBOT, pythons=())).commands[0]
-    (tmp_path / 'lists').mkdir()
-    done = process.run(dataclasses.replace(command, argv=(
-        *command.argv[:-1], command.argv[-1].replace('. /opt/ros/jazzy/setup.sh\n', '')),
-        environment={**rosdep_source(tmp_path / 'lists', {'fogt_key': '[fogt]'}),
-                     'HOME': str(tmp_path),
-                     'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}'}),
-        timeout=60.0, check=False)
-    assert done.returncode == 0, done.stderr
-    assert 'Cannot locate rosdep definition for [fogt_none]' in done.stderr
 
 
 def test_compiled_code_is_built_for_another_processor_or_system(root: Path) -> None:

@@ -11,7 +11,7 @@ from fogros2.deploy.machine_job import MachineJob, Step
 from fogros2.deploy.undo import CONTAINERS
 from fogros2.errors import CommandError, PrerequisiteError
 from fogros2.host import container_scripts, containers
-from fogros2.host.bootstrap import apt_install
+from fogros2.host.installer import apt_install
 from fogros2.model import NodeSpec
 
 
@@ -120,8 +120,7 @@ class Containers(Step):
         if not self._engine and not job.run(containers.FIND, timeout=timeouts.command).strip():
             try:
                 # the configuration of podman may name crun, and its package may bring another
-                job.run(apt_install(['podman', 'crun'], 'install podman'),
-                        timeout=timeouts.install)
+                job.run(apt_install(['podman', 'crun']), timeout=timeouts.install)
             except CommandError as error:
                 raise PrerequisiteError(
                     f"'{job.name}' has neither podman nor docker, and podman can't be installed: "

@@ -14,7 +14,7 @@ from fogros2 import plan
 from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob, Step
 from fogros2.errors import CommandError, PrerequisiteError
-from fogros2.host import bootstrap, modules, workspace
+from fogros2.host import bootstrap, installer, modules, workspace
 from fogros2.model import Command, NodeSpec
 from fogros2.report import Progress, Warned
 
@@ -117,8 +117,8 @@ class Modules(Step):
                     timeout=self._context.timeouts.install, cancel=self._job.cancel)
         else:
             try:
-                self._run(modules.install(
-                    self._environment, self._setup, target, present.missing))
+                self._run(installer.pinned_install(
+                    modules.pinned(present.missing), target, self._environment, self._setup))
             except CommandError as error:
                 self._discard(target)
                 raise self._without(present, str(error)) from error
@@ -159,4 +159,4 @@ class Modules(Step):
                     f'machine that has them: pip install {names}')
         return PrerequisiteError(
             f"'{self._job.name}' can't get {', '.join(present.missing)}, which programs there "
-            f'import: {why}', modules.library_hint(why) or hint)
+            f'import: {why}', installer.library_hint(why) or hint)

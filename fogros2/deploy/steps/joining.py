@@ -115,8 +115,8 @@ class Joining(Step):
         """Make the agent repair the machine's VPN when its program ends."""
         job, vpn = self._job, self._context.vpn.vpn
         job.agent.request(
-            'keep', timeout=self._context.timeouts.agent, what='vpn', interval=1.0,
-            alive=list(vpn.health_check(job.interface).argv),
+            'watch', timeout=self._context.timeouts.agent, what='vpn', interval=1.0,
+            argv=list(vpn.health_check(job.interface).argv),
             repair=[list(c.argv) for c in vpn.repair(job.interface, peers)],
             down=[list(c.argv) for c in vpn_down(job.record)])
 

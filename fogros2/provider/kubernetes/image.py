@@ -8,13 +8,13 @@ Build images for pods that contain what a launch would install: a pod's disk can
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import dataclasses
+import json
 import os
 from pathlib import Path
 import re
 from typing import Optional
-from xml.sax.saxutils import escape
 
 from fogros2 import process
 from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError, ProviderError
@@ -26,7 +26,6 @@ from fogros2.provider.kubernetes.options import IMAGE
 ENGINES = {'podman': 'podman', 'docker': 'docker.io', 'buildah': 'buildah'}
 NAME = 'fogros2'
 CONTAINERFILE = 'Containerfile'
-MANIFEST = 'package.xml'
 #: Seconds for the build, and for the push.
 STEP_TIMEOUT = 3600.0
 
@@ -41,25 +40,23 @@ class Recipe:
 
     :param reference: its name with registry and tag.
     :param base: the base image.
-    :param files: names and contents of all files of the build, with the Containerfile.
+    :param containerfile: its text; the build needs no other file.
     """
 
     reference: str
     base: str
-    files: tuple[tuple[str, str], ...]
+    containerfile: str
 
 
 def recipe(
-    registry: str, *, dependencies: str, packages: Sequence[str], keys: Sequence[str] = (),
-    base: str = IMAGE, user: str = 'fog', distro: str = 'jazzy',
+    registry: str, *, dependencies: str, script: str, base: str = IMAGE, user: str = 'fog',
 ) -> Recipe:
     """
     Return how to build the image for a robot's machines.
 
     :param registry: such as 'registry.example/robots'.
     :param dependencies: hash of the image's content, its tag.
-    :param packages: Debian packages.
-    :param keys: rosdep keys of the workspace's dependencies.
+    :param script: script for sh that installs the packages, as root.
     :param base: base image.
     :param user: login user; see the option of this name.
     :raises ConfigurationError: a value is invalid.
@@ -67,66 +64,30 @@ def recipe(
     if not _REGISTRY.fullmatch(registry):
         raise ConfigurationError(f"'{registry}' can't be a registry",
                                  "such as 'registry.example/robots' or 'localhost:5000'")
-    for word in (*packages, *keys, dependencies, user, distro):
+    for word in (dependencies, user):
         if not _WORD.fullmatch(word):
-            raise ConfigurationError(f"'{word}' can't be part of an image's recipe",
-                                     'is it the name of a package, as package.xml has it?')
+            raise ConfigurationError(f"'{word}' can't be part of an image's recipe")
     if not base or base.startswith('-') or any(c.isspace() for c in base):
         raise ConfigurationError(f"'{base}' can't be the image to begin with",
                                  'such as docker.io/library/ros:jazzy-ros-base')
-    files = [(CONTAINERFILE, _containerfile(dependencies, packages, keys, base, user, distro))]
-    if keys:
-        files.append((MANIFEST, _manifest(keys)))
-    return Recipe(f'{registry}/{NAME}:{dependencies}', base, tuple(files))
-
-
-def _containerfile(
-    dependencies: str, packages: Sequence[str], keys: Sequence[str], base: str, user: str,
-    distro: str,
-) -> str:
     lines = ['# what a robot installs on a machine otherwise, at each launch', f'FROM {base}',
-             'USER root', f'LABEL fogros2-dependencies={dependencies}']
-    if packages:
-        listed = ' \\\n        '.join(sorted(set(packages)))
-        lines.append(
-            'RUN apt-get update \\\n'
-            '    && DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends \\\n'
-            f'        {listed} \\\n'
-            '    && rm -rf /var/lib/apt/lists/*')
-    if keys:
-        lines += [
-            f'COPY {MANIFEST} /tmp/fogros2/{MANIFEST}',
-            'RUN apt-get update \\\n'
-            '    && { [ -e /etc/ros/rosdep/sources.list.d/20-default.list ] || rosdep init; } \\\n'
-            f'    && rosdep update --rosdistro {distro} \\\n'
-            f'    && DEBIAN_FRONTEND=noninteractive rosdep install --rosdistro {distro} \\\n'
-            '        --from-paths /tmp/fogros2 --ignore-src -y -r \\\n'
-            '    && rm -rf /tmp/fogros2 /var/lib/apt/lists/*']
+             'USER root', f'LABEL fogros2-dependencies={dependencies}',
+             f"RUN {json.dumps(['sh', '-ec', script])}", 'RUN rm -rf /var/lib/apt/lists/*']
     if user != 'root':
         # The first launch then need not create the user.
         lines.append(f'RUN grep -q "^{user}:" /etc/passwd || useradd -m -u {UID} {user}')
-    return '\n'.join(lines) + '\n'
-
-
-def _manifest(keys: Sequence[str]) -> str:
-    """Return a package.xml with the workspace's dependencies, for rosdep."""
-    depends = '\n'.join(f'  <depend>{escape(key)}</depend>' for key in sorted(set(keys)))
-    return ('<?xml version="1.0"?>\n<package format="3">\n  <name>fogros2_machine</name>\n'
-            "  <version>0.0.0</version>\n  <description>A workspace's needs</description>\n"
-            '  <maintainer email="robot@localhost">robot</maintainer>\n'
-            f'  <license>Apache-2.0</license>\n{depends}\n</package>\n')
+    return Recipe(f'{registry}/{NAME}:{dependencies}', base, '\n'.join([*lines, '']))
 
 
 def write(what: Recipe, folder: Path) -> Path:
     """
-    Write a recipe's files, and return the Containerfile's path.
+    Write a recipe's Containerfile, and return its path.
 
     :raises PrerequisiteError: the folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, text in what.files:
-            (folder / name).write_text(text)
+        (folder / CONTAINERFILE).write_text(what.containerfile)
     except OSError as error:
         raise PrerequisiteError(f'{folder} can not be written: {error.strerror}',
                                 '--folder names another') from error
