@@ -38,7 +38,7 @@ def data_files():
     yield 'lib/fogros2', [
         'fogros2_monitor/scripts/bridge', 'fogros2_monitor/scripts/record',
         'fogros2_replicas/scripts/first_answer',
-        'fogros2_share/scripts/share']
+        'fogros2_share/scripts/limits', 'fogros2_share/scripts/share']
 
 
 #: What builds the documentation.

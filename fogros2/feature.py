@@ -129,6 +129,10 @@ class LaunchedMachine(Protocol):
         """Whether the provider reclaims the machine, which may still run, or it is gone."""
 
     @property
+    def replicated(self) -> Mapping[str, str]:
+        """New names of topics and services of its replicas, by the names that all have."""
+
+    @property
     def sent(self) -> Sequence[NodeSpec]:
         """Its nodes that have started, or are about to, as they were before ``starting``."""
 

@@ -13,7 +13,7 @@ each other machine publishes here, so a message changes threads once in each pro
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 import contextlib
 import fcntl
 import json
@@ -208,15 +208,10 @@ class Relay(Node):
 
     def _look(self, name: str, shared: Shared) -> None:
         """Subscribe with the type and QoS of the publishers, and again when these change."""
-        publishers, subscriptions = ([one for one in endpoints if one.node_name != self.get_name()]
-                                     for endpoints in (self.get_publishers_info_by_topic(name),
-                                                       self.get_subscriptions_info_by_topic(name)))
+        publishers = others(self, self.get_publishers_info_by_topic(name))
+        subscriptions = others(self, self.get_subscriptions_info_by_topic(name))
         shared.kind = next((one.topic_type for one in (*publishers, *subscriptions)), '')
-        profiles = [one.qos_profile for one in publishers]
-        kept = sum(one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in profiles)
-        form = Form(
-            shared.kind, all(one.reliability == ReliabilityPolicy.RELIABLE for one in profiles),
-            min(kept, DEEPEST) if kept == len(profiles) else 0) if profiles else None
+        form = form_of(publishers)
         if form == shared.form or form and self._imported(form.kind) is None:
             return
         if shared.subscription is not None:
@@ -382,6 +377,21 @@ def proven(file: int, path: Path) -> bool:
 def topics_of(folder: Path) -> frozenset[str]:
     """Return the topics that a machine was made for, from its folder."""
     return frozenset((folder / TOPICS).read_text().split())
+
+
+def others(node: Node, endpoints: Iterable[Any]) -> list[Any]:
+    """Return the publishers or subscriptions that are not of a node itself."""
+    return [one for one in endpoints if one.node_name != node.get_name()]
+
+
+def form_of(publishers: Sequence[Any]) -> Optional[Form]:
+    """Return the form of a topic's messages, None without publishers."""
+    profiles = [one.qos_profile for one in publishers]
+    kept = sum(one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in profiles)
+    return Form(
+        publishers[0].topic_type,
+        all(one.reliability == ReliabilityPolicy.RELIABLE for one in profiles),
+        min(kept, DEEPEST) if kept == len(profiles) else 0) if publishers else None
 
 
 def profile(form: Form, least: int = 1) -> QoSProfile:

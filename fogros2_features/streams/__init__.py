@@ -1,51 +1,58 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Streams: topics that cross the VPN encoded, by ``stream_topics`` and ``<stream_topic>``.
+What crosses the VPN: topics encoded, by ``stream_topics``; at a limited rate; or not at all.
 
-In reading order: ``transport`` is the plugin interface of transports, ``topics`` names the topics
-of streams, ``nodes`` and ``republish`` have the transports, ``entries`` converts what a launch
-file says, ``collection`` has the streams of a launch, ``uncompressed`` warns of images that
-should be streamed, ``part`` acts in the launch, ``parsing`` reads the element of XML and YAML, and
-``elements`` registers it with launch.
+In reading order: ``policy`` has the limits of a machine's link, ``transport`` is the plugin
+interface of transports, ``topics`` names the topics of streams, ``nodes`` and ``republish`` have
+the transports, ``entries`` converts what a launch file says, ``collection`` has the streams of a
+launch, ``uncompressed`` warns of images that should be streamed, ``part`` acts in the launch,
+``parsing`` reads the element of XML and YAML, and ``elements`` registers it with launch.
 """
 
 from __future__ import annotations
 
-import re
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Optional, TYPE_CHECKING
 
 from fogros2.errors import ConfigurationError
 from fogros2.feature import Feature, LaunchPart, RunningLaunch
+from fogros2.model import MachineSpec
+from fogros2_features.streams.policy import Policy, policy
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
 
-_PREFIXES = {'': 1.0, 'k': 1e3, 'M': 1e6, 'G': 1e9}
+    from fogros2.describe.machines import Scalar
 
 
 class Streaming(Feature):
-    """``stream_topics=[('/camera', 'h264')]`` of nodes, ``bandwidth='10Mbit/s'`` of machines."""
+    """``stream_topics=[('/camera', 'h264')]`` of nodes; of machines, what their link may carry."""
 
     node_list = ('stream_topics', 'stream_topic')
 
     @staticmethod
-    def options(bandwidth: Optional[SomeSubstitutionsType] = None) -> float:
+    def options(
+        bandwidth: Optional[SomeSubstitutionsType] = None,
+        deny_topics: Sequence[SomeSubstitutionsType] = (),
+        limit_topics: Mapping[str, Scalar] = MappingProxyType({}),
+    ) -> Policy:
         """
-        Return the bits per second that streams may use in each direction, 0 for no limit.
+        Return the policy of the machine's link.
 
-        :param bandwidth: such as '10Mbit/s'.
+        :param bandwidth: that streams may use in each direction, such as '10Mbit/s'.
+        :param deny_topics: topics that do not cross.
+        :param limit_topics: the rate at which a topic crosses, such as '20 Hz', by topic.
         """
-        if bandwidth is None:
-            return 0.0
-        match = re.fullmatch(r'(\d+(?:\.\d+)?) ?([kMG]?)bit/s|(\d+(?:\.\d+)?)',
-                             str(bandwidth).strip())
-        bits = 0.0 if match is None else (
-            float(match[1] or match[3]) * _PREFIXES[match[2] or ''])
-        if not 1e5 <= bits <= 1e12:
+        return policy(bandwidth, deny_topics, limit_topics)
+
+    def check(self, spec: MachineSpec, own: Policy) -> None:
+        """Check that the machine shares no topic that is denied or limited."""
+        if both := sorted({*spec.share} & {*own.names(spec.name)}):
             raise ConfigurationError(
-                f'bandwidth={bandwidth!r} is no bandwidth from 100 kbit/s to 1 Tbit/s',
-                "write '500kbit/s', '10Mbit/s' or '1Gbit/s'")
-        return bits
+                f"'{spec.name}' has {', '.join(both)} in share= and in deny_topics or "
+                'limit_topics',
+                'leave one of the two out: all of the launch hears what is shared')
 
     def in_launch(self, launch: RunningLaunch) -> LaunchPart:
         """Return what the streams of a launch do."""

@@ -9,12 +9,14 @@ from typing import Optional
 import launch.logging
 
 from fogros2 import feature
+from fogros2.errors import ConfigurationError
 from fogros2.feature import LaunchPart, Program, RunningLaunch
 from fogros2.model import NodeSpec
 from fogros2.ros_names import remapped
 from fogros2.runtime.node_spec import full_name
 from fogros2_features.streams import collection, uncompressed
 from fogros2_features.streams.entries import Entry, StreamTopic
+from fogros2_features.streams.policy import Policy
 
 
 class Part(LaunchPart):
@@ -26,6 +28,8 @@ class Part(LaunchPart):
         self._everywhere: list[tuple[Sequence[Entry], str]] = []
         #: By machine: the topic names that the first loaded components got.
         self._component_names: dict[str, dict[str, str]] = {}
+        #: Machines whose links have the programs of limits.
+        self._limited: set[str] = set()
         self._logger = launch.logging.get_logger('fogros2')
 
     def check(self, items: Sequence[Entry]) -> None:
@@ -45,12 +49,27 @@ class Part(LaunchPart):
         return resolved
 
     def beside(self, own: Sequence[StreamTopic], machine: Optional[str]) -> list[Program]:
-        """Return the nodes that a process's streams need and no earlier process did."""
+        """Return the nodes that a process needs for streams and limits, and no earlier one did."""
         if machine is not None:
-            return self._add(own, machine)
+            return [*self._add(own, machine), *self._limit(machine)]
         # the robot has its own topics; other machines send theirs
         return [program for entry in own if entry.source is not None for program in self._add(
             [entry.but(direction='to_robot', source=None)], entry.source)]
+
+    def _policy(self, machine: str) -> Policy:
+        made: Policy = feature.options(
+            'streams', self._launch.spec(machine).features.get('streams', {}))
+        return made
+
+    def _limit(self, machine: str) -> list[Program]:
+        policy = self._policy(machine)
+        _refuse(self._launch.machines[machine].replicated, policy.names(machine),
+                f"deny_topics or limit_topics of '{machine}'",
+                'the first answer of replicas already carries it')
+        if machine in self._limited:
+            return []
+        self._limited.add(machine)
+        return [Program(spec, host, machine) for host, spec in policy.ends(machine)]
 
     def _all(self, own: Iterable[StreamTopic]) -> list[StreamTopic]:
         return [*(entry for some in self._everywhere for entry in self.resolve(*some)), *own]
@@ -62,19 +81,17 @@ class Part(LaunchPart):
         machines = self._launch.machines
         away = [name for name, one in machines.items() if one.interrupted]
         before = {name: self._streams.remappings(name) for name in machines}
-        for name in (machine, *(entry.source for entry in streams)):
-            if name is not None:
-                self._streams.bandwidths[name] = self._bandwidth(name)
+        ends = {machine, *(entry.source for entry in streams if entry.source is not None)}
+        for name in ends:
+            self._streams.bandwidths[name] = self._policy(name).bandwidth
         new = self._streams.add([collection.from_robot(entry, away) for entry in streams], machine)
+        for name in ends:
+            _refuse(self._streams.remappings(name), self._policy(name).limits,
+                    f"limit_topics of '{name}'", 'a stream already carries it')
         # another machine may be the source
         for name in machines:
             self._warn_of_early(name, before[name])
         return [Program(spec, host, machine) for host, spec in new]
-
-    def _bandwidth(self, machine: str) -> float:
-        bits: float = feature.options(
-            'streams', self._launch.spec(machine).features.get('streams', {}))
-        return bits
 
     def _warn_of_early(self, machine: str, before: Mapping[str, str]) -> None:
         names = self._streams.remappings(machine)
@@ -95,23 +112,24 @@ class Part(LaunchPart):
             del self._component_names[machine]
 
     def starting(self, machine: str, nodes: Sequence[NodeSpec]) -> list[NodeSpec]:
-        """Rename the streamed topics of nodes."""
-        names = self._streams.remappings(machine)
-        without_arguments = [node.name for node in nodes if '--ros-args' not in node.arguments]
+        """Rename the topics of nodes that have other names on the machine."""
+        names = {**self._policy(machine).names(machine), **self._streams.remappings(machine)}
+        without_arguments = [node.name for node in nodes if '--ros-args' not in node.arguments
+                             and node.package != 'fogros2']
         if names and without_arguments:
             self._logger.warning(
                 f"{machine}: {', '.join(without_arguments)} takes no ROS arguments and so "
-                f"does not use the stream of {', '.join(names)}; if it is a ROS node that "
-                "uses the topic, add '--ros-args' to its command")
+                f"does not use the new name or the stream of {', '.join(names)}; if it is a ROS "
+                "node that uses the topic, add '--ros-args' to its command")
         return [remapped(node, names) for node in nodes]
 
     def names(self, machine: str) -> dict[str, str]:
-        """Return the new names of streamed topics."""
+        """Return the new names of topics."""
         names = self._streams.remappings(machine)
         loaded = self._component_names.setdefault(machine, names)
         self._component_names[machine] = {
             name: new for name, new in loaded.items() if name in names}
-        return names
+        return {**self._policy(machine).names(machine), **names}
 
     def topics(self, own: Sequence[StreamTopic]) -> dict[str, bool]:
         """Return the streamed topics, and whether the robot publishes each."""
@@ -121,8 +139,10 @@ class Part(LaunchPart):
         return {entry.topic: entry.topic in here for entry in entries}
 
     def moved(self, machine: str) -> tuple[list[str], list[Program]]:
-        """Let the robot take the machine's place in streams."""
+        """Let the robot take the machine's place in streams; its link has no limits any more."""
         ended, new, lost = self._streams.take_over(machine)
+        ended += [node.id for host, node in self._policy(machine).ends(machine) if host is None]
+        self._limited.discard(machine)
         if lost:
             self._logger.warning(f"{', '.join(lost)} of '{machine}' no longer reaches other "
                                  'machines: the robot streams it in another way')
@@ -141,3 +161,10 @@ class Part(LaunchPart):
             for name, machine in list(self._launch.machines.items())}
         return uncompressed.crossing_images(
             machines, self._launch.environment, self._launch.ended)
+
+
+def _refuse(carried: Iterable[str], topics: Iterable[str], place: str, reason: str) -> None:
+    """Refuse topics of a policy that cross in another way."""
+    if both := sorted({*carried} & {*topics}):
+        raise ConfigurationError(f"{', '.join(both)} can't be in {place}: {reason}",
+                                 'leave one of the two out')

@@ -179,6 +179,7 @@ LISTS = {'fetch': ('~/bags, /var/map', ['~/bags', '/var/map']),
          'record': ('/tf, /scan', ['/tf', '/scan']),
          'monitor_allow': ('198.51.100.0/28,::1', ['198.51.100.0/28', '::1']),
          'share': ('/map, /tf_static', ['/map', '/tf_static']),
+         'deny_topics': ('/costmap, /rosout', ['/costmap', '/rosout']),
          'apt': ('libzbar0, g++', ['libzbar0', 'g++']),
          'pip': ('pyzbar==0.1.9, qrcode', ['pyzbar==0.1.9', 'qrcode'])}
 
@@ -208,6 +209,15 @@ def test_keywords_are_attributes_and_take_substitutions(provider):
                               spec.features.items()] for spec in (found, expected))
             assert plain == wanted, keyword.name
             assert dataclasses.replace(found, features=expected.features) == expected, keyword.name
+
+
+def test_limits_of_topics_are_elements():
+    found = machine(xml("""
+      <fog_machine name="planner" provider="container" ros_workspace="" deny_topics="/costmap">
+        <limit_topics name="/tf" value="$(var rate)"/>
+      </fog_machine>"""), rate='20 Hz')
+    policy = feature.options('streams', found.features['streams'])
+    assert (policy.denied, policy.limits) == (('/costmap',), {'/tf': 20.0})
 
 
 def test_container_on_another_computer():

@@ -36,6 +36,7 @@ from fogros2 import (
     CloudNode,
     ContainerInstance,
     FogROSLaunchDescription,
+    Replicated,
     StreamTopic,
 )
 from fogros2.actions.override import OverrideMachines
@@ -325,7 +326,7 @@ def test_program_without_ros_arguments_is_named(run, fake, planner, caplog):
             if 'takes no ROS arguments' in record.getMessage()]
     assert len(said) == 1
     assert re.match(
-        r'planner: own_plain(-\d+)? takes .* use the stream of /camera, /camera_info', said[0])
+        r'planner: own_plain(-\d+)? takes .* the stream of /camera, /camera_info', said[0])
     assert '/camera:=/fogros2/planner/camera' in rules(fake, 'planner', 'own_node')
 
 
@@ -438,3 +439,42 @@ def test_group_without_processes_creates_no_machine(run, fake, planner):
     assert run(LaunchDescription([CloudGroup(planner, [
         Node(package='demo', executable='talker', condition=IfCondition('false'))])])) == 0
     assert fake.notes == [] and fake.report is None
+
+
+def test_denied_and_limited_topics_are_renamed_on_their_machine(
+        run, fake, mapper, box, caplog):
+    """Programs pass the limited ones at both ends; components have the names too."""
+    ends_when_all_started(fake, 4)
+    limited = ContainerInstance(name='planner', ros_workspace='', deny_topics=['/costmap'],
+                                limit_topics={'/tf': '20 Hz'})
+    load = Loading(ComposableNode(package='demo', plugin='demo::View', name='view'))
+    assert run(watched(
+        fake, FogROSLaunchDescription, CloudGroup(limited, [box, load]), talker(mapper))) == 0
+    assert there(fake, 'planner') == ['limits_planner', 'own']
+    assert there(fake, 'mapper') == ['own'] and here(fake) == ['limits_planner']
+    names = {'/costmap': '/fogros2/planner/costmap', '/tf': '/fogros2/planner/tf'}
+    assert rules(fake, 'planner')[-2:] == [f'{old}:={new}' for old, new in names.items()]
+    assert Loading.told == ([*names.items()],) and rules(fake, 'mapper') == []
+    assert 'takes no ROS arguments' not in caplog.text
+
+
+@pytest.mark.parametrize(('topic', 'streams'), [
+    ('/seen', lambda planner: [StreamTopic('/seen', 'h264', source=planner)]),
+    ('/camera_info', lambda planner: [StreamTopic('/camera', 'h264', camera_info=True)])])
+def test_topic_of_a_stream_is_not_limited(run, fake, capfd, topic, streams):
+    """What a decoder publishes would be sent back."""
+    limited = ContainerInstance(name='planner', ros_workspace='', limit_topics={topic: 5})
+    machine = ContainerInstance(name='mapper', ros_workspace='') if topic == '/seen' else limited
+    assert run(FogROSLaunchDescription([
+        talker(limited), talker(machine, stream_topics=streams(limited))])) == 1
+    assert f"{topic} can't be in limit_topics of 'planner'" in capfd.readouterr().out
+    assert fake.noted('up') == []
+
+
+def test_topic_of_replicas_is_neither_denied_nor_limited(run, fake, mapper, capfd):
+    limited = ContainerInstance(name='planner', ros_workspace='', limit_topics={'/seen': 5})
+    assert run(FogROSLaunchDescription([Replicated(
+        machines=[limited, mapper], topics=[('/camera', '/seen')],
+        actions=[Node(package='demo', executable='talker')])])) == 1
+    assert "/seen can't be in deny_topics or limit_topics of 'planner'" in capfd.readouterr().out
+    assert fake.noted('up') == []

@@ -17,6 +17,7 @@ import pytest
 from fogros2 import process
 from fogros2.model import Command
 from fogros2.waiting import wait_until
+from fogros2_features.streams.policy import Policy
 
 if TYPE_CHECKING:
     from rigs.vpn_lab import Child, Lab
@@ -196,3 +197,17 @@ def test_unread_topics_send_only_announcements_across(vpn: Lab) -> None:
     # what is under way when the reader leaves still counts
     wait_until(lambda: rate() < idle, timeout=60.0, what='announcements alone')
     assert camera.process.poll() is None
+
+
+def test_denied_topic_stays_on_its_side(vpn: Lab) -> None:
+    away = Policy(denied=('/costmap',)).names('machine')['/costmap']
+    vpn.node('robot', 'to:/costmap', 'to:/up')
+    vpn.node('machine', f'to:{away}', 'to:/down')
+    robot = vpn.node('robot', 'from:/costmap', 'from:/down')
+    machine = vpn.node('machine', f'from:{away}', 'from:/up')
+    for child, topic in (
+            (robot, '/costmap'), (robot, '/down'), (machine, away), (machine, '/up')):
+        child.wait('topic', topic, count=10, timeout=60.0)
+    for child, topic in ((robot, '/costmap'), (machine, away)):
+        numbers = [line['number'] for line in child.lines('topic', topic)]
+        assert len(numbers) == len({*numbers}), 'two publishers are heard'

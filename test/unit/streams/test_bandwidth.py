@@ -20,7 +20,7 @@ from fogros2.feature import options
     ('1Gbit/s', 1e9), ('250000bit/s', 250e3), (10_000_000, 10e6), ('1000000', 1e6)])
 def test_bandwidth_is_read_as_bits_per_second(given: Any, bits: float) -> None:
     machine = ContainerInstance(name='a', bandwidth=given).spec(LaunchContext())
-    assert options('streams', machine.features.get('streams', {})) == bits
+    assert options('streams', machine.features.get('streams', {})).bandwidth == bits
 
 
 @pytest.mark.parametrize(('given', 'said'), [

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What leaves an end of a limited link, and when; by value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed')
+from fogros2_share import limits
+from fogros2_share.wire import Form
+
+
+class Bench:
+    """A node's timer, which a test lets expire, and a publisher."""
+
+    def __init__(self, kind: str) -> None:
+        self.sent: list[Any] = []
+        self.running = False
+        self.expire: Callable[[], None] = lambda: None
+        self.leaving, self.coming = self._ways()
+        for way in (self.leaving, self.coming):
+            way.form = Form(kind, True, 1)
+            way.message = lambda transforms: transforms
+            way.publisher = SimpleNamespace(publish=self.sent.append)
+
+    def _ways(self) -> tuple[limits.Leaving, limits.Coming]:
+        node: Any = SimpleNamespace(create_timer=self._timer)
+        leaving = limits.Leaving(node, '/tf', '/there', 0.05)
+        return leaving, limits.Coming(node, '/back', '/tf', leaving)
+
+    def _timer(self, period: float, callback: Callable[[], None], **_: Any) -> Any:
+        self.expire = callback
+        return SimpleNamespace(
+            is_canceled=lambda: not self.running, reset=lambda: setattr(self, 'running', True),
+            cancel=lambda: setattr(self, 'running', False))
+
+
+def test_newest_message_of_a_period_is_sent() -> None:
+    bench = Bench('std_msgs/msg/String')
+    for data in (b'a', b'b', b'c'):
+        bench.leaving.heard(data)
+    assert bench.sent == [b'a']
+    bench.expire()
+    assert bench.sent == [b'a', b'c'] and bench.running
+    bench.expire()
+    assert not bench.running
+    bench.leaving.heard(b'd')
+    assert bench.sent == [b'a', b'c', b'd']
+
+
+def test_newest_transform_of_each_child_frame_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, 'deserialize_message', lambda data, kind: SimpleNamespace(
+        transforms=[SimpleNamespace(child_frame_id=word[0], at=word[1:])
+                    for word in data.decode().split()]))
+    bench = Bench(limits.TRANSFORMS)
+    for data in (b'a0', b'b1', b'a2 c2', b'b3'):
+        bench.leaving.heard(data)
+    bench.expire()
+    assert [[one.child_frame_id + one.at for one in message] for message in bench.sent] == [
+        ['a0'], ['b3', 'a2', 'c2']]
+
+
+def test_message_does_not_return() -> None:
+    bench = Bench('std_msgs/msg/String')
+    bench.leaving.subscription = object()
+    bench.coming.heard(b'theirs')
+    bench.leaving.heard(b'theirs')
+    assert bench.sent == [b'theirs']
+    # a latched one is heard again by a later subscription
+    bench.leaving.heard(b'theirs')
+    assert bench.sent == [b'theirs']
+    bench.leaving.heard(b'ours')
+    assert bench.sent == [b'theirs', b'ours']
