@@ -141,6 +141,7 @@ setup(
             'results = fogros2_features.results:Results',
             'streams = fogros2_features.streams:Streaming',
             'vpn_path = fogros2_features.vpn_path:VpnPath',
+            'volumes = fogros2_features.volumes:Volumes',
         ],
         'fogros2.monitor': [
             'foxglove = fogros2_monitor:FOXGLOVE',
@@ -215,6 +216,7 @@ setup(
             'shell = ros2fog_cli.verb.shell:ShellVerb',
             'ssh-config = ros2fog_cli.verb.ssh_config:SshConfigVerb',
             'status = ros2fog_cli.verb.status:StatusVerb',
+            'volume = ros2fog_cli.verb.volume:VolumeVerb',
             'wait = ros2fog_cli.verb.wait:WaitVerb',
         ],
     },

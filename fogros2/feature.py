@@ -13,12 +13,15 @@ import contextlib
 import dataclasses
 from decimal import Decimal
 import threading
-from typing import Any, ClassVar, Optional, Protocol
+from typing import Any, ClassVar, Optional, Protocol, TYPE_CHECKING
 
 from fogros2 import plugin_system
 from fogros2.model import Command, Endpoint, Machine, MachineSpec, NodeSpec, VpnInterface
 from fogros2.shell import Shell
 from fogros2.store import Record
+
+if TYPE_CHECKING:
+    from fogros2.provider import Provider
 
 #: The group of entry points.
 GROUP = 'fogros2.feature'
@@ -29,12 +32,14 @@ class RunningMachine(Protocol):
     A machine that is up, as features see it.
 
     :ivar machine: as the provider reported it.
+    :ivar provider: the machine's.
     :ivar shell: copies files; for commands there is ``run``.
     :ivar interface: its end of the launch's VPN, and ``vpn_address`` the address there.
     """
 
     spec: MachineSpec
     machine: Machine
+    provider: Provider
     shell: Shell
     interface: VpnInterface
     vpn_address: str
@@ -294,6 +299,10 @@ class Feature:
         :raises FogError: there is no such time.
         """
         return spec.lifetime
+
+    def volumes(self, own: Any) -> Mapping[str, tuple[str, int]]:
+        """Return the volumes that a machine is created with, as ``CreateRequest.with_volumes``."""
+        return {}
 
     def check_node(self, spec: MachineSpec, node: NodeSpec, own: Any) -> None:
         """

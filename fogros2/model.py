@@ -189,6 +189,33 @@ class Image:
 
 
 @dataclasses.dataclass(frozen=True)
+class Volume:
+    """
+    A disk or folder that outlives the machines that use it.
+
+    :param id: opaque to the core; contains its location.
+    :param region: region or zone, context and namespace, or engine; for people.
+    :param user: the machine that has it attached, '' for none.
+    :param gb_month: the usual price in US dollars for a GB and a month, None if unknown.
+    """
+
+    id: str
+    name: str
+    provider: str
+    region: str = ''
+    size_gb: Optional[int] = None
+    user: str = ''
+    gb_month: Optional[Decimal] = None
+
+    @property
+    def cost_per_month(self) -> Optional[Decimal]:
+        """US dollars, None if unknown."""
+        if self.gb_month is None or self.size_gb is None:
+            return None
+        return self.gb_month * self.size_gb
+
+
+@dataclasses.dataclass(frozen=True)
 class CreateRequest:
     """
     The core's request to create a machine, in addition to the spec.
@@ -203,6 +230,8 @@ class CreateRequest:
         finds a baked image; '' if unknown.
     :param application: container image of a web application that serves HTTP on port 8080, for
         providers that run one beside the machine (``Capabilities.application_port``); '' for none.
+    :param with_volumes: by name, where volumes appear on the machine, and the GB of a new one; for
+        providers with the capability ``keeps_volumes``.
     """
 
     token: str
@@ -212,6 +241,7 @@ class CreateRequest:
     agent_config: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     dependencies: str = ''
     application: str = ''
+    with_volumes: Mapping[str, tuple[str, int]] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -40,6 +40,7 @@ class RunningMachine(Step):
         super().__init__(context, job)
         self.spec = job.spec
         self.machine = job.machine
+        self.provider = job.provider
         self.shell = job.shell
         self.agent = job.agent
         self.heartbeat = job.heartbeat

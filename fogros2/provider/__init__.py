@@ -19,7 +19,15 @@ import threading
 from typing import ClassVar, Optional
 
 from fogros2.errors import MachineNotFound, ProviderError, Unsupported
-from fogros2.model import CreateRequest, Image, Machine, MachineSpec, MachineState, OtherVpn
+from fogros2.model import (
+    CreateRequest,
+    Image,
+    Machine,
+    MachineSpec,
+    MachineState,
+    OtherVpn,
+    Volume,
+)
 from fogros2.provider.offers import Offer, Offers, Region, Wants
 from fogros2.waiting import wait_until
 
@@ -68,6 +76,7 @@ class Capabilities:
         request's application, 0 if it serves none.
     :param preemption_notice: command that the agent runs as root every few seconds. Exit status 0
         means that the provider is about to reclaim the machine; the output has reason and time.
+    :param keeps_volumes: it has disks or folders that outlive machines.
     """
 
     shell_kind: str = 'ssh'
@@ -88,6 +97,20 @@ class Capabilities:
     share_folders: tuple[str, ...] = ()
     application_port: int = 0
     preemption_notice: tuple[str, ...] = ()
+    keeps_volumes: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Attached:
+    """
+    How a volume appears on a machine; without both, ``create`` has mounted it at its path.
+
+    :param devices: paths of its block device, of which one appears.
+    :param folder: of a computer that exists already; '~/' stands for the login user's home.
+    """
+
+    devices: tuple[str, ...] = ()
+    folder: str = ''
 
 
 class Provider(abc.ABC):
@@ -451,6 +474,45 @@ class Provider(abc.ABC):
     def _no_images(self) -> Unsupported:
         return Unsupported(f"provider '{self.name}' keeps no images of machines",
                            'AWS, Azure and Google Cloud do; for pods: ros2 fog image create')
+
+    # -- volumes --------------------------------------------------------------------------------
+
+    def volumes(self, hosts: Sequence[str] = ()) -> Iterable[Volume]:
+        """
+        Yield the volumes (``keeps_volumes``).
+
+        :param hosts: computers with an SSH server whose volumes are meant, too.
+        :raises Unsupported: the provider has none, or lists none.
+        """
+        raise self.no_volumes()
+
+    def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
+        """
+        Attach a volume to a running machine; make it if there is none of this name.
+
+        Idempotent. ``create`` has refused a volume that another machine uses.
+
+        :raises NameTaken: another machine has got the volume since.
+        :raises Unsupported: the provider has no volumes.
+        """
+        raise self.no_volumes()
+
+    def detach(self, machine_id: str, name: str) -> None:
+        """Detach a volume that the machine no longer uses; idempotent."""
+
+    def delete_volume(self, volume_id: str) -> None:
+        """
+        Delete a volume and its data; idempotent.
+
+        :raises NameTaken: a machine uses it.
+        :raises Unsupported: the provider has none.
+        """
+        raise self.no_volumes()
+
+    def no_volumes(self) -> Unsupported:
+        """Return the error for a volume at this provider."""
+        return Unsupported(f"provider '{self.name}' has no volumes",
+                           'AWS, Azure, Google Cloud, Kubernetes, containers and SSH hosts do')
 
     # -- regions and prices ---------------------------------------------------------------------
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import dataclasses
 import getpass
 import os
@@ -12,15 +12,44 @@ import socket
 from typing import Any, ClassVar
 from urllib.parse import parse_qsl, urlencode
 
-from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError, Unsupported
-from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
-from fogros2.provider import Capabilities, Provider
+from fogros2.errors import (
+    CommandError,
+    ConfigurationError,
+    MachineNotFound,
+    NameTaken,
+    ProviderError,
+    Unsupported,
+)
+from fogros2.model import (
+    Command,
+    CreateRequest,
+    Endpoint,
+    Machine,
+    MachineSpec,
+    MachineState,
+    Volume,
+)
+from fogros2.provider import Attached, Capabilities, Provider
 from fogros2.provider.options import parsed
-from fogros2.shell import ssh_config
+from fogros2.shell import connect, ssh_config
 
 _SCHEME = 'ssh:'
 #: Seconds after which a computer without an answer counts as off.
 _TIMEOUT = 5.0
+#: Seconds for a look at volumes, and for the deletion of one.
+_VOLUMES_TIMEOUT = 600.0
+_VOLUMES = '~/.local/share/fogros2-volumes'
+# A launch that uses a volume holds its lock.
+_LIST = f"""\
+cd {_VOLUMES} 2>/dev/null || exit 0
+for each in *; do
+    [ ! -d "$each" ] || {{ flock -n "$each" true && echo "$each free" || echo "$each used"; }}
+done
+"""
+_DELETE = f"""\
+cd {_VOLUMES} 2>/dev/null && [ -d "$1" ] || exit 0
+flock -n "$1" rm -rf -- "$1" || {{ [ ! -d "$1" ] || exit 75; }}
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +105,7 @@ class SSHProvider(Provider):
     """Computers that exist before and after the launch."""
 
     name: ClassVar[str] = 'ssh'
-    capabilities: ClassVar[Capabilities] = Capabilities(owned=False)
+    capabilities: ClassVar[Capabilities] = Capabilities(owned=False, keeps_volumes=True)
     poll_interval: ClassVar[float] = 0.1
 
     def check(self, spec: MachineSpec) -> None:
@@ -138,6 +167,41 @@ class SSHProvider(Provider):
 
     def destroy(self, machine_id: str) -> None:
         """Do nothing: the launch did not create the computer."""
+
+    def volumes(self, hosts: Sequence[str] = ()) -> Iterator[Volume]:
+        """Yield the folders of these computers, whose volumes nobody else lists."""
+        for host in hosts:
+            for line in self._run(host, _LIST).splitlines():
+                name, _, state = line.partition(' ')
+                yield Volume(f'{_SCHEME}{host}/{name}', name, self.name, host,
+                             user='a launch' if state == 'used' else '')
+
+    def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
+        """Return a folder, whose size has no limit."""
+        return Attached(folder=f'{_VOLUMES}/{name}')
+
+    def delete_volume(self, volume_id: str) -> None:
+        """Delete a folder unless a launch holds its lock."""
+        host, _, name = volume_id.removeprefix(_SCHEME).rpartition('/')
+        try:
+            self._run(host, _DELETE, name)
+        except CommandError as error:
+            if error.result.returncode != 75:
+                raise
+            raise NameTaken(f"a launch uses the volume '{name}' on {host}",
+                            'end that launch first') from error
+
+    def _run(self, host: str, script: str, *words: str) -> str:
+        machine = self.describe(self.create(
+            MachineSpec(host, self.name, {'host': host}), CreateRequest('', '', {}, 0)))
+        assert machine.shell is not None  # it has just answered
+        shell = connect(machine.shell, name=host)
+        try:
+            return shell.run(Command(('sh', '-c', script, 'sh', *words),
+                                     what=f'look at volumes on {host}'),
+                             timeout=_VOLUMES_TIMEOUT).stdout
+        finally:
+            shell.close()
 
 
 def reach(settings: ssh_config.Settings) -> str:

@@ -19,14 +19,23 @@ class ListVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the table, or JSON."""
+        from concurrent.futures import ThreadPoolExecutor
+
         from ros2fog_cli.api import machines, table
-        entries = machines.survey(warn, regions=args.region)
+        from ros2fog_cli.api import volumes as api
+        with ThreadPoolExecutor(1, 'fog-volumes') as pool:
+            # what is wrong with a provider, the list of machines says
+            asked = pool.submit(api.survey, lambda text: None, regions=args.region)
+            entries = machines.survey(warn, regions=args.region)
+            volumes = asked.result()
         now = time.time()
         if args.json:
-            print_json(machines=[entry.to_json(now) for entry in entries])
+            print_json(machines=[entry.to_json(now) for entry in entries],
+                       volumes=[api.to_json(volume) for volume in volumes])
             return 0
+        kept = api.total(volumes, table.cost)
         if not entries:
-            print('no machines')
+            print('\n'.join(filter(None, ('no machines', kept))))
             return 0
         print(table.table(
             ('NAME', 'PROVIDER', 'PLACE', 'KIND', 'STATE', 'AGE', 'ADDRESS', 'TIME LEFT',
@@ -49,4 +58,6 @@ class ListVerb(VerbExtension):
             print(f'{table.cost(total[0])} an hour, {table.cost(total[1], 2)} so far, '
                   'disks and traffic aside'
                   + f'; the price of {unknown} more is unknown' * bool(unknown))
+        if kept:
+            print(kept)
         return 0

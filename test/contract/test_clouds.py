@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+import dataclasses
 import logging
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import time
 
 import pytest
 
-from fogros2.errors import FogError, ProviderError, Unsupported
+from fogros2.errors import FogError, NameTaken, ProviderError, Unsupported
 from fogros2.model import MachineSpec
 from fogros2.plugin_system import load
 from fogros2.provider import TAG_ON_EXIT, TAG_ROBOT
@@ -51,6 +52,66 @@ class TestClouds(VmContract):
 
     def fault(self, how, times):
         return self.memory.fault(how, times)
+
+
+def wait_free(provider):
+    wait_until(lambda: not [one for one in provider.volumes() if one.user], timeout=30.0,
+               what='the volume to be free')
+
+
+def with_volume(memory, name, **options):
+    spec = MachineSpec(name, memory.name, {**memory.options, **options})
+    request = dataclasses.replace(request_for(spec), with_volumes={'models': ('/data', 60)})
+    provider = memory.provider()
+    machine_id = provider.create(spec, request)
+    provider.reachable(machine_id, name=name, timeout=30.0)
+    return machine_id, provider.attach(machine_id, 'models', 60)
+
+
+def test_volume_leads_the_next_machine_to_its_zone(memory):
+    provider = memory.provider()
+    one, attached = with_volume(memory, 'one')
+    assert attached.devices and provider.attach(one, 'models', 60) == attached
+    (volume,) = provider.volumes()
+    assert (volume.name, volume.size_gb, volume.user in one) == ('models', 60, True)
+    assert volume.cost_per_month > 4
+    # another launch, and the verb
+    with pytest.raises(NameTaken, match="'models' .* is in use by"):
+        with_volume(memory, 'two')
+    with pytest.raises(NameTaken, match="'models' .* is in use by"):
+        provider.delete_volume(volume.id)
+    provider.destroy(one)
+    wait_free(provider)
+    # of two regions, the volume's is taken
+    two, _ = with_volume(memory, 'two', region=memory.away,
+                         regions=[volume.region, volume.id.split(':')[1].split('/')[0]][1:])
+    assert [(one.id, one.user in two) for one in provider.volumes()] == [(volume.id, True)]
+    provider.detach(two, 'models')
+    provider.detach(two, 'models')
+    wait_free(provider)
+    provider.destroy(two)
+    assert provider.tidy() == []
+    provider.delete_volume(volume.id)
+    wait_until(lambda: not list(provider.volumes()), timeout=30.0, what='no volume')
+    provider.delete_volume(volume.id)
+
+
+def test_two_launches_that_make_a_volume_at_once_keep_one(memory):
+    provider = memory.provider()
+    spec = MachineSpec('two', memory.name, dict(memory.options))
+    two = provider.create(spec, request_for(spec))
+    provider.reachable(two, name='two', timeout=30.0)
+    one, _ = with_volume(memory, 'one')
+    adapter = vars(provider)['_cloud']
+    list_disks = type(adapter).disks
+    # the first look came before the other launch's volume
+    looks = iter([()])
+    memory.patch.setattr(type(adapter), 'disks', lambda own, region, name='': next(
+        looks, list_disks(own, region, name)))
+    with pytest.raises(NameTaken, match='is in use by'):
+        provider.attach(two, 'models', 60)
+    memory.patch.setattr(type(adapter), 'disks', list_disks)
+    assert [volume.user in one for volume in provider.volumes()] == [True]
 
 
 def create(memory, name='planner', **options):

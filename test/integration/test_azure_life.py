@@ -278,9 +278,12 @@ def test_role_of_the_page_has_exactly_the_actions_needed(robot):
     wait_until(lambda: robot.provider.describe(machine_id).state is MachineState.STOPPED,
                timeout=60.0, what='the stop')
     robot.provider.start(machine_id)
+    robot.provider.attach(machine_id, 'models', 1)
     robot.provider.tidy()
     robot.provider.delete_image(image_id)
     robot.provider.destroy(machine_id)
+    for volume in robot.provider.volumes():
+        robot.provider.delete_volume(volume.id)
     # Azure asks for these of resources that a request names
     linked = {action for action in role['Actions'] if '/join/' in action or 'GetAccess' in action}
     asked = robot.azure.actions - {''}

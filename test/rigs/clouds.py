@@ -206,7 +206,7 @@ class Aws(Cloud):
     places = ({'region': 'us-east-1'},
               {'region': 'eu-central-1', 'ec2_instance_type': 'c5.large'})
     elsewhere, announced = 'eu-central-1', 'an EC2 instance'
-    listing = 36  # the regions, and one request for each
+    listing = 72  # twice, for machines and volumes: the regions, and one request for each
     creating = frozenset({'RunInstances', 'ImportKeyPair', 'CreateSecurityGroup'})
     order = 'Action=RunInstances'
     refusals = (
@@ -335,7 +335,7 @@ class Gcp(Cloud):
     places = ({'region': 'nearest'},
               {'zone': 'europe-west3-b', 'machine_type': 'n2-standard-2'})
     elsewhere, announced, checked = 'europe-west3', '', 'gcp: project robots, us-central1'
-    listing = 1
+    listing = 2
     creating = frozenset({'instances.insert', 'firewalls.insert'})
     order = '^POST .*/instances '
     refusals = (
@@ -441,7 +441,7 @@ class Azure(Cloud):
     region, kind, price = 'westeurope', 'Standard_B2als_v2', '0.0376'
     places = ({'region': 'westeurope'}, {'region': 'eastus', 'vm_size': 'Standard_D2s_v5'})
     elsewhere, announced = 'eastus', 'a resource group'
-    listing = 2
+    listing = 3
     creating = frozenset({'PUT'})
     order = '^PUT .*/virtualMachines/[^/]* '
     refusals = (
@@ -480,8 +480,10 @@ class Azure(Cloud):
         return service.environment(box.endpoint if here else box.inside)
 
     def left(self, box: Any) -> list[str]:
-        """Return the resource groups."""
-        return list(box.things()['groups'])
+        """Return the resource groups, and disks in that of volumes, which stays without any."""
+        things = box.things()
+        return [*(name for name in things['groups'] if name != 'fogros2-volumes'),
+                *(name for name in things['resources'] if '/fogros2-volumes/' in name)]
 
     def clear(self, box: Any) -> None:
         """Delete everything."""

@@ -19,7 +19,7 @@ from ros2cli.cli import main
 from fogros2 import events, plugin_system
 from fogros2.clock import ClockOffset
 from fogros2.journal import Step
-from fogros2.model import Image, MachineSpec
+from fogros2.model import Image, MachineSpec, Volume
 from fogros2.provider import Capabilities
 from fogros2.provider.offers import MachineType, Offer
 from fogros2.store import Record, Store
@@ -27,7 +27,7 @@ from fogros2_features.guests.listing import Guest
 from fogros2_replicas import figures
 from fogros2_testing.fakes import FakeProvider
 from fogros2_testing.plugins import instead
-from ros2fog_cli.api import images, output, shown, watching
+from ros2fog_cli.api import images, output, shown, volumes, watching
 from ros2fog_cli.api.doctor import Check
 from ros2fog_cli.api.machines import Entry
 from ros2fog_cli.api.reach import Link
@@ -164,9 +164,11 @@ def test_fields_of_regions_are_on_the_page() -> None:
     assert sorted(fields('### `ros2 fog regions`')) == sorted(map(ast.literal_eval, found.keys))
 
 
-def test_fields_of_images_and_checks_are_on_the_page() -> None:
+def test_fields_of_images_volumes_and_checks_are_on_the_page() -> None:
     assert sorted(fields('### `ros2 fog image list`')) == sorted(
         images.to_json(Image('i', 'n', 'p')))
+    assert sorted(fields('### `ros2 fog volume list`')) == sorted(
+        volumes.to_json(Volume('i', 'n', 'p')))
     assert sorted(fields('### `ros2 fog doctor`')) == keys(Check)
 
 

@@ -10,7 +10,7 @@ import time
 from typing import Any, Optional
 import uuid
 
-from fogros2 import model, monitor_addresses, plan, process
+from fogros2 import feature, model, monitor_addresses, plan, process
 from fogros2.deploy import requests
 from fogros2.deploy.machine_job import Step
 from fogros2.deploy.undo import close_ports
@@ -170,7 +170,9 @@ class Creation(Step):
             machine_id = context.provider.create(job.spec, CreateRequest(
                 token=token, authorized_key=key, tags=tags,
                 vpn_port=plan.machine_port(context.launch), agent_config=config,
-                dependencies=dependencies,
+                dependencies=dependencies, with_volumes={
+                    name: volume for each, own in feature.used(job.spec)
+                    for name, volume in each.volumes(own).items()},
                 application=monitor_addresses.IMAGE if job.spec.monitored else ''))
         except FogError as error:
             # after a refusal, no machine has to be looked for

@@ -3,5 +3,6 @@
 EC2 instances, by boto3.
 
 In reading order: ``login``, ``options``, ``failures`` (AWS's refusals), ``clients`` (calls),
-``instances``, ``network``, ``prices``, ``images``, ``cloud`` (the adapter), ``provider``.
+``instances``, ``network``, ``disks``, ``prices``, ``images``, ``cloud`` (the adapter),
+``provider``.
 """

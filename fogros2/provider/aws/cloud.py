@@ -12,6 +12,7 @@ from fogros2.errors import MachineNotFound
 from fogros2.model import MachineSpec
 from fogros2.provider.aws import clients, images, instances, login
 from fogros2.provider.aws.clients import Account
+from fogros2.provider.aws.disks import Ec2Disks
 from fogros2.provider.aws.network import Ec2Network
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import Ec2Prices
@@ -28,7 +29,7 @@ def api_host(region: str) -> str:
     return f'ec2.{region}.amazonaws.com{suffix}'
 
 
-class Ec2(Ec2Prices, images.Ec2Images, Ec2Network):
+class Ec2(Ec2Prices, images.Ec2Images, Ec2Network, Ec2Disks):
     """
     EC2 instances, each with its own security group and key pair.
 

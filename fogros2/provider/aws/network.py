@@ -54,7 +54,8 @@ class Ec2Network(VmCloud):
 
     def begin(self, region: str, order: Order, created: list[str]) -> None:
         """Create the security group and import the key, in parallel."""
-        vpc = self._vpc_of(region, order.options.subnet) if order.options.subnet else ''
+        vpc = self._vpc_of(region, order.options.subnet, order.zone) \
+            if order.options.subnet else ''
         with ThreadPoolExecutor(1, 'fog-aws') as pool:
             importing = pool.submit(self._import_key, region, order)
             created.append(self._create_group(region, order, vpc))
@@ -169,11 +170,11 @@ class Ec2Network(VmCloud):
                                        GroupId=groups[0]['GroupId'],
                                        IpPermissions=[rule('tcp', port, networks)])
 
-    def _vpc_of(self, region: str, subnet: str) -> str:
+    def _vpc_of(self, region: str, subnet: str, zone: str) -> str:
         """
         Return the VPC that a subnet belongs to.
 
-        :raises ConfigurationError: there is no such subnet in the region.
+        :raises ConfigurationError: there is no such subnet in the region, or in the zone.
         """
         try:
             subnets = self._account.call(
@@ -184,15 +185,25 @@ class Ec2Network(VmCloud):
                 raise ConfigurationError(f"there is no subnet '{subnet}' in {region}",
                                          'check subnet= and region=') from error
             raise
+        if zone not in ('', subnets[0]['AvailabilityZone']):
+            raise ConfigurationError(f"the subnet '{subnet}' is not in {zone}, as the volume is",
+                                     'name a subnet there, or leave subnet= out')
         return str(subnets[0]['VpcId'])
 
     def places(self, region: str, order: Order) -> Iterator[str]:
-        """Yield the subnet that is named; else EC2's choice, then the default VPC's subnets."""
-        yield order.options.subnet
+        """
+        Yield the subnet that is named; else EC2's choice, then the default VPC's subnets.
+
+        With a volume, yield only those in its zone.
+        """
+        if order.options.subnet or not order.zone:
+            yield order.options.subnet
         if not order.options.subnet:
             subnets = self._account.call(
                 'ec2', region, 'describe_subnets', 'looking for zones',
-                Filters=[{'Name': 'default-for-az', 'Values': ['true']}])['Subnets']
+                Filters=[{'Name': 'default-for-az', 'Values': ['true']}, *(
+                    [{'Name': 'availability-zone', 'Values': [order.zone]}] if order.zone else []
+                )])['Subnets']
             yield from (str(subnet['SubnetId']) for subnet in sorted(
                 subnets, key=lambda entry: str(entry['AvailabilityZone'])))
 

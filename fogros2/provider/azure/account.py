@@ -23,7 +23,8 @@ VERSIONS = {
     'Microsoft.Authorization/roleDefinitions': '2022-04-01',
     'Microsoft.Authorization': '2022-04-01', 'Microsoft.DevTestLab': '2018-09-15',
     'Microsoft.Resources/tags': '2021-04-01', 'Microsoft.Compute/skus': '2021-07-01',
-    'Microsoft.Compute/snapshots': '2024-03-02', 'Microsoft.Compute/galleries': '2024-03-03',
+    'Microsoft.Compute/snapshots': '2024-03-02', 'Microsoft.Compute/disks': '2024-03-02',
+    'Microsoft.Compute/galleries': '2024-03-03',
     'Microsoft.Compute': '2024-07-01', 'Microsoft.Network': '2024-05-01',
     '': '2022-09-01'}
 #: Seconds for an operation; the deletion of a group takes a minute or two.

@@ -22,6 +22,7 @@ from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_EXPIRES
 from fogros2.provider.azure import ending, images, login, machines, prices
 from fogros2.provider.azure.account import Account, endpoint, subscription
+from fogros2.provider.azure.disks import AzureDisks
 from fogros2.provider.azure.failures import refusal
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
@@ -52,7 +53,7 @@ ALLOCATION = 300.0
 _USUAL = Account()
 
 
-class Azure(prices.AzurePrices, images.AzureImages):
+class Azure(prices.AzurePrices, images.AzureImages, AzureDisks):
     """
     Virtual machines of Azure.
 

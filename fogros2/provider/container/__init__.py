@@ -31,8 +31,8 @@ from fogros2.errors import (
     ProviderError,
     Unsupported,
 )
-from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState
-from fogros2.provider import Capabilities, Provider
+from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState, Volume
+from fogros2.provider import Attached, Capabilities, Provider
 from fogros2.provider.container import debian_root, hidden_files, login_ids, packet_filter
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import entry as container_entry
@@ -150,7 +150,8 @@ class ContainerProvider(Provider):
     name: ClassVar[str] = 'container'
     #: Containers only on request: they need SYS_ADMIN, which weakens the machine's isolation.
     capabilities: ClassVar[Capabilities] = Capabilities(
-        containers=False, stop=True, agent_directory=f'/{container_entry.AGENT_DIRECTORY}',
+        containers=False, stop=True, keeps_volumes=True,
+        agent_directory=f'/{container_entry.AGENT_DIRECTORY}',
         agent_program=f'/{container_entry.FOLDER}/agent.py',
         share_folders=container_options.SHARE_FOLDERS)
     poll_interval: ClassVar[float] = 0.1
@@ -226,6 +227,10 @@ class ContainerProvider(Provider):
             container_engine.select(options.engine, options.image or None))
         engine = next(ways)
         create = self._create_from_image if options.image else self._create_from_root
+        for name in request.with_volumes:
+            user = _user_of(engine, container_machine.volume_name(name))
+            if user not in ('', spec.name):
+                raise _in_use(name, user)
         with _sharing(spec, request.token):
             while True:
                 try:
@@ -407,6 +412,33 @@ class ContainerProvider(Provider):
                            what=f"publish the VPN port of '{machine.name}'"), timeout=10.0)
         return host or '', port
 
+    def volumes(self, hosts: Sequence[str] = ()) -> Iterator[Volume]:
+        """Yield the engines' own volumes with FogROS2's names."""
+        prefix = container_machine.volume_name('')
+        for engine in container_engine.installed():
+            listed = engine.call('volume', 'ls', '-q', f'--filter=name={prefix}',
+                                 what='listing volumes', check=False).stdout.split()
+            for name in listed:
+                if name.startswith(prefix):
+                    yield Volume(f'{engine.name}:{name}', name[len(prefix):], self.name,
+                                 engine.name, user=_user_of(engine, name))
+
+    def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
+        """Return nothing: the engine has mounted the volume, whose size has no limit."""
+        return Attached()
+
+    def delete_volume(self, volume_id: str) -> None:
+        """Remove a volume of an engine, which refuses if any container uses it."""
+        kind, _, name = volume_id.partition(':')
+        engine, prefix = container_engine.named(kind), container_machine.volume_name('')
+        if not name.startswith(prefix):
+            raise MachineNotFound(f"'{volume_id}' is no volume of a container machine")
+        user = _user_of(engine, name)
+        if user:
+            raise _in_use(name[len(prefix):], user)
+        if name in engine.call('volume', 'ls', '-q', what='listing volumes').stdout.split():
+            engine.call('volume', 'rm', name, what=f'removing the volume {name}', timeout=600.0)
+
     def _host_key(self, engine: Engine, entry: Mapping[str, Any]) -> Optional[str]:
         """Return the public host key that a machine created at its first boot, None before."""
         identity = str(entry['Id'])[:12]
@@ -448,6 +480,18 @@ class ContainerProvider(Provider):
             or container_engine.last_line(f'{log.stderr}\n{log.stdout}')
         raise ProviderError(f'container {identity} could not start: {reason}',
                             'it needs sshd, sudo, rsync and python3, or apt-get and a network')
+
+
+def _user_of(engine: Engine, volume: str) -> str:
+    """Return a machine whose container has a volume, '' for none."""
+    names = engine.call('ps', '-a', f'--filter=volume={volume}', '--format', '{{.Names}}',
+                        what='looking at a volume').stdout.split()
+    return names[0].removeprefix(container_machine.container_name('')) if names else ''
+
+
+def _in_use(name: str, user: str) -> NameTaken:
+    return NameTaken(f"the machine '{user}' has the volume '{name}'",
+                     f'end its launch, or: ros2 fog delete {user}')
 
 
 @contextlib.contextmanager

@@ -118,7 +118,8 @@ class HostedProvider(Provider):
     """Containers of podman or docker on a computer with an SSH server."""
 
     name: ClassVar[str] = 'hosted'
-    capabilities: ClassVar[Capabilities] = ContainerProvider.capabilities
+    capabilities: ClassVar[Capabilities] = dataclasses.replace(
+        ContainerProvider.capabilities, keeps_volumes=False)
 
     def __init__(self) -> None:
         self._ssh: Provider = plugin_system.load('fogros2.provider', 'ssh')()

@@ -50,6 +50,11 @@ def container_name(machine: str, tags: Mapping[str, str] = {}) -> str:
     return f"fogros2-{machine}{tags.get(HOSTED, '')}"
 
 
+def volume_name(name: str) -> str:
+    """Return the engine's name of a volume."""
+    return f'fogros2-volume-{name}'
+
+
 def directory(token: str) -> Path:
     """
     Return the folder of the root of the machine with this token, which its name does not tell.

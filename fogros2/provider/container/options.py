@@ -25,6 +25,7 @@ from fogros2.provider.container.machine import (
     LOGIN,
     MACHINE,
     share_folder,
+    volume_name,
     VPN_PORT,
 )
 from fogros2.provider.options import parsed
@@ -223,6 +224,8 @@ def common_flags(
     for mount in options.mounts:
         source, _, target = mount.partition(':')
         yield from ('-v', f'{source}:{target or source}:ro')
+    for name, (path, _) in request.with_volumes.items():
+        yield from ('-v', f'{volume_name(name)}:{path}')
     if spec.on_exit != 'stop':
         yield '--rm'
     if runs_containers(spec, options):

@@ -14,6 +14,7 @@ from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_ON_EXIT
 from fogros2.provider.gcp import guest, images, instances, login, prices
 from fogros2.provider.gcp.account import Account, ENDPOINT_VARIABLE
+from fogros2.provider.gcp.disks import GoogleDisks
 from fogros2.provider.gcp.failures import GoogleError
 from fogros2.provider.gcp.firewall import GoogleFirewall
 from fogros2.provider.gcp.options import Options
@@ -37,7 +38,7 @@ from fogros2.waiting import cancellable, wait_until
 DEFAULT_REGION = 'us-central1'
 
 
-class ComputeEngine(images.GoogleImages, GoogleFirewall):
+class ComputeEngine(images.GoogleImages, GoogleFirewall, GoogleDisks):
     """
     Compute Engine instances, each with its own firewall rules.
 
@@ -162,16 +163,17 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
     def prepare(self, region: str, order: Order, types: Sequence[str]) -> dict[str, Any]:
         """Return the zones and the image of each type."""
         options: Options = order.options
+        zone = order.zone or options.zone
         chosen: dict[str, Any] = {}
         for entry in self._types(region, types):
             kind = instances.machine_type(entry)
-            if entry['zone'] == (options.zone or entry['zone']):
+            if entry['zone'] == (zone or entry['zone']):
                 chosen.setdefault(kind.name, {
                     'arch': kind.arch, 'gpus': bool(kind.gpus or options.accelerators),
                     'zones': []})['zones'].append(entry['zone'])
         if not chosen:
             raise ConfigurationError(
-                f'{options.zone or region} has no machine type {" or ".join(types)}',
+                f'{zone or region} has no machine type {" or ".join(types)}',
                 'gcloud compute machine-types list shows what it has')
         chosen_images: dict[Any, tuple[str, int]] = {}
         for entry in chosen.values():
@@ -184,7 +186,8 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall):
 
     def places(self, region: str, order: Order) -> Iterator[str]:
         types = self._types(region, order.options.types)
-        yield from [order.options.zone] if order.options.zone else sorted(
+        zone = order.zone or order.options.zone
+        yield from [zone] if zone else sorted(
             {str(entry['zone']) for entry in types})
 
     def insert(

@@ -43,6 +43,13 @@ def label_filter(tags: Mapping[str, str]) -> str:
         f'(labels.{key} = "{value}")' for key, value in RULES.encode(tags).items())])
 
 
+def disk_type(kind: str) -> str:
+    """Return the type of disks for a type of machines."""
+    # types since the fourth generation take no other disks
+    new = re.match(r'[a-z]+(\d+)', kind)
+    return 'hyperdisk-balanced' if new and int(new[1]) >= 4 else 'pd-balanced'
+
+
 def insertion(
     place: Place, order: Order, image: Mapping[str, Any], subnet: str, tags: Mapping[str, str],
 ) -> dict[str, Any]:
@@ -56,9 +63,6 @@ def insertion(
     zone, name = f'zones/{place.zone}', own_name(order.attempt)
     disk = max(options.disk_size, image['size'])
     labels = labels_of({**tags, TAG_DISK: str(disk), _TAG_IMAGE: image['path']}, options)
-    # types since the fourth generation take no other disks
-    new = re.match(r'[a-z]+(\d+)', place.kind)
-    disk_type = 'hyperdisk-balanced' if new and int(new[1]) >= 4 else 'pd-balanced'
     return {
         'name': name,
         'description': f'FogROS2 machine {order.spec.name}',
@@ -72,7 +76,7 @@ def insertion(
             {'key': 'block-project-ssh-keys', 'value': 'TRUE'}]},
         'disks': [{'boot': True, 'autoDelete': True, 'initializeParams': {
             'sourceImage': image['path'], 'diskSizeGb': str(disk), 'labels': labels,
-            'diskType': f'{zone}/diskTypes/{disk_type}'}}],
+            'diskType': f'{zone}/diskTypes/{disk_type(place.kind)}'}}],
         'networkInterfaces': [{
             'network': f'global/networks/{options.network}',
             **({'subnetwork': subnet} if subnet else {}),

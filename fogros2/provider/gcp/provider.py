@@ -16,4 +16,5 @@ class GCPProvider(VmProvider):
     name = ComputeEngine.name
     adapter = ComputeEngine
     capabilities = dataclasses.replace(
-        VmProvider.capabilities, stop=True, images=True, preemption_notice=guest.NOTICE)
+        VmProvider.capabilities, stop=True, images=True, keeps_volumes=True,
+        preemption_notice=guest.NOTICE)

@@ -3,10 +3,10 @@
 Run machines as pods: a Job for each, which owns the pod and its Service, and ends both in time.
 
 ``options`` parses what a launch file asks for, ``names`` has names, ids and tags. ``boot`` is the
-first process of a pod, ``manifests`` describes Job, pod and Service. ``hints`` explains refusals,
-``pods`` reads the state of Jobs and pods, ``start`` waits for a pod. ``exposure`` and ``ways``
-find how UDP reaches the pod, and open TCP ports, ``ending`` deletes everything. ``image`` builds
-images.
+first process of a pod, ``hints`` explains refusals. ``claims`` has the volumes, ``manifests``
+describes Job, pod and Service. ``pods`` reads the state of Jobs and pods, ``start`` waits for a
+pod. ``exposure`` and ``ways`` find how UDP reaches the pod, and open TCP ports, ``ending`` deletes
+everything. ``image`` builds images.
 """
 
 from __future__ import annotations
@@ -34,9 +34,18 @@ from fogros2.kubernetes_client import (
     selector,
     Unreachable,
 )
-from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState
-from fogros2.provider import Capabilities, Provider, TAG_ON_EXIT
-from fogros2.provider.kubernetes import boot, ending, hints, manifests, names, pods, ways
+from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState, Volume
+from fogros2.provider import Attached, Capabilities, Provider, TAG_ON_EXIT
+from fogros2.provider.kubernetes import (
+    boot,
+    claims,
+    ending,
+    hints,
+    manifests,
+    names,
+    pods,
+    ways,
+)
 from fogros2.provider.kubernetes.exposure import Exposure
 from fogros2.provider.kubernetes.hints import explained, refused
 from fogros2.provider.kubernetes.names import MachineId
@@ -58,7 +67,8 @@ class KubernetesProvider(Provider):
     name: ClassVar[str] = 'kubernetes'
     #: A pod has only the rights that WireGuard needs.
     capabilities: ClassVar[Capabilities] = Capabilities(
-        shell_kind='kubernetes', containers=False, application_port=manifests.APPLICATION_PORT,
+        shell_kind='kubernetes', containers=False, keeps_volumes=True,
+        application_port=manifests.APPLICATION_PORT,
         preemption_notice=boot.NOTICE_COMMAND)
     poll_interval: ClassVar[float] = 1.0
 
@@ -136,11 +146,13 @@ class KubernetesProvider(Provider):
         options = Options.parse(spec.options)
         api, namespace = self._place(options)
         self._lifetimes[names.job_name(spec.name)] = spec.lifetime
+        claims.make(api, namespace, names.job_name(spec.name), request.with_volumes, self.cancel)
         existing = None
         try:
             # Pods of one kind differ only by their names.
             self._once(
-                f'{api.context} {namespace} {request.dependencies} {options}',
+                f'{api.context} {namespace} {request.dependencies} {options} '
+                f'{request.with_volumes}',
                 lambda: api.request(
                     'POST', path('pods', namespace), manifests.pod(spec, request, options),
                     dryRun='All', cancel=self.cancel))
@@ -252,7 +264,7 @@ class KubernetesProvider(Provider):
                 continue
             api = kubernetes_client.connect(context)
             labels = selector(names.wanted(tags))
-            for namespace, jobs in self._jobs(api, labels):
+            for namespace, jobs in self._entries(api, 'jobs', labels):
                 wanted = [job for job in jobs if tags.items() <= names.tags_of(job).items()]
                 pod_list = items(self._ask(api, 'pods', namespace, labels)) if wanted else ()
                 for job in wanted:
@@ -261,9 +273,11 @@ class KubernetesProvider(Provider):
                         seen.add(where.uid)
                         yield self._machine(api, where, job, pods.pod_of(job, pod_list))
 
-    def _jobs(self, api: Api, labels: str) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    def _entries(
+        self, api: Api, kind: str, labels: str,
+    ) -> Iterator[tuple[str, list[dict[str, Any]]]]:
         try:
-            yield '', list(items(self._ask(api, 'jobs', '', labels)))
+            yield '', list(items(self._ask(api, kind, '', labels)))
             return
         except ApiError as error:
             if error.status != 403:
@@ -271,8 +285,8 @@ class KubernetesProvider(Provider):
         namespaces = {api.namespace, *(
             space for context, space in self._places if context in ('', api.context))}
         for namespace in sorted(namespaces):
-            with explained('listing the machines', namespace):
-                yield namespace, list(items(self._ask(api, 'jobs', namespace, labels)))
+            with explained(f'listing {kind}', namespace):
+                yield namespace, list(items(self._ask(api, kind, namespace, labels)))
 
     def _ask(self, api: Api, kind: str, namespace: str, labels: str) -> dict[str, Any]:
         return api.request('GET', path(kind, namespace), labelSelector=labels, timeout=_FIRST)
@@ -299,6 +313,37 @@ class KubernetesProvider(Provider):
         if pod is None:
             raise MachineNotFound(f"the pod of '{where.job}' is gone")
         return ways.open_port(api, where, machine, pod, port, sources, self.cancel)
+
+    def volumes(self, hosts: Sequence[str] = ()) -> Iterator[Volume]:
+        """Yield the claims in all namespaces if the user may list them."""
+        api = kubernetes_client.connect()
+        for namespace, entries in self._entries(
+                api, 'persistentvolumeclaims', f'{selector(names.MANAGED)},{claims.VOLUME}'):
+            taken = claims.users(api, namespace) if entries else {}
+            for entry in entries:
+                meta = entry['metadata']
+                yield Volume(
+                    f'{self.name}:{api.context}/{meta["namespace"]}/{meta["name"]}',
+                    str(meta['labels'][claims.VOLUME]), self.name,
+                    f'{api.context}/{meta["namespace"]}'.lstrip('/'), claims.size_of(entry),
+                    taken.get(str(meta['name']), '').removeprefix('fogros2-'))
+
+    def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
+        """Return nothing: the kubelet has mounted the volume."""
+        return Attached()
+
+    def delete_volume(self, volume_id: str) -> None:
+        """Delete a claim, which by its storage class deletes the disk."""
+        context, namespace, name = volume_id.removeprefix(f'{self.name}:').rsplit('/', 2)
+        api = kubernetes_client.connect(context)
+        with explained(f"deleting '{name}'", namespace):
+            claims.check_free(name.removeprefix(claims.claim_name('')),
+                              claims.users(api, namespace))
+            try:
+                api.request('DELETE', path('persistentvolumeclaims', namespace, name))
+            except ApiError as error:
+                if error.status != 404:
+                    raise
 
     # -- shared by the methods above ------------------------------------------------------------
 

@@ -10,7 +10,7 @@ import math
 from typing import Any
 
 from fogros2.model import CreateRequest, MachineSpec
-from fogros2.provider.kubernetes import boot, names
+from fogros2.provider.kubernetes import boot, claims, names
 from fogros2.provider.kubernetes.options import Options
 
 #: Seconds after which the cluster deletes a machine that has ended, with all that it owns.
@@ -88,6 +88,8 @@ def pod_spec(spec: MachineSpec, request: CreateRequest, options: Options) -> dic
         'restartPolicy': 'Never', 'automountServiceAccountToken': False,
         'enableServiceLinks': False, 'hostname': names.job_name(spec.name)[len('fogros2-'):],
         'terminationGracePeriodSeconds': boot.GRACE, 'containers': [container]}
+    if request.with_volumes:
+        manifest['volumes'], container['volumeMounts'] = claims.mounts(request.with_volumes)
     if request.application:
         manifest['containers'].append(_application(request.application, resources))
     if options.node_selector:

@@ -39,6 +39,8 @@ TAG_SSH_FROM = 'fogros2-ssh-from'
 TAG_BAKED = 'fogros2-baked'
 #: Only on resources beside the machine: seconds since the epoch of their creation.
 TAG_MADE = 'fogros2-made'
+#: Only on disks that outlive machines: the volume's name.
+TAG_VOLUME = 'fogros2-volume'
 _LOGGER = logging.getLogger(__name__)
 
 Adapter = TypeVar('Adapter', bound='VmCloud')
@@ -114,6 +116,28 @@ class Vm:
 
 
 @dataclasses.dataclass(frozen=True)
+class Disk:
+    """
+    A volume as its cloud reports it.
+
+    :param zone: '' if machines in the whole region can use it.
+    :param vm: the cloud's id of the machine that has it, '' for none.
+    :param ready: it is neither being made, attached nor detached.
+    :param created: seconds since the epoch. Of several with one name, the one in use counts, and
+        else the first.
+    """
+
+    id: str
+    name: str
+    region: str
+    zone: str
+    size_gb: int
+    vm: str = ''
+    ready: bool = True
+    created: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
 class Order:
     """
     A request for a machine, the same in every region and zone that is tried.
@@ -122,6 +146,7 @@ class Order:
     :param tags: for the machine and every resource beside it.
     :param sources: networks (CIDR) that may reach the SSH port; empty without the capability
         ``firewall``.
+    :param zone: where its volumes are, '' for any.
     """
 
     spec: MachineSpec
@@ -130,6 +155,7 @@ class Order:
     tags: Mapping[str, str]
     user_data: bytes
     sources: Sequence[str]
+    zone: str = ''
 
     @property
     def attempt(self) -> str:
@@ -197,6 +223,8 @@ class VmCloud(abc.ABC):
     base_region: ClassVar[str]
     #: The most characters of user data that has to be text; 0 where a cloud takes any bytes.
     text_limit: ClassVar[int] = 0
+    #: The usual price of a GB of a volume in US dollars a month, None without volumes.
+    gb_month: ClassVar[Optional[Decimal]] = None
     #: Seconds for which ``types`` and ``zones`` are used again. They are few, because a type that
     #: has no capacity now may be left out; a cloud that lists all types may set a day.
     types_age: ClassVar[float] = 300.0
@@ -419,6 +447,34 @@ class VmCloud(abc.ABC):
 
     def sweep(self, region: str, attempt: str) -> None:
         """Delete what an attempt created besides its machine."""
+
+    # -- volumes --------------------------------------------------------------------------------
+
+    def beside(self: Adapter, machine: VmId) -> Adapter:
+        """Return an adapter for the account (project) in which a machine is."""
+        return self
+
+    def disks(self, region: str, name: str = '') -> Iterable[Disk]:
+        """Return the volumes of a region, of one name if it is given."""
+        return ()
+
+    def make_disk(self, machine: VmId, name: str, size_gb: int) -> str:
+        """Make a volume where a machine is; return its id, perhaps before it is ready."""
+        raise Unsupported(f'FogROS2 makes no volumes at {self.title}')
+
+    def attach_disk(self, machine: VmId, disk: Disk) -> tuple[str, ...]:
+        """
+        Attach a volume that the machine may have already; return paths, of which one appears.
+
+        The machine's end leaves it.
+        """
+        raise Unsupported(f'FogROS2 has no volumes at {self.title}')
+
+    def detach_disk(self, machine: VmId, disk: Disk) -> None:
+        """Detach a volume."""
+
+    def delete_disk(self, disk: Disk) -> None:
+        """Delete a volume; idempotent."""
 
     # -- images ---------------------------------------------------------------------------------
 

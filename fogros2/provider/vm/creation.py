@@ -46,6 +46,7 @@ class Creation:
     :param sources: returns the networks that may log in, if ``ssh_from=`` names none.
     :param price: returns the price of a type, given its region and name, in US dollars per hour;
         None if it is unknown.
+    :param zone: where its volumes are, '' for any.
     :param unsure: whether a machine may exist although no answer said so.
     :param undo_failures: errors of undo steps.
     """
@@ -57,6 +58,7 @@ class Creation:
     options: VmOptions
     sources: Callable[[], list[str]]
     price: Callable[[str, str], Optional[Decimal]]
+    zone: str = ''
     unsure: bool = False
     undo_failures: list[FogError] = dataclasses.field(default_factory=list)
 
@@ -97,7 +99,7 @@ class Creation:
             lookup = pool.submit(self._existing, region, tags[TAG_ATTEMPT])
             sources = pool.submit(lambda: list(options.ssh_from) or self.sources())
             data = pool.submit(self._user_data, region, options, tags)
-            order = Order(self.spec, self.request, options, tags, b'', ())
+            order = Order(self.spec, self.request, options, tags, b'', (), self.zone)
             prepared = pool.submit(self.cloud.prepare, region, order, options.types)
             existing = lookup.result()
             if existing is not None:

@@ -20,16 +20,26 @@ from fogros2.errors import (
     ConfigurationError,
     FogError,
     MachineNotFound,
+    NameTaken,
     ProviderError,
     Unsupported,
 )
-from fogros2.model import CreateRequest, Endpoint, Image, Machine, MachineSpec, MachineState
-from fogros2.provider import Capabilities, Provider, TAG_NAME
+from fogros2.model import (
+    CreateRequest,
+    Endpoint,
+    Image,
+    Machine,
+    MachineSpec,
+    MachineState,
+    Volume,
+)
+from fogros2.provider import Attached, Capabilities, Provider, TAG_NAME
 from fogros2.provider.offers import Offer, Offers, Region, Wants
 from fogros2.provider.vm.address import RobotAddress
 from fogros2.provider.vm.cloud import (
     attempt_of,
     CloudError,
+    Disk,
     END_TIMEOUT,
     TAG_ATTEMPT,
     TAG_DISK,
@@ -208,13 +218,17 @@ class VmProvider(Provider):
             spec = self.resolve(spec)
             options = self._cloud.options.of(spec)
         cloud, firewall = self._cloud.account(options), self.capabilities.firewall
+        regions = list(dict.fromkeys([self._region(options), *options.regions]))
+        zone = ''
+        if request.with_volumes:
+            regions, zone = _beside(cloud.until(cancel), regions, request.with_volumes)
         creation = Creation(
             cloud.until(cancel), cloud, spec, request, options,
             sources=lambda: _ROBOT_ADDRESS.with_ipv6(
                 [self._address(cancel)]) if firewall else [],
             price=functools.cache(
-                lambda region, kind: self._price(region, kind, options, cancel)))
-        machine = creation.run(list(dict.fromkeys([self._region(options), *options.regions])))
+                lambda region, kind: self._price(region, kind, options, cancel)), zone=zone)
+        machine = creation.run(regions)
         cloud.notes[machine.vm] += map(str, creation.undo_failures)
         if not firewall:
             cloud.notes[machine.vm].append(
@@ -370,6 +384,62 @@ class VmProvider(Provider):
     def delete_image(self, image_id: str) -> None:
         self._cloud.delete_image(image_id)
 
+    # -- volumes --------------------------------------------------------------------------------
+
+    def volumes(self, hosts: Sequence[str] = ()) -> Iterator[Volume]:
+        for disk in self._disks():
+            yield Volume(self._volume_id(disk), disk.name, self.name, disk.zone or disk.region,
+                         disk.size_gb, disk.vm, self._cloud.gb_month)
+
+    def _disks(self) -> list[Disk]:
+        cloud = self._until()
+        by_region = self._everywhere(cloud, lambda region: list(cloud.disks(region)))
+        return [disk for disks in by_region for disk in disks]
+
+    def _volume_id(self, disk: Disk) -> str:
+        return f'{self.name}:{disk.region}/{disk.id}'
+
+    def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
+        """Attach the first volume of this name; two launches that make one keep the first."""
+        machine = self._id(machine_id)
+        cloud = self._cloud.beside(machine).until(self.cancel)
+        made = '' if _first(cloud.disks(machine.region, name)) else cloud.make_disk(
+            machine, name, size_gb)
+
+        def look(attached: bool) -> Optional[Disk]:
+            disk = _first(cloud.disks(machine.region, name))
+            if disk is None:
+                return None
+            if made not in ('', disk.id):
+                cloud.until(None).delete_disk(dataclasses.replace(disk, id=made))
+                raise _in_use(disk)
+            if disk.vm not in ('', machine.vm):
+                raise _in_use(disk)
+            return disk if disk.ready and (disk.vm or not attached) else None
+
+        def wait(state: str) -> Disk:
+            return wait_until(
+                lambda: look(state == 'attached'), timeout=END_TIMEOUT, cancel=self.cancel,
+                first=0.3, interval=1.0, longest=3.0, what=f"the volume '{name}' to be {state}")
+
+        devices = cloud.attach_disk(machine, wait('ready'))
+        wait('attached')
+        return Attached(devices)
+
+    def detach(self, machine_id: str, name: str) -> None:
+        machine = self._id(machine_id)
+        cloud = self._cloud.beside(machine)
+        for disk in cloud.disks(machine.region, name):
+            if disk.vm == machine.vm:
+                cloud.detach_disk(machine, disk)
+
+    def delete_volume(self, volume_id: str) -> None:
+        for disk in self._disks():
+            if self._volume_id(disk) == volume_id:
+                if disk.vm:
+                    raise _in_use(disk)
+                self._cloud.delete_disk(disk)
+
     # -- regions and prices ---------------------------------------------------------------------
 
     def nearest(self, names: Sequence[str] = ()) -> str:
@@ -468,6 +538,42 @@ class VmProvider(Provider):
         if match is None:
             raise MachineNotFound(f"'{text}' is no machine at {self._cloud.title}")
         return VmId(*match.groups())
+
+
+def _first(disks: Iterable[Disk]) -> Optional[Disk]:
+    return min(disks, key=lambda disk: (not disk.vm, disk.created, disk.id), default=None)
+
+
+def _in_use(disk: Disk) -> NameTaken:
+    return NameTaken(f"the volume '{disk.name}' in {disk.zone or disk.region} is in use by "
+                     f'{disk.vm or "another launch"}', 'end that machine: ros2 fog list shows it')
+
+
+def _beside(
+    cloud: VmCloud, regions: Sequence[str], names: Iterable[str],
+) -> tuple[list[str], str]:
+    """
+    Return the regions and the zone for a machine: those of its volumes, if some exist.
+
+    :raises NameTaken: another machine has a volume.
+    :raises ConfigurationError: no zone has all of them.
+    """
+    for region in regions:
+        listed = list(cloud.disks(region))
+        disks = [disk for name in names if (
+            disk := _first(one for one in listed if one.name == name)) is not None]
+        for disk in disks:
+            if disk.vm:
+                raise _in_use(disk)
+        zones = {disk.zone for disk in disks}
+        if len(zones) > 1:
+            raise ConfigurationError(
+                'no machine can have ' + ' and '.join(
+                    f"the volume '{disk.name}' in {disk.zone}" for disk in disks),
+                'leave one out, or delete it: ros2 fog volume delete NAME')
+        if disks:
+            return [region], zones.pop()
+    return list(regions), ''
 
 
 def _ip(text: str) -> str:

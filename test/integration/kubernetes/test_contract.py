@@ -5,8 +5,10 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
+import dataclasses
 import secrets
 import threading
+from types import SimpleNamespace
 
 import pytest
 
@@ -16,6 +18,7 @@ from fogros2.model import Command, MachineSpec
 from fogros2.provider.kubernetes import KubernetesProvider
 from fogros2.shell.kubernetes import KubernetesShell
 from fogros2.waiting import wait_until
+from fogros2_features.volumes import Volumes
 from fogros2_testing import ProviderContract, request_for, ShellContract
 from fogros2_testing.shell_contract import raised
 from rigs.cluster import BARE, Refused
@@ -276,3 +279,45 @@ def test_deletion_keeps_pods_of_other_jobs(place, client):
         assert 'deletionTimestamp' not in now['metadata']
     finally:
         client.ask('DELETE', f'{base}/fogros2-same-other', gracePeriodSeconds='0')
+
+
+def test_volume_outlives_its_pod(place, client, tmp_path):
+    """With a disk that an administrator has made: nothing here makes disks."""
+    name = f'models-{secrets.token_hex(3)}'
+    disk = f'/api/v1/persistentvolumes/{name}'
+    client.create('/api/v1/persistentvolumes', 'v1 PersistentVolume', name, spec={
+        'capacity': {'storage': '1Gi'}, 'accessModes': ['ReadWriteOnce'],
+        'hostPath': {'path': str(tmp_path / 'disk'), 'type': 'DirectoryOrCreate'}})
+    provider, wanted = KubernetesProvider(), {name: ('/data', 1)}
+
+    def created(machine):
+        spec = MachineSpec(machine, provider.name, {'container_image': BARE})
+        return provider.create(spec, dataclasses.replace(request_for(spec), with_volumes=wanted))
+
+    def within(machine_id, script):
+        machine = provider.reachable(machine_id, name='holds', timeout=60.0)
+        with contextlib.closing(KubernetesShell(machine.shell, name='holds')) as shell:
+            running = SimpleNamespace(
+                lost='', machine=machine, provider=provider, interface=SimpleNamespace(name='lo'),
+                spec=MachineSpec('holds', provider.name),
+                step=lambda name: contextlib.nullcontext([]),
+                run=lambda command, timeout: shell.run(command, timeout=timeout).stdout)
+            with Volumes().machine(running, wanted):
+                return shell.run(Command(('sh', '-ec', script)), timeout=30.0).stdout
+
+    try:
+        first = created('first')
+        assert within(first, 'stat -c %U /data; echo kept >/data/model') == 'fog\n'
+        (volume,) = provider.volumes()
+        assert (volume.name, volume.size_gb, volume.user) == (name, 1, 'first')
+        raised(NameTaken, lambda: created('second'))
+        raised(NameTaken, lambda: provider.delete_volume(volume.id))
+        provider.destroy(first)
+        second = created('second')
+        assert within(second, 'cat /data/model') == 'kept\n'
+        provider.destroy(second)
+        provider.delete_volume(volume.id)
+        wait_until(lambda: not list(provider.volumes()), timeout=30.0, what='no claim')
+        provider.delete_volume(volume.id)
+    finally:
+        client.ask('DELETE', disk)

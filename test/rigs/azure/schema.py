@@ -14,7 +14,7 @@ _MODELS = {
     'virtualmachines': ('compute', 'VirtualMachine'),
     'extensions': ('compute', 'VirtualMachineExtension'), 'snapshots': ('compute', 'Snapshot'),
     'galleries': ('compute', 'Gallery'), 'images': ('compute', 'GalleryImage'),
-    'versions': ('compute', 'GalleryImageVersion'),
+    'versions': ('compute', 'GalleryImageVersion'), 'disks': ('compute', 'Disk'),
     'networksecuritygroups': ('network', 'NetworkSecurityGroup'),
     'securityrules': ('network', 'SecurityRule'),
     'publicipaddresses': ('network', 'PublicIPAddress'),

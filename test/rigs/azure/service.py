@@ -110,6 +110,12 @@ class Computers:
     def copy_disk(self, vm: dict[str, Any], image: str) -> None:
         """Copy a computer's disk for an image."""
 
+    def attach(self, number: str, disk: str, size_gb: int, path: str) -> None:
+        """Let a machine have a disk that outlives it."""
+
+    def detach(self, number: str, disk: str) -> None:
+        """Take such a disk from a machine."""
+
     def protect(self) -> None:
         """Put the rules of the network security groups in force."""
 
@@ -284,7 +290,7 @@ class Service:
         if method == 'DELETE':
             return self._remove(path)
         if method in ('PUT', 'PATCH'):
-            return self._put(path, kind, group, body, fault)
+            return self._put(method, path, kind, group, body, fault)
         raise Refusal(405, 'MethodNotAllowed')
 
     def _authorize(self, method: str, path: str, kind: str, who: str) -> None:
@@ -412,6 +418,7 @@ class Service:
     def _vanish(self, entry: dict[str, Any]) -> None:
         self.resources.pop(entry['id'].lower(), None)
         if kind_of(entry['id']) == 'virtualmachines':
+            self._free(entry['id'])
             entry['properties']['provisioningState'] = 'Deleting'
             self.ghosts.append((time.monotonic() + self.ghost, entry))
 
@@ -464,12 +471,48 @@ class Service:
             'code': f'PowerState/{power}', 'level': 'Info', 'displayStatus': f'VM {power}'}]
             if power else [])]}
 
+    def _attach(self, path: str, body: Any) -> tuple[int, dict[str, str], Any]:
+        """Replace the data disks of a machine, as a PATCH does."""
+        vm = self._there(path)
+        if trouble := schema.unknown('virtualmachines', body):
+            raise Refusal(400, 'InvalidRequestContent', f'Could not find member {trouble}.')
+        storage, wanted = vm['properties']['storageProfile'], body['properties'][
+            'storageProfile']['dataDisks']
+        if len({one['lun'] for one in wanted}) < len(wanted):
+            raise Refusal(400, 'InvalidParameter', 'lun')
+        disks = [self._there(one['managedDisk']['id']) for one in wanted]
+        for disk in disks:
+            if disk.get('managedBy', path).lower() != path.lower():
+                raise Refusal(409, 'AttachDiskWhileBeingDetached', 'another machine has the disk')
+            if disk['location'] != vm['location']:
+                raise Refusal(400, 'BadRequest', 'the disk is in another region')
+        before = {one['managedDisk']['id'].lower() for one in storage.get('dataDisks') or ()}
+        self._free(path)
+        storage['dataDisks'] = wanted
+        for one, disk in zip(wanted, disks):
+            disk['managedBy'] = path
+            if disk['id'].lower() not in before:
+                self.computers.attach(vm['name'], disk['name'], disk['properties']['diskSizeGB'],
+                                      f'/dev/disk/azure/scsi1/lun{one["lun"]}')
+        for gone in before - {disk['id'].lower() for disk in disks}:
+            self.computers.detach(vm['name'], gone.rpartition('/')[2])
+        return 200, self.later(path, lambda: None), plain(vm)
+
+    def _free(self, path: str) -> None:
+        """Detach the data disks of a machine."""
+        for entry in self.resources.values():
+            if entry.get('managedBy', '').lower() == path.lower() \
+                    and entry['properties'].get('creationData'):
+                del entry['managedBy']
+
     def _put(
-        self, path: str, kind: str, group: Optional[dict[str, Any]], body: Any,
+        self, method: str, path: str, kind: str, group: Optional[dict[str, Any]], body: Any,
         fault: Optional[Fault],
     ) -> tuple[int, dict[str, str], Any]:
         if kind not in _NAMES or not isinstance(body, Mapping):
             raise Refusal(400, 'InvalidRequestContent')
+        if method == 'PATCH':
+            return self._attach(path, body)
         if group and group['properties']['provisioningState'] == 'Deleting':
             raise Refusal(409, 'ResourceGroupBeingDeleted')
         _name(kind, path.rpartition('/')[2])
@@ -490,7 +533,7 @@ class Service:
         if not kind.startswith('role'):
             entry['properties']['provisioningState'] = 'Updating'
         getattr(self, f'_new_{kind}', lambda *_: None)(entry, old)
-        if old is not None and kind == 'virtualmachines':
+        if old is not None and kind in ('virtualmachines', 'disks'):
             return 200, {}, plain(old)
         self.resources[path.lower()] = entry
         if kind == 'virtualmachines':

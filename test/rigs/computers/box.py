@@ -77,6 +77,7 @@ class Box:
     :param mounts: folders of this computer that every instance sees, read-only; None for this
         Python environment and ROS 2, as an image made for it would have them.
     :param regions: whose API hosts the robot can connect to, for who measures which is near.
+    :param volumes: an instance may mount disks, which are loop devices of this computer.
     """
 
     #: Module of the process.
@@ -86,14 +87,14 @@ class Box:
 
     def __init__(
         self, *, boot_delay: float = 0.0, mounts: Optional[Sequence[str]] = None,
-        regions: Sequence[str] = (),
+        regions: Sequence[str] = (), volumes: bool = False,
     ) -> None:
         self.mark = secrets.token_hex(2)
         self.endpoint = ''
         self.robot = ''
         self._settings = {
             'mark': self.mark, 'boot_delay': boot_delay,
-            'regions': list(regions or self.REGIONS),
+            'regions': list(regions or self.REGIONS), 'volumes': volumes,
             'mounts': container_root.environment_mounts(None) if mounts is None
             else list(mounts)}
         self._child: Optional[subprocess.Popen[str]] = None

@@ -78,10 +78,12 @@ class Cloud(abc.ABC):
     :param mark: the box; on everything that it makes.
     :param boot_delay: seconds from the request until an instance's first process starts.
     :param mounts: folders of this computer that every instance sees, read-only.
+    :param volumes: instances may mount disks.
     """
 
     def __init__(
         self, mark: str, net: network.Network, *, boot_delay: float, mounts: tuple[str, ...],
+        volumes: bool = False,
     ) -> None:
         self.mark = mark
         self.net = net
@@ -90,6 +92,7 @@ class Cloud(abc.ABC):
         self.addresses = network.Addresses()
         self.machines: dict[str, Machine] = {}
         self._mounts = mounts
+        self._volumes = volumes
         #: Held by who changes an instance's state.
         self.lock = threading.RLock()
         self._closing = threading.Event()
@@ -138,7 +141,8 @@ class Cloud(abc.ABC):
     def launch(self, number: str, instance: Any, *, spot: bool, disk_of: str) -> None:
         """Give a new instance a computer and start it."""
         machine = Machine(
-            number, instance, Computer(self.mark, self.disks / number, self._mounts), spot,
+            number, instance,
+            Computer(self.mark, self.disks / number, self._mounts, volumes=self._volumes), spot,
             disk_of)
         with self.lock:
             self.machines[number] = machine
@@ -290,6 +294,18 @@ class Cloud(abc.ABC):
         self.addresses.give_back(filter(None, gone))
         # all at once: from this moment on it may be started again
         self._set(machine, 'terminated' if machine.wanted == 'terminate' else 'stopped')
+
+    # -- disks that outlive instances -----------------------------------------------------
+
+    def attach(self, number: str, disk: str, size_gb: int, path: str) -> None:
+        """Let an instance that runs have a disk as a block device."""
+        if self._volumes and number in self.machines:
+            self.machines[number].computer.attach(self.disks / f'{disk}.disk', size_gb, path)
+
+    def detach(self, number: str, disk: str) -> None:
+        """Take a disk from an instance."""
+        if self._volumes and number in self.machines:
+            self.machines[number].computer.detach(self.disks / f'{disk}.disk')
 
     # -- images ---------------------------------------------------------------------------
 

@@ -71,6 +71,18 @@ done
 """
 
 
+#: Show a file as a block device, whose number the program prints.
+_ATTACH = """\
+[ -e "$1" ] || truncate -s "$2G" "$1"
+losetup --show -f "$1"
+"""
+_DETACH = """\
+losetup -nl -O NAME,BACK-FILE | while read -r device file; do
+    case $file in "$1"*) losetup -d "$device" ;; esac
+done
+"""
+
+
 @dataclasses.dataclass(frozen=True)
 class Boot:
     """
@@ -159,12 +171,17 @@ class Computer:
     :param mark: the box it belongs to.
     :param disk: folder of its disk.
     :param mounts: folders of this computer that it sees, read-only.
+    :param volumes: it may mount disks.
     """
 
-    def __init__(self, mark: str, disk: Path, mounts: Sequence[str] = ()) -> None:
+    def __init__(
+        self, mark: str, disk: Path, mounts: Sequence[str] = (), *, volumes: bool = False,
+    ) -> None:
         self.disk = disk
         self._mark = mark
         self._mounts = mounts
+        self._volumes = volumes
+        self._attached: list[Path] = []
         self._name = ''
         self._handle: Optional[int] = None
         self._lock = threading.Lock()
@@ -189,6 +206,9 @@ class Computer:
             '--label', f'{LABEL}={self._mark}', *container_engine.limits()]
         for right in ('NET_ADMIN', 'NET_RAW', 'AUDIT_WRITE', 'MKNOD'):
             words += ['--cap-add', right]
+        if self._volumes:
+            # loop devices have the number 7
+            words += ['--cap-add', 'SYS_ADMIN', '--device-cgroup-rule', 'b 7:* rwm']
         for path in container_root.system_mounts():
             layer = f'{self.disk}/layers{path}'
             words += ['-v', f'{path}:{path}:O,upperdir={layer}/upper,workdir={layer}/work']
@@ -268,6 +288,22 @@ class Computer:
             'exec', self._name, 'sh', '-ec', script, what=f'run {script!r} on an instance',
             timeout=60.0, check=check).stdout
 
+    def attach(self, file: Path, size_gb: int, path: str) -> None:
+        """Let it have a disk, in a file of this computer, as a block device."""
+        device = process.run(
+            Command(('sh', '-ec', _ATTACH, 'sh', str(file), str(size_gb)), sudo=True),
+            timeout=30.0).stdout.strip()
+        self._attached.append(file)
+        number = device.removeprefix('/dev/loop')
+        self.run(f'[ -e {device} ] || mknod {device} b 7 {number}\n'
+                 f'mkdir -p {os.path.dirname(path)}; ln -sf {device} {path}', check=True)
+
+    def detach(self, file: Path) -> None:
+        """Take a disk from it, which it does not use any more."""
+        if file in self._attached:
+            self._attached.remove(file)
+            process.run(Command(('sh', '-c', _DETACH, 'sh', str(file)), sudo=True), timeout=30.0)
+
     @contextlib.contextmanager
     def still(self) -> Iterator[None]:
         """Hold it for the time of the block, as a snapshot is of one moment."""
@@ -292,6 +328,8 @@ class Computer:
         if self._name:
             self._engine.call('rm', '-f', '-t', '0', self._name, what='remove an instance',
                               check=False)
+        for file in list(self._attached):
+            self.detach(file)
 
 
 def sweep(mark: str) -> None:
@@ -305,6 +343,8 @@ def sweep(mark: str) -> None:
                         what='list containers', check=False).stdout.split()
     if found:
         engine.call('rm', '-f', '-t', '0', *found, what='remove instances', check=False)
+    process.run(Command(('sh', '-c', _DETACH, 'sh', f'{DISKS / mark}/'), sudo=True), timeout=30.0,
+                check=False)
     remove_disk(DISKS / mark)
 
 

@@ -46,7 +46,9 @@ def install(cloud: Cloud) -> None:
     MOTO.update(
         start=instances.Instance.start, stop=instances.Instance.stop,
         terminate=instances.Instance.terminate, run=instances.InstanceBackend.run_instances,
-        image=amis.AmiBackend.create_image, deregister=amis.AmiBackend.deregister_image)
+        image=amis.AmiBackend.create_image, deregister=amis.AmiBackend.deregister_image,
+        attach=parts.elastic_block_store.EBSBackend.attach_volume,
+        detach=parts.elastic_block_store.EBSBackend.detach_volume)
 
     def run_instances(self: Any, *args: Any, **kwargs: Any) -> Any:
         reservation = MOTO['run'](self, *args, **kwargs)
@@ -97,6 +99,22 @@ def install(cloud: Cloud) -> None:
         cloud.forget_image(ami_id)
         return answer
 
+    def attach_volume(
+        self: Any, volume_id: str, instance_id: str, *args: Any, **kwargs: Any,
+    ) -> Any:
+        answer = MOTO['attach'](self, volume_id, instance_id, *args, **kwargs)
+        # as Nitro's NVMe shows it
+        cloud.attach(instance_id, volume_id, int(self.get_volume(volume_id).size),
+                     '/dev/disk/by-id/nvme-Amazon_Elastic_Block_Store_'
+                     + volume_id.replace('-', ''))
+        return answer
+
+    def detach_volume(self: Any, volume_id: str, instance_id: str, device_path: str) -> Any:
+        cloud.detach(instance_id, volume_id)
+        return MOTO['detach'](self, volume_id, instance_id, device_path)
+
+    parts.elastic_block_store.EBSBackend.attach_volume = attach_volume
+    parts.elastic_block_store.EBSBackend.detach_volume = detach_volume
     for name, method in (('start', start), ('stop', stop), ('terminate', terminate),
                          ('reboot', reboot)):
         setattr(instances.Instance, name, method)

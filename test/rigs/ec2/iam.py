@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fogros2.provider.vm.cloud import TAG_ATTEMPT, TAG_BAKED
+from fogros2.provider.vm.cloud import TAG_ATTEMPT, TAG_BAKED, TAG_VOLUME
 
 #: Asked of what anybody has.
 LOOK = (
@@ -32,12 +32,19 @@ PRICES = (
 MAKE = (
     'ec2:CreateImage',
     'ec2:CreateSecurityGroup',
+    'ec2:CreateVolume',
     'ec2:DeleteKeyPair',
     'ec2:ImportKeyPair',
     'ec2:RunInstances',
 )
+#: What takes a right on a machine and one on a volume.
+ATTACH = (
+    'ec2:AttachVolume',
+    'ec2:DetachVolume',
+)
 #: What changes or ends a machine: those with FogROS2's tag alone.
 CHANGE = (
+    *ATTACH,
     'ec2:AuthorizeSecurityGroupIngress',
     'ec2:DeleteSecurityGroup',
     'ec2:DeleteVolume',
@@ -48,6 +55,11 @@ CHANGE = (
     'ec2:StopInstances',
     'ec2:TerminateInstances',
 )
+#: The same for volumes.
+CHANGE_VOLUMES = (
+    *ATTACH,
+    'ec2:DeleteVolume',
+)
 #: The same for images.
 CHANGE_IMAGES = (
     'ec2:DeleteSnapshot',
@@ -57,7 +69,9 @@ TAG = ('ec2:CreateTags',)
 #: Optional: with it, messages name the action that was refused.
 HELPFUL = ('sts:DecodeAuthorizationMessage',)
 
-ACTIONS = (*LOOK, *PRICES, *MAKE, *CHANGE, *CHANGE_IMAGES, *TAG, *HELPFUL)
+#: With ``volumes=`` alone.
+VOLUMES = (*ATTACH, 'ec2:CreateVolume')
+ACTIONS = (*LOOK, *PRICES, *MAKE, *CHANGE, *CHANGE_VOLUMES, *CHANGE_IMAGES, *TAG, *HELPFUL)
 #: Calls that no policy can refuse.
 FREE = ('sts:GetCallerIdentity',)
 
@@ -67,13 +81,14 @@ def policy() -> dict[str, Any]:
     machine = {'Null': {f'aws:ResourceTag/{TAG_ATTEMPT}': 'false'}}
     image = {'Null': {f'aws:ResourceTag/{TAG_BAKED}': 'false'}}
     born = {'StringEquals': {'ec2:CreateAction': [
-        'CreateImage', 'CreateSecurityGroup', 'ImportKeyPair', 'RunInstances']}}
+        'CreateImage', 'CreateSecurityGroup', 'CreateVolume', 'ImportKeyPair', 'RunInstances']}}
     statements: list[tuple[str, tuple[str, ...], dict[str, Any]]] = [
         ('Look', (*LOOK, *PRICES, *HELPFUL), {}),
         ('Make', MAKE, {}),
         ('TagWhatIsMade', TAG, born),
         ('TagMachines', TAG, machine),
         ('ChangeMachines', CHANGE, machine),
+        ('ChangeVolumes', CHANGE_VOLUMES, {'Null': {f'aws:ResourceTag/{TAG_VOLUME}': 'false'}}),
         ('ChangeImages', CHANGE_IMAGES, image),
     ]
     return {

@@ -73,6 +73,8 @@ class Project:
         self.instances: dict[str, dict[str, Any]] = {}
         self.firewalls: dict[str, dict[str, Any]] = {}
         self.images: dict[tuple[str, str], dict[str, Any]] = {}
+        #: Disks that outlive instances, by their links.
+        self.kept: dict[str, dict[str, Any]] = {}
         self.operations: dict[str, Operation] = {}
         self._asked: dict[str, tuple[str, str]] = {}
         self._deleted: dict[str, tuple[float, dict[str, Any]]] = {}
@@ -106,6 +108,7 @@ class Project:
     def clear(self) -> None:
         """Delete everything but what Google ships."""
         self._prune()
+        self.kept.clear()
         for instance in self.instances.values():
             self.cloud.end(instance['id'], 'terminate')
         for name in [name for name in self.firewalls if not name.startswith('default-')]:
@@ -583,14 +586,67 @@ class Project:
         return self.aggregated('disk', self.disks(), query)
 
     def disks(self) -> list[dict[str, Any]]:
-        """Return the disks of all instances."""
+        """Return the disks of all instances, and those that outlive them."""
         self._prune()
-        return [{'kind': 'compute#disk', 'id': f'{i["id"]}1', 'name': _last(d['source']),
-                 'sizeGb': d['diskSizeGb'], 'zone': i['zone'], 'selfLink': d['source'],
-                 'status': 'READY', 'users': [i['selfLink']],
-                 'type': f'{i["zone"]}/diskTypes/pd-standard',
-                 'creationTimestamp': i['creationTimestamp']}
-                for i in self.instances.values() for d in i['disks']]
+        users: dict[str, list[str]] = {}
+        for instance in self.instances.values():
+            for disk in instance['disks']:
+                users.setdefault(disk['source'], []).append(instance['selfLink'])
+        return [*({'kind': 'compute#disk', 'id': f'{i["id"]}1', 'name': _last(d['source']),
+                   'sizeGb': d['diskSizeGb'], 'zone': i['zone'], 'selfLink': d['source'],
+                   'status': 'READY', 'users': [i['selfLink']],
+                   'type': f'{i["zone"]}/diskTypes/pd-standard',
+                   'creationTimestamp': i['creationTimestamp']}
+                  for i in self.instances.values() for d in i['disks'] if d['boot']),
+                *({**disk, 'users': users.get(link, [])} for link, disk in self.kept.items())]
+
+    def disks_insert(self, words: Words, query: Words, body: Any) -> Any:
+        """Create a disk without an instance."""
+        zone = words['zone']
+        self._known_zone(zone)
+        path = f'{self.name}/zones/{zone}/disks/{body["name"]}'
+        if BASE + path in self.kept:
+            raise Refusal('alreadyExists', f"The resource '{body['name']}' already exists")
+        if _last(body['type']) not in catalogue.DISK_TYPES:
+            raise Refusal('notFound', f"The resource '{body['type']}' was not found")
+        _check_labels(body.get('labels', {}))
+        disk = self.kept[BASE + path] = {
+            **body, **self._new('disk', body['name'], path), 'status': 'READY',
+            'zone': f'{BASE}{self.name}/zones/{zone}'}
+        return self.start('insert', disk)
+
+    def disks_delete(self, words: Words, query: Words, body: Any) -> Any:
+        """Delete a disk that no instance has."""
+        link = f'{BASE}{self.name}/zones/{words["zone"]}/disks/{words["disk"]}'
+        if link not in self.kept:
+            raise Refusal('notFound', f"The resource '{words['disk']}' was not found")
+        if any(disk['selfLink'] == link and disk['users'] for disk in self.disks()):
+            raise Refusal('resourceInUseByAnotherResource', 'The disk is in use')
+        return self.start('delete', self.kept.pop(link))
+
+    def instances_attach_disk(self, words: Words, query: Words, body: Any) -> Any:
+        """Attach a disk of the instance's zone that no other instance has."""
+        instance, link = self._instance(words), self._url(body['source'])
+        if link not in self.kept or self.kept[link]['zone'] != instance['zone']:
+            raise Refusal('notFound', f"The resource '{body['source']}' was not found")
+        if any(disk['selfLink'] == link and disk['users'] for disk in self.disks()):
+            raise Refusal('resourceInUseByAnotherResource', 'The disk is in use')
+        instance['disks'].append({
+            'kind': 'compute#attachedDisk', 'boot': False, 'type': 'PERSISTENT', **body,
+            'source': link, 'diskSizeGb': self.kept[link]['sizeGb']})
+        self.cloud.attach(instance['id'], self.kept[link]['id'], int(self.kept[link]['sizeGb']),
+                          f'/dev/disk/by-id/google-{body["deviceName"]}')
+        return self.start('attachDisk', instance)
+
+    def instances_detach_disk(self, words: Words, query: Words, body: Any) -> Any:
+        """Detach a disk by its device's name."""
+        instance = self._instance(words)
+        for disk in instance['disks']:
+            if disk.get('deviceName') == query['deviceName']:
+                self.cloud.detach(instance['id'], self.kept[disk['source']]['id'])
+        instance['disks'] = [disk for disk in instance['disks']
+                             if disk.get('deviceName') != query['deviceName']]
+        return self.start('detachDisk', instance)
 
     # -- images ---------------------------------------------------------------------------
 

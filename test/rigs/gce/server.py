@@ -21,7 +21,8 @@ class Box(server.Box):
         from rigs.gce.cloud import Cloud
         from rigs.gce.resources import Project
         cloud = Cloud(self.mark, self.net, boot_delay=float(self.settings['boot_delay']),
-                      mounts=tuple(self.settings['mounts']))
+                      mounts=tuple(self.settings['mounts']),
+                      volumes=self.settings['volumes'])
         project = Project(cloud, name=self.settings['project'])
         return cloud, Api(project, keys.public(self.settings['key']))
 

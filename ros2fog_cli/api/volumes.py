@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""List the volumes of all providers that have some."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import dataclasses
+from typing import Any, Optional
+
+from fogros2 import plugin_system
+from fogros2.model import Volume
+from fogros2.provider import Provider
+from ros2fog_cli.api import machines
+from ros2fog_cli.api.machines import Warn
+
+
+def survey(
+    warn: Warn, *, regions: Optional[Sequence[str]] = None, hosts: Sequence[str] = (),
+) -> list[Volume]:
+    """Return the volumes of all providers; warn about a provider that does not answer."""
+    def ask(name: str) -> list[Volume]:
+        kind: type[Provider] = plugin_system.load('fogros2.provider', name)
+        if not kind.capabilities.keeps_volumes:
+            return []
+        return list(machines.load(name, regions).volumes(hosts))
+
+    answers = machines.ask_all(warn, machines.configured(regions), ask)
+    return sorted((volume for volumes in answers for volume in volumes or ()),
+                  key=lambda volume: (volume.name, volume.id))
+
+
+def to_json(volume: Volume) -> dict[str, Any]:
+    """Return a volume as JSON data: size in GB, prices in US dollars."""
+    fields = dataclasses.asdict(volume)
+    cost, place = volume.cost_per_month, fields.pop('region')
+    del fields['gb_month']
+    return {**fields, 'place': place, 'cost_per_month': None if cost is None else float(cost)}
+
+
+def total(volumes: Sequence[Volume], cost: Any) -> str:
+    """
+    Return what volumes cost together, '' without volumes of a known price.
+
+    :param cost: returns a sum of US dollars as people read it.
+    """
+    costs = [each for volume in volumes if (each := volume.cost_per_month) is not None]
+    return f'volumes: about {cost(sum(costs), 2)} a month (ros2 fog volume list)' if costs else ''

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 fog volume``."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from ros2fog_cli.verb import (
+    add_json,
+    add_region,
+    agreed,
+    print_json,
+    say,
+    VerbExtension,
+    warn,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fogros2.model import Volume
+
+
+class VolumeVerb(VerbExtension):
+    """List and delete volumes: disks and folders that outlive machines."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
+        """Add the verb's arguments."""
+        parser.add_argument('action', choices=('list', 'delete'))
+        _add_options(parser)
+        parser.add_argument('rest', nargs=argparse.REMAINDER, metavar='...',
+                            help='names or ids of volumes to delete; options may be anywhere')
+
+    def main(self, *, args: argparse.Namespace) -> int:
+        """List all volumes, or delete those that are named."""
+        from fogros2.errors import ConfigurationError
+        from ros2fog_cli.api import volumes as api
+        late = argparse.ArgumentParser(prog='ros2 fog volume')
+        _add_options(late)
+        late.add_argument('names', nargs='*')
+        names = late.parse_intermixed_args(args.rest, args).names
+        if (args.action == 'delete') != bool(names):
+            raise ConfigurationError("'ros2 fog volume list' takes no names, 'delete' some",
+                                     'ros2 fog volume list shows them')
+        volumes = api.survey(warn, regions=args.region, hosts=args.host)
+        if args.action == 'delete':
+            return _delete(_named(volumes, names), args)
+        if args.json:
+            print_json(volumes=[api.to_json(volume) for volume in volumes])
+        else:
+            _print(volumes)
+        return 0
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--host', action='append', default=[],
+                        help='an SSH host whose volumes are meant; may be repeated')
+    add_region(parser)
+    parser.add_argument('--yes', '-y', action='store_true', help="delete: don't ask")
+    add_json(parser)
+
+
+def _print(volumes: Sequence[Volume]) -> None:
+    from ros2fog_cli.api import table
+    if not volumes:
+        print('no volumes')
+        return
+    print(table.table(
+        ('NAME', 'VOLUME', 'PROVIDER', 'PLACE', 'SIZE', 'USED BY', 'COST/MONTH'),
+        [(volume.name, volume.id, volume.provider, volume.region or table.NONE,
+          table.NONE if volume.size_gb is None else f'{volume.size_gb} GB',
+          volume.user or table.NONE, table.cost(volume.cost_per_month, 2)) for volume in volumes],
+        width=table.terminal_width(), optional=('PROVIDER', 'PLACE', 'VOLUME')))
+
+
+def _named(volumes: Sequence[Volume], words: Sequence[str]) -> list[Volume]:
+    """
+    Return the volumes with these names or ids.
+
+    :raises ConfigurationError: a word fits none, or several.
+    """
+    from fogros2.errors import ConfigurationError
+    chosen = []
+    for word in words:
+        matches = [volume for volume in volumes if word in (volume.id, volume.name)]
+        if not matches:
+            raise ConfigurationError(f"there is no volume '{word}'",
+                                     'ros2 fog volume list shows those there are')
+        if len(matches) > 1:
+            raise ConfigurationError(f"there are {len(matches)} volumes '{word}'", 'name one: '
+                                     + ', '.join(volume.id for volume in matches))
+        chosen += matches
+    return chosen
+
+
+def _delete(volumes: Sequence[Volume], args: argparse.Namespace) -> int:
+    from fogros2.errors import FogError
+    from ros2fog_cli.api import machines, progress
+    for volume in volumes:
+        say(f'delete {volume.name} with its data: {volume.provider} {volume.id}')
+    if not args.yes and not agreed('this volume', 'volumes', len(volumes)):
+        return 1
+    failed = 0
+    with progress.working('deleting'):
+        for volume in volumes:
+            try:
+                machines.load(volume.provider, args.region).delete_volume(volume.id)
+                say(f'deleted {volume.name}')
+            except FogError as error:
+                warn(f'{volume.name}: {error}')
+                failed = 1
+    return failed

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Volumes: how they are written, what is refused, and which one a verb deletes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from fogros2.errors import ConfigurationError, FogError
+from fogros2.model import MachineSpec, Volume
+from fogros2_features.volumes import Volumes
+from ros2fog_cli.verb.volume import _named
+
+
+def test_a_volume_has_a_path_and_a_size() -> None:
+    assert Volumes.options({'models': '/data/', 'maps': '/var/fog/maps:200GB'}) == {
+        'models': ('/data', 50), 'maps': ('/var/fog/maps', 200)}
+
+
+@pytest.mark.parametrize(('given', 'error'), [
+    ({'../x': '/data'}, "'../x' is no name of a volume"),
+    ({'Models': '/data'}, "'Models' is no name"),
+    ({'m': 'data'}, "no folder and size, but 'data'"),
+    ({'m': '~/data'}, 'no folder'),
+    ({'m': '/data/../usr'}, 'no folder'),
+    ({'m': '/data//x'}, 'no folder'),
+    ({'m': '/data,x'}, 'no folder'),
+    ({'m': '/'}, 'no folder'),
+    ({'m': '/usr'}, 'would hide /usr of the system'),
+    ({'m': '/etc/x'}, 'would hide /etc/x'),
+    ({'m': '/home/ubuntu'}, 'would hide'),
+    ({'m': '/var/lib'}, 'would hide'),
+    ({'m': '/opt/ros/jazzy'}, 'would hide'),
+    ({'m': '/data:0GB'}, "can't have 0 GB"),
+    ({'m': '/data:99999GB'}, "can't have 99999 GB"),
+    ({'m': '/data:5TB'}, 'no folder and size'),
+    ({'a': '/data', 'b': '/data'}, "'a' and 'b' have one path /data"),
+    ({'a': '/data', 'b': '/data/x'}, 'have one path'),
+])
+def test_wrong_volumes_are_refused(given: dict[str, str], error: str) -> None:
+    with pytest.raises(ConfigurationError, match=error):
+        Volumes.options(given)
+
+
+@pytest.mark.parametrize(('provider', 'more', 'error'), [
+    ('hosted', {}, "provider 'hosted' has no volumes"),
+    ('joined', {}, "provider 'joined' has no volumes"),
+    ('ssh', {'workspace': '/data/ws'}, 'would hide the workspace'),
+    ('aws', {'wanted': {'region': 'nearest'}}, 'may be at another cloud'),
+])
+def test_machines_that_cannot_have_a_volume(
+    provider: str, more: dict[str, Any], error: str,
+) -> None:
+    with pytest.raises(FogError, match=error):
+        Volumes().check(MachineSpec('a', provider, **more), Volumes.options({'m': '/data'}))
+
+
+def test_a_name_of_several_volumes_deletes_none() -> None:
+    volumes = [Volume('aws:x/1', 'models', 'aws'), Volume('gcp:y/2', 'models', 'gcp')]
+    with pytest.raises(ConfigurationError, match="2 volumes 'models'.*aws:x/1, gcp:y/2"):
+        _named(volumes, ['models'])
+    assert _named(volumes, ['gcp:y/2']) == volumes[1:]
+    with pytest.raises(ConfigurationError, match="no volume 'maps'"):
+        _named(volumes, ['maps'])
