@@ -151,7 +151,7 @@ def with_ros(computer: BareComputer) -> Iterator[None]:
     """Give the computer what stands for ROS 2 Jazzy."""
     rmw = '/opt/ros/jazzy/share/ament_index/resource_index/rmw_typesupport'
     computer.run(
-        f'mkdir -p /usr/local/bin {rmw}; : >{rmw}/rmw_cyclonedds_cpp; : >/opt/ros/jazzy/setup.sh\n'
+        f'mkdir -p /usr/local/bin {rmw}; : >{rmw}/rmw_fastrtps_cpp; : >/opt/ros/jazzy/setup.sh\n'
         "printf '#!/bin/sh\\n' >/usr/local/bin/rosdep\n"
         f"cat >/usr/local/bin/colcon <<'END'\n{COLCON}END\n"
         'printf "#!/bin/sh\\n" >/usr/local/bin/wireguard-go\n'
