@@ -19,7 +19,7 @@ from fogros2.shell import flow
 from fogros2.shell import multiplexer as mux
 from fogros2.shell.remote import RemoteShell
 
-#: Seconds of silence after which the robot sends a ping.
+#: Seconds between two signs of life, and of silence after which the robot sends a ping.
 ASK = 15.0
 
 
@@ -310,12 +310,16 @@ class Link:
         """
         poll = select.poll()
         poll.register(self._socket, select.POLLIN)
-        heard = time.monotonic()
+        heard = told = time.monotonic()
         while True:
             for kind, number, payload in mux.frames(self._incoming):
                 channel = self._channels.get(number)
                 if channel is not None:
                     channel.take(kind, payload)
+            if time.monotonic() - told >= ASK:
+                # a machine that sends little hears nothing else; no answer may block its end
+                self.send(mux.PONG, 0)
+                told = time.monotonic()
             if not self._pending() and not poll.poll(ASK * 1000):
                 if time.monotonic() - heard > 3 * ASK:
                     raise ConnectError(f"'{self._name}' has fallen silent")

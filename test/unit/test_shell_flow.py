@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 from collections import deque
+import contextlib
 import signal
 import socket
 import threading
 
 import pytest
 
-from fogros2.shell import flow
+from fogros2.shell import flow, multiplexed
+from fogros2.shell import multiplexer as mux
 from fogros2.shell.flow import LEAST, MOST, Window
 from fogros2.waiting import wait_until
 
@@ -68,6 +70,25 @@ def test_tcp_connections_hold_little_that_is_unsent() -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
         flow.keep_prompt(ours)
+
+
+def test_machine_that_sends_all_the_time_hears_of_the_robot(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(multiplexed, 'ASK', 0.2)
+    ours, theirs = socket.socketpair()
+    link, heard = multiplexed.Link(ours, 'm', 'root'), bytearray()
+    with theirs:
+        theirs.settimeout(0.02)
+
+        def tells() -> bool:
+            theirs.sendall(mux.frame(mux.PONG, 0, b''))
+            with contextlib.suppress(TimeoutError):
+                heard.extend(theirs.recv(4096))
+            return any(mux.frames(heard))
+
+        wait_until(tells, timeout=10.0, longest=0.02, what='a sign of life')
+        link.close()
 
 
 def test_turns_are_taken_in_the_order_of_asking() -> None:
