@@ -70,8 +70,11 @@ def relay(channel: Channel, stdin: int, stdout: int, stderr: int) -> int:
     ended, end = os.pipe()
 
     def up() -> None:
+        poll = select.poll()  # unlike select(), it takes descriptors above 1023
+        for source in (stdin, ended):
+            poll.register(source, select.POLLIN)
         with contextlib.suppress(OSError, FogError):
-            while ended not in select.select([stdin, ended], [], [])[0]:
+            while ended not in (ready for ready, _ in poll.poll()):
                 # Large reads save system calls; sendall() splits them into packets.
                 data = os.read(stdin, 1 << 18)
                 if not data:

@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 from pathlib import Path
+import resource
 import socket
 import subprocess
 import sys
@@ -333,9 +335,11 @@ def test_terminal_follows_the_users_size(api, shell):
     channel.close()
 
 
-def relayed(shell, script: str, given: bytes | None) -> tuple[int, bytes]:
+def relayed(shell, script: str, given: bytes | None, least: int = 0) -> tuple[int, bytes]:
     """Relay to a script; None keeps the input open. Return its exit status and output."""
-    streams = [*os.pipe(), *os.pipe()]
+    begin, *streams = [*os.pipe(), *os.pipe()]
+    streams.insert(0, fcntl.fcntl(begin, fcntl.F_DUPFD, least))
+    os.close(begin)
     try:
         channel = shell._connected(10.0).open(Command(('sh', '-c', script)))
         if given is not None:
@@ -354,6 +358,15 @@ def relayed(shell, script: str, given: bytes | None) -> tuple[int, bytes]:
 def test_input_and_output_are_relayed_until_the_command_ends(api, shell):
     assert relayed(shell, 'cat; exit 5', b'keys') == (5, b'keys')
     assert relayed(shell, 'echo done', None) == (0, b'done\n')
+
+
+def test_input_is_relayed_in_a_process_with_many_files(api, shell):
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    try:
+        assert relayed(shell, 'cat', b'keys', least=1100) == (0, b'keys')
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_relay_ends_with_a_lost_connection(api, shell):

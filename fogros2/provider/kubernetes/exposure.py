@@ -148,8 +148,11 @@ def first_to_answer(
                     link.send(question)
             begin = time.monotonic()
             while (remaining := begin + INTERVAL - time.monotonic()) > 0:
-                ready, _, _ = select.select(list(links), [], [], remaining)
-                for link in ready:
+                poll = select.poll()  # unlike select(), it takes descriptors above 1023
+                for link in links:
+                    poll.register(link, select.POLLIN)
+                ready = {number for number, _ in poll.poll(1000 * remaining)}
+                for link in [link for link in links if link.fileno() in ready]:
                     place = links[link]
                     with contextlib.suppress(OSError):
                         if link.recv(512) == question:
