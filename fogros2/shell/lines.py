@@ -10,6 +10,7 @@ from typing import Optional, Protocol
 
 from fogros2.errors import ConnectError, FogError
 from fogros2.process import Tail
+from fogros2.untrusted import DIGITS
 
 #: Maximum bytes of a line, so that a machine cannot fill the robot's memory: JSON of empty lists
 #: takes 40 times as much when it is parsed. An agent's longest messages are output of 64 K
@@ -162,8 +163,9 @@ class Output:
         """Add new standard output and standard error."""
         if self._head is not None:
             first, newline, out = (self._head + out).partition(b'\n')
-            self._head = None if newline else first
-            if newline and first.isdigit():
+            # the machine may send anything: a first line without an end, a number without one
+            self._head = None if newline else first[:DIGITS + 1]
+            if newline and first.isdigit() and len(first) <= DIGITS:
                 self.pid = int(first)
         self._out.add(out)
         self._err.add(err)

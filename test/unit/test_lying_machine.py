@@ -46,6 +46,15 @@ def test_a_line_without_an_end_fills_no_memory(monkeypatch):
     assert channel.closed
 
 
+def test_first_line_of_a_command_is_a_number_or_nothing():
+    output = lines.Output(None, announced=True)
+    for _ in range(100):
+        output.add(b'9' * (1 << 16))
+    kept = vars(output)['_head']
+    output.add(b'\nwords\n')
+    assert (output.pid, output.text()[0], len(kept) < 100) == (0, 'words\n', True)
+
+
 class Told:
     """An agent that says what a test tells it to."""
 
