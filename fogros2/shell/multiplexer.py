@@ -141,7 +141,8 @@ class Multiplexer:
         except (OSError, KeyError, ValueError, subprocess.SubprocessError) as error:
             missing = isinstance(error, FileNotFoundError)
             text = 'command not found' if missing else str(error)
-            self.send(ERR, number, f"{what['argv'][0]}: {text}\n".encode())
+            name = (what['argv'] or ['login shell'])[0]
+            self.send(ERR, number, f'{name}: {text}\n'.encode())
             self.send(OUT, number)
             self.send(ERR, number)
             self.send(EXIT, number, struct.pack('>i', 127 if missing else 126))

@@ -300,6 +300,16 @@ def test_commands_run_as_login_user_or_on_request_as_root(api):
         assert told.stdout == 'nobody yes\n'
 
 
+def test_login_shell_that_cannot_start_ends_no_other_command(api):
+    shell = KubernetesShell(Endpoint('kubernetes', 'robots/a-pod@', user='stranger'), name='m')
+    with contextlib.closing(shell):
+        link = shell._connected(10.0)
+        channel = link.open(None)
+        assert b'login shell: ' in channel.recv_stderr(1000) and channel.recv(1000) == b''
+        assert channel.recv_exit_status() == 126 and link.is_alive()
+        assert shell.run(Command(('true',), sudo=True), timeout=60.0).returncode == 0
+
+
 def test_unread_output_stops_only_its_program(api, shell):
     stream = shell.open(Command(('yes',)))
     assert stream.readline() == b'y\n'
