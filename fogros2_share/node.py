@@ -43,8 +43,8 @@ TOPICS, OWN, NAME, PROOF = 'topics', 'own', 'relay', 'to-{}'
 #: the type or QoS of another machine's topic. Messages that a publisher or subscription queues.
 LOOK, CHANGE, DEPTH = 0.25, 1.0, 10
 #: Maximum number of other machines, and of connections that have not said which machine they are
-#: of; maximum bytes that wait for a machine.
-MOST, WAITING = 64, 1 << 27
+#: of; maximum bytes that wait for a machine, and what a part takes in memory beside its bytes.
+MOST, WAITING, PART = 64, 1 << 27, 400
 #: Bytes that are read at once.
 BUFFER = 1 << 16
 #: By topic, what publishes for another machine: its form, since when, and the publisher.
@@ -80,6 +80,7 @@ class Reader:
         self._link = link
         self.topics = topics
         self._waiting = deque[memoryview](memoryview(part) for part in waiting)
+        self._size = sum(map(_memory, self._waiting))
         self._news, self._left = threading.Condition(), False
         threading.Thread(target=self._send, name='fog-share-send', daemon=True).start()
 
@@ -90,13 +91,14 @@ class Reader:
             if not self._waiting:
                 with contextlib.suppress(OSError):  # the other thread notices the end
                     sent = self._link.sendmsg(parts, [], socket.MSG_DONTWAIT)
-            elif sum(map(len, self._waiting)) >= WAITING:
+            elif self._size >= WAITING:
                 return
             while rest and sent >= len(rest[0]):
                 sent -= len(rest.popleft())
             if rest:
                 rest[0] = rest[0][sent:]
                 self._waiting += rest
+                self._size += sum(map(_memory, rest))
                 self._news.notify()
 
     def _send(self) -> None:
@@ -111,7 +113,7 @@ class Reader:
                 self._link.sendall(part)
                 with self._news:
                     # a message that comes meanwhile has to queue behind this one
-                    self._waiting.popleft()
+                    self._size -= _memory(self._waiting.popleft())
 
     def has_left(self) -> bool:
         """Return whether the other relay has closed its end; it has nothing to say."""
@@ -361,6 +363,10 @@ class Relay(Node):
         shared.theirs[folder].append(hash(data))
         if shared.subscription is not None:
             shared.echoes.add(now, data)
+
+
+def _memory(part: memoryview) -> int:
+    return len(part) + PART
 
 
 def proven(file: int, path: Path) -> bool:

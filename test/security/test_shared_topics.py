@@ -16,8 +16,8 @@ pytest.importorskip('rclpy', reason='neither ROS 2 nor the embedded default is i
 from std_msgs.msg import String
 
 from fogros2.waiting import wait_until
-from fogros2_share import wire
-from fogros2_share.node import MOST, NAME, OWN, PROOF, TOPICS
+from fogros2_share import node, wire
+from fogros2_share.node import MOST, NAME, OWN, PART, PROOF, Reader, TOPICS
 from rigs.sharing import LATCHED, repeated, Robot, robot
 
 __all__ = ['robot']
@@ -131,3 +131,25 @@ def test_machine_has_one_reader(robot: Robots) -> None:
             assert link.recv(1) == b'', 'a newer one takes its place'
         with links[-1].makefile('rb') as stream:
             assert topic(stream) == '/chat'
+
+
+def test_small_messages_that_wait_take_little_memory(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(node, 'WAITING', 1 << 20)
+    ours, theirs = socket.socketpair()
+    with theirs:
+        reader = Reader(ours, frozenset(), [])
+        for _ in range(20_000):
+            reader.put(b'head', b'data')
+        assert 0 < len(reader._waiting) <= (1 << 20) / PART + 2
+        theirs.settimeout(0.01)
+
+        def comes(last: bytes) -> bool:
+            reader.put(last)  # dropped until there is room again
+            with contextlib.suppress(TimeoutError):
+                return theirs.recv(1 << 16).endswith(last)
+            return False
+
+        wait_until(lambda: comes(b'the last one'), timeout=60, longest=0.01, what='room')
+        reader.close()
