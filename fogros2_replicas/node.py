@@ -326,10 +326,13 @@ class FirstAnswer(Node):
         with self.lock:
             text = json.dumps([row for one in self._public for row in figures.rows(
                 one.name, [*one.figures.replicas.values()])])
-        with open(f'{self._path}.new', 'w', opener=functools.partial(
-                os.open, mode=0o600)) as file:
-            file.write(text)
-        os.replace(f'{self._path}.new', f'{self._path}.json')
+        try:
+            with open(f'{self._path}.new', 'w', opener=functools.partial(
+                    os.open, mode=0o600)) as file:
+                file.write(text)
+            os.replace(f'{self._path}.new', f'{self._path}.json')
+        except OSError as error:  # such as a full disk; the services go on
+            self.complain(f'figures of replicas are not written: {error}')
 
 
 def _printable(text: str) -> str:

@@ -132,6 +132,18 @@ def test_first_answer_of_a_service_wins(bench):
     assert [bench.rows()[name]['won'] for name in 'ab'] == [0, 1]
 
 
+def test_services_go_on_where_figures_cannot_be_written(bench):
+    def answer(request, response):
+        response.result.names = ['answered']
+        return response
+
+    (bench.folder / 'first.new').mkdir()  # like a full disk
+    bench.serve('a', Sum, answer)
+    bench.start(['/plan'])
+    bench.said('figures of replicas are not written')
+    assert bench.answer(bench.call(Sum, Sum.Request())).result.names == ['answered']
+
+
 def test_failure_is_answered_when_all_have_failed(bench):
     asked = []
 
