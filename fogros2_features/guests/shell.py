@@ -43,9 +43,15 @@ def admitted(endpoint: Endpoint, name: str, timeout: float) -> socket.socket:
     Return a connection to the shell behind a machine's door.
 
     :raises ConnectError: the machine does not answer, or has no account for a guest.
-    :raises AuthenticationError: the machine does not know the invitation.
+    :raises AuthenticationError: the machine does not know the invitation, or this computer has
+        left it.
     """
-    secret, text = bytes.fromhex(Path(endpoint.key_file or '').read_text()), b''
+    text = b''
+    try:
+        secret = bytes.fromhex(Path(endpoint.key_file or '').read_text())
+    except (OSError, ValueError) as error:
+        raise AuthenticationError(f"this computer has left '{name}': {error}",
+                                  'join it again: ros2 fog join') from error
     try:
         link = socket.create_connection((endpoint.host, endpoint.port), timeout)
     except OSError as error:

@@ -8,10 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from fogros2.model import VpnInterface
+from fogros2.errors import AuthenticationError
+from fogros2.model import Command, Endpoint, VpnInterface
 from fogros2_features.guests import network
 from fogros2_features.guests import program as guests
 from fogros2_features.guests.program import Guest
+from fogros2_features.guests.shell import GuestShell
 
 KEY, OTHER = 'first=', 'second='
 
@@ -81,3 +83,15 @@ def test_list_is_private_and_replaces_no_file_of_others(tmp_path: Path) -> None:
     guests.write(path, json.dumps([1]))
     assert path.read_text() == '[1]' and path.stat().st_mode & 0o777 == 0o600
     assert (tmp_path / 'other').read_text() == ''
+
+
+@pytest.mark.parametrize('secret', [None, 'damaged'])
+def test_machine_that_this_computer_has_left_refuses_commands(
+    tmp_path: Path, secret: str | None,
+) -> None:
+    if secret is not None:
+        (tmp_path / 'door.key').write_text(secret)
+    shell = GuestShell(Endpoint('guest', '127.0.0.1', 9, 'a', key_file=str(tmp_path / 'door.key')),
+                       name='planner')
+    with pytest.raises(AuthenticationError, match="has left 'planner'"):
+        shell.run(Command(('true',)), timeout=10.0)
