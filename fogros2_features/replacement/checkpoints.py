@@ -8,6 +8,7 @@ from collections.abc import Callable
 import logging
 from pathlib import Path
 import threading
+import time
 from typing import Any, Optional, Protocol
 import zlib
 
@@ -20,7 +21,7 @@ from fogros2.shell import connect, Shell
 from fogros2_features.replacement.options import Options
 from fogros2_features.replacement.snapshots import Checkpoint
 
-#: Seconds that a node has to answer ``~/checkpoint``.
+#: Seconds that the nodes have to answer ``~/checkpoint``.
 ANSWER = 5.0
 
 
@@ -116,7 +117,7 @@ class Checkpoints:
         from launch_ros.ros_adapters import get_ros_node
         from rclpy.exceptions import InvalidHandle
         from std_srvs.srv import Trigger
-        waits = []
+        waits, until = [], time.monotonic() + ANSWER
         try:
             for name in map(full_name, nodes):
                 if name not in self._clients:
@@ -129,7 +130,8 @@ class Checkpoints:
                     waits.append((future, answered))
         except InvalidHandle:
             return [False]  # the launch is ending and has destroyed its node
-        return [answered.wait(ANSWER) and future.result().success for future, answered in waits]
+        return [answered.wait(max(0.0, until - time.monotonic())) and future.result().success
+                for future, answered in waits]
 
     async def save(self, shell: Shell, *, still: bool) -> None:
         """Copy the folders of a machine, or of the robot; warn of a folder that is not copied."""
