@@ -220,9 +220,14 @@ class Relay(Node):
             self.destroy_subscription(shared.subscription)
         with self._lock:
             shared.form, shared.kept = form, deque(shared.kept, form.kept if form else 0)
-        shared.subscription = form and self.create_subscription(
-            self._imported(form.kind), name, lambda data: self._heard(name, shared, form, data),
-            profile(form, DEPTH), raw=True)
+        try:
+            shared.subscription = form and self.create_subscription(
+                self._imported(form.kind), name,
+                lambda data: self._heard(name, shared, form, data), profile(form, DEPTH), raw=True)
+        except RuntimeError as error:  # with Fast DDS, a process has one type of a topic
+            shared.subscription = None
+            self._complain(f'{name} is {shared.kind} here and another type on another robot, so '
+                           f'it is not shared: {error}')
 
     def _heard(self, name: str, shared: Shared, form: Form, data: bytes) -> None:
         with self._lock:

@@ -120,6 +120,25 @@ def test_type_of_another_robot_has_to_match(robot: Callable[[str], Robot]) -> No
     assert wrong == []
 
 
+def test_type_that_a_node_here_uses_later_ends_no_relay(robot: Callable[[str], Robot]) -> None:
+    """A process has one type of a topic with Fast DDS."""
+    one, two = robot('one'), robot('two')
+    for each in (one, two):
+        each.start('/count', '/chat')
+    count, heard = one.publisher(String, '/count'), two.heard(String, '/chat')
+    late = []
+
+    def look() -> bool:
+        count.publish(String(data='three'))
+        if not late and two.node.count_publishers('/count'):
+            late.append(two.publisher(Int32, '/count'))
+        return any('/count is ' in line for line in two.lines)
+
+    wait_until(look, timeout=60, what='the warning')
+    repeated(one.publisher(String, '/chat'), lambda number: String(data='on'), heard)
+    assert two.relay is not None and two.relay.poll() is None
+
+
 @contextlib.contextmanager
 def stranger(folder: Path, *data: bytes) -> Iterator[list[bool]]:
     """Stand for a hijacked machine, whose relay sends ``data``; yield its connections' fates."""
