@@ -67,7 +67,7 @@ class BridgeNode(GraphNode, ServerListener):
         backlog = int(self.declare_parameter('backlog', BACKLOG).value)
         self._offered: dict[str, str] = {}
         self._service_calls = Services(self)
-        self._node_parameters = Parameters(self._service_calls, self._shows, self._refuse)
+        self._node_parameters = Parameters(self._service_calls, self._shows, self.refuse)
         self._free = threading.Semaphore(WAITING)
         self._server = foxglove.start_server(
             name=self.get_name(), host=address, port=port, server_listener=self,
@@ -121,12 +121,12 @@ class BridgeNode(GraphNode, ServerListener):
         """Set parameters of nodes; return their values."""
         if self._publish and parameters:
             return self._with_parameters([each.name for each in parameters], parameters)
-        self._refuse('this bridge sets no parameters')
+        self.refuse('this bridge sets no parameters')
         return []
 
     def _with_parameters(self, names: list[str], changes: list[Parameter]) -> list[Parameter]:
         if not self._free.acquire(blocking=False):
-            self._refuse(f'{WAITING} viewers wait for parameters')
+            self.refuse(f'{WAITING} viewers wait for parameters')
             return []
         # this thread of the SDK waits; a message, even about nothing, wakes one for other viewers
         self._work.create_task(lambda: self._server.remove_status(['']))
@@ -203,14 +203,15 @@ class BridgeNode(GraphNode, ServerListener):
     def _advertise(self, key: tuple[int, int], topic: str, encoding: str, kind: str) -> None:
         """Create a publisher for a viewer; report to all viewers if that is impossible."""
         if encoding != 'cdr':
-            self._refuse(f"{topic}: publishes '{encoding}', this bridge takes cdr")
+            self.refuse(f"{topic}: publishes '{encoding}', this bridge takes cdr")
             return
         try:
             self._published[key] = self.create_publisher(ros_types.message(kind), topic, 10)
         except (LookupError, NameValidationException) as error:
-            self._refuse(f'{topic}: {error}')
+            self.refuse(f'{topic}: {error}')
 
-    def _refuse(self, why: str) -> None:
+    def refuse(self, why: str) -> None:
+        """Report to the log and to all viewers."""
         why = clean(why[:1000])
         self.get_logger().warning(why)
         self._server.publish_status(why, foxglove.StatusLevel.Warning)
@@ -225,7 +226,11 @@ def main() -> None:
     node = BridgeNode(executor)
     executor.add_node(node)
     try:
-        executor.spin()
+        while rclpy.ok():
+            try:
+                executor.spin()
+            except RuntimeError as error:  # such as for another type of a topic with Fast DDS
+                node.refuse(str(error))
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:

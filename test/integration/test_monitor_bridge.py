@@ -262,6 +262,12 @@ def test_message_that_cannot_be_published_is_reported(bench):
     viewer.wish(publish='/a b', schemaName='std_msgs/msg/String', definition='string data',
                 message={'data': ''})
     assert '/a b' in viewer.until('status')['status']
+    if rclpy.get_rmw_implementation_identifier() == 'rmw_fastrtps_cpp':
+        # a process has one type of a topic
+        viewer.wish(publish='/parameter_events', schemaName='std_msgs/msg/String',
+                    definition='string data', message={'data': ''})
+        assert 'incompatible type' in viewer.until('status')['status']
+        assert bench.bridge.poll() is None
 
 
 class Publishing:
