@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Mapping
+import contextlib
 import dataclasses
+import json
 import os
 from pathlib import Path
 from typing import Optional
@@ -15,7 +17,14 @@ from fogros2.dds import addresses_of, DdsVendor
 from fogros2.deploy.robot import check_robot, clear, run
 from fogros2.errors import ConfigurationError, DdsError, did_you_mean, VpnError
 from fogros2.model import OtherVpn, Peer, to_json, VpnInterface
-from fogros2.store import boot_id, OTHER_VPN, process_start, Store, write_private
+from fogros2.store import (
+    boot_id,
+    OTHER_VPN,
+    process_alive,
+    process_start,
+    Store,
+    write_private,
+)
 from fogros2.store import other_vpn as stored_vpn
 from fogros2.vpn import addresses, helped, Vpn
 from fogros2.waiting import Timeouts
@@ -40,6 +49,7 @@ def join(
     :raises FogError: the invitation is not for this computer, has expired, or collides with a
         network here; the user does not agree; or the interface cannot be created.
     """
+    owner = owner or {'pid': 1, 'pid_start': process_start(1) or 0, 'boot': boot_id()}
     key = own_key(store)
     invitation = unseal(text, key)
     vendor = _vendor(invitation, environment)
@@ -47,6 +57,8 @@ def join(
     up = is_up(invitation)
     other = other_vpn(invitation, store)
     if up and stored_vpn(folder) == other and secret_of(folder) == invitation.secret:
+        if not is_held(folder):
+            write_private(folder / 'process.json', to_json(owner).encode())
         return folder
     if not invitation.private and not agreed(
             f'{invitation.network} has public addresses. Send what is for them to the computer '
@@ -68,8 +80,7 @@ def join(
     private = base64.b64encode(key).decode()
     store.launch(invitation.number)
     try:
-        _write(folder, invitation, other, vendor, environment, owner or {
-            'pid': 1, 'pid_start': process_start(1) or 0, 'boot': boot_id()})
+        _write(folder, invitation, other, vendor, environment, owner)
         if helped.made(interface):
             process.run(helped.lend(interface, private), timeout=Timeouts().vpn)
         else:
@@ -102,6 +113,14 @@ def secret_of(folder: Path) -> str:
 def is_up(invitation: Invitation) -> bool:
     """Return whether this computer's end of a machine's VPN exists."""
     return Path('/sys/class/net', f'fog{invitation.number}').exists()
+
+
+def is_held(folder: Path) -> bool:
+    """Return whether the process that has joined still runs, or this computer joined by hand."""
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+        owner = json.loads((folder / 'process.json').read_text())
+        return process_alive(int(owner['pid']), int(owner['pid_start']), str(owner['boot']))
+    return False
 
 
 def check_rmw(rmw: str) -> None:

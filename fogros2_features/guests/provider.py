@@ -68,7 +68,9 @@ class JoinedProvider(Provider):
             raise DdsError(
                 f"'{spec.name}' has RMW_IMPLEMENTATION={invitation.rmw} and ROS_DOMAIN_ID="
                 f'{invitation.domain}, this launch {rmw} and {domain}', 'launch with the same')
-        by_hand = membership.is_up(invitation)
+        # a launch that was killed has left it
+        by_hand = membership.is_up(invitation) and membership.is_held(
+            Store().root / 'launches' / invitation.number)
         folder = membership.join(self._text(spec), Store(), environment, owner=this_process())
         try:
             yield

@@ -32,7 +32,7 @@ from fogros2.model import (
 from fogros2.provider import Capabilities
 from fogros2.provider.container import packet_filter
 from fogros2.store import OTHER_VPN, process_start, Record, Store, write_private
-from fogros2_features.guests import invitation, listing, membership, program
+from fogros2_features.guests import invitation, listing, membership, program, provider
 from fogros2_testing.fakes import FakeProvider, FakeShell
 from fogros2_testing.plugins import instead
 from ros2fog_cli.api import endings, reach
@@ -222,6 +222,18 @@ def test_folder_of_a_joined_machine_stays_until_a_reboot(
     process = json.loads((folder / 'process.json').read_text())
     (folder / 'process.json').write_text(json.dumps({**process, 'boot': 'before'}))
     assert endings.leftovers(store) == [folder]
+
+    # the next launch takes over what one that was killed has left, and ends it
+    cleared: list[Path] = []
+    monkeypatch.setattr(membership, 'is_up', lambda invitation: True)
+    monkeypatch.setattr(provider, 'Store', lambda: store)
+    monkeypatch.setattr(provider, 'clear', cleared.append)
+    spec = MachineSpec('m', 'joined', options={'invitation': text})
+    for ends in ([folder], []):
+        with provider.JoinedProvider().join(spec, 'rmw_cyclonedds_cpp', 7, {}):
+            assert endings.leftovers(store) == []
+        assert cleared == ends
+        cleared.clear()  # the folder stays here, and its owner runs
 
 
 def test_range_of_the_joiners_own_is_one_clear_error(
