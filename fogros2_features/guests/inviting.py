@@ -10,7 +10,7 @@ import time
 from typing import Optional
 
 from fogros2 import plugin_system
-from fogros2.errors import CommandError, ConfigurationError
+from fogros2.errors import CommandError, ConfigurationError, VpnError
 from fogros2.model import host_port
 from fogros2.shell import multiplexer
 from fogros2.store import Record, Store, VPN_LEFT
@@ -60,7 +60,10 @@ def invite(
             'patience': max(PATIENCE, record.spec.robot_timeout),
             'addresses': [str(address) for address in network.guests(record.vpn.network)
                           if int(address) & 255 != 255]})
-    address = next((guest['address'] for guest in guests if guest['key'] == public), '')
+    address = next((guest['address'] for guest in guests if guest['key'] == public), None)
+    if address is None:
+        raise VpnError(f"'{name}' admits nobody: by this robot's clock, its lifetime is over",
+                       f'ros2 fog status {name} shows the time that it has left')
     return invitation.seal(invitation.Invitation(
         machine=name, key=record.public_key, address=record.vpn.address,
         endpoint=host_port(server, port), joiner=address, network=record.vpn.network,

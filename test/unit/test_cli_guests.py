@@ -125,6 +125,15 @@ def test_machine_that_nobody_can_dial_is_one_clear_error(
     assert capsys.readouterr().out == '' and asked == []
 
 
+def test_machine_whose_lifetime_is_over_admits_nobody(
+    monkeypatch: pytest.MonkeyPatch, asked: list[tuple[str, Any]],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(listing, 'ask', lambda *_: [])  # the program removes such a guest
+    assert 'its lifetime is over' in fog('invite', 'planner', '--key', OTHER)
+    assert capsys.readouterr().out == ''
+
+
 @pytest.mark.parametrize('change, words', [
     ({'launch': ''}, 'no launch on this robot'), ({'public_key': ''}, 'no launch on this robot'),
     ({'rmw': 'rmw_zenoh_cpp'}, 'rmw_zenoh_cpp'), ({'key': 'AAAA'}, 'no key')])
