@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 import dataclasses
+import math
 import secrets
 import struct
 import threading
@@ -90,11 +91,14 @@ class SliceSender:
                 self._pacemaker = max
                 self._settle(time.monotonic())
                 if not self._pace.may_send():
-                    # the link is cut, or nobody listens any more
+                    # the link is cut or slower than before, or nobody listens any more
                     self._under_way.clear()
                     self._pace = Pace(QUEUED)
+                    self._adapt(math.inf)
                     return
-        self._adapt((time.monotonic() - begin) * size / len(data))
+        seconds = (time.monotonic() - begin) * size / len(data)
+        if len(data) > self._size or seconds > SLOW:  # larger than the image would change nothing
+            self._adapt(seconds)
 
     def _adapt(self, seconds: float) -> None:
         """Choose the size of the next image's slices by the time that one took."""

@@ -137,6 +137,21 @@ def test_cut_link_costs_the_image_and_no_more(
     assert images == [bytes(3 * LEAST)]
 
 
+def test_slices_that_a_link_does_not_carry_in_time_shrink(
+    wire: Wire, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(slices, 'LONGEST', 0.05)
+    receiver(wire)
+    one = sender(wire)
+    for _ in range(6):  # a quick link, for which the whole image is one slice at last
+        one.send(bytes(16 * LEAST))
+    assert one._size == 16 * LEAST
+    wire.lose = lambda topic, data: True
+    for _ in range(5):
+        one.send(bytes(16 * LEAST))
+    assert sizes(wire)[-1] == LEAST
+
+
 @pytest.mark.parametrize('first', [0, 1, 2])
 def test_image_with_a_slice_missing_is_not_shown(wire: Wire, first: int) -> None:
     images = receiver(wire)
