@@ -95,6 +95,13 @@ def fault_of(certificate: bytes, host: str, known: Known) -> str | None:
 
     :param host: the name that the certificate has to be for.
     """
+    try:
+        return _fault_of(certificate, host, known)
+    except ValueError:  # of bytes that are no UTF-8, or no key
+        return 'is damaged'
+
+
+def _fault_of(certificate: bytes, host: str, known: Known) -> str | None:
     import paramiko
     message = paramiko.Message(certificate)
     kind = message.get_text()

@@ -139,6 +139,14 @@ def test_certificate_of_another_authority_decides_nothing(keys, tmp_path):
     assert fault(keys, blob, revoked=(keys[1]['ca2'],)) == 'is of a revoked authority'
 
 
+@pytest.mark.parametrize('change', [
+    lambda blob: b'\0\0\0\1\xff' + blob,
+    lambda blob: blob.replace(b'lab.example', b'lab\xffexample')])
+def test_damaged_certificate_is_refused(keys, tmp_path, change):
+    blob = certificate(keys, tmp_path, '-h', '-n', 'lab.example')
+    assert fault(keys, change(blob)) == 'is damaged'
+
+
 def test_certificate_with_a_sha_1_signature_is_refused(keys, tmp_path):
     blob = certificate(keys, tmp_path, '-h', '-t', 'ssh-rsa', authority='rsa')
     assert fault(keys, blob, authorities=(keys[1]['rsa'],)) == 'has a wrong signature'
