@@ -115,11 +115,13 @@ def process_alive(pid: int, start: int, boot: str = '') -> bool:
     """
     Return whether a recorded process still runs.
 
-    :param start: recorded result of :func:`process_start`.
+    :param start: recorded result of :func:`process_start`; 0 for the first process where this
+        user may not see it (hidepid).
     :param boot: recorded result of :func:`boot_id`, because process ids and clock restart at
         each boot; '' if none was recorded.
     """
-    return bool(pid) and boot in ('', boot_id()) and process_start(pid) == start
+    return bool(pid) and boot in ('', boot_id()) and (
+        process_start(pid) == start or (pid, start) == (1, 0))
 
 
 def this_process() -> dict[str, Any]:

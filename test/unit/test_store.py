@@ -16,6 +16,7 @@ from fogros2.model import Endpoint, MachineSpec, VpnInterface
 from fogros2.store import (
     boot_id,
     is_another_robot,
+    process_alive,
     process_start,
     Record,
     robot_id,
@@ -212,6 +213,12 @@ def read_only(opened):
             raise OSError(errno.EROFS, 'Read-only file system')
         return opened(path, flags, *mode)
     return opener
+
+
+def test_first_process_runs_where_nobody_may_see_it(monkeypatch):
+    monkeypatch.setattr(store_module, 'process_start', lambda pid: None)
+    assert process_alive(1, 0, boot_id()) and not process_alive(1, 0, 'another boot')
+    assert not process_alive(1, 5, boot_id()) and not process_alive(2, 0, boot_id())
 
 
 def test_home_that_is_no_folder_has_no_records():
