@@ -51,17 +51,18 @@ class Way:
         Follow type and QoS of the publishers; subscribe while the target has subscribers.
 
         :raises LookupError: the type is not installed here.
+        :raises RuntimeError: the other side has another type.
         """
         node = self.node
         form = form_of(others(node, node.get_publishers_info_by_topic(self.source)))
         if form != self.form:
             message = form and ros_types.message(form.kind)
             self.unsubscribe()
-            if self.publisher is not None:
-                node.destroy_publisher(self.publisher)
+            self.unpublish()
             self.form, self.message = form, message
             self.publisher = form and node.create_publisher(message, self.target, profile(form))
-        if not form or not others(node, node.get_subscriptions_info_by_topic(self.target)):
+        if not form or self.publisher is None or not others(
+                node, node.get_subscriptions_info_by_topic(self.target)):
             self.unsubscribe()
         elif self.subscription is None:
             self.subscription = node.create_subscription(
@@ -72,6 +73,12 @@ class Way:
         if self.subscription is not None:
             self.node.destroy_subscription(self.subscription)
             self.subscription = None
+
+    def unpublish(self) -> None:
+        """End the publisher, if there is one."""
+        if self.publisher is not None:
+            self.node.destroy_publisher(self.publisher)
+            self.publisher = None
 
     def heard(self, data: bytes) -> None:
         """Handle a serialized message."""
@@ -165,8 +172,10 @@ class Limits(Node):
         for way in self._ways:
             try:
                 way.look()
-            except LookupError as error:
-                if way.source not in self._complaints:
+            except (LookupError, RuntimeError) as error:
+                if isinstance(error, RuntimeError):
+                    way.unpublish()  # until the publishers change
+                if rclpy.ok() and way.source not in self._complaints:
                     self._complaints.add(way.source)
                     self.get_logger().warning(f'{way.source} does not cross: {error}')
 

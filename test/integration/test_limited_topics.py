@@ -19,7 +19,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed')
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import OccupancyGrid
-from std_msgs.msg import Int32
+from std_msgs.msg import Int32, String
 
 from fogros2 import process
 from fogros2.waiting import wait_until
@@ -114,6 +114,16 @@ def test_topic_crosses_while_the_other_side_subscribes(
     wait_until(lambda: len(heard) == 1 and heard[0].data[0] == 7, timeout=60, what='the map')
     one.node.destroy_subscription(subscription)
     wait_until(lambda: link() == 0, timeout=60, what='the end of the subscription')
+
+
+def test_topic_with_two_types_stops_no_other(one: Robot, limited: Callable[..., None]) -> None:
+    """A process has one type of a topic with Fast DDS."""
+    limited(count=10, chat=10)
+    for kind, topic in ((String, '/count'), (Int32, f'{THERE}/count')):
+        one.publisher(kind, topic)
+        one.heard(kind, topic)
+    heard = one.heard(Int32, f'{THERE}/chat')
+    repeated(one.publisher(Int32, '/chat'), lambda number: Int32(data=number), heard, 20)
 
 
 def test_transforms_are_limited_by_child_frame(one: Robot, limited: Callable[..., None]) -> None:
