@@ -120,6 +120,13 @@ def test_missing_program_is_found_without_the_vpn(launch, checked):
     assert list((launch.store.root / 'launches').glob('*/vpn.key')) == []
 
 
+def test_computer_of_the_user_cannot_be_stopped(launch, checked, monkeypatch):
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(owned=False))
+    monkeypatch.setattr(deployed, 'check_robot', lambda: None)
+    with pytest.raises(ConfigurationError, match="'planner' is a computer that exists already"):
+        launch.prepare([dataclasses.replace(SPEC, on_exit='stop')])
+
+
 def test_first_problem_ends_the_early_checks(launch, checked, monkeypatch):
     monkeypatch.setattr(deployed, '_QUICK', 60.0)
     let_go = threading.Event()
