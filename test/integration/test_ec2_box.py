@@ -22,7 +22,8 @@ from rigs.ec2 import Ec2Box
 
 boto3 = pytest.importorskip('boto3', reason='needs boto3')
 pytest.importorskip('moto', reason='needs moto[server]')
-pytestmark = pytest.mark.usefixtures('engine')
+#: Tests of what other tests run in: launches there show most of it.
+pytestmark = [pytest.mark.soak, pytest.mark.usefixtures('engine')]
 
 UBUNTU = '/aws/service/canonical/ubuntu/server/24.04/stable/current/amd64/hvm/ebs-gp3/ami-id'
 ROBOT = '198.51.100.2'
