@@ -494,14 +494,6 @@ def test_a_machine_that_boots_slowly_has_the_time_of_its_boot(launch, provider, 
     assert connection._timeout() == 60.0
 
 
-def test_lasting_refusal_of_a_login_is_reported(launch, provider, mute):
-    with socket.create_server(('127.0.0.1', 0)) as server:
-        port = server.getsockname()[1]
-    launch.timeouts = Timeouts(ssh=0.3)
-    with pytest.raises(ConnectError, match='refuses connections'):
-        reach(launch, port)
-
-
 def test_health_check_survives_time_out(launch, monkeypatch):
     def run(command, **arguments):
         raise DeadlineExceeded('it took longer than 30 s')
