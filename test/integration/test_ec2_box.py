@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 import functools
 import json
 import os
@@ -239,25 +238,6 @@ def test_an_image_remembers_the_files(box, key):
     refused('InvalidAMIID.Unavailable', lambda: Launched(box, key, ImageId=image))
 
 
-def test_a_client_token_makes_one_instance(box):
-    ec2 = client(box)
-    before = {found.id for found in box.instances()}
-    words = {'ImageId': ubuntu(box), 'MinCount': 1, 'MaxCount': 1, 'ClientToken': 'once'}
-
-    def run(kind='t3.medium'):
-        return ec2.run_instances(InstanceType=kind, **words)['Instances'][0]['InstanceId']
-
-    # the answer to the first gets lost
-    box.fail('InternalError', action='RunInstances', after=True)
-    with ThreadPoolExecutor(3) as pool:
-        made = set(pool.map(lambda _: run(), range(3)))
-    assert len(made) == 1
-    assert {found.id for found in box.instances()} - before == made
-    refused('IdempotentParameterMismatch', lambda: run('t3.large'))
-    ec2.terminate_instances(InstanceIds=list(made))
-    refused('IdempotentInstanceTerminated', run)
-
-
 def test_spot_instances_end_and_are_never_stopped(box, key):
     spot = {'MarketType': 'spot', 'SpotOptions': {'SpotInstanceType': 'one-time'}}
     low = {**spot, 'SpotOptions': {'MaxPrice': '0.001'}}
@@ -278,39 +258,6 @@ def test_spot_instances_end_and_are_never_stopped(box, key):
                      InstanceInitiatedShutdownBehavior='stop').runs()
     box.run(other.id, 'shutdown -h now', check=False)
     assert box.wait_for(other.id, 'terminated').reason == 'Client.InstanceInitiatedShutdown'
-
-
-def test_it_boots_as_slowly_as_it_is_told(box, key):
-    box.set_boot_delay(1.0)
-    begin = time.monotonic()
-    it = Launched(box, key)
-    assert it.described()['State']['Name'] == 'pending'
-    assert 'PublicIpAddress' not in it.described()
-    box.wait_for(it.id, 'running')
-    assert 'PublicIpAddress' in it.described()
-    it.runs()
-    assert time.monotonic() - begin >= 1.0
-    # one that nobody wants any more before its computer is on
-    box.set_boot_delay(60.0)
-    other = Launched(box, key)
-    other.ec2.terminate_instances(InstanceIds=[other.id])
-    box.wait_for(other.id, 'terminated', timeout=30)
-
-
-@pytest.mark.parametrize('code', [
-    'InsufficientInstanceCapacity', 'VcpuLimitExceeded', 'UnauthorizedOperation', 'ExpiredToken',
-    'RequestLimitExceeded'])
-def test_errors_come_to_order(box, code):
-    from botocore.config import Config
-    once = boto3.client('ec2', region_name='us-east-1', **box.client_arguments,
-                        config=Config(retries={'total_max_attempts': 1}))
-    box.forget_calls()
-    box.fail(code, action='DescribeVpcs')
-    once.describe_subnets()
-    refused(code, once.describe_vpcs)
-    once.describe_vpcs()
-    assert [(call.action, call.error) for call in box.calls()] == [
-        ('DescribeSubnets', ''), ('DescribeVpcs', code), ('DescribeVpcs', '')]
 
 
 def test_what_ec2_refuses(box, key):
@@ -339,35 +286,6 @@ def test_what_ec2_refuses(box, key):
     it = Launched(box, key)
     refused('DependencyViolation', lambda: it.ec2.delete_security_group(GroupId=it.group))
     assert {found.id for found in box.instances()} - before == {it.id}
-
-
-def test_prices_are_there(box):
-    filters = [{'Type': 'TERM_MATCH', 'Field': field, 'Value': value} for field, value in {
-        'regionCode': 'eu-central-1', 'operatingSystem': 'Linux', 'tenancy': 'Shared',
-        'preInstalledSw': 'NA', 'capacitystatus': 'Used'}.items()]
-    pages = client(box, 'pricing').get_paginator('get_products').paginate(
-        ServiceCode='AmazonEC2', Filters=filters, PaginationConfig={'PageSize': 10})
-    entries = [json.loads(text) for page in pages for text in page['PriceList']]
-    kinds = [entry['product']['attributes']['instanceType'] for entry in entries]
-    assert len(kinds) == len(set(kinds)) > 10
-    assert 't3.medium' in kinds
-    history = client(box, region='eu-central-1').describe_spot_price_history(
-        InstanceTypes=['t3.medium'], ProductDescriptions=['Linux/UNIX'])['SpotPriceHistory']
-    assert len({entry['AvailabilityZone'] for entry in history}) >= 2
-    assert all(0 < float(entry['SpotPrice']) < 0.05 for entry in history)
-
-
-def test_two_regions_are_two_places(box, key):
-    known = client(box).describe_regions()['Regions']
-    assert len(known) == 17 and all(
-        region['OptInStatus'] == 'opt-in-not-required' for region in known)
-    refused('AuthFailure', lambda: client(box, region='af-south-1').describe_instances())
-    one, two = (Launched(box, key, region=region).runs()
-                for region in ('us-east-1', 'eu-central-1'))
-    assert one.described()['PublicIpAddress'] != two.described()['PublicIpAddress']
-    found = one.ec2.describe_instances(Filters=[
-        {'Name': 'instance-state-name', 'Values': ['running']}])['Reservations']
-    assert [i['InstanceId'] for r in found for i in r['Instances']] == [one.id]
 
 
 def test_groups_name_groups_and_a_reboot_is_no_new_boot(box, key):
