@@ -609,28 +609,6 @@ def test_detached_agent_reports_when_it_is_ready(rig):
     assert not rig.directory.exists()
 
 
-@pytest.mark.parametrize('number, change, starts', [
-    (signal.SIGKILL, '', 2), (signal.SIGTERM, '', 1),
-    (signal.SIGKILL, 'os.rmdir(folder)', 1),
-    (signal.SIGKILL, 'os.rmdir(folder); os.mkdir(folder)', 1)])
-def test_agent_starts_again_unless_it_was_ended(tmp_path, number, change, starts):
-    """Python has no handler of SIGTERM while it ends; another launch may have the directory."""
-    program = (
-        'import os, sys\n'
-        'from fogros2.agent import server\n'
-        'folder = sys.argv[1]\n'
-        f'server.time.sleep = lambda seconds: exec({change!r})\n'
-        'server.supervise(folder, os.open(os.devnull, os.O_WRONLY))\n'
-        'with open(sys.argv[2], "a") as stream:\n'
-        '    stream.write("start\\n")\n'
-        'if os.path.getsize(sys.argv[2]) == 6:\n'
-        f'    os.kill(os.getpid(), {int(number)})\n')
-    (tmp_path / 'agent').mkdir()
-    subprocess.run([sys.executable, '-c', program, str(tmp_path / 'agent'),
-                    str(tmp_path / 'starts')], timeout=20, check=True)
-    assert (tmp_path / 'starts').read_text().count('start') == starts
-
-
 def test_killed_node_starts_again_after_its_delay(rig):
     rig.serve()
     client = rig.client()
@@ -762,25 +740,14 @@ def test_machine_with_a_slow_clock_is_measured(rig, free_udp_port, slow_agent):
         heartbeat.close()
 
 
-@pytest.mark.parametrize('wrong', ['key', 'peer', 'nonsense'])
-def test_foreign_heartbeats_do_not_count(rig, free_udp_port, wrong):
+def test_heartbeats_of_another_address_do_not_count(rig, free_udp_port):
     rig.serve(robot_timeout=0.8, end_command=ends(rig))
-    client = rig.client()
-    client.request('configure', heartbeat={
-        'bind': '127.0.0.1', 'port': free_udp_port,
-        'peer': '127.0.0.2' if wrong == 'peer' else '127.0.0.1', 'key': KEY})
-    with contextlib.ExitStack() as stack:
-        link = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        heartbeat = None
-        if wrong == 'nonsense':
-            for data in (b'', b'x', b'[]', b'[' * 2000, b'7', b'\xff', b'{"launch": 1}'):
-                link.sendto(data, ('127.0.0.1', free_udp_port))
-        else:
-            heartbeat = stack.enter_context(contextlib.closing(Heartbeat(
-                '127.0.0.1', free_udp_port, 'ff' * 32 if wrong == 'key' else KEY,
-                interval=0.05)))
+    rig.client().request('configure', heartbeat={
+        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.2', 'key': KEY})
+    heartbeat = Heartbeat('127.0.0.1', free_udp_port, KEY, interval=0.05)
+    with contextlib.closing(heartbeat):
         assert rig.wait('watchdog')['reason'] == 'robot gone'
-        assert heartbeat is None or heartbeat.round_trip is None
+        assert heartbeat.round_trip is None
 
 
 def test_kept_machine_stops_nodes_and_stays_for_its_lifetime(rig, free_udp_port):
