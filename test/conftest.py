@@ -209,8 +209,26 @@ def gce(
         yield found
 
 
+@pytest.fixture(scope='session')
+def boto_models() -> Iterator[None]:
+    """Let all sessions of boto3 share the services' models: reading EC2's takes 0.2 s."""
+    loaders = pytest.importorskip('botocore.loaders', reason='needs boto3')
+    read, models = loaders.JSONFileLoader.load_file, {}
+
+    def load_file(loader: Any, path: str) -> Any:
+        if path not in models:
+            models[path] = read(loader, path)
+        return models[path]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loaders.JSONFileLoader, 'load_file', load_file)
+        yield
+
+
 @pytest.fixture
-def moto_aws(moto_server: str, hasty: None, monkeypatch: pytest.MonkeyPatch) -> str:
+def moto_aws(
+    moto_server: str, boto_models: None, hasty: None, monkeypatch: pytest.MonkeyPatch,
+) -> str:
     """Lead boto3 to an empty AWS of Moto's that has the public images; returns its URL."""
     from moto.core import DEFAULT_ACCOUNT_ID  # type: ignore[attr-defined]
     from moto.ec2.models import ec2_backends

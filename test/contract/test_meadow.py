@@ -76,20 +76,6 @@ def ordered(**options):
     return spec(**options), request_for(spec(**options))
 
 
-def test_full_zone_fails_over_to_the_next(meadow):
-    meadow.full = {'north-a'}
-    MeadowProvider().create(*ordered(machine_type='small'))
-    machine, = meadow.machines.values()
-    assert machine['zone'] == 'north-b'
-
-
-def test_full_region_leaves_nothing(meadow):
-    meadow.full = {'north-a', 'north-b'}
-    with pytest.raises(ProviderError, match='no free machine'):
-        MeadowProvider().create(*ordered(machine_type='small'))
-    assert not meadow.machines
-
-
 class PlainMeadow(Meadow):
     """A cloud without a firewall, whose user data is text and whose types have their disks."""
 

@@ -482,15 +482,7 @@ BAD_REQUESTS = [
     (b'{"command": "start", "nodes": [{"id": 1}]}\n', "has an 'id' and a 'name'"),
     (b'{"command": "stop", "nodes": ["x"]}\n', "no node 'x'"),
     (b'{"command": "configure", "lifetime": -1}\n', "'lifetime' has to be above 0"),
-    (b'{"command": "configure", "lifetime": NaN}\n', "'lifetime' has to be above 0"),
-    (b'{"command": "configure", "lifetime": "x"}\n', "'lifetime' can't be"),
-    (b'{"command": "configure", "on_exit": "explode"}\n', "'on_exit' can't be 'explode'"),
     (b'{"command": "configure", "environment": {"A=B": "x"}}\n', "can't set"),
-    (b'{"command": "configure", "environment": {"A": 1}}\n', "can't set"),
-    (b'{"command": "configure", "end_command": [1]}\n', 'list of words'),
-    (b'{"command": "configure", "heartbeat": {"port": 1}}\n', 'needs bind and peer'),
-    (b'{"command": "configure", "heartbeat": {"bind": "x", "peer": "y", "port": 1}}\n',
-     'needs bind and peer'),
     (b'{"command": "watch", "what": "x", "argv": "ls"}\n', 'no list of words'),
     (b'{"command": "log", "from": "x"}\n', 'malformed request'),
 ]
@@ -578,9 +570,7 @@ def test_second_agent_is_refused_and_stale_socket_replaced(rig):
 @pytest.mark.parametrize('config, reason', [
     ({'directory': '/proc/nothing/here'}, "can't be used"),
     ({'directory': '/'}, "can't have the directory '/'"),
-    ({'directory': 'relative'}, "can't have the directory 'relative'"),
     ({'user': 'nobody-of-that-name'}, "no user 'nobody-of-that-name'"),
-    ({'lifetime': 0}, "'lifetime' has to be above 0"),
 ])
 def test_invalid_configuration_is_reported_in_one_line(rig, config, reason):
     path = rig.config(**config)
@@ -617,28 +607,6 @@ def test_detached_agent_reports_when_it_is_ready(rig):
     client.request('release', exit=True)
     wait_until(gone(ready['pid']), timeout=60, what='the agent to leave')
     assert not rig.directory.exists()
-
-
-@pytest.mark.parametrize('number, change, starts', [
-    (signal.SIGKILL, '', 2), (signal.SIGTERM, '', 1),
-    (signal.SIGKILL, 'os.rmdir(folder)', 1),
-    (signal.SIGKILL, 'os.rmdir(folder); os.mkdir(folder)', 1)])
-def test_agent_starts_again_unless_it_was_ended(tmp_path, number, change, starts):
-    """Python has no handler of SIGTERM while it ends; another launch may have the directory."""
-    program = (
-        'import os, sys\n'
-        'from fogros2.agent import server\n'
-        'folder = sys.argv[1]\n'
-        f'server.time.sleep = lambda seconds: exec({change!r})\n'
-        'server.supervise(folder, os.open(os.devnull, os.O_WRONLY))\n'
-        'with open(sys.argv[2], "a") as stream:\n'
-        '    stream.write("start\\n")\n'
-        'if os.path.getsize(sys.argv[2]) == 6:\n'
-        f'    os.kill(os.getpid(), {int(number)})\n')
-    (tmp_path / 'agent').mkdir()
-    subprocess.run([sys.executable, '-c', program, str(tmp_path / 'agent'),
-                    str(tmp_path / 'starts')], timeout=20, check=True)
-    assert (tmp_path / 'starts').read_text().count('start') == starts
 
 
 def test_killed_node_starts_again_after_its_delay(rig):
@@ -711,26 +679,16 @@ def test_variables_configured_later_reach_the_nodes(rig):
     assert rig.text('n') == 'yes\n'
 
 
-def test_variables_of_setup_files_reach_the_nodes(rig):
-    setup = rig.folder / 'setup.bash'
-    setup.write_text('echo printed\nexport LISTED="sourced:$LISTED"\n')
+def test_setup_files_are_sourced(rig):
+    setup = rig.folder / "it's a setup.bash"
+    setup.write_text('echo printed\nexport SOURCED="from ${BASH_SOURCE[0]##*/} $# $LISTED"\n')
     rig.serve(setup=[str(setup)], environment={
         'LISTED': 'configured',
         **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ}})
     client = rig.client()
-    client.request('start', nodes=[rig.node('n', 'import os\nprint(os.environ["LISTED"])\n')])
-    rig.wait('exited', node='n')
-    assert rig.text('n') == 'sourced:configured\n'
-
-
-def test_setup_files_are_sourced(rig):
-    setup = rig.folder / "it's a setup.bash"
-    setup.write_text('export SOURCED="from ${BASH_SOURCE[0]##*/} $#"\n')
-    rig.serve(setup=[str(setup)])
-    client = rig.client()
     client.request('start', nodes=[rig.node('n', 'import os\nprint(os.environ["SOURCED"])\n')])
     rig.wait('exited', node='n')
-    assert rig.text('n') == "from it's a setup.bash 0\n"
+    assert rig.text('n') == "from it's a setup.bash 0 configured\n"
     client.request('configure', setup=['/no/such/setup.bash'])
     with pytest.raises(AgentError, match='setup.bash to be sourced is not there'):
         client.request('start', nodes=[rig.node('later', SLEEP)])
@@ -782,25 +740,14 @@ def test_machine_with_a_slow_clock_is_measured(rig, free_udp_port, slow_agent):
         heartbeat.close()
 
 
-@pytest.mark.parametrize('wrong', ['key', 'peer', 'nonsense'])
-def test_foreign_heartbeats_do_not_count(rig, free_udp_port, wrong):
+def test_heartbeats_of_another_address_do_not_count(rig, free_udp_port):
     rig.serve(robot_timeout=0.8, end_command=ends(rig))
-    client = rig.client()
-    client.request('configure', heartbeat={
-        'bind': '127.0.0.1', 'port': free_udp_port,
-        'peer': '127.0.0.2' if wrong == 'peer' else '127.0.0.1', 'key': KEY})
-    with contextlib.ExitStack() as stack:
-        link = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        heartbeat = None
-        if wrong == 'nonsense':
-            for data in (b'', b'x', b'[]', b'[' * 2000, b'7', b'\xff', b'{"launch": 1}'):
-                link.sendto(data, ('127.0.0.1', free_udp_port))
-        else:
-            heartbeat = stack.enter_context(contextlib.closing(Heartbeat(
-                '127.0.0.1', free_udp_port, 'ff' * 32 if wrong == 'key' else KEY,
-                interval=0.05)))
+    rig.client().request('configure', heartbeat={
+        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.2', 'key': KEY})
+    heartbeat = Heartbeat('127.0.0.1', free_udp_port, KEY, interval=0.05)
+    with contextlib.closing(heartbeat):
         assert rig.wait('watchdog')['reason'] == 'robot gone'
-        assert heartbeat is None or heartbeat.round_trip is None
+        assert heartbeat.round_trip is None
 
 
 def test_kept_machine_stops_nodes_and_stays_for_its_lifetime(rig, free_udp_port):
@@ -897,8 +844,9 @@ def test_machine_of_a_later_launch_is_not_kept_after_a_reboot(rig):
 def test_machine_that_a_launch_sets_up_is_not_taken_over(rig):
     rig.serve(boot_timeout=60.0)
     client = rig.client()
-    with pytest.raises(AgentError, match="belongs to launch 'abc123'"):
-        client.request('configure', launch='def456')
+    for known in ({}, {'force': 'xyz789'}):
+        with pytest.raises(AgentError, match="belongs to launch 'abc123'"):
+            client.request('configure', launch='def456', **known)
     client.request('release', on_exit='keep')
     client.request('configure', launch='def456')
 
@@ -1010,17 +958,6 @@ def test_signalled_agent_reports_before_its_nodes_end(rig):
     kinds = [e['event'] for e in rig.events]
     assert kinds.count('ending') == 1
     assert kinds.index('ending') < kinds.index('exited')
-
-
-@pytest.mark.parametrize('known', ['abc123', 'xyz789'])
-def test_takeover_needs_the_id_of_the_dead_launch(rig, known):
-    rig.serve(boot_timeout=60.0)
-    client = rig.client()
-    if known == 'abc123':
-        client.request('configure', launch='def456', force=known)
-    else:
-        with pytest.raises(AgentError, match="belongs to launch 'abc123'"):
-            client.request('configure', launch='def456', force=known)
 
 
 def test_failed_end_command_is_reported(rig):

@@ -17,7 +17,6 @@ import pytest
 from fogros2.errors import (
     Cancelled,
     ConfigurationError,
-    FogError,
     MachineNotFound,
     PrerequisiteError,
     ProviderError,
@@ -123,19 +122,6 @@ def test_every_request_is_one_that_the_service_has(aws):
         aws.account.call('ec2', HOME, 'describe_instances', 'asking', NoSuch=1)
 
 
-def test_the_host_key_is_told_on_every_computer_and_pinned_anew(aws):
-    spec, request = ask()
-    machine_id = aws.provider.create(spec, request)
-    another = AWSProvider()
-    once = another.describe(machine_id).shell.host_key
-    script = gzip.decompress(aws.asked('RunInstances')[0]['UserData']).decode()
-    assert once in script
-    another.pin(machine_id, f'{KEY} root@planner')
-    assert aws.provider.describe(machine_id).shell.host_key == KEY
-    found, = AWSProvider().find({TAG_NAME: 'planner'})
-    assert found.shell.host_key == KEY
-
-
 def test_ssh_rule_changes_and_ends(aws):
     first, request = ask()
     second, other = ask('mapper')
@@ -194,20 +180,6 @@ def test_an_instance_that_is_not_ours_is_never_ended(aws):
     aws.provider.destroy(f'aws:{HOME}/{theirs}/0123456789abcdef')
     assert left()['instances'] == [theirs]
     assert not list(aws.provider.find({}))
-
-
-def test_find_takes_at_most_two_calls_per_region(aws, monkeypatch):
-    here = aws.provider.create(*ask('planner', region=HOME))
-    there = aws.provider.create(*ask('mapper', region=AWAY))
-    assert here.startswith('aws:eu-central-1/') and there.startswith('aws:us-east-1/')
-    monkeypatch.delenv('FOGROS2_AWS_REGIONS')
-    aws.calls.clear()
-    assert {m.id for m in aws.provider.find({})} == {here, there}
-    enabled = len(ec2().describe_regions()['Regions'])
-    assert enabled >= 17
-    assert aws.count() == {'ec2:DescribeRegions': 1, 'ec2:DescribeInstances': enabled}
-    aws.provider.search_in([AWAY])
-    assert [m.id for m in aws.provider.find({})] == [there]
 
 
 def test_a_region_that_is_closed_to_us_hides_no_other(aws, monkeypatch):
@@ -336,31 +308,6 @@ def test_a_price_above_the_cap_is_refused(aws):
 
 
 # -- refused ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(('operation', 'code', 'words'), [
-    ('RunInstances', 'UnauthorizedOperation', 'does not allow ec2:RunInstances'),
-    ('RunInstances', 'VcpuLimitExceeded', 'Service Quotas'),
-    ('RunInstances', 'InvalidParameterValue', 'as AWS said'),
-    ('RunInstances', 'ExpiredToken', 'aws sso login'),
-    ('CreateSecurityGroup', 'VPCIdNotSpecified', 'create-default-vpc'),
-    ('CreateSecurityGroup', 'UnauthorizedOperation', 'ec2:CreateSecurityGroup'),
-    ('AuthorizeSecurityGroupIngress', 'UnauthorizedOperation', 'ec2:AuthorizeSecurity'),
-    ('ImportKeyPair', 'UnauthorizedOperation', 'does not allow ec2:ImportKeyPair'),
-    ('GetParameter', 'AccessDeniedException', 'does not allow ssm:GetParameter'),
-    ('DescribeInstances', 'RequestExpired', 'timedatectl'),
-    ('DescribeInstances', 'AuthFailure', 'get-caller-identity'),
-    ('DescribeInstances', 'OptInRequired', 'enable it'),
-])
-def test_a_refusal_is_one_line_with_a_hint_and_leaves_nothing(aws, operation, code, words):
-    aws.refuse(operation, code)
-    with pytest.raises(FogError) as caught:
-        aws.provider.create(*ask())
-    assert words in str(caught.value)
-    assert caught.value.refused
-    assert '\n' not in str(caught.value)
-    assert HOME in str(caught.value)
-    assert left() == NOTHING
 
 
 def test_failed_undo_does_not_stop_the_other_undos(aws):

@@ -55,17 +55,10 @@ def home(tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope='module')
-def small(tmp_path_factory):
-    """Return a folder whose namesake on the computer is on a disk of a megabyte."""
-    return tmp_path_factory.mktemp('small')
-
-
-@pytest.fixture(scope='module')
-def computer(cloud_network, tmp_path_factory, small):
+def computer(cloud_network, tmp_path_factory):
     """Run a computer that has the robot's environment, reached by SSH."""
     with bare_computer(f'fogt-{NAME}', tmp_path_factory.mktemp('computer'), cloud_network,
-                       mounts=container_root.environment_mounts(None),
-                       options=['--tmpfs', f'{small}:size=1m,mode=1777']) as running:
+                       mounts=container_root.environment_mounts(None)) as running:
         yield running
 
 
@@ -121,18 +114,6 @@ def nothing_was_made(text):
 
 # -- what the launch file says ------------------------------------------------------------------
 
-def test_unknown_attribute_is_refused(refused, cloud_network):
-    error, text = refused(container(cloud_network, lifetme='1h'))
-    assert "ContainerInstance has no attribute 'lifetme'" in text
-    assert "did you mean 'lifetime'?" in text
-
-
-def test_invalid_name_is_refused(refused, cloud_network):
-    error, text = refused(container(cloud_network, name='$(reboot)'))
-    assert "'$(reboot)' is no name for a machine" in text
-    assert 'such as slam-1' in text
-
-
 def test_unknown_package_is_refused(refused, cloud_network):
     error, text = refused(container(cloud_network), package='fogros2_exmples')
     assert "there is no package 'fogros2_exmples'" in error
@@ -140,57 +121,11 @@ def test_unknown_package_is_refused(refused, cloud_network):
     assert nothing_was_made(text)
 
 
-def test_unknown_executable_is_refused(refused, cloud_network):
-    error, text = refused(container(cloud_network), executable='talkr')
-    assert "package 'fogros2_examples' has no executable 'talkr'" in error
-    assert "did you mean 'talker'?" in error
-    assert nothing_was_made(text)
-
-
-def test_missing_workspace_is_refused(refused, cloud_network, tmp_path):
-    error, text = refused(container(cloud_network, ros_workspace=str(tmp_path / 'nowhere')))
-    assert f'{tmp_path}/nowhere is no folder' in error
-    assert nothing_was_made(text)
-    (tmp_path / 'empty').mkdir()
-    error, text = refused(container(cloud_network, ros_workspace=str(tmp_path / 'empty')))
-    assert f'{tmp_path}/empty is no colcon workspace' in error
-    assert 'colcon build' in error
-    assert nothing_was_made(text)
-
-
-def test_two_machines_of_one_name_are_refused(refused, cloud_network, write):
-    error, text = refused(
-        f'{container(cloud_network)}\n'
-        f'    other = {container(cloud_network, memory="2g")}\n'
-        f'    from launch import LaunchDescription\n'
-        f'    return LaunchDescription([CloudNode(machine=m, package="fogros2_examples", '
-        f'executable="talker") for m in (machine, other)])')
-    assert f"two machines of this launch have the name '{NAME}'" in error
-    assert nothing_was_made(text)
-
-
-def test_ssh_computer_cannot_be_stopped(refused, computer):
-    error, text = refused(ssh(computer, on_exit='stop'))
-    assert f"'{NAME}' is a computer that exists already" in error and "'keep'" in error
-    assert nothing_was_made(text)
-
-
 # -- what the environment says ------------------------------------------------------------------
 
-@pytest.mark.parametrize('domain', ['300', 'seven'])
-def test_invalid_domain_is_refused(refused, cloud_network, domain):
-    error, text = refused(container(cloud_network), environment={'ROS_DOMAIN_ID': domain})
-    assert 'ROS_DOMAIN_ID' in error and domain in error and 'use 0 to 101' in error
-    assert nothing_was_made(text)
-
-
-def test_unknown_middleware_is_refused(refused, cloud_network):
-    # set late: ROS 2 itself refuses one that isn't installed, before anything of ours runs
-    error, text = refused(
-        f'{container(cloud_network)}\n    import os\n'
-        f"    os.environ['RMW_IMPLEMENTATION'] = 'rmw_connextdds'")
-    assert 'FogROS2 does not support RMW_IMPLEMENTATION=rmw_connextdds' in error
-    assert 'rmw_cyclonedds_cpp' in error
+def test_invalid_domain_is_refused(refused, cloud_network):
+    error, text = refused(container(cloud_network), environment={'ROS_DOMAIN_ID': 'seven'})
+    assert 'ROS_DOMAIN_ID' in error and 'seven' in error and 'use 0 to 101' in error
     assert nothing_was_made(text)
 
 
@@ -244,12 +179,11 @@ def test_missing_root_is_reported(write, cloud_network):
     assert nothing_was_made(text)
 
 
-@pytest.mark.parametrize('program', ['wg', 'rsync'])
 @needs_namespaces
-def test_missing_program_is_reported(refused, cloud_network, program):
+def test_missing_program_is_reported(refused, cloud_network):
     error, text = refused(container(cloud_network), wrap=without(
-        f'$(readlink -f $(command -v {program}))'))
-    assert f'{program} not found on this computer' in error and 'apt-get install' in error
+        '$(readlink -f $(command -v wg))'))
+    assert 'wg not found on this computer' in error and 'apt-get install' in error
     assert nothing_was_made(text)
 
 
@@ -260,44 +194,11 @@ def test_unreachable_host_is_reported(refused, computer, nobody):
     assert f'{nobody} port 22 does not answer' in error and 'is it on' in error
 
 
-def test_unknown_host_name_is_reported(refused, computer):
-    error, _ = refused(ssh(computer, host='planner.invalid'))
-    assert "there is no host called 'planner.invalid'" in error and 'check host=' in error
-
-
-def test_invalid_host_is_refused(refused, computer):
-    error, text = refused(ssh(computer, host='-oPort=1'))
-    assert "'-oPort=1' can't be the host of an SSH machine" in error
-    assert 'host= takes a name or an address' in error
-    assert nothing_was_made(text)
-
-
-def test_port_without_an_ssh_server_is_reported(refused, computer):
-    error, _ = refused(ssh(computer, port=2222))
-    assert 'refuses connections to port 2222' in error and 'does its SSH server run' in error
-
-
-def test_changed_host_key_is_refused(refused, computer):
-    other = (computer.key.parent / 'id.pub').read_text().split()[:2]
-    error, text = refused(ssh(computer, host_key=' '.join(other)))
-    assert 'another host key than the pinned one' in error
-    assert computer.host_key in error
-    assert f'{NAME}: watchdog' not in text
-
-
 def test_unknown_host_key_is_refused(refused, computer):
     error, text = refused(ssh(computer, host_key=None))
     assert f"the host key of '{NAME}' ({computer.address}) is unknown" in error
     assert f'known_hosts: {computer.address} {computer.host_key}' in error
     assert f'{NAME}: watchdog' not in text
-
-
-def test_refused_login_key_is_reported(refused, computer, tmp_path):
-    key = tmp_path / 'other'
-    subprocess.run(['ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f', str(key)], check=True)
-    error, _ = refused(ssh(computer, key=str(key)))
-    assert f'({computer.user}@{computer.address}) does not accept {key}' in error
-    assert 'authorized_keys' in error
 
 
 @pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)')
@@ -321,19 +222,6 @@ def test_missing_rsync_is_reported(refused, computer):
                      'mv /usr/bin/apt.away /usr/bin/apt-get')
     assert f"machine '{NAME}' lacks rsync" in error
     assert 'apt-get install rsync' in error
-
-
-def test_full_disk_is_reported(refused, computer, small):
-    prefix = small / 'install' / 'large'
-    index = prefix / 'share' / 'ament_index' / 'resource_index' / 'packages'
-    index.mkdir(parents=True)
-    (small / 'install' / '.colcon_install_layout').write_text('isolated\n')
-    (small / 'src').mkdir()
-    (index / 'large').write_text('')
-    (prefix / 'share' / 'data').write_bytes(os.urandom(4 << 20))
-    error, _ = refused(ssh(computer, ros_workspace=str(small)))
-    assert f"the disk of '{NAME}' is full: {small} did not fit" in error
-    assert 'make room there' in error
 
 
 @pytest.mark.skipif(not embedded(), reason='this robot has an installation of ROS 2')

@@ -220,19 +220,6 @@ def test_failed_creation_leaves_nothing(cloud):
         cloud.create(cloud.spec(options={'nets': 'x'}))
 
 
-def test_many_come_up_at_once(cloud):
-    specs = [cloud.spec() for _ in range(4)]
-    threads = [threading.Thread(target=cloud.create, args=(spec,)) for spec in specs]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60.0)
-    machines = [cloud.reached(machine_id) for machine_id in cloud.ids]
-    assert sorted(m.name for m in machines) == sorted(spec.name for spec in specs)
-    assert len({m.vpn_host for m in machines}) == 4
-    assert len({m.shell.host_key for m in machines}) == 4
-
-
 _KILLED = """
 import sys
 from fogros2.model import CreateRequest, MachineSpec
@@ -293,20 +280,6 @@ def test_the_agent_is_armed_at_boot_and_comes_back(cloud):
         said(shell, 'kill', '-KILL', first, sudo=True)
         # the one that is killed may be there a moment longer
         wait_until(lambda: running() not in ('', first), timeout=60.0, what='the agent to return')
-
-
-def test_an_agent_that_waits_in_vain_ends_the_machine(cloud):
-    config = agent_config(robot_timeout=1, boot_timeout=1)
-    machine_id = cloud.create(cloud.spec(), agent_config=config)
-
-    def gone() -> bool:
-        try:
-            cloud.provider.describe(machine_id)
-        except MachineNotFound:
-            return True
-        return False
-
-    wait_until(gone, timeout=60.0, what='the machine to end itself')
 
 
 @pytest.fixture

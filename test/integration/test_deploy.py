@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
-import re
 import shutil
 import sys
 import threading
@@ -15,7 +13,6 @@ import uuid
 from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
 import pytest
-from ros2cli.cli import main
 
 from fogros2 import ros2_daemon
 from fogros2.deploy import Launch
@@ -24,12 +21,10 @@ from fogros2.errors import FogError, NameTaken, WorkspaceError
 from fogros2.feature import Feature
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
-from fogros2.provider.container import entry as container_entry
-from fogros2.report import ClockMeasured, StepDone, StepFailed, StepStarted
+from fogros2.report import StepDone, StepFailed, StepStarted
 from fogros2.store import Store
 from fogros2.waiting import wait_until
 from fogros2_testing.plugins import instead
-from ros2fog_cli.api import doctor
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
@@ -113,30 +108,6 @@ def test_launch_stops_the_daemon_of_its_terminals_before_its_vpn():
     thread.join(60)
     assert not thread.is_alive()
     assert seen == [True] and not interface.exists() and not folder.exists()
-
-
-def test_machine_with_a_slow_clock_is_warned_of_and_shown(
-    spec, slow_agent, monkeypatch, capsys,
-):
-    monkeypatch.setattr(container_entry, 'joined', slow_agent.read_text)
-    events = []
-    launch = Launch(report=events.append)
-    name = spec().name
-    try:
-        launch.up(spec())
-        wait_until(lambda: any(isinstance(e, ClockMeasured) for e in events), timeout=60,
-                   what='the offset')
-        assert main(argv=['fog', 'status', name, '--json']) == 0
-        clock = json.loads(capsys.readouterr().out)['clock']
-        assert main(argv=['fog', 'status', name]) == 0
-        shown = capsys.readouterr().out
-        assert re.search(r"^clock +1\.\d\d s behind the robot's \(± ", shown, re.MULTILINE)
-        found = doctor.clocks()
-    finally:
-        assert launch.down() == []
-    assert abs(clock['seconds'] + 1.5) <= clock['uncertainty'] + 1e-3
-    assert [e.warn for e in events if isinstance(e, ClockMeasured)][0]
-    assert found.verdict == 'warning' and re.search(rf'{name}: 1\.\d\d s behind', found.detail)
 
 
 STEPS = ['machine', 'connect', 'ROS 2', 'watchdog', 'VPN', 'agent']

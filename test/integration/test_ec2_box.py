@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 import functools
 import json
 import os
@@ -22,7 +21,8 @@ from rigs.ec2 import Ec2Box
 
 boto3 = pytest.importorskip('boto3', reason='needs boto3')
 pytest.importorskip('moto', reason='needs moto[server]')
-pytestmark = pytest.mark.usefixtures('engine')
+#: Tests of what other tests run in: launches there show most of it.
+pytestmark = [pytest.mark.soak, pytest.mark.usefixtures('engine')]
 
 UBUNTU = '/aws/service/canonical/ubuntu/server/24.04/stable/current/amd64/hvm/ebs-gp3/ami-id'
 ROBOT = '198.51.100.2'
@@ -175,143 +175,6 @@ def test_the_robot_has_no_way_out_and_may_move(box):
         box.move_robot(back=True)
 
 
-def test_a_disk_outlives_a_stop(box, key):
-    it = Launched(box, key, config={'bootcmd': ['echo boot >>/boots'],
-                                    'runcmd': ['echo first >>/firsts']},
-                  InstanceInitiatedShutdownBehavior='stop').runs()
-    it.allow()
-    first = it.described()['PublicIpAddress']
-    # as the system's package manager would
-    assert it.ssh('cloud-init status --wait; sudo sh -c "echo kept >/usr/local/kept; '
-                  'rm /etc/host.conf"').returncode == 0
-    it.ssh('sudo poweroff', deadline=0)
-    stopped = box.wait_for(it.id, 'stopped')
-    assert stopped.reason == 'Client.InstanceInitiatedShutdown'
-    assert 'PublicIpAddress' not in it.described()
-    it.ec2.start_instances(InstanceIds=[it.id])
-    it.runs()
-    assert it.described()['PublicIpAddress'] != first
-    done = it.ssh('cloud-init status --wait; cat /usr/local/kept /firsts; wc -l </boots; '
-                  'ls /etc/host.conf; ls /run')
-    assert done.stdout.split('\n')[:4] == ['status: done', 'kept', 'first', '2']
-    assert '/etc/host.conf' not in done.stdout
-    # stopped through the API this time
-    it.ec2.stop_instances(InstanceIds=[it.id])
-    assert it.described()['State']['Name'] == 'stopping'
-    refused('IncorrectInstanceState', lambda: it.ec2.start_instances(InstanceIds=[it.id]))
-    box.wait_for(it.id, 'stopped')
-    # started at once: nothing of that stop may reach the next boot
-    it.ec2.start_instances(InstanceIds=[it.id])
-    it.runs()
-    assert it.ssh('sleep 2.5; echo still').stdout == 'still\n'
-    it.ec2.stop_instances(InstanceIds=[it.id])
-    box.wait_for(it.id, 'stopped')
-    it.ec2.terminate_instances(InstanceIds=[it.id])
-    box.wait_for(it.id, 'terminated')
-
-
-def test_an_image_remembers_the_files(box, key):
-    it = Launched(box, key).runs()
-    it.allow()
-    it.ssh('cloud-init status --wait; sudo sh -c "echo baked >/opt/baked; sync"')
-    image = it.ec2.create_image(
-        InstanceId=it.id, Name='baked', NoReboot=True, TagSpecifications=[
-            {'ResourceType': kind, 'Tags': [{'Key': 'of', 'Value': kind}]}
-            for kind in ('image', 'snapshot')])['ImageId']
-
-    def described():
-        return it.ec2.describe_images(ImageIds=[image])['Images'][0]
-
-    wait_until(lambda: described()['State'] == 'available', timeout=60, what='the image')
-    assert it.described()['State']['Name'] == 'running'
-    snapshot = described()['BlockDeviceMappings'][0]['Ebs']['SnapshotId']
-    (tags,) = [s['Tags'] for s in it.ec2.describe_snapshots(
-        SnapshotIds=[snapshot])['Snapshots']]
-    assert tags == [{'Key': 'of', 'Value': 'snapshot'}]
-    other = Launched(box, key, config={'runcmd': ['touch /again']}, ImageId=image).runs()
-    other.allow()
-    done = other.ssh('cloud-init status --wait; cat /opt/baked; ls /again')
-    assert done.stdout.split() == ['status:', 'done', 'baked', '/again']
-    refused('InvalidSnapshot.InUse', lambda: it.ec2.delete_snapshot(SnapshotId=snapshot))
-    it.ec2.deregister_image(ImageId=image)
-    it.ec2.delete_snapshot(SnapshotId=snapshot)
-    refused('InvalidAMIID.Unavailable', lambda: Launched(box, key, ImageId=image))
-
-
-def test_a_client_token_makes_one_instance(box):
-    ec2 = client(box)
-    before = {found.id for found in box.instances()}
-    words = {'ImageId': ubuntu(box), 'MinCount': 1, 'MaxCount': 1, 'ClientToken': 'once'}
-
-    def run(kind='t3.medium'):
-        return ec2.run_instances(InstanceType=kind, **words)['Instances'][0]['InstanceId']
-
-    # the answer to the first gets lost
-    box.fail('InternalError', action='RunInstances', after=True)
-    with ThreadPoolExecutor(3) as pool:
-        made = set(pool.map(lambda _: run(), range(3)))
-    assert len(made) == 1
-    assert {found.id for found in box.instances()} - before == made
-    refused('IdempotentParameterMismatch', lambda: run('t3.large'))
-    ec2.terminate_instances(InstanceIds=list(made))
-    refused('IdempotentInstanceTerminated', run)
-
-
-def test_spot_instances_end_and_are_never_stopped(box, key):
-    spot = {'MarketType': 'spot', 'SpotOptions': {'SpotInstanceType': 'one-time'}}
-    low = {**spot, 'SpotOptions': {'MaxPrice': '0.001'}}
-    refused('SpotMaxPriceTooLow', lambda: Launched(box, key, InstanceMarketOptions=low))
-    it = Launched(box, key, InstanceMarketOptions=spot,
-                  InstanceInitiatedShutdownBehavior='stop').runs()
-    assert it.described()['InstanceLifecycle'] == 'spot'
-    refused('UnsupportedOperation', lambda: it.ec2.stop_instances(InstanceIds=[it.id]))
-    box.interrupt(it.id, notice=1.0)
-    told = box.run(it.id, """
-        url=http://169.254.169.254/latest
-        token=$(curl -s -X PUT -H 'X-aws-ec2-metadata-token-ttl-seconds: 60' $url/api/token)
-        curl -s -H "X-aws-ec2-metadata-token: $token" $url/meta-data/spot/instance-action
-        """)
-    assert json.loads(told)['action'] == 'terminate'
-    assert box.wait_for(it.id, 'terminated').reason == 'Server.SpotInstanceTermination'
-    other = Launched(box, key, InstanceMarketOptions=spot,
-                     InstanceInitiatedShutdownBehavior='stop').runs()
-    box.run(other.id, 'shutdown -h now', check=False)
-    assert box.wait_for(other.id, 'terminated').reason == 'Client.InstanceInitiatedShutdown'
-
-
-def test_it_boots_as_slowly_as_it_is_told(box, key):
-    box.set_boot_delay(1.0)
-    begin = time.monotonic()
-    it = Launched(box, key)
-    assert it.described()['State']['Name'] == 'pending'
-    assert 'PublicIpAddress' not in it.described()
-    box.wait_for(it.id, 'running')
-    assert 'PublicIpAddress' in it.described()
-    it.runs()
-    assert time.monotonic() - begin >= 1.0
-    # one that nobody wants any more before its computer is on
-    box.set_boot_delay(60.0)
-    other = Launched(box, key)
-    other.ec2.terminate_instances(InstanceIds=[other.id])
-    box.wait_for(other.id, 'terminated', timeout=30)
-
-
-@pytest.mark.parametrize('code', [
-    'InsufficientInstanceCapacity', 'VcpuLimitExceeded', 'UnauthorizedOperation', 'ExpiredToken',
-    'RequestLimitExceeded'])
-def test_errors_come_to_order(box, code):
-    from botocore.config import Config
-    once = boto3.client('ec2', region_name='us-east-1', **box.client_arguments,
-                        config=Config(retries={'total_max_attempts': 1}))
-    box.forget_calls()
-    box.fail(code, action='DescribeVpcs')
-    once.describe_subnets()
-    refused(code, once.describe_vpcs)
-    once.describe_vpcs()
-    assert [(call.action, call.error) for call in box.calls()] == [
-        ('DescribeSubnets', ''), ('DescribeVpcs', code), ('DescribeVpcs', '')]
-
-
 def test_what_ec2_refuses(box, key):
     words = {'MinCount': 1, 'MaxCount': 1, 'ImageId': ubuntu(box)}
     ec2 = client(box)
@@ -338,68 +201,6 @@ def test_what_ec2_refuses(box, key):
     it = Launched(box, key)
     refused('DependencyViolation', lambda: it.ec2.delete_security_group(GroupId=it.group))
     assert {found.id for found in box.instances()} - before == {it.id}
-
-
-def test_prices_are_there(box):
-    filters = [{'Type': 'TERM_MATCH', 'Field': field, 'Value': value} for field, value in {
-        'regionCode': 'eu-central-1', 'operatingSystem': 'Linux', 'tenancy': 'Shared',
-        'preInstalledSw': 'NA', 'capacitystatus': 'Used'}.items()]
-    pages = client(box, 'pricing').get_paginator('get_products').paginate(
-        ServiceCode='AmazonEC2', Filters=filters, PaginationConfig={'PageSize': 10})
-    entries = [json.loads(text) for page in pages for text in page['PriceList']]
-    kinds = [entry['product']['attributes']['instanceType'] for entry in entries]
-    assert len(kinds) == len(set(kinds)) > 10
-    assert 't3.medium' in kinds
-    history = client(box, region='eu-central-1').describe_spot_price_history(
-        InstanceTypes=['t3.medium'], ProductDescriptions=['Linux/UNIX'])['SpotPriceHistory']
-    assert len({entry['AvailabilityZone'] for entry in history}) >= 2
-    assert all(0 < float(entry['SpotPrice']) < 0.05 for entry in history)
-
-
-def test_two_regions_are_two_places(box, key):
-    known = client(box).describe_regions()['Regions']
-    assert len(known) == 17 and all(
-        region['OptInStatus'] == 'opt-in-not-required' for region in known)
-    refused('AuthFailure', lambda: client(box, region='af-south-1').describe_instances())
-    one, two = (Launched(box, key, region=region).runs()
-                for region in ('us-east-1', 'eu-central-1'))
-    assert one.described()['PublicIpAddress'] != two.described()['PublicIpAddress']
-    found = one.ec2.describe_instances(Filters=[
-        {'Name': 'instance-state-name', 'Values': ['running']}])['Reservations']
-    assert [i['InstanceId'] for r in found for i in r['Instances']] == [one.id]
-
-
-def test_groups_name_groups_and_a_reboot_is_no_new_boot(box, key):
-    one = Launched(box, key, config={'bootcmd': ['echo boot >>/boots'],
-                                     'runcmd': ['echo first >>/firsts']}).runs()
-    two = Launched(box, key).runs()
-    address = one.described()['PrivateIpAddress']
-
-    def reached():
-        said = box.run(two.id, f'timeout 1 bash -c "</dev/tcp/{address}/22" && echo yes',
-                       check=False)
-        return 'yes' in said
-
-    assert not reached()
-    one.ec2.authorize_security_group_ingress(GroupId=one.group, IpPermissions=[{
-        'IpProtocol': 'tcp', 'FromPort': 22, 'ToPort': 22,
-        'UserIdGroupPairs': [{'GroupId': two.group}]}])
-    assert reached()
-    refused('DependencyViolation', lambda: one.ec2.delete_security_group(GroupId=two.group))
-    public = one.described()['PublicIpAddress']
-    box.run(one.id, 'cloud-init status --wait')
-    one.ec2.reboot_instances(InstanceIds=[one.id])
-
-    def booted_twice():
-        return box.run(one.id, 'cat /boots /firsts', check=False).split() == [
-            'boot', 'boot', 'first']
-
-    wait_until(booted_twice, timeout=60, longest=0.2, what='the reboot')
-    assert one.runs().described()['PublicIpAddress'] == public
-    # and by its own word
-    box.run(one.id, 'reboot', check=False)
-    wait_until(lambda: box.run(one.id, 'wc -l </boots', check=False).strip() == '3', timeout=60,
-               longest=0.2, what='the second reboot')
 
 
 STARTER = """

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from fogros2 import process
-from fogros2.errors import Cancelled, MachineNotFound, NameTaken, PrerequisiteError, ShellError
+from fogros2.errors import Cancelled, NameTaken, PrerequisiteError, ShellError
 from fogros2.model import Command, MachineSpec, MachineState
 from fogros2.provider.container.hosted import HostedProvider
 from fogros2.shell.ssh import SSHShell
@@ -118,20 +118,6 @@ def test_host_refuses_what_it_lacks(host: Fleet, key: Path) -> None:
     with pytest.raises(Exception, match="'/no/such/folder' of mounts= doesn't exist"):
         host.provider().create(spec, request(key, spec))
     assert host.containers() == {}
-
-
-def test_machine_without_its_robot_ends_itself(host: Fleet, key: Path) -> None:
-    provider, spec = host.provider(), MachineSpec(
-        'planner', 'hosted', host.options, share=('/map',))
-    machine_id = provider.create(spec, request(key, spec, robot_timeout=1, boot_timeout=1))
-
-    def gone() -> bool:
-        with contextlib.suppress(MachineNotFound):
-            return provider.describe(machine_id).state is MachineState.DELETED
-        return True
-
-    wait_until(gone, timeout=60.0, what='the machine to end')
-    wait_until(lambda: not host.traces(), timeout=60.0, what='its traces to be gone')
 
 
 @pytest.mark.parametrize('delay', [0.05, 0.4, 0.9])

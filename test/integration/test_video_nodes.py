@@ -59,9 +59,8 @@ def source(bench: Bench, **options: Any) -> Callable[[], None]:
 
 
 @pytest.mark.parametrize(('encoding', 'options'), [
-    ('bgr8', {}), ('rgb8', {'width': 97, 'height': 63, 'pad': 5}), ('mono8', {'pixel': 1}),
-    ('rgba8', {'pixel': 4, 'big': 1}), ('yuv422', {'pixel': 2}),
-    ('16UC1', {'pixel': 2, 'pad': 2}), ('32FC1', {'pixel': 4, 'width': 31})], ids=str)
+    ('rgb8', {'width': 97, 'height': 63, 'pad': 5}), ('rgba8', {'pixel': 4, 'big': 1}),
+    ('32FC1', {'pixel': 4, 'width': 31})], ids=str)
 def test_what_goes_in_comes_out(bench: Bench, encoding: str, options: dict[str, int]) -> None:
     """All fields of header and image, and nearly the same pixels; depth to the bit."""
     bench.pair()
@@ -75,7 +74,7 @@ def test_what_goes_in_comes_out(bench: Bench, encoding: str, options: dict[str, 
         assert (got.height, got.width, got.encoding, got.step, got.is_bigendian) == (
             sent.height, sent.width, sent.encoding, sent.step, sent.is_bigendian)
         a, b = (numpy.frombuffer(m.data, numpy.uint8).astype(int) for m in (got, sent))
-        assert numpy.abs(a - b).mean() < (0.01 if encoding in ('16UC1', '32FC1') else 4)
+        assert numpy.abs(a - b).mean() < (0.01 if encoding == '32FC1' else 4)
 
 
 @pytest.mark.parametrize(('encoding', 'options', 'reliability'), [

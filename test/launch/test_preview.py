@@ -21,7 +21,7 @@ from launch.actions import (
 )
 from launch.conditions import IfCondition
 from launch.launch_description_sources import AnyLaunchDescriptionSource
-from launch.substitutions import Command, LaunchConfiguration
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 import pytest
 from ros2cli.cli import main
@@ -135,15 +135,6 @@ def test_what_only_a_launch_knows_is_said():
     assert found[0].startswith('a: aws: ') and 'nowhere' in found[0]
     assert found[1:] == ['    demo talker', 'b: container', '    demo talker (under a condition)',
                          'Not shown: what functions, and files that cannot be read now, may add.']
-
-
-def test_preview_runs_no_command(tmp_path: Path):
-    made = tmp_path / 'made'
-    command = Command(['touch ', str(made)])
-    found = lines([node(AWSCloudInstance(name='a', region=command)),
-                   ExecuteProcess(cmd=['echo', command])])
-    assert found[0].startswith('a: aws: ') and found[1:3] == ['    demo talker', 'robot']
-    assert found[3].startswith('    echo <Command(') and not made.exists()
 
 
 def test_machines_run_where_the_command_line_says():

@@ -15,29 +15,9 @@ from fogros2.errors import ConnectError
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import TAG_EXPIRES, TAG_ROBOT
 from fogros2.shell import ssh_connection
-from fogros2.store import Record, robot_id, robot_name
+from fogros2.store import Record, robot_id
 from ros2fog_cli.api import endings
 from ros2fog_cli.api.machines import Entry
-
-REGION = 'eu-central-1'
-
-
-@pytest.mark.parametrize(('robot', 'collected'), [
-    (f'{robot_name()}-00000000', False), ('', True), (robot_name(), True)])
-def test_neighbour_s_group_stays_during_its_creation(
-    moto_aws: str, robot: str, collected: bool,
-) -> None:
-    """The neighbour's clock is a quarter of an hour behind this robot's."""
-    boto3 = pytest.importorskip('boto3')
-    from fogros2.provider.aws.instances import tag_list
-    from fogros2.provider.aws.provider import AWSProvider
-    attempt = '0123456789abcdef'
-    boto3.client('ec2', REGION).create_security_group(
-        GroupName=f'fogros2-{attempt}', Description='FogROS2', TagSpecifications=[{
-            'ResourceType': 'security-group', 'Tags': tag_list({
-                'fogros2-attempt': attempt, 'fogros2-name': 'slam', TAG_ROBOT: robot,
-                'fogros2-made': str(int(time.time() - 1000))})}])
-    assert bool(AWSProvider().tidy()) is collected
 
 
 @pytest.mark.parametrize('armed', [0.0, 60.0])

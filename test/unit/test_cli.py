@@ -731,10 +731,9 @@ def test_unknown_machine_is_one_line_and_a_status(
     assert len(text) == 1
 
 
-@pytest.mark.parametrize('name', ['a b', 'x;rm -rf', '../up', 'UPPER', ''])
-def test_invalid_machine_name_is_refused(name: str) -> None:
-    for verb in ('status', 'env', 'connect'):
-        assert 'no name for a machine' in str(run(verb, name))
+@pytest.mark.parametrize('verb', ['status', 'env', 'connect'])
+def test_invalid_machine_name_is_refused(verb: str) -> None:
+    assert 'no name for a machine' in str(run(verb, '../up'))
 
 
 def test_names_are_completed_without_asking_providers(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -770,18 +769,17 @@ def test_no_verb_prints_the_help(capsys: pytest.CaptureFixture[str]) -> None:
         assert verb in said
 
 
-@pytest.mark.parametrize('words', [
-    [], ['bugreport'], ['connect'], ['dashboard'], ['delete'], ['doctor'], ['env'], ['gc'],
-    ['image'], ['list'], ['logs'], ['plan'], ['price'], ['regions'], ['shell'], ['ssh-config'],
-    ['status'], ['wait']], ids=' '.join)
-def test_help_imports_no_core(words: list[str], tmp_path: Path) -> None:
+def test_help_imports_no_core(tmp_path: Path) -> None:
     # beside what ros2cli loads for a command of its own
     code = ('import sys\nfrom ros2cli.cli import main\n'
-            f"for words in ['daemon'], ['fog', *{words!r}]:\n"
-            '    before = set(sys.modules)\n'
+            "for words in (['daemon'], ['fog'], *(['fog', verb] for verb in ("
+            "    'bugreport', 'connect', 'dashboard', 'delete', 'doctor', 'env', 'gc', 'image',"
+            "    'list', 'logs', 'plan', 'price', 'regions', 'shell', 'ssh-config', 'status',"
+            "    'wait'))):\n"
             # commands with verbs of their own read them there, whatever main() is given
             "    sys.argv = ['ros2', *words, '-h']\n"
             '    try:\n        main()\n    except SystemExit:\n        pass\n'
+            "    if words == ['daemon']:\n        before = set(sys.modules)\n"
             "print([m for m in set(sys.modules) - before if m.split('.')[0] in "
             "('paramiko', 'boto3', 'botocore', 'kubernetes', 'requests', 'yaml')"
             " or m in ('fogros2.deploy', 'fogros2.provider')], file=sys.stderr)")

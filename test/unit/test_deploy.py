@@ -120,6 +120,13 @@ def test_missing_program_is_found_without_the_vpn(launch, checked):
     assert list((launch.store.root / 'launches').glob('*/vpn.key')) == []
 
 
+def test_computer_of_the_user_cannot_be_stopped(launch, checked, monkeypatch):
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(owned=False))
+    monkeypatch.setattr(deployed, 'check_robot', lambda: None)
+    with pytest.raises(ConfigurationError, match="'planner' is a computer that exists already"):
+        launch.prepare([dataclasses.replace(SPEC, on_exit='stop')])
+
+
 def test_first_problem_ends_the_early_checks(launch, checked, monkeypatch):
     monkeypatch.setattr(deployed, '_QUICK', 60.0)
     let_go = threading.Event()
@@ -485,14 +492,6 @@ def test_a_machine_that_boots_slowly_has_the_time_of_its_boot(launch, provider, 
     assert 270 < connection._timeout() <= 280
     mine.record = dataclasses.replace(mine.record, host_key='its own')
     assert connection._timeout() == 60.0
-
-
-def test_lasting_refusal_of_a_login_is_reported(launch, provider, mute):
-    with socket.create_server(('127.0.0.1', 0)) as server:
-        port = server.getsockname()[1]
-    launch.timeouts = Timeouts(ssh=0.3)
-    with pytest.raises(ConnectError, match='refuses connections'):
-        reach(launch, port)
 
 
 def test_health_check_survives_time_out(launch, monkeypatch):

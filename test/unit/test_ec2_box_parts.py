@@ -4,10 +4,7 @@
 from __future__ import annotations
 
 import base64
-import datetime
-from decimal import Decimal
 import gzip
-import json
 import shutil
 import subprocess
 
@@ -17,7 +14,6 @@ from fogros2 import process
 from fogros2.model import Command
 from rigs.computers import cloud_config, network
 from rigs.computers.cloud_config import parse, Plan, UserDataError
-from rigs.ec2 import market
 
 
 def test_a_cloud_config_is_understood():
@@ -108,47 +104,3 @@ def test_nft_understands_the_rules(root):
         process.argv(Command(('nft', '-c', '-f', '-'), sudo=True)), text=True,
         input=network.rules([host]), capture_output=True)
     assert checked.returncode == 0, checked.stderr
-
-
-def test_addresses_are_all_of_the_test_network_and_unlike():
-    addresses = network.Addresses()
-    given = [addresses.take(private=n % 2 == 1) for n in range(100)]
-    assert len(set(given)) == 100
-    assert all(address.startswith('198.51.100.') for address in given)
-    assert not set(given) & {network.ROUTER, network.ROBOT, network.ROBOT_ELSEWHERE}
-    few = network.Addresses()
-    taken = [few.take() for _ in range(110)]
-    with pytest.raises(LookupError):
-        few.take()
-    few.give_back(taken[:1])
-    assert few.take() == taken[0]
-
-
-def test_prices_are_those_of_the_region_asked_for():
-    wanted = {'regionCode': 'eu-central-1', 'instanceType': 't3.medium',
-              'operatingSystem': 'Linux'}
-    (text,) = market.products(wanted, {}, ['eu-central-1'])
-    entry = json.loads(text)
-    (term,) = entry['terms']['OnDemand'].values()
-    (dimension,) = term['priceDimensions'].values()
-    assert Decimal(dimension['pricePerUnit']['USD']) == Decimal('0.0416') * Decimal('1.15')
-    assert entry['product']['attributes']['regionCode'] == 'eu-central-1'
-    assert market.price('eu-central-1', 'no.such') is None
-    xml = market.spot_history('us-east-1', ['t3.medium'], {'t3.medium': ['us-east-1a']},
-                              datetime.datetime(2026, 1, 2, 3, 4, 5))
-    assert '<availabilityZone>us-east-1a</availabilityZone>' in xml
-    assert '2026-01-02T03:04:05.000Z' in xml
-    assert market.spot_price('us-east-1', 't3.medium', 'us-east-1a') < Decimal('0.0416')
-
-
-def test_public_parameters_name_images_of_their_architecture():
-    top = '/aws/service/canonical/ubuntu/server/24.04/stable/current'
-    one = market.image_of(f'{top}/amd64/hvm/ebs-gp3/ami-id', 'us-east-1')
-    two = market.image_of(f'{top}/arm64/hvm/ebs-gp3/ami-id', 'us-east-1')
-    far = market.image_of(f'{top}/amd64/hvm/ebs-gp3/ami-id', 'eu-west-1')
-    gpu = market.image_of('/aws/service/deeplearning/ami/x86_64/'
-                          'base-oss-nvidia-driver-gpu-ubuntu-24.04/latest/ami-id', 'us-east-1')
-    assert len({image.id for image in (one, two, far, gpu)}) == 4
-    assert (one.architecture, two.architecture, gpu.architecture) == (
-        'x86_64', 'arm64', 'x86_64')
-    assert market.image_of('/aws/service/no/such', 'us-east-1') is None

@@ -10,6 +10,7 @@ import pytest
 
 boto3 = pytest.importorskip('boto3', reason='needs boto3')
 CLOUDS = ('aws',)
+pytestmark = pytest.mark.soak
 
 
 #: Asking all regions is another test's.

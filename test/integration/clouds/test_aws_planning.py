@@ -11,6 +11,7 @@ pytest.importorskip('ompl', reason='ompl is in the extra applications')
 pytest.importorskip('fcl', reason='python-fcl is in the extra applications')
 
 CLOUDS = ('aws',)
+pytestmark = pytest.mark.soak
 
 
 def test_motion_planning(robot, box, tmp_path):

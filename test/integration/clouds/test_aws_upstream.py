@@ -6,6 +6,8 @@ from __future__ import annotations
 import difflib
 from pathlib import Path
 
+import pytest
+
 CLOUDS = ('aws',)
 
 #: Ours, with what FogROS2's talker.aws.launch.py uses: a release that the robot doesn't have, an
@@ -96,6 +98,7 @@ def test_fogros2s_talker_aws_on_a_simulated_ubuntu_22_04(upstream, robot, box, j
         'us-west-1', 'c5.4xlarge', 'ami-034160df82745c454')
 
 
+@pytest.mark.soak
 def test_fogros2s_form_of_choosing_region_and_type(robot, box):
     box.publish('ami-00000011', region='us-west-1')
     box.publish('ami-00000012', region='us-east-1')
@@ -124,6 +127,7 @@ def test_fogros2s_talker_auto_aws_with_one_line_changed(upstream, robot, box):
         ('us-west-1', 'ami-02ea247e531eb3ce6'), ('us-east-1', 'ami-08c40ec9ead489470'))
 
 
+@pytest.mark.soak
 def test_the_image_and_the_type_follow_the_region(robot, box, name):
     for region, image in (('eu-central-1', 'ami-0fedcba9876543210'),
                           ('us-east-1', 'ami-0123456789abcdef0')):
@@ -139,6 +143,7 @@ def test_the_image_and_the_type_follow_the_region(robot, box, name):
         ('us-east-1', 'ami-0123456789abcdef0', 't3a.medium'))
 
 
+@pytest.mark.soak
 def test_a_region_that_a_mapping_lacks_ends_the_launch(robot, box, name):
     run = robot.launch(robot.write('missing.launch.py', MISSING.format(name=name)))
     assert run.ended() == 1, run.text

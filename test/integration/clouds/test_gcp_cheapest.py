@@ -16,6 +16,7 @@ from rigs.azure import service
 from rigs.gce.catalogue import API_KEY
 
 CLOUDS = ('gcp',)
+pytestmark = pytest.mark.soak
 
 #: Azure without computers: it has the lowest price, and no capacity. It runs on the robot.
 FULL_AZURE = '''\

@@ -120,9 +120,7 @@ def test_talker_from_nothing_to_nothing(cloud, robot, box, name):
     assert len(asked) - looked <= CALLS + (time.monotonic() - begin) / POLL_INTERVAL, asked
 
 
-@pytest.mark.parametrize('cloud', [
-    'aws', *(pytest.param(name, marks=pytest.mark.soak) for name in ('azure', 'gcp'))],
-    indirect=True, scope='session')
+@pytest.mark.soak
 def test_machines_of_two_places_hear_each_other(cloud, robot, box, name):
     run = robot.launch(robot.write('two.launch.py', TWO.format(
         machine=cloud.machine, name=name, places=cloud.places)))
@@ -190,9 +188,7 @@ def test_kept_machine_is_baked_listed_and_deleted_elsewhere(cloud, robot, box, n
     assert not robot.things()
 
 
-@pytest.mark.parametrize('cloud', [
-    'aws', *(pytest.param(name, marks=pytest.mark.soak) for name in ('azure', 'gcp'))],
-    indirect=True, scope='session')
+@pytest.mark.soak
 def test_kept_machine_is_a_host_for_the_robots_of_its_fleet(cloud, robot, box, name, tmp_path):
     key = tmp_path / 'robot two'
     subprocess.run(['ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f', key], check=True)
@@ -336,6 +332,9 @@ def interrupted(cloud, robot, box, name, pattern, seconds):
     return run
 
 
+@pytest.mark.parametrize('cloud', [
+    'aws', *(pytest.param(name, marks=pytest.mark.soak) for name in ('azure', 'gcp'))],
+    indirect=True, scope='session')
 @pytest.mark.parametrize('seconds', [
     4.0, *(pytest.param(seconds, marks=pytest.mark.soak) for seconds in (0.5, 10.0))])
 def test_interrupted_request_for_a_machine_leaves_none(cloud, robot, box, name, seconds):
@@ -353,6 +352,9 @@ def test_interrupted_requests_before_the_machine_leave_nothing(cloud, robot, box
         assert run.errors == [] and box.alive() == []
 
 
+@pytest.mark.parametrize('cloud', [
+    'gcp', *(pytest.param(name, marks=pytest.mark.soak) for name in ('aws', 'azure'))],
+    indirect=True, scope='session')
 def test_machine_that_appears_after_its_launch_is_cleared(cloud, robot, box, name):
     """The launch does not wait for ever; one that is killed does not wait at all."""
     killed, ended = (interrupted(cloud, robot, box, f'{name}-{what}', cloud.order, 300.0)
