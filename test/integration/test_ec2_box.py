@@ -21,8 +21,7 @@ from rigs.ec2 import Ec2Box
 
 boto3 = pytest.importorskip('boto3', reason='needs boto3')
 pytest.importorskip('moto', reason='needs moto[server]')
-#: Tests of what other tests run in: launches there show most of it.
-pytestmark = [pytest.mark.soak, pytest.mark.usefixtures('engine')]
+pytestmark = pytest.mark.usefixtures('engine')
 
 UBUNTU = '/aws/service/canonical/ubuntu/server/24.04/stable/current/amd64/hvm/ebs-gp3/ami-id'
 ROBOT = '198.51.100.2'
@@ -175,6 +174,7 @@ def test_the_robot_has_no_way_out_and_may_move(box):
         box.move_robot(back=True)
 
 
+@pytest.mark.soak
 def test_what_ec2_refuses(box, key):
     words = {'MinCount': 1, 'MaxCount': 1, 'ImageId': ubuntu(box)}
     ec2 = client(box)
@@ -229,6 +229,7 @@ def traces_of(mark):
     return found + [str(path) for path in Path('/etc/netns').glob(f'fogt{mark}*')]
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize('whose', ['test', 'box'])
 def test_box_leaves_nothing_whichever_process_dies(box, whose, tmp_path):
     # its log's folder is what the one that is killed can't take away
