@@ -137,6 +137,7 @@ setup(
             'budget = fogros2_features.budget:Budget',
             'guests = fogros2_features.guests.feature:Guests',
             'idle = fogros2_features.idle:IdleTimeout',
+            'monitor = fogros2_monitor.feature:Monitor',
             'replacement = fogros2_features.replacement:Replacement',
             'results = fogros2_features.results:Results',
             'streams = fogros2_features.streams:Streaming',
@@ -144,7 +145,6 @@ setup(
             'volumes = fogros2_features.volumes:Volumes',
         ],
         'fogros2.monitor': [
-            'foxglove = fogros2_monitor:FOXGLOVE',
             'graph = fogros2_monitor:GRAPH',
         ],
         'fogros2.shell': [
@@ -196,7 +196,7 @@ setup(
         'fogros2.verb': [
             'bugreport = ros2fog_cli.verb.bugreport:BugreportVerb',
             'connect = ros2fog_cli.verb.connect:ConnectVerb',
-            'dashboard = ros2fog_cli.verb.dashboard:DashboardVerb',
+            'dashboard = fogros2_monitor.verbs:DashboardVerb',
             'delete = ros2fog_cli.verb.delete:DeleteVerb',
             'doctor = ros2fog_cli.verb.doctor:DoctorVerb',
             'env = ros2fog_cli.verb.env:EnvVerb',
@@ -208,7 +208,7 @@ setup(
             'leave = fogros2_features.guests.verbs:LeaveVerb',
             'list = ros2fog_cli.verb.list:ListVerb',
             'logs = ros2fog_cli.verb.logs:LogsVerb',
-            'monitor = ros2fog_cli.verb.monitor:MonitorVerb',
+            'monitor = fogros2_monitor.verbs:MonitorVerb',
             'plan = ros2fog_cli.verb.plan:PlanVerb',
             'price = ros2fog_cli.verb.price:PriceVerb',
             'regions = ros2fog_cli.verb.regions:RegionsVerb',

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from fogros2.actions.cloud_group import CloudGroup
     from fogros2.actions.fog_machine import FogMachine
-    from fogros2.actions.foxglove import Foxglove
     from fogros2.actions.launch_description import FogROSLaunchDescription
     from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, LifecycleNode, Node
     from fogros2.actions.replicated import Replicated
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from fogros2.runtime.interruption import MachineInterrupted
     from fogros2_features.guests.machine import JoinedMachine
     from fogros2_features.streams.entries import StreamTopic
+    from fogros2_monitor.action import Foxglove
 
 #: Written out for type checkers, which do not run the module.
 __all__ = [
@@ -56,7 +56,6 @@ __all__ = [
 _NAMES = {
     'actions.cloud_group': 'CloudGroup',
     'actions.fog_machine': 'FogMachine',
-    'actions.foxglove': 'Foxglove',
     'actions.launch_description': 'FogROSLaunchDescription',
     'actions.nodes': 'CloudNode ComposableNodeContainer LifecycleNode Node',
     'actions.replicated': 'Replicated',
@@ -71,6 +70,7 @@ _NAMES = {
     'runtime.interruption': 'MachineInterrupted',
 }
 _MODULES = {
+    'Foxglove': 'fogros2_monitor.action',
     'JoinedMachine': 'fogros2_features.guests.machine',
     'StreamTopic': 'fogros2_features.streams.entries',
     **{name: f'fogros2.{module}' for module, names in _NAMES.items() for name in names.split()}}

@@ -70,6 +70,17 @@ class RunningMachine(Protocol):
     def warn(self, text: str, remedy: str) -> None:
         """Warn the user, with what to do about it on a line of its own."""
 
+    def note(self, name: str, text: str) -> None:
+        """Let ``ros2 fog`` show a text while the launch runs: see ``Feature.notes``."""
+
+    def open_port(self, port: int, sources: Sequence[str]) -> tuple[str, int]:
+        """
+        Open a TCP port of the machine until the machine ends; return (host, port) to connect to.
+
+        :param sources: networks (CIDR) that may connect.
+        :raises FogError: the provider cannot open the port.
+        """
+
     def watch(
         self, name: str, argv: Sequence[str], interval: float, then: Callable[[str], None],
     ) -> None:
@@ -311,8 +322,12 @@ class Feature:
         :raises FogError: the feature can't work with it.
         """
 
-    def beside(self, spec: MachineSpec, own: Any) -> Sequence[NodeSpec]:
-        """Return programs that run on the machine beside its nodes, from its first node on."""
+    def beside(self, spec: MachineSpec, own: Any) -> Sequence[Any]:
+        """
+        Return programs that run on the machine beside its nodes, from its first node on.
+
+        Each is a NodeSpec, or an action of launch.
+        """
         return ()
 
     def vpn(self, link: VpnLink, own: Any) -> contextlib.AbstractContextManager[Any]:
@@ -323,6 +338,14 @@ class Feature:
         another robot's VPN.
         """
         return contextlib.nullcontext()
+
+    def application(self, own: Any) -> str:
+        """
+        Return the container image of a web application that serves HTTP on port 8080, '' for none.
+
+        Providers whose machines run no containers may run it beside the machine.
+        """
+        return ''
 
     def machine(self, running: RunningMachine, own: Any) -> contextlib.AbstractContextManager[Any]:
         """
@@ -351,6 +374,9 @@ class Feature:
         """
         return None
 
+    #: What it may note of a machine, and the line of ``ros2 fog list`` about that, with ``{name}``
+    #: of the machine and ``{note}``; '' for none.
+    notes: ClassVar[Mapping[str, str]] = {}
     #: The headings of its table in ``ros2 fog status``; none for no table.
     headings: ClassVar[Sequence[str]] = ()
 
@@ -387,13 +413,13 @@ def load(name: str) -> Feature:
     return feature
 
 
-def with_tables() -> dict[str, Feature]:
+def installed() -> dict[str, Feature]:
     """
-    Return the features that have a table, by name.
+    Return all features, by name.
 
-    :raises PrerequisiteError: a feature cannot be loaded.
+    :raises PrerequisiteError: one cannot be loaded.
     """
-    return {name: each for name in plugin_system.names(GROUP) if (each := load(name)).headings}
+    return {name: load(name) for name in plugin_system.names(GROUP)}
 
 
 def options(name: str, given: Mapping[str, Any], of: str = 'options') -> Any:
@@ -423,4 +449,4 @@ def names(spec: MachineSpec) -> Sequence[str]:
     :raises ConfigurationError: one is not installed.
     """
     return list(dict.fromkeys([*spec.features, *(
-        name for name in plugin_system.names(GROUP) if load(name).always)]))
+        name for name, each in installed().items() if each.always)]))

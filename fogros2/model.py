@@ -50,7 +50,6 @@ class MachineSpec:
     :param robot_timeout: seconds without the launch's heartbeat after which the nodes stop.
     :param environment: variables of every node on the machine.
     :param containers: ``docker run`` command lines that start before the nodes.
-    :param monitor_allow: networks (CIDR) that may reach its Foxglove bridge, besides the robot.
     :param apt: Debian packages to install; ``pip`` Python packages, in pip's syntax.
     :param share: topics that it has in common with machines of other robots on its host.
     :param features: the values of features' keywords, by feature; JSON types only.
@@ -69,9 +68,7 @@ class MachineSpec:
     bootstrap: Bootstrap = 'auto'
     environment: Mapping[str, str] = dataclasses.field(default_factory=dict)
     containers: tuple[str, ...] = ()
-    launch_foxglove: bool = False
     vpn: str = 'wireguard'
-    monitor_allow: tuple[str, ...] = ()
     apt: tuple[str, ...] = ()
     pip: tuple[str, ...] = ()
     share: tuple[str, ...] = ()
@@ -82,11 +79,6 @@ class MachineSpec:
     def workspaces(self) -> tuple[str, ...]:
         """All workspaces to send; the packages of earlier ones win."""
         return (self.workspace, *self.underlays) if self.workspace else ()
-
-    @property
-    def monitored(self) -> bool:
-        """Whether a Foxglove bridge starts with the first node."""
-        return self.launch_foxglove or bool(self.monitor_allow)
 
 
 @dataclasses.dataclass(frozen=True)

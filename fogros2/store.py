@@ -165,9 +165,7 @@ class Record:
     :param robot_vpn: the robot's VPN interface.
     :param carried: what carries the packets of its VPN in place of UDP, '' for nothing.
     :param agent: the agent's folder on the machine.
-    :param monitor: TCP port of its Foxglove bridge, 0 for none.
-    :param monitor_open: where external clients reach that bridge (``host:port``), '' if they
-        cannot.
+    :param notes: what features show of it while its launch runs, by name.
     :param made: what its launch has made and not undone yet, in this order.
     :param damage: why the record cannot be read, '' if it can.
     """
@@ -194,8 +192,7 @@ class Record:
     carried: str = ''
     agent: str = ''
     agent_program: str = ''
-    monitor: int = 0
-    monitor_open: str = ''
+    notes: Mapping[str, str] = dataclasses.field(default_factory=dict)
     made: tuple[Made, ...] = ()
     damage: str = ''
 
@@ -517,7 +514,7 @@ def record_from_json(data: Mapping[str, Any]) -> Record:
     values = {key: value for key, value in data.items() if key in names}
     fields = {f.name for f in dataclasses.fields(MachineSpec)}
     spec: dict[str, Any] = {k: v for k, v in values['spec'].items() if k in fields}
-    for key in ('underlays', 'containers', 'monitor_allow', 'apt', 'pip', 'share'):
+    for key in ('underlays', 'containers', 'apt', 'pip', 'share'):
         spec[key] = tuple(spec[key])
     values['spec'] = MachineSpec(**spec)
     for key, kind in (('shell', Endpoint), ('vpn', VpnInterface), ('robot_vpn', VpnInterface)):

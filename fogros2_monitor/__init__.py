@@ -15,14 +15,18 @@ files of robot models (:mod:`~fogros2_monitor.assets`).
 :mod:`~fogros2_monitor.tunnel` and :mod:`~fogros2_monitor.urls` open the bridge on the robot.
 :mod:`~fogros2_monitor.dashboard` is the page of ``ros2 fog dashboard``.
 
-``fogros2`` does not import this package. It finds the two programs below by the entry-point group
-``fogros2.monitor``.
+In launch files: :mod:`~fogros2_monitor.feature` has the keywords of machines
+(:mod:`~fogros2_monitor.networks`), :mod:`~fogros2_monitor.action` the action ``Foxglove``, which
+starts the bridge (:mod:`~fogros2_monitor.addresses`). :mod:`~fogros2_monitor.verbs` has the verbs
+of ``ros2 fog``, :mod:`~fogros2_monitor.access` reads a machine's token for them, and
+:mod:`~fogros2_monitor.browser` starts a browser.
+
+``fogros2`` and ``ros2fog_cli`` do not import this package. They find the program below by the
+entry-point group ``fogros2.monitor``.
 """
 
 import sys
 
-#: Package and executable that serve a machine's topics to Foxglove.
-FOXGLOVE = ('fogros2', 'bridge')
 #: Command that prints the topics of a launch, see :mod:`~fogros2_monitor.dashboard.graph`.
 #: Without the current folder: it may have modules of other accounts.
 GRAPH = (sys.executable, '-c', 'import sys; sys.path[:] = filter(None, sys.path); '

@@ -16,7 +16,7 @@ import ssl
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2.monitor_addresses import CREDENTIALS
+from fogros2_monitor.addresses import CREDENTIALS
 
 #: Validity of a certificate in days; longer than the lifetime of any machine.
 DAYS = 365
@@ -35,7 +35,7 @@ def make_token(folder: Path) -> Credentials:
     """
     Create the token unless it exists; delete the credentials of earlier launches.
 
-    :param folder: folder of this launch, see ``monitor_addresses.folder_of``. The function creates
+    :param folder: folder of this launch, see ``addresses.folder_of``. The function creates
         the folder and its parents with mode 0700.
     :raises OSError: the folder is not writable.
     """

@@ -30,8 +30,8 @@ import sys
 from ament_index_python.packages import get_package_prefix, PackageNotFoundError
 
 from fogros2.errors import FogError
-from fogros2.monitor_addresses import application_port
 from fogros2_monitor import credentials
+from fogros2_monitor.addresses import application_port
 from fogros2_monitor.application import say
 
 #: The parameter ``topics`` of ``foxglove_bridge``, which takes regular expressions.

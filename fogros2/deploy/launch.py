@@ -54,7 +54,7 @@ class Launch:
     ) -> None:
         self.id = secrets.token_hex(3)
         self.store = store or Store()
-        # `ros2 fog status --watch` and the dashboard read the journal
+        # `ros2 fog status --watch` reads the journal
         self.report: Reporter = Journal(report, self.store.root / 'launches' / self.id)
         self.timeouts = timeouts or Timeouts()
         self.cancel = cancel or threading.Event()

@@ -16,10 +16,10 @@ from fogros2.deploy.machine_job import MachineJob, SILENCE_TIMEOUT, Step
 from fogros2.deploy.steps.containers import Containers
 from fogros2.deploy.steps.installing import Modules
 from fogros2.deploy.steps.watching import POLL_INTERVAL, Watch
-from fogros2.deploy.undo import MONITOR_PORT
+from fogros2.deploy.undo import OPEN_PORT
 from fogros2.errors import AgentError, DeadlineExceeded, FogError
 from fogros2.events import Event
-from fogros2.model import Command, host_port, Machine, NodeSpec
+from fogros2.model import Command, Machine, NodeSpec
 from fogros2.report import Warned
 from fogros2.waiting import wait_until
 
@@ -132,9 +132,9 @@ class RunningMachine(Step):
         else:
             self.agent.request(command, timeout=30.0, **arguments)
 
-    def serves(self, port: int) -> None:
-        """Record the TCP port of the Foxglove bridge on the machine."""
-        self._job.save(monitor=port)
+    def note(self, name: str, text: str) -> None:
+        """Let ``ros2 fog`` show a note; see :class:`fogros2.feature.RunningMachine`."""
+        self._job.save(notes={**self._job.record.notes, name: text})
 
     def open_port(self, port: int, sources: Sequence[str]) -> tuple[str, int]:
         """
@@ -145,9 +145,8 @@ class RunningMachine(Step):
         """
         job = self._job
         if port not in self._published:  # a program that listens there may have restarted
-            job.makes(MONITOR_PORT, port)
+            job.makes(OPEN_PORT, port)
             self._published[port] = job.provider.open_port(self.machine, port, sources)
-            job.save(monitor_open=host_port(*self._published[port]))
         return self._published[port]
 
     def subscribe(self, callback: EventCallback) -> None:

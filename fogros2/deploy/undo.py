@@ -134,16 +134,16 @@ def _close_ssh(site: Site, made: Made) -> None:
 
 #: Kinds of what a launch makes; reports name them.
 WATCHDOG, NODES, VPN, CONTAINERS = 'watchdog', 'nodes', 'VPN', 'containers'
-SSH_PORT, MONITOR_PORT = 'firewall', 'port of the monitor'
+SSH_PORT, OPEN_PORT = 'firewall', 'open port'
 #: Kinds that need the provider alone, and are there while the machine is stopped.
-PORTS = (SSH_PORT, MONITOR_PORT)
+PORTS = (SSH_PORT, OPEN_PORT)
 _UNDO: Mapping[str, Callable[[Site, Made], object]] = {
     WATCHDOG: _remove_agent,
     NODES: lambda site, made: site.release(),
     VPN: _take_vpn_down,
     CONTAINERS: lambda site, made: site.clean_up([containers.remove(site.record.last)]),
     SSH_PORT: _close_ssh,
-    MONITOR_PORT: lambda site, made: site.provider.open_port(site.machine, made.port, ()),
+    OPEN_PORT: lambda site, made: site.provider.open_port(site.machine, made.port, ()),
 }
 
 

@@ -10,7 +10,7 @@ import shlex
 from typing import Any, NoReturn, Optional, TYPE_CHECKING, Union
 
 from fogros2 import ros_names
-from fogros2.describe import features, names, networks, values, variables
+from fogros2.describe import features, names, values, variables
 from fogros2.describe.kinds import check, options_of, parameters_of
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.host import containers, dependencies
@@ -42,7 +42,6 @@ class CloudInstance:
         Its sourced underlays are sent too.
     :param working_dir_base: accepted for FogROS2's launch files; only :meth:`info` shows it. The
         records of machines are below FOGROS2_STATE_HOME.
-    :param launch_foxglove: serve the machine's topics to Foxglove.
     :param name: up to 40 lower-case letters, digits and hyphens, unique on this robot; without
         a name, each launch invents one.
     :param on_exit: what happens to the machine when the launch ends: 'delete', 'stop' or 'keep'.
@@ -57,8 +56,6 @@ class CloudInstance:
     :param apt: Debian packages that the machine needs, such as 'libzbar0'.
     :param pip: Python packages that the machine needs, in pip's syntax ('pyzbar>=0.1.9'). If the
         system has the same package, the system's version is used.
-    :param monitor_allow: networks (CIDR) from which external clients may connect to the Foxglove
-        bridge, by TLS and with a token.
     :param share: topics, such as '/map', that pass between this launch and those of other robots
         whose machines are on the same host and list them too; serialized, with their QoS.
     :param options: the provider's own options; subclasses set it.
@@ -71,15 +68,13 @@ class CloudInstance:
 
     def __init__(
         self, ros_workspace: Optional[SomeSubstitutionsType] = None,
-        working_dir_base: Optional[SomeSubstitutionsType] = None,
-        launch_foxglove: Bool = False, *,
+        working_dir_base: Optional[SomeSubstitutionsType] = None, *,
         name: Optional[SomeSubstitutionsType] = None,
         on_exit: SomeSubstitutionsType = 'delete',
         lifetime: Optional[Value] = None,
         robot_timeout: Optional[Value] = None,
         bootstrap: Optional[SomeSubstitutionsType] = None,
         environment: Optional[Mapping[str, SomeSubstitutionsType]] = None,
-        monitor_allow: Optional[Sequence[SomeSubstitutionsType]] = None,
         apt: Optional[Sequence[SomeSubstitutionsType]] = None,
         pip: Optional[Sequence[SomeSubstitutionsType]] = None,
         share: Optional[Sequence[SomeSubstitutionsType]] = None,
@@ -103,8 +98,6 @@ class CloudInstance:
         self._values = {name: parameters[name] for name in _CHECKS if parameters[name] is not None}
         self._environment = dict(environment or {})
         self._options = {k: v for k, v in (options or {}).items() if v is not None}
-        self._foxglove = launch_foxglove
-        self._monitor_allow = networks.items(monitor_allow)
         self._containers: list[SomeSubstitutionsType] = []
         self._lists = {name: _listed(name, parameters) for name, parameters in (
             ('apt', apt), ('pip', pip), ('share', share))}
@@ -280,9 +273,6 @@ class CloudInstance:
                     key: str(self._resolved(context, 'environment', value))
                     for key, value in self._environment.items()}, context.environment),
                 containers=tuple(values.resolve(context, line) for line in self._containers),
-                launch_foxglove=self._resolved(
-                    context, 'launch_foxglove', values.Bool(self._foxglove)),
-                monitor_allow=networks.resolve(context, self._monitor_allow),
                 apt=self._wanted(context, 'apt'), pip=self._wanted(context, 'pip'),
                 share=self._wanted(context, 'share'),
                 features=features.by_feature({

@@ -55,6 +55,7 @@ class Capabilities:
     :param account: a launch has a login there that another robot gave and may take away, and
         nothing beside it; ``other_vpn`` and ``join`` lead to the machine.
     :param containers: a container engine can run on its machines, without an option for it.
+    :param ports: other networks reach a port of the machine after ``open_port``.
     :param firewall: ``allow`` and ``robot_address`` decide who reaches a machine. The launch then
         closes the SSH port as soon as the VPN works.
     :param one_time_host_key: other programs may have read the host key that ``describe`` reports.
@@ -83,6 +84,7 @@ class Capabilities:
     owned: bool = True
     account: bool = False
     containers: bool = True
+    ports: bool = True
     firewall: bool = False
     one_time_host_key: bool = False
     stop: bool = False

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Optional
 
-from fogros2 import feature, plugin_system
+from fogros2 import feature
 from fogros2.feature import LaunchPart, Program, RunningLaunch
 from fogros2.model import NodeSpec
 
@@ -22,10 +22,9 @@ class Parts:
     """
 
     def __init__(self, launch: RunningLaunch) -> None:
-        self._parts: dict[str, LaunchPart] = {}
-        for name in plugin_system.names(feature.GROUP):
-            one = feature.load(name)
-            self._parts[one.node_list[0] or name] = one.in_launch(launch)
+        self._parts: dict[str, LaunchPart] = {
+            one.node_list[0] or name: one.in_launch(launch)
+            for name, one in feature.installed().items()}
 
     def __iter__(self) -> Iterator[LaunchPart]:
         return iter(self._parts.values())

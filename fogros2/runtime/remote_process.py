@@ -15,7 +15,7 @@ from launch.actions import ExecuteLocal
 from fogros2 import feature, plan
 from fogros2.launch_internals import components, private
 from fogros2.model import NodeSpec
-from fogros2.runtime import foxglove, node_spec
+from fogros2.runtime import node_spec
 from fogros2.runtime.added_process import AddedProcess
 from fogros2.runtime.coordinator import Coordinator, Planned
 from fogros2.runtime.remote_run import RemoteRun
@@ -136,7 +136,7 @@ class RemoteProcess:
     def _helpers(
         self, coordinator: Coordinator, session: Session,
     ) -> list[LaunchDescriptionEntity]:
-        """Return the machine's containers, relay and Foxglove bridge, with its first process."""
+        """Return containers, relay and features' programs of a machine, with its first process."""
         if session.has_helpers or session.interrupted:
             return []
         session.has_helpers = True
@@ -153,13 +153,9 @@ class RemoteProcess:
                 id=f'share-{name}', name='share', package='fogros2', executable='share',
                 respawn=True, respawn_delay=1.0, arguments=(json.dumps({
                     'topics': session.spec.share, 'folders': folders}),)), name))
-        helpers += [process_on(node, name) for each, own in feature.used(session.spec)
-                    for node in each.beside(session.spec, own)]
-        if session.spec.monitored:
-            bridge, started = foxglove.on_machine(
-                coordinator, session, allow=session.spec.monitor_allow)
-            send(bridge, name)
-            helpers += [bridge, started]
+        helpers += [process_on(one, name) if isinstance(one, NodeSpec) else one
+                    for each, own in feature.used(session.spec)
+                    for one in each.beside(session.spec, own)]
         return helpers
 
     def _come_here(self, context: LaunchContext) -> None:

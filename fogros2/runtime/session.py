@@ -99,7 +99,7 @@ class Session:
         self.running: Optional[RunningMachine] = None
         #: True when the machine is up, False when it never will be.
         self.came_up: asyncio.Future[bool] = loop.create_future()
-        #: Whether containers and monitor of the machine have been requested.
+        #: Whether containers and programs beside the nodes have been requested.
         self.has_helpers = False
         #: New names of topics and services that the node ``first_answer`` serves on the robot.
         self.replicated: dict[str, str] = {}
@@ -241,16 +241,6 @@ class Session:
     def halted(self, run: RemoteRun) -> bool:
         """Note that a process has left its machine; return whether it must not start elsewhere."""
         return False
-
-    def open_port(
-        self, port: int, sources: Sequence[str], opened: Callable[[str, int], None],
-    ) -> None:
-        """Open a TCP port of the running machine; ``opened`` is called with host and port."""
-        async def open_port() -> None:
-            assert self.running is not None
-            opened(*await self._in_thread(self.running.open_port, port, sources))
-
-        self.request(open_port)
 
     # -- the machine ----------------------------------------------------------------------------
 

@@ -36,7 +36,7 @@ class JoinedProvider(Provider):
 
     name: ClassVar[str] = 'joined'
     capabilities: ClassVar[Capabilities] = Capabilities(
-        shell_kind='guest', owned=False, account=True, containers=False)
+        shell_kind='guest', owned=False, account=True, containers=False, ports=False)
     poll_interval: ClassVar[float] = 0.1
 
     def check(self, spec: MachineSpec) -> None:
@@ -44,9 +44,6 @@ class JoinedProvider(Provider):
         if not self._unsealed(spec).interface:
             raise ConfigurationError(f"the invitation of '{spec.name}' has no place for nodes",
                                      'invite by a newer version of FogROS2')
-        if spec.monitored:
-            raise Unsupported(f"'{spec.name}' is another robot's, and serves no viewer",
-                              'leave launch_foxglove and monitor_allow out')
 
     def _text(self, spec: MachineSpec) -> str:
         return parsed(Options, spec.options, 'a joined machine').invitation

@@ -401,7 +401,7 @@ def let_go(record: Record, machine: Optional[Machine], store: Store) -> None:
             record, launch='', pid=0, pid_start=0, robot_vpn=None))
         if machine is not None:
             store.save(dataclasses.replace(
-                record, monitor_open='', made=close_ports(_Left(record, machine))))
+                record, notes={}, made=close_ports(_Left(record, machine))))
 
 
 def leftovers(store: Store, now: Optional[float] = None) -> list[Path]:

@@ -14,9 +14,9 @@ import threading
 import time
 from typing import Any, Optional
 
+from fogros2 import plugin_system
 from fogros2.errors import FogError
 from fogros2.store import Record, Store
-from fogros2_monitor import GRAPH
 from ros2fog_cli.api import reach
 
 #: Seconds before an ended program is restarted, and time-out of a program's end in seconds.
@@ -39,8 +39,9 @@ class Graph:
         self._told = ''
         # A launch has its own DDS configuration, so its graph needs its own process.
         self._process = subprocess.Popen(
-            GRAPH, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            text=True, errors='replace', env=environment,
+            plugin_system.load('fogros2.monitor', 'graph'), stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors='replace',
+            env=environment,
             # Ctrl-C must reach only this process, which then closes the program's standard input.
             start_new_session=True)
         self._readers = [threading.Thread(target=read, daemon=True, name='fog-graph')
@@ -170,10 +171,10 @@ class Graphs:
             return None
         try:
             environment = reach.robot_environment(record, self._store)
+            if environment is None:
+                return None  # the launch has just ended
+            self._graphs[launch] = Graph({**os.environ, **environment})
         except FogError as error:
             self._refused[launch] = now, f'topics are not looked at: {error}'
             return None
-        if environment is None:
-            return None  # the launch has just ended
-        self._graphs[launch] = Graph({**os.environ, **environment})
         return self._graphs[launch]

@@ -12,7 +12,7 @@ import threading
 import time
 from typing import Any, NamedTuple, Optional, TypeVar
 
-from fogros2 import monitor_addresses, plugin_system
+from fogros2 import feature, plugin_system
 from fogros2.errors import (
     Cancelled,
     ConfigurationError,
@@ -120,12 +120,11 @@ class Entry:
         return shell.host if shell is not None else ''
 
     @property
-    def monitor(self) -> str:
-        """The Foxglove bridge's address for this robot, without its token; '' if none runs."""
-        record = self.record
-        if record is None or not record.monitor or record.vpn is None or not record.launch_alive:
-            return ''
-        return monitor_addresses.bridge(record.vpn.address, record.monitor)
+    def notes(self) -> dict[str, Optional[str]]:
+        """What features have noted of the machine while its launch runs, by name."""
+        alive = self.record is not None and self.record.launch_alive
+        return {key: self.record.notes.get(key) if alive and self.record else None
+                for key in notes()}
 
     @property
     def launch(self) -> str:
@@ -175,12 +174,16 @@ class Entry:
             'place': self.known.region, 'kind': self.known.kind,
             'image': self.known.image or None, 'key': self.known.key or None,
             'disk_gb': self.known.disk_gb,
-            'monitor': self.monitor or None,
-            'monitor_open': self.record.monitor_open or None
-            if self.record is not None and self.monitor else None,
+            **self.notes,
             'cost_per_hour': None if self.cost is None else float(self.cost),
             'cost': None if (spent := self.spent(now)) is None else round(float(spent), 6),
         }
+
+
+def notes() -> dict[str, str]:
+    """Return what features may note of machines, each with its line for ``ros2 fog list``."""
+    return {key: line for each in feature.installed().values()
+            for key, line in each.notes.items()}
 
 
 class Answer(NamedTuple):

@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 import time
 from typing import Any, Optional, TextIO
+from urllib.parse import urlsplit
 
 from fogros2 import journal
 from fogros2.clock import ClockOffset
@@ -98,7 +99,7 @@ def machine_json(key: str, shown: Shown) -> dict[str, Any]:
         'address': entry.address, 'place': entry.known.region, 'kind': entry.known.kind,
         'cost_per_hour': None if entry.cost is None else float(entry.cost),
         'on_exit': record.spec.on_exit if record is not None else '',
-        'bridge': record.monitor if record is not None else 0,
+        'bridge': urlsplit(record.notes.get('monitor', '') if record else '').port or 0,
         'steps': steps,
         'vpn': _vpn(follower.vpn) if follower is not None else None,
         'clock': None if follower is None or shown.clock is None

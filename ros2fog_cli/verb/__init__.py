@@ -81,17 +81,6 @@ def region(text: str) -> str:
     raise argparse.ArgumentTypeError(f"no provider has a region '{text}' ({hint})")
 
 
-def port(text: str) -> int:
-    """
-    Parse a TCP port, 0 for any free one.
-
-    :raises argparse.ArgumentTypeError: it is none.
-    """
-    if not text.isdecimal() or int(text) > 65535:
-        raise argparse.ArgumentTypeError(f"'{text}' is no port (0 to 65535)")
-    return int(text)
-
-
 def seconds(text: str) -> float:
     """
     Parse a number of seconds, 0 or more.
@@ -171,14 +160,6 @@ def print_json(**fields: object) -> None:
     """Print what ``--json`` of a verb shows."""
     from ros2fog_cli.api import output
     print(output.as_json(fields), flush=True)
-
-
-def add_page(parser: argparse.ArgumentParser) -> None:
-    """Add the options of verbs that serve a page."""
-    parser.add_argument('--port', type=port, default=0,
-                        help='port of this computer (default: any free port)')
-    parser.add_argument('--no-browser', action='store_true',
-                        help='print the address, but start no browser')
 
 
 def say(text: str, *, error: bool = False) -> None:

@@ -49,9 +49,9 @@ class ListVerb(VerbExtension):
             width=table.terminal_width(),
             optional=('KIND', 'PLACE', 'ADDRESS', 'COST', 'AGE', 'COST/H', 'PROVIDER')))
         for entry in entries:
-            if entry.monitor:
-                print(f'{entry.name}: topics at {entry.monitor}; '
-                      f'with its token: ros2 fog monitor {entry.name}')
+            for key, line in machines.notes().items():
+                if line and entry.notes[key]:
+                    print(f'{entry.name}:', line.format(name=entry.name, note=entry.notes[key]))
         total = machines.total(entries, now)
         if total is not None:
             unknown = sum(entry.runs and entry.cost is None for entry in entries)

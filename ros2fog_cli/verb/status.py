@@ -36,7 +36,7 @@ class StatusVerb(VerbExtension):
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the status; return 1 if there are problems or no expected agent answers."""
         from fogros2.errors import ConfigurationError, FogError
-        from fogros2.feature import used, with_tables
+        from fogros2.feature import installed, used
         from fogros2.store import other_vpn, Store
         from ros2fog_cli.api import reach, replicas
         if args.watch:
@@ -55,7 +55,7 @@ class StatusVerb(VerbExtension):
         if other is not None and not store.exists(args.name):
             return show_link(reach.link_of(other), as_json=args.json)
         entry = reach.find(args.name, warn, regions=args.region)
-        tables = with_tables()
+        tables = {name: each for name, each in installed().items() if each.headings}
         status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'clock': None, 'agent': None,
                                   'streams': [], 'replicas': [], 'features': [],
                                   **{name: [] for name in tables}}
@@ -123,7 +123,7 @@ def show(
 
     from fogros2.clock import ClockOffset
     from fogros2.report import size
-    from ros2fog_cli.api import replicas
+    from ros2fog_cli.api import machines, replicas
     from ros2fog_cli.api.table import cost, duration, NODES, nodes, shares, table
     now = time.time()
     lines = [
@@ -131,7 +131,7 @@ def show(
         ('state', status['state']),
         ('address', status['address'] or '-'),
         *((key.replace('_', ' '), status[key])
-          for key in ('place', 'kind', 'monitor', 'monitor_open') if status[key]),
+          for key in ('place', 'kind', *machines.notes()) if status[key]),
         ('age', duration(status['age'])),
         ('time left', duration(status['time_left'])),
         ('launch', 'none: it is kept for the next one' if idle else status['launch'] or '-'),

@@ -17,9 +17,9 @@ pytest.importorskip('websocket', reason='the extra "kubernetes" is not installed
 
 from fogros2.errors import NameTaken
 from fogros2.waiting import wait_until
+from fogros2_monitor.browser import Ticket
 from fogros2_monitor.dashboard.server import Dashboard
 from rigs.browser import Browser, program
-from ros2fog_cli.api.browser import Ticket
 
 pytestmark = [
     pytest.mark.skipif(program() is None, reason='needs Chromium'),

@@ -118,7 +118,7 @@ PYTHON_MACHINE = {
     'spot': True, 'min_memory_gb': 7.5, 'gpu': 'L4', 'max_price': 0.30,
     'regions': ['eu-west-1', 'eu-west-2'], 'ssh_from': ['198.51.100.0/24'],
     'instance_types': ['t3.large', 't3.nano'], 'on_exit': 'stop', 'lifetime': '1h30m',
-    'robot_timeout': 60, 'bandwidth': '10Mbit/s', 'ros_workspace': '',
+    'robot_timeout': 60, 'bandwidth': '10Mbit/s', 'launch_foxglove': False, 'ros_workspace': '',
     'tags': {'team': 'slam', 'cost': '42'}, 'environment': {'RCUTILS_COLORIZED_OUTPUT': '1'}}
 
 

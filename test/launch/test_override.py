@@ -91,8 +91,8 @@ def test_container_moves_to_another_computer_and_back():
 def test_what_holds_for_any_machine_can_be_said_too():
     found = spec('planner=aws,on_exit=keep,lifetime=2h,launch_foxglove=true,ros_workspace=/ws',
                  AWSCloudInstance(**AWS))
-    assert (found.on_exit, found.lifetime, found.launch_foxglove, found.workspace) == (
-        'keep', 7200.0, True, '/ws')
+    assert (found.on_exit, found.lifetime, found.features, found.workspace) == (
+        'keep', 7200.0, {'monitor': {'launch_foxglove': True}}, '/ws')
     assert found.environment == {'A': 'b'}
 
 

@@ -30,13 +30,13 @@ from fogros2.shell import relay
 from fogros2.waiting import wait_until
 from fogros2_features.guests.program import Door
 from fogros2_monitor import accounts, request
+from fogros2_monitor.browser import Ticket
 from fogros2_monitor.dashboard.server import Dashboard
 from fogros2_monitor.gate import Gate
 from fogros2_monitor.tunnel import Tunnel
 from fogros2_testing.fakes import FakeShell
 from rigs import loops
 from rigs.stranger import stranger
-from ros2fog_cli.api.browser import Ticket
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Another account opens the helper's folder and locks it; then root makes a name a user's own.

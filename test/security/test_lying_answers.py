@@ -19,8 +19,8 @@ from fogros2.shell import host_key, sync
 from fogros2.untrusted import InvalidMessage
 from fogros2.vpn import addresses
 from fogros2_features.replacement import snapshots
+from fogros2_monitor import access
 from fogros2_testing import FakeShell
-from ros2fog_cli.api import monitor
 
 DIGITS = '9' * 5000
 #: What a machine may print in place of what was asked for.
@@ -68,11 +68,11 @@ def installed(answer: str, _: Path) -> None:
 
 
 def tokens(answer: str, _: Path) -> None:
-    record = SimpleNamespace(agent='/run/a', monitor=1, launch_alive=True, launch='1',
-                             monitor_open='203.0.113.1:8765')
+    record = SimpleNamespace(agent='/run/a', launch_alive=True, launch='1', notes={
+        'monitor': 'ws://198.18.7.2:1', 'monitor_open': '203.0.113.1:8765'})
     entry: Any = SimpleNamespace(name='planner', provider='fake', record=record)
-    for read in (lambda: monitor.token_of(entry, Machine(answer), 1),
-                 lambda: monitor.credentials_of(entry, Machine(answer))[1]):
+    for read in (lambda: access.token_of(entry, Machine(answer), 1),
+                 lambda: access.credentials_of(entry, Machine(answer))[1]):
         assert read().isascii()
 
 

@@ -25,11 +25,9 @@ import urllib.parse
 import pytest
 
 from fogros2.waiting import wait_until
-from fogros2_monitor import page, request, urls
+from fogros2_monitor import access, page, request, urls, verbs
 from rigs.domains import taken
-from ros2fog_cli.api import monitor as monitor_api
 from ros2fog_cli.api import reach
-from ros2fog_cli.verb import monitor
 
 pytest.importorskip('foxglove', reason='the extra "monitor" is not installed')
 
@@ -185,11 +183,11 @@ def test_no_link_to_another_site_has_the_token(
     """The servers of a hosted application would get it in the address that a browser requests."""
     token, where = 'sesame-0123456789', '198.51.100.7:8766' if encrypted else 'localhost:8765'
     monkeypatch.setattr(reach, 'session', lambda entry: contextlib.nullcontext())
-    monkeypatch.setattr(monitor_api, 'credentials_of', lambda *_: (where, token, 'AB:CD'))
+    monkeypatch.setattr(access, 'credentials_of', lambda *_: (where, token, 'AB:CD'))
     if encrypted:
-        monitor.share(SimpleNamespace())  # type: ignore[arg-type]
+        verbs.share(SimpleNamespace())  # type: ignore[arg-type]
     else:
-        monitor.say('{}', where, token)
+        verbs.say('{}', where, token)
     asked = request.parse(f'GET /?token={token} HTTP/1.1\r\nHost: {where}\r\n\r\n'.encode())
     answer = page.links(asked, 'planner', token, encrypted=encrypted).decode()
     for text in (capsys.readouterr().out, html.unescape(answer)):

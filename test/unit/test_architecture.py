@@ -29,7 +29,7 @@ ORDER = """
     ros_names
     waiting report process
     agent ros_types
-    plugin_system store journal ros2_daemon monitor_addresses
+    plugin_system store journal ros2_daemon
     kubernetes_client
     shell vpn dds
     agent_client
@@ -77,7 +77,8 @@ PUBLIC = CORE / '__init__.py'
 #: Names of features that the core had, and clouds may have. Only ever add some.
 MOVED = (
     'StreamTopic', 'image_transport', 'republish(ers)?', r'[Cc]heckpoint\w*', r'[Rr]eplacer\w*',
-    r'Replacement\w*', 'drained', r'\w*[Gg]uest\w*', '[Ii]nvit(e|ed|ations?)', 'JoinedMachine')
+    r'Replacement\w*', 'drained', r'\w*[Gg]uest\w*', '[Ii]nvit(e|ed|ations?)', 'JoinedMachine',
+    'Foxglove', '[Mm]onitor(ed)?', '[Dd]ashboard')
 CLOUDS = {'aws', 'azure', 'gcp', 'kubernetes'}
 #: All of the core but the import of types.
 BUT_TYPES = r'fogros2(?! import ros_types$)'
@@ -190,10 +191,11 @@ def test_exceptions_name_what_exists() -> None:
 
 
 @pytest.mark.parametrize(('folder', 'above'), [
-    ('fogros2', ABOVE), ('fogros2_monitor', tuple(n for n in ABOVE if n != 'fogros2_monitor')),
+    ('fogros2', ABOVE),
     # a feature may have verbs
-    ('fogros2_features', tuple(n for n in ABOVE[1:] if n != 'ros2fog_cli')),
-    ('ros2fog_cli', ('fogros2_features', 'fogros2_testing', 'rigs')),
+    *((own, tuple(n for n in ABOVE if n not in (own, 'ros2fog_cli')))
+      for own in ('fogros2_features', 'fogros2_monitor')),
+    ('ros2fog_cli', ('fogros2_features', 'fogros2_monitor', 'fogros2_testing', 'rigs')),
     ('fogros2_replicas', (BUT_TYPES, 'fogros2_monitor', 'ros2fog_cli', 'rigs')),
     ('fogros2_share', (BUT_TYPES, 'fogros2_monitor', 'ros2fog_cli', 'rigs')),
     ('point_cloud_stream', (*ABOVE, 'fogros2')),
@@ -248,7 +250,8 @@ def test_ros_and_sdks_are_imported_by_their_parts(path: Path) -> None:
 def test_verb_imports_nothing_slow_before_it_runs() -> None:
     """``ros2 fog -h`` loads all verbs; one of them must not bring an SDK or the core with it."""
     for path in (*python_files(ROOT / 'ros2fog_cli' / 'verb'),
-                 *(ROOT / 'fogros2_features').glob('*/verbs.py')):
+                 *(ROOT / 'fogros2_features').glob('*/verbs.py'),
+                 ROOT / 'fogros2_monitor' / 'verbs.py'):
         for name, early in imports(path):
             if early:
                 assert name.split('.')[0] in (

@@ -515,14 +515,14 @@ def test_gc_closes_the_ports_of_a_kept_machines_launch(
     monkeypatch.setattr(Memory, 'capabilities', Capabilities(firewall=True))
     monkeypatch.setattr(Memory, 'allow', lambda self, *what: closed.append(what))
     machine('a')
-    ports = Made(undo.SSH_PORT, 2222), Made(undo.MONITOR_PORT, 8766)
-    record('a', on_exit='keep', monitor_open='198.51.100.7:8766',
+    ports = Made(undo.SSH_PORT, 2222), Made(undo.OPEN_PORT, 8766)
+    record('a', on_exit='keep', notes={'monitor_open': '198.51.100.7:8766'},
            made=(*ports, Made(undo.NODES)), **dead())
     assert run('gc') == 0
     assert capsys.readouterr().out == 'cleared leftovers of a: its launch is gone\n'
     assert closed == [('id-a', 8766, ()), ('id-a', 2222, ())]
     after = Store().load('a')
-    assert (after.launch, after.monitor_open, after.made) == ('', '', (Made(undo.NODES),))
+    assert (after.launch, after.notes, after.made) == ('', {}, (Made(undo.NODES),))
 
 
 def test_gc_tries_ports_again_that_could_not_be_closed(

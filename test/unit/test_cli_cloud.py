@@ -49,13 +49,13 @@ from fogros2.provider import (
 from fogros2.provider.offers import MachineType, Offer, Offers, ranked, Region, Wants
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.waiting import wait_until
+from fogros2_monitor import access
 from fogros2_testing.fakes import FakeProvider, FakeShell
 from fogros2_testing.plugins import instead
 from ros2fog_cli.api import (
     doctor,
     endings,
     images,
-    monitor,
     pod_image,
     progress,
     reach,
@@ -869,4 +869,4 @@ def test_token_that_takes_long_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> 
 
     entry = Entry('slam', 'cloud', machine('slam'), record('slam', launch='abc123', agent='/run'))
     with pytest.raises(DeadlineExceeded, match='ros2 fog status slam'):
-        monitor.token_of(entry, Slow(), 8765)
+        access.token_of(entry, Slow(), 8765)

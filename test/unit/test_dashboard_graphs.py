@@ -51,7 +51,7 @@ def launched(launch: str = 'abc123', **changes: Any) -> Record:
 
 def instead(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
     monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
-    monkeypatch.setattr(graphs, 'GRAPH', (sys.executable, '-c', program))
+    monkeypatch.setattr('fogros2_monitor.GRAPH', (sys.executable, '-c', program))
 
 
 def test_output_of_a_graph_program_is_collected(

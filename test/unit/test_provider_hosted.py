@@ -223,13 +223,6 @@ def test_wrong_options_are_refused_without_the_host(
         HostedProvider().check(MachineSpec('planner', 'hosted', options))
 
 
-def test_viewers_of_other_computers_are_refused() -> None:
-    spec = MachineSpec('planner', 'hosted', {'on': {'host': 'box'}},
-                       monitor_allow=('198.51.100.0/24',))
-    with pytest.raises(Unsupported, match='monitor_allow'):
-        HostedProvider().check(spec)
-
-
 @pytest.mark.parametrize('machine_id', ['x', ID, 'hosted:', f'hosted:{ID}', 'ssh:host=a'])
 def test_foreign_id_is_no_machine(machine_id: str) -> None:
     with pytest.raises(MachineNotFound):

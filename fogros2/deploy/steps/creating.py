@@ -10,7 +10,7 @@ import time
 from typing import Any, Optional
 import uuid
 
-from fogros2 import feature, model, monitor_addresses, plan, process
+from fogros2 import feature, model, plan, process
 from fogros2.deploy import requests
 from fogros2.deploy.machine_job import Step
 from fogros2.deploy.undo import close_ports
@@ -173,7 +173,8 @@ class Creation(Step):
                 dependencies=dependencies, with_volumes={
                     name: volume for each, own in feature.used(job.spec)
                     for name, volume in each.volumes(own).items()},
-                application=monitor_addresses.IMAGE if job.spec.monitored else ''))
+                application=next(filter(None, (
+                    each.application(own) for each, own in feature.used(job.spec))), '')))
         except FogError as error:
             # after a refusal, no machine has to be looked for
             self._asked = not error.refused
@@ -207,7 +208,7 @@ class Creation(Step):
         job.save(
             token=token, created=job.record.created or time.time(), armed=time.time(),
             launch=context.launch, last=context.launch, robot=robot_id(), **this_process(),
-            robot_vpn=context.vpn.interface, carried='', monitor=0, monitor_open='')
+            robot_vpn=context.vpn.interface, carried='', notes={})
 
     def _login_key(self) -> str:
         context, job = self._context, self._job
@@ -232,7 +233,7 @@ class Creation(Step):
                     return
                 if mode == 'stop' and job.record.machine_id is not None:
                     context.provider.stop(job.record.machine_id)
-                job.save(launch='', pid=0, pid_start=0, robot_vpn=None, monitor_open='')
+                job.save(launch='', pid=0, pid_start=0, robot_vpn=None, notes={})
         finally:
             context.choices.end(job.name)
 

@@ -119,7 +119,7 @@ class HostedProvider(Provider):
 
     name: ClassVar[str] = 'hosted'
     capabilities: ClassVar[Capabilities] = dataclasses.replace(
-        ContainerProvider.capabilities, keeps_volumes=False)
+        ContainerProvider.capabilities, keeps_volumes=False, ports=False)
 
     def __init__(self) -> None:
         self._ssh: Provider = plugin_system.load('fogros2.provider', 'ssh')()
@@ -170,9 +170,6 @@ class HostedProvider(Provider):
     def check(self, spec: MachineSpec) -> None:
         """Check the options without a connection; the host checks their values."""
         self._ssh.check(MachineSpec(spec.name, 'ssh', self._options(spec)[0]))
-        if spec.monitor_allow:
-            raise Unsupported(f"'{spec.name}' can't open a port of its host for monitor_allow",
-                              "leave it out, and use 'ros2 fog monitor'")
 
     def check_here(self, spec: MachineSpec) -> None:
         """Check that the host answers."""

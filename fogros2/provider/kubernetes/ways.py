@@ -261,7 +261,7 @@ def open_port(
     except DeadlineExceeded as error:
         raise ProviderError(
             f'the cluster created no load balancer for {what} in {exposure.LOAD_BALANCER:.0f} s',
-            'leave monitor_allow= out on this cluster') from error
+            'let no other networks in on this cluster') from error
     return node_hosts(api, pod, cancel)[0], exposure.node_port(made)
 
 

@@ -27,7 +27,7 @@ TIMEOUT = 150.0
 #: Seconds after its end for which a Job stays here, by its ttlSecondsAfterFinished.
 TTL = 5
 #: Has a launch file take the tests' web application for Lichtblick.
-IMAGE = f"from fogros2 import monitor_addresses\nmonitor_addresses.IMAGE = '{APPLICATION}'\n"
+IMAGE = f"from fogros2_monitor import addresses\naddresses.IMAGE = '{APPLICATION}'\n"
 
 HEADER = """
 from fogros2 import CloudNode, FogROSLaunchDescription, KubeInstance

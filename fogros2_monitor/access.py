@@ -11,13 +11,13 @@ import socket
 import threading
 from typing import Optional
 
-from fogros2 import monitor_addresses, untrusted
+from fogros2 import untrusted
 from fogros2.deploy.machine_job import AGENT_FOLDER
 from fogros2.errors import AgentError, CommandError, ConfigurationError, DeadlineExceeded
 from fogros2.model import Command
 from fogros2.shell import Shell
 from fogros2.store import Store
-from fogros2_monitor import credentials
+from fogros2_monitor import addresses, credentials
 from fogros2_monitor.tunnel import Tunnel
 from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Entry
@@ -48,7 +48,7 @@ def carrying(tunnel: Tunnel) -> Iterator[threading.Event]:
 
 def on_robot(name: str) -> Optional[tuple[int, str]]:
     """Return port and token of the bridge of a machine that this robot replaces, or None."""
-    folder = monitor_addresses.on_robot(Store(), name)
+    folder = addresses.on_robot(Store(), name)
     for path in folder.glob('monitor-*/*/token'):
         port = int(path.parts[-3].partition('-')[2])
         with contextlib.suppress(OSError), socket.create_connection(
@@ -68,7 +68,7 @@ def token_of(entry: Entry, shell: Shell, port: int) -> str:
         or machines.load(entry.provider).capabilities.agent_directory \
         or f'{AGENT_FOLDER}/{entry.name}'
     return _read(entry, shell, ('sh', '-c', 'cat "$1"/*/token', 'sh',
-                                str(Path(monitor_addresses.folder_of(folder, port, '')))))[0]
+                                str(Path(addresses.folder_of(folder, port, '')))))[0]
 
 
 def credentials_of(entry: Entry, shell: Shell) -> tuple[str, str, str]:
@@ -79,18 +79,20 @@ def credentials_of(entry: Entry, shell: Shell) -> tuple[str, str, str]:
     :raises AgentError: no running launch of this robot serves the bridge, or it has no token yet.
     """
     record = entry.record
-    if record is None or not record.monitor or not record.launch_alive or not record.agent:
+    port = 0 if record is None else addresses.port_of(record.notes)
+    if record is None or not port or not record.launch_alive or not record.agent:
         raise AgentError(f"no launch of this robot serves the topics of '{entry.name}' now",
                          'ros2 fog list shows the robot of the machine')
-    if not record.monitor_open:
+    where = record.notes.get(addresses.NOTE_OPEN)
+    if not where:
         raise ConfigurationError(
             f"only this robot may watch '{entry.name}'",
             "monitor_allow=['198.51.100.0/28'] in its launch file lets others in")
     made = credentials.Credentials(Path(
-        monitor_addresses.folder_of(record.agent, record.monitor, record.launch)))
+        addresses.folder_of(record.agent, port, record.launch)))
     token, certificate = _read(entry, shell, ('cat', str(made.token), str(made.certificate)))
     try:
-        return record.monitor_open, token, credentials.fingerprint(certificate)
+        return where, token, credentials.fingerprint(certificate)
     except ValueError as error:
         raise _wrong(entry, 'certificate') from error
 

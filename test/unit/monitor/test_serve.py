@@ -41,7 +41,7 @@ def test_foxglove_bridge_of_ros_runs_if_installed(tmp_path):
     process = subprocess.Popen(
         [sys.executable, '-m', 'fogros2_monitor.serve', '--listen', f'127.0.0.1:{port}',
          '--secrets', str(tmp_path / 'secrets'), '--topic', '/camera/*'],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=Path(__file__).parents[2],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=Path(__file__).parents[3],
         env={**os.environ, 'AMENT_PREFIX_PATH': f'{tmp_path}{os.pathsep}{prefixes}'})
     try:
         lines = sorted(process.stdout.readline().strip() for _ in range(2))

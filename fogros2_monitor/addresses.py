@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from fogros2.model import host_port
 from fogros2.store import Store
@@ -14,6 +16,8 @@ PORT = 8765
 #: was chosen, or it isn't taken.
 IMAGE = ('ghcr.io/lichtblick-suite/lichtblick@sha256:'
          'ebaff0942173dc42c221ec0cc14d2bd7e6591e27c16cd11c8b2e557ce8da28d9')
+#: What the record of a machine has of its bridge: the addresses for the robot, and for others.
+NOTE, NOTE_OPEN = 'monitor', 'monitor_open'
 #: What the name of the folder begins with that the credentials of one port are in.
 CREDENTIALS = 'monitor-'
 
@@ -31,6 +35,11 @@ def application_port(port: int) -> int:
 def bridge(host: str, port: int) -> str:
     """Return a bridge's address without its token."""
     return f'ws://{host_port(host, port)}'
+
+
+def port_of(notes: Mapping[str, str]) -> int:
+    """Return the port of the bridge in a record's notes, 0 without one."""
+    return urlsplit(notes.get(NOTE, '')).port or 0
 
 
 def folder_of(agent: str, port: int, launch: str) -> str:

@@ -10,16 +10,16 @@ import stat
 
 import pytest
 
-from fogros2 import monitor_addresses, process
+from fogros2 import process
 from fogros2.model import Command
-from fogros2_monitor import credentials
+from fogros2_monitor import addresses, credentials
 
 with_openssl = pytest.mark.skipif(shutil.which('openssl') is None, reason='needs openssl')
 
 
 @with_openssl
 def test_credentials_are_private_and_kept_for_a_launch(tmp_path):
-    folder = Path(monitor_addresses.folder_of(str(tmp_path), 8765, 'a1b2c3'))
+    folder = Path(addresses.folder_of(str(tmp_path), 8765, 'a1b2c3'))
     made = credentials.make(folder, 'planner')
     token = made.token.read_text()
     assert len(token.strip()) == 32
@@ -36,7 +36,7 @@ def test_credentials_are_private_and_kept_for_a_launch(tmp_path):
 
 @with_openssl
 def test_fingerprint_is_that_of_openssl(tmp_path):
-    made = credentials.make(Path(monitor_addresses.folder_of(str(tmp_path), 1, 'x')), 'planner')
+    made = credentials.make(Path(addresses.folder_of(str(tmp_path), 1, 'x')), 'planner')
     said = process.run(Command(('openssl', 'x509', '-in', str(made.certificate), '-noout',
                         '-fingerprint', '-sha256')), timeout=20).stdout
     assert said.strip().partition('=')[2] == credentials.fingerprint(
@@ -50,7 +50,7 @@ def test_foreign_folder_is_not_emptied(tmp_path):
 
 
 def test_token_needs_no_openssl(tmp_path, monkeypatch):
-    folder = Path(monitor_addresses.folder_of(str(tmp_path / 'new/place'), 8765, 'a1b2c3'))
+    folder = Path(addresses.folder_of(str(tmp_path / 'new/place'), 8765, 'a1b2c3'))
     token = credentials.make_token(folder).token.read_text()
     assert len(token.strip()) == 32
     assert stat.S_IMODE((tmp_path / 'new').stat().st_mode) == 0o700
@@ -63,6 +63,6 @@ def test_machine_without_openssl_admits_nobody_else(tmp_path, monkeypatch, capsy
     monkeypatch.setattr(process, 'argv', lambda command: ['/no/such/openssl'])
     serve = pytest.importorskip(
         'fogros2_monitor.serve', reason='rclpy is not installed')
-    folder = monitor_addresses.folder_of(str(tmp_path), 8765, 'a1b2c3')
+    folder = addresses.folder_of(str(tmp_path), 8765, 'a1b2c3')
     assert serve.public_port(8766, folder, 'planner') == []
     assert 'nobody but the robot is let in: ' in capsys.readouterr().err

@@ -19,26 +19,24 @@ from launch import LaunchContext
 from launch.substitutions import TextSubstitution
 import pytest
 
-from fogros2 import ContainerInstance, Foxglove, monitor_addresses, ros_names
-from fogros2.actions import foxglove
+from fogros2 import ContainerInstance, Foxglove, ros_names
 from fogros2.deploy import RunningMachine, undo
 from fogros2.deploy.steps.creating import Creation
-from fogros2.describe import networks
-from fogros2.errors import AgentError, ConfigurationError, ProviderError
+from fogros2.errors import AgentError, ConfigurationError, ProviderError, Unsupported
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState, Result, VpnInterface
 from fogros2.provider.kubernetes import manifests, ways
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.runtime import added_process
-from fogros2.runtime import foxglove as runtime_foxglove
 from fogros2.store import Made, process_start, Record, Store
-from fogros2_monitor import credentials
+from fogros2_monitor import access, action, addresses, credentials, networks
+from fogros2_monitor.browser import Ticket
+from fogros2_monitor.feature import Monitor
 from fogros2_testing.fakes import FakeProvider, FakeShell
 from rigs import deploying
-from ros2fog_cli.api import monitor
-from ros2fog_cli.api.browser import Ticket
 from ros2fog_cli.api.machines import Entry
 
 SOURCES = ('198.51.100.0/28',)
+NOTES = {'monitor': 'ws://198.18.7.2:8765', 'monitor_open': '198.51.100.9:8766'}
 VPN = VpnInterface('fog1', '198.18.7.2', '198.18.7.0/24', 51820, '/key')
 
 
@@ -63,6 +61,20 @@ def test_invalid_network_is_refused_in_the_launch_file(given, said):
             make()
 
 
+@pytest.mark.parametrize(('provider', 'given', 'said'), [
+    ('hosted', {'monitor_allow': SOURCES}, "can't open a port of its host for monitor_allow"),
+    ('joined', {'launch_foxglove': True}, "is another robot's, and serves no viewer"),
+    ('joined', {'monitor_allow': SOURCES}, "is another robot's")])
+def test_machine_that_cannot_serve_viewers_is_refused(provider, given, said):
+    with pytest.raises(Unsupported, match=said):
+        Monitor().check(MachineSpec('planner', provider), Monitor.options(**given))
+
+
+def test_bridge_of_a_hosted_machine_is_for_its_robot():
+    Monitor().check(MachineSpec('planner', 'hosted'), Monitor.options(launch_foxglove=True))
+    Monitor().check(MachineSpec('planner', 'joined'), Monitor.options())
+
+
 @pytest.fixture
 def provider(monkeypatch):
     monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(firewall=True))
@@ -84,7 +96,6 @@ def test_port_is_closed_at_the_end_of_the_launch(
     running = RunningMachine(context, job, None, None)
     assert running.open_port(8766, SOURCES) == ('198.51.100.9', 8766)
     assert provider.allowed == {('fake-1', 8766): list(SOURCES)}
-    assert context.store.load('planner').monitor_open == '198.51.100.9:8766'
     # the bridge was started again: nothing is opened twice
     assert running.open_port(8766, SOURCES) == ('198.51.100.9', 8766)
     assert provider.calls.count('allow') == 1
@@ -97,32 +108,32 @@ def test_next_launch_closes_the_port_of_a_killed_one(
     context, job = deploying.job(
         tmp_path, MachineSpec('planner', 'fake', on_exit='keep'), provider=provider)
     with context.store.lock('planner'):
-        job.save(machine_id='fake-1', monitor=8765, monitor_open='198.51.100.9:8766',
-                 made=(Made(undo.VPN), Made(undo.MONITOR_PORT, 8766)))
+        job.save(machine_id='fake-1', notes=NOTES,
+                 made=(Made(undo.VPN), Made(undo.OPEN_PORT, 8766)))
         provider.machines['fake-1'] = machine = Machine(
             'fake-1', 'planner', 'fake', MachineState.RUNNING)
         Creation(context, job)._adopt(machine)
     assert provider.allowed == {('fake-1', 8766): []}
     after = context.store.load('planner')
-    assert (after.monitor, after.monitor_open, after.made) == (0, '', (Made(undo.VPN),))
+    assert (after.notes, after.made) == ({}, (Made(undo.VPN),))
 
 
 def entry(**changes):
     made = Record(
         'planner', 'fake', MachineSpec('planner', 'fake'), machine_id='fake-1', launch='abc123',
-        pid=os.getpid(), pid_start=process_start(os.getpid()) or 0, vpn=VPN, monitor=8765,
-        monitor_open='198.51.100.9:8766', agent='/run/fogros2')
+        pid=os.getpid(), pid_start=process_start(os.getpid()) or 0, vpn=VPN, notes=NOTES,
+        agent='/run/fogros2')
     return Entry('planner', 'fake', Machine(
         'fake-1', 'planner', 'fake', MachineState.RUNNING, shell=Endpoint('fake')),
         dataclasses.replace(made, **changes))
 
 
 def test_monitor_address_is_shown_while_a_launch_serves_it():
-    assert entry().monitor == 'ws://198.18.7.2:8765'
-    assert entry().to_json()['monitor_open'] == '198.51.100.9:8766'
-    for changes in ({'monitor': 0}, {'pid': 0}, {'vpn': None}):
-        assert entry(**changes).monitor == ''
-        assert entry(**changes).to_json()['monitor_open'] is None
+    shown = entry().to_json()
+    assert {key: shown[key] for key in NOTES} == NOTES
+    for changes in ({'notes': {}}, {'pid': 0}):
+        shown = entry(**changes).to_json()
+        assert [shown[key] for key in NOTES] == [None, None]
 
 
 def test_share_reads_token_and_certificate(tmp_path):
@@ -131,34 +142,34 @@ def test_share_reads_token_and_certificate(tmp_path):
     made = credentials.make(tmp_path / 'monitor' / 'x', 'planner')
     text = made.token.read_text() + made.certificate.read_text()
     shell = FakeShell(handlers={'cat': lambda command: Result(0, text, '')})
-    where, token, fingerprint = monitor.credentials_of(entry(), shell)
+    where, token, fingerprint = access.credentials_of(entry(), shell)
     assert (where, token) == ('198.51.100.9:8766', made.token.read_text().strip())
     assert fingerprint == credentials.fingerprint(made.certificate.read_text())
     assert shell.commands[0].argv[1] == '/run/fogros2/monitor-8765/abc123/token'
     for changes, kind, said in (
-            ({'monitor': 0}, AgentError, 'serves the topics'),
+            ({'notes': {}}, AgentError, 'serves the topics'),
             ({'pid': 0}, AgentError, 'serves the topics'),
-            ({'monitor_open': ''}, ConfigurationError, 'only this robot')):
+            ({'notes': {**NOTES, 'monitor_open': ''}}, ConfigurationError, 'only this robot')):
         with pytest.raises(kind, match=said):
-            monitor.credentials_of(entry(**changes), shell)
+            access.credentials_of(entry(**changes), shell)
 
 
 def test_tunnel_reads_the_token_of_the_bridges_port():
     shell = FakeShell(handlers={'sh': lambda command: Result(0, 'sesame\n', '')})
-    assert monitor.token_of(entry(), shell, 9000) == 'sesame'
+    assert access.token_of(entry(), shell, 9000) == 'sesame'
     assert [command.argv[2:] for command in shell.commands] == [
         ('cat "$1"/*/token', 'sh', '/run/fogros2/monitor-9000')]
     assert shell.commands[0].sudo
 
 
 def test_bridge_of_the_robot_is_found_while_it_listens():
-    folder = monitor_addresses.on_robot(Store(), 'planner')
+    folder = addresses.on_robot(Store(), 'planner')
     with socket.create_server(('127.0.0.1', 0)) as bridge:
         port = bridge.getsockname()[1]
-        made = credentials.make_token(Path(monitor_addresses.folder_of(str(folder), port, '1')))
-        assert monitor.on_robot('planner') == (port, made.token.read_text().strip())
-        assert monitor.on_robot('another') is None
-    assert monitor.on_robot('planner') is None
+        made = credentials.make_token(Path(addresses.folder_of(str(folder), port, '1')))
+        assert access.on_robot('planner') == (port, made.token.read_text().strip())
+        assert access.on_robot('another') is None
+    assert access.on_robot('planner') is None
 
 
 def test_browser_is_led_to_the_page_once_and_in_time(monkeypatch):
@@ -181,7 +192,7 @@ def test_browser_is_led_to_the_page_once_and_in_time(monkeypatch):
         place = urllib.parse.urlsplit(ticket.url)
         late = time.monotonic() + 61
         with monkeypatch.context() as patch:
-            patch.setattr('ros2fog_cli.api.browser.time.monotonic', lambda: late)
+            patch.setattr('fogros2_monitor.browser.time.monotonic', lambda: late)
             assert ask(place.path) == (404, '')
 
 
@@ -230,13 +241,13 @@ def made(monkeypatch):
             found.append(spec)
             super().__init__(spec)
 
-    monkeypatch.setattr(runtime_foxglove, 'AddedProcess', Added)
-    monkeypatch.setattr(foxglove, 'send', lambda process, machine: None)
+    monkeypatch.setattr(action, 'AddedProcess', Added)
+    monkeypatch.setattr(action, 'send', lambda process, machine: None)
     return found
 
 
 def coordinated(monkeypatch, spec, *, on_robot=False):
-    monkeypatch.setattr(foxglove, 'Coordinator', SimpleNamespace(of=lambda _: SimpleNamespace(
+    monkeypatch.setattr(action, 'Coordinator', SimpleNamespace(of=lambda _: SimpleNamespace(
         on_robot=lambda _: on_robot, resolve=lambda machine: machine,
         session=lambda _: SimpleNamespace(spec=spec),
         launch=SimpleNamespace(id='abc123', provider=lambda _: FakeProvider()))))
@@ -248,7 +259,8 @@ def test_gate_forwards_to_the_providers_application(
 ):
     monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(containers=False))
     monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(application_port=8080))
-    coordinated(monkeypatch, MachineSpec('pod', 'fake', launch_foxglove=launch_foxglove))
+    coordinated(monkeypatch, MachineSpec(
+        'pod', 'fake', features={'monitor': {'launch_foxglove': launch_foxglove}}))
     Foxglove('pod').execute(LaunchContext())
     words = ' '.join(made[0].arguments)
     assert ('--application 127.0.0.1:8080' in words) is beside and '--image' not in words
@@ -269,7 +281,7 @@ def test_bridge_gets_the_options_of_the_machine(monkeypatch, made, runs, on_robo
     assert told[-2:] == ('-r', '/camera:=/fogros2/planner/camera')
     # the robot's own has neither others nor an application
     if on_robot:
-        folder = monitor_addresses.on_robot(Store(), 'planner')
+        folder = addresses.on_robot(Store(), 'planner')
         assert words[4:-5] == ['--secrets', f'{folder}/monitor-9000/{os.getpid()}']
     else:
         assert words[4:-5] == [

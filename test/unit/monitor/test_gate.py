@@ -19,8 +19,7 @@ import threading
 
 import pytest
 
-from fogros2 import monitor_addresses
-from fogros2_monitor import accounts, credentials, page
+from fogros2_monitor import accounts, addresses, credentials, page
 from fogros2_monitor.gate import endpoint, network
 from fogros2_monitor.request import check, check_site, cookie, parse, Refused
 
@@ -207,7 +206,7 @@ class Running:
 def running(folder: Path, to: int, *words: str) -> Iterator[Running]:
     if shutil.which('openssl') is None:
         pytest.skip('needs openssl')
-    folder = Path(monitor_addresses.folder_of(str(folder), 8765, 'launch'))
+    folder = Path(addresses.folder_of(str(folder), 8765, 'launch'))
     made = credentials.make(folder, 'planner')
     process = subprocess.Popen(
         [sys.executable, '-m', 'fogros2_monitor.gate', '--to', f'127.0.0.1:{to}',
