@@ -69,7 +69,7 @@ setup(
     description='Runs nodes of a ROS 2 launch file on machines in the cloud',
     license='Apache-2.0',
     python_requires='>=3.10',
-    # folders with an __init__.py: a test compares them with plugin_system.OWN_PACKAGES
+    # folders with an __init__.py
     packages=find_packages(),
     package_data={'fogros2': ['py.typed'], 'fogros2.host': ['locked.txt'],
                   **{f'fogros2.provider.{name}': ['regions.csv']
@@ -143,6 +143,12 @@ setup(
             'streams = fogros2_features.streams:Streaming',
             'vpn_path = fogros2_features.vpn_path:VpnPath',
             'volumes = fogros2_features.volumes:Volumes',
+        ],
+        'fogros2.modules': [
+            'fogros2 = fogros2_monitor.needs:NEEDS',
+            'fogros2_examples = fogros2_examples.needs:NEEDS',
+            'image_transport_h264 = fogros2_features.streams.needs:IMAGES',
+            'point_cloud_stream = fogros2_features.streams.needs:CLOUDS',
         ],
         'fogros2.monitor': [
             'graph = fogros2_monitor:GRAPH',

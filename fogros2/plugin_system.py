@@ -13,10 +13,6 @@ if TYPE_CHECKING:
 
 #: What messages call the plugins of a group whose name does not end so.
 _KINDS = {'fogros2.machine': 'provider', 'fogros2.vpn': 'VPN', 'fogros2.dds': 'DDS vendor'}
-#: All packages that setup.py installs; a package index may have unrelated projects of these names.
-OWN_PACKAGES = (
-    'fogros2', 'fogros2_examples', 'fogros2_features', 'fogros2_monitor', 'fogros2_replicas',
-    'fogros2_share', 'image_transport_h264', 'point_cloud_stream', 'ros2fog_cli')
 
 
 @functools.lru_cache(maxsize=1)
@@ -31,6 +27,14 @@ def _all() -> Any:
 @functools.cache
 def _entry_points(group: str) -> dict[str, EntryPoint]:
     return {point.name: point for point in _all().select(group=group)}
+
+
+@functools.cache
+def own_packages() -> tuple[str, ...]:
+    """Return all packages of FogROS2; an index may have unrelated projects of these names."""
+    from importlib import metadata
+
+    return tuple((metadata.distribution('fogros2').read_text('top_level.txt') or '').split())
 
 
 def names(group: str) -> list[str]:
@@ -53,7 +57,7 @@ def load(group: str, name: str) -> Any:
         return points[name].load()
     except ImportError as error:
         module = error.name or name
-        ours = module.partition('.')[0] in OWN_PACKAGES
+        ours = module.partition('.')[0] in own_packages()
         raise PrerequisiteError(
             f"the {_kind(group)} '{name}' can't be loaded: {error}",
             'install FogROS2 again from the folder that it came from' if ours else

@@ -21,7 +21,7 @@ import sys
 import tempfile
 
 from fogros2.host import locked
-from fogros2.host.modules import MODULES
+from fogros2.host.modules import known
 
 #: The real ROS 2, as far as there are wheels of it. Their builder: doc/developers/decisions.md.
 ROS = ('ros-jazzy-rclpy[fastrtps]==7.1.6', 'ros-jazzy-common-interfaces==5.3.6')
@@ -83,7 +83,7 @@ def write(
 def main() -> None:
     """Resolve all together, as they are used together, and keep those that are asked for."""
     requirements = list(dict.fromkeys(
-        [*EMBEDDED, *(module.requirement for module in MODULES.values())]))
+        [*EMBEDDED, *(module.requirement for module in known().values())]))
     entries = locked.parse(resolved([*ROS, *requirements]))
     names = sorted({
         *map(locked.name_of, requirements),

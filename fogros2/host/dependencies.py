@@ -15,10 +15,10 @@ import re
 from fogros2.errors import ConfigurationError
 from fogros2.host import locked
 from fogros2.host.workspace import dependencies, run_dependencies, Workspace
-from fogros2.plugin_system import OWN_PACKAGES
+from fogros2.plugin_system import own_packages
 
 #: Distributions that only this project's own wheels may install, and their modules.
-OURS = tuple(locked.name_of(name) for name in (*OWN_PACKAGES, 'ros2_embedded'))
+OURS = tuple(locked.name_of(name) for name in (*own_packages(), 'ros2_embedded'))
 #: Name of a Debian package, with an optional architecture and version.
 _APT = re.compile(r'[a-z0-9][a-z0-9+.-]+(:[a-z0-9-]+)?(=[A-Za-z0-9.+:~-]+)?')
 #: A requirement begins with a name (PEP 508): neither an option nor a URL.
@@ -69,7 +69,7 @@ def keys(
     for workspace in workspaces:
         own |= set(workspace.packages)
         for name, prefix in workspace.installed.items():
-            if name not in OWN_PACKAGES:
+            if name not in own_packages():
                 names |= run_dependencies(prefix / 'share' / name / 'package.xml')
     return tuple(sorted(names - own - {''}))
 

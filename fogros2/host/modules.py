@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
+import functools
 import hashlib
 from importlib import metadata
 import importlib.util
@@ -22,7 +23,7 @@ import shlex
 import sys
 from typing import Any, Optional
 
-from fogros2 import untrusted
+from fogros2 import plugin_system, untrusted
 from fogros2.errors import PrerequisiteError
 from fogros2.host import locked
 from fogros2.host.installer import among_nodes
@@ -52,40 +53,8 @@ class Module:
         return f'{self.distributions[0]}>={version}' if version else self.distributions[0]
 
 
-MODULES: Mapping[str, Module] = {module.name: module for module in (
-    Module('numpy', ('numpy',)),
-    # 16 converts bgr8 with a wrong colour range, 14 damages depth images of a few pixels
-    Module('av', ('av',), (17,)),
-    Module('cv2', ('opencv-python-headless', 'opencv-contrib-python-headless', 'opencv-python',
-                   'opencv-contrib-python')),
-    Module('zstandard', ('zstandard',)),
-    Module('foxglove', ('foxglove-sdk',), (0, 30), replaced_by='foxglove_bridge'),
-    # for the applications; their wheels need only NumPy
-    Module('gtsam', ('gtsam',)),
-    Module('ompl', ('ompl',), (2,)),
-    Module('fcl', ('python-fcl',)),
-    Module('onnxruntime', ('onnxruntime', 'onnxruntime-gpu')),
-)}
-IMAGES = ('numpy', 'av', 'cv2')
-CLOUDS = ('numpy', 'zstandard')
-#: Modules that (package, executable) pairs need.
-NEEDS: Mapping[tuple[str, str], tuple[str, ...]] = {
-    ('image_transport_h264', 'encoder'): IMAGES,
-    ('image_transport_h264', 'decoder'): IMAGES,
-    ('point_cloud_stream', 'encoder'): CLOUDS,
-    ('point_cloud_stream', 'decoder'): CLOUDS,
-    ('fogros2_examples', 'lidar'): ('numpy',),
-    ('fogros2_examples', 'obstacle_finder'): ('numpy',),
-    ('fogros2_examples', 'camera'): ('numpy', 'cv2'),
-    ('fogros2_examples', 'image_processor'): ('numpy', 'cv2'),
-    ('fogros2_examples', 'slam'): ('numpy', 'cv2', 'gtsam'),
-    ('fogros2_examples', 'grasp_planner'): ('numpy', 'cv2', 'fcl'),
-    ('fogros2_examples', 'motion_planner'): ('numpy', 'ompl', 'fcl'),
-    ('fogros2_examples', 'policy_server'): ('numpy', 'cv2', 'onnxruntime'),
-    ('fogros2_examples', 'policy_client'): ('numpy', 'cv2'),
-    ('fogros2', 'bridge'): ('foxglove',),
-    ('fogros2', 'record'): ('foxglove',),
-}
+#: Group of entry points: by the name of a ROS package, the modules that its executables need.
+GROUP = 'fogros2.modules'
 
 #: Imports each module, because an installed module may lack a shared library.
 _ASK = """\
@@ -150,16 +119,28 @@ class Copy:
     versions: tuple[str, ...]
 
 
+@functools.cache
+def _needs() -> Mapping[tuple[str, str], Sequence[Module]]:
+    return {(package, executable): needed for package in plugin_system.names(GROUP)
+            for executable, needed in plugin_system.load(GROUP, package).items()}
+
+
+@functools.cache
+def known() -> Mapping[str, Module]:
+    """Return the modules that any program needs, by name."""
+    return {module.name: module for needed in _needs().values() for module in needed}
+
+
 def needed_by(programs: Iterable[tuple[str, str]]) -> tuple[str, ...]:
-    """Return the names of the modules that (package, executable) pairs need, in fixed order."""
-    needed = {name for program in programs for name in NEEDS.get(program, ())}
-    return tuple(name for name in MODULES if name in needed)
+    """Return the names of the modules that (package, executable) pairs need, sorted."""
+    return tuple(sorted({
+        module.name for program in programs for module in _needs().get(program, ())}))
 
 
 def lacking_here(names: Iterable[str]) -> list[Module]:
     """Return the modules that this Python lacks or has too old; do not import them."""
-    return [MODULES[name] for name in names
-            if importlib.util.find_spec(name) is None or _too_old(MODULES[name])]
+    return [module for module in map(known().__getitem__, names)
+            if importlib.util.find_spec(module.name) is None or _too_old(module)]
 
 
 def _too_old(module: Module) -> bool:
@@ -181,8 +162,8 @@ def ask(
     :param site: an additional folder, which Python searches first.
     """
     words = ['python3', '-c', _ASK, json.dumps([
-        (name, MODULES[name].distributions, MODULES[name].oldest, MODULES[name].replaced_by)
-        for name in names])]
+        (one.name, one.distributions, one.oldest, one.replaced_by)
+        for one in map(known().__getitem__, names)])]
     return among_nodes(
         environment, setup, f'{_path([site]) if site else ""}exec {shlex.join(words)}',
         'look for Python modules')
@@ -200,7 +181,7 @@ def answer(output: str) -> Answer:
         untrusted.checked([major, minor], list[int])
         untrusted.checked([architecture, libc], list[str])
         untrusted.checked(missing, dict[str, str])
-        if not missing.keys() <= MODULES.keys():
+        if not missing.keys() <= known().keys():
             raise untrusted.InvalidMessage('it names modules that were not asked for')
         return Answer((major, minor), architecture, libc, tuple(missing),
                       tuple(filter(None, missing.values())))
@@ -217,7 +198,7 @@ def copy(facts: Answer) -> Optional[Copy]:
     entries: dict[str, set[str]] = {}
     versions = []
     for name in facts.missing:
-        distribution = next(filter(None, map(_installed, MODULES[name].distributions)), None)
+        distribution = next(filter(None, map(_installed, known()[name].distributions)), None)
         if distribution is None or not _runs(distribution, facts):
             return None
         # The other files are programs in a bin folder.
@@ -269,7 +250,7 @@ def pinned(missing: Iterable[str]) -> list[str]:
 
     :raises PrerequisiteError: a module is not pinned.
     """
-    return locked.requirements(MODULES[name].distributions[0] for name in missing)
+    return locked.requirements(known()[name].distributions[0] for name in missing)
 
 
 def fitted(node: NodeSpec, places: Mapping[str, str]) -> NodeSpec:

@@ -23,7 +23,7 @@ from fogros2 import process
 from fogros2.errors import WorkspaceError
 from fogros2.host.inspection import DISTRO, HostFacts
 from fogros2.model import Command
-from fogros2.plugin_system import OWN_PACKAGES
+from fogros2.plugin_system import own_packages
 from fogros2.report import size
 from fogros2.shell import Shell
 from fogros2.waiting import Timeouts
@@ -182,7 +182,7 @@ def dependencies(*paths: str | os.PathLike[str]) -> list[str]:
             manifests.setdefault(name, prefix / 'share' / name / 'package.xml')
     needed: set[str] = set()
     for name, manifest in manifests.items():
-        if name not in OWN_PACKAGES and manifest.is_file():
+        if name not in own_packages() and manifest.is_file():
             needed |= {*_field_texts(manifest, *_ALL)}
     return sorted(needed - {''} - set(manifests))
 

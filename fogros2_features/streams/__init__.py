@@ -3,10 +3,11 @@
 What crosses the VPN: topics encoded, by ``stream_topics``; at a limited rate; or not at all.
 
 In reading order: ``policy`` has the limits of a machine's link, ``transport`` is the plugin
-interface of transports, ``topics`` names the topics of streams, ``nodes`` and ``republish`` have
-the transports, ``entries`` converts what a launch file says, ``collection`` has the streams of a
-launch, ``uncompressed`` warns of images that should be streamed, ``part`` acts in the launch,
-``parsing`` reads the element of XML and YAML, and ``elements`` registers it with launch.
+interface of transports, ``topics`` names the topics of streams, ``needs`` has the Python modules
+of their nodes, ``nodes`` and ``republish`` have the transports, ``entries`` converts what a launch
+file says, ``collection`` has the streams of a launch, ``uncompressed`` warns of images that should
+be streamed, ``part`` acts in the launch, ``parsing`` reads the element of XML and YAML, and
+``elements`` registers it with launch.
 """
 
 from __future__ import annotations

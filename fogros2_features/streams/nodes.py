@@ -11,7 +11,6 @@ import dataclasses
 from typing import ClassVar
 
 from fogros2.errors import ConfigurationError
-from fogros2.host import modules
 from fogros2.model import NodeSpec
 from fogros2_features.streams.topics import (
     carries_info,
@@ -86,7 +85,7 @@ class PointCloud(Raw):
 
     def check(self) -> None:
         """Check for NumPy and zstandard."""
-        check_modules(modules.CLOUDS, 'point clouds')
+        check_modules('point_cloud_stream', 'point clouds')
 
     def _node(self, stream: Stream, role: str, codec: str = '') -> NodeSpec:
         return node(

@@ -77,13 +77,14 @@ def names_of(stream: Stream, role: str, name: str) -> tuple[str, str, str]:
     return label, full, f'{local_topic(stream.topic, stream.source)}/{name}'
 
 
-def check_modules(names: Iterable[str] = modules.IMAGES, what: str = 'images') -> None:
+def check_modules(package: str = 'image_transport_h264', what: str = 'images') -> None:
     """
-    Check that the nodes of a stream can run on this computer.
+    Check that the nodes of a stream, which a package has, can run on this computer.
 
     :raises PrerequisiteError: a Python module is missing.
     """
-    lacking = [module.requirement for module in modules.lacking_here(names)]
+    lacking = [module.requirement for module in modules.lacking_here(
+        modules.needed_by([(package, 'encoder')]))]
     if lacking:
         raise PrerequisiteError(
             f"streams of {what} need {', '.join(lacking)}, which this Python does not have",

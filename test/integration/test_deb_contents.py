@@ -20,7 +20,7 @@ from types import ModuleType
 
 import pytest
 
-from fogros2.plugin_system import OWN_PACKAGES
+from fogros2.plugin_system import own_packages
 
 ROOT = Path(__file__).resolve().parents[2]
 SITE = 'opt/ros/jazzy/lib/python3.12/site-packages'
@@ -111,7 +111,7 @@ def test_brings_our_packages_without_the_rigs(
 ) -> None:
     modules = {Path(name).relative_to(SITE) for name in files
                if name.startswith(f'{SITE}/') and name.endswith('.py')}
-    assert {path.parts[0] for path in modules} == set(OWN_PACKAGES)
+    assert {path.parts[0] for path in modules} == {*own_packages()}
     assert f'{SITE}/fogros2_monitor/dashboard/page.html' in files
 
 

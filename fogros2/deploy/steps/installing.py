@@ -146,7 +146,7 @@ class Modules(Step):
         return self._job.run(command, timeout=self._context.timeouts.install)
 
     def _without(self, present: modules.Answer, why: str) -> PrerequisiteError:
-        names = ' '.join(modules.MODULES[name].distributions[0] for name in present.missing)
+        names = ' '.join(modules.known()[name].distributions[0] for name in present.missing)
         if present.architecture != platform.machine():
             hint = (f"take an image with them (pip install {names}): this robot's own are for "
                     f'{platform.machine()} processors, and the machine has {present.architecture}')
