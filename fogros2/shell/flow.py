@@ -67,11 +67,6 @@ class Turns:
         self._now = self._next = 0
         self._over: set[int] = set()
 
-    @property
-    def waiting(self) -> int:
-        """The number of threads that wait."""
-        return max(0, self._next - self._now - 1 - len(self._over))
-
     def __enter__(self) -> None:
         with self._changed:
             mine, self._next = self._next, self._next + 1

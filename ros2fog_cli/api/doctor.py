@@ -49,8 +49,8 @@ class Check:
     remedy: str = ''
 
 
-#: Providers that have checks of their own, or nothing to ask.
-_LOOKED_AT = ('container', 'hosted', 'joined', 'ssh')
+#: Providers that have checks of their own.
+_LOOKED_AT = ('container', 'hosted')
 #: Receive buffer in bytes that releases of wireguard-go since 2023 request: several raw images.
 WIREGUARD_BUFFER = 7 << 20
 #: DDS participants that know each other within 10 s: see doc/developers/dds_network.md.
@@ -74,7 +74,7 @@ def examine(*, lan_seconds: float = 1.5, providers: Sequence[str] = ()) -> list[
     for name in dict.fromkeys([*others, *providers]):
         checks.append(functools.partial(provider, name, needed=name in providers))
     with ThreadPoolExecutor(6, 'fog-doctor') as pool:
-        return list(pool.map(lambda check: check(), checks))
+        return [done for done in pool.map(lambda check: check(), checks) if done.detail]
 
 
 def provider(name: str, *, needed: bool = False, timeout: float = TIMEOUT) -> Check:
@@ -87,7 +87,7 @@ def provider(name: str, *, needed: bool = False, timeout: float = TIMEOUT) -> Ch
             return Check(title, 'ok', 'not set up here')
         answer = _in_time(lambda: kind().answers(), timeout)
     except Unsupported:
-        return Check(title, 'ok', 'is there')
+        return Check(title, 'ok', 'is there' if needed else '')
     except FogError as error:
         return Check(title, wrong, str(error.args[0]), error.hint)
     if answer is None:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fake a provider, a VPN, a stream and a shell, without any effect."""
+"""Fake a provider, a VPN, a stream, a shell and a machine that is up."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import contextlib
 import dataclasses
 from decimal import Decimal
 from pathlib import Path
@@ -35,7 +36,7 @@ from fogros2.model import (
     VpnInterface,
 )
 from fogros2.provider import Capabilities, Provider
-from fogros2.shell import Stream
+from fogros2.shell import connect, Shell, Stream
 from fogros2.vpn import Vpn
 
 #: Endpoint of every fake machine, in TEST-NET-2, which is never assigned.
@@ -356,3 +357,64 @@ class FakeShell:
     def close(self) -> None:
         """Count the calls in ``closed``."""
         self.closed += 1
+
+
+class FakeRunning:
+    """
+    A machine that is up, as features see it: this computer, or what a shell reaches.
+
+    :ivar details: what its steps reported.
+    :ivar calls: other calls, each with the method's name and its arguments.
+    :ivar watches: by name, what is called with the output of a watch.
+    """
+
+    directory = '/var/lib/agent'
+    interface = VpnInterface('foga', '198.18.7.2', '198.18.7.0/24', 51820, '/key')
+    vpn_address = interface.address
+    lost = ''
+    cost: tuple[Optional[Decimal], Decimal] = (None, Decimal(0))
+
+    def __init__(self, shell: Any = None, *, spec: Optional[MachineSpec] = None) -> None:
+        self.spec = spec or MachineSpec('a', 'fake')
+        self.machine = Machine('fake-1', self.spec.name, 'fake', MachineState.RUNNING)
+        self.shell: Shell = shell or connect(Endpoint('local'), name=self.spec.name)
+        self.details: list[str] = []
+        self.calls: list[tuple[Any, ...]] = []
+        self.watches: dict[str, Callable[[str], None]] = {}
+
+    def run(self, command: Command, *, timeout: float) -> str:
+        """Run a command by the shell."""
+        return self.shell.run(command, timeout=timeout).stdout
+
+    @contextlib.contextmanager
+    def step(self, name: str) -> Iterator[list[str]]:
+        """Collect the details of all steps."""
+        yield self.details
+
+    def warn(self, text: str, remedy: str) -> None:
+        """Collect the call."""
+        self.calls.append(('warn', text, remedy))
+
+    def note(self, name: str, text: str) -> None:
+        """Collect the call."""
+        self.calls.append(('note', name, text))
+
+    def open_port(self, port: int, sources: Sequence[str]) -> tuple[str, int]:
+        """Collect the call; return the same port of a fake machine."""
+        self.calls.append(('open_port', port, sources))
+        return FAKE_ENDPOINT.host, port
+
+    def watch(
+        self, name: str, argv: Sequence[str], interval: float, then: Callable[[str], None],
+    ) -> None:
+        """Collect the call."""
+        self.calls.append(('watch', name, argv, interval))
+        self.watches[name] = then
+
+    def give_up(self, reason: str) -> None:
+        """Collect the call."""
+        self.calls.append(('give_up', reason))
+
+    def lose_after(self, seconds: float) -> None:
+        """Collect the call."""
+        self.calls.append(('lose_after', seconds))

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-import contextlib
 import inspect
 import io
 import os
@@ -23,12 +22,11 @@ from fogros2.describe import defaults, features, keywords
 from fogros2.describe.overrides import Overrides
 from fogros2.errors import ConfigurationError, ConnectError, ShellError, StoreError
 from fogros2.feature import Feature
-from fogros2.model import Command, Endpoint, MachineSpec
+from fogros2.model import MachineSpec
 from fogros2.report import silent
-from fogros2.shell import connect
 from fogros2_features import results
 from fogros2_features.results import Results
-from fogros2_testing.fakes import FakeProvider
+from fogros2_testing.fakes import FakeProvider, FakeRunning
 from fogros2_testing.plugins import instead
 
 if TYPE_CHECKING:
@@ -207,27 +205,7 @@ def test_a_feature_that_is_not_installed_is_one_error(check: Callable[..., None]
 # -- results -------------------------------------------------------------------------------------
 
 
-class Running:
-    """A machine whose home is the robot's."""
-
-    def __init__(self) -> None:
-        self.spec = MachineSpec('a', 'fake')
-        self.machine: Any = SimpleNamespace()
-        self.shell: Any = connect(Endpoint('local'), name='a')
-        self.vpn_address = ''
-        self.lost = ''
-        self.details: list[str] = []
-
-    def run(self, command: Command, *, timeout: float) -> str:
-        return str(self.shell.run(command, timeout=timeout).stdout)
-
-    @contextlib.contextmanager
-    def step(self, name: str) -> Any:
-        assert name == 'results'
-        yield self.details
-
-
-def brought(running: Running, **keywords: Any) -> list[str]:
+def brought(running: FakeRunning, **keywords: Any) -> list[str]:
     """Run the end of a launch; return what came home, by path and content."""
     own = Results.options(**keywords)
     with Results().machine(running, own):
@@ -240,7 +218,7 @@ def test_folders_come_home_when_the_launch_ends(home: Path) -> None:
     for name in ('bags/deep/one', 'maps/one', 'other/maps/two'):
         (home / name).parent.mkdir(parents=True)
         (home / name).write_text(name)
-    running = Running()
+    running = FakeRunning()
     found = brought(running, fetch=['~/bags', '~/none'])
     assert found == ['bags/deep/one=bags/deep/one']
     assert f' MB to {home}/fogros2/a-20' in running.details[0]
@@ -260,7 +238,7 @@ def test_folder_that_is_a_link_counts_with_its_content(home: Path) -> None:
     (home / 'data/one').write_bytes(bytes(200_000))
     (home / 'bags').symlink_to('data')
     with pytest.raises(ShellError, match='more than fetch_limit='):
-        brought(Running(), fetch=['~/bags'], fetch_limit='100kB')
+        brought(FakeRunning(), fetch=['~/bags'], fetch_limit='100kB')
 
 
 def test_one_bad_folder_does_not_keep_the_others(
@@ -269,7 +247,7 @@ def test_one_bad_folder_does_not_keep_the_others(
     for name in ('bags', 'maps'):
         (home / name).mkdir()
         (home / name / 'one').write_text(name)
-    running = Running()
+    running = FakeRunning()
     fetch = running.shell.fetch
 
     def broken(source: str, *words: Any, **more: Any) -> None:
@@ -284,7 +262,7 @@ def test_one_bad_folder_does_not_keep_the_others(
 
 
 def test_machine_without_the_folders_is_said(home: Path) -> None:
-    running = Running()
+    running = FakeRunning()
     assert brought(running, fetch=['~/bags']) == []
     assert running.details == ['no ~/bags there'] and not (home / 'fogros2').exists()
 
@@ -293,14 +271,14 @@ def test_too_large_folders_do_not_come_home(home: Path) -> None:
     (home / 'bags').mkdir()
     (home / 'bags/one').write_bytes(bytes(200_000))
     with pytest.raises(ShellError, match='~/bags of .a. have 0.00020. GB, more than fetch_limit='):
-        brought(Running(), fetch=['~/bags'], fetch_limit='100kB')
+        brought(FakeRunning(), fetch=['~/bags'], fetch_limit='100kB')
     assert not (home / 'fogros2').exists()
 
 
 def test_broken_connection_is_tried_again(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (home / 'bags').mkdir()
     (home / 'bags/one').write_text('1')
-    running, tries = Running(), []
+    running, tries = FakeRunning(), []
     fetch = running.shell.fetch
 
     def broken(*words: Any, **more: Any) -> None:
@@ -333,7 +311,7 @@ def test_folder_of_another_account_gets_no_results(home: Path) -> None:
     with pytest.raises(StoreError, match='theirs belongs to another account'):
         Results().check(MachineSpec('a', 'fake'), Results.options(**given))
     with pytest.raises(StoreError, match='another account'), \
-            Results().machine(Running(), Results.options(**given)):
+            Results().machine(FakeRunning(), Results.options(**given)):
         pass
     assert not [*(home / 'theirs').iterdir()]
 
@@ -349,7 +327,7 @@ def test_lost_connection_is_not_tried_for_each_folder(
 
     for name in ('bags', 'maps'):
         (home / name).mkdir()
-    running = Running()
+    running = FakeRunning()
     monkeypatch.setattr(running.shell, 'fetch', broken)
     with pytest.raises(ConnectError):
         brought(running, fetch=['~/bags', '~/maps'])
@@ -357,7 +335,7 @@ def test_lost_connection_is_not_tried_for_each_folder(
 
 
 def test_machine_cannot_report_a_size_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    running = Running()
+    running = FakeRunning()
     monkeypatch.setattr(running.shell, 'run', lambda *_, **__: SimpleNamespace(stdout='\x1b[2J'))
     with pytest.raises(ShellError, match='size of ~/bags'):
         brought(running, fetch=['~/bags'])
@@ -375,10 +353,10 @@ def test_recordings_come_home_once(home: Path) -> None:
     folder = home / 'fogros2-a/recordings'
     folder.mkdir(parents=True)
     (folder / '1.mcap').write_text('tf')
-    assert brought(Running(), record=['/tf']) == ['recordings/1.mcap=tf']
+    assert brought(FakeRunning(), record=['/tf']) == ['recordings/1.mcap=tf']
     assert not folder.parent.exists()
     folder.mkdir(parents=True)
     (folder / '2.mcap').write_text('too much')
     with pytest.raises(ShellError, match='more than fetch_limit='):
-        brought(Running(), record=['/tf'], fetch_limit='1', fetch_to=str(home / 'two'))
+        brought(FakeRunning(), record=['/tf'], fetch_limit='1', fetch_to=str(home / 'two'))
     assert (folder / '2.mcap').exists()

@@ -13,7 +13,6 @@ import socket
 import subprocess
 import sys
 import time
-from types import SimpleNamespace
 
 from hypothesis import given, strategies
 from launch import LaunchContext
@@ -38,6 +37,7 @@ from fogros2_features.idle.program import (
     ready,
     TRAFFIC,
 )
+from fogros2_testing import FakeRunning
 
 #: What each interval between two samples had: its seconds, the seconds that all nodes computed,
 #: bytes in the VPN, and the most seconds that a thread ran or waited for a processor. Recorded of
@@ -257,31 +257,15 @@ def test_short_timeouts_are_sampled_more_often(timeout, seconds):
 
 # -- the feature ---------------------------------------------------------------------------------
 
-class Machine:
-    """A machine that notes what is watched there."""
-
-    directory = '/var/lib/agent'
-    interface = SimpleNamespace(name='foga')
-
-    def __init__(self):
-        self.watched = []
-        self.reasons = []
-
-    def watch(self, name, argv, interval, then):
-        self.watched.append((name, argv[:3], argv[4:-1], interval))
-        then('\x1b[2J forged')
-
-    def give_up(self, reason):
-        self.reasons.append(reason)
-
-
 def test_each_start_of_nodes_lets_the_time_begin_anew():
-    machine, node = Machine(), NodeSpec('a', 'a', arguments=('true',))
+    machine, node = FakeRunning(), NodeSpec('a', 'a', arguments=('true',))
     for _ in range(2):
         assert IdleTimeout().starting(machine, [node], 60.0) == [node]
-    assert machine.watched == [
-        ('idle', ['python3', '-IS', '-c'], ['foga', '/var/lib/agent', '60.0'], 6.0)] * 2
-    assert machine.reasons == ['nobody has used it for 60 s'] * 2
+    assert [(name, argv[:3], argv[4:-1], interval) for _, name, argv, interval in machine.calls] \
+        == [('idle', ['python3', '-IS', '-c'], ['foga', '/var/lib/agent', '60.0'], 6.0)] * 2
+    # not what the machine says
+    machine.watches['idle']('\x1b[2J forged')
+    assert machine.calls[-1] == ('give_up', 'nobody has used it for 60 s')
 
 
 @pytest.mark.parametrize('how', [

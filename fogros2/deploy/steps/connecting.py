@@ -98,10 +98,9 @@ class Connection(Step):
             self._shell.move(inside)
             self._allow([])
             job.forget(Made(SSH_PORT, outside.port))
-            detail.append(
-                'SSH through the VPN, and open to the fleet'
-                if self._context.provider.ssh_networks(job.spec)
-                else f'SSH through the VPN alone, port {outside.port} closed')
+            others = ', '.join(self._context.provider.ssh_networks(job.spec))
+            detail.append(f'SSH through the VPN, and open to {others}' if others else
+                          f'SSH through the VPN alone, port {outside.port} closed')
 
     def _leave_vpn(self) -> None:
         """Reach a kept machine from outside again, before the VPN is taken down."""

@@ -196,7 +196,7 @@ def test_kept_machine_is_a_host_for_the_robots_of_its_fleet(cloud, robot, box, n
                'ssh_from': [f'{ROBOT}/32'], 'on_exit': 'keep'}
     run = robot.own(name, options)
     run.wait_for(f'I heard: [Hello World from {name} ')
-    run.wait_for('open to the fleet')
+    run.wait_for('SSH through the VPN, and open to ')
     (instance,) = box.alive()
     box.run(instance.id, f'cat >/root/ports.py <<END\n{PORTS}\nEND\n'
                          'setsid python3 /root/ports.py >/dev/null 2>&1 &')
