@@ -182,6 +182,7 @@ setup(
         ],
         'launch.frontend.launch_extension': [
             'fogros2 = fogros2.actions.frontend.elements',
+            'fogros2_replicas = fogros2_features.replicas.elements',
             'fogros2_streams = fogros2_features.streams.elements',
         ],
         'ros2doctor.checks': [

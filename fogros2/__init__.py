@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from fogros2.actions.fog_machine import FogMachine
     from fogros2.actions.launch_description import FogROSLaunchDescription
     from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, LifecycleNode, Node
-    from fogros2.actions.replicated import Replicated
     from fogros2.describe.choices import (
         find_cheapest,
         find_cheapest_ec2_instance_type,
@@ -39,6 +38,7 @@ if TYPE_CHECKING:
     from fogros2.errors import FogError
     from fogros2.runtime.interruption import MachineInterrupted
     from fogros2_features.guests.machine import JoinedMachine
+    from fogros2_features.replicas.action import Replicated
     from fogros2_features.streams.entries import StreamTopic
     from fogros2_monitor.action import Foxglove
 
@@ -58,7 +58,6 @@ _NAMES = {
     'actions.fog_machine': 'FogMachine',
     'actions.launch_description': 'FogROSLaunchDescription',
     'actions.nodes': 'CloudNode ComposableNodeContainer LifecycleNode Node',
-    'actions.replicated': 'Replicated',
     'describe.choices':
         'find_cheapest find_cheapest_ec2_instance_type find_nearest_aws_region '
         'nearest_aws_region_now',
@@ -72,6 +71,7 @@ _NAMES = {
 _MODULES = {
     'Foxglove': 'fogros2_monitor.action',
     'JoinedMachine': 'fogros2_features.guests.machine',
+    'Replicated': 'fogros2_features.replicas.action',
     'StreamTopic': 'fogros2_features.streams.entries',
     **{name: f'fogros2.{module}' for module, names in _NAMES.items() for name in names.split()}}
 #: Modules that FogROS2 has in a package ``utils``: ``from fogros2 import region_ami_selection``.

@@ -145,8 +145,8 @@ class LaunchedMachine(Protocol):
         """Whether the provider reclaims the machine, which may still run, or it is gone."""
 
     @property
-    def replicated(self) -> Mapping[str, str]:
-        """New names of topics and services of its replicas, by the names that all have."""
+    def renamed(self) -> Mapping[str, str]:
+        """New names of topics and services of its nodes, by the names that others have too."""
 
     @property
     def sent(self) -> Sequence[NodeSpec]:

@@ -17,14 +17,14 @@ from launch.event_handlers import OnProcessStart, OnShutdown
 import launch.logging
 
 from fogros2 import feature
-from fogros2.describe import values
+from fogros2.describe import features, values
 from fogros2.errors import ConfigurationError, Unsupported
 from fogros2.model import host_port, NodeSpec
 from fogros2.runtime.added_process import AddedProcess
 from fogros2.runtime.coordinator import Coordinator
 from fogros2.runtime.remote_process import send
 from fogros2.store import Store
-from fogros2_monitor import addresses, networks
+from fogros2_monitor import addresses
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
@@ -70,7 +70,7 @@ class Foxglove(Action):
         self.machine = machine
         self._topics = list(topics)
         self._port = port
-        self._allow = networks.items(monitor_allow)
+        self._allow = features.own({'monitor_allow': monitor_allow})
         self._image = image
         if isinstance(port, (int, str)):
             _port(port)
@@ -80,7 +80,8 @@ class Foxglove(Action):
         coordinator = Coordinator.of(context)
         port = _port(values.resolve(context, self._port))
         topics = [values.resolve(context, topic) for topic in self._topics]
-        allow = networks.resolve(context, self._allow)
+        allow = feature.options('monitor', {
+            name: values.resolve(context, value) for name, value in self._allow.items()}) or ()
         machine = coordinator.resolve(self.machine)
         if coordinator.on_robot(machine):
             return _on_robot(machine if isinstance(machine, str) else machine.name, port, topics)

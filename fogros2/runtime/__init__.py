@@ -8,7 +8,6 @@ converts a process action to a NodeSpec, ``parts`` has what features do in the l
 ``added_process`` the processes that FogROS2 adds, ``backlog`` holds a machine's events until
 launch takes them, ``run_state`` decides what follows for one process on a machine, ``remote_run``
 connects it with launch, ``interruption`` has the event of a machine that ends early, ``session``
-is a machine of the launch, ``coordinator`` connects the launch with its machines,
-``remote_process`` is the action of a remote process, and ``replicas`` starts the node that serves
-the public names of replicated nodes.
+is a machine of the launch, ``coordinator`` connects the launch with its machines, and
+``remote_process`` is the action of a remote process.
 """

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import dataclasses
 import functools
 import logging
@@ -15,7 +15,6 @@ import launch.logging
 from fogros2.describe import values
 from fogros2.errors import (
     AgentError,
-    ConfigurationError,
     ConnectError,
     DeadlineExceeded,
     FogError,
@@ -101,8 +100,9 @@ class Session:
         self.came_up: asyncio.Future[bool] = loop.create_future()
         #: Whether containers and programs beside the nodes have been requested.
         self.has_helpers = False
-        #: New names of topics and services that the node ``first_answer`` serves on the robot.
-        self.replicated: dict[str, str] = {}
+        #: New names of topics and services of its nodes, and what goes on without these nodes.
+        self.renamed: dict[str, str] = {}
+        self.others = ''
         self._loop = loop
         self._in_thread = in_thread
         self._fail = fail
@@ -158,18 +158,15 @@ class Session:
             if self.running is not None:
                 instance.is_up(self.running)
 
-    def replicate(self, names: dict[str, str]) -> None:
+    def rename(self, names: Mapping[str, str], others: str) -> None:
         """
-        Rename the topics and services of replicated nodes.
+        Rename topics and services of nodes without which the launch goes on.
 
-        :raises ConfigurationError: another group of replicas has one of them, or the nodes may
-            move to the robot, where ``first_answer`` has these names.
+        :param others: what goes on, for messages.
+        :raises ConfigurationError: the nodes may move to the robot.
         """
-        for name in names:
-            if name in self.replicated:
-                raise ConfigurationError(f"two groups of replicas have '{name}' on the machine "
-                                         f"'{self.spec.name}'", 'name it in one of them')
-        self.replicated.update(names)
+        self.renamed.update(names)
+        self.others = others
 
     def warn_of_paths(self, node: NodeSpec, paths: Sequence[str]) -> None:
         """Warn once of each path of the robot that a node gets."""
@@ -291,7 +288,7 @@ class Session:
             async with self._order:
                 await self._in_thread(
                     self.running.start,
-                    self._starting([remapped(run.node, self.replicated) for run in runs]))
+                    self._starting([remapped(run.node, self.renamed) for run in runs]))
         except (AgentError, ConnectError, DeadlineExceeded) as error:
             # the machine's doing: the nodes of the robot go on
             for run in runs:
@@ -372,7 +369,7 @@ class Session:
         """End all processes: nobody knows of them any more."""
         respawning = self._respawning()
         self._end_unreported([])
-        if respawning and not self.replicated:
+        if respawning and not self.others:
             self._fail(AgentError(
                 f"{', '.join(run.node.name for run in respawning)} can't respawn: the agent "
                 f"of '{self.spec.name}' is gone", 'launch again'))
@@ -386,8 +383,8 @@ class Session:
         """
         if event.lost:
             self.end_all()
-        if self.replicated:
-            self._logger.warning(f'{event}; the other replicas go on')
+        if self.others:
+            self._logger.warning(f'{event}; {self.others} go on')
             return []
         raise ProviderError(str(event), remedy)
 

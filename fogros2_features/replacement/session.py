@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import functools
 from typing import Any, Optional, TYPE_CHECKING
 
@@ -71,17 +71,17 @@ class Interruptible(Session):
 
     # -- processes ------------------------------------------------------------------------------
 
-    def replicate(self, names: dict[str, str]) -> None:
-        """Rename the topics and services of replicated nodes; see the base class."""
+    def rename(self, names: Mapping[str, str], others: str) -> None:
+        """Rename topics and services of nodes; see the base class."""
         if self.own.on_interrupt == 'robot':
             raise ConfigurationError(
                 f"replicas cannot move to the robot, as on_interrupt='robot' of "
                 f"'{self.spec.name}' wants it", 'leave on_interrupt= out: the others go on')
-        super().replicate(names)
+        super().rename(names, others)
 
     def command_here(self, resolve: Callable[[], list[str]]) -> Optional[list[str]]:
         """Return the command of a process on the robot, None if it stays on machines."""
-        if self.own.on_interrupt == 'shutdown' or self.replicated:
+        if self.own.on_interrupt == 'shutdown' or self.others:
             return None
         try:
             return resolve()

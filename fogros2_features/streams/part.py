@@ -63,7 +63,7 @@ class Part(LaunchPart):
 
     def _limit(self, machine: str) -> list[Program]:
         policy = self._policy(machine)
-        _refuse(self._launch.machines[machine].replicated, policy.names(machine),
+        _refuse(self._launch.machines[machine].renamed, policy.names(machine),
                 f"deny_topics or limit_topics of '{machine}'",
                 'the first answer of replicas already carries it')
         if machine in self._limited:

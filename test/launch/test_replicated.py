@@ -35,7 +35,7 @@ from fogros2 import (
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
 from fogros2.model import NodeSpec
-from fogros2.runtime import replicas
+from fogros2_features.replicas import starting
 from fogros2_testing.plugins import instead
 from rigs.launching import Harmless
 
@@ -51,7 +51,7 @@ def first(monkeypatch):
         found.append(json.loads(given['arguments'][0]))
         return NodeSpec(**{**given, 'package': 'demo', 'executable': 'talker'})
 
-    monkeypatch.setattr(replicas, 'NodeSpec', spec)
+    monkeypatch.setattr(starting, 'NodeSpec', spec)
     return found
 
 

@@ -78,7 +78,8 @@ PUBLIC = CORE / '__init__.py'
 MOVED = (
     'StreamTopic', 'image_transport', 'republish(ers)?', r'[Cc]heckpoint\w*', r'[Rr]eplacer\w*',
     r'Replacement\w*', 'drained', r'\w*[Gg]uest\w*', '[Ii]nvit(e|ed|ations?)', 'JoinedMachine',
-    r'[Ff]oxglove\w*', r'\w*[Mm]onitor(ed|_\w+)?', '[Dd]ashboard')
+    r'[Ff]oxglove\w*', r'\w*[Mm]onitor(ed|_\w+)?', '[Dd]ashboard',
+    r'[Rr]eplic\w*', 'first_answer')
 CLOUDS = {'aws', 'azure', 'gcp', 'kubernetes'}
 #: All of the core but the import of types.
 BUT_TYPES = r'fogros2(?! import ros_types$)'

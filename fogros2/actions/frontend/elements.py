@@ -8,6 +8,7 @@ parsers are imported only when needed. doc/launch_xml_yaml.md describes all elem
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING
 
 from launch.frontend import expose_action
@@ -20,15 +21,15 @@ if TYPE_CHECKING:
     from fogros2.actions.frontend.entity import Parsed
 
 
-def _expose(name: str) -> None:
+def expose(name: str, module: str) -> None:
+    """Let launch read an element by the function of this name in a module."""
     def parse(entity: Entity, parser: Parser) -> Parsed:
-        from fogros2.actions.frontend import parsing
-        parsed: Parsed = getattr(parsing, name)(entity, parser)
+        parsed: Parsed = getattr(importlib.import_module(module), name)(entity, parser)
         return parsed
 
     expose_action(name)(parse)
 
 
 hints.of_elements()
-for _name in ('fog_machine', 'cloud_node', 'cloud_group', 'replicated', 'fogros_launch'):
-    _expose(_name)
+for _name in ('fog_machine', 'cloud_node', 'cloud_group', 'fogros_launch'):
+    expose(_name, 'fogros2.actions.frontend.parsing')

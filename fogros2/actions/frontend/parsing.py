@@ -20,7 +20,6 @@ from fogros2.actions.frontend.entity import (
     value,
 )
 from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, LifecycleNode, Node
-from fogros2.actions.replicated import Replicated
 from fogros2.describe import features, keywords, kinds, values
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.host import docker_lines
@@ -135,23 +134,6 @@ def cloud_group(entity: Entity, parser: Parser) -> Parsed:
     kwargs.update(lists)
     complete(entity, ('machine', *features.node_lists().values(), *_GROUP, *CONDITIONS))
     return CloudGroup, kwargs
-
-
-def replicated(entity: Entity, parser: Parser) -> Parsed:
-    """Read ``<replicated machines="a, b" services="/plan" topics="/in:/out">``."""
-    _, kwargs = Action.parse(entity, parser)
-    parameters: dict[str, kinds.Kind] = {
-        'machines': 'list', 'services': 'list', 'topics': 'list', 'hedge_after': 'scalar',
-        'deadline': 'scalar'}
-    for name, kind in parameters.items():
-        content = value(entity, parser, kinds.Keyword(name, kind))
-        if content is not None:
-            kwargs[name] = content
-    kwargs.setdefault('machines', [])
-    kwargs['actions'], lists = separate(map(parser.parse_action, entity.children))
-    kwargs.update(lists)
-    complete(entity, (*parameters, *features.node_lists().values(), *CONDITIONS))
-    return Replicated, kwargs
 
 
 def _machine(entity: Entity, parser: Parser) -> Any:

@@ -28,7 +28,7 @@ from fogros2.provider.kubernetes import manifests, ways
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.runtime import added_process
 from fogros2.store import Made, process_start, Record, Store
-from fogros2_monitor import access, action, addresses, credentials, networks
+from fogros2_monitor import access, action, addresses, credentials
 from fogros2_monitor.browser import Ticket
 from fogros2_monitor.feature import Monitor
 from fogros2_testing.fakes import FakeProvider, FakeShell
@@ -44,9 +44,10 @@ VPN = VpnInterface('fog1', '198.18.7.2', '198.18.7.0/24', 51820, '/key')
     ('198.51.100.0/28', '198.51.100.0/28'), (' 198.51.100.7 ', '198.51.100.7/32'),
     ('2001:db8::1', '2001:db8::1/128')])
 def test_networks_are_normalised(text, found):
-    given = networks.items([text, TextSubstitution(text=text)])
-    assert networks.resolve(LaunchContext(), given) == (found, found)
-    assert networks.resolve(LaunchContext(), networks.items(None)) == ()
+    machine = ContainerInstance(name='a', monitor_allow=[text, TextSubstitution(text=text)])
+    own = machine.spec(LaunchContext()).features['monitor']
+    assert Monitor.options(**own) == (found, found)
+    assert Monitor.options() is None and Monitor.options(launch_foxglove=True) == ()
 
 
 @pytest.mark.parametrize(('given', 'said'), [

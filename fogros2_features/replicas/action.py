@@ -18,10 +18,10 @@ from fogros2.launch_internals import components, private
 from fogros2.launch_internals.wrapping import wrap
 from fogros2.model import NodeSpec
 from fogros2.ros_names import absolute, local_topic, remapped
-from fogros2.runtime import replicas
 from fogros2.runtime.added_process import AddedProcess
 from fogros2.runtime.coordinator import Coordinator
 from fogros2.runtime.remote_process import remote_of
+from fogros2_features.replicas import starting
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
@@ -89,7 +89,7 @@ class Replicated(Action):
         # checked before a machine is requested
         labels = [ROBOT if machine is None else coordinator.resolve(machine)
                   for machine in machines]
-        replicas.check([label if isinstance(label, str) else label.name for label in labels],
+        starting.check([label if isinstance(label, str) else label.name for label in labels],
                        services, pairs, hedge_after, deadline)
         groups = [self._group(None) if label == ROBOT else group for label, group in zip(
             labels, self._groups or map(self._group, machines))]
@@ -105,8 +105,13 @@ class Replicated(Action):
         forwarded = self._forwarded(coordinator, namespace, [output for _, output in pairs])
         public = [*services, *(name for pair in pairs for name in pair)]
         for name, session in sessions.items():
-            session.replicate({one: local_topic(one, name) for one in public})
-        first = replicas.first_answer(
+            for one in session.renamed.keys() & public:
+                raise ConfigurationError(
+                    f"two groups of replicas have '{one}' on the machine '{name}'",
+                    'name it in one of them')
+            session.rename({one: local_topic(one, name) for one in public},
+                           others='the other replicas')
+        first = starting.first_answer(
             coordinator.launch.store.launch(coordinator.launch.id), sessions, services,
             [(*pair, pair[0] in forwarded) for pair in pairs], hedge_after, deadline, context)
         for group in groups:
