@@ -35,7 +35,7 @@ def arguments(machine: str, name: str, second: str = '') -> list[DeclareLaunchAr
             description='where the cloud nodes run'),
         argument('name', name, 'what the machine is called'),
         argument('on_exit', 'delete', 'what becomes of it: delete, stop or keep'),
-        argument('vpn_path', 'auto', "how the VPN's packets travel: auto, udp or stream"),
+        argument('vpn_path', '', "how the VPN's packets travel: udp, stream or, usually, auto"),
         argument('network', '', "machine:=container: its network; '' for the engine's own"),
         argument('host', '', 'machine:=ssh: name or address of the computer'),
         argument('user', '', 'machine:=ssh: login user there'),

@@ -13,7 +13,7 @@ import pytest
 from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.deploy.steps.containers import Containers
 from fogros2.errors import FogError
-from fogros2.host import dependencies, inspection, modules, wheels
+from fogros2.host import inspection, installer, modules, wheels
 from fogros2.model import Result, SyncReport
 from fogros2.shell import host_key, sync
 from fogros2.untrusted import InvalidMessage
@@ -89,7 +89,7 @@ READERS: dict[str, Callable[[str, Path], object]] = {
     'networks': lambda answer, _: addresses.parse_used(answer),
     'host key': lambda answer, _: host_key.parse(answer),
     'interfaces': lambda answer, _: CycloneDds(domain=0).parse_lan(answer),
-    'packages': lambda answer, _: dependencies.resolved(answer)}
+    'packages': lambda answer, _: installer.resolved(answer)}
 
 
 @pytest.mark.parametrize('name', READERS)

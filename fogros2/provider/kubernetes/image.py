@@ -66,7 +66,8 @@ def recipe(
                                  "such as 'registry.example/robots' or 'localhost:5000'")
     for word in (dependencies, user):
         if not _WORD.fullmatch(word):
-            raise ConfigurationError(f"'{word}' can't be part of an image's recipe")
+            raise ConfigurationError(f"'{word}' can't be part of an image's recipe",
+                                     'use letters, digits and . + : _ -')
     if not base or base.startswith('-') or any(c.isspace() for c in base):
         raise ConfigurationError(f"'{base}' can't be the image to begin with",
                                  'such as docker.io/library/ros:jazzy-ros-base')
