@@ -15,7 +15,7 @@ import contextlib
 import time
 
 from fogros2 import plugin_system
-from fogros2.errors import ConnectError, DeadlineExceeded, FogError
+from fogros2.errors import ConnectError, DeadlineExceeded, FogError, StoreError
 from fogros2.host import containers
 from fogros2.model import Command, Machine
 from fogros2.provider import Provider
@@ -153,6 +153,9 @@ def unmake(site: Site, made: Made) -> None:
 
     :raises FogError: it may still be there.
     """
+    if made.kind not in _UNDO:  # of another version's launch
+        raise StoreError(f"the record of '{site.record.name}' has '{made.kind}', which this "
+                         "version can't undo", 'undo it with the version that made it')
     _UNDO[made.kind](site, made)
 
 

@@ -875,6 +875,13 @@ def test_machine_that_is_ended_in_order_is_not_lost(launch, provider):
     assert seen == ['']
 
 
+def test_undo_of_another_version_is_reported_and_the_others_are_done(launch, provider):
+    context, mine = begun(launch)
+    mine.shell = FakeShell(handlers={'sh': lambda command: Result(0, '', '')})
+    failure, = undo.unmake_all(mine, [Made(undo.WATCHDOG), Made('balloon')])
+    assert "'balloon', which this version can't undo" in str(failure) and mine.shell.commands
+
+
 def test_what_could_not_be_undone_stays_in_the_record(launch, provider):
     context, mine = begun(launch, dataclasses.replace(SPEC, on_exit='keep'))
     mine.failed = False
