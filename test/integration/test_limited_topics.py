@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-import os
 from pathlib import Path
 import shutil
 import signal
@@ -48,8 +47,7 @@ def limited(one: Robot) -> Iterator[Callable[..., None]]:
             ends.append(subprocess.Popen(
                 [sys.executable, str(ROOT / 'fogros2_share/scripts/limits'),
                  str(node.arguments[0])],
-                env={**os.environ, 'ROS_DOMAIN_ID': one.domain, 'PYTHONPATH': os.pathsep.join(
-                    filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))},
+                env=one.environment,
                 preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)))
 
     yield start

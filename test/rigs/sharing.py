@@ -48,6 +48,18 @@ class Robot:
         self.thread = threading.Thread(target=self.executor.spin, daemon=True)
         self.thread.start()
 
+    @property
+    def environment(self) -> dict[str, str]:
+        """
+        Return the environment of programs in its domain, with the middleware of its node.
+
+        Fast DDS does not notice the end of a subscription of Cyclone DDS.
+        """
+        return {**os.environ, 'ROS_DOMAIN_ID': self.domain,
+                'RMW_IMPLEMENTATION': rclpy.get_rmw_implementation_identifier(),
+                'PYTHONPATH': os.pathsep.join(
+                    filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))}
+
     def start(self, *topics: str) -> None:
         """Start its relay."""
         if self.folder.exists():
@@ -57,8 +69,7 @@ class Robot:
                 'topics': topics, 'folders': [str(self.folder / OWN), str(self.fleet)]})],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-            env={**os.environ, 'ROS_DOMAIN_ID': self.domain, 'PYTHONPATH': os.pathsep.join(
-                filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))})
+            env=self.environment)
         threading.Thread(target=lambda: self.lines.extend(relay.stdout or ()), daemon=True).start()
 
     def stop(self) -> int:
