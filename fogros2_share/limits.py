@@ -10,6 +10,7 @@ frame, all in one message. A topic crosses only while the other side has a subsc
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
@@ -29,6 +30,8 @@ from image_transport_h264 import memory
 
 #: The type whose messages are limited by child frame.
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
+#: Maximum number of child frames in a message.
+MOST = 10_000
 
 
 class Way:
@@ -59,10 +62,10 @@ class Way:
             message = form and ros_types.message(form.kind)
             self.unsubscribe()
             self.unpublish()
-            self.form, self.message = form, message
+            self.form = None
             self.publisher = form and node.create_publisher(message, self.target, profile(form))
-        if not form or self.publisher is None or not others(
-                node, node.get_subscriptions_info_by_topic(self.target)):
+            self.form, self.message = form, message
+        if not form or not others(node, node.get_subscriptions_info_by_topic(self.target)):
             self.unsubscribe()
         elif self.subscription is None:
             self.subscription = node.create_subscription(
@@ -113,8 +116,10 @@ class Leaving(Way):
         if self.echoes.heard(time.monotonic(), data) or hash(data) in self.latched:
             return
         if self.form is not None and self.form.kind == TRANSFORMS:
-            for one in deserialize_message(data, self.message).transforms:
-                self._newest[one.child_frame_id] = one
+            with contextlib.suppress(RuntimeError):  # the bytes are no transforms
+                for one in deserialize_message(data, self.message).transforms:
+                    if len(self._newest) < MOST or one.child_frame_id in self._newest:
+                        self._newest[one.child_frame_id] = one
         else:
             self._newest[''] = data
         if self._timer.is_canceled():
@@ -173,8 +178,6 @@ class Limits(Node):
             try:
                 way.look()
             except (LookupError, RuntimeError) as error:
-                if isinstance(error, RuntimeError):
-                    way.unpublish()  # until the publishers change
                 if rclpy.ok() and way.source not in self._complaints:
                     self._complaints.add(way.source)
                     self.get_logger().warning(f'{way.source} does not cross: {error}')
