@@ -23,7 +23,7 @@ import time
 
 TYPE_CHECKING = False  # importing it from typing would take the machine a while
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
 #: Seconds for which what is under way may wait in the buffers of systems, programs and networks.
 DELAY = 0.05
@@ -51,6 +51,20 @@ def line(data: bytes) -> bytes:
 def datagram(text: bytes) -> bytes:
     """Return the datagram of a line without its letter and its newline."""
     return text.replace(b'\\n', b'\n').replace(b'\\e', b'\\')
+
+
+def datagrams(link: socket.socket) -> Iterator[bytes]:
+    """Yield what comes to a connected socket until it is shut down."""
+    while True:
+        try:
+            data, sender = link.recvfrom(1 << 16)
+        except ConnectionRefusedError:
+            continue  # an interface is being repaired
+        except OSError:
+            return
+        if sender is None:
+            return
+        yield data
 
 
 class Window:
@@ -241,18 +255,11 @@ class Carrier:
             self.deliver(datagram(text[1:-1]))
 
     def _take(self) -> None:
-        while not self.over:
-            try:
-                data = self._link.recv(1 << 16)
-            except ConnectionRefusedError:
-                continue  # the interface is being repaired
-            except OSError:
-                return
-            if data:
-                self._copy(data)
-                with self._changed:
-                    self.queue.add(data, self.window.rate)
-                    self._changed.notify_all()
+        for data in datagrams(self._link):
+            self._copy(data)
+            with self._changed:
+                self.queue.add(data, self.window.rate)
+                self._changed.notify_all()
 
     def _send(self) -> None:
         with contextlib.suppress(*self._errors):

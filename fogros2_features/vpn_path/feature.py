@@ -33,10 +33,8 @@ WORKING = 10.0
 TRIAL, SHORTEST, LONGEST = 2.5, 5.0, 60.0
 #: Seconds without progress after which a stream is opened anew.
 STALLED = 5.0
-#: Seconds for an attempt to open it, and between two attempts.
+#: Seconds to connect and for the program's first line, and between two attempts.
 OPENING, PAUSE = 10.0, 2.0
-#: Seconds that the end waits for an attempt to open a stream.
-ENDING = 2.0
 #: Seconds between two decisions, and while UDP works.
 INTERVAL, STEADY = 0.1, 1.0
 
@@ -106,15 +104,7 @@ class Trial:
 
     def _listen(self) -> None:
         assert self._link is not None
-        while True:
-            try:
-                data = self._link.recv(1 << 16)
-            except ConnectionRefusedError:
-                continue
-            except OSError:
-                return
-            if not data:
-                return
+        for data in carrier.datagrams(self._link):
             self._last = time.monotonic()
             self._began = self._began or self._last
             self._answer(data)
@@ -145,8 +135,8 @@ class Way:
         #: Longer after each return to UDP, which may work for a while only.
         self._pause = SHORTEST
         self._stop = threading.Event()
+        #: Guards what has to be undone, and changes of the path, which end with the way.
         self._lock = threading.Lock()
-        self._looking = threading.Lock()
         if own == STREAM:
             try:
                 self._open()
@@ -160,15 +150,9 @@ class Way:
         self._stop.set()
         with self._lock:
             self._undo.close()
-        if self._looking.acquire(timeout=ENDING):  # what it changes is recorded by then
-            self._looking.release()
 
     def _look(self) -> Optional[float]:
         """Change the path if it is time to; return the seconds until the next look, if long."""
-        with self._looking:
-            return self._decide() if not self._stop.is_set() else None
-
-    def _decide(self) -> Optional[float]:
         now, age = time.monotonic(), self._link.silence
         working = self._trial.working(now) if self._trial is not None else 0.0
         target = choose(
@@ -195,10 +179,12 @@ class Way:
         return STEADY if self._path == UDP and age is not None else None
 
     def _use(self, path: str, relay: str) -> None:
-        with self._link.step('VPN path') as detail:
-            self._link.dial(relay, path if relay else '')
-            detail.append(path)
-        self._path = path
+        with self._lock:
+            if not self._stop.is_set():
+                with self._link.step('VPN path') as detail:
+                    self._link.dial(relay, path if relay else '')
+                    detail.append(path)
+                self._path = path
 
     def _end(self) -> None:
         with self._lock:
@@ -221,7 +207,12 @@ class Way:
             ('python3', '-IS', '-c', Path(carrier.__file__).read_text(), str(link.port)),
             what='carry the VPN'))
         self._push(stream.close)
-        if stream.readline() != carrier.READY:
+        late = threading.Timer(OPENING, stream.close)
+        late.daemon = True
+        late.start()
+        first = stream.readline()
+        late.cancel()
+        if first != carrier.READY:
             raise ShellError(f"'{link.spec.name}' does not run the program that carries the VPN")
         trial = Trial(link.direct if self._own == AUTO else None,
                       lambda data: carried.deliver(data), self._pause)

@@ -4,13 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import contextlib
 import heapq
 import itertools
 import random
+import threading
+from typing import Any
 
 import pytest
 
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, ShellError
+from fogros2.model import MachineSpec
 from fogros2_features.vpn_path import carrier, feature, VpnPath
 from fogros2_features.vpn_path.carrier import Queue, Window
 
@@ -132,3 +136,70 @@ def test_other_values_are_refused():
     assert VpnPath.options() == 'auto'
     with pytest.raises(ConfigurationError, match="vpn_path='tcp' is no path of a VPN"):
         VpnPath.options('tcp')
+
+
+class Shells:
+    """A machine whose shell opens a stream when a test lets it."""
+
+    def __init__(self) -> None:
+        self.opening, self.opened, self.ended = (threading.Event() for _ in range(3))
+        self.dialled: list[str] = []
+        self.outside: Any = 'the shell'
+        self.spec = MachineSpec('planner', 'ssh')
+        self.port = self.robot_port = 9
+        self.silence = self.direct = None
+
+    def connect(self, *_: Any, **__: Any) -> Shells:
+        return self
+
+    def open(self, command: Any) -> Shells:
+        self.opening.set()
+        self.opened.wait(60.0)
+        return self
+
+    def write(self, data: bytes) -> None:
+        pass
+
+    def readline(self) -> bytes:
+        self.ended.wait(60.0)
+        return b''
+
+    def close(self) -> None:
+        self.ended.set()
+
+    def dial(self, relay: str, carried: str) -> None:
+        self.dialled.append(carried)
+
+    def advise(self, remedy: str) -> None:
+        self.remedy = remedy
+
+    def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
+        return contextlib.nullcontext([])
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    shells = Shells()
+    monkeypatch.setattr(feature, 'shells', shells)
+    return shells
+
+
+def test_path_stays_after_the_end_of_the_way(machine, monkeypatch):
+    """The machine's record may be deleted by then."""
+    monkeypatch.setattr(feature, 'FIRST', 0.0)
+    monkeypatch.setattr(feature.carrier, 'READY', b'')
+    way = feature.Way(machine, 'auto')
+    assert machine.opening.wait(60.0)
+    way.close()
+    looking = [thread for thread in threading.enumerate() if thread.name == 'fog-path']
+    machine.opened.set()
+    for thread in looking:
+        thread.join(60.0)
+    assert machine.dialled == []
+
+
+def test_machine_that_does_not_answer_holds_no_launch(machine, monkeypatch):
+    monkeypatch.setattr(feature, 'OPENING', 0.05)
+    machine.opened.set()
+    with pytest.raises(ShellError, match='does not run the program'):
+        feature.Way(machine, 'stream')
