@@ -18,7 +18,7 @@ from decimal import Decimal
 import threading
 from typing import ClassVar, Optional
 
-from fogros2.errors import MachineNotFound, ProviderError, Unsupported
+from fogros2.errors import MachineNotFound, NameTaken, ProviderError, Unsupported
 from fogros2.model import (
     CreateRequest,
     Image,
@@ -113,6 +113,12 @@ class Attached:
 
     devices: tuple[str, ...] = ()
     folder: str = ''
+
+
+def made_without(machine: str, volume: str) -> NameTaken:
+    """Return the error for a kept machine that was created without a volume."""
+    return NameTaken(f"the machine '{machine}' of an earlier launch has no volume '{volume}'",
+                     f'give the machine another name=, or: ros2 fog delete {machine}')
 
 
 class Provider(abc.ABC):
@@ -494,7 +500,7 @@ class Provider(abc.ABC):
 
         Idempotent. ``create`` has refused a volume that another machine uses.
 
-        :raises NameTaken: another machine has got the volume since.
+        :raises NameTaken: another machine has got the volume since, or a kept machine has none.
         :raises Unsupported: the provider has no volumes.
         """
         raise self.no_volumes()

@@ -3,12 +3,17 @@
 
 from __future__ import annotations
 
+import contextlib
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from fogros2.errors import ConfigurationError, FogError
+from fogros2.errors import ConfigurationError, FogError, NameTaken
 from fogros2.model import MachineSpec, Volume
+from fogros2.provider import container
+from fogros2.provider.container import machine as container_machine
+from fogros2.provider.kubernetes import claims, names
 from fogros2_features.volumes import Volumes
 from ros2fog_cli.verb.volume import _named
 
@@ -63,3 +68,28 @@ def test_a_name_of_several_volumes_deletes_none() -> None:
     assert _named(volumes, ['gcp:y/2']) == volumes[1:]
     with pytest.raises(ConfigurationError, match="no volume 'maps'"):
         _named(volumes, ['maps'])
+
+
+@pytest.mark.parametrize(('containers', 'error'), [
+    ('fogros2-one', ''),
+    ('fogros2-two fogros2-one', "'two' has the volume 'models'"),
+    ('', "'one' of an earlier launch has no volume 'models'"),
+])
+def test_container_has_a_volume_alone(
+    monkeypatch: pytest.MonkeyPatch, containers: str, error: str,
+) -> None:
+    """Of two launches at once, each may have created a container; a kept one may lack it."""
+    engine = SimpleNamespace(call=lambda *_, **__: SimpleNamespace(stdout=containers))
+    monkeypatch.setattr(container, '_inspected', lambda machine_id: (
+        engine, 'id', {'Config': {'Labels': {container_machine.MACHINE: 'one'}}}))
+    with pytest.raises(NameTaken, match=error) if error else contextlib.nullcontext():
+        container.ContainerProvider().attach('podman:id', 'models', 50)
+
+
+def test_first_of_two_pods_has_the_volume() -> None:
+    pods = [{'metadata': {'name': f'{job}-x', 'uid': job, 'creationTimestamp': f'{time}Z',
+                          'labels': {names.MACHINE: job}}, 'status': {'phase': 'Running'},
+             'spec': {'volumes': [{'persistentVolumeClaim': {'claimName': 'fogros2-volume-m'}}]}}
+            for job, time in (('b', '10:00'), ('a', '10:00'), ('c', '10:01'))]
+    api: Any = SimpleNamespace(request=lambda *_, **__: {'items': pods})
+    assert claims.users(api, 'default') == {'fogros2-volume-m': 'a'}

@@ -32,7 +32,7 @@ from fogros2.errors import (
     Unsupported,
 )
 from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState, Volume
-from fogros2.provider import Attached, Capabilities, Provider
+from fogros2.provider import Attached, Capabilities, made_without, Provider
 from fogros2.provider.container import debian_root, hidden_files, login_ids, packet_filter
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import entry as container_entry
@@ -228,9 +228,7 @@ class ContainerProvider(Provider):
         engine = next(ways)
         create = self._create_from_image if options.image else self._create_from_root
         for name in request.with_volumes:
-            user = _user_of(engine, container_machine.volume_name(name))
-            if user not in ('', spec.name):
-                raise _in_use(name, user)
+            _check_free(engine, name, spec.name)
         with _sharing(spec, request.token):
             while True:
                 try:
@@ -421,10 +419,15 @@ class ContainerProvider(Provider):
             for name in listed:
                 if name.startswith(prefix):
                     yield Volume(f'{engine.name}:{name}', name[len(prefix):], self.name,
-                                 engine.name, user=_user_of(engine, name))
+                                 engine.name, user=', '.join(_users_of(engine, name)))
 
     def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
         """Return nothing: the engine has mounted the volume, whose size has no limit."""
+        engine, _, report = _inspected(machine_id)
+        machine = container_machine.labels_of(report)[container_machine.MACHINE]
+        _check_free(engine, name, machine)  # of two launches at once, each may have created one
+        if not _users_of(engine, container_machine.volume_name(name)):
+            raise made_without(machine, name)
         return Attached()
 
     def delete_volume(self, volume_id: str) -> None:
@@ -433,9 +436,7 @@ class ContainerProvider(Provider):
         engine, prefix = container_engine.named(kind), container_machine.volume_name('')
         if not name.startswith(prefix):
             raise MachineNotFound(f"'{volume_id}' is no volume of a container machine")
-        user = _user_of(engine, name)
-        if user:
-            raise _in_use(name[len(prefix):], user)
+        _check_free(engine, name[len(prefix):])
         if name in engine.call('volume', 'ls', '-q', what='listing volumes').stdout.split():
             engine.call('volume', 'rm', name, what=f'removing the volume {name}', timeout=600.0)
 
@@ -482,16 +483,23 @@ class ContainerProvider(Provider):
                             'it needs sshd, sudo, rsync and python3, or apt-get and a network')
 
 
-def _user_of(engine: Engine, volume: str) -> str:
-    """Return a machine whose container has a volume, '' for none."""
+def _users_of(engine: Engine, volume: str) -> list[str]:
+    """Return the machines whose containers have a volume."""
     names = engine.call('ps', '-a', f'--filter=volume={volume}', '--format', '{{.Names}}',
                         what='looking at a volume').stdout.split()
-    return names[0].removeprefix(container_machine.container_name('')) if names else ''
+    return [name.removeprefix(container_machine.container_name('')) for name in names]
 
 
-def _in_use(name: str, user: str) -> NameTaken:
-    return NameTaken(f"the machine '{user}' has the volume '{name}'",
-                     f'end its launch, or: ros2 fog delete {user}')
+def _check_free(engine: Engine, name: str, machine: str = '') -> None:
+    """
+    Check that no other machine has a volume.
+
+    :raises NameTaken: one has.
+    """
+    for user in _users_of(engine, container_machine.volume_name(name)):
+        if user != machine:
+            raise NameTaken(f"the machine '{user}' has the volume '{name}'",
+                            f'end its launch, or: ros2 fog delete {user}')
 
 
 @contextlib.contextmanager

@@ -35,7 +35,7 @@ from fogros2.kubernetes_client import (
     Unreachable,
 )
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState, Volume
-from fogros2.provider import Attached, Capabilities, Provider, TAG_ON_EXIT
+from fogros2.provider import Attached, Capabilities, made_without, Provider, TAG_ON_EXIT
 from fogros2.provider.kubernetes import (
     boot,
     claims,
@@ -330,6 +330,12 @@ class KubernetesProvider(Provider):
 
     def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
         """Return nothing: the kubelet has mounted the volume."""
+        where = MachineId.parse(machine_id)
+        taken = claims.users(kubernetes_client.connect(where.context), where.namespace,
+                             self.cancel)
+        claims.check_free(name, taken, (where.job,))  # two launches may have made pods at once
+        if claims.claim_name(name) not in taken:
+            raise made_without(where.job.removeprefix('fogros2-'), name)
         return Attached()
 
     def delete_volume(self, volume_id: str) -> None:

@@ -32,12 +32,14 @@ def claim(name: str, size_gb: int) -> dict[str, Any]:
 
 
 def users(api: Api, namespace: str, cancel: Optional[threading.Event] = None) -> dict[str, str]:
-    """Return the Jobs of pods that have not ended, by the claims that they mount."""
+    """Return the Job of the first pod that has not ended, by the claims that pods mount."""
     answer = api.request('GET', path('pods', namespace), labelSelector=selector(names.MANAGED),
                          cancel=cancel)
+    latest_first = sorted(items(answer), reverse=True, key=lambda pod: (
+        pod['metadata']['creationTimestamp'], pod['metadata']['uid']))
     return {volume['persistentVolumeClaim']['claimName']: pod['metadata']['labels'].get(
                 names.MACHINE, pod['metadata']['name'])
-            for pod in items(answer) if pod['status'].get('phase') not in ('Succeeded', 'Failed')
+            for pod in latest_first if pod['status'].get('phase') not in ('Succeeded', 'Failed')
             for volume in pod['spec'].get('volumes') or () if 'persistentVolumeClaim' in volume}
 
 
