@@ -60,7 +60,12 @@ if [ $# -gt 0 ]; then
     if ! mountpoint -q -- "$path"; then
         make
         traces=$(wipefs -n -- "$device")
-        [ -n "$traces" ] || { mkfs.ext4 -q -m 0 "$device"; echo new; }
+        if [ -z "$traces" ]; then  # as on a new disk, or where mkfs was ended
+            cmp -s -n 4096 -- "$device" /dev/zero ||
+                failed 'the disk has data, but no file system'
+            mkfs.ext4 -q -m 0 "$device"
+            echo new
+        fi
         mount -- "$device" "$path"
     fi
     [ "$(findmnt -n -o SOURCE -M "$path")" = "$device" ] || failed "$path has another disk"

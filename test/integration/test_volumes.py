@@ -14,6 +14,7 @@ from fogros2.model import Command
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import root as container_root
 from fogros2.waiting import wait_until
+from fogros2_features import volumes
 from rigs.bare_computer import bare_computer, BareComputer
 from rigs.launched import embedded, launching, ros2
 
@@ -134,3 +135,20 @@ def test_volume_of_an_ssh_host_is_a_folder_with_a_lock(
     assert volume in listed.stdout
     assert ros2('fog', 'volume', 'delete', '--host', 'lab', volume, '--yes').returncode == 0
     assert computer.run(f'ls /home/{computer.user}/.local/share/fogros2-volumes').stdout == ''
+
+
+@pytest.mark.parametrize('content', [b'', b'data of somebody'])
+def test_disk_with_data_and_no_file_system_stays(tmp_path: Path, content: bytes) -> None:
+    disk, path = tmp_path / 'disk', tmp_path / 'data'
+    disk.write_bytes(content.ljust(1 << 24, b'\0'))
+    interface = f'fogt{uuid.uuid4().hex[:6]}'
+    result = process.run(Command(('unshare', '-m', 'sh', '-ec', """
+device=$(losetup --show -f "$1")
+trap 'umount "$2" 2>/dev/null || :; losetup -d "$device"; rm -f "/run/$3.volume-models"' EXIT
+sh -ec "$4" sh models "$2" root "$3" '' "$device"
+""", 'sh', str(disk), str(path), interface, volumes._MOUNT), sudo=True), timeout=60.0, check=False)
+    if content:
+        assert 'the disk has data, but no file system' in result.stderr
+        assert disk.read_bytes().startswith(content)
+    else:
+        assert (result.returncode, result.stdout) == (0, 'new\n'), result.stderr
