@@ -103,11 +103,18 @@ def test_two_launches_that_make_a_volume_at_once_keep_one(memory):
     provider.reachable(two, name='two', timeout=30.0)
     one, _ = with_volume(memory, 'one')
     adapter = vars(provider)['_cloud']
-    list_disks = type(adapter).disks
-    # the first look came before the other launch's volume
-    looks = iter([()])
+    list_disks, delete_disk = type(adapter).disks, type(adapter).delete_disk
+    # the first look came before the other launch's volume, others while it is made
+    looks = iter([lambda disks: [], *2 * [lambda disks: [
+        dataclasses.replace(disk, ready=False) for disk in disks]]])
+
+    def delete(own, disk):
+        assert not [*looks]
+        delete_disk(own, disk)
+
     memory.patch.setattr(type(adapter), 'disks', lambda own, region, name='': next(
-        looks, list_disks(own, region, name)))
+        looks, list)(list_disks(own, region, name)))
+    memory.patch.setattr(type(adapter), 'delete_disk', delete)
     with pytest.raises(NameTaken, match='is in use by'):
         provider.attach(two, 'models', 60)
     memory.patch.setattr(type(adapter), 'disks', list_disks)

@@ -407,10 +407,13 @@ class VmProvider(Provider):
             machine, name, size_gb)
 
         def look(attached: bool) -> Optional[Disk]:
-            disk = _first(cloud.disks(machine.region, name))
+            disks = list(cloud.disks(machine.region, name))
+            disk = _first(disks)
             if disk is None:
                 return None
             if made not in ('', disk.id):
+                if any(one.id == made and not one.ready for one in disks):
+                    return None  # EC2 deletes no disk that it still makes
                 cloud.until(None).delete_disk(dataclasses.replace(disk, id=made))
                 raise _in_use(disk)
             if disk.vm not in ('', machine.vm):
