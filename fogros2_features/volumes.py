@@ -34,8 +34,8 @@ _SYSTEM = ('bin', 'boot', 'dev', 'etc', 'lib', 'lib32', 'lib64', 'libx32', 'proc
 _OUTER = re.compile(r'/(home|media|mnt|opt|root|srv|var)?|/home/[^/]+|/opt/ros(/.*)?|/var/[a-z]+')
 
 # $1 name, $2 path, $3 login user, $4 the launch's interface, $5 folder; then paths of a device.
-# A folder has a lock, which a process holds as long as the launch's VPN is there: an agent removes
-# that even if the launch was killed. A disk is attached to one machine.
+# A folder and its path have locks, which a process holds as long as the launch's VPN is there: an
+# agent removes that even if the launch was killed. A disk is attached to one machine.
 _MOUNT = """\
 path=$2 user=$3 link=$4 folder=$5 mark=/run/$4.volume-$1
 shift 5
@@ -43,7 +43,8 @@ failed() { echo "$1" >&2; exit 1; }
 make() {
     made=
     [ -d "$path" ] || { mkdir -p -- "$path"; made=yes; }
-    ! mountpoint -q -- "$path" || failed "$path has another volume"
+    exec 8<"$path"
+    flock -n 8 && ! mountpoint -q -- "$path" || failed "$path has another volume"
     [ -z "$(ls -A -- "$path")" ] || failed "$path has files, which the volume would hide"
 }
 if [ $# -gt 0 ]; then

@@ -152,3 +152,12 @@ sh -ec "$4" sh models "$2" root "$3" '' "$device"
         assert disk.read_bytes().startswith(content)
     else:
         assert (result.returncode, result.stdout) == (0, 'new\n'), result.stderr
+
+
+def test_two_volumes_at_once_get_no_common_path(tmp_path: Path) -> None:
+    path, folder = tmp_path / 'data', tmp_path / 'models'
+    path.mkdir()
+    result = process.run(Command(  # another launch holds the lock until it has mounted its volume
+        ('unshare', '-m', 'flock', str(path), 'sh', '-ec', volumes._MOUNT, 'sh', 'models',
+         str(path), 'root', 'fogt-none', str(folder)), sudo=True), timeout=60.0, check=False)
+    assert (result.returncode, result.stderr) == (1, f'{path} has another volume\n')
