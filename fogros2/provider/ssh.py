@@ -48,7 +48,7 @@ done
 """
 _DELETE = f"""\
 cd {_VOLUMES} 2>/dev/null && [ -d "$1" ] || exit 0
-flock -n "$1" rm -rf -- "$1" || {{ [ ! -d "$1" ] || exit 75; }}
+flock -n -E 75 "$1" rm -rf -- "$1"
 """
 
 

@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
+from pathlib import Path
+import subprocess
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +14,7 @@ import pytest
 
 from fogros2.errors import ConfigurationError, FogError, NameTaken
 from fogros2.model import MachineSpec, Volume
-from fogros2.provider import container
+from fogros2.provider import container, ssh
 from fogros2.provider.container import machine as container_machine
 from fogros2.provider.kubernetes import claims, names
 from fogros2_features.volumes import Volumes
@@ -93,3 +96,13 @@ def test_first_of_two_pods_has_the_volume() -> None:
             for job, time in (('b', '10:00'), ('a', '10:00'), ('c', '10:01'))]
     api: Any = SimpleNamespace(request=lambda *_, **__: {'items': pods})
     assert claims.users(api, 'default') == {'fogros2-volume-m': 'a'}
+
+
+def test_folder_that_cannot_be_deleted_is_not_in_use(tmp_path: Path) -> None:
+    (tmp_path / '.local/share/fogros2-volumes/models').mkdir(parents=True)
+    (tmp_path / 'rm').write_text('#!/bin/sh\necho denied >&2; exit 1\n')
+    (tmp_path / 'rm').chmod(0o755)
+    result = subprocess.run(
+        ['sh', '-c', ssh._DELETE, 'sh', 'models'], capture_output=True, text=True, check=False,
+        env={'HOME': str(tmp_path), 'PATH': f"{tmp_path}:{os.environ['PATH']}"})
+    assert (result.returncode, result.stderr) == (1, 'denied\n')
