@@ -875,7 +875,7 @@ def test_machine_that_is_ended_in_order_is_not_lost(launch, provider):
     assert seen == ['']
 
 
-def test_undo_of_another_version_is_reported_and_the_others_are_done(launch, provider):
+def test_undo_of_another_version_is_reported_others_are_done(launch, provider):
     context, mine = begun(launch)
     mine.shell = FakeShell(handlers={'sh': lambda command: Result(0, '', '')})
     failure, = undo.unmake_all(mine, [Made(undo.WATCHDOG), Made('balloon')])
