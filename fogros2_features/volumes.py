@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 #: GB of a new volume, and the most.
 SIZE, LARGEST = 50, 16000
+#: Volumes of a machine: EC2 recommends 11 names of devices.
+MOST = 10
 _NAME = re.compile(r'[a-z]([a-z0-9-]{0,38}[a-z0-9])?')
 _VALUE = re.compile(r'(/[A-Za-z0-9._/-]*?)/?(?::(\d{1,5}) ?GB)?')
 #: Folders that belong to the system, with all below them; and those that hold others.
@@ -114,6 +116,9 @@ class Volumes(Feature):
         :param volumes: by name, the folder on the machine, such as '/data' or '/data:200GB'.
         """
         result = {name: _read(name, str(value)) for name, value in (volumes or {}).items()}
+        if len(result) > MOST:
+            raise ConfigurationError(f'{len(result)} volumes, and a machine has {MOST} at most',
+                                     'keep several folders in one volume')
         for (one, (path, _)), (two, (other, _)) in itertools.permutations(result.items(), 2):
             if f'{other}/'.startswith(f'{path}/'):
                 raise ConfigurationError(f"the volumes '{one}' and '{two}' have one path {other}",

@@ -30,7 +30,7 @@ def switch(request, response):
     return response
 node.create_service(SetBool, 'switch', switch)
 actions = [node.create_publisher(String, 'count/_action/feedback', 10),
-           node.create_subscription(String, 'walk/_action/feedback', print, 10)]
+           node.create_subscription(String, 'walk/_action/feedback', lambda _: None, 10)]
 print('ready', flush=True)
 try:
     rclpy.spin(node)

@@ -29,6 +29,7 @@ def test_a_volume_has_a_path_and_a_size() -> None:
 @pytest.mark.parametrize(('given', 'error'), [
     ({'../x': '/data'}, "'../x' is no name of a volume"),
     ({'Models': '/data'}, "'Models' is no name"),
+    ({f'm{number}': f'/data{number}' for number in range(11)}, '11 volumes'),
     ({'m': 'data'}, "no folder and size, but 'data'"),
     ({'m': '~/data'}, 'no folder'),
     ({'m': '/data/../usr'}, 'no folder'),
