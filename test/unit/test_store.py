@@ -208,10 +208,10 @@ def test_readers_find_digits_that_they_may_not_write(monkeypatch, tmp_path):
 
 def read_only(opened):
     """Return ``os.open`` for a file system that is mounted read-only."""
-    def opener(path, flags, *mode):
+    def opener(path, flags, *mode, **place):
         if flags & (os.O_WRONLY | os.O_RDWR):
             raise OSError(errno.EROFS, 'Read-only file system')
-        return opened(path, flags, *mode)
+        return opened(path, flags, *mode, **place)
     return opener
 
 
