@@ -7,7 +7,9 @@ from collections.abc import Sequence
 import dataclasses
 from typing import Any, Optional
 
+from fogros2 import plugin_system
 from fogros2.model import Volume
+from fogros2.provider import Provider
 from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Warn
 
@@ -17,8 +19,10 @@ def survey(
 ) -> list[Volume]:
     """Return the volumes of all providers; warn about a provider that does not answer."""
     def ask(name: str) -> list[Volume]:
-        provider = machines.load(name, regions)
-        return list(provider.volumes(hosts)) if provider.capabilities.keeps_volumes else []
+        kind: type[Provider] = plugin_system.load('fogros2.provider', name)
+        if not kind.capabilities.keeps_volumes:
+            return []
+        return list(machines.load(name, regions).volumes(hosts))
 
     answers = machines.ask_all(warn, machines.configured(regions), ask)
     return sorted((volume for volumes in answers for volume in volumes or ()),

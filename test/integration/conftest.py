@@ -37,7 +37,7 @@ __all__ = ['cloud_network', 'engine']
 #: Stands for ROS 2 without Cyclone DDS, and for the package manager that brings it.
 ROS = {
     'usr/bin/apt-get': """#!/bin/sh
-[ "$1" != install ] || busybox touch /opt/ros/jazzy/lib/librmw_fastrtps_cpp.so
+case " $* " in *" install "*) busybox touch /opt/ros/jazzy/lib/librmw_fastrtps_cpp.so ;; esac
 """,
     'opt/ros/jazzy/setup.sh': 'AMENT_PREFIX_PATH=/opt/ros/jazzy\n',
     'opt/ros/jazzy/lib/demo/program': """#!/bin/sh

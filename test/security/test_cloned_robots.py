@@ -41,6 +41,7 @@ def provider(monkeypatch: pytest.MonkeyPatch) -> FakeProvider:
         return fake
 
     plugin.configured = lambda: True  # type: ignore[attr-defined]
+    plugin.capabilities = FakeProvider.capabilities  # type: ignore[attr-defined]
     instead(monkeypatch, 'fogros2.provider', {'fake': plugin})
     instead(monkeypatch, 'fogros2.vpn', {'wireguard': FakeVpn})
     return fake
