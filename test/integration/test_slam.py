@@ -181,7 +181,8 @@ def test_slam_survives_bad_camera_messages():
     side = Side()
     try:
         for what, told in (
-                (lambda: side.show(image, depth, info=CameraInfo()), 'no focal length'),
+                # a frame may meet the next camera info: it must not be one that starts the map
+                (lambda: side.show(image, depth * 0, info=CameraInfo()), 'no focal length'),
                 (lambda: side.show(image, depth * 0), 'features have a depth'),
                 (lambda: side.show(blank, depth), '0 features in the image'),
                 (lambda: side.show(image[:, :, :2], depth, 'yuv422'), "an image as 'yuv422'"),
