@@ -28,7 +28,7 @@ def test_motion_planning(kubernetes, namespace, tmp_path, monkeypatch):
         # 0 says that the service's answer had a path in it
         assert run.ended(150.0) == 0, run.text
     assert run.errors == [] and 'WARNING' not in run.text, run.text
-    assert re.search(r'planner: Python modules .*ompl, fcl sent', run.text), run.text
+    assert re.search(r'planner: Python modules .*fcl, ompl sent', run.text), run.text
     assert re.search(r'\[planner[.]motion_planner-\d+\] .*path of \d', run.text), run.text
     assert re.search(r'\[planning_client-\d+\] .*path of \d', run.text), run.text
     assert drawn.read_bytes().startswith(b'\x89PNG')
