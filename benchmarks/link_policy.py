@@ -10,6 +10,7 @@ have; middlewares that are not on this computer are left out.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from pathlib import Path
@@ -37,6 +38,7 @@ def publish() -> None:
     """Publish transforms until a signal, serialized once: the processors are few."""
     from geometry_msgs.msg import TransformStamped
     import rclpy
+    from rclpy.executors import ExternalShutdownException
     from rclpy.serialization import serialize_message
     from tf2_msgs.msg import TFMessage
 
@@ -49,12 +51,14 @@ def publish() -> None:
         one.header.frame_id = 'base_link'
     data = serialize_message(message)
     node.create_timer(1 / RATE, lambda: publisher.publish(data))
-    rclpy.spin(node)
+    with contextlib.suppress(ExternalShutdownException):
+        rclpy.spin(node)
 
 
 def listen(topic: str) -> None:
     """Print the number of messages so far and the frames of the last one, again and again."""
     import rclpy
+    from rclpy.executors import ExternalShutdownException
     from rclpy.serialization import deserialize_message
     from tf2_msgs.msg import TFMessage
 
@@ -69,7 +73,8 @@ def listen(topic: str) -> None:
         print(json.dumps({'count': len(heard), 'frames': len(frames)}), flush=True)
 
     node.create_timer(0.1, tell)
-    rclpy.spin(node)
+    with contextlib.suppress(ExternalShutdownException):
+        rclpy.spin(node)
 
 
 def measured(vendor: DdsVendor, name: str, policy: Policy) -> tuple[float, float, float]:
