@@ -36,8 +36,8 @@ from rigs.launched import launching
 
 ARCHITECTURE, DEBIAN_NAME, ELF_MACHINE = 'aarch64', 'arm64', b'\xb7\x00'
 EMULATOR = '/usr/bin/qemu-aarch64-static'
-PACKAGES = ('ca-certificates', 'iproute2', 'libc6-dev', 'openssh-client', 'openssh-server',
-            'python3', 'python3-venv', 'rsync', 'sudo', 'tcc', 'wireguard-tools')
+PACKAGES = ('ca-certificates', 'iproute2', 'libc6-dev', 'nftables', 'openssh-client',
+            'openssh-server', 'python3', 'python3-venv', 'rsync', 'sudo', 'tcc', 'wireguard-tools')
 
 pytestmark = [
     # a minute to make the system, and three for what is emulated
