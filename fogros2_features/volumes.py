@@ -8,7 +8,7 @@ a new disk, mounts it and unmounts it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import itertools
 import re
@@ -151,8 +151,10 @@ class Volumes(Feature):
         with contextlib.ExitStack() as undo:
             with running.step('volumes') as detail:
                 for name, (path, size) in own.items():
+                    ways: list[Attached] = []
+                    undo.callback(_detach, running, name, path, ways)
                     attached = running.provider.attach(running.machine.id, name, size)
-                    undo.callback(_detach, running, name, path, attached)
+                    ways.append(attached)
                     assert running.machine.shell is not None
                     output = running.run(Command(
                         ('sh', '-ec', _MOUNT, 'sh', name, path, running.machine.shell.user,
@@ -162,13 +164,14 @@ class Volumes(Feature):
             yield
 
 
-def _detach(running: RunningMachine, name: str, path: str, attached: Attached) -> None:
+def _detach(running: RunningMachine, name: str, path: str, ways: Sequence[Attached]) -> None:
     if running.lost:
         return  # its provider detaches a disk when the machine ends
-    running.run(Command(
-        ('sh', '-ec', _UNMOUNT, 'sh', name, path, running.interface.name,
-         attached.folder or ''.join(attached.devices)),
-        sudo=True, what=f"unmount the volume '{name}'"), timeout=120.0)
+    for attached in ways:  # none, if an interrupt or an error ended 'attach'
+        running.run(Command(
+            ('sh', '-ec', _UNMOUNT, 'sh', name, path, running.interface.name,
+             attached.folder or ''.join(attached.devices)),
+            sudo=True, what=f"unmount the volume '{name}'"), timeout=120.0)
     if running.spec.on_exit != 'delete':  # the end of a machine detaches, too
         running.provider.detach(running.machine.id, name)
 

@@ -10,6 +10,7 @@ frame, all in one message. A topic crosses only while the other side has a subsc
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import json
 import os
@@ -34,7 +35,7 @@ TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 MOST = 10_000
 
 
-class Way:
+class Way(abc.ABC):
     """
     One direction of a topic.
 
@@ -83,9 +84,9 @@ class Way:
             self.node.destroy_publisher(self.publisher)
             self.publisher = None
 
+    @abc.abstractmethod
     def heard(self, data: bytes) -> None:
         """Handle a serialized message."""
-        raise NotImplementedError
 
 
 class Leaving(Way):

@@ -8,6 +8,7 @@ import dataclasses
 import getpass
 import os
 from pathlib import Path
+import re
 import socket
 from typing import Any, ClassVar
 from urllib.parse import parse_qsl, urlencode
@@ -39,6 +40,7 @@ _TIMEOUT = 5.0
 #: Seconds for a look at volumes, and for the deletion of one.
 _VOLUMES_TIMEOUT = 600.0
 _VOLUMES = '~/.local/share/fogros2-volumes'
+_VOLUME = re.compile('[a-z0-9-]+')
 # A launch that uses a volume holds its lock.
 _LIST = f"""\
 cd {_VOLUMES} 2>/dev/null || exit 0
@@ -172,9 +174,10 @@ class SSHProvider(Provider):
         """Yield the folders of these computers, whose volumes nobody else lists."""
         for host in hosts:
             for line in self._run(host, _LIST).splitlines():
-                name, _, state = line.partition(' ')
-                yield Volume(f'{_SCHEME}{host}/{name}', name, self.name, host,
-                             user='a launch' if state == 'used' else '')
+                name, _, state = line.rpartition(' ')
+                if _VOLUME.fullmatch(name):  # not another folder, nor what a host makes up
+                    yield Volume(f'{_SCHEME}{host}/{name}', name, self.name, host,
+                                 user='a launch' if state == 'used' else '')
 
     def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
         """Return a folder, whose size has no limit."""

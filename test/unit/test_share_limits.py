@@ -109,7 +109,7 @@ def test_topic_crosses_when_both_sides_have_its_type_again() -> None:
         get_name=lambda: 'limits', get_publishers_info_by_topic=lambda topic: [publisher],
         get_subscriptions_info_by_topic=lambda topic: [publisher],
         create_publisher=create, create_subscription=lambda *_, **__: 'subscription')
-    way = limits.Way(node, '/back', '/chatter')
+    way = limits.Coming(node, '/back', '/chatter', leaving=SimpleNamespace())  # type: ignore[arg-type]
     with pytest.raises(RuntimeError):
         way.look()
     refused.clear()

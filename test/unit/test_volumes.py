@@ -12,12 +12,13 @@ from typing import Any
 
 import pytest
 
-from fogros2.errors import ConfigurationError, FogError, NameTaken
+from fogros2.errors import Cancelled, ConfigurationError, FogError, NameTaken
 from fogros2.model import MachineSpec, Volume
 from fogros2.provider import container, ssh
 from fogros2.provider.container import machine as container_machine
 from fogros2.provider.kubernetes import claims, names
 from fogros2_features.volumes import Volumes
+from fogros2_testing.fakes import FakeRunning
 from ros2fog_cli.verb.volume import _named
 
 
@@ -107,3 +108,26 @@ def test_folder_that_cannot_be_deleted_is_not_in_use(tmp_path: Path) -> None:
         ['sh', '-c', ssh._DELETE, 'sh', 'models'], capture_output=True, text=True, check=False,
         env={'HOME': str(tmp_path), 'PATH': f"{tmp_path}:{os.environ['PATH']}"})
     assert (result.returncode, result.stderr) == (1, 'denied\n')
+
+
+def test_volume_is_detached_when_its_attachment_is_interrupted() -> None:
+    """The disk may have been attached by then; nothing of it is mounted."""
+    calls: list[tuple[str, ...]] = []
+
+    def attach(machine_id: str, name: str, size_gb: int) -> None:
+        calls.append(('attach', machine_id, name))
+        raise Cancelled('attach')
+
+    running: Any = FakeRunning(spec=MachineSpec('a', 'aws', on_exit='stop'))
+    running.provider = SimpleNamespace(
+        attach=attach, detach=lambda *words: calls.append(('detach', *words)))
+    with pytest.raises(Cancelled), Volumes().machine(running, {'models': ('/data', 50)}):
+        raise AssertionError('no node may start')
+    assert calls == [('attach', 'fake-1', 'models'), ('detach', 'fake-1', 'models')]
+
+
+def test_host_lists_no_volume_of_another_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ssh.SSHProvider, '_run', lambda *_: (
+        'models used\nmaps free\na folder free\n../x free\n\x1b[2J free\n'))
+    assert [(volume.name, bool(volume.user)) for volume in ssh.SSHProvider().volumes(['lab'])] == [
+        ('models', True), ('maps', False)]
