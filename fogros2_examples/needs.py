@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-from fogros2.host.modules import Module
-from fogros2_features.streams.needs import NUMPY, OPENCV
+from fogros2.host.modules import Module, NUMPY, OPENCV
 
 # wheels that need only NumPy
 _GTSAM = Module('gtsam', ('gtsam',))

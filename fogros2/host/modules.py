@@ -53,6 +53,11 @@ class Module:
         return f'{self.distributions[0]}>={version}' if version else self.distributions[0]
 
 
+#: What nodes that handle images or points need.
+NUMPY = Module('numpy', ('numpy',))
+OPENCV = Module('cv2', (
+    'opencv-python-headless', 'opencv-contrib-python-headless', 'opencv-python',
+    'opencv-contrib-python'))
 #: Group of entry points: by the name of a ROS package, the modules that its executables need.
 GROUP = 'fogros2.modules'
 

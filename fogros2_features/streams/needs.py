@@ -3,12 +3,8 @@
 
 from __future__ import annotations
 
-from fogros2.host.modules import Module
+from fogros2.host.modules import Module, NUMPY, OPENCV
 
-NUMPY = Module('numpy', ('numpy',))
-OPENCV = Module('cv2', (
-    'opencv-python-headless', 'opencv-contrib-python-headless', 'opencv-python',
-    'opencv-contrib-python'))
 # 16 converts bgr8 with a wrong colour range, 14 damages depth images of a few pixels
 _IMAGES = (NUMPY, Module('av', ('av',), (17,)), OPENCV)
 _CLOUDS = (NUMPY, Module('zstandard', ('zstandard',)))
