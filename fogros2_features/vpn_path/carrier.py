@@ -158,8 +158,6 @@ class Queue:
     def __init__(self) -> None:
         self._waiting: deque[bytes] = deque()
         self._size = 0
-        #: The number of those displaced.
-        self.dropped = 0
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -174,7 +172,6 @@ class Queue:
         self._size += len(data)
         while self._size > max(LEAST_QUEUE, rate * QUEUE):
             self.take()
-            self.dropped += 1
 
     def take(self) -> bytes:
         """Return the oldest datagram."""

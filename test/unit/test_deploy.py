@@ -26,7 +26,7 @@ from fogros2.deploy.steps import connecting, dds, installing, watching
 from fogros2.deploy.steps.arming import Arming
 from fogros2.deploy.steps.connecting import Connection
 from fogros2.deploy.steps.creating import Creation
-from fogros2.deploy.steps.joining import Joining, RobotLink
+from fogros2.deploy.steps.joining import Joining
 from fogros2.deploy.steps.watching import Watch
 from fogros2.errors import (
     AgentError,
@@ -63,7 +63,6 @@ from fogros2.waiting import Periodic, Timeouts, wait_until
 from fogros2_features.guests import invitation
 from fogros2_features.replacement import Replacement
 from fogros2_testing.fakes import (
-    FAKE_ENDPOINT,
     FakeProvider,
     FakeShell,
     FakeStream,
@@ -464,23 +463,6 @@ def test_wait_ends_when_a_booting_machine_ends(
     known = (ProviderError, 'ended while') if ended else (ConnectError, 'refuses connections')
     with mine.undo, pytest.raises(known[0], match=known[1]):
         Connection(context, mine).open()
-
-
-def test_ssh_that_carries_the_vpn_stays_outside(launch, provider, members, monkeypatch):
-    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(firewall=True))
-    context, mine = begun(launch)
-    Creation(context, mine).run()
-    mine.save(shell=FAKE_ENDPOINT)
-    mine.note(undo.SSH_PORT, FAKE_ENDPOINT.port)
-    mine.interface = context.vpn.interface
-    link = RobotLink(context, mine, members.add(2))
-    link.dial('127.0.0.1:4', 'stream')
-    Connection(context, mine).enter_vpn()
-    assert link.outside == FAKE_ENDPOINT
-    assert launch.store.load('planner').carried == 'stream'
-    # closed, it leads nowhere
-    mine.forget(Made(undo.SSH_PORT, FAKE_ENDPOINT.port))
-    assert link.outside is None
 
 
 def test_a_machine_that_boots_slowly_has_the_time_of_its_boot(launch, provider, monkeypatch):
