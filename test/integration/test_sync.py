@@ -32,9 +32,9 @@ pytestmark = [
 ]
 
 
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[PrivateSshd]:
-    with private_sshd(tmp_path / 'sshd') as running:
+@pytest.fixture(scope='module')
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PrivateSshd]:
+    with private_sshd(tmp_path_factory.mktemp('server') / 'sshd') as running:
         yield running
 
 
