@@ -217,7 +217,7 @@ class Way:
         trial = Trial(link.direct if self._own == AUTO else None,
                       lambda data: carried.deliver(data), self._pause)
         self._push(trial.close)
-        carried = Carrier(link.robot_port, stream.write, stream.readline, trial.copy, (FogError,))
+        carried = Carrier(link.robot_port, stream.write, stream.readline, trial.copy)
         self._push(carried.close)
         threading.Thread(target=carried.run, name='fog-carry', daemon=True).start()
         self._carrier, self._trial = carried, trial
