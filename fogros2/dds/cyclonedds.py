@@ -150,8 +150,7 @@ class CycloneDds(DdsVendor):
 
     def machine_interfaces(self, vpn: str) -> list[DdsInterface]:
         """Return the interfaces of a machine's nodes; their peers are the other machines."""
-        return [DdsInterface(vpn, 10, required=False),
-                DdsInterface('lo')]
+        return [DdsInterface(vpn, 10, required=False), DdsInterface('lo')]
 
     def render(
         self, interfaces: Sequence[DdsInterface], peers: Sequence[str],

@@ -143,7 +143,7 @@ class Connection(Step):
         """Reach a kept machine from outside again, before the VPN is taken down."""
         with self._entering:
             self._leaving = True
-        if self._job.survives:
+        if self._inside and self._job.survives:
             self._shell.move(self._shell_to(self.open_outside()))
 
     @property
