@@ -335,7 +335,7 @@ def test_refused_exec_is_reported(api, server, monkeypatch, old):
             lambda self: object.__getattribute__(self, 'absent'), lambda self, body: None),
             raising=False)
     server.answers = [(500, {'kind': 'Status', 'message': 'container not running'})]
-    error = raised(ApiError, lambda: api.execute('/exec', 'machine', ['true'], timeout=5.0))
+    error = raised(ApiError, lambda: api.websocket('/exec', {}, timeout=5.0))
     assert error.status == 500
     assert ('container not running' in str(error)) is body
 

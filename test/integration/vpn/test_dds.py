@@ -207,6 +207,7 @@ def test_unread_topics_send_only_announcements_across(vpn: Lab) -> None:
     assert camera.process.poll() is None
 
 
+@pytest.mark.parametrize('middleware', ['fastdds'])
 def test_denied_topic_stays_on_its_side(vpn: Lab) -> None:
     away = Policy(denied=('/costmap',)).names('machine')['/costmap']
     vpn.node('robot', 'to:/costmap', 'to:/up')
