@@ -63,6 +63,7 @@ from fogros2.waiting import Periodic, Timeouts, wait_until
 from fogros2_features.guests import invitation
 from fogros2_features.replacement import Replacement
 from fogros2_testing.fakes import (
+    FAKE_ENDPOINT,
     FakeProvider,
     FakeShell,
     FakeStream,
@@ -463,6 +464,26 @@ def test_wait_ends_when_a_booting_machine_ends(
     known = (ProviderError, 'ended while') if ended else (ConnectError, 'refuses connections')
     with mine.undo, pytest.raises(known[0], match=known[1]):
         Connection(context, mine).open()
+
+
+def test_ssh_port_stays_closed_after_the_launch_has_left(launch, provider, monkeypatch):
+    """A feature may just be about to open it."""
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(firewall=True))
+    monkeypatch.setattr(provider, 'robot_address', lambda: '198.51.100.7/32', raising=False)
+    allowed = []
+    monkeypatch.setattr(provider, 'allow', lambda *words: allowed.append(words[1:]),
+                        raising=False)
+    context, mine = begun(launch)
+    Creation(context, mine).run()
+    mine.save(shell=FAKE_ENDPOINT, carried='stream')
+    connection = Connection(context, mine)
+    connection.enter_vpn()
+    assert connection.open_outside() == FAKE_ENDPOINT
+    assert allowed == [(FAKE_ENDPOINT.port, ['198.51.100.7/32'])]
+    assert launch.store.load('planner').made[-1].kind == undo.SSH_PORT
+    mine.undo.close()
+    with pytest.raises(Cancelled):
+        connection.open_outside()
 
 
 def test_a_machine_that_boots_slowly_has_the_time_of_its_boot(launch, provider, monkeypatch):

@@ -20,6 +20,7 @@ from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob, Step
 from fogros2.deploy.undo import SSH_PORT
 from fogros2.errors import (
+    Cancelled,
     ConnectError,
     DeadlineExceeded,
     FogError,
@@ -75,6 +76,7 @@ class Connection(Step):
             job.save(shell=endpoint)
             if context.capabilities.firewall:
                 job.makes(SSH_PORT, endpoint.port)
+                job.undo.callback(self._leave)
                 if job.reused:
                     # the earlier launch closed the port, or the robot's address has changed
                     self._open_port()
@@ -105,11 +107,16 @@ class Connection(Step):
                               f'SSH through the VPN alone, port {self._outside.port} closed')
 
     def open_outside(self) -> Endpoint:
-        """Open the SSH port to the robot; return how a shell reaches the machine by it."""
+        """
+        Open the SSH port to the robot; return how a shell reaches the machine by it.
+
+        :raises Cancelled: the launch leaves the machine.
+        """
         if self._context.capabilities.firewall:
             with self._entering:
-                self._job.note(SSH_PORT, self._outside.port)
-                self._open_port()
+                if self._leaving:
+                    raise Cancelled('opening the SSH port')
+                self._note_and_open()
         return self._outside
 
     def close_outside(self) -> None:
@@ -139,12 +146,21 @@ class Connection(Step):
             self._allow([])
             self._job.forget(Made(SSH_PORT, self._outside.port))
 
-    def _leave_vpn(self) -> None:
-        """Reach a kept machine from outside again, before the VPN is taken down."""
+    def _note_and_open(self) -> None:
+        self._job.note(SSH_PORT, self._outside.port)
+        self._open_port()
+
+    def _leave(self) -> None:
+        """Let no feature open the port or move the shell from now on."""
         with self._entering:
             self._leaving = True
+
+    def _leave_vpn(self) -> None:
+        """Reach a kept machine from outside again, before the VPN is taken down."""
+        self._leave()
         if self._inside and self._job.survives:
-            self._shell.move(self._shell_to(self.open_outside()))
+            self._note_and_open()
+            self._shell.move(self._shell_to(self._outside))
 
     @property
     def _outside(self) -> Endpoint:
