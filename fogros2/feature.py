@@ -113,9 +113,19 @@ class VpnLink(Protocol):
     robot_port: int
     direct: Optional[str]
 
-    @property
-    def outside(self) -> Optional[Endpoint]:
-        """How a shell reaches the machine without the VPN, None if that is closed."""
+    def open_outside(self) -> Endpoint:
+        """
+        Let the robot in without the VPN; return how a shell reaches the machine then.
+
+        :raises FogError: the firewall can't be changed.
+        """
+
+    def close_outside(self) -> None:
+        """
+        Let nobody in without the VPN any more, where the launch closes machines; may be repeated.
+
+        :raises FogError: the firewall can't be changed, or the VPN does not work.
+        """
 
     @property
     def silence(self) -> Optional[float]:

@@ -343,7 +343,6 @@ class DdsInterface:
     name: str
     priority: int = 0
     required: bool = True
-    multicast: bool = False
 
 
 def host_port(host: str, port: int) -> str:

@@ -35,7 +35,7 @@ from figures.robots import DOMAIN, Robot, robot, UP
 from figures.secrets_scan import agent_of
 from fogros2.agent.protocol import BEAT, sign
 from fogros2.plan import HEARTBEAT_PORT
-from fogros2.vpn.wireguard import dds_ports
+from fogros2.vpn.addresses import dds_ports
 from fogros2.waiting import wait_until
 from rigs import rtps
 from rigs.computers.netns import answers, made_in

@@ -7,7 +7,6 @@ import abc
 from collections.abc import Mapping, Sequence
 import contextlib
 import dataclasses
-import ipaddress
 import socket
 from types import MappingProxyType
 from typing import ClassVar, Optional
@@ -157,12 +156,3 @@ def addresses_of(hosts: Sequence[str]) -> list[str]:
             addresses |= {str(info[4][0])
                           for info in socket.getaddrinfo(host, None, socket.AF_INET)}
     return sorted(addresses)
-
-
-def is_address(text: str) -> bool:
-    """Return whether a text is an IP address rather than a name."""
-    try:
-        ipaddress.ip_address(text)
-    except ValueError:
-        return False
-    return True

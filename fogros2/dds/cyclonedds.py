@@ -20,7 +20,6 @@ is inversely proportional to the interval.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-import ipaddress
 from pathlib import Path
 import re
 from types import MappingProxyType
@@ -30,9 +29,10 @@ from xml.etree.ElementTree import Element
 from xml.sax.saxutils import quoteattr
 
 from fogros2 import untrusted
-from fogros2.dds import check_discovery, DdsVendor, is_address, local_only, static_peers
+from fogros2.dds import check_discovery, DdsVendor, local_only, static_peers
 from fogros2.errors import DdsError
 from fogros2.model import Command, DdsInterface
+from fogros2.vpn.addresses import dds_ports
 
 #: Maximum number of ROS 2 processes of a host in a domain, limited by its ports.
 MAX_PARTICIPANTS = 119
@@ -40,9 +40,6 @@ MAX_PARTICIPANTS = 119
 #: interval, whether or not a process uses the port. An asked process answers, so only two
 #: processes that both have higher numbers on their hosts do not find each other.
 ASKED = 10
-#: RTPS 2.5, 9.6.2.3: participant i of a domain listens at 7410 + 250 * domain + 2 * i.
-PORT_BASE = 7410
-PORTS_PER_DOMAIN = 250
 #: Seconds between announcements of a participant: how soon a host is found again after its lease
 #: ended in a long interruption, or its first announcement was lost. Fifty processes send 210 kB/s.
 SPDP_INTERVAL = 3
@@ -58,12 +55,10 @@ HEARTBEAT = 20
 #: Requested receive buffer in bytes (a raw 1080p image is 6 MB in one burst). The kernel limits
 #: it to its rmem_max; a required minimum above that limit would fail.
 RECEIVE_BUFFER = 4 * 1024 * 1024
-#: Bytes of a fragment; MESSAGE: of a retransmission, and of any message where all messages cross
-#: the VPN: what fits into 1420 bytes after IPv4 and UDP (28), RTPS, INFO_DST, INFO_TS and
-#: DATA_FRAG (84).
+#: Bytes of a fragment; MESSAGE: of a retransmission: what fits into 1420 bytes after IPv4 and UDP
+#: (28), RTPS, INFO_DST, INFO_TS and DATA_FRAG (84).
 FRAGMENT = 1280
 MESSAGE = 1380
-LOOPBACK = '127.0.0.1'
 #: FogROS2's own interfaces, and the loopback.
 _NOT_LAN = re.compile('lo$|fog')
 #: <linux/if.h>
@@ -136,11 +131,11 @@ class CycloneDds(DdsVendor):
         interfaces = []
         if not any(_attribute(one, 'name') == 'lo' or _attribute(one, 'address').startswith('127.')
                    for one in listed):
-            interfaces.append(DdsInterface('lo', -5 if has_peers else 20, multicast=True))
+            interfaces.append(DdsInterface('lo', -5 if has_peers else 20))
         if lan is not None and not listed and not local_only(user):
-            interfaces.append(DdsInterface(lan, 10, required=False, multicast=True))
+            interfaces.append(DdsInterface(lan, 10, required=False))
         # below 0, the default priority of the user's own interfaces
-        return [*interfaces, DdsInterface(vpn, -10, required=False, multicast=True)]
+        return [*interfaces, DdsInterface(vpn, -10, required=False)]
 
     def _find(self, tag: str, user: Mapping[str, str]) -> list[Element]:
         """Return the user's settings with a tag, in lower case, that are for our domain."""
@@ -155,8 +150,7 @@ class CycloneDds(DdsVendor):
 
     def machine_interfaces(self, vpn: str) -> list[DdsInterface]:
         """Return the interfaces of a machine's nodes; their peers are the other machines."""
-        return [DdsInterface(vpn, 10, required=False, multicast=True),
-                DdsInterface('lo', multicast=True)]
+        return [DdsInterface(vpn, 10, required=False), DdsInterface('lo')]
 
     def render(
         self, interfaces: Sequence[DdsInterface], peers: Sequence[str],
@@ -166,17 +160,10 @@ class CycloneDds(DdsVendor):
         Return the XML; the user's own configuration stays separate, see :meth:`environment`.
 
         :param peers: ignored if the preferred interface is a loopback, which cannot ask them.
-        :raises DdsError: no interface.
         """
-        if not interfaces:
-            raise DdsError('Cyclone DDS needs a network interface',
-                           'ip link shows those there are')
         ordered = sorted(interfaces, key=lambda interface: -interface.priority)
-        multicast = any(interface.multicast for interface in interfaces)
-        networks = [interface for interface in interfaces if not _is_loopback(interface)]
-        hosts = [] if _is_loopback(ordered[0]) and networks else list(dict.fromkeys(peers))
-        if not multicast:
-            hosts.insert(0, LOOPBACK)
+        networks = [interface for interface in interfaces if interface.name != 'lo']
+        hosts = list(dict.fromkeys(peers)) if ordered[0] in networks else []
         return '\n'.join([
             '<?xml version="1.0" encoding="UTF-8"?>',
             '<CycloneDDS xmlns="https://cdds.io/config">',
@@ -186,15 +173,12 @@ class CycloneDds(DdsVendor):
             *(f'        {_interface(interface)}' for interface in ordered),
             '      </Interfaces>',
             # multicast for announcements only: data is sent to matching participants
-            f'      <AllowMulticast>{"spdp" if multicast else "false"}</AllowMulticast>',
-            *_if(multicast, '      <MulticastRecvNetworkInterfaceAddresses>all'
-                            '</MulticastRecvNetworkInterfaceAddresses>'),
+            '      <AllowMulticast>spdp</AllowMulticast>',
+            '      <MulticastRecvNetworkInterfaceAddresses>all'
+            '</MulticastRecvNetworkInterfaceAddresses>',
             # machines: addresses outside the VPN's subnet, as in the robot's LAN, are unreachable
             *_if(len(networks) == 1 and ordered[0] in networks,
                  '      <DontRoute>true</DontRoute>'),
-            # the size applies to the whole process: small only if no data stays on the host
-            *_if(len(interfaces) == len(networks) == 1,
-                 f'      <MaxMessageSize>{MESSAGE} B</MaxMessageSize>'),
             f'      <MaxRexmitMessageSize>{MESSAGE} B</MaxRexmitMessageSize>',
             f'      <FragmentSize>{FRAGMENT} B</FragmentSize>',
             '    </General>',
@@ -220,10 +204,8 @@ class CycloneDds(DdsVendor):
             ''])
 
     def _addresses(self, host: str) -> list[str]:
-        begin = PORT_BASE + PORTS_PER_DOMAIN * self.domain
-        # asking more processes of this host uses no network
-        count = 4 * ASKED if host == LOOPBACK else ASKED
-        return [f'{host}:{port}' for port in range(begin, begin + 2 * count, 2)]
+        begin, _ = dds_ports(self.domain)
+        return [f'{host}:{begin + 10 + 2 * index}' for index in range(ASKED)]
 
     def environment(self, path: str, user: Mapping[str, str]) -> Mapping[str, str]:
         """
@@ -360,22 +342,10 @@ def _has_multicast(interface: str) -> bool:
 
 
 def _interface(interface: DdsInterface) -> str:
-    attribute = 'address' if is_address(interface.name) else 'name'
-    return (
-        f'<NetworkInterface {attribute}={quoteattr(interface.name)}'
-        f' priority="{interface.priority}" multicast="{_boolean(interface.multicast)}"'
-        f' presence_required="{_boolean(interface.required)}"/>')
+    required = 'true' if interface.required else 'false'
+    return (f'<NetworkInterface name={quoteattr(interface.name)} multicast="true"'
+            f' priority="{interface.priority}" presence_required="{required}"/>')
 
 
 def _if(condition: bool, line: str) -> list[str]:
     return [line] if condition else []
-
-
-def _boolean(value: bool) -> str:
-    return 'true' if value else 'false'
-
-
-def _is_loopback(interface: DdsInterface) -> bool:
-    if is_address(interface.name):
-        return ipaddress.ip_address(interface.name).is_loopback
-    return interface.name == 'lo'

@@ -36,18 +36,13 @@ from xml.etree.ElementTree import Element
 from fogros2.dds import check_discovery, DdsVendor, local_only, static_peers
 from fogros2.errors import DdsError
 from fogros2.model import DdsInterface
-from fogros2.vpn.addresses import multicast_group
+from fogros2.vpn.addresses import dds_ports, DISCOVERY_GROUP, multicast_group
 
 #: Environment variable with the path of Fast DDS's profiles.
 VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 NAMESPACE = 'http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles'
 #: Number of processes that a host without multicast is asked for; ROS 2 asks as many.
 ASKED = 32
-#: RTPS 2.5, 9.6.2.3: participant i of a domain listens at 7410 + 250 * domain + 2 * i.
-PORT_BASE = 7410
-PORTS_PER_DOMAIN = 250
-#: RTPS 2.5, 9.6.2.4: multicast group of participant announcements.
-DISCOVERY_GROUP = '239.255.0.1'
 #: Seconds between announcements of a participant, which are sent to each known participant: the
 #: traffic grows with the square of their number.
 ANNOUNCEMENT = 3
@@ -181,15 +176,15 @@ class FastDds(DdsVendor):
 
     def _group(self, address: str) -> Element:
         # the domain's first port is Fast DDS's default; it joins one group for each port
-        return _locator(address, PORT_BASE + PORTS_PER_DOMAIN * self.domain - (
-            10 if address == DISCOVERY_GROUP else 8))
+        begin, _ = dds_ports(self.domain)
+        return _locator(address, begin if address == DISCOVERY_GROUP else begin + 2)
 
     def _ports(self, host: str) -> list[Element]:
         if not _PEER.fullmatch(host):
             raise DdsError(f"'{host}' of ROS_STATIC_PEERS is no address or host name",
                            'write addresses or names, separated by ;')
-        begin = PORT_BASE + PORTS_PER_DOMAIN * self.domain
-        return [_locator(host, begin + 2 * index) for index in range(ASKED)]
+        begin, _ = dds_ports(self.domain)
+        return [_locator(host, begin + 10 + 2 * index) for index in range(ASKED)]
 
     def environment(self, path: str, user: Mapping[str, str]) -> Mapping[str, str]:
         """

@@ -87,7 +87,7 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
             pool.submit(installing.send_workspaces, context, job, ros, ros_step.result),
             pool.submit(install_modules), pool.submit(start_containers))
     for name in feature.names(job.spec):
-        for link in joining.links:
+        for link in joining.links(connection):
             carrying = contextlib.ExitStack()
             job.undo.add(name, carrying.close)
             carrying.enter_context(feature.load(name).vpn(

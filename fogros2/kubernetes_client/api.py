@@ -9,7 +9,7 @@ kinds of objects take most of a second to load.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 import contextlib
 import json
 import math
@@ -272,24 +272,6 @@ class Api:
             raise refusal(error.status_code, parsed(data), data) from error
         except (websocket.WebSocketException, OSError) as error:
             raise self._unreachable(error) from error
-
-    def execute(
-        self, path: str, container: str, command: Sequence[str], *, timeout: float,
-    ) -> None:
-        """
-        Run a command in a pod; wait at most ``timeout`` seconds for its first output or its end.
-
-        :raises ApiError: the API server refused, or there is no such pod.
-        :raises Unreachable: the API server does not answer.
-        """
-        import websocket
-
-        link = self.websocket(path, {
-            'container': container, 'command': list(command), 'stdout': 'true',
-            'stderr': 'true'}, timeout=timeout)
-        with contextlib.suppress(websocket.WebSocketException, OSError):
-            link.recv()
-        link.close(timeout=0)
 
 
 class Watch:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choose the subnet, addresses and port of a launch's VPN, apart from those in use."""
+"""Choose the subnet, addresses and port of a launch's VPN; the ports of DDS."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ FIRST_FREE = 224
 #: Networks with a shorter prefix mean "everything" in some VPN (two halves, four quarters). They
 #: do not collide: the more specific route wins.
 EVERYTHING = 8
+#: RTPS 2.5, 9.6.2.4: multicast group of the announcements of DDS.
+DISCOVERY_GROUP = '239.255.0.1'
 
 _Network = ipaddress.IPv4Network
 
@@ -74,6 +76,17 @@ def multicast_group(address: str) -> str:
     :param address: the host's VPN address; the VPN's subnet for the range of all groups.
     """
     return f"239.{address.partition('.')[2]}"
+
+
+def dds_ports(domain: int) -> tuple[int, int]:
+    """
+    Return the first and last UDP port of DDS in a ROS domain (RTPS 2.5, 9.6.2.3).
+
+    The range contains multicast discovery (+0) and data (+1), and for each participant i unicast
+    discovery (+10 + 2 i) and data (+11 + 2 i), i up to 119.
+    """
+    begin = 7400 + 250 * domain
+    return begin, begin + 249
 
 
 def overlapping(subnet: str, used: Iterable[str]) -> list[str]:

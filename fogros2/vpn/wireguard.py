@@ -22,6 +22,7 @@ import shlex
 from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
 from fogros2.vpn import addresses, Vpn
+from fogros2.vpn.addresses import dds_ports, DISCOVERY_GROUP
 
 #: Programs that each host needs, and their Debian and Ubuntu packages. ``wireguard-go`` is only
 #: for kernels without the module.
@@ -29,11 +30,6 @@ PACKAGES = {
     'wg': 'wireguard-tools', 'ip': 'iproute2', 'nft': 'nftables', 'wireguard-go': 'wireguard-go'}
 #: Interval of keepalive packets in seconds: routers keep a NAT mapping for 30 s or more.
 KEEPALIVE = 25
-#: RTPS 2.5, 9.6.2.3: the ports of a domain begin at 7400 + 250 * domain.
-PORT_BASE = 7400
-PORTS_PER_DOMAIN = 250
-#: RTPS 2.5, 9.6.2.4: multicast group of participant announcements.
-DISCOVERY_GROUP = '239.255.0.1'
 MAX_NAME = 15
 #: Matches messages of DDS: their first bytes are 'RTPS' (RTPS 2.5, 9.4.4). The hooks of the filter
 #: see whole datagrams: the kernel reassembles before ``input``, and fragments after ``output``.
@@ -215,17 +211,6 @@ class WireGuard(Vpn):
         return [
             _filter(interface, self.ports), *confined, _link(interface),
             _Step(_configure(interface, peers, recall=recall)), _address(interface, peers)]
-
-
-def dds_ports(domain: int) -> tuple[int, int]:
-    """
-    Return the first and last UDP port of DDS in a ROS domain.
-
-    The range contains multicast discovery (+0) and data (+1), and for each participant i unicast
-    discovery (+10 + 2 i) and data (+11 + 2 i), i up to 119.
-    """
-    begin = PORT_BASE + PORTS_PER_DOMAIN * domain
-    return begin, begin + PORTS_PER_DOMAIN - 1
 
 
 def _what(verb: str, interface: VpnInterface, rest: str = '') -> str:

@@ -15,7 +15,7 @@ from fogros2.model import host_port
 from fogros2.shell import multiplexer
 from fogros2.store import Record, Store, VPN_LEFT
 from fogros2.vpn import addresses, Vpn
-from fogros2.vpn.wireguard import dds_ports
+from fogros2.vpn.addresses import dds_ports
 from fogros2_features.guests import invitation, listing, membership, network
 from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry

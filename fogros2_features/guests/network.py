@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import ipaddress
 
 from fogros2.model import VpnInterface
-from fogros2.vpn.addresses import FIRST_FREE, multicast_group
-from fogros2.vpn.wireguard import DISCOVERY_GROUP
+from fogros2.vpn.addresses import DISCOVERY_GROUP, FIRST_FREE, multicast_group
 
 #: TCP port of a machine on its VPN address at which guests' robots reach their accounts.
 PORT = 7399

@@ -41,6 +41,8 @@ PIECE = 1 << 14
 BUFFER = 1 << 20
 #: The first line of the machine's end.
 READY = b'ready\n'
+#: Errors of a stream that has ended; the robot's shells raise RuntimeErrors.
+ENDED = (OSError, ValueError, RuntimeError)
 
 
 def line(data: bytes) -> bytes:
@@ -158,8 +160,6 @@ class Queue:
     def __init__(self) -> None:
         self._waiting: deque[bytes] = deque()
         self._size = 0
-        #: The number of those displaced.
-        self.dropped = 0
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -174,7 +174,6 @@ class Queue:
         self._size += len(data)
         while self._size > max(LEAST_QUEUE, rate * QUEUE):
             self.take()
-            self.dropped += 1
 
     def take(self) -> bytes:
         """Return the oldest datagram."""
@@ -188,7 +187,7 @@ class Carrier:
     One end of the stream.
 
     :param port: UDP port of the interface on this host.
-    :param write: sends bytes into the stream; raises OSError or ``errors`` if it has ended.
+    :param write: sends bytes into the stream; raises one of ``ENDED`` if it has ended.
     :param readline: returns the next line of the stream, b'' after its end.
     :param copy: called with each datagram of the interface before the datagram is sent.
     """
@@ -196,10 +195,8 @@ class Carrier:
     def __init__(
         self, port: int, write: Callable[[bytes], object], readline: Callable[[], bytes],
         copy: Callable[[bytes], object] = lambda data: None,
-        errors: tuple[type[BaseException], ...] = (),
     ) -> None:
         self._write, self._readline, self._copy = write, readline, copy
-        self._errors: tuple[type[BaseException], ...] = (OSError, ValueError, *errors)
         self.window = Window()
         self.queue = Queue()
         self._changed = threading.Condition()
@@ -223,8 +220,8 @@ class Carrier:
         try:
             while not self.over and (text := self._readline()):
                 self._arrive(text)
-        except self._errors:
-            pass  # the stream has ended
+        except ENDED:
+            pass
         finally:
             self.close()
             for thread in threads:
@@ -262,7 +259,7 @@ class Carrier:
                 self._changed.notify_all()
 
     def _send(self) -> None:
-        with contextlib.suppress(*self._errors):
+        with contextlib.suppress(*ENDED):
             while not self.over:
                 self._write(self._next())
         self.close()

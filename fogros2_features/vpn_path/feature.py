@@ -169,6 +169,8 @@ class Way:
                 self._use(UDP, '')
                 self._end()
                 self._pause = min(2 * self._pause, LONGEST)
+            elif target == UDP and age is not None:
+                self._link.close_outside()
         except (FogError, OSError) as error:
             self._link.advise(f'the stream in place of UDP failed: {error}')
             self._end()
@@ -198,10 +200,8 @@ class Way:
         :raises FogError: it can't be opened.
         """
         link = self._link
-        if link.outside is None:
-            raise ShellError(f"the shell of '{link.spec.name}' can only be reached by its VPN")
         # a connection of its own: packets would wait there for files and commands
-        shell = shells.connect(link.outside, name=link.spec.name, timeout=OPENING)
+        shell = shells.connect(link.open_outside(), name=link.spec.name, timeout=OPENING)
         self._push(shell.close)
         stream = shell.open(Command(
             ('python3', '-IS', '-c', Path(carrier.__file__).read_text(), str(link.port)),
@@ -217,7 +217,7 @@ class Way:
         trial = Trial(link.direct if self._own == AUTO else None,
                       lambda data: carried.deliver(data), self._pause)
         self._push(trial.close)
-        carried = Carrier(link.robot_port, stream.write, stream.readline, trial.copy, (FogError,))
+        carried = Carrier(link.robot_port, stream.write, stream.readline, trial.copy)
         self._push(carried.close)
         threading.Thread(target=carried.run, name='fog-carry', daemon=True).start()
         self._carrier, self._trial = carried, trial

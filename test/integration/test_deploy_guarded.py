@@ -23,6 +23,9 @@ from fogros2.provider.container import machine as container_machine
 from fogros2.report import StepDone
 from fogros2.store import Store
 from fogros2.waiting import wait_until
+from fogros2_features.vpn_path import feature as vpn_path
+from rigs.launched import ros2
+from rigs.networks import without_udp
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
@@ -150,6 +153,38 @@ def test_firewalled_machine_is_reached_only_through_the_vpn(cloud, spec):
         assert server_address(again) == again.vpn_address
     finally:
         assert second.down() == []
+
+
+def test_vpn_leaves_udp_and_returns(cloud, spec, cloud_network, monkeypatch):
+    # nobody here has the time of a network
+    for name, seconds in (('MISSING', 5.0), ('WORKING', 3.0), ('SHORTEST', 3.0)):
+        monkeypatch.setattr(vpn_path, name, seconds)
+    events = []
+    launch = Launch(report=events.append)
+
+    def uses(path, sources):
+        def used():
+            paths = [event.detail for event in events
+                     if isinstance(event, StepDone) and event.step == 'VPN path']
+            return paths[-1:] == [path] and machine.heartbeat.age < 1.0 \
+                and cloud.asked[-1] == (22, sources)
+
+        wait_until(used, timeout=60.0, what=f'answers by {path}')
+        assert f'VPN path    {path}\n' in ros2('fog', 'status', machine.spec.name).stdout
+        kinds = [made.kind for made in launch.store.load(machine.spec.name).made]
+        assert not sources or 'firewall' in kinds, 'nothing would close the port after a kill'
+        return answers(machine.machine.shell.host) == bool(sources)
+
+    try:
+        with without_udp(cloud_network):
+            machine = launch.up(spec())
+            assert uses('stream', [cloud.robot])
+        assert uses('udp', [])
+        assert server_address(machine) == machine.vpn_address
+        with without_udp(cloud_network):
+            assert uses('stream', [cloud.robot])
+    finally:
+        assert launch.down() == []
 
 
 def test_a_robot_that_comes_from_another_address_is_let_in(cloud, spec, monkeypatch):

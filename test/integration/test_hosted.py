@@ -163,7 +163,9 @@ def test_robots_hear_shared_topics_of_each_other_alone(
     one = launch(str(path), 'robot:=one', environment=host.environment('one'))
     one.wait_for('heard count of one')
     # the second robot comes later, and gets the map that was published before
-    two = launch(str(path), 'robot:=two', environment=host.environment('two'))
+    two = launch(str(path), 'robot:=two', 'vpn_path:=stream',
+                 environment=host.environment('two'))
+    two.wait_for('VPN path')
     two.wait_for('heard map of one')
     one.wait_for('heard map of two')
     for each in (one, two):

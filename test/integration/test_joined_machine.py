@@ -112,12 +112,31 @@ def join(
         yield launch
 
 
+@pytest.fixture
+def workspace(tmp_path: Path) -> Path:
+    """Return the prefix of a package whose program prints where it is."""
+    prefix = tmp_path / 'own ws' / 'install' / 'own'
+    for name, text in {
+            'share/ament_index/resource_index/packages/own': '',
+            'share/own/package.xml': '<package><name>own</name></package>',
+            'lib/own/where': '#!/usr/bin/python3\nprint(__file__)\n',
+            '../local_setup.sh': f'export AMENT_PREFIX_PATH="{prefix}:$AMENT_PREFIX_PATH"\n',
+    }.items():
+        (prefix / name).parent.mkdir(parents=True, exist_ok=True)
+        (prefix / name).write_text(text)
+    (prefix / 'lib/own/where').chmod(0o755)
+    return prefix
+
+
 def test_nodes_of_a_second_robot_end_with_its_heartbeat(
     first: Callable[[str], First], second: SecondRobot, join: Callable[..., Launched],
+    workspace: Path,
 ) -> None:
     host = first('delete')
     text = host.invited(second)
-    joined = join(text)
+    joined = join(text, str(workspace.parents[1]))
+    joined.wait_for(f'/ws{workspace}/lib/own/where')
+    assert any('/var/lib/fogros2-guests/fog' in line for line in joined.said), joined.text
     joined.wait_for('I heard')
     assert host.talkers() == 1
     host.launched.wait_for('I heard')  # the first robot's node there hears the second's too
@@ -141,26 +160,6 @@ def test_nodes_of_a_second_robot_end_with_its_heartbeat(
     again.kill()
     second.run('ros2', 'fog', 'gc')
     assert second.run('ip', '-brief', 'link').count('fog') == 0
-
-
-def test_workspace_is_in_the_home_of_the_guest(
-    first: Callable[[str], First], second: SecondRobot, join: Callable[..., Launched],
-    tmp_path: Path,
-) -> None:
-    prefix = tmp_path / 'own ws' / 'install' / 'own'
-    for name, text in {
-            'share/ament_index/resource_index/packages/own': '',
-            'share/own/package.xml': '<package><name>own</name></package>',
-            'lib/own/where': '#!/usr/bin/python3\nprint(__file__)\n',
-            '../local_setup.sh': f'export AMENT_PREFIX_PATH="{prefix}:$AMENT_PREFIX_PATH"\n',
-    }.items():
-        (prefix / name).parent.mkdir(parents=True, exist_ok=True)
-        (prefix / name).write_text(text)
-    (prefix / 'lib/own/where').chmod(0o755)
-    joined = join(first('delete').invited(second), str(prefix.parents[1]))
-    joined.wait_for(f'/ws{prefix}/lib/own/where')
-    assert any('/var/lib/fogros2-guests/fog' in line for line in joined.said), joined.text
-    joined.wait_for('I heard')
 
 
 def test_nodes_go_on_when_the_inviting_launch_keeps_its_machine(

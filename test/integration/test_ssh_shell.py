@@ -22,13 +22,12 @@ import pytest
 from fogros2 import process
 from fogros2.errors import (
     AuthenticationError,
-    Cancelled,
     ConnectError,
     DeadlineExceeded,
     HostKeyError,
 )
 from fogros2.model import Command, Endpoint
-from fogros2.shell import connect, lines
+from fogros2.shell import lines
 from fogros2.shell.ssh import SSHShell
 from fogros2.waiting import wait_until
 from fogros2_testing import ShellContract
@@ -38,9 +37,9 @@ pytestmark = pytest.mark.skipif(
     process.which('sshd') is None, reason='needs sshd (openssh-server)')
 
 
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[PrivateSshd]:
-    with private_sshd(tmp_path / 'sshd') as running:
+@pytest.fixture(scope='module')
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PrivateSshd]:
+    with private_sshd(tmp_path_factory.mktemp('server') / 'sshd') as running:
         yield running
 
 
@@ -59,42 +58,32 @@ def home(tmp_path, monkeypatch):
     return tmp_path / 'home'
 
 
+def made_key(path: Path, kind: str = 'ed25519', passphrase: str = '') -> Path:
+    process.run(Command(('ssh-keygen', '-q', '-t', kind, '-N', passphrase, '-f', str(path))),
+                timeout=60.0)
+    return path
+
+
 class TestSSHShell(ShellContract):
 
     sudo = os.geteuid() == 0 or process.run(
         Command(('sudo', '-n', 'true')), timeout=60.0, check=False).returncode == 0
 
-    @contextlib.contextmanager
-    def connected(self, folder):
+    @pytest.fixture(autouse=True)
+    def at_a_server(self, server):
+        self.server = server
+
+    def make(self, folder):
         there = folder / 'there'
         there.mkdir()
-        with private_sshd(folder / 'sshd') as running, contextlib.closing(
-                SSHShell(running.endpoint, name='planner', timeout=60.0)) as opened:
-            yield opened, str(there)
+        return SSHShell(self.server.endpoint, name='planner', timeout=60.0), str(there)
 
 
-def test_the_plugin_is_found_by_the_endpoint_s_kind(server):
-    shell = connect(server.endpoint, name='planner')
-    assert isinstance(shell, SSHShell)
-    assert shell.run(Command(('true',)), timeout=60.0).returncode == 0
-    shell.close()
-
-
-def test_another_host_key_than_the_pinned_one_is_refused(server, tmp_path):
-    process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f',
-                         str(tmp_path / 'other'))), timeout=60.0)
-    pinned = dataclasses.replace(
-        server.endpoint, host_key=(tmp_path / 'other.pub').read_text())
-    with pytest.raises(HostKeyError, match='another host key than the pinned one'):
-        SSHShell(pinned, name='planner').run(Command(('true',)), timeout=60.0)
-
-
-def test_a_pinned_key_of_another_type_is_refused(server, tmp_path):
-    process.run(Command(('ssh-keygen', '-q', '-t', 'ecdsa', '-N', '', '-f',
-                         str(tmp_path / 'other'))), timeout=60.0)
-    pinned = dataclasses.replace(
-        server.endpoint, host_key=(tmp_path / 'other.pub').read_text())
-    with pytest.raises(HostKeyError):
+@pytest.mark.parametrize('kind', ['ed25519', 'ecdsa'])
+def test_another_host_key_than_the_pinned_one_is_refused(server, tmp_path, kind):
+    pinned = dataclasses.replace(server.endpoint, host_key=made_key(
+        tmp_path / 'other', kind).with_suffix('.pub').read_text())
+    with pytest.raises(HostKeyError, match='another host key' if kind == 'ed25519' else ''):
         SSHShell(pinned, name='planner').run(Command(('true',)), timeout=60.0)
 
 
@@ -105,11 +94,6 @@ def test_an_unknown_host_is_refused_with_the_line_to_add(server, home):
     line = refused.value.hint.partition('known_hosts: ')[2]
     assert line == f'[127.0.0.1]:{server.port} {server.host_key}'
     (home / '.ssh/known_hosts').write_text(f'{line}\n')
-    assert shell.run(Command(('true',)), timeout=60.0).returncode == 0
-    shell.close()
-    # as ssh writes it where HashKnownHosts is set
-    process.run(Command(('ssh-keygen', '-H', '-f', str(home / '.ssh/known_hosts'))), timeout=60.0)
-    assert '127.0.0.1' not in (home / '.ssh/known_hosts').read_text()
     assert shell.run(Command(('true',)), timeout=60.0).returncode == 0
     shell.close()
 
@@ -124,18 +108,21 @@ def test_a_changed_host_is_refused_with_the_way_out(server, home):
     assert f"'[127.0.0.1]:{server.port}'" in refused.value.hint
 
 
-def test_refused_key_is_named(server, tmp_path):
-    process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f',
-                         str(tmp_path / 'stranger'))), timeout=60.0)
-    endpoint = dataclasses.replace(server.endpoint, key_file=str(tmp_path / 'stranger'))
-    with pytest.raises(AuthenticationError, match='does not accept .*authorized_keys'):
-        SSHShell(endpoint, name='planner').run(Command(('true',)), timeout=60.0)
+def test_useless_keys_are_named(server, tmp_path):
+    (tmp_path / 'text').write_text('no key')
+    for path, words in ((made_key(tmp_path / 'stranger'), 'does not accept .*authorized_keys'),
+                        (made_key(tmp_path / 'locked', passphrase='secret'), 'ssh-add'),
+                        (tmp_path / 'missing', 'can not be read'),
+                        (tmp_path / 'text', 'no private key')):
+        endpoint = dataclasses.replace(server.endpoint, key_file=str(path))
+        with pytest.raises(AuthenticationError, match=words) as refused:
+            SSHShell(endpoint, name='planner').run(Command(('true',)), timeout=60.0)
+        assert str(path) in str(refused.value)
 
 
-@pytest.mark.parametrize('kind', ['ed25519', 'ecdsa', 'rsa'])
+@pytest.mark.parametrize('kind', ['ecdsa', 'rsa'])
 def test_keys_of_every_type_log_in(server, tmp_path, kind):
-    path = tmp_path / 'own'
-    process.run(Command(('ssh-keygen', '-q', '-t', kind, '-N', '', '-f', str(path))), timeout=60.0)
+    path = made_key(tmp_path / 'own', kind)
     with open(server.folder / 'authorized_keys', 'a') as keys:
         keys.write(path.with_suffix('.pub').read_text())
     endpoint = dataclasses.replace(server.endpoint, key_file=str(path))
@@ -154,27 +141,6 @@ def test_the_user_s_own_keys_are_tried(server, home):
 def test_missing_key_is_reported(server, home):
     endpoint = dataclasses.replace(server.endpoint, key_file=None)
     with pytest.raises(AuthenticationError, match='no key to log in'):
-        SSHShell(endpoint, name='planner').run(Command(('true',)), timeout=60.0)
-
-
-@pytest.mark.parametrize('content, words', [
-    (None, 'can not be read'), ('no key', 'no private key'),
-])
-def test_a_useless_key_file_is_named(server, tmp_path, content, words):
-    path = tmp_path / 'key'
-    if content is not None:
-        path.write_text(content)
-    endpoint = dataclasses.replace(server.endpoint, key_file=str(path))
-    with pytest.raises(AuthenticationError, match=words) as refused:
-        SSHShell(endpoint, name='planner').run(Command(('true',)), timeout=60.0)
-    assert str(path) in str(refused.value)
-
-
-def test_a_key_with_a_passphrase_is_the_agent_s_part(server, tmp_path):
-    process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', 'secret', '-f',
-                         str(tmp_path / 'locked'))), timeout=60.0)
-    endpoint = dataclasses.replace(server.endpoint, key_file=str(tmp_path / 'locked'))
-    with pytest.raises(AuthenticationError, match='ssh-add'):
         SSHShell(endpoint, name='planner').run(Command(('true',)), timeout=60.0)
 
 
@@ -221,15 +187,6 @@ def test_a_lost_connection_is_opened_again(server, shell):
         assert shell.run(Command(('echo', 'again')), timeout=60.0).stdout == 'again\n'
 
 
-def test_a_server_that_was_restarted_is_connected_to_again(server, shell):
-    shell.run(Command(('true',)), timeout=60.0)
-    server.stop()
-    with pytest.raises(ConnectError, match='refuses connections'):
-        shell.run(Command(('true',)), timeout=60.0)
-    server.start()
-    assert shell.run(Command(('true',)), timeout=60.0).returncode == 0
-
-
 def test_a_connection_lost_under_a_command_is_an_error(server, shell, tmp_path):
     started = tmp_path / 'started'
     failed: list[BaseException] = []
@@ -259,16 +216,9 @@ def test_a_stream_ends_with_its_connection(server, shell):
         wait_until(lambda: stream.write(b'more\n'), timeout=60.0, what='the loss to be noticed')
 
 
-@pytest.mark.parametrize('how', ['timeout', 'cancel'])
-def test_a_command_given_up_ends_there(server, shell, how):
-    words = ('sleep', '4711.25')
-    cancel = threading.Event()
-    timer = threading.Timer(0.2, cancel.set)
-    timer.start()
-    with pytest.raises((Cancelled, DeadlineExceeded)):
-        shell.run(Command(words), timeout=0.2 if how == 'timeout' else 30.0,
-                  cancel=cancel if how == 'cancel' else None)
-    timer.join()
+def test_a_command_given_up_ends_there(server, shell):
+    with pytest.raises(DeadlineExceeded):
+        shell.run(Command(('sleep', '4711.25')), timeout=0.2)
     wait_until(lambda: '4711.25' not in process.run(
         Command(('ps', '-eo', 'args')), timeout=60.0).stdout.replace('ps -eo args', ''),
         timeout=60.0, what='the command to end')

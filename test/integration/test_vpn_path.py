@@ -12,11 +12,9 @@ from fogros2.deploy import Launch
 from fogros2.errors import VpnError
 from fogros2.model import MachineSpec
 from fogros2.provider.container import root as container_root
-from fogros2.report import StepDone
-from fogros2.waiting import Timeouts, wait_until
-from fogros2_features.vpn_path import feature
+from fogros2.waiting import Timeouts
 from rigs.bare_computer import bare_computer
-from rigs.launched import launching, ros2
+from rigs.launched import launching
 from rigs.networks import without_udp
 
 pytestmark = [
@@ -46,33 +44,6 @@ def spec(cloud_network):
         return MachineSpec(f'path-{RUN}', 'container', {'network': cloud_network},
                            features={'vpn_path': {'vpn_path': path}})
     return make
-
-
-def test_vpn_leaves_udp_and_returns(cloud_network, spec, monkeypatch):
-    # nobody here has the time of a network
-    for name, seconds in (('MISSING', 5.0), ('WORKING', 3.0), ('SHORTEST', 3.0)):
-        monkeypatch.setattr(feature, name, seconds)
-    events = []
-    launch = Launch(report=events.append)
-
-    def answers(path):
-        def used():
-            paths = [event.detail for event in events
-                     if isinstance(event, StepDone) and event.step == 'VPN path']
-            return paths[-1:] == [path] and machine.heartbeat.age < 1.0
-
-        wait_until(used, timeout=60.0, what=f'answers by {path}')
-        return f'VPN path    {path}\n' in ros2('fog', 'status', machine.spec.name).stdout
-
-    try:
-        with without_udp(cloud_network):
-            machine = launch.up(spec())
-            assert answers('stream')
-        assert answers('udp')
-        with without_udp(cloud_network):
-            assert answers('stream')
-    finally:
-        assert launch.down() == []
 
 
 def test_udp_alone_fails_and_names_the_remedy(cloud_network, spec):

@@ -63,9 +63,10 @@ from launch.substitutions import LaunchConfiguration
 def generate_launch_description():
     machine = ContainerInstance(
         name='planner', on=SSHInstance(**{host!r}), network='{network}', share=['{topic}'],
-        cpus=0.5, memory='500m', robot_timeout=5, ros_workspace='')
+        cpus=0.5, memory='500m', robot_timeout=5, ros_workspace='',
+        vpn_path=LaunchConfiguration('vpn_path'))
     return FogROSLaunchDescription([
-        DeclareLaunchArgument('robot'),
+        DeclareLaunchArgument('robot'), DeclareLaunchArgument('vpn_path', default_value='auto'),
         CloudGroup(machine=machine, actions=[
             ExecuteProcess(
                 cmd=['python3', '-c', {node!r}, LaunchConfiguration('robot'), '{topic}'],

@@ -78,7 +78,8 @@ from launch.actions import ExecuteProcess
 def generate_launch_description():
     return FogROSLaunchDescription([
         Replicated(
-            [*(ContainerInstance(name=name, network={network!r}) for name in {names!r}),
+            [*(ContainerInstance(name=name, network={network!r}, vpn_path={path!r})
+               for name in {names!r}),
              *{robot!r}],
             [ExecuteProcess(cmd=['python3', '-c', {server!r}, '--ros-args'], name='planner',
                             respawn=True, respawn_delay=0.5, output='screen')],
@@ -90,7 +91,7 @@ def generate_launch_description():
 
 def write(
     path: Path, names: Sequence[str], network: Optional[str], hedge: float = HEDGE,
-    deadline: Optional[float] = None,
+    deadline: Optional[float] = None, vpn_path: str = 'auto',
 ) -> Path:
     """
     Write the launch file; names of machines end with ``-`` and a number.
@@ -100,5 +101,5 @@ def write(
     robot, when = ([], f'hedge_after={hedge}') if deadline is None else (
         [None], f'deadline={deadline}')
     path.write_text(LAUNCH.format(names=list(names), network=network, server=SERVER,
-                                  client=CLIENT, robot=robot, when=when))
+                                  client=CLIENT, robot=robot, when=when, path=vpn_path))
     return path

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from fogros2.model import Command, Peer, VpnInterface
-from fogros2.vpn.wireguard import dds_ports
+from fogros2.vpn.addresses import dds_ports
 from fogros2.waiting import wait_until
 from fogros2_features.guests import listing, network
 from rigs.second_robot import NAT

@@ -48,8 +48,7 @@ for word in sys.argv[2:]:
 '''
 
 
-by_middleware = pytest.mark.parametrize(
-    'middleware', ['cyclonedds 0.10', 'cyclonedds', 'fastdds'])
+by_middleware = pytest.mark.parametrize('middleware', ['cyclonedds 0.10', 'fastdds'])
 
 
 def listener(vpn: Lab, host: str, *at: str, group: str = '') -> Child:

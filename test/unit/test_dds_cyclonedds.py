@@ -35,29 +35,6 @@ def attributes(root: ElementTree.Element, name: str) -> list[dict[str, str]]:
     return [element.attrib for element in root.iterfind(f'.//c:{name}', NAMESPACE)]
 
 
-def test_the_vpn_is_preferred_and_may_be_absent() -> None:
-    root = rendered(LOOPBACK, VPN)
-    assert attributes(root, 'NetworkInterface') == [
-        {'name': 'foga1b2c3', 'priority': '10', 'multicast': 'false',
-         'presence_required': 'false'},
-        {'name': 'lo', 'priority': '0', 'multicast': 'false', 'presence_required': 'true'}]
-
-
-def test_an_interface_may_be_given_by_its_address() -> None:
-    assert attributes(rendered(DdsInterface('198.51.100.7')), 'NetworkInterface')[0] == {
-        'address': '198.51.100.7', 'priority': '0', 'multicast': 'false',
-        'presence_required': 'true'}
-
-
-def test_peers_and_localhost_are_asked_without_multicast() -> None:
-    root = rendered(VPN, LOOPBACK, peers=('198.18.7.2', '198.18.7.3', '198.18.7.2'))
-    hosts = [peer['address'].partition(':')[0] for peer in attributes(root, 'Peer')]
-    assert [hosts.count(f'{a}') for a in ('127.0.0.1', '198.18.7.2', '198.18.7.3')] == [
-        40, 10, 10]
-    assert texts(root, 'AllowMulticast') == ['false']
-    assert texts(root, 'ParticipantIndex') == ['auto']
-
-
 def test_the_robot_prefers_itself_then_its_lan_then_the_vpn() -> None:
     root = rendered(*CYCLONE.robot_interfaces('foga1b2c3', 'eth0', {}), peers=('198.18.7.2',))
     found = attributes(root, 'NetworkInterface')
@@ -86,8 +63,11 @@ def test_robot_without_a_lan_uses_the_loopback() -> None:
 
 def test_machine_uses_vpn_and_loopback_only() -> None:
     root = rendered(*CYCLONE.machine_interfaces('foga1b2c3m0'))
-    assert [interface['name'] for interface in attributes(root, 'NetworkInterface')] == [
-        'foga1b2c3m0', 'lo']
+    assert attributes(root, 'NetworkInterface') == [
+        {'name': 'foga1b2c3m0', 'priority': '10', 'multicast': 'true',
+         'presence_required': 'false'},
+        {'name': 'lo', 'priority': '0', 'multicast': 'true', 'presence_required': 'true'}]
+    assert texts(root, 'ParticipantIndex') == ['auto']
     assert texts(root, 'DontRoute') == ['true']
     assert attributes(root, 'Peer') == []
 
@@ -95,9 +75,10 @@ def test_machine_uses_vpn_and_loopback_only() -> None:
 @pytest.mark.parametrize('domain, port', [(0, 7410), (5, 8660)])
 def test_peer_ports_are_those_of_the_domain(domain: int, port: int) -> None:
     interfaces = CYCLONE.machine_interfaces('foga1b2c3m0')
-    root = ElementTree.fromstring(CycloneDds(domain).render(interfaces, ['198.18.7.3']))
+    root = ElementTree.fromstring(
+        CycloneDds(domain).render(interfaces, ['198.18.7.3', '198.18.7.4', '198.18.7.3']))
     assert [peer['address'] for peer in attributes(root, 'Peer')] == [
-        f'198.18.7.3:{port + 2 * i}' for i in range(10)]
+        f'198.18.7.{host}:{port + 2 * i}' for host in (3, 4) for i in range(10)]
     assert texts(root, 'MaxAutoParticipantIndex') == ['119']
 
 
@@ -294,13 +275,6 @@ def test_this_computers_interfaces_are_read() -> None:
     CYCLONE.parse_lan(process.run(CYCLONE.ask_lan(), timeout=10.0).stdout)
 
 
-def test_messages_are_small_only_where_all_of_them_cross_the_vpn() -> None:
-    assert texts(rendered(VPN), 'MaxMessageSize') == ['1380 B']
-    assert texts(rendered(VPN, LOOPBACK), 'MaxMessageSize') == []
-    assert texts(rendered(LOOPBACK), 'MaxMessageSize') == []
-    assert texts(rendered(DdsInterface('127.0.0.1')), 'MaxMessageSize') == []
-
-
 def test_the_receive_buffer_asks_for_no_minimum() -> None:
     assert attributes(rendered(VPN, LOOPBACK), 'SocketReceiveBufferSize') == [
         {'max': '4194304 B'}]
@@ -313,11 +287,6 @@ def test_lost_messages_are_repeated_within_milliseconds() -> None:
     assert texts(root, 'HeartbeatInterval') == ['20 ms']
     assert attributes(root, 'HeartbeatInterval') == [
         {'min': '5 ms', 'minsched': '10 ms', 'max': '1 s'}]
-
-
-def test_no_interface_is_an_error() -> None:
-    with pytest.raises(DdsError):
-        CYCLONE.render([], [])
 
 
 def test_the_environment_holds_our_file(tmp_path: Path) -> None:

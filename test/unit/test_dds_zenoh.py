@@ -61,5 +61,3 @@ def test_what_leads_nodes_elsewhere_is_refused(user: dict[str, str]) -> None:
         Zenoh().environment('/x', {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'off'})
     with pytest.raises(DdsError, match='300'):
         Zenoh(300)
-    with pytest.raises(DdsError, match='one address'):
-        Zenoh().render([], ())

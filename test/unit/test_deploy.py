@@ -26,7 +26,7 @@ from fogros2.deploy.steps import connecting, dds, installing, watching
 from fogros2.deploy.steps.arming import Arming
 from fogros2.deploy.steps.connecting import Connection
 from fogros2.deploy.steps.creating import Creation
-from fogros2.deploy.steps.joining import Joining, RobotLink
+from fogros2.deploy.steps.joining import Joining
 from fogros2.deploy.steps.watching import Watch
 from fogros2.errors import (
     AgentError,
@@ -466,21 +466,24 @@ def test_wait_ends_when_a_booting_machine_ends(
         Connection(context, mine).open()
 
 
-def test_ssh_that_carries_the_vpn_stays_outside(launch, provider, members, monkeypatch):
+def test_ssh_port_stays_closed_after_the_launch_has_left(launch, provider, monkeypatch):
+    """A feature may just be about to open it."""
     monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(firewall=True))
+    monkeypatch.setattr(provider, 'robot_address', lambda: '198.51.100.7/32', raising=False)
+    allowed = []
+    monkeypatch.setattr(provider, 'allow', lambda *words: allowed.append(words[1:]),
+                        raising=False)
     context, mine = begun(launch)
     Creation(context, mine).run()
-    mine.save(shell=FAKE_ENDPOINT)
-    mine.note(undo.SSH_PORT, FAKE_ENDPOINT.port)
-    mine.interface = context.vpn.interface
-    link = RobotLink(context, mine, members.add(2))
-    link.dial('127.0.0.1:4', 'stream')
-    Connection(context, mine).enter_vpn()
-    assert link.outside == FAKE_ENDPOINT
-    assert launch.store.load('planner').carried == 'stream'
-    # closed, it leads nowhere
-    mine.forget(Made(undo.SSH_PORT, FAKE_ENDPOINT.port))
-    assert link.outside is None
+    mine.save(shell=FAKE_ENDPOINT, carried='stream')
+    connection = Connection(context, mine)
+    connection.enter_vpn()
+    assert connection.open_outside() == FAKE_ENDPOINT
+    assert allowed == [(FAKE_ENDPOINT.port, ['198.51.100.7/32'])]
+    assert launch.store.load('planner').made[-1].kind == undo.SSH_PORT
+    mine.undo.close()
+    with pytest.raises(Cancelled):
+        connection.open_outside()
 
 
 def test_a_machine_that_boots_slowly_has_the_time_of_its_boot(launch, provider, monkeypatch):

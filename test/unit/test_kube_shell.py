@@ -178,22 +178,6 @@ def test_incomplete_message_does_not_block_others(api, shell, monkeypatch):
     assert not closing.is_alive()
 
 
-def test_broken_connection_leaves_no_half_written_file(api, shell, tmp_path):
-    target = tmp_path / 'file'
-
-    def cut() -> None:
-        # aside first: it grows while it comes
-        wait_until(lambda: any(p.stat().st_size > 1_000_000 for p in tmp_path.glob('file.*')),
-                   timeout=60.0, what='some of it to come', longest=0.01)
-        api.cut()
-
-    thread = threading.Thread(target=cut)
-    thread.start()
-    raised(ConnectError, lambda: shell.put(os.urandom(20_000_000), str(target), mode=0o600))
-    thread.join()
-    assert not target.exists()
-
-
 def test_restart_of_the_api_server_is_waited_for(api, shell):
     api.refusals = [Unreachable('refused'), ApiError('no', status=503), Unreachable('refused')]
     assert shell.run(Command(('echo', 'x')), timeout=20.0).stdout == 'x\n'
@@ -249,15 +233,12 @@ def test_missing_pod_is_reported_at_once(api, shell):
     assert 'is gone' in str(error)
 
 
-def test_refusal_after_a_restart_is_retried(api, shell):
+@pytest.mark.parametrize('noticed', [True, False])
+def test_refusal_after_a_restart_is_retried(api, shell, noticed):
     """Its list of who may what is empty at first."""
-    api.lost()
-    api.refusals = [ApiError('cannot create resource "pods/exec"', status=403)] * 2
-    assert shell.run(Command(('echo', 'x')), timeout=20.0).stdout == 'x\n'
-
-
-def test_refusal_after_a_restart_that_nobody_saw_is_retried(api, shell):
-    api.forbidden = True
+    if noticed:
+        api.lost()
+    api.forbidden = not noticed
     api.refusals = [ApiError('cannot create resource "pods/exec"', status=403)] * 2
     assert shell.run(Command(('echo', 'x')), timeout=20.0).stdout == 'x\n'
 
@@ -266,20 +247,6 @@ def test_missing_rights_are_named(api, shell):
     api.refusals = [ApiError('cannot create resource "pods/exec"', status=403)]
     error = raised(ShellError, lambda: shell.run(Command(('true',)), timeout=20.0))
     assert 'pods/exec' in error.hint
-
-
-def test_dead_pod_ends_its_commands(api, shell):
-    started = threading.Event()
-
-    def die(_: str) -> None:
-        api.refusals = [ApiError('pods "a-pod" not found', status=404)] * 3
-        api.cut()
-        started.set()
-
-    error = raised(ConnectError, lambda: shell.run(
-        Command(('sh', '-c', 'echo begun; exec sleep 30')), timeout=30.0, on_output=die))
-    assert started.is_set()
-    assert 'lost' in str(error)
 
 
 def test_close_ends_running_commands(api, shell, tmp_path):
@@ -379,19 +346,8 @@ def test_input_is_relayed_in_a_process_with_many_files(api, shell):
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
-def test_relay_ends_with_a_lost_connection(api, shell):
-    shell.run(Command(('true',)), timeout=60.0)
-    threading.Timer(0.2, api.cut).start()
-    assert relayed(shell, 'exec sleep 30', None)[0] == 255
-
-
-@pytest.mark.parametrize('host, told', [
-    ('robots/pod@ctx', ('ctx', 'robots', 'pod')),
-    ('robots/pod@', ('', 'robots', 'pod')),
-    ('robots/pod@arn:aws:eks:x:1:cluster/a@b', ('arn:aws:eks:x:1:cluster/a@b', 'robots', 'pod'))])
-def test_host_of_an_endpoint_names_a_pod(host, told):
-    assert kubernetes_link.parse_host(host) == told
-
-
-def test_host_that_names_no_pod_is_refused():
+def test_host_of_an_endpoint_names_a_pod():
+    assert kubernetes_link.parse_host('robots/pod@') == ('', 'robots', 'pod')
+    context = 'arn:aws:eks:x:1:cluster/a@b'
+    assert kubernetes_link.parse_host(f'robots/pod@{context}') == (context, 'robots', 'pod')
     raised(ConnectError, lambda: kubernetes_link.parse_host('198.51.100.7'))

@@ -23,15 +23,6 @@ from fogros2.shell import multiplexed, multiplexer, relay, sync
 PINNED = Endpoint('ssh', '198.51.100.7', 2222, 'fog', 'ssh-ed25519 AAAA', '/keys/my key')
 
 
-def test_includes_come_before_excludes():
-    words = sync.rsync(Path('/ws'), '/ws', excludes=['build/*'], includes=['build/a'],
-                       rsh={'FOGROS2_LINK': '3'}).argv
-    assert words.index('--include=build/a') < words.index('--exclude=build/*')
-    assert words[-2:] == ('/ws/', 'machine:/ws/')
-    assert '--delete' in words
-    assert words[-3] == '--'
-
-
 @contextlib.contextmanager
 def openssh(endpoint, folder, monkeypatch):
     """Yield what OpenSSH is called with for an endpoint, and the known hosts that it gets."""

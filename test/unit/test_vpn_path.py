@@ -32,12 +32,11 @@ def test_full_queue_drops_its_oldest():
     count = carrier.LEAST_QUEUE // 1000 + 5
     for number in range(count):
         queue.add(b'%04d' % number * 250, 0.0)
-    assert queue.dropped == 5
     assert queue.take() == b'0005' * 250
     # a faster link takes no longer for more
     for number in range(count, 2 * count):
         queue.add(b'%04d' % number * 250, 3 * carrier.LEAST_QUEUE / carrier.QUEUE)
-    assert queue.dropped == 5
+    assert queue.take() == b'0006' * 250
 
 
 class Link:
@@ -144,13 +143,14 @@ class Shells:
     def __init__(self) -> None:
         self.opening, self.opened, self.ended = (threading.Event() for _ in range(3))
         self.dialled: list[str] = []
-        self.outside: Any = 'the shell'
         self.spec = MachineSpec('planner', 'ssh')
         self.port = self.robot_port = 9
         self.silence = self.direct = None
 
     def connect(self, *_: Any, **__: Any) -> Shells:
         return self
+
+    open_outside = connect
 
     def open(self, command: Any) -> Shells:
         self.opening.set()

@@ -12,7 +12,8 @@ import pytest
 
 from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
-from fogros2.vpn.wireguard import dds_ports, RTPS, WireGuard
+from fogros2.vpn.addresses import dds_ports
+from fogros2.vpn.wireguard import WireGuard
 
 KEY = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
 OTHER = 'Kg7ZbFqs9cU1UuPHc9zzQUoyo+MdSEgx7xQ7iDqIexk='
@@ -58,13 +59,6 @@ def test_all_but_looking_needs_root() -> None:
     assert all(c.sudo for c in every_command(ROBOT, TO_MACHINE) if c != looks)
 
 
-def test_the_private_key_is_made_where_it_stays() -> None:
-    text = script(WireGuard().keys(ROBOT))
-    assert text.splitlines()[0] == 'umask 077; set -C'
-    assert 'wg genkey >/state/vpn.key' in text
-    assert text.splitlines()[-1] == 'wg pubkey </state/vpn.key'
-
-
 def test_full_disk_is_the_reason_that_the_key_is_not_written(tmp_path: Path) -> None:
     """``wg genkey`` ends well there, and ``wg pubkey`` would speak of the key's length."""
     (tmp_path / 'wg').write_text('#!/bin/sh\n')
@@ -87,21 +81,6 @@ def test_filter_exists_before_and_after_the_interface() -> None:
 def test_large_images_have_room_on_both_hosts(interface: VpnInterface) -> None:
     assert (f'link set dev {interface.name} mtu 1420 multicast on txqueuelen 3000 up'
             in script(*WireGuard().up(interface, [])))
-
-
-def test_machine_of_a_launch_takes_dds_from_the_vpn_only() -> None:
-    text = script(*WireGuard().up(MACHINE, [TO_ROBOT]))
-    assert 'iifname != { "lo", "foga1b2c3m0" } ip daddr { 198.18.7.2, 239.18.7.2 } drop' in text
-    assert f'iifname != {{ "lo", "foga1b2c3m0" }} {RTPS} drop' in text
-    assert 'confine' not in text
-
-
-def test_only_the_launch_is_filtered_where_it_is_a_guest() -> None:
-    guest = dataclasses.replace(MACHINE, process='/run/a/agent.pid')
-    text = script(*WireGuard().up(guest, [TO_ROBOT]))
-    assert f'{RTPS} drop' not in text and f'{RTPS} socket cgroupv2 level %s "%s" drop' in text
-    assert 'pid=$(cat /run/a/agent.pid)' in text
-    assert '/run/foga1b2c3m0.group' in script(*WireGuard().down(guest))
 
 
 def test_robot_sends_to_the_hosts_that_the_user_names() -> None:
@@ -153,16 +132,6 @@ def test_peers_get_their_address_and_group_one_the_common_one() -> None:
     assert "'PersistentKeepalive = 25'" in text
 
 
-def test_repair_recalls_where_a_peer_without_endpoint_was() -> None:
-    wireguard = WireGuard()
-    text = script(*wireguard.repair(MACHINE, [TO_ROBOT]))
-    assert f'seen {OTHER}' in text and 'seen()' not in script(*wireguard.up(MACHINE, [TO_ROBOT]))
-    assert '</run/foga1b2c3m0.noted' in text
-    assert '>/run/foga1b2c3m0.noted' in script(wireguard.health_check(MACHINE))
-    down = script(*wireguard.down(MACHINE))
-    assert "rm -f '/run/it'\"'\"'s/vpn.key' /run/foga1b2c3m0.noted" in down
-
-
 @pytest.mark.parametrize(('endpoint', 'host'), [
     ('198.51.100.7:51820', '198.51.100.7'), ('[2001:db8::1]:51820', '2001:db8::1'),
     ('[fe80::1%eth0]:1', 'fe80::1%eth0'), ('(none)', '')])
@@ -208,21 +177,6 @@ def test_endpoints_may_be_names_and_ipv6(endpoint: str) -> None:
 def test_interfaces_without_a_proper_name_are_refused(name: str) -> None:
     with pytest.raises(ConfigurationError, match='name a VPN interface'):
         list(WireGuard().up(dataclasses.replace(ROBOT, name=name), []))
-
-
-def test_a_machine_with_a_network_that_overlaps_keeps_it() -> None:
-    machine = dataclasses.replace(MACHINE, host_routes=True)
-    wireguard = WireGuard()
-    up, peers = script(*wireguard.up(machine, [TO_ROBOT])), script(
-        *wireguard.peers(machine, [TO_ROBOT, TO_MACHINE]))
-    assert "'address replace 198.18.7.2/24 dev foga1b2c3m0 noprefixroute'" in up
-    assert up.index('link set') < up.index("'route replace 198.18.7.1/32 dev foga1b2c3m0'")
-    assert "'route replace 198.18.7.2/32 dev foga1b2c3m0'" in peers
-    for plain in (wireguard.up(MACHINE, [TO_ROBOT]), wireguard.peers(MACHINE, [TO_ROBOT])):
-        text = script(*plain)
-        assert 'noprefixroute' not in text and 'route replace' not in text
-    for command in every_command(machine, TO_ROBOT):
-        subprocess.run(['sh', '-n', '-c', command.argv[-1]], check=True)
 
 
 def test_status_asks_for_nothing_secret_and_is_understood() -> None:

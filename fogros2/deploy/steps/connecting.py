@@ -11,13 +11,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 import contextlib
 import dataclasses
+import threading
 import time
 from typing import Optional
 
 from fogros2 import shell as shells
-from fogros2.deploy.machine_job import Step
+from fogros2.deploy.context import Context
+from fogros2.deploy.machine_job import MachineJob, Step
 from fogros2.deploy.undo import SSH_PORT
 from fogros2.errors import (
+    Cancelled,
     ConnectError,
     DeadlineExceeded,
     FogError,
@@ -49,6 +52,13 @@ class Connection(Step):
     _allowed = ''
     _checked = 0.0
     _shell: MovableShell
+    #: Whether the shell is in the VPN, and whether it has to stay outside from now on.
+    _inside = _leaving = False
+
+    def __init__(self, context: Context, job: MachineJob) -> None:
+        super().__init__(context, job)
+        #: Guards the record's note of the SSH port with the rules of the firewall.
+        self._entering = threading.Lock()
 
     def open(self) -> None:
         """
@@ -66,6 +76,7 @@ class Connection(Step):
             job.save(shell=endpoint)
             if context.capabilities.firewall:
                 job.makes(SSH_PORT, endpoint.port)
+                job.undo.callback(self._leave)
                 if job.reused:
                     # the earlier launch closed the port, or the robot's address has changed
                     self._open_port()
@@ -82,33 +93,81 @@ class Connection(Step):
         """
         Move SSH into the VPN, and close the SSH port to the outside.
 
-        Does nothing where the provider has no firewall, and where SSH may carry the VPN.
+        Does nothing where the provider has no firewall. SSH that carries the VPN stays outside.
         """
-        job, outside = self._job, self._job.record.shell
-        if not self._context.capabilities.firewall or outside is None or job.record.carried:
+        job = self._job
+        if not self._context.capabilities.firewall:
             return
-        with job.step('firewall') as detail:
-            inside = self._shell_to(dataclasses.replace(outside, host=job.interface.address))
+        job.undoing(SSH_PORT, self._leave_vpn)
+        if not job.record.carried:
+            with job.step('firewall') as detail:
+                self._enter()
+                others = ', '.join(self._context.provider.ssh_networks(job.spec))
+                detail.append(f'SSH through the VPN, and open to {others}' if others else
+                              f'SSH through the VPN alone, port {self._outside.port} closed')
+
+    def open_outside(self) -> Endpoint:
+        """
+        Open the SSH port to the robot; return how a shell reaches the machine by it.
+
+        :raises Cancelled: the launch leaves the machine.
+        """
+        if self._context.capabilities.firewall:
+            with self._entering:
+                if self._leaving:
+                    raise Cancelled('opening the SSH port')
+                self._note_and_open()
+        return self._outside
+
+    def close_outside(self) -> None:
+        """Move SSH of a machine that is up into the VPN again, if its SSH port is open."""
+        job = self._job
+        if not job.failed and Made(SSH_PORT, self._outside.port) in job.record.made:
+            self._enter()
+
+    def _enter(self) -> None:
+        inside = None
+        if not self._inside:
+            inside = self._shell_to(
+                dataclasses.replace(self._outside, host=self._job.interface.address))
             try:
                 self._log_in(inside)
             except BaseException:
                 inside.close()
                 raise
-            job.undoing(SSH_PORT, self._leave_vpn)
-            self._shell.move(inside)
+        with self._entering:
+            if self._leaving:
+                if inside is not None:
+                    inside.close()
+                return
+            if inside is not None:
+                self._shell.move(inside)
+                self._inside = True
             self._allow([])
-            job.forget(Made(SSH_PORT, outside.port))
-            others = ', '.join(self._context.provider.ssh_networks(job.spec))
-            detail.append(f'SSH through the VPN, and open to {others}' if others else
-                          f'SSH through the VPN alone, port {outside.port} closed')
+            self._job.forget(Made(SSH_PORT, self._outside.port))
+
+    def _note_and_open(self) -> None:
+        self._job.note(SSH_PORT, self._outside.port)
+        self._open_port()
+
+    def _leave(self) -> None:
+        """Let no feature open the port or move the shell from now on."""
+        with self._entering:
+            self._leaving = True
 
     def _leave_vpn(self) -> None:
         """Reach a kept machine from outside again, before the VPN is taken down."""
+        self._leave()
+        if self._inside and self._job.survives:
+            self._note_and_open()
+            self._shell.move(self._shell_to(self._outside))
+
+    @property
+    def _outside(self) -> Endpoint:
+        """How a shell reaches the machine without the VPN."""
         outside = self._job.record.shell
-        if self._job.survives and outside is not None:
-            self._job.note(SSH_PORT, outside.port)
-            self._open_port()
-            self._shell.move(self._shell_to(outside))
+        assert outside is not None
+        return outside
 
     def _open_port(self) -> None:
         """Open the SSH port to the robot's current public address."""
@@ -117,10 +176,8 @@ class Connection(Step):
         self._allowed = address
 
     def _allow(self, sources: Sequence[str]) -> None:
-        outside = self._job.record.shell
-        assert outside is not None
         provider = self._context.provider
-        provider.allow(self._job.machine_id, outside.port,
+        provider.allow(self._job.machine_id, self._outside.port,
                        [*sources, *provider.ssh_networks(self._job.spec)])
 
     def _shell_to(self, endpoint: Endpoint) -> Shell:

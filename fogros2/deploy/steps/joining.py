@@ -12,9 +12,10 @@ from fogros2 import plan
 from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob, Step
 from fogros2.deploy.robot_vpn import VpnMember
-from fogros2.deploy.undo import SSH_PORT, VPN, vpn_down
+from fogros2.deploy.steps.connecting import Connection
+from fogros2.deploy.undo import VPN, vpn_down
 from fogros2.errors import CommandError, FogError, VpnError
-from fogros2.model import Command, Endpoint, host_port, Machine, Peer, VpnInterface
+from fogros2.model import Command, host_port, Machine, Peer, VpnInterface
 from fogros2.report import step
 from fogros2.store import VPN_LEFT
 from fogros2.vpn import addresses
@@ -120,10 +121,10 @@ class Joining(Step):
             repair=[list(c.argv) for c in vpn.repair(job.interface, peers)],
             down=[list(c.argv) for c in vpn_down(job.record)])
 
-    @property
-    def links(self) -> Sequence[RobotLink]:
-        """The link to the machine, for features that may carry its packets."""
-        return [RobotLink(self._context, self._job, self._member)] if self._member else []
+    def links(self, connection: Connection) -> Sequence[RobotLink]:
+        """Return the link to the machine, for features that may carry its packets."""
+        return [RobotLink(self._context, self._job, self._member, connection)] \
+            if self._member else []
 
     def redial(self, machine: Machine) -> None:
         """
@@ -150,7 +151,9 @@ class Joining(Step):
 class RobotLink(Step):
     """The robot's end of the VPN to a machine; see :class:`fogros2.feature.VpnLink`."""
 
-    def __init__(self, context: Context, job: MachineJob, member: VpnMember) -> None:
+    def __init__(
+        self, context: Context, job: MachineJob, member: VpnMember, connection: Connection,
+    ) -> None:
         super().__init__(context, job)
         self._member = member
         self.spec = job.spec
@@ -158,15 +161,7 @@ class RobotLink(Step):
         self.robot_port = context.vpn.interface.port
         self.direct = member.route.peer.endpoint
         self.step = job.step
-
-    @property
-    def outside(self) -> Optional[Endpoint]:
-        """How a shell reaches the machine without the VPN, None if that is closed."""
-        job = self._job
-        if self._context.capabilities.firewall and all(
-                made.kind != SSH_PORT for made in job.record.made):
-            return None
-        return job.record.shell
+        self.open_outside, self.close_outside = connection.open_outside, connection.close_outside
 
     @property
     def silence(self) -> Optional[float]:

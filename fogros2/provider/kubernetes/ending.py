@@ -3,15 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-import contextlib
 import time
 from typing import Any, Optional
 
 from fogros2 import kubernetes_client
-from fogros2.errors import ProviderError
 from fogros2.kubernetes_client import Api, ApiError, existing, items, path, selector
-from fogros2.provider.kubernetes import boot, names, pods
+from fogros2.provider.kubernetes import names, pods
 from fogros2.provider.kubernetes.names import MachineId
 
 #: Grace period of a pod that the robot deletes, in seconds: its nodes have ended before.
@@ -90,19 +87,8 @@ def _end_pods(api: Api, where: MachineId) -> None:
         return None if uids else True
 
     if uids:
-        for pod in pod_list:
-            _tell(api, pod)
         api.follow(target, look, again=again, timeout=GONE, labelSelector=labels,
                    what=f"the pod of '{where.job}' to end")
     if pod_list:
         # Nothing runs in the pods; the node would need seconds to clean up.
         delete(0)
-
-
-def _tell(api: Api, pod: Mapping[str, Any]) -> None:
-    """Ask a pod to end itself: it may be waiting for its nodes to move."""
-    meta = pod['metadata']
-    # If the request does not reach the pod, the node ends it.
-    with contextlib.suppress(ProviderError):
-        api.execute(path('pods', str(meta['namespace']), str(meta['name']), 'exec'),
-                    names.CONTAINER, boot.END_COMMAND, timeout=2.0)

@@ -2,7 +2,7 @@
 """
 Build images for pods that contain what a launch would install: a pod's disk cannot be kept.
 
-``recipe`` decides; ``write`` and ``build`` act. The tag is the hash of the image's content, so
+``recipe`` decides, ``build`` acts. The tag is the hash of the image's content, so
 ``container_image='REGISTRY/fogros2:{dependencies}'`` names the image for a launch.
 """
 
@@ -30,7 +30,6 @@ CONTAINERFILE = 'Containerfile'
 STEP_TIMEOUT = 3600.0
 
 _REGISTRY = re.compile(r'[a-z0-9][a-z0-9.-]*(:[0-9]+)?(/[a-z0-9._-]+)*')
-_WORD = re.compile(r'[A-Za-z0-9][A-Za-z0-9.+:_-]*')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +48,7 @@ class Recipe:
 
 
 def recipe(
-    registry: str, *, dependencies: str, script: str, base: str = IMAGE, user: str = 'fog',
+    registry: str, *, dependencies: str, script: str, base: str = IMAGE,
 ) -> Recipe:
     """
     Return how to build the image for a robot's machines.
@@ -58,41 +57,20 @@ def recipe(
     :param dependencies: hash of the image's content, its tag.
     :param script: script for sh that installs the packages, as root.
     :param base: base image.
-    :param user: login user; see the option of this name.
     :raises ConfigurationError: a value is invalid.
     """
     if not _REGISTRY.fullmatch(registry):
         raise ConfigurationError(f"'{registry}' can't be a registry",
                                  "such as 'registry.example/robots' or 'localhost:5000'")
-    for word in (dependencies, user):
-        if not _WORD.fullmatch(word):
-            raise ConfigurationError(f"'{word}' can't be part of an image's recipe",
-                                     'use letters, digits and . + : _ -')
     if not base or base.startswith('-') or any(c.isspace() for c in base):
         raise ConfigurationError(f"'{base}' can't be the image to begin with",
                                  'such as docker.io/library/ros:jazzy-ros-base')
     lines = ['# what a robot installs on a machine otherwise, at each launch', f'FROM {base}',
              'USER root', f'LABEL fogros2-dependencies={dependencies}',
-             f"RUN {json.dumps(['sh', '-ec', script])}", 'RUN rm -rf /var/lib/apt/lists/*']
-    if user != 'root':
-        # The first launch then need not create the user.
-        lines.append(f'RUN grep -q "^{user}:" /etc/passwd || useradd -m -u {UID} {user}')
+             f"RUN {json.dumps(['sh', '-ec', script])}", 'RUN rm -rf /var/lib/apt/lists/*',
+             # the first launch then need not create its user
+             f'RUN grep -q "^fog:" /etc/passwd || useradd -m -u {UID} fog']
     return Recipe(f'{registry}/{NAME}:{dependencies}', base, '\n'.join([*lines, '']))
-
-
-def write(what: Recipe, folder: Path) -> Path:
-    """
-    Write a recipe's Containerfile, and return its path.
-
-    :raises PrerequisiteError: the folder cannot be written.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / CONTAINERFILE).write_text(what.containerfile)
-    except OSError as error:
-        raise PrerequisiteError(f'{folder} can not be written: {error.strerror}',
-                                '--folder names another') from error
-    return folder / CONTAINERFILE
 
 
 def engine(wanted: str = 'auto') -> str:
@@ -131,9 +109,15 @@ def build(
     :param folder: folder for the Containerfile, which stays there.
     :param program: result of ``engine``.
     :param on_output: callback for each line of the program's output.
+    :raises PrerequisiteError: the folder cannot be written.
     :raises ProviderError: the build failed, or the registry refused the image.
     """
-    write(what, folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / CONTAINERFILE).write_text(what.containerfile)
+    except OSError as error:
+        raise PrerequisiteError(f'{folder} can not be written: {error.strerror}',
+                                '--folder names another') from error
     for command in commands(what, folder, program, push=push):
         try:
             process.run(dataclasses.replace(command, environment=_login()), timeout=STEP_TIMEOUT,

@@ -40,32 +40,6 @@ def pod(name: str, *words: str, **spec: object) -> dict[str, object]:
                      **spec}}
 
 
-ECHO = ('import socket\ns = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)\n'
-        "s.bind(('', 5000))\nwhile True:\n s.sendto(*s.recvfrom(99))")
-
-
-def test_udp_gets_to_a_pod_by_a_port_of_the_node(kubernetes, client, namespaces):
-    space = namespaces().name
-    client.ask('POST', f'/api/v1/namespaces/{space}/pods', pod('echo', 'python3', '-c', ECHO))
-    service = client.create(
-        f'/api/v1/namespaces/{space}/services', 'v1 Service', 'echo', spec={
-            'type': 'NodePort', 'selector': {'pod': 'echo'},
-            'ports': [{'port': 5000, 'protocol': 'UDP'}]})
-    port = service['spec']['ports'][0]['nodePort']
-
-    def answered():
-        # what was sent before the port led anywhere has made its own port lead nowhere for long
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as robot:
-            robot.settimeout(0.2)
-            robot.sendto(b'hello', (kubernetes.layout.node, port))
-            try:
-                return robot.recv(99)
-            except OSError:
-                return None
-
-    assert wait_until(answered, timeout=30.0, what='an answer') == b'hello'
-
-
 def test_pods_reach_the_robot_and_nobody_else(kubernetes, client, namespaces):
     space = namespaces().name
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as robot:

@@ -83,11 +83,6 @@ class TestShell(ShellContract):
         return shell, there
 
 
-def test_nodes_do_not_run_as_root(pod):
-    with contextlib.closing(KubernetesShell(pod.shell, name='shells')) as shell:
-        assert shell.run(Command(('id', '-un')), timeout=30.0).stdout == 'fog\n'
-
-
 def test_pod_has_no_token_of_the_cluster(pod):
     with contextlib.closing(KubernetesShell(pod.shell, name='shells')) as shell:
         found = shell.run(Command(('ls', '/var/run/secrets/kubernetes.io'), sudo=True),

@@ -56,8 +56,8 @@ def start(vpn: Lab, words: tuple[str, ...], *topics: str, host: str = 'machine')
     return child
 
 
-@pytest.mark.parametrize('place', [(), CONTAINER], ids=['root', 'container'])
-@pytest.mark.parametrize('host', ['robot', 'machine'])
+@pytest.mark.parametrize(
+    ('host', 'place'), [('robot', ()), ('machine', CONTAINER)], ids=['root', 'container'])
 def test_accounts_hear_each_other(
         vpn: Lab, public: Path, user: tuple[str, ...], place: tuple[str, ...], host: str) -> None:
     first = start(vpn, place, 'to:/down', 'from:/up', host=host)

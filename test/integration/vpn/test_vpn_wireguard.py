@@ -179,33 +179,6 @@ def test_another_peer_doesnt_disturb_the_first(vpn: Lab) -> None:
     assert not vpn.ping('robot', MACHINE, timeout=1.0)
 
 
-@pytest.mark.parametrize('host', ['robot', 'machine'])
-def test_a_killed_wireguard_go_is_repaired_on_the_same_interface(vpn: Lab, host: str) -> None:
-    if not vpn.wireguard_go(host):
-        pytest.skip('this kernel has WireGuard itself')
-    assert vpn.ping('robot', MACHINE) and vpn.alive('robot') and vpn.alive('machine')
-    index = vpn.shell(host, f'cat /sys/class/net/{vpn.interfaces[host].name}/ifindex')
-    process.run(Command(('kill', '-9', str(vpn.wireguard_go(host))), sudo=True), timeout=60.0)
-    wait_until(lambda: not vpn.alive(host), timeout=60.0, what='the process to be missed')
-    vpn.repair(host)
-    assert vpn.alive(host)
-    assert vpn.ping('robot', MACHINE, timeout=4.0)
-    assert index == vpn.shell(host, f'cat /sys/class/net/{vpn.interfaces[host].name}/ifindex')
-
-
-def test_a_new_address_of_the_robot_is_taken_up(vpn: Lab) -> None:
-    assert vpn.ping('robot', MACHINE)
-    space = vpn.spaces['robot']
-    vpn.ip('-n', space, 'address', 'delete', '198.51.100.2/24', 'dev', 'e0')
-    vpn.ip('-n', space, 'address', 'add', '198.51.100.9/24', 'dev', 'e0')
-    assert not vpn.alive('robot')
-    vpn.repair('robot')
-    assert vpn.ping('robot', MACHINE, timeout=4.0)
-    assert vpn.alive('robot')
-    vpn.bad(rebind=True)
-    assert vpn.ping('robot', MACHINE, timeout=4.0)
-
-
 def test_networks_that_lead_to_no_machine_may_come_and_go(vpn: Lab) -> None:
     space = vpn.spaces['robot']
     vpn.ip('-n', space, 'link', 'add', 'br7', 'type', 'bridge')

@@ -22,7 +22,7 @@ from rigs.cluster.node_process import ask, ClusterError, run_node
 from rigs.cluster.pod_security import make_policies
 
 #: Users besides the administrator; none has a right until somebody gives it one.
-USERS = ('robot', 'limited')
+USERS = ('robot',)
 #: Networks for the cable between computer and node. Of TEST-NET-2, the last ones: the tests'
 #: container networks take the first.
 CABLES = [f'198.51.100.{last}/30' for last in (252, 248, 244, 240)]
@@ -74,10 +74,6 @@ class Cluster:
         """Run a program in the node's namespaces, as root."""
         reply = ask(self.folder, {'run': list(words)})
         return Result(reply['returncode'], reply['stdout'], reply['stderr'])
-
-    def log(self, service: str) -> str:
-        """Return what a service has said."""
-        return self.run('cat', f'{services.HERE}/log/{service}.log').stdout
 
     def requests(self, user: str) -> list[dict[str, Any]]:
         """Return the API server's audit lines for the requests of a user, each once."""

@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 from pathlib import Path
 import secrets
-from typing import Any, Optional
+from typing import Any
 
 import yaml
 
@@ -76,11 +76,10 @@ def making_namespaces(
 
     def make(
         change: Callable[[dict[str, Any]], None] = lambda role: None, *, user: str = 'robot',
-        labels: Optional[dict[str, str]] = None, policy: str = ALL,
+        policy: str = ALL,
     ) -> Namespace:
         name = f'it-{secrets.token_hex(3)}'
-        client.create('/api/v1/namespaces', 'v1 Namespace', name,
-                      metadata={'labels': labels or {}})
+        client.create('/api/v1/namespaces', 'v1 Namespace', name)
         made.append(name)
         rights = role(role_file.read_text(), name)
         change(rights)
