@@ -120,6 +120,12 @@ def test_missing_program_is_found_without_the_vpn(launch, checked):
     assert list((launch.store.root / 'launches').glob('*/vpn.key')) == []
 
 
+def test_domain_that_is_no_number_is_refused(launch):
+    launch.user_environment['ROS_DOMAIN_ID'] = 'seven'
+    with pytest.raises(ConfigurationError, match='ROS_DOMAIN_ID=seven is no number .use 0 to 101'):
+        launch.dds()
+
+
 def test_computer_of_the_user_cannot_be_stopped(launch, checked, monkeypatch):
     monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(owned=False))
     monkeypatch.setattr(deployed, 'check_robot', lambda: None)
