@@ -438,13 +438,6 @@ def test_of_two_machines_of_one_name_the_condition_chooses(run, fake):
     assert fake.machines['planner'].spec.options == {'memory': '2g'}
 
 
-def test_undescribed_machine_is_refused(run, fake):
-    description = xml('<fog_machine name="planner" provider="container"/>'
-                      '<cloud_node machine="planer" pkg="demo" exec="talker"/>')
-    assert run(description) == 1
-    assert fake.noted('prepare') == []
-
-
 def test_docker_containers_of_a_machine(run, fake):
     there = []
     description = xml("""

@@ -240,7 +240,7 @@ def test_plan_of_a_missing_file_is_an_error(tmp_path):
 
 @pytest.mark.skipif(find_spec('ros2launch') is not None,
                     reason="ROS 2's own ros2launch makes launch's log folder")
-@pytest.mark.parametrize('words', [['launch', '-s'], ['launch', '-p'], ['fog', 'plan']])
+@pytest.mark.parametrize('words', [['launch', '-p'], ['fog', 'plan']])
 def test_previews_write_no_file_and_name_the_node_with_a_machine(words, tmp_path):
     def said(text, home):
         path = tmp_path / 'x.launch.py'
@@ -251,9 +251,7 @@ def test_previews_write_no_file_and_name_the_node_with_a_machine(words, tmp_path
             name: value for name, value in {**os.environ, 'HOME': str(home)}.items()
             if name not in ('ROS_LOG_DIR', 'ROS_HOME')}, capture_output=True, text=True)
 
-    for home in (tmp_path / 'home', '/dev/null'):
-        done = said("LogInfo(msg='a')", home)
-        assert (done.returncode, done.stderr) == (0, '')
-    assert not (tmp_path / 'home').exists()
-    done = said("Node(executable='a', machine='m')", tmp_path / 'home')
+    done = said("LogInfo(msg='a')", tmp_path / 'home')
+    assert (done.returncode, done.stderr) == (0, '') and not (tmp_path / 'home').exists()
+    done = said("Node(executable='a', machine='m')", '/dev/null')
     assert done.returncode == 1 and 'from fogros2 import Node' in done.stderr
