@@ -217,35 +217,23 @@ def test_machine_without_agent_is_given_up(make):
         client.request('status')
 
 
-def test_client_waits_for_a_restarting_agent(make):
+def test_agent_that_does_not_come_back_is_given_up(make):
     def absent() -> ScriptedStream:
         stream = ScriptedStream(lambda request: [])
         stream.say({'error': 'no agent serves /run/x', 'kind': 'absent'})
         stream.say(None)
         return stream
-    first = agent()
-    client = make(first, absent(), absent(), agent())
+    # it may take a moment to restart
+    first, second = agent(), agent()
+    client = make(first, absent(), absent(), second, *(absent() for _ in range(50)), restart=0.5)
     seen: list[dict[str, Any]] = []
     client.subscribe(seen.append, since=1)
     client.request('status')
     first.say(None)
     until(lambda: len(seen) == 2)
-    assert [e['state'] for e in seen] == ['lost', 'back']
-
-
-def test_agent_that_does_not_come_back_is_given_up(make):
-    first = agent()
-    streams = [ScriptedStream(lambda request: []) for _ in range(50)]
-    for stream in streams:
-        stream.say({'error': 'no agent serves /run/x', 'kind': 'absent'})
-        stream.say(None)
-    client = make(first, *streams, restart=0.3)
-    seen: list[dict[str, Any]] = []
-    client.subscribe(seen.append, since=1)
-    client.request('status')
-    first.say(None)
-    until(lambda: len(seen) == 2)
-    assert [e['state'] for e in seen] == ['lost', 'absent']
+    second.say(None)
+    until(lambda: len(seen) == 4)
+    assert [e['state'] for e in seen] == ['lost', 'back', 'lost', 'absent']
 
 
 def test_program_that_ends_without_output_is_given_up(make):
@@ -269,11 +257,6 @@ def test_machine_that_refuses_the_key_is_given_up(make):
     assert [e['state'] for e in seen] == ['lost', 'absent']
     with pytest.raises(AgentError, match='key refused'):
         client.request('status')
-
-
-def test_unreachable_machine_raises_connect_error(make):
-    with pytest.raises(ConnectError):
-        make().request('status')
 
 
 def test_close_ends_the_thread_and_waiting_requests(make):
@@ -328,33 +311,18 @@ def test_silent_connection_is_replaced(make):
     assert len(seen) == 2
 
 
-NUMBER = '9' * 400
-#: Messages of a hijacked machine, and the field of each that is wrong.
+#: Messages of a hijacked machine, and the field of each that is wrong; test_events.py has more.
 INVALID = [
-    ('{"event": ["started"]}', 'event'), ('{"event": null}', 'event'),
-    ('{"event": "started", "node": ["n"], "name": "n", "pid": 1, "cmd": []}', 'node'),
+    ('{"event": null}', 'event'),
     ('{"event": "started", "node": "n", "name": "n", "cmd": []}', 'pid'),
-    ('{"event": "started", "node": "n", "name": "n", "pid": 1, "cmd": [1]}', 'cmd'),
-    ('{"event": "started", "node": "n", "name": "n", "pid": true, "cmd": []}', 'pid'),
     ('{"event": "output", "node": "n", "name": "n", "stream": "stdout", "text": 5}', 'text'),
-    ('{"event": "exited", "node": "n", "name": "n", "returncode": "x", "respawns": false}',
-     'returncode'),
-    ('{"event": "exited", "node": "n", "name": "n", "returncode": 0, "respawns": 0}', 'respawns'),
-    ('{"event": "exited", "node": "n", "name": "n", "returncode": %s, "respawns": false}' % NUMBER,
-     'returncode'),
-    ('{"event": "vpn_repaired", "what": "vpn", "seconds": NaN}', 'seconds'),
     ('{"event": "vpn_repaired", "what": "vpn", "seconds": 1e999}', 'seconds'),
-    ('{"event": "restarted", "seq": "x"}', 'seq'),
     ('{"event": "unheard of", "seq": "x"}', 'seq'),
-    ('{"event": "ending", "reason": "x", "seq": %s}' % NUMBER, 'seq'),
-    ('{"event": "ending", "reason": {"a": 1}, "seq": 1}', 'reason'),
     ('{"id": 2, "ok": true}', 'machine'),
     ('{"id": 2, "ok": false, "error": []}', 'error'),
-    ('{"id": 1, "ok": true, "first": 1, "next": "x", "lost": 0}', 'next'),
-    ('{"id": 1, "ok": true, "first": 1, "next": 1, "lost": %s}' % NUMBER, 'lost'),
+    ('{"id": 1, "ok": true, "first": 1, "next": 1, "lost": %s}' % ('9' * 400), 'lost'),
     ('{"id": 1, "ok": false}', 'first'),
-    ('[' * 100_000, 'not an event or an answer'), ('%s0' % (NUMBER * 20), 'not an event'),
-    ('nonsense', 'not an event or an answer'), ('7', 'not an event or an answer'),
+    ('[' * 100_000, 'not an event or an answer'), ('nonsense', 'not an event or an answer'),
 ]
 
 
