@@ -141,10 +141,10 @@ class Rig:
             return True
         return False
 
-    def client(self, *, follow: bool = True, **more: Any) -> AgentClient:
+    def client(self, *, follow: bool = True) -> AgentClient:
         client = AgentClient(
             self.shell, str(self.directory),  # type: ignore[arg-type]
-            agent_path=str(self.program), **more)
+            agent_path=str(self.program))
         self.clients.append(client)
         if follow:
             client.subscribe(self.events.append, since=1)

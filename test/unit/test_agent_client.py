@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from fogros2.agent.protocol import ANSWER, BEAT, sign, verify
-from fogros2.agent_client import AgentClient, Heartbeat, interval_for
+from fogros2.agent_client import AgentClient, connection, Heartbeat, interval_for
 from fogros2.errors import (
     AgentError,
     AuthenticationError,
@@ -93,12 +93,16 @@ def agent(next_seq: int = 1, **status: Any) -> ScriptedStream:
 
 
 @pytest.fixture
-def make() -> Iterator[Callable[..., AgentClient]]:
+def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., AgentClient]]:
     clients: list[AgentClient] = []
 
-    def build(*streams: Any, **more: Any) -> AgentClient:
+    def build(
+        *streams: Any, silence: float = connection.SILENCE, restart: float = connection.RESTART,
+    ) -> AgentClient:
+        monkeypatch.setattr(connection, 'SILENCE', silence)
+        monkeypatch.setattr(connection, 'RESTART', restart)
         shell: Any = ScriptedShell(*streams)
-        clients.append(AgentClient(shell, '/run/x', agent_path='/run/x/agent.py', **more))
+        clients.append(AgentClient(shell, '/run/x', agent_path='/run/x/agent.py'))
         return clients[-1]
     yield build
     for client in clients:
