@@ -122,13 +122,6 @@ PYTHON_MACHINE = {
     'tags': {'team': 'slam', 'cost': '42'}, 'environment': {'RCUTILS_COLORIZED_OUTPUT': '1'}}
 
 
-def test_machine_of_any_cloud_is_an_element():
-    spec = machine(xml('<fog_machine name="planner" provider="cheapest" min_cpu="8" gpu="L4" '
-                       'max_round_trip_ms="60" providers="aws, azure" ros_workspace=""/>'))
-    assert (spec.provider, spec.options) == ('cheapest', {
-        'min_cpu': 8, 'gpu': 'L4', 'max_round_trip_ms': 60, 'providers': ['aws', 'azure']})
-
-
 @pytest.mark.parametrize('text', [f'<launch>{XML_MACHINE}</launch>', YAML_MACHINE])
 def test_a_machine_is_the_one_that_python_makes(text):
     assert machine(load(text)) == AWSCloudInstance(**PYTHON_MACHINE).spec(LaunchContext())
