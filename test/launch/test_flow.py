@@ -28,7 +28,10 @@ import pytest
 
 from fogros2 import CloudGroup, CloudNode, ContainerInstance, FogROSLaunchDescription
 from fogros2.errors import (
+    AgentError,
     ConfigurationError,
+    ConnectError,
+    DeadlineExceeded,
     PrerequisiteError,
     ProviderError,
     VpnError,
@@ -411,6 +414,18 @@ def test_nodes_respawn_after_the_death_of_their_agent(
     assert seen == ['on_start', 'on_exit'] * 3
     assert len({life.id for life in lives}) == 3
     assert [life.respawn_max_retries for life in lives] == [5, 4, 3]
+
+
+@pytest.mark.parametrize(('error', 'status'), [
+    (AgentError('no', 'never'), 0), (ConnectError('it is lost'), 0),
+    (DeadlineExceeded("the agent didn't answer 'start'"), 0),
+    # the user has to add it: no machine says this
+    (PrerequisiteError('the machine lacks numpy', 'pip=[...]'), 1)])
+def test_agent_that_starts_no_node_ends_no_launch(run, fake, planner, capfd, error, status):
+    """It may be hijacked."""
+    fake.start_error = error
+    assert run(LaunchDescription([talker(planner)])) == status
+    assert (f"process can't be started: {error}" in capfd.readouterr().out) == (not status)
 
 
 def test_nodes_respawn_at_most_as_often_as_they_may(run, fake, planner, monkeypatch, capfd):

@@ -112,24 +112,29 @@ def test_interrupted_machine_ends_the_launch_by_default(run, fake, talker, watch
                for line in lines)
 
 
-def test_notice_that_the_provider_denies_ends_nothing(run, fake, talker, watch, capfd):
-    """A node can forge it; the launch ends when the machine is gone."""
-    machine = ContainerInstance(name='planner', ros_workspace='')
+@pytest.mark.parametrize('how', ['shutdown', 'replace'])
+@pytest.mark.parametrize('confirmed', [False, True])
+def test_notice_that_the_provider_denies_ends_nothing(
+        run, fake, talker, watch, capfd, confirmed, how):
+    """A node can forge it; the launch acts when the provider confirms it, or it is gone."""
+    machine = ContainerInstance(name='planner', ros_workspace='', on_interrupt=how)
 
     def forged(event):
-        fake.machines['planner'].confirms = False
+        fake.machines['planner'].confirms = [False, confirmed]
         return says(fake, 'notice', reason=REASON)(event)
 
     def later(context):
         context.asyncio_loop.call_later(
             0.3, lambda: fake.machines['planner'].say('lost', reason='it was deleted'))
 
-    watch.at_start = {1: lambda event: [*forged(event), OpaqueFunction(function=later)]}
-    assert run(LaunchDescription([*watch(), talker(machine=machine)])) == 1
-    assert "the machine 'planner' is gone: it was deleted" in watch.shutdowns[0]
-    assert watch.interrupted == [('planner', 'it was deleted', True)]
+    after = [] if confirmed else [OpaqueFunction(function=later)]
+    watch.at_start = {1: lambda event: [*forged(event), *after], 2: end}
+    assert run(LaunchDescription([*watch(), talker(machine=machine)])) == (how == 'shutdown')
+    assert watch.interrupted[:1] == [
+        ('planner', REASON, False) if confirmed else ('planner', 'it was deleted', True)]
     assert [note[1] for note in fake.noted('reclaimed')] == [0.0, 150.0]
-    assert 'its provider has not confirmed' in capfd.readouterr().out
+    said = capfd.readouterr().out
+    assert ('its provider has not confirmed' in said) == (not confirmed)
 
 
 def test_lost_machine_ends_the_launch_by_default(run, fake, talker, watch, capfd):
