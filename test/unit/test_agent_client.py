@@ -397,8 +397,9 @@ def test_heartbeats_are_sent_and_answers_measured():
             machine.sendto(nonsense, robot)
         machine.recvfrom(2048)
         assert heartbeat.round_trip is None and heartbeat.age is None
-        machine.sendto(sign(KEY, ANSWER.pack(*beat, time.time())), robot)
+        machine.sendto(sign(KEY, ANSWER.pack(*beat, time.time() - 3600)), robot)
         until(lambda: heartbeat.round_trip is not None)
+        assert heartbeat.clock_offset.exceeds and -3601 < heartbeat.clock_offset.seconds < -3590
         assert heartbeat.round_trip < 5 and heartbeat.age is not None
         heartbeat.close()
         assert not heartbeat._thread.is_alive()

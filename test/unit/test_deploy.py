@@ -343,31 +343,6 @@ def test_a_step_that_fails_ends_those_beside_it(launch, provider, monkeypatch):
     assert not launch.cancel.is_set(), 'other machines of the launch go on'
 
 
-def test_workspace_vpn_and_ros_are_set_up_in_parallel(
-        launch, provider, monkeypatch):
-    travelling, joining = threading.Event(), threading.Event()
-    equipped = []
-
-    def install_ros(context, job, on_plan):
-        on_plan(RosInstall('ros'))
-        assert travelling.wait(60) and joining.wait(60)
-        assert not equipped
-        raise PrerequisiteError('no such package')
-
-    def send(context, job, ros, installed):
-        travelling.set()
-        installed()
-
-    skip_early_steps(monkeypatch)
-    monkeypatch.setattr(Joining, 'join', lambda self: joining.set())
-    monkeypatch.setattr(installing, 'install_ros', install_ros)
-    monkeypatch.setattr(installing, 'send_workspaces', send)
-    monkeypatch.setattr(installing.Modules, 'ensure', lambda *_: equipped.append('modules'))
-    with pytest.raises(PrerequisiteError, match='no such package'):
-        launch.up(SPEC)
-    assert not equipped
-
-
 class BusyAgent(FakeStream):
     """The agent of another launch, which has the machine."""
 
