@@ -377,16 +377,6 @@ def test_shutdown_process_ends_one_node(run, fake, planner):
     assert 'first' in name and first.return_code == -2
 
 
-def test_a_refused_node_is_an_error_line(run, fake, planner, capfd):
-    def refuses(machine, node):
-        machine.say('refused', node, error='no such program', hint='')
-
-    fake.on_start = refuses
-    node = talker(planner)
-    assert run(LaunchDescription([node])) == 0
-    assert "process can't be started: no such program" in capfd.readouterr().out
-
-
 @pytest.mark.parametrize('reported', [False, True])
 def test_nodes_respawn_after_the_death_of_their_agent(
     run, fake, planner, monkeypatch, reported,
