@@ -216,24 +216,6 @@ All machines: $0.0832 an hour
     assert 'c: aws' not in capsys.readouterr().out
 
 
-@pytest.mark.skipif(not any(map(find_spec, ('tomllib', 'tomli'))),
-                    reason='needs Python 3.11 or tomli')
-def test_plan_names_the_file_of_a_refused_option(tmp_path, capsys, cloud, monkeypatch):
-    def refuse(self, spec):
-        raise ConfigurationError("'x' can't be the region", 'write eu-west-1')
-
-    monkeypatch.setattr(cloud, 'resolve', refuse)
-    monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path))
-    file = tmp_path / 'fogros2/fogros2.toml'
-    file.parent.mkdir()
-    file.write_text("[aws]\nregion = 'x'\n")
-    path = tmp_path / 'x.launch.xml'
-    path.write_text('<launch><fog_machine name="a" provider="aws"/>'
-                    '<cloud_node machine="a" pkg="demo" exec="talker"/></launch>')
-    assert main(argv=['fog', 'plan', str(path)]) == 1
-    assert f'(write eu-west-1; {file} sets region)' in capsys.readouterr().err
-
-
 def test_plan_of_a_missing_file_is_an_error(tmp_path):
     assert 'there is no file' in main(argv=['fog', 'plan', str(tmp_path / 'no.launch.py')])
 
