@@ -68,7 +68,6 @@ class MachineSpec:
     bootstrap: Bootstrap = 'auto'
     environment: Mapping[str, str] = dataclasses.field(default_factory=dict)
     containers: tuple[str, ...] = ()
-    vpn: str = 'wireguard'
     apt: tuple[str, ...] = ()
     pip: tuple[str, ...] = ()
     share: tuple[str, ...] = ()

@@ -8,8 +8,6 @@ import selectors
 import socket
 import time
 
-from fogros2.agent.journal import BLOCK
-
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any, Optional
@@ -70,77 +68,3 @@ class Loop:
         for timer in due:
             if timer.at is not None:
                 timer.call()
-
-
-class Channel:
-    """
-    A socket that exchanges lines without blocking.
-
-    :param take: called with received lines.
-    """
-
-    def __init__(
-        self, loop: Loop, connection: socket.socket, take: Callable[[list[bytes]], None],
-    ) -> None:
-        connection.setblocking(False)
-        self.loop = loop
-        self.socket = connection
-        self.take = take
-        self.received = bytearray()
-        self.out = bytearray()
-        #: Whether the other end sends nothing more.
-        self.ended = False
-        #: Whether ``send`` has more to send than ``out``.
-        self.more = False
-        loop.select(connection, selectors.EVENT_READ, self.serve)
-
-    def send(self, data: bytes = b'') -> None:
-        """Send data as far as the other end takes it now, the rest later."""
-        self.out += data
-        try:
-            while self.out:
-                del self.out[:self.socket.send(self.out[:BLOCK])]
-        except BlockingIOError:
-            pass
-        except OSError:
-            self.broken()
-            return
-        self.wait()
-
-    def broken(self) -> None:
-        """Give up sending: the other end has closed the connection."""
-        self.out.clear()
-        self.wait()
-
-    def wait(self) -> None:
-        """Wait for data, and until the other end takes the rest of the output."""
-        # a socket at its end would wake the selector forever
-        events = 0 if self.ended else selectors.EVENT_READ
-        if self.out or self.more:
-            events |= selectors.EVENT_WRITE
-        self.loop.select(self.socket, events, self.serve)
-
-    def receive(self) -> bool:
-        """Read once, and handle the whole lines; return whether there may be more."""
-        try:
-            data = self.socket.recv(BLOCK)
-        except BlockingIOError:
-            return False
-        except OSError:
-            data = b''
-        self.ended = not data
-        self.received += data
-        *lines, self.received = self.received.split(b'\n')
-        self.take([bytes(line) for line in lines if line.strip()])
-        return bool(data)
-
-    def serve(self, mask: int) -> None:
-        """Exchange data with the other end when the socket is ready."""
-        if mask & selectors.EVENT_READ:
-            self.receive()
-        self.send()
-
-    def close(self) -> None:
-        """Close the socket."""
-        self.loop.select(self.socket, 0, self.serve)
-        self.socket.close()

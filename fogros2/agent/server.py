@@ -22,7 +22,7 @@ import threading
 import time
 
 from fogros2.agent.journal import BLOCK, Journal
-from fogros2.agent.loop import Channel, Loop
+from fogros2.agent.loop import Loop
 from fogros2.agent.nodes import Node, Nodes
 from fogros2.agent.processes import (
     Identity,
@@ -53,23 +53,45 @@ RESUMED = (
     'launch', 'on_exit', 'lifetime', 'robot_timeout', 'heartbeat', 'environment', 'setup')
 
 
-class Client(Channel):
-    """A connection: receives requests, sends replies and events."""
+class Client:
+    """A connection: receives requests, sends replies and events, and blocks on neither."""
 
     def __init__(self, agent: Agent, connection: socket.socket) -> None:
-        super().__init__(agent.loop, connection, self._requests)
+        connection.setblocking(False)
         self.agent = agent
+        self.loop = agent.loop
+        self.socket = connection
+        self.received = bytearray()
+        self.out = bytearray()
+        #: Whether the other end sends nothing more.
+        self.ended = False
         #: The journal's position of the next event to send; None until the client wants events.
         self.position: Optional[int] = None
         #: The number of replies that are not available yet.
         self.awaiting = 0
-        self.active = agent.loop.clock()
+        self.active = self.loop.clock()
+        self.loop.select(connection, selectors.EVENT_READ, self._serve)
 
-    def _requests(self, lines: list[bytes]) -> None:
+    def _serve(self, mask: int) -> None:
+        """Exchange data with the other end when the socket is ready."""
+        if mask & selectors.EVENT_READ:
+            self._receive()
+        self.send()
+
+    def _receive(self) -> None:
+        try:
+            data = self.socket.recv(BLOCK)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b''
+        self.ended = not data
+        self.received += data
+        *lines, self.received = self.received.split(b'\n')
         self.active = self.loop.clock()
         for line in lines:
-            if self in self.agent.clients:
-                self.agent.request(self, line)
+            if line.strip() and self in self.agent.clients:
+                self.agent.request(self, bytes(line))
         if len(self.received) > MAX_LINE:
             self.received.clear()
             self.ended = True
@@ -91,29 +113,40 @@ class Client(Channel):
         return reply
 
     def send(self, data: bytes = b'') -> None:
-        """Send data, then events; the journal is the queue of the events."""
+        """Send data, then events, as far as the other end takes them now, the rest later."""
         if self not in self.agent.clients:
             return
         self.out += data
-        self.more = self.position is not None
-        while self.more and len(self.out) < BLOCK:
+        more = self.position is not None
+        while more and len(self.out) < BLOCK:
             assert self.position is not None
+            # the journal is the queue of the events
             events, self.position = self.agent.journal.read(self.position)
             self.out += events
-            self.more = bool(events)
-        super().send()
+            more = bool(events)
+        try:
+            while self.out:
+                del self.out[:self.socket.send(self.out[:BLOCK])]
+        except BlockingIOError:
+            pass
+        except OSError:  # its other end is gone
+            self.close()
+            return
         if self.ended and not self.out and not self.awaiting:
             self.close()
-
-    def broken(self) -> None:
-        """Close a connection whose other end is gone."""
-        self.close()
+            return
+        # a socket at its end would wake the selector forever
+        wanted = 0 if self.ended else selectors.EVENT_READ
+        if self.out or more:
+            wanted |= selectors.EVENT_WRITE
+        self.loop.select(self.socket, wanted, self._serve)
 
     def close(self) -> None:
         """Close the connection; idempotent."""
         if self in self.agent.clients:
             self.agent.clients.remove(self)
-            super().close()
+            self.loop.select(self.socket, 0, self._serve)
+            self.socket.close()
 
 
 class Agent:

@@ -24,9 +24,10 @@ from fogros2.model import Command, to_json
 from fogros2.shell import Shell, Stream
 from fogros2.waiting import wait_until
 
-#: Seconds without data after which a connection counts as lost.
+#: Seconds without data, although a ping was sent, after which a connection counts as lost. TCP
+#: would need 15 minutes after the robot has changed networks.
 SILENCE = 20.0
-#: Seconds after which an agent that has gone will not come back.
+#: Seconds that an agent may need to restart.
 RESTART = 5.0
 
 #: A request without a waiting caller; its reply shows that the agent is there.
@@ -57,20 +58,9 @@ class AgentClient:
     :param shell: reaches the machine.
     :param directory: the agent's directory on the machine.
     :param agent_path: path of ``agent.py`` on the machine.
-    :param silence: seconds without a byte, although a ping was sent, after which a connection
-        counts as lost. TCP would need 15 minutes after the robot has changed networks.
-    :param restart: seconds that an agent may need to restart.
     """
 
-    def __init__(
-        self,
-        shell: Shell,
-        directory: str,
-        *,
-        agent_path: str,
-        silence: float = SILENCE,
-        restart: float = RESTART,
-    ) -> None:
+    def __init__(self, shell: Shell, directory: str, *, agent_path: str) -> None:
         self._shell = shell
         self._command = Command(
             # -IS: the agent needs only the standard library, and searching for more takes time
@@ -80,13 +70,11 @@ class AgentClient:
         self._closed = threading.Event()
         self._lock = threading.Lock()
         self._writing = threading.Lock()
-        self._silence = silence
         self._heard = 0.0
         self._numbers = itertools.count(1)
         self._pending: dict[int, _Pending] = {}
         self._stream: Optional[Stream] = None
         self._error: Optional[AgentError] = None
-        self._restart = restart
         self._ever = self._lost = False
         self._absent: Optional[str] = None
         self._next: Optional[int] = None
@@ -96,7 +84,7 @@ class AgentClient:
 
     @property
     def silent_for(self) -> float:
-        """Seconds since the last data from the machine; normally up to ``silence / 4``."""
+        """Seconds since the last data from the machine; normally up to ``SILENCE / 4``."""
         return time.monotonic() - self._heard
 
     def connect(self) -> None:
@@ -130,7 +118,7 @@ class AgentClient:
 
         :param timeout: seconds, including the time of lost connections.
         :param silent: seconds without any data after which the request fails earlier; must be more
-            than half of ``silence``, because a busy agent still answers pings.
+            than half of ``SILENCE``, because a busy agent still answers pings.
         :raises AgentError: refused, with the agent's hint; or no agent is there (any more).
         :raises DeadlineExceeded: no reply in time.
         """
@@ -231,9 +219,9 @@ class AgentClient:
 
     def _judge(self, seconds: float) -> None:
         """Give up an agent that was silent for so many seconds, if it will not come back."""
-        if self._absent is not None and (not self._ever or seconds > self._restart):
+        if self._absent is not None and (not self._ever or seconds > RESTART):
             self._error = AgentAbsent(self._absent, 'its machine may have ended')
-        elif not self._ever and seconds > self._restart:
+        elif not self._ever and seconds > RESTART:
             self._error = AgentError(
                 'the program that connects to the agent ended without an answer',
                 'is python3 on the machine, and agent.py with it?')
@@ -321,14 +309,14 @@ class AgentClient:
         """Ping a silent connection, and close it if nothing comes back."""
         thread = self._thread
         while thread is not None and thread.is_alive():
-            if self._closed.wait(self._silence / 4):
+            if self._closed.wait(SILENCE / 4):
                 return
             stream, silent = self._stream, time.monotonic() - self._heard
-            if stream is None or silent < self._silence / 4:
+            if stream is None or silent < SILENCE / 4:
                 continue
-            if silent > self._silence:
+            if silent > SILENCE:
                 stream.close()
-            elif self._writing.acquire(timeout=self._silence / 4):
+            elif self._writing.acquire(timeout=SILENCE / 4):
                 # a thread that holds the lock for longer is stuck in a dead connection
                 self._writing.release()
                 self._send(stream, _PING)

@@ -55,14 +55,13 @@ def check(
     programs: Sequence[tuple[str, str]], images: Sequence[str], report: Reporter,
 ) -> None:
     """
-    Check a machine's options, rights, containers and programs; report undeclared packages.
+    Check a machine's options, rights and containers; report undeclared packages.
 
     :param environment: the user's environment variables.
     :param programs: the (package, executable) pairs that will run there.
     :param images: the container images that nodes there will run in.
     :raises FogError: the first problem that was found, with its remedy.
     """
-    prefixes = plan.ament_prefixes(environment)
     shells.warm(provider.capabilities.shell_kind)
     provider.check(spec)
     if spec.on_exit == 'stop' and not provider.capabilities.owned:
@@ -80,14 +79,11 @@ def check(
     for each, own in feature.used(spec):
         each.check(spec, own)
     chain = [workspace.inspect(path) for path in spec.workspaces]
-    if not provider.has_own_packages(spec):
-        for package, executable in programs:
-            check_program(package, executable, prefixes, spec.workspace)
     # a step that cannot do without reports what is wrong
     with contextlib.suppress(FogError, OSError):
         warned = undeclared.warning(
-            spec, chain, {package for package, _ in programs}, prefixes,
-            provider.shared_folders(spec))
+            spec, chain, {package for package, _ in programs},
+            plan.ament_prefixes(environment), provider.shared_folders(spec))
         if warned:
             report(warned)
 

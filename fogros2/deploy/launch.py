@@ -420,11 +420,6 @@ class Launch:
         """Whether the launch is on its way down."""
         return self._ending.is_set()
 
-    def machines(self) -> list[RunningMachine]:
-        """Return the machines that are up now."""
-        return [up.result() for up in list(self._ups.values())
-                if up.done() and up.exception() is None]
-
     # -- down -----------------------------------------------------------------------------------
 
     def down(self) -> list[FogError]:

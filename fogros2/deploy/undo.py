@@ -109,7 +109,7 @@ def first_config(record: Record) -> str:
 def vpn_down(record: Record) -> Iterator[Command]:
     """Yield the commands that take a machine's interface down, or leave it to others."""
     assert record.vpn is not None
-    vpn: Vpn = plugin_system.load('fogros2.vpn', record.spec.vpn)()
+    vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')()
     return (vpn.leave if record.spec.on_exit == 'keep' else vpn.down)(record.vpn)
 
 

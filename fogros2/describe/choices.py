@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 import functools
 import threading
-from typing import Any, Optional, TYPE_CHECKING, Union
+from typing import Any, Optional, TYPE_CHECKING
 
 from launch import LaunchContext, Substitution
 
@@ -25,8 +25,6 @@ from fogros2.provider import clouds, offers, Provider
 from fogros2.provider.cheapest import WANTS
 
 if TYPE_CHECKING:
-    from decimal import Decimal
-
     from launch import SomeSubstitutionsType
 
 #: The value that stands for the region with the fastest response.
@@ -111,57 +109,37 @@ def find_nearest_region_and_ami(
 
 
 def find_cheapest_ec2_instance_type(
-    region_name: SomeSubstitutionsType, cpu_architecture: Optional[str] = None,
-    default_cores: Optional[int] = None, default_threads_per_core: Optional[int] = None,
-    gpu: Union[bool, int, str, None] = None, *, arch: Optional[str] = None,
-    min_cpu: Optional[int] = None, min_memory_gb: Optional[float] = None,
-    cpu_type: Optional[str] = None, gpu_memory_gb: Optional[float] = None,
-    max_price: Union[Decimal, str, float, None] = None, spot: bool = False,
+    region_name: SomeSubstitutionsType, cpu_architecture: str = 'x86_64', default_cores: int = 2,
+    default_threads_per_core: int = 1, gpu: bool = False,
 ) -> Choice:
     """
-    Choose the cheapest EC2 instance type of a region that meets the requirements.
+    Choose the cheapest EC2 instance type of a region as FogROS2 does.
 
-    With FogROS2's keywords, or with none, the type has exactly the cores and threads that FogROS2
-    looks for. With the keywords of AWSCloudInstance, their values are minimums.
+    It has exactly so many cores and threads. ``ec2_instance_type='cheapest'`` of a machine, and
+    :func:`find_cheapest`, take minimums.
 
     :param region_name: such as 'eu-central-1', or 'nearest'.
-    :param cpu_architecture: keyword of FogROS2; default 'x86_64'.
-    :param default_cores: keyword of FogROS2; default 2.
-    :param default_threads_per_core: keyword of FogROS2; default 1.
-    :param gpu: True for any GPU, the number of GPUs, or part of the GPU's name.
-    :raises ConfigurationError: keywords of both kinds.
+    :param gpu: whether it has a GPU.
     """
-    theirs = _said(cpu_architecture=cpu_architecture, default_cores=default_cores,
-                   default_threads_per_core=default_threads_per_core)
-    ours = _said(arch=arch, min_cpu=min_cpu, min_memory_gb=min_memory_gb, cpu_type=cpu_type,
-                 gpu_memory_gb=gpu_memory_gb, max_price=max_price, spot=spot or None)
-    if theirs and ours:
-        raise ConfigurationError(
-            f"{', '.join(theirs)} can't be combined with {', '.join(ours)}",
-            'use arch, min_cpu, min_memory_gb')
-    ask: Callable[..., str]
-    if not ours and isinstance(gpu, (bool, type(None))):
-        ask = functools.partial(_type_of_fogros2, **theirs, **_said(gpu=gpu))
-    else:
-        ask = functools.partial(_type, wanted={**ours, **_said(gpu=gpu)})
-    return Choice('the cheapest type there', ask,
-                  {'region': region_name})
+    return Choice('the cheapest type there', functools.partial(_type, wanted={
+        'arch': cpu_architecture, 'min_cpu': 0, 'min_memory_gb': 0, 'gpu': gpu,
+        'cores': default_cores, 'threads_per_core': default_threads_per_core}),
+        {'region': region_name})
 
 
 def find_cheapest(
     regions: Optional[Sequence[SomeSubstitutionsType]] = None, *, provider: str = 'aws',
     max_round_trip_ms: Optional[float] = None, **wanted: Any,
-) -> tuple[Choice, ...]:
+) -> tuple[Choice, Choice]:
     """
-    Choose the cheapest machine of a cloud, or of all clouds, that meets the requirements.
+    Choose the cheapest machine of a cloud that meets the requirements.
 
     :param regions: candidates; None for all regions that the account may use.
-    :param provider: the cloud, such as 'azure'; 'all' for all clouds that are set up.
+    :param provider: the cloud, such as 'azure'.
     :param max_round_trip_ms: maximum of the measured time to the region and back.
     :param wanted: ``arch``, ``min_cpu``, ``min_memory_gb``, ``cpu_type``, ``gpu``,
         ``gpu_memory_gb``, ``max_price``, ``spot``, with the meaning of AWSCloudInstance.
-    :returns: region and type; with 'all', the provider's name comes first. For a machine, use
-        :class:`~fogros2.CheapestInstance`: it continues with the next offer.
+    :returns: region and type. :class:`~fogros2.CheapestInstance` compares all clouds.
     :raises ConfigurationError: an unknown keyword.
     """
     for name in wanted:
@@ -170,18 +148,13 @@ def find_cheapest(
                 f"find_cheapest takes no '{name}'",
                 f"it takes regions, provider, max_round_trip_ms, {', '.join(WANTS)}")
     ask = functools.partial(
-        _cheapest, providers=() if provider == clouds.ALL else (provider,),
-        max_round_trip_ms=max_round_trip_ms, wanted=wanted)
-    # one request answers all
+        _cheapest, provider=provider, max_round_trip_ms=max_round_trip_ms, wanted=wanted)
+    # one request answers both
     offer = Choice('the cheapest offer', ask, {'regions': values.items(regions)})
-    parts = tuple(
-        Choice(f'the {part} of the cheapest offer', functools.partial(_part, number),
-               {'offer': offer}) for number, part in enumerate(('provider', 'region', 'type')))
-    return parts if provider == clouds.ALL else parts[1:]
-
-
-def _said(**values: Any) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if value is not None}
+    return (Choice('the region of the cheapest offer', lambda offer: offer.split(' ')[0],
+                   {'offer': offer}),
+            Choice('the type of the cheapest offer', lambda offer: offer.split(' ')[1],
+                   {'offer': offer}))
 
 
 # The provider is loaded only when a request is made.
@@ -199,24 +172,10 @@ def _type(region: str, wanted: Mapping[str, Any]) -> str:
     return _aws().offers(offers.wants(**wanted), [region]).chosen.type.name
 
 
-def _type_of_fogros2(
-    region: str, cpu_architecture: str = 'x86_64', default_cores: int = 2,
-    default_threads_per_core: int = 1, gpu: bool = False,
-) -> str:
-    """Choose the type as FogROS2 does: with exactly so many cores and threads."""
-    return _type(region, {
-        'arch': cpu_architecture, 'min_cpu': 0, 'min_memory_gb': 0, 'gpu': gpu,
-        'cores': default_cores, 'threads_per_core': default_threads_per_core})
-
-
 def _cheapest(
-    regions: Optional[Sequence[str]], providers: Sequence[str],
+    regions: Optional[Sequence[str]], provider: str,
     max_round_trip_ms: Optional[float], wanted: Mapping[str, Any],
 ) -> str:
-    offer = clouds.compare(offers.wants(**wanted), providers, regions or [clouds.ALL],
+    offer = clouds.compare(offers.wants(**wanted), (provider,), regions or [clouds.ALL],
                            max_round_trip_ms=max_round_trip_ms).chosen
-    return f'{offer.provider} {offer.region} {offer.type.name}'
-
-
-def _part(number: int, offer: str) -> str:
-    return offer.split(' ')[number]
+    return f'{offer.region} {offer.type.name}'

@@ -297,7 +297,6 @@ class AzureCloudInstance(VmInstance):
     :param machine_type: the same as ``vm_size``.
     :param disk_size: GB; default and minimum 30.
     :param region: such as 'westeurope'; 'nearest' for the region with the fastest response.
-    :param location: the same as ``region``.
     :param vm_size: such as 'Standard_B2als_v2'; 'cheapest' for the cheapest size that meets the
         requirements.
     :param image: 'publisher:offer:sku:version' of the Marketplace, or an image's resource id.
@@ -314,7 +313,6 @@ class AzureCloudInstance(VmInstance):
         machine_type: Optional[ByRegion] = None,
         disk_size: Optional[Value] = None, *,
         region: Optional[SomeSubstitutionsType] = None,
-        location: Optional[SomeSubstitutionsType] = None,
         vm_size: Optional[ByRegion] = None,
         image: Optional[ByRegion] = None,
         cpu_type: Optional[SomeSubstitutionsType] = None,
@@ -322,8 +320,8 @@ class AzureCloudInstance(VmInstance):
         **common: Any,
     ) -> None:
         options = options_of(AzureCloudInstance.__init__, locals())
-        for other, name in (('location', 'region'), ('zone', 'region'),
-                            ('machine_type', 'vm_size'), ('ami_image', 'image')):
+        for other, name in (('zone', 'region'), ('machine_type', 'vm_size'),
+                            ('ami_image', 'image')):
             value = options.pop(other, None)
             if value is not None:
                 if options.get(name) is not None:

@@ -9,8 +9,8 @@ resolves the action, registers its handlers and then creates a task from its pri
 :func:`delay_start` calls it later. Everything else (substitutions, handlers, output, ``on_exit``,
 signals) stays launch's own code. The options that the method reads have no getters.
 
-The names are those of Jazzy (launch 3.4), which the embedded default shares;
-``test/unit/test_launch_internals.py`` checks each name.
+The names are those of Jazzy (launch 3.4), which the embedded default shares; the launches of
+``test/launch`` use each of them.
 """
 
 from __future__ import annotations

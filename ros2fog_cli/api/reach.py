@@ -194,21 +194,18 @@ def link(record: Record, *, pings: int = 5) -> Optional[Link]:
     if record.vpn is None or record.robot_vpn is None:
         return None
     return dataclasses.replace(
-        measure(record.vpn.address, record.robot_vpn, record.public_key, record.spec.vpn, pings),
+        measure(record.vpn.address, record.robot_vpn, record.public_key, pings),
         carried=record.carried)
 
 
-def measure(
-    address: str, interface: VpnInterface, key: str, kind: str, pings: int = 5,
-) -> Link:
+def measure(address: str, interface: VpnInterface, key: str, pings: int = 5) -> Link:
     """
     Measure the link from an interface of this computer to a machine.
 
     :param key: the machine's public key.
-    :param kind: the VPN plugin.
     :raises FogError: the status of the interface cannot be read.
     """
-    vpn: Vpn = plugin_system.load('fogros2.vpn', kind)()
+    vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')()
     status = process.run(vpn.status(interface), timeout=10.0)
     peer = vpn.parse_status(status.stdout).get(key, {})
     handshake = peer.get('handshake', 0.0)
@@ -308,5 +305,4 @@ def link_of(other: OtherVpn) -> Link:
 
     :raises FogError: the status of the interface cannot be read.
     """
-    return measure(
-        other.interface.address, other.own, other.machine.public_key, 'wireguard')
+    return measure(other.interface.address, other.own, other.machine.public_key)

@@ -19,7 +19,6 @@ from typing import Any
 import pytest
 
 from fogros2 import process
-from fogros2.agent_client import joined
 from fogros2.errors import PrerequisiteError
 from fogros2.model import Command
 from fogros2.process import run, which
@@ -54,17 +53,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if {'images', 'isolated_root'} & set(getattr(item, 'fixturenames', ())):
             item.add_marker(pytest.mark.timeout(900), append=False)
-
-
-@pytest.fixture
-def slow_agent(tmp_path: Path) -> Path:
-    """Return the agent's file for a machine whose clock is 1.5 s behind this computer's."""
-    clock = 'import time\n_now = time.time\ntime.time = lambda: _now() - 1.5\n'
-    source = joined()
-    assert source.count('import time\n') == 1
-    path = tmp_path / 'agent.py'
-    path.write_text(source.replace('import time\n', clock))
-    return path
 
 
 @pytest.fixture(scope='session')

@@ -22,7 +22,7 @@ from fogros2 import process
 from fogros2.provider.container import root as container_root
 from fogros2.store import Store
 from rigs.bare_computer import bare_computer
-from rigs.launched import embedded, launching
+from rigs.launched import launching
 from rigs.sshd import private_sshd
 
 pytestmark = [
@@ -112,23 +112,6 @@ def nothing_was_made(text):
     return f'{NAME}: machine' not in text
 
 
-# -- what the launch file says ------------------------------------------------------------------
-
-def test_unknown_package_is_refused(refused, cloud_network):
-    error, text = refused(container(cloud_network), package='fogros2_exmples')
-    assert "there is no package 'fogros2_exmples'" in error
-    assert "did you mean 'fogros2_examples'?" in error
-    assert nothing_was_made(text)
-
-
-# -- what the environment says ------------------------------------------------------------------
-
-def test_invalid_domain_is_refused(refused, cloud_network):
-    error, text = refused(container(cloud_network), environment={'ROS_DOMAIN_ID': 'seven'})
-    assert 'ROS_DOMAIN_ID' in error and 'seven' in error and 'use 0 to 101' in error
-    assert nothing_was_made(text)
-
-
 # -- what this computer lacks -------------------------------------------------------------------
 
 def without(path, script='mount --bind /dev/null "$hidden"'):
@@ -179,14 +162,6 @@ def test_missing_root_is_reported(write, cloud_network):
     assert nothing_was_made(text)
 
 
-@needs_namespaces
-def test_missing_program_is_reported(refused, cloud_network):
-    error, text = refused(container(cloud_network), wrap=without(
-        '$(readlink -f $(command -v wg))'))
-    assert 'wg not found on this computer' in error and 'apt-get install' in error
-    assert nothing_was_made(text)
-
-
 # -- computers that exist already ---------------------------------------------------------------
 
 def test_unreachable_host_is_reported(refused, computer, nobody):
@@ -210,28 +185,6 @@ def test_robot_is_refused_as_its_own_machine(refused, root_at_login, tmp_path):
             f'{server.endpoint.key_file!r}, {server.host_key!r}, name={NAME!r})')
     assert f"'{NAME}' is this robot itself" in error
     assert f'--machine {NAME}=robot' in error
-
-
-def test_missing_rsync_is_reported(refused, computer):
-    # not by apt-get either: there is no way out of here
-    computer.run('mv /usr/bin/rsync /usr/bin/rsync.away; mv /usr/bin/apt-get /usr/bin/apt.away')
-    try:
-        error, _ = refused(ssh(computer))
-    finally:
-        computer.run('mv /usr/bin/rsync.away /usr/bin/rsync; '
-                     'mv /usr/bin/apt.away /usr/bin/apt-get')
-    assert f"machine '{NAME}' lacks rsync" in error
-    assert 'apt-get install rsync' in error
-
-
-@pytest.mark.skipif(not embedded(), reason='this robot has an installation of ROS 2')
-def test_small_home_is_reported(refused, cloud_network, tmp_path):
-    with bare_computer(f'fogt-small-{NAME}', tmp_path / 'computer', cloud_network,
-                       options=['--tmpfs', '/home/fog:size=1m,mode=1777']) as computer:
-        # what is to be sent may have to be made first
-        error, _ = refused(ssh(computer, bootstrap='pip'), within=150.0)
-    assert 'are free in /home/fog, 400 are needed' in error
-    assert 'make room there' in error
 
 
 @contextlib.contextmanager

@@ -17,7 +17,7 @@ import pytest
 from fogros2 import ros2_daemon
 from fogros2.deploy import Launch
 from fogros2.deploy import launch as launched
-from fogros2.errors import FogError, NameTaken, WorkspaceError
+from fogros2.errors import FogError, NameTaken
 from fogros2.feature import Feature
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
@@ -286,10 +286,3 @@ def wireguard_of(interface):
         if words[0].endswith('wireguard-go') and interface in words:
             found.add(int(pid))
     return found
-
-
-def test_unknown_executable_is_reported_before_creation(spec):
-    launch = Launch()
-    with pytest.raises(WorkspaceError, match="did you mean 'talker'"):
-        launch.prepare([spec()], {spec().name: [('fogros2_examples', 'talkr')]})
-    assert launch.down() == []

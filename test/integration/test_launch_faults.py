@@ -47,9 +47,7 @@ def generate_launch_description():
 
 #: What a launch prints as a step begins, and at last when messages arrive.
 STEPS = {
-    'create': f'{NAME}: machine ...', 'vpn interface': 'robot: VPN interface ...',
-    'connect': f'{NAME}: connect ...', 'watchdog': f'{NAME}: watchdog ...',
-    'vpn': f'{NAME}: VPN ...', 'agent': f'{NAME}: agent ...', 'running': 'I heard',
+    'create': f'{NAME}: machine ...', 'vpn': f'{NAME}: VPN ...', 'running': 'I heard',
 }
 
 
@@ -142,26 +140,18 @@ def launched(tmp_path, cloud_network):
         launch.child.wait(60)
 
 
-# test_deploy.py cancels a launch in each of its steps
-@pytest.mark.parametrize(('number', 'step'), [
-    (signal.SIGINT, 'create'), (signal.SIGINT, 'vpn'), (signal.SIGINT, 'running'),
-    (signal.SIGTERM, 'connect'), (signal.SIGTERM, 'agent'), (signal.SIGTERM, 'running')])
+# test_deploy.py cancels a launch in each of its steps, launch/test_signals.py has all signals
+@pytest.mark.parametrize(('number', 'step'), [(signal.SIGINT, 'vpn'), (signal.SIGTERM, 'running')])
 def test_a_signal_takes_everything_back(launched, number, step):
+    """A second one does not stop the way back."""
     launch = launched()
     launch.wait_for(STEPS[step])
-    launch.child.send_signal(number)
+    for _ in range(2):
+        launch.child.send_signal(number)
+        launch.wait_for(number.name)
     code = launch.ended()
     assert 'Traceback' not in ''.join(launch.said)
     assert code in (0, 1), ''.join(launch.said)
-
-
-def test_a_second_interrupt_does_not_stop_the_way_back(launched):
-    launch = launched()
-    launch.wait_for(STEPS['vpn'])
-    launch.child.send_signal(signal.SIGINT)
-    launch.wait_for('SIGINT')
-    launch.child.send_signal(signal.SIGINT)
-    launch.ended()
 
 
 def end_at(launch, step, deafen):
@@ -177,16 +167,15 @@ def end_at(launch, step, deafen):
     assert containers() == [] and not Store().exists(NAME)
 
 
-@pytest.mark.parametrize(('step', 'output'), [
-    ('create', 'pipe'), ('ending', 'terminal'),
-    ('running', 'terminal'), ('running', 'pipe'), ('running', 'unread pipe')])
+# test_runtime_console.py has all kinds of screens
+@pytest.mark.parametrize(('step', 'output'), [('ending', 'terminal'), ('running', 'unread pipe')])
 def test_closed_output_takes_everything_back(launched, step, output):
     """A closed terminal also sends SIGHUP; `| less` does not read until it is asked to."""
     launch = launched(terminal=output == 'terminal')
     end_at(launch, step, lambda: launch.deafen(close=output != 'unread pipe'))
 
 
-@pytest.mark.parametrize('step', ['create', 'running', 'ending'])
+@pytest.mark.parametrize('step', ['create', 'running'])
 def test_full_disk_takes_everything_back(launched, monkeypatch, tmp_path, step):
     disk = tmp_path / 'small'
     disk.mkdir()
@@ -212,7 +201,9 @@ def fill(disk: Path) -> None:
                     file.write(b'x' * size)
 
 
-@pytest.mark.parametrize('step', ['create', 'vpn interface', 'watchdog', 'vpn', 'running'])
+# without a machine, with an agent that waits for the launch, with one that had heartbeats;
+# benchmarks/chaos.py kills launches at any time
+@pytest.mark.parametrize('step', ['create', 'vpn', 'running'])
 def test_a_killed_launch_leaves_a_machine_that_ends_itself(launched, step):
     launch = launched(timeout=6)
     launch.wait_for(STEPS[step])
@@ -250,16 +241,15 @@ def fog(*words: str) -> int:
 
 def test_nodes_respawn_when_their_agent_is_killed(launched):
     launch = launched()
-    for _ in range(2):
-        launch.wait_for(STEPS['running'])
-        launch.said.clear()
-        killed = subprocess.run(
-            ['ros2', 'fog', 'connect', NAME, '--', 'sh', '-c',
-             'sudo kill -9 $(cat /run/fogros2/agent.pid)'],
-            stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60)
-        assert killed.returncode == 0, killed
-        launch.wait_for('its agent died and was started again')
-        launch.wait_for('process started with pid')
-        launch.wait_for('Publishing')
+    launch.wait_for(STEPS['running'])
+    launch.said.clear()
+    killed = subprocess.run(
+        ['ros2', 'fog', 'connect', NAME, '--', 'sh', '-c',
+         'sudo kill -9 $(cat /run/fogros2/agent.pid)'],
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60)
+    assert killed.returncode == 0, killed
+    launch.wait_for('its agent died and was started again')
+    launch.wait_for('process started with pid')
+    launch.wait_for('Publishing')
     launch.child.send_signal(signal.SIGINT)
     assert launch.ended() == 0, ''.join(launch.said)

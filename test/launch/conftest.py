@@ -33,11 +33,13 @@ class FakeMachine:
         self.signals = []
         self.answers = True
         self.exits_on_stop = True
-        #: Whether the provider confirms a notice.
-        self.confirms = True
+        #: Whether the provider confirms a notice: its answers, of which the last stays.
+        self.confirms = [True]
         self.pids = iter(range(4001, 5000))
 
     def start(self, nodes):
+        if self.launch.start_error is not None:
+            raise self.launch.start_error
         for node in nodes:
             self.launch.note('start', self.spec.name, node.name)
             self.all.append(node)
@@ -58,7 +60,7 @@ class FakeMachine:
 
     def reclaimed(self, timeout):
         self.launch.note('reclaimed', self.spec.name, timeout)
-        return self.confirms
+        return self.confirms.pop(0) if len(self.confirms) > 1 else self.confirms[0]
 
     def end(self, reason):
         self.launch.note('end', self.spec.name, reason)
@@ -102,6 +104,8 @@ class FakeLaunch:
         #: Errors of the next calls of ``retire``, one for each call.
         self.retire_errors = []
         self.here_error = None
+        #: What machines refuse nodes with.
+        self.start_error = None
         self.prepare_error = None
         self.down_errors = []
         self.costs = []

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import functools
+
 from launch import events, LaunchDescription, LaunchDescriptionSource
 from launch.actions import (
     DeclareLaunchArgument,
@@ -30,35 +32,29 @@ def cloud_node(planner, **kwargs):
     return CloudNode(machine=planner, package='demo', executable='talker', **kwargs)
 
 
-def node(planner=None, **kwargs):
+def node(**kwargs):
     return Node(package='demo', executable='talker', **kwargs)
 
 
-def included(make, planner):
-    return IncludeLaunchDescription(
-        LaunchDescriptionSource(LaunchDescription([make(planner)]), location='included'))
-
-
 DEPTHS = {
-    'directly': lambda make, planner: make(planner),
-    'group': lambda make, planner: GroupAction([make(planner)]),
-    'condition': lambda make, planner: GroupAction(
-        [GroupAction([make(planner)], condition=IfCondition('true'))],
+    'directly': lambda make: make(),
+    'group': lambda make: GroupAction([make()]),
+    'condition': lambda make: GroupAction(
+        [GroupAction([make()], condition=IfCondition('true'))],
         condition=UnlessCondition('false')),
-    'include': lambda make, planner: included(make, planner),
-    'function': lambda make, planner: OpaqueFunction(
-        function=lambda context: [make(planner)]),
-    'timer': lambda make, planner: TimerAction(period=0.01, actions=[make(planner)]),
-    'timer in function': lambda make, planner: OpaqueFunction(
-        function=lambda context: [TimerAction(period=0.01, actions=[
-            GroupAction([make(planner)])])]),
-    'handler': lambda make, planner: GroupAction([
+    'include': lambda make: IncludeLaunchDescription(
+        LaunchDescriptionSource(LaunchDescription([make()]), location='included')),
+    'function': lambda make: OpaqueFunction(function=lambda context: [make()]),
+    'timer': lambda make: TimerAction(period=0.01, actions=[make()]),
+    'timer in function': lambda make: OpaqueFunction(
+        function=lambda context: [TimerAction(period=0.01, actions=[GroupAction([make()])])]),
+    'handler': lambda make: GroupAction([
         RegisterEventHandler(OnProcessExit(
-            target_action=lambda action: 'robot' in action.name, on_exit=[make(planner)])),
+            target_action=lambda action: 'robot' in action.name, on_exit=[make()])),
     ]),
-    'handler with a function': lambda make, planner: RegisterEventHandler(OnProcessExit(
+    'handler with a function': lambda make: RegisterEventHandler(OnProcessExit(
         target_action=lambda action: 'robot' in action.name,
-        on_exit=lambda event, context: [make(planner)])),
+        on_exit=lambda event, context: [make()])),
 }
 
 
@@ -66,25 +62,39 @@ def robot_process():
     return ExecuteProcess(cmd=['true'], name='robot')
 
 
-@pytest.mark.parametrize('description', [LaunchDescription, FogROSLaunchDescription])
-@pytest.mark.parametrize('depth', DEPTHS)
-def test_cloud_node_is_found_at_any_depth(run, fake, planner, depth, description):
-    fake.on_start = ends
-    entity = DEPTHS[depth](cloud_node, planner)
-    assert run(description([entity, robot_process()])) == 0
-    assert fake.noted('up') == [('planner',)]
-    assert len(fake.noted('start')) == 1
-    assert len(fake.noted('down')) == 1
+def at_all_depths(make, **kwargs):
+    """Return an entity for each depth, whose process has the depth's name."""
+    return [within(functools.partial(make, exec_name=depth, **kwargs))
+            for depth, within in DEPTHS.items()]
+
+
+def depths(fake):
+    return sorted(name.rpartition('-')[0] for _, name in fake.noted('start'))
 
 
 @pytest.mark.parametrize('description', [LaunchDescription, FogROSLaunchDescription])
-@pytest.mark.parametrize('depth', DEPTHS)
-def test_cloud_group_finds_nodes_at_any_depth(run, fake, planner, depth, description, capfd):
+def test_cloud_node_is_found_at_any_depth(run, fake, planner, description):
     fake.on_start = ends
-    entity = DEPTHS[depth](node, planner)
-    assert run(description([CloudGroup(planner, [entity]), robot_process()])) == 0
-    assert len(fake.noted('start')) == 1
+    assert run(description([*at_all_depths(cloud_node, planner=planner), robot_process()])) == 0
+    assert depths(fake) == sorted(DEPTHS)
+    assert fake.noted('up') == [('planner',)] and len(fake.noted('down')) == 1
+
+
+@pytest.mark.parametrize('description', [LaunchDescription, FogROSLaunchDescription])
+def test_cloud_group_finds_nodes_at_any_depth(run, fake, planner, description, capfd):
+    fake.on_start = ends
+    assert run(description([CloudGroup(planner, at_all_depths(node)), robot_process()])) == 0
+    assert depths(fake) == sorted(DEPTHS)
     assert 'here' not in capfd.readouterr().out
+
+
+@pytest.mark.parametrize('depth', DEPTHS)
+def test_only_node_of_a_launch_is_found(run, fake, planner, depth):
+    """Where nothing else makes the launch engage its machine, or wait."""
+    fake.on_start = ends
+    assert run(FogROSLaunchDescription([
+        DEPTHS[depth](functools.partial(cloud_node, planner)), robot_process()])) == 0
+    assert len(fake.noted('start')) == 1
 
 
 def test_false_conditions_cost_nothing(run, fake, planner):

@@ -122,13 +122,6 @@ PYTHON_MACHINE = {
     'tags': {'team': 'slam', 'cost': '42'}, 'environment': {'RCUTILS_COLORIZED_OUTPUT': '1'}}
 
 
-def test_machine_of_any_cloud_is_an_element():
-    spec = machine(xml('<fog_machine name="planner" provider="cheapest" min_cpu="8" gpu="L4" '
-                       'max_round_trip_ms="60" providers="aws, azure" ros_workspace=""/>'))
-    assert (spec.provider, spec.options) == ('cheapest', {
-        'min_cpu': 8, 'gpu': 'L4', 'max_round_trip_ms': 60, 'providers': ['aws', 'azure']})
-
-
 @pytest.mark.parametrize('text', [f'<launch>{XML_MACHINE}</launch>', YAML_MACHINE])
 def test_a_machine_is_the_one_that_python_makes(text):
     assert machine(load(text)) == AWSCloudInstance(**PYTHON_MACHINE).spec(LaunchContext())
@@ -268,11 +261,8 @@ launch:
      ['needs a provider', 'aws, azure, cheapest, container, gcp, joined, kubernetes, robot, ssh']),
     ('<fog_machine provider="aws"/>', ['needs a name']),
     ('<fog_machine name="p" provider="ssh"/>', ["provider 'ssh' needs host"]),
-    ('<fog_machine name="p" provider="joined"/>', ["provider 'joined' needs invitation"]),
-    ('<fog_machine name="P_" provider="aws"/>', ["'P_' is no name for a machine"]),
     ('<fog_machine name="p" provider="aws" regoin="x"/>',
      ["provider 'aws'", "'regoin'", "did you mean 'region'"]),
-    ('<fog_machine name="p" provider="container" region="x"/>', ["'region'", 'did you mean']),
     ('<fog_machine name="p" provider="aws"><tag name="a" value="b"/></fog_machine>',
      ["'tag'", "did you mean 'tags'"]),
     ('<fog_machine name="p" provider="aws"><tags nmae="a" value="b"/></fog_machine>',
@@ -280,9 +270,6 @@ launch:
     ('<fog_machine name="p" provider="aws"><tags name="a"/></fog_machine>', ['a name', 'a value']),
     ('<fog_machine name="p" provider="aws" spot="perhaps"/>', ['spot:', 'neither true nor false']),
     ('<fog_machine name="p" provider="aws" disk_size="large"/>', ['disk_size:', 'no number']),
-    ('<fog_machine name="p" provider="aws" on_exit="kepe"/>', ['on_exit', "did you mean 'keep'"]),
-    ('<fog_machine name="p" provider="aws" lifetime="1y"/>', ['lifetime', 'no duration']),
-    ('<fog_machine name="p" provider="aws" regions="[a"/>', ['regions:', 'no list']),
     ('<fog_machine name="p" provider="aws"><docker_container/></fog_machine>',
      ['a cmd, or an image']),
     ('<fog_machine name="p" provider="aws"><docker_container imag="a"/></fog_machine>',
@@ -293,8 +280,6 @@ launch:
      ["tolerations has no 'kye'", "did you mean 'key'"]),
     ('launch: [{fog_machine: {name: p, provider: aws, spot: 3}}]', ["spot can't be 3",
                                                                     'true or false']),
-    ('launch: [{fog_machine: {name: p, provider: aws, disk_size: true}}]', ["can't be True"]),
-    ('launch: [{fog_machine: {name: p, provider: aws, region: 3}}]', ["region can't be 3"]),
     ('launch: [{fog_machine: {name: p, provider: aws, region: [a]}}]', ["can't be ['a']"]),
     ('launch: [{fog_machine: {name: p, provider: aws, regions: [1]}}]', ["can't be [1]"]),
     ('launch: [{fog_machine: {name: p, provider: aws, region: {a: b}}}]', ["'region' is no"]),
@@ -309,7 +294,6 @@ launch:
     ('<stream_topic topic="/a"><param name="bitrate"/></stream_topic>', ['a name', 'value']),
     ('<stream_topic topic="/a"><param name="topic" value="/b"/></stream_topic>', ['a name']),
     ('<fogros_launch robot_nodes="never"/>', ["robot_nodes='never' is unknown"]),
-    ('<fogros_launch robot_node="x"/>', ["did you mean 'robot_nodes'"]),
     ('<cloud_group machine="p"><stream_topic topic="/a" if="true"/></cloud_group>',
      ['/a', 'condition']),
 ])
@@ -436,13 +420,6 @@ def test_of_two_machines_of_one_name_the_condition_chooses(run, fake):
         'exited', node, returncode=0, respawns=False)
     assert run(description) == 0
     assert fake.machines['planner'].spec.options == {'memory': '2g'}
-
-
-def test_undescribed_machine_is_refused(run, fake):
-    description = xml('<fog_machine name="planner" provider="container"/>'
-                      '<cloud_node machine="planer" pkg="demo" exec="talker"/>')
-    assert run(description) == 1
-    assert fake.noted('prepare') == []
 
 
 def test_docker_containers_of_a_machine(run, fake):

@@ -9,7 +9,7 @@ import re
 import stat
 import threading
 
-from launch import EventHandler, LaunchDescription
+from launch import LaunchDescription
 from launch.actions import (
     EmitEvent,
     ExecuteProcess,
@@ -19,7 +19,7 @@ from launch.actions import (
     Shutdown,
     TimerAction,
 )
-from launch.event_handlers import OnProcessExit, OnProcessIO, OnProcessStart, OnShutdown
+from launch.event_handlers import OnProcessExit, OnProcessIO
 from launch.events import matches_action
 from launch.events.process import ShutdownProcess
 from launch_ros.actions import Node, PushROSNamespace, SetRemap
@@ -30,20 +30,15 @@ from fogros2 import (
     CloudNode,
     ContainerInstance,
     FogROSLaunchDescription,
-    MachineInterrupted,
     StreamTopic,
 )
 from fogros2.errors import AgentError, ProviderError
+from fogros2.runtime import remote_run
 from fogros2_features.replacement import session
 from fogros2_testing.plugins import instead
-from rigs.launching import Harmless
+from rigs.launching import end, Harmless, HERE, says, Watch
 
 REASON = 'spot instance, at 12:00'
-#: Says where it runs, and ends when told to.
-HERE = """#!/bin/sh
-echo "here: $*"
-exec sleep 60
-"""
 
 
 @pytest.fixture
@@ -60,58 +55,9 @@ def talker(package):
     return functools.partial(CloudNode, package='demo', executable='says', output='screen')
 
 
-class Watch:
-    """Notes what launch says of processes, and does something at the n-th start."""
-
-    def __init__(self):
-        self.starts = []
-        self.exits = []
-        self.said = []
-        self.interrupted = []
-        self.shutdowns = []
-        self.at_start = {}
-
-    def __call__(self):
-        return [
-            RegisterEventHandler(OnProcessStart(on_start=self._start)),
-            RegisterEventHandler(OnProcessExit(on_exit=self._exit)),
-            RegisterEventHandler(OnProcessIO(on_stdout=self._io)),
-            RegisterEventHandler(OnShutdown(on_shutdown=self._shutdown)),
-            RegisterEventHandler(EventHandler(
-                matcher=lambda event: isinstance(event, MachineInterrupted),
-                entities=[OpaqueFunction(function=self._interrupted)])),
-        ]
-
-    def _start(self, event, context):
-        self.starts.append((plain(event.process_name), event.cmd[0]))
-        do = self.at_start.get(len(self.starts))
-        return None if do is None else do(event)
-
-    def _exit(self, event, context):
-        self.exits.append((plain(event.process_name), event.returncode))
-
-    def _io(self, event):
-        self.said.append(event.text.decode())
-
-    def _shutdown(self, event, context):
-        self.shutdowns.append(event.reason)
-
-    def _interrupted(self, context):
-        event = context.locals.event
-        self.interrupted.append((event.machine, event.reason, event.lost))
-
-
 @pytest.fixture
 def watch():
     return Watch()
-
-
-def plain(name):
-    return name.rpartition('-')[0]
-
-
-def end(event=None):
-    return [Shutdown(reason='the test is over')]
 
 
 def end_when(true):
@@ -121,14 +67,6 @@ def end_when(true):
 
     def do(event=None):
         return [OpaqueFunction(function=look)]
-    return do
-
-
-def says(fake, kind, **fields):
-    """Return what has the machine say something, once all there is to visit was visited."""
-    def do(event=None):
-        return [OpaqueFunction(function=lambda context: context.asyncio_loop.call_soon(
-            lambda: fake.machines['planner'].say(kind, **fields)) and None)]
     return do
 
 
@@ -174,24 +112,29 @@ def test_interrupted_machine_ends_the_launch_by_default(run, fake, talker, watch
                for line in lines)
 
 
-def test_notice_that_the_provider_denies_ends_nothing(run, fake, talker, watch, capfd):
-    """A node can forge it; the launch ends when the machine is gone."""
-    machine = ContainerInstance(name='planner', ros_workspace='')
+@pytest.mark.parametrize('how', ['shutdown', 'replace'])
+@pytest.mark.parametrize('confirmed', [False, True])
+def test_notice_that_the_provider_denies_ends_nothing(
+        run, fake, talker, watch, capfd, confirmed, how):
+    """A node can forge it; the launch acts when the provider confirms it, or it is gone."""
+    machine = ContainerInstance(name='planner', ros_workspace='', on_interrupt=how)
 
     def forged(event):
-        fake.machines['planner'].confirms = False
+        fake.machines['planner'].confirms = [False, confirmed]
         return says(fake, 'notice', reason=REASON)(event)
 
     def later(context):
         context.asyncio_loop.call_later(
             0.3, lambda: fake.machines['planner'].say('lost', reason='it was deleted'))
 
-    watch.at_start = {1: lambda event: [*forged(event), OpaqueFunction(function=later)]}
-    assert run(LaunchDescription([*watch(), talker(machine=machine)])) == 1
-    assert "the machine 'planner' is gone: it was deleted" in watch.shutdowns[0]
-    assert watch.interrupted == [('planner', 'it was deleted', True)]
+    after = [] if confirmed else [OpaqueFunction(function=later)]
+    watch.at_start = {1: lambda event: [*forged(event), *after], 2: end}
+    assert run(LaunchDescription([*watch(), talker(machine=machine)])) == (how == 'shutdown')
+    assert watch.interrupted[:1] == [
+        ('planner', REASON, False) if confirmed else ('planner', 'it was deleted', True)]
     assert [note[1] for note in fake.noted('reclaimed')] == [0.0, 150.0]
-    assert 'its provider has not confirmed' in capfd.readouterr().out
+    said = capfd.readouterr().out
+    assert ('its provider has not confirmed' in said) == (not confirmed)
 
 
 def test_lost_machine_ends_the_launch_by_default(run, fake, talker, watch, capfd):
@@ -226,47 +169,28 @@ def test_nodes_of_a_lost_machine_continue_on_the_robot(run, fake, package, plann
     assert [code for _, code in watch.exits] == [-2], 'that of the one here, at the end'
 
 
-def test_machine_lost_after_its_notice_holds_nothing_up(run, fake, planner, talker, watch):
-    """The machine vanishes while its nodes are being ended: they don't wait for it."""
-    def on_start(machine, node):
-        machine.exits_on_stop = False
-        original = machine.stop
-
-        def stop(ids):
-            original(ids)
-            machine.say('lost', reason='it was deleted')
-        machine.stop = stop
-
-    fake.on_start = on_start
-    watch.at_start = {1: says(fake, 'notice', reason=REASON), 2: end}
-    assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
-    assert len(watch.starts) == 2 and watch.interrupted == [('planner', REASON, False)]
+def vanishes(machine, ids):
+    machine.say('lost', reason='it was deleted')
 
 
-def test_silent_machine_does_not_hold_up_its_nodes(run, fake, planner, talker, watch, monkeypatch):
-    from fogros2.runtime import remote_run
+def refuses(machine, ids):
+    raise AgentError('the agent is gone')
+
+
+@pytest.mark.parametrize('stop', [vanishes, refuses, lambda machine, ids: None])
+def test_machine_that_ends_no_node_holds_none_up(
+        run, fake, planner, talker, watch, monkeypatch, stop):
+    """After its notice it vanishes, refuses or is silent: its nodes don't wait for it."""
     monkeypatch.setattr(remote_run, 'GRACE', 0.0)
 
     def on_start(machine, node):
-        machine.exits_on_stop = False
+        machine.stop = functools.partial(stop, machine)
 
     fake.on_start = on_start
     watch.at_start = {1: says(fake, 'notice', reason=REASON), 2: end}
     assert run(LaunchDescription([*watch(), talker(
         machine=planner, sigterm_timeout='0.1', sigkill_timeout='0.1')])) == 0
-    assert len(watch.starts) == 2
-
-
-def test_nodes_continue_though_stop_requests_fail(run, fake, planner, talker, watch):
-    def on_start(machine, node):
-        def stop(ids):
-            raise AgentError('the agent is gone')
-        machine.stop = stop
-
-    fake.on_start = on_start
-    watch.at_start = {1: says(fake, 'notice', reason=REASON), 2: end}
-    assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
-    assert len(watch.starts) == 2
+    assert len(watch.starts) == 2 and watch.interrupted == [('planner', REASON, False)]
 
 
 def test_robot_respawns_nodes_of_a_lost_machine(run, fake, package, planner, watch):
@@ -279,20 +203,6 @@ def test_robot_respawns_nodes_of_a_lost_machine(run, fake, package, planner, wat
         respawn_max_retries=2)])) == 0
     assert [cmd for _, cmd in watch.starts] == ['/there/program', *[str(program)] * 3]
     assert [code for _, code in watch.exits] == [3, 3, 3]
-
-
-def test_node_awaiting_its_respawn_runs_on_the_robot_only(run, fake, planner, talker, watch):
-    """The machine must not start it again while it runs here."""
-    def on_start(machine, node):
-        machine.exits_on_stop = False
-        machine.say('exited', node, returncode=1, respawns=True)
-        machine.say('notice', reason=REASON)
-
-    fake.on_start = on_start
-    watch.at_start = {2: end}
-    assert run(LaunchDescription([*watch(), talker(machine=planner, respawn=True)])) == 0
-    (spec,) = fake.machines['planner'].all
-    assert fake.machines['planner'].stops == [[spec.id]] and len(watch.starts) == 2
 
 
 def test_shutdown_event_reaches_a_moved_process(run, fake, planner, talker, watch):
@@ -332,15 +242,6 @@ def test_groups_continue_with_names_and_plain_programs(run, fake, planner, watch
     assert 'no node' in here
 
 
-def test_another_machine_is_left_alone(run, fake, planner, talker, watch):
-    other = ContainerInstance(name='other', ros_workspace='', on_interrupt='robot')
-    watch.at_start = {2: says(fake, 'lost', reason='evicted'), 3: end}
-    assert run(LaunchDescription([
-        *watch(), talker(machine=planner), talker(machine=other, exec_name='elsewhere')])) == 0
-    assert [name for name, _ in watch.starts].count('elsewhere') == 1
-    assert len(fake.machines['other'].stops) == 1, 'at the end'
-
-
 def test_missing_program_of_the_robot_is_found_first(run, fake, planner, capfd):
     machine = ContainerInstance(
         name='planner', ros_workspace='', image='has-it', on_interrupt='robot')
@@ -376,17 +277,6 @@ def test_they_have_ended_if_the_news_never_comes(run, fake, planner, talker, wat
     fake.on_start = lambda machine, node: last_words(machine, node, 'ending')
     assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
     assert len(watch.starts) == 1 and [code for _, code in watch.exits] == [-15]
-
-
-def test_a_shutdown_does_not_wait_for_the_news(run, fake, planner, talker, watch):
-    def on_start(machine, node):
-        last_words(machine, node, 'ending')
-        machine.exits_on_stop = False
-
-    fake.on_start = on_start
-    watch.at_start = {1: lambda event: [TimerAction(period=0.2, actions=end())]}
-    assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
-    assert len(watch.starts) == 1
 
 
 # -- streams --------------------------------------------------------------------------------------

@@ -16,7 +16,6 @@ from launch.actions import (
     RegisterEventHandler,
     TimerAction,
 )
-from launch.conditions import IfCondition
 from launch.event_handlers import OnProcessStart
 from launch.events import matches_action
 from launch.events.process import ShutdownProcess
@@ -31,7 +30,6 @@ from fogros2 import (
     CloudGroup,
     CloudNode,
     ComposableNodeContainer,
-    ContainerInstance,
     FogROSLaunchDescription,
     LifecycleNode,
     Node,
@@ -91,12 +89,6 @@ def test_machine_option_without_machine_is_refused(option):
         node(**option)
 
 
-def test_node_runs_on_the_machine_of_its_group(run, fake, planner):
-    fake.on_start = ends
-    assert run(LaunchDescription([CloudGroup(planner, [node()])])) == 0
-    assert started(fake) == [('planner', 'talker')]
-
-
 # -- with one ------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('cls', KINDS)
@@ -135,18 +127,6 @@ def test_a_machine_is_named_by_text_or_substitution(run, fake, planner, name):
     assert started(fake) == [('planner', 'named'), ('planner', 'talker')]
 
 
-def test_false_condition_creates_no_machine(run, fake, planner):
-    assert run(LaunchDescription([node(machine=planner, condition=IfCondition('0'))])) == 0
-    assert fake.notes == []
-
-
-def test_a_node_keeps_its_machine_inside_a_group(run, fake, planner):
-    fake.on_start = ends
-    other = ContainerInstance(name='other', ros_workspace='')
-    assert run(LaunchDescription([CloudGroup(other, [node(machine=planner), node()])])) == 0
-    assert started(fake) == [('other', 'talker'), ('planner', 'talker')]
-
-
 @pytest.mark.parametrize('cls', KINDS)
 def test_machine_overridden_by_the_robot_is_not_created(run, fake, planner, cls):
     here = node(cls, machine=planner)
@@ -181,7 +161,7 @@ def test_a_machine_of_another_type_is_refused():
         with pytest.raises(ConfigurationError, match='machine=7 is no machine'):
             node(machine=7) if cls is Node else cls(7, package='demo', executable='talker')
     with pytest.raises(ConfigurationError, match='machine=None is no machine'):
-        CloudNode(machine=None, package='demo', executable='talker')
+        CloudGroup(None, [])
 
 
 def test_an_unknown_keyword_gets_the_nearest_name(planner):
@@ -313,13 +293,6 @@ def test_arguments_of_included_files_stay_visible(tmp_path):
     assert [argument.name for argument in description.get_launch_arguments()] == ['rate']
 
 
-def test_an_unknown_machine_gets_the_nearest_name(run, fake, capfd):
-    assert run(fogros_launch('<node machine="planer" pkg="demo" exec="talker"/>')) == 1
-    assert "this launch has no machine named 'planer' (did you mean 'planner'?)" in (
-        capfd.readouterr().out)
-    assert fake.noted('up') == []
-
-
 @pytest.mark.parametrize(('text', 'said'), [
     ('<node machine="" pkg="demo" exec="talker"/>', 'a node needs a machine'),
     ('<node machine="planner" pkg="demo" exec="talker" imag="a"/>', "did you mean 'image'?"),
@@ -421,13 +394,6 @@ def test_files_are_read_in_several_threads(registry):
     with ThreadPoolExecutor(8) as pool:
         for each in [pool.submit(read, talker) for read in 50 * (fogros_launch, fails)]:
             each.result()
-
-
-def test_fogros2_adds_elements_and_replaces_none(registry):
-    assert {name for name, parse in expose.action_parse_methods.items()
-            if parse.__module__.startswith('fogros2')} == {
-                'fog_machine', 'cloud_node', 'cloud_group', 'stream_topic', 'replicated',
-                'fogros_launch'}
 
 
 def test_home_of_the_robot_is_mentioned_once(run, fake, planner, monkeypatch, capfd):

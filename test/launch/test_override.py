@@ -114,18 +114,13 @@ def test_a_name_beats_a_pattern_and_the_last_one_counts():
 @pytest.mark.parametrize('text, words', [
     ('planner', ["'planner'", 'planner=container',
                  'aws, azure, cheapest, container, gcp, joined, kubernetes, robot, ssh']),
-    ('=container', ['lacks the name']),
     ('planner=', ['lacks the name']),
     ('planner=contaner', ["'contaner'", "did you mean 'container'? there are: aws"]),
     ('planner=aws,regoin=x', ["'regoin'", "did you mean 'region'"]),
-    ('planner=aws,name=x', ["'name'"]),
     ('planner=aws,spot', ["'spot'", 'keyword=value']),
     ('planner=aws,spot=perhaps', ['spot:', 'neither']),
-    ('planner=container,cpus=many', ['cpus:', 'no number']),
     ('planner=ssh', ['needs host']),
-    ('planner=aws,lifetime=x', ['lifetime']),
     ('planner=aws,tags=team', ['tags:', '{name: value}']),
-    ('planner=kubernetes,tolerations=[{kye: gpu}]', ["tolerations has no 'kye'"]),
 ])
 def test_wrong_argument_is_refused_with_a_hint(text, words):
     with pytest.raises(ConfigurationError) as error:

@@ -9,8 +9,8 @@ import stat
 import threading
 
 from launch import LaunchDescription
-from launch.actions import ExecuteProcess, OpaqueFunction, RegisterEventHandler, Shutdown
-from launch.event_handlers import OnProcessExit, OnProcessIO, OnProcessStart
+from launch.actions import ExecuteProcess, OpaqueFunction, RegisterEventHandler
+from launch.event_handlers import OnProcessExit, OnProcessIO
 from launch.events import Shutdown as ShutdownEvent
 import pytest
 
@@ -22,11 +22,8 @@ from fogros2.shell.local import LocalShell
 from fogros2.store import Store
 from fogros2.waiting import wait_until
 from fogros2_features.replacement import Replacement, replacer, snapshots
+from rigs.launching import end, HERE, says, Watch
 
-HERE = """#!/bin/sh
-echo "here: $*"
-exec sleep 60
-"""
 THERE = '/there/program'
 
 
@@ -43,41 +40,9 @@ def talker(package):
     return functools.partial(CloudNode, package='demo', executable='says', output='screen')
 
 
-class Watch:
-    """Notes starts and exits, and does something at the n-th start."""
-
-    def __init__(self):
-        self.starts = []
-        self.exits = []
-        self.at_start = {}
-
-    def __call__(self):
-        return [RegisterEventHandler(OnProcessStart(on_start=self._start)),
-                RegisterEventHandler(OnProcessExit(on_exit=self._exit))]
-
-    def _start(self, event, context):
-        self.starts.append(event.cmd[0])
-        do = self.at_start.get(len(self.starts))
-        return do and do(event)
-
-    def _exit(self, event, context):
-        self.exits.append(event.process_name.rpartition('-')[0])
-
-
 @pytest.fixture
 def watch():
     return Watch()
-
-
-def end(event=None):
-    return [Shutdown(reason='the test is over')]
-
-
-def says(fake, kind, **fields):
-    def do(event=None):
-        return [OpaqueFunction(function=lambda context: context.asyncio_loop.call_soon(
-            lambda: fake.machines['planner'].say(kind, **fields)) and None)]
-    return do
 
 
 def held(fake, event, handler=OnProcessIO):
@@ -98,13 +63,13 @@ def test_nodes_run_here_until_a_new_machine_runs_them(run, fake, package, planne
     notice, free = held(fake, says(fake, 'notice', reason='at 12:00'))
     watch.at_start = {1: notice, 3: end}
     assert run(LaunchDescription([*watch(), free, node])) == 0
-    assert watch.starts == [THERE, str(package / 'lib/demo/says'), THERE]
+    assert [cmd for _, cmd in watch.starts] == [THERE, str(package / 'lib/demo/says'), THERE]
     first, second = fake.noted('up'), [note[0] for note in fake.notes]
     assert first == [('planner',), ('planner',)]
     order = [what for what in second if what in ('start', 'stop', 'retire', 'up')]
     assert order[:6] == ['up', 'start', 'stop', 'retire', 'up', 'start']
     # the same process to launch, which ended once: with the launch
-    assert watch.exits == ['says']
+    assert [name for name, _ in watch.exits] == ['says']
 
 
 @pytest.mark.parametrize('kind', ['notice', 'lost'])
@@ -113,7 +78,8 @@ def test_node_that_the_robot_lacks_waits_for_the_machine(run, fake, planner, wat
     node = CloudNode(machine=planner, package='absent', executable='says')
     watch.at_start = {1: says(fake, kind, reason='at 12:00'), 2: end}
     assert run(LaunchDescription([*watch(), node])) == 0
-    assert watch.starts == [THERE, THERE] and watch.exits == ['says']
+    assert [cmd for _, cmd in watch.starts] == [THERE, THERE]
+    assert [name for name, _ in watch.exits] == ['says']
 
 
 def test_lost_machine_is_deleted_before_nodes_start_here(

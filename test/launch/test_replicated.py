@@ -123,18 +123,6 @@ def test_robot_runs_a_copy_under_a_name_of_its_own(run, fake, first, robot):
     assert settings['replicas'] == {'one': '/fogros2/one', 'robot': '/fogros2/robot'}
 
 
-@pytest.mark.parametrize(('robots', 'deadline'), [
-    ([], 0.2), ([None], None), ([None], 0), ([None], -1), ([None], 'soon'), ([None], float('inf')),
-    ([None, 'robot'], 0.2)])
-def test_robot_and_deadline_go_together(run, fake, caplog, robots, deadline):
-    assert run(FogROSLaunchDescription([Replicated(
-        [*machines('one', 'two'), *robots], [talker()], services=['/plan'],
-        deadline=deadline)])) == 1
-    assert fake.noted('up') == []
-    assert any(words in caplog.text for words in (
-        'the robot answers last', 'is no number', "the machine 'robot' twice"))
-
-
 def test_names_are_relative_to_their_namespace(run, fake, first):
     ends_when_started(fake, 2)
     assert run(LaunchDescription([GroupAction([PushROSNamespace('arm'), Replicated(
@@ -200,14 +188,6 @@ def test_streamed_input_is_not_forwarded_again(run, fake, first, monkeypatch):
     assert first[0]['topics'] == [['/image', '/seen', True]]
 
 
-def test_streamed_output_is_refused(run, caplog, monkeypatch):
-    instead(monkeypatch, 'fogros2.image_transport', {'h264': Harmless})
-    assert run(FogROSLaunchDescription([Replicated(
-        machines('one', 'two'), [talker()], topics=[('/image', '/seen')],
-        stream_topics=[StreamTopic('/seen', 'h264', 'to_robot')])])) == 1
-    assert '/seen is an output of replicas and in stream_topics=' in caplog.text
-
-
 def test_on_the_robot_the_nodes_run_once_with_their_own_names(run, fake, first):
     replicated = Replicated(machines('one', 'two'), [talker()],
                             services=['/plan'])
@@ -236,33 +216,33 @@ def test_on_the_robot_the_nodes_run_once_with_their_own_names(run, fake, first):
     ({'topics': ['/a']}, 'is no pair of topics'),
     ({'hedge_after': -1}, 'hedge_after=-1 is no time'),
     ({'hedge_after': 'soon'}, "'soon' is no number"),
-])
-def test_bad_input_is_refused_before_a_machine_is_made(run, fake, caplog, given, said):
-    given = {'machines': ['one', 'two'], 'services': ['/plan'], **given}
-    names = given.pop('machines')
-    assert run(LaunchDescription([Replicated(machines(*names) if names else [], [talker()],
-                                             **given)])) == 1
-    assert said in caplog.text and fake.noted('up') == []
-
-
-@pytest.mark.parametrize(('content', 'said'), [
-    (lambda: LifecycleNode(package='demo', executable='talker', name='x', namespace=''),
+    ({'deadline': 0.2}, 'the robot answers last'),
+    ({'machines': ['one', 'two', None]}, 'the robot answers last'),
+    ({'machines': ['one', None], 'deadline': 0}, 'the robot answers last'),
+    ({'machines': ['one', None], 'deadline': 'soon'}, 'is no number'),
+    ({'machines': ['one', None], 'deadline': float('inf')}, 'the robot answers last'),
+    ({'machines': ['one', None, 'robot'], 'deadline': 0.2}, "the machine 'robot' twice"),
+    ({'topics': [('/image', '/seen')],
+      'stream_topics': [StreamTopic('/seen', 'h264', 'to_robot')]},
+     '/seen is an output of replicas and in stream_topics='),
+    ({'machines': [ContainerInstance(name='one', on_interrupt='robot'), 'two']},
+     'replicas cannot move to the robot'),
+    ({'actions': lambda: LifecycleNode(
+        package='demo', executable='talker', name='x', namespace='')},
      'LifecycleNode cannot be replicated'),
-    (lambda: LoadComposableNodes(target_container='/box', composable_node_descriptions=[]),
+    ({'actions': lambda: LoadComposableNodes(
+        target_container='/box', composable_node_descriptions=[])},
      'LoadComposableNodes cannot be replicated'),
-    (lambda: CloudNode(machine=machines('own')[0], package='demo', executable='talker'),
+    ({'actions': lambda: CloudNode('own', package='demo', executable='talker')},
      'a part of replicas has a machine of its own'),
 ])
-def test_content_that_cannot_be_replicated_is_refused(run, fake, caplog, content, said):
-    assert run(LaunchDescription([Replicated(
-        machines('one', 'two'), [content()], services=['/plan'])])) == 1
-    assert said in caplog.text
-
-
-def test_machine_that_would_move_to_the_robot_is_refused(run, caplog):
-    assert run(LaunchDescription([Replicated(
-        machines('one', 'two', on_interrupt='robot'), [talker()], services=['/plan'])])) == 1
-    assert 'replicas cannot move to the robot' in caplog.text
+def test_bad_input_is_refused_before_a_machine_is_made(
+        run, fake, caplog, monkeypatch, given, said):
+    instead(monkeypatch, 'fogros2.image_transport', {'h264': Harmless})
+    given = {'machines': ['one', 'two'], 'services': ['/plan'], 'actions': talker, **given}
+    given['machines'] = [machines(one)[0] if one in NAMES else one for one in given['machines']]
+    assert run(LaunchDescription([Replicated(actions=[given.pop('actions')()], **given)])) == 1
+    assert said in caplog.text and fake.noted('up') == []
 
 
 def test_two_groups_with_the_same_name_are_refused(run, caplog):

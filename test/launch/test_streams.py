@@ -161,13 +161,15 @@ def test_one_encoder_for_several_nodes_and_machines(run, fake, planner, mapper):
 
 
 def test_launch_streams_apply_to_every_machine(run, fake, planner, mapper):
-    ends_when_all_started(fake, 5)
+    ends_when_all_started(fake, 9)
     assert run(watched(
-        fake, FogROSLaunchDescription,
-        DeclareLaunchArgument('x', default_value='h264'), talker(planner), talker(mapper),
-        stream_topics=[('/camera', 'h264')])) == 0
-    assert there(fake, 'planner') == there(fake, 'mapper') == ['camera_h264_decoder', 'own']
-    assert here(fake) == ['camera_h264_encoder']
+        fake, FogROSLaunchDescription, talker(planner), talker(mapper),
+        stream_topics=[('/camera', 'h264'), BACK])) == 0
+    assert here(fake) == ['camera_h264_encoder', 'seen_h264_decoder_from_mapper',
+                          'seen_h264_decoder_from_planner']
+    for machine in ('planner', 'mapper'):
+        assert there(fake, machine) == ['camera_h264_decoder', 'own', 'seen_h264_encoder']
+        assert f'/seen:=/fogros2/{machine}/seen' in rules(fake, machine)
 
 
 def test_group_streams_apply_to_all_its_nodes(run, fake, planner):
@@ -232,24 +234,18 @@ def test_failed_machine_starts_no_encoder(run, fake, planner):
     assert not fake.noted('starts')
 
 
-@pytest.mark.parametrize('late', [False, True])
-def test_unknown_transport_is_refused_first(run, fake, planner, late, capfd):
-    wrong = talker(planner, stream_topics=[('/camera', 'h265')])
-    assert run(FogROSLaunchDescription([
-        talker(planner), TimerAction(period=60.0, actions=[wrong]) if late else wrong])) == 1
-    said = capfd.readouterr().out
-    assert "there is no image transport 'h265' (did you mean 'h264'? there are: h264, raw)" in (
-        said)
-    assert not fake.noted('up')
-
-
 @pytest.mark.parametrize('make', [
+    lambda machine, streams: talker(machine, stream_topics=streams),
+    lambda machine, streams: TimerAction(
+        period=60.0, actions=[talker(machine, stream_topics=streams)]),
     lambda machine, streams: CloudGroup(machine, [talker(machine)], stream_topics=streams),
     lambda machine, streams: FogROSLaunchDescription([talker(machine)], stream_topics=streams)])
-def test_unknown_transport_of_group_or_launch_is_refused(run, fake, planner, make, capfd):
+def test_unknown_transport_is_refused_first(run, fake, planner, make, capfd):
     made = make(planner, [('/camera', 'h265')])
-    assert run(made if isinstance(made, LaunchDescription) else LaunchDescription([made])) == 1
-    assert 'there are: h264, raw' in capfd.readouterr().out
+    assert run(made if isinstance(made, LaunchDescription)
+               else FogROSLaunchDescription([talker(planner), made])) == 1
+    assert "there is no image transport 'h265' (did you mean 'h264'? there are: h264, raw)" in (
+        capfd.readouterr().out)
     assert not fake.noted('up')
 
 
@@ -259,16 +255,6 @@ def test_contradicting_streams_are_refused_first(run, fake, planner, mapper, cap
         talker(mapper, stream_topics=[('/seen', 'h264')])])) == 1
     assert '/seen is streamed both from the robot and to it' in capfd.readouterr().out
     assert not fake.noted('up')
-
-
-def test_one_topic_comes_back_from_several_machines(run, fake, planner, mapper):
-    ends_when_all_started(fake, 6)
-    assert run(watched(fake, FogROSLaunchDescription, talker(planner), talker(mapper),
-                       stream_topics=[BACK])) == 0
-    assert here(fake) == ['seen_h264_decoder_from_mapper', 'seen_h264_decoder_from_planner']
-    for machine in ('planner', 'mapper'):
-        assert there(fake, machine) == ['own', 'seen_h264_encoder']
-        assert f'/seen:=/fogros2/{machine}/seen' in rules(fake, machine)
 
 
 @pytest.mark.parametrize('first', ['source', 'target'])

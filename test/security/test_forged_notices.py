@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable, Iterator
 import contextlib
 import json
@@ -11,21 +10,15 @@ from pathlib import Path
 import socket
 import subprocess
 import sys
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-pytest.importorskip('launch.actions', reason='launch is not installed')
 from fogros2.agent_client import joined
 from fogros2.errors import MachineNotFound
-from fogros2.model import Machine, MachineSpec, MachineState
+from fogros2.model import Machine, MachineState
 from fogros2.provider.ssh import SSHProvider
-from fogros2.store import Store
 from fogros2.waiting import wait_until
-from fogros2_features.replacement.options import read
-from fogros2_features.replacement.session import Interruptible
-from rigs import loops
 
 FORGED = ['echo', 'forged']
 
@@ -106,55 +99,6 @@ def test_next_launch_sets_its_own_command(serve: Callable[..., Agent]) -> None:
     agent = serve(notice=['false'])  # as a launch starts it
     assert agent.ask('configure', launch='def456', force='abc123', notice=['echo', 'new'])['ok']
     wait_until(lambda: agent.notices() == ['new'], timeout=60, what='the notice')
-
-
-def launched(
-    on_interrupt: str, confirms: list[bool], folder: Path,
-) -> tuple[list[Any], list[Any]]:
-    """
-    Return what the launch did after a forged notice: failures, and interruptions.
-
-    :param confirms: the provider's answers.
-    """
-    failed: list[Any] = []
-    interrupted: list[Any] = []
-
-    async def run() -> None:
-        loop = asyncio.get_running_loop()
-
-        async def in_thread(function: Callable[..., Any], *args: Any) -> Any:
-            return function(*args)
-
-        robot = SimpleNamespace(context=SimpleNamespace(asyncio_loop=loop), launch=SimpleNamespace(
-            store=Store(folder), id='abc123', cancel=None))
-        session = Interruptible(
-            read({'on_interrupt': on_interrupt}), MachineSpec('planner', 'container'), loop,
-            robot=robot, in_thread=in_thread, fail=failed.append, changed=lambda: None,
-            preempted=lambda one, why: interrupted.append((why, one.lost)))
-        said: list[Callable[[Any], None]] = []
-        session.up(SimpleNamespace(  # type: ignore[arg-type]
-            subscribe=said.append, start=lambda nodes: None,
-            reclaimed=lambda timeout: confirms.pop(0)))
-        await asyncio.gather(*session.requests)
-        for _ in range(5):  # while one is asked about, the others count nothing
-            said[0]({'event': 'notice', 'reason': 'forged'})
-        while (confirms or session.requests) and not interrupted:
-            await asyncio.sleep(0)
-        if not interrupted:
-            said[0]({'event': 'lost', 'reason': 'it was deleted'})
-            while not interrupted:
-                await asyncio.sleep(0)
-
-    loops.run(asyncio.wait_for(run(), 10))
-    return failed, interrupted
-
-
-@pytest.mark.parametrize('how', ['shutdown', 'replace'])
-def test_notice_alone_interrupts_no_machine(how: str, tmp_path: Path) -> None:
-    assert launched(how, [False, False], tmp_path) == ([], [('it was deleted', True)])
-    # the provider says so itself, at once or later
-    assert launched(how, [True], tmp_path) == ([], [('forged', False)])
-    assert launched(how, [False, True], tmp_path) == ([], [('forged', False)])
 
 
 @pytest.mark.parametrize(('state', 'reclaims'), [

@@ -80,15 +80,9 @@ def test_restarted_agent_continues_the_journal(tmp_path):
     assert (again.first, again.next) == (log.first, log.next)
     again.append([event('more')])
     assert read(again)[-1]['seq'] == log.next
-
-
-def test_restart_after_a_rotation_knows_the_next_number(tmp_path):
-    log = Journal(str(tmp_path), 4096)
-    for number in range(100):
-        log.append([event(str(number))])
-    log.rotate(log.next)
-    again = Journal(str(tmp_path), 4096)
-    assert again.next == log.next and again.first == log.first
+    again.rotate(again.next)
+    later = Journal(str(tmp_path), 4096)
+    assert (later.first, later.next) == (again.first, again.next)
 
 
 def test_torn_line_is_cut(tmp_path):
@@ -143,10 +137,6 @@ def test_machine_without_launch_ends_after_boot_timeout():
     dog = Watchdog(config(), 5.0)
     assert dog.due(104.9) is None
     assert dog.due(105.0) == 'no launch came'
-
-
-def test_configuring_restarts_the_boot_timeout():
-    dog = Watchdog(config(), 0.0)
     dog.configured(90.0, heartbeat=False)
     assert dog.due(189.0) is None
     assert dog.due(190.0) == 'no launch came'

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from fogros2.agent.protocol import ANSWER, BEAT, sign, verify
-from fogros2.agent_client import AgentClient, Heartbeat, interval_for
+from fogros2.agent_client import AgentClient, connection, Heartbeat, interval_for
 from fogros2.errors import (
     AgentError,
     AuthenticationError,
@@ -93,12 +93,16 @@ def agent(next_seq: int = 1, **status: Any) -> ScriptedStream:
 
 
 @pytest.fixture
-def make() -> Iterator[Callable[..., AgentClient]]:
+def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., AgentClient]]:
     clients: list[AgentClient] = []
 
-    def build(*streams: Any, **more: Any) -> AgentClient:
+    def build(
+        *streams: Any, silence: float = connection.SILENCE, restart: float = connection.RESTART,
+    ) -> AgentClient:
+        monkeypatch.setattr(connection, 'SILENCE', silence)
+        monkeypatch.setattr(connection, 'RESTART', restart)
         shell: Any = ScriptedShell(*streams)
-        clients.append(AgentClient(shell, '/run/x', agent_path='/run/x/agent.py', **more))
+        clients.append(AgentClient(shell, '/run/x', agent_path='/run/x/agent.py'))
         return clients[-1]
     yield build
     for client in clients:
@@ -217,35 +221,23 @@ def test_machine_without_agent_is_given_up(make):
         client.request('status')
 
 
-def test_client_waits_for_a_restarting_agent(make):
+def test_agent_that_does_not_come_back_is_given_up(make):
     def absent() -> ScriptedStream:
         stream = ScriptedStream(lambda request: [])
         stream.say({'error': 'no agent serves /run/x', 'kind': 'absent'})
         stream.say(None)
         return stream
-    first = agent()
-    client = make(first, absent(), absent(), agent())
+    # it may take a moment to restart
+    first, second = agent(), agent()
+    client = make(first, absent(), absent(), second, *(absent() for _ in range(50)), restart=0.5)
     seen: list[dict[str, Any]] = []
     client.subscribe(seen.append, since=1)
     client.request('status')
     first.say(None)
     until(lambda: len(seen) == 2)
-    assert [e['state'] for e in seen] == ['lost', 'back']
-
-
-def test_agent_that_does_not_come_back_is_given_up(make):
-    first = agent()
-    streams = [ScriptedStream(lambda request: []) for _ in range(50)]
-    for stream in streams:
-        stream.say({'error': 'no agent serves /run/x', 'kind': 'absent'})
-        stream.say(None)
-    client = make(first, *streams, restart=0.3)
-    seen: list[dict[str, Any]] = []
-    client.subscribe(seen.append, since=1)
-    client.request('status')
-    first.say(None)
-    until(lambda: len(seen) == 2)
-    assert [e['state'] for e in seen] == ['lost', 'absent']
+    second.say(None)
+    until(lambda: len(seen) == 4)
+    assert [e['state'] for e in seen] == ['lost', 'back', 'lost', 'absent']
 
 
 def test_program_that_ends_without_output_is_given_up(make):
@@ -269,11 +261,6 @@ def test_machine_that_refuses_the_key_is_given_up(make):
     assert [e['state'] for e in seen] == ['lost', 'absent']
     with pytest.raises(AgentError, match='key refused'):
         client.request('status')
-
-
-def test_unreachable_machine_raises_connect_error(make):
-    with pytest.raises(ConnectError):
-        make().request('status')
 
 
 def test_close_ends_the_thread_and_waiting_requests(make):
@@ -328,33 +315,18 @@ def test_silent_connection_is_replaced(make):
     assert len(seen) == 2
 
 
-NUMBER = '9' * 400
-#: Messages of a hijacked machine, and the field of each that is wrong.
+#: Messages of a hijacked machine, and the field of each that is wrong; test_events.py has more.
 INVALID = [
-    ('{"event": ["started"]}', 'event'), ('{"event": null}', 'event'),
-    ('{"event": "started", "node": ["n"], "name": "n", "pid": 1, "cmd": []}', 'node'),
+    ('{"event": null}', 'event'),
     ('{"event": "started", "node": "n", "name": "n", "cmd": []}', 'pid'),
-    ('{"event": "started", "node": "n", "name": "n", "pid": 1, "cmd": [1]}', 'cmd'),
-    ('{"event": "started", "node": "n", "name": "n", "pid": true, "cmd": []}', 'pid'),
     ('{"event": "output", "node": "n", "name": "n", "stream": "stdout", "text": 5}', 'text'),
-    ('{"event": "exited", "node": "n", "name": "n", "returncode": "x", "respawns": false}',
-     'returncode'),
-    ('{"event": "exited", "node": "n", "name": "n", "returncode": 0, "respawns": 0}', 'respawns'),
-    ('{"event": "exited", "node": "n", "name": "n", "returncode": %s, "respawns": false}' % NUMBER,
-     'returncode'),
-    ('{"event": "vpn_repaired", "what": "vpn", "seconds": NaN}', 'seconds'),
     ('{"event": "vpn_repaired", "what": "vpn", "seconds": 1e999}', 'seconds'),
-    ('{"event": "restarted", "seq": "x"}', 'seq'),
     ('{"event": "unheard of", "seq": "x"}', 'seq'),
-    ('{"event": "ending", "reason": "x", "seq": %s}' % NUMBER, 'seq'),
-    ('{"event": "ending", "reason": {"a": 1}, "seq": 1}', 'reason'),
     ('{"id": 2, "ok": true}', 'machine'),
     ('{"id": 2, "ok": false, "error": []}', 'error'),
-    ('{"id": 1, "ok": true, "first": 1, "next": "x", "lost": 0}', 'next'),
-    ('{"id": 1, "ok": true, "first": 1, "next": 1, "lost": %s}' % NUMBER, 'lost'),
+    ('{"id": 1, "ok": true, "first": 1, "next": 1, "lost": %s}' % ('9' * 400), 'lost'),
     ('{"id": 1, "ok": false}', 'first'),
-    ('[' * 100_000, 'not an event or an answer'), ('%s0' % (NUMBER * 20), 'not an event'),
-    ('nonsense', 'not an event or an answer'), ('7', 'not an event or an answer'),
+    ('[' * 100_000, 'not an event or an answer'), ('nonsense', 'not an event or an answer'),
 ]
 
 
@@ -425,8 +397,9 @@ def test_heartbeats_are_sent_and_answers_measured():
             machine.sendto(nonsense, robot)
         machine.recvfrom(2048)
         assert heartbeat.round_trip is None and heartbeat.age is None
-        machine.sendto(sign(KEY, ANSWER.pack(*beat, time.time())), robot)
+        machine.sendto(sign(KEY, ANSWER.pack(*beat, time.time() - 3600)), robot)
         until(lambda: heartbeat.round_trip is not None)
+        assert heartbeat.clock_offset.exceeds and -3601 < heartbeat.clock_offset.seconds < -3590
         assert heartbeat.round_trip < 5 and heartbeat.age is not None
         heartbeat.close()
         assert not heartbeat._thread.is_alive()

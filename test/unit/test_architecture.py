@@ -94,9 +94,18 @@ def part(path: Path) -> str:
     return path.relative_to(CORE).parts[0].removesuffix('.py')
 
 
-def imports(path: Path) -> Iterator[tuple[str, bool]]:
-    """Yield what a file imports, and whether that is when it is itself imported."""
-    tree = ast.parse(path.read_text(), str(path))
+@functools.cache
+def text(path: Path) -> str:
+    return path.read_text()
+
+
+@functools.cache
+def imports(path: Path) -> list[tuple[str, bool]]:
+    """Return what a file imports, and whether that is when it is itself imported."""
+    return list(_imports(ast.parse(text(path), str(path))))
+
+
+def _imports(tree: ast.Module) -> Iterator[tuple[str, bool]]:
     late = {id(node) for block in ast.walk(tree)
             if isinstance(block, (ast.FunctionDef, ast.AsyncFunctionDef))
             or isinstance(block, ast.If) and 'TYPE_CHECKING' in ast.unparse(block.test)
@@ -209,19 +218,17 @@ def test_package_imports_nothing_above_it(folder: str, above: tuple[str, ...]) -
 
 def test_core_names_no_keyword_of_a_feature() -> None:
     lists = features.node_lists()
-    for keyword in {*features.keywords(), *features.keywords('node_options'), *lists,
-                    *lists.values()}:
-        # words such as fetch have other uses
-        pattern = rf'\b{keyword}\b' if '_' in keyword else rf'\b{keyword}='
-        for path in python_files(CORE):
-            assert not re.search(pattern, path.read_text()), f'{path} names {keyword}'
+    # words such as fetch have other uses
+    pattern = '|'.join(rf'{keyword}\b' if '_' in keyword else f'{keyword}=' for keyword in {
+        *features.keywords(), *features.keywords('node_options'), *lists, *lists.values()})
+    for path in python_files(CORE):
+        assert not re.search(rf'\b({pattern})', text(path)), path
 
 
-@pytest.mark.parametrize('word', MOVED)
-def test_core_names_nothing_that_has_moved_to_a_feature(word: str) -> None:
+def test_core_names_nothing_that_has_moved_to_a_feature() -> None:
     for path in (path for path in python_files(CORE) if path != PUBLIC):
         if not CLOUDS & {*path.parts}:
-            assert not re.search(rf'\b{word}\b', path.read_text()), path
+            assert not re.search(rf"\b({'|'.join(MOVED)})\b", text(path)), path
 
 
 def plugin(module: str) -> str:
@@ -238,14 +245,14 @@ def test_plugins_are_found_by_name() -> None:
     assert named == NAMED_PLUGINS, 'load these by their entry points, or shorten the list'
 
 
-@pytest.mark.parametrize('path', python_files(CORE), ids=lambda p: str(p.relative_to(CORE)))
-def test_ros_and_sdks_are_imported_by_their_parts(path: Path) -> None:
-    own = part(path)
-    for name, _ in imports(path):
-        words = name.split('.')
-        assert words[0] not in ROS or own in ROS_ALLOWED, f'{own} imports {name}'
-        if words[0] in SDKS:
-            assert own == SDKS[words[0]], f'{own} imports {name}'
+def test_ros_and_sdks_are_imported_by_their_parts() -> None:
+    for path in python_files(CORE):
+        own = part(path)
+        for name, _ in imports(path):
+            words = name.split('.')
+            assert words[0] not in ROS or own in ROS_ALLOWED, f'{path} imports {name}'
+            if words[0] in SDKS:
+                assert own == SDKS[words[0]], f'{path} imports {name}'
 
 
 def test_verb_imports_nothing_slow_before_it_runs() -> None:
@@ -290,10 +297,10 @@ def test_forbidden_words(pattern: str) -> None:
     for folder in ('fogros2', 'fogros2_monitor', 'ros2fog_cli', 'fogros2_examples', 'launch',
                    'tools', 'test/rigs'):
         for path in python_files(ROOT / folder):
-            found = re.search(pattern, path.read_text(), re.MULTILINE)
+            found = re.search(pattern, text(path), re.MULTILINE)
             if found and path in OPEN and found[0] == '0.0.0.0/0':
                 # its one occurrence; WireGuard answers nobody it doesn't know
-                assert path.read_text().count(found[0]) == 1
+                assert text(path).count(found[0]) == 1
                 found = None
             assert not found, f'{path.relative_to(ROOT)}: {found[0]!r}: {FORBIDDEN[pattern]}'
 
@@ -303,7 +310,7 @@ def test_only_one_module_starts_processes() -> None:
     # relocation is a program for machines
     allowed = {'process.py', 'relocation.py', 'serve.py'}
     for path in (*python_files(CORE), *python_files(ROOT / 'fogros2_monitor')):
-        if path.name not in allowed and 'subprocess' in path.read_text():
+        if path.name not in allowed and 'subprocess' in text(path):
             names = {name for name, _ in imports(path)}
             place = path.relative_to(ROOT)
             assert not names & {'subprocess'} or place.parts[1] in (

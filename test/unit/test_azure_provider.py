@@ -56,7 +56,7 @@ def test_keywords_of_pull_request_109_are_accepted():
     body = machines.request(PLACE, dataclasses.replace(order(), options=options), KNOWN, '', {})
     assert body['properties']['storageProfile']['osDisk']['diskSizeGB'] == 30
     with pytest.raises(ConfigurationError, match='are the same option'):
-        AzureCloudInstance(zone='eastus', location='eastus')
+        AzureCloudInstance(zone='eastus', region='eastus')
 
 
 def test_request_is_one_that_azure_s_models_have():

@@ -373,6 +373,8 @@ def test_apt_installs_ros_on_noble_alone() -> None:
         plan(dataclasses.replace(NOBLE, root=False), 'apt')
     with pytest.raises(PrerequisiteError, match='are free'):
         plan(dataclasses.replace(NOBLE, free_bytes=1 << 20), 'apt')
+    with pytest.raises(PrerequisiteError, match='1 MB are free in .*, 400 are needed .make room'):
+        plan(dataclasses.replace(NOBLE, free_bytes=1 << 20), 'pip')
 
 
 def test_auto_installs_packages_where_wheels_lack() -> None:

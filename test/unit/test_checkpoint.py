@@ -3,11 +3,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 from pathlib import Path
-import random
-import signal
 import subprocess
 import sys
 
@@ -146,41 +142,6 @@ def test_robot_whose_disk_is_full_keeps_the_last_snapshot(kept, folder, shell, t
     assert ended.returncode != 0 and 'Error: ' in ended.stderr
     assert texts(kept.newest) == {'parts/1': 'one'}
     assert not (tmp_path / 'robot/partial').exists()
-
-
-def test_killed_copies_leave_complete_snapshots(tmp_path):
-    """At random moments; each snapshot has one generation of all files."""
-    folder = tmp_path / 'map'
-    folder.mkdir()
-    dice = random.Random(21)
-    program = ('import sys\nfrom pathlib import Path\n'
-               'from fogros2_features.replacement.snapshots import Checkpoint\n'
-               'from fogros2.model import Endpoint\n'
-               'from fogros2.shell.local import LocalShell\n'
-               'kept = Checkpoint(sys.argv[1], Path(sys.argv[2]))\n'
-               'print("ready", flush=True); sys.stdin.readline()\n'
-               'kept.save(LocalShell(Endpoint("local"), name="planner"), still=False)\n')
-    kept = Checkpoint(str(folder), tmp_path / 'robot')
-    used = set()
-    for generation in range(6):
-        for number in range(20):
-            (folder / str(number)).write_text(str(generation) * 20_000)
-        child = subprocess.Popen(
-            [sys.executable, '-c', program, str(folder), str(tmp_path / 'robot')],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
-        child.stdout.readline()
-        child.stdin.write('go\n')
-        child.stdin.flush()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            child.wait(dice.uniform(0.0, 0.6))
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(child.pid, signal.SIGKILL)
-        child.communicate()
-        if kept.newest is not None:
-            found = texts(kept.newest)
-            assert len(found) == 20 and len({text[:1] for text in found.values()}) == 1
-            used.add(found['0'][:1])
-    assert kept.save(LocalShell(Endpoint('local'), name='planner'), still=False) or used
 
 
 @pytest.mark.parametrize('given, path', [

@@ -166,11 +166,6 @@ def test_launch_goes_on_where_packages_cannot_be_looked_at(
     assert 'resolve' in provider.calls
 
 
-def test_several_choices_are_described(provider):
-    chosen = dataclasses.replace(SPEC, options={'size': 'small', 'others': ['large', 'huge']})
-    assert provider.choices(SPEC, chosen) == ['others large or huge', 'size small']
-
-
 def test_leftovers_of_a_creation_are_reported_with_its_error(
         launch, provider, events):
     error = ProviderError('no room')
@@ -185,10 +180,6 @@ def test_leftovers_of_a_creation_are_reported_with_its_error(
     assert [event.reason for event in events if isinstance(event, StepFailed)] == [
         'the key is left', 'no room']
     assert [str(failure) for failure in launch.down()] == ['the key is left']
-
-
-def test_choice_is_cancelled_with_the_launch(launch, provider):
-    assert launch.provider('fake').cancel is launch.cancel
 
 
 def keep(launch, spec):
@@ -259,12 +250,6 @@ def test_a_machine_s_cost_runs_until_it_has_ended(launch, provider, monkeypatch)
     mine.undo.close()
     now[0] += 60
     assert launch.cost() == [('planner', Decimal('0.5'), 60.0)]
-
-
-def test_a_machine_without_a_price_costs_nothing(launch, provider):
-    provider.prices.clear()
-    create(launch)
-    assert launch.cost() == []
 
 
 def test_provider_knows_what_will_be_installed(launch, provider, monkeypatch):

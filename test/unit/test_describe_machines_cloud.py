@@ -160,7 +160,7 @@ def asked(monkeypatch):
 
     def offers(self, wanted, regions=(), *, refresh=False):
         noted.append(('offers', wanted, tuple(regions)))
-        name = 't2.medium' if wanted.cores else 'c7i.large' if wanted.gpus else 't4g.large'
+        name = 't2.medium' if wanted.cores else 't4g.large'
         region = 'eu-west-3' if len(regions) != 1 or 'all' in regions else regions[0]
         kind = MachineType(name, 8, 4, 16.0, 'x86_64')
         return Offers(wanted, (Offer(region, kind, Decimal(1), Decimal(1)),), tuple(regions))
@@ -177,15 +177,17 @@ def found(machine, context):
 
 def test_nobody_is_asked_before_the_launch_does(asked, context):
     region = fogros2.find_nearest_aws_region()
-    kind = fogros2.find_cheapest_ec2_instance_type(region, min_cpu=8, gpu='L4')
+    kind = fogros2.find_cheapest_ec2_instance_type(region, default_cores=4, gpu=True)
     machine = AWSCloudInstance(region=region, ec2_instance_type=kind)
     assert 'nearest' in repr(region) and 'nearest' in machine.info()['ec2_region']
     spec = machine.spec(context)
     assert asked == []
     assert values.await_all(spec.options) == {
-        'region': 'eu-north-1', 'ec2_instance_type': 'c7i.large'}
+        'region': 'eu-north-1', 'ec2_instance_type': 't2.medium'}
     assert asked == [('nearest', ()),
-                     ('offers', wants(min_cpu=8, gpu='L4'), ('eu-north-1',))]
+                     ('offers', wants(
+                         arch='x86_64', min_cpu=0, min_memory_gb=0, gpu=True, cores=4,
+                         threads_per_core=1), ('eu-north-1',))]
     # once, for all machines
     other = AWSCloudInstance(region=region, ec2_instance_type=kind)
     assert found(other, context) == values.await_all(spec.options)
@@ -199,18 +201,13 @@ def test_the_one_helper_that_asks_at_once(asked):
     assert {'eu-north-1': 'ami-3'}[region] == 'ami-3'
 
 
-def test_the_cheapest_of_all(asked, context, monkeypatch):
+def test_the_cheapest_of_all(asked, context):
     region, kind = fogros2.find_cheapest(['eu-west-3', 'eu-west-1'], spot=True)
     assert found(AWSCloudInstance(region=region, ec2_instance_type=kind), context) == {
         'region': 'eu-west-3', 'ec2_instance_type': 't4g.large'}
     assert asked == [('offers', wants(spot=True), ('eu-west-3', 'eu-west-1'))]
     with pytest.raises(ConfigurationError, match="takes no 'cores'"):
         fogros2.find_cheapest(cores=3)
-    monkeypatch.setattr(clouds, 'clouds', lambda: (['aws'], []))
-    parts = fogros2.find_cheapest(['eu-west-3'], provider='all')
-    assert asked[1:] == []
-    assert [part.perform(context) for part in parts] == ['aws', 'eu-west-3', 't4g.large']
-    assert len(asked) == 2
 
 
 def test_machine_of_any_cloud_is_described_without_a_request(context, monkeypatch):
@@ -249,5 +246,3 @@ def test_fogros2_s_own_names(asked, context):
     assert asked == [
         ('offers', wants(arch='arm64', min_cpu=0, min_memory_gb=0, gpu=True, cores=4,
                          threads_per_core=2), ('nearest',))]
-    with pytest.raises(ConfigurationError, match="default_cores can't be combined with min_cpu"):
-        later.find_cheapest_ec2_instance_type('us-east-1', default_cores=2, min_cpu=2)

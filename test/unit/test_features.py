@@ -223,14 +223,11 @@ def test_folders_come_home_when_the_launch_ends(home: Path) -> None:
     assert found == ['bags/deep/one=bags/deep/one']
     assert f' MB to {home}/fogros2/a-20' in running.details[0]
     assert running.details[0].endswith(', no ~/none there')
-    found = brought(running, fetch=['~/maps', '~/other/maps'], fetch_to=str(home / 'two'))
-    assert found == ['maps-2/two=other/maps/two', 'maps/one=maps/one']
-
-
-def test_folders_of_one_name_come_home_beside_each_other(tmp_path: Path) -> None:
-    assert [path.name for path in results._targets(
-        tmp_path, ['~/p/bags', '/p/bags', '~/bags', '~/bags-2']).values()] == [
-            'bags', 'bags-2', 'bags-3', 'bags-2-2']
+    (home / 'maps-2').mkdir()
+    (home / 'maps-2/three').write_text('3')
+    found = brought(running, fetch=['~/maps', '~/other/maps', '~/maps-2'],
+                    fetch_to=str(home / 'two'))
+    assert found == ['maps-2-2/three=3', 'maps-2/two=other/maps/two', 'maps/one=maps/one']
 
 
 def test_folder_that_is_a_link_counts_with_its_content(home: Path) -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 from launch import LaunchContext, LaunchDescription, LaunchService
 from launch.actions import ExecuteLocal, ExecuteProcess, RegisterEventHandler, TimerAction
 from launch.event_handlers import OnProcessExit, OnProcessIO, OnProcessStart
-from launch.utilities import AsyncSafeSignalManager
 import pytest
 
 from fogros2.launch_internals import components, private
@@ -22,39 +21,6 @@ def test_methods():
     assert inspect.iscoroutinefunction(getattr(TimerAction, private.WAIT_TO_FIRE))
     assert list(inspect.signature(ExecuteLocal._shutdown_process).parameters) == [
         'self', 'context', 'send_sigint']
-
-
-def test_options():
-    action = ExecuteProcess(
-        cmd=['true'], respawn=True, respawn_delay=2.0, respawn_max_retries=3, log_cmd=True)
-    action.prepare(LaunchContext())
-    names = ('respawn', 'respawn_delay', 'respawn_max_retries', 'log_cmd')
-    assert [private.option(action, name) for name in names] == [True, 2.0, 3, True]
-    assert private.transport(action) is None
-
-
-def test_completed():
-    loop = asyncio.new_event_loop()
-    context = LaunchContext()
-    context._set_asyncio_loop(loop)
-    action = ExecuteProcess(cmd=['true'])
-    assert private.completed(action) is None
-    setattr(action, private.EXECUTE_PROCESS, _do_nothing)
-    action.execute(context)
-    assert private.completed(action) is action.get_asyncio_future() is not None
-    loop.run_until_complete(asyncio.gather(*asyncio.all_tasks(loop)))
-    loop.close()
-
-
-async def _do_nothing(context: LaunchContext) -> None:
-    """Start no process."""
-
-
-def test_output_format():
-    action = ExecuteProcess(cmd=['true'])
-    private.prefix_output(action, 'planner')
-    assert vars(action)['_ExecuteLocal__output_format'] == (
-        '[planner.{this.process_description.final_name}] {line}')
 
 
 @pytest.mark.parametrize('begins', [True, False])
@@ -79,11 +45,6 @@ def test_delayed_process_starts_only_if_allowed(begins):
     loop.close()
 
 
-def test_methods_that_are_replaced_exist():
-    assert hasattr(ExecuteProcess, private.EXECUTE_PROCESS)
-    assert hasattr(TimerAction, private.WAIT_TO_FIRE)
-
-
 def test_kept_environments():
     context = LaunchContext()
     before = len(private.kept_environments(context))
@@ -91,20 +52,6 @@ def test_kept_environments():
     context._push_environment()
     assert len(private.kept_environments(context)) == before + 1
     context._pop_environment()
-
-
-def test_the_signal_manager():
-    assert private.signal_manager() is None
-    loop = asyncio.new_event_loop()
-    with AsyncSafeSignalManager(loop) as manager:
-        assert private.signal_manager() is manager
-    assert private.signal_manager() is None
-    loop.close()
-
-
-def test_handlers_of_the_context_can_be_gone_through():
-    context = LaunchService().context
-    assert len(tuple(context._event_handlers)) >= 2
 
 
 def test_remappings_of_components():

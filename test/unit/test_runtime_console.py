@@ -66,20 +66,22 @@ def test_lines(lines):
     console(StepDone('planner', 'sync', 1.234, '3 files'))
     console(StepFailed('', 'VPN interface', 0.5, 'no TUN'))
     console(StepFailed('', 'VPN repair', 0.5, 'no TUN', fatal=False))
+    console(ClockMeasured('planner', ClockOffset(0.01, 0.001)))
+    console(ClockMeasured('planner', ClockOffset(-1.2, 0.001), warn=True))
+    console(Silence('planner', 4.7))
+    console(Silence('planner', 12.3, over=True))
+    console(Warned('planner', 'it may lack x', "add pip=['x']"))
     assert lines == [
         ('INFO', 'planner: sync ...'),
         ('INFO', 'planner: sync 1.23 s (3 files)'),
         ('INFO', 'robot: VPN interface failed after 0.50 s'),
-        ('WARNING', 'robot: VPN repair failed after 0.50 s: no TUN')]
-
-
-def test_only_a_large_clock_offset_is_a_warning(lines):
-    console = Console(io.StringIO())
-    console(ClockMeasured('planner', ClockOffset(0.01, 0.001)))
-    console(ClockMeasured('planner', ClockOffset(-1.2, 0.001), warn=True))
-    assert lines == [('WARNING', (
-        "the clock of 'planner' is 1.20 s behind the robot's (± 1.0 ms), so TF look-ups and stamp "
-        'matching between the two fail\nsynchronise both clocks: sudo apt-get install chrony'))]
+        ('WARNING', 'robot: VPN repair failed after 0.50 s: no TUN'),
+        ('WARNING', "the clock of 'planner' is 1.20 s behind the robot's (± 1.0 ms), so TF "
+         'look-ups and stamp matching between the two fail\n'
+         'synchronise both clocks: sudo apt-get install chrony'),
+        ('WARNING', 'planner: no answer for 5 s (VPN); nodes keep running'),
+        ('INFO', 'planner: answers again, after 12 s'),
+        ('WARNING', "it may lack x\nadd pip=['x']")]
 
 
 def test_log_level(lines):
@@ -193,19 +195,6 @@ def test_what_threads_do_is_noted_and_forgotten():
     assert cancellable(lambda: doing(threading.get_ident()), None, what='asking') == 'asking'
     run(Command(('sleep', '0.1'), what='sleep'), timeout=5.0)
     assert doing(threading.get_ident()) == ''
-
-
-def test_silence_and_its_end_are_a_line_each(lines):
-    console = Console(io.StringIO())
-    console(Silence('planner', 4.7))
-    console(Silence('planner', 12.3, over=True))
-    assert lines == [('WARNING', 'planner: no answer for 5 s (VPN); nodes keep running'),
-                     ('INFO', 'planner: answers again, after 12 s')]
-
-
-def test_warning_has_its_remedy_on_a_line_of_its_own(lines):
-    Console(io.StringIO())(Warned('planner', 'it may lack x', "add pip=['x']"))
-    assert lines == [('WARNING', "it may lack x\nadd pip=['x']")]
 
 
 def dead(how):

@@ -140,8 +140,6 @@ def test_environment(context):
 
 
 def test_unknown_programs(context):
-    with pytest.raises(WorkspaceError, match="there is no package 'dmo'"):
-        convert(Node(package='dmo', executable='talker'), context)
     with pytest.raises(WorkspaceError, match="no executable 'taker'"):
         convert(Node(package='demo', executable='taker'), context)
     spec = convert(Node(package='theirs', executable='own'), context, own_packages=True)
