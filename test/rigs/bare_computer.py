@@ -88,7 +88,7 @@ def bare_computer(
     archive = container_root.Archive()
     container_entry.add(
         archive, user=USER, number=1000, authorized_key=key.with_suffix('.pub').read_text(),
-        environment={}, agent_config={})
+        agent_config={})
     container_root.accounts(archive, USER, 1000)
     engine = container_engine.named('podman')
     words = [

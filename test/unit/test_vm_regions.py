@@ -167,11 +167,6 @@ def test_a_connection_is_timed_without_its_look_up(monkeypatch: pytest.MonkeyPat
         regions.connect_time('ec2.nowhere.amazonaws.com', port, 2.0)
 
 
-def test_the_api_s_host() -> None:
-    assert api_host('eu-west-1') == 'ec2.eu-west-1.amazonaws.com'
-    assert api_host('cn-north-1') == 'ec2.cn-north-1.amazonaws.com.cn'
-
-
 def test_distances() -> None:
     assert regions.distance_km((0, 0), (0, 180)) == pytest.approx(math.pi * 6371)
     assert regions.distance_km((52.5, 13.4), (52.5, 13.4)) == 0
