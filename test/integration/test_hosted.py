@@ -120,7 +120,7 @@ def test_host_refuses_what_it_lacks(host: Fleet, key: Path) -> None:
     assert host.containers() == {}
 
 
-@pytest.mark.parametrize('delay', [0.05, 0.4, 0.9])
+@pytest.mark.parametrize('delay', [0.05, 0.6])
 def test_cancelled_creation_leaves_nothing(host: Fleet, key: Path, delay: float) -> None:
     provider, spec = host.provider(), MachineSpec('planner', 'hosted', host.options)
     provider.cancel = threading.Event()

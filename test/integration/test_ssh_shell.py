@@ -28,7 +28,7 @@ from fogros2.errors import (
     HostKeyError,
 )
 from fogros2.model import Command, Endpoint
-from fogros2.shell import connect, lines
+from fogros2.shell import lines
 from fogros2.shell.ssh import SSHShell
 from fogros2.waiting import wait_until
 from fogros2_testing import ShellContract
@@ -73,28 +73,14 @@ class TestSSHShell(ShellContract):
             yield opened, str(there)
 
 
-def test_the_plugin_is_found_by_the_endpoint_s_kind(server):
-    shell = connect(server.endpoint, name='planner')
-    assert isinstance(shell, SSHShell)
-    assert shell.run(Command(('true',)), timeout=60.0).returncode == 0
-    shell.close()
-
-
-def test_another_host_key_than_the_pinned_one_is_refused(server, tmp_path):
-    process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f',
+@pytest.mark.parametrize('kind', ['ed25519', 'ecdsa'])
+def test_another_host_key_than_the_pinned_one_is_refused(server, tmp_path, kind):
+    process.run(Command(('ssh-keygen', '-q', '-t', kind, '-N', '', '-f',
                          str(tmp_path / 'other'))), timeout=60.0)
     pinned = dataclasses.replace(
         server.endpoint, host_key=(tmp_path / 'other.pub').read_text())
-    with pytest.raises(HostKeyError, match='another host key than the pinned one'):
-        SSHShell(pinned, name='planner').run(Command(('true',)), timeout=60.0)
-
-
-def test_a_pinned_key_of_another_type_is_refused(server, tmp_path):
-    process.run(Command(('ssh-keygen', '-q', '-t', 'ecdsa', '-N', '', '-f',
-                         str(tmp_path / 'other'))), timeout=60.0)
-    pinned = dataclasses.replace(
-        server.endpoint, host_key=(tmp_path / 'other.pub').read_text())
-    with pytest.raises(HostKeyError):
+    with pytest.raises(HostKeyError, match='another host key than the pinned one'
+                       if kind == 'ed25519' else None):
         SSHShell(pinned, name='planner').run(Command(('true',)), timeout=60.0)
 
 
@@ -154,27 +140,6 @@ def test_the_user_s_own_keys_are_tried(server, home):
 def test_missing_key_is_reported(server, home):
     endpoint = dataclasses.replace(server.endpoint, key_file=None)
     with pytest.raises(AuthenticationError, match='no key to log in'):
-        SSHShell(endpoint, name='planner').run(Command(('true',)), timeout=60.0)
-
-
-@pytest.mark.parametrize('content, words', [
-    (None, 'can not be read'), ('no key', 'no private key'),
-])
-def test_a_useless_key_file_is_named(server, tmp_path, content, words):
-    path = tmp_path / 'key'
-    if content is not None:
-        path.write_text(content)
-    endpoint = dataclasses.replace(server.endpoint, key_file=str(path))
-    with pytest.raises(AuthenticationError, match=words) as refused:
-        SSHShell(endpoint, name='planner').run(Command(('true',)), timeout=60.0)
-    assert str(path) in str(refused.value)
-
-
-def test_a_key_with_a_passphrase_is_the_agent_s_part(server, tmp_path):
-    process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', 'secret', '-f',
-                         str(tmp_path / 'locked'))), timeout=60.0)
-    endpoint = dataclasses.replace(server.endpoint, key_file=str(tmp_path / 'locked'))
-    with pytest.raises(AuthenticationError, match='ssh-add'):
         SSHShell(endpoint, name='planner').run(Command(('true',)), timeout=60.0)
 
 
