@@ -223,7 +223,7 @@ class ContainerProvider(Provider):
         engine = next(ways)
         create = self._create_from_image if options.image else self._create_from_root
         for name in request.with_volumes:
-            _check_free(engine, name, spec.name)
+            _check_free(engine, name, container_machine.container_name(spec.name, request.tags))
         with _sharing(spec, request.token):
             while True:
                 try:
@@ -419,8 +419,10 @@ class ContainerProvider(Provider):
     def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
         """Return nothing: the engine has mounted the volume, whose size has no limit."""
         engine, _, report = _inspected(machine_id)
-        machine = container_machine.labels_of(report)[container_machine.MACHINE]
-        _check_free(engine, name, machine)  # of two launches at once, each may have created one
+        labels = container_machine.labels_of(report)
+        machine = labels[container_machine.MACHINE]
+        # of two launches at once, each may have created one
+        _check_free(engine, name, container_machine.container_name(machine, labels))
         if not _users_of(engine, container_machine.volume_name(name)):
             raise made_without(machine, name)
         return Attached()
@@ -484,14 +486,14 @@ def _users_of(engine: Engine, volume: str) -> list[str]:
     return [name.removeprefix(container_machine.container_name('')) for name in names]
 
 
-def _check_free(engine: Engine, name: str, machine: str = '') -> None:
+def _check_free(engine: Engine, name: str, container: str = '') -> None:
     """
-    Check that no other machine has a volume.
+    Check that no other container has a volume.
 
     :raises NameTaken: one has.
     """
     for user in _users_of(engine, container_machine.volume_name(name)):
-        if user != machine:
+        if container_machine.container_name(user) != container:
             raise NameTaken(f"the machine '{user}' has the volume '{name}'",
                             f'end its launch, or: ros2 fog delete {user}')
 
