@@ -26,15 +26,6 @@ pytestmark = [
 
 #: Other runs of these tests may be under way on the same computer.
 RUN = uuid.uuid4().hex[:6]
-#: Removes a computer's own modules. Its /usr is an overlay: this computer keeps them.
-FORGET_MODULES = """
-for name in numpy av cv2; do
-    while at=$(python3 -c "from importlib.util import find_spec; found = find_spec('$name')
-print((found.submodule_search_locations or [found.origin])[0])" 2>/dev/null); do
-        rm -r "$at"
-    done
-done
-"""
 COLCON = shutil.which('colcon', path=os.pathsep.join(
     [os.path.dirname(sys.executable), os.environ.get('PATH', '')]))
 
@@ -213,42 +204,6 @@ def test_kept_computer_gets_only_changed_workspace_files(
     assert 'workspace' in second.text and '(1 files, ' in second.text
     assert nothing_runs(computer) == []
     assert name not in listed()
-
-
-@pytest.mark.skipif(not embedded(), reason='with ROS 2 the computer has all that the robot has')
-def test_streams_bring_what_they_import_once(computer, launch, tmp_path):
-    path = tmp_path / 'video.launch.py'
-    path.write_text(textwrap.dedent(f"""
-        from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance, StreamTopic
-        from launch.actions import Shutdown
-        from launch_ros.actions import Node
-
-
-        def generate_launch_description():
-            machine = SSHInstance(
-                '{computer.address}', '{computer.user}', key='{computer.key}',
-                host_key='{computer.host_key}', name='video-{RUN}', bootstrap='pip')
-            return FogROSLaunchDescription([
-                CloudNode(machine=machine, package='fogros2_examples', output='screen',
-                          executable='image_processor', on_exit=Shutdown(), stream_topics=[
-                              ('/camera', 'h264'), StreamTopic('/annotated', 'h264', 'to_robot')]),
-                Node(package='fogros2_examples', executable='camera',
-                     on_exit=Shutdown()),
-            ])
-        """))
-    computer.run(FORGET_MODULES)
-    for turn, how in enumerate(('av, cv2 sent', 'there from before')):
-        computer.run('touch /tmp/marker')
-        seen = launch(str(path))
-        seen.wait_for('images/s')
-        seen.interrupt()
-        assert seen.ended() == 0, seen.text
-        assert f'({how})' in seen.text
-        assert 'after it was taken' in seen.text
-        assert seen.text.count('WARNING') == 1 and seen.errors == [], seen.text  # of the Ctrl-C
-        sent = [path for path in sent_since(computer, '/tmp/marker') if '/modules-' in path]
-        assert bool(sent) == (turn == 0)
-        assert nothing_runs(computer) == []
 
 
 #: A package that reads a parameter file out of its share folder.
