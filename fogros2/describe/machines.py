@@ -318,7 +318,6 @@ class ContainerInstance(CloudInstance):
     :param engine: 'podman' or 'docker'; None for the one that works.
     :param user: login user, created if needed.
     :param network: name of an existing container network; None for the engine's default.
-    :param ip: fixed address in that network.
     :param cpus: CPU limit, such as 1.5.
     :param memory: memory limit, such as '2g'.
     :param ports: ports to publish on the robot, in the engine's syntax.
@@ -338,7 +337,6 @@ class ContainerInstance(CloudInstance):
         isolated: Optional[Bool] = None,
         engine: Optional[SomeSubstitutionsType] = None,
         network: Optional[SomeSubstitutionsType] = None,
-        ip: Optional[SomeSubstitutionsType] = None,
         cpus: Optional[Value] = None,
         memory: Optional[SomeSubstitutionsType] = None,
         ports: Optional[Sequence[SomeSubstitutionsType]] = None,

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import dataclasses
 from typing import Any, TYPE_CHECKING, TypeVar
 
@@ -13,22 +13,6 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
     Options = TypeVar('Options', bound=DataclassInstance)
-
-
-def known(given: Mapping[str, Any], names: Iterable[str], what: str) -> dict[str, Any]:
-    """
-    Return the options that are not None.
-
-    :param names: the names that exist.
-    :param what: owner of the options for messages, such as 'a container machine'.
-    :raises ConfigurationError: an option is unknown; the hint has the nearest name.
-    """
-    names = list(names)
-    for name in given:
-        if name not in names:
-            raise ConfigurationError(
-                f"{what} has no option '{name}'", did_you_mean(name, names))
-    return {name: value for name, value in given.items() if value is not None}
 
 
 def parsed(
@@ -46,9 +30,13 @@ def parsed(
     """
     defaults = {field.name: {} if field.default is dataclasses.MISSING else field.default
                 for field in dataclasses.fields(kind)}
+    for name in given:
+        if name not in defaults:
+            raise ConfigurationError(
+                f"{what} has no option '{name}'", did_you_mean(name, list(defaults)))
     value = value or convert
     return kind(**{name: value(name, word, defaults[name])
-                   for name, word in known(given, defaults, what).items()})
+                   for name, word in given.items() if word is not None})
 
 
 def convert(name: str, value: Any, default: Any) -> Any:

@@ -5,22 +5,18 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 import dataclasses
-import logging
 import subprocess
 import sys
-import time
 
 import pytest
 
-from fogros2.errors import FogError, NameTaken, ProviderError, Unsupported
+from fogros2.errors import NameTaken, ProviderError, Unsupported
 from fogros2.model import MachineSpec
-from fogros2.plugin_system import load
-from fogros2.provider import TAG_ON_EXIT, TAG_ROBOT
-from fogros2.provider.vm import cloud
+from fogros2.provider import TAG_ON_EXIT
 from fogros2.waiting import wait_until
 from fogros2_testing import request_for, VmContract
 from fogros2_testing.provider_contract import PUBLIC_KEY
-from rigs.clouds_in_memory import DAMAGED, MEMORIES
+from rigs.clouds_in_memory import MEMORIES
 
 STEPS = [(name, *step) for name, memory in MEMORIES.items() for step in memory.steps]
 
@@ -151,27 +147,11 @@ def test_full_quota_leads_to_the_next_type(memory):
     gone(memory)
 
 
-def test_no_room_anywhere_is_the_error(memory):
-    memory.fill(0)
-    with pytest.raises(FogError) as caught:
-        create(memory, **memory.more)
-    assert caught.value.refused and 'quota' in str(caught.value).lower()
-    gone(memory)
-
-
-def test_full_region_leads_to_the_next(memory):
-    memory.fill(1)
-    machine, _ = create(memory, regions=[memory.away])
-    assert memory.provider().describe(machine).region == memory.away
-    memory.provider().destroy(machine)
-    gone(memory)
-
-
-def test_eight_machines_at_once_are_eight(memory):
-    with ThreadPoolExecutor(8) as pool:
-        made = list(pool.map(lambda number: create(memory, f'm{number}')[0], range(8)))
+def test_machines_at_once_are_as_many(memory):
+    with ThreadPoolExecutor(3) as pool:
+        made = list(pool.map(lambda number: create(memory, f'm{number}')[0], range(3)))
         assert {machine.id for machine in memory.provider().find({})} == set(made)
-        assert len(set(made)) == 8
+        assert len(set(made)) == 3
         list(pool.map(memory.provider().destroy, made))
     gone(memory)
 
@@ -233,51 +213,10 @@ def test_cloud_is_described_without_its_library(name):
     assert done.stdout == '[]\n', done.stderr
 
 
-@pytest.mark.parametrize('name', MEMORIES)
-def test_regions_have_places_on_the_globe(name):
-    table = load('fogros2.provider', name).adapter.regions.table
-    for latitude, longitude, place, _ in table.values():
-        assert -90 < latitude < 90 and -180 <= longitude <= 180 and place
-
-
-def test_leftovers_go_when_they_have_settled(memory, monkeypatch):
-    create(memory)
-    memory.vanish()
-    provider = memory.provider()
-    assert provider.tidy() == []  # a new attempt may still get its machine
-    monkeypatch.setattr(cloud, 'SETTLED', -1.0)
-    (said,) = provider.tidy()
-    assert 'planner' in said
-    gone(memory)
-
-
 def test_leftovers_of_a_dead_launch_go_at_once(memory):
     _, token = create(memory)
     memory.vanish()
-    assert len(memory.provider().tidy([token])) == 1
+    assert memory.provider().tidy() == []  # a new attempt may still get its machine
+    (said,) = memory.provider().tidy([token])
+    assert 'planner' in said
     gone(memory)
-
-
-@pytest.mark.parametrize(('tags', 'age'), [
-    ({TAG_ROBOT: 'neighbour-0-00000000'}, 1e6), ({}, 0.0)])
-def test_leftovers_of_others_or_of_now_stay(memory, tags, age):
-    create(memory)
-    memory.vanish()
-    memory.retag({**tags, cloud.TAG_MADE: str(int(time.time() - age))})
-    assert memory.provider().tidy() == []
-    assert memory.left()
-
-
-@pytest.mark.parametrize('text', [DAMAGED, 'nan', 'inf', ''])
-def test_damaged_time_tag_is_skipped_with_a_warning(memory, caplog, text):
-    create(memory)
-    memory.vanish()
-    memory.retag({cloud.TAG_MADE: text})
-    _, token = create(memory, 'mapper')
-    memory.vanish()
-    with caplog.at_level(logging.WARNING):
-        (said,) = memory.provider().tidy([token])
-    assert 'mapper' in said
-    (record,) = [each for each in caplog.records if each.levelno == logging.WARNING]
-    assert "'planner' has the damaged tag fogros2-made" in record.message
-    assert memory.left()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 import os
 from pathlib import Path
 import shutil
@@ -53,32 +54,6 @@ def spec(cloud_network):
     return make
 
 
-def one_node(launch_id, words=(sys.executable, '-c', 'print("hello", flush=True)')):
-    return NodeSpec(f'{launch_id}-1', 'node-1', arguments=tuple(words))
-
-
-def test_a_node_runs_on_a_machine_of_its_own_and_everything_goes(spec):
-    events = []
-    launch = Launch(report=events.append)
-    try:
-        launch.prepare([spec()])
-        machine = launch.up(spec())
-        heard = []
-        machine.subscribe(heard.append)
-        code = 'import os, socket; print(socket.gethostname(), os.getuid(), flush=True)'
-        machine.start([one_node('a', ('python3', '-c', code))])
-        wait_until(lambda: any(e['event'] == 'exited' for e in heard), timeout=60,
-                   what='the node to end')
-        text = ''.join(e['text'] for e in heard if e['event'] == 'output').split()
-        assert text[0] == f'planner-{RUN}'
-        assert text[1] != '0', 'nodes must not run as root'
-    finally:
-        assert launch.down() == []
-    started = [(e.machine, e.step) for e in events if isinstance(e, StepStarted)]
-    done = [(e.machine, e.step) for e in events if isinstance(e, StepDone)]
-    assert sorted(started) == sorted(done)
-
-
 def test_launch_stops_the_daemon_of_its_terminals_before_its_vpn():
     launch = Launch()
     seen = []
@@ -125,7 +100,7 @@ def test_a_fault_in_any_step_leaves_nothing(spec, step):
     assert launch.down() == []
 
 
-@pytest.mark.parametrize('step', ['VPN interface', *STEPS])
+@pytest.mark.parametrize('step', ['machine', 'ROS 2', 'agent'])
 def test_a_cancel_in_any_step_leaves_nothing(spec, step):
     launch = Launch(report=lambda event: cancel.set() if (
         isinstance(event, StepStarted) and event.step == step) else None)
@@ -153,26 +128,29 @@ def test_an_undo_that_fails_is_reported_and_the_others_run(spec, monkeypatch):
 
 
 def test_machines_come_up_in_parallel_and_reach_each_other(spec):
-    launch = Launch()
-    names = ['one', 'two', 'three']
-    launch.expect(f'{name}-{RUN}' for name in names)
-    machines = {}
+    events, heard = [], []
+    launch = Launch(report=events.append)
+    specs = [spec('one'), spec('two')]
+    launch.prepare(specs)
+    launch.expect(each.name for each in specs)
     try:
-        threads = [
-            threading.Thread(target=lambda n=n: machines.update({n: launch.up(spec(n))}))
-            for n in names]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        assert sorted(machines) == sorted(names)
-        from fogros2.model import Command
-        for machine in machines.values():
-            for other in machines.values():
-                machine.shell.run(
-                    Command(('ping', '-c', '1', '-W', '5', other.vpn_address)), timeout=60)
+        with ThreadPoolExecutor(2) as pool:
+            machines = list(pool.map(launch.up, specs))
+        for machine, other in zip(machines, reversed(machines)):
+            machine.shell.run(
+                Command(('ping', '-c', '1', '-W', '5', other.vpn_address)), timeout=60)
+        machines[0].subscribe(heard.append)
+        code = 'import os, socket; print(socket.gethostname(), os.getuid(), flush=True)'
+        machines[0].start([NodeSpec('a-1', 'node-1', arguments=('python3', '-c', code))])
+        wait_until(lambda: any(e['event'] == 'exited' for e in heard), timeout=60,
+                   what='the node to end')
     finally:
         assert launch.down() == []
+    name, user = ''.join(e['text'] for e in heard if e['event'] == 'output').split()[:2]
+    assert name == f'one-{RUN}' and user != '0', 'nodes must not run as root'
+    started = [(e.machine, e.step) for e in events if isinstance(e, StepStarted)]
+    done = [(e.machine, e.step) for e in events if isinstance(e, StepDone)]
+    assert sorted(started) == sorted(done)
 
 
 def test_two_launches_at_once_do_not_meet(spec):
@@ -189,16 +167,15 @@ def test_two_launches_at_once_do_not_meet(spec):
         assert second.down() == []
 
 
-def test_a_kept_machine_is_reused_by_the_next_launch(spec):
+@pytest.mark.parametrize('on_exit', ['keep', 'stop'])
+def test_the_next_launch_reuses_a_machine(spec, on_exit):
     store = Store()
-    kept = spec(on_exit='keep')
     first = Launch(store=store)
-    machine_id = first.up(kept).machine.id
-    assert [made.kind for made in store.load(kept.name).made] == ['VPN', 'nodes']
+    machine_id = first.up(spec(on_exit=on_exit)).machine.id
+    assert [made.kind for made in store.load(spec().name).made] == ['VPN', 'nodes']
     assert first.down() == []
-    assert store.load(kept.name).made == ()
-    events = []
-    second = Launch(store=store, report=events.append)
+    assert store.load(spec().name).made == ()
+    second = Launch(store=store)
     try:
         assert second.up(spec()).machine.id == machine_id
     finally:
@@ -243,19 +220,6 @@ def test_machine_whose_feature_fails_is_deleted(spec, monkeypatch):
     with pytest.raises(Injected):
         launch.up(spec(on_exit='keep', features={'failing': {}}))
     assert launch.down() == [] and not launch.store.exists(spec().name)
-
-
-def test_a_stopped_machine_is_started_by_the_next_launch(spec):
-    store = Store()
-    first = Launch(store=store)
-    machine = first.up(spec(on_exit='stop'))
-    machine_id = machine.machine.id
-    assert first.down() == []
-    second = Launch(store=store)
-    try:
-        assert second.up(spec()).machine.id == machine_id
-    finally:
-        assert second.down() == []
 
 
 def test_a_killed_wireguard_comes_back(spec):

@@ -45,10 +45,15 @@ def generate_launch_description():
         Node(package='fogros2_examples', executable='talker'), listener])
 '''
 
-pytestmark = pytest.mark.timeout(1800)
+#: Imports the libraries of the clouds, prints what the image has, and runs the launch.
+LOOK = """
+python -c 'import azure.identity, boto3, google.auth, kubernetes; print("providers of all clouds")'
+ros2 fog doctor || :
+exec ros2 launch /mnt/two.launch.py
+"""
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture
 def podman(engine: str) -> Callable[..., Result]:
     """Return a function that runs podman."""
     def call(*words: str, check: bool = True, timeout: float = 120.0) -> Result:
@@ -56,15 +61,14 @@ def podman(engine: str) -> Callable[..., Result]:
     return call
 
 
-@pytest.fixture(scope='module')
-def base(podman: Callable[..., Result], tmp_path_factory: pytest.TempPathFactory,
-         ) -> Iterator[str]:
+@pytest.fixture
+def base(podman: Callable[..., Result], tmp_path: Path) -> Iterator[str]:
     """Return an image of a Debian system."""
     if which('debootstrap') is None:
         pytest.skip('needs debootstrap')
     cache = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache', 'fogros2/kubernetes')
     name = f'localhost/fogros2-base:{uuid.uuid4().hex[:8]}'
-    layer = tmp_path_factory.mktemp('base') / 'layer.tar'
+    layer = tmp_path / 'layer.tar'
     try:
         with images.alone(cache):
             images.pack(layer, images.base(cache, print))
@@ -77,17 +81,38 @@ def base(podman: Callable[..., Result], tmp_path_factory: pytest.TempPathFactory
     layer.unlink()
     yield name
     podman('rmi', '-f', name)
-    left = [podman('images', '-a').stdout,
-            podman('ps', '-a', '--external', '--format', '{{.Image}} {{.Names}}').stdout]
-    assert name.partition(':')[2] not in ' '.join(left)
 
 
-@pytest.fixture(scope='module')
-def robot(podman: Callable[..., Result], base: str) -> Iterator[Callable[..., str]]:
-    """Build the image; return a function that runs a command in it, without a network."""
+def test_dockerfile_takes_the_sources_alone(
+    podman: Callable[..., Result], tmp_path: Path,
+) -> None:
+    copy = 'COPY . /opt/fogros2\n'
+    assert copy in (ROOT / 'packaging/Dockerfile').read_text()
+    file, name = tmp_path / 'Dockerfile', f'localhost/fogros2-sources:{uuid.uuid4().hex[:8]}'
+    file.write_text(f'FROM scratch\n{copy}')
+    podman('build', '-q', '-t', name, '-f', str(file), str(ROOT))
+    try:
+        folder = podman('image', 'mount', name).stdout.strip()
+        copied = run(Command(('ls', '-A', f'{folder}/opt/fogros2'), sudo=True),
+                     timeout=30.0).stdout
+        podman('image', 'unmount', name)
+    finally:
+        podman('rmi', '-f', name)
+    packages = {path.parent.name for path in ROOT.glob('*/__init__.py')} - {'test'}
+    assert set(copied.split()) == {
+        'LICENSE', 'README.md', 'package.xml', 'pyproject.toml', 'setup.cfg', 'setup.py', 'launch',
+        'packaging', 'resource', 'ros2_embedded', 'tools', *packages}
+
+
+@pytest.mark.soak  # minutes, most of them of the package indexes
+@pytest.mark.timeout(1800)
+def test_image_of_the_robot_runs_launches(
+    podman: Callable[..., Result], base: str, tmp_path: Path,
+) -> None:
     name = base.replace('-base', '-robot')
     mounts = [word for path in SETTINGS if Path(path).exists()
               for word in ('-v', f'{path}:{path}:ro')]
+    (tmp_path / 'two.launch.py').write_text(LAUNCH)
     try:
         built = podman(
             'build', '--network', 'host', '--layers=false', '--force-rm', *mounts,
@@ -97,35 +122,13 @@ def robot(podman: Callable[..., Result], base: str) -> Iterator[Callable[..., st
         if built.returncode and any(words in said for words in OFFLINE):
             pytest.skip('needs package indexes')
         assert built.returncode == 0, said
-
-        def call(*words: str, options: tuple[str, ...] = ()) -> str:
-            return podman('run', '--rm', '--network', 'none', *container_engine.limits(),
-                          *options, name, *words).stdout
-
-        yield call
+        said = podman(
+            'run', '--rm', '--network', 'none', *container_engine.limits(), '-v',
+            f'{tmp_path}:/mnt:ro', '--cap-add', 'NET_ADMIN', '--device', '/dev/net/tun', name,
+            'sh', '-ec', LOOK).stdout
     finally:
         podman('rmi', '-f', name, check=False)
-
-
-def test_image_runs_nodes_of_a_launch(robot: Callable[..., str], tmp_path: Path) -> None:
-    (tmp_path / 'two.launch.py').write_text(LAUNCH)
-    said = robot('ros2', 'launch', '/mnt/two.launch.py', options=('-v', f'{tmp_path}:/mnt:ro'))
-    assert 'I heard' in said
-
-
-def test_image_has_what_launches_on_machines_need(robot: Callable[..., str]) -> None:
-    said = robot('sh', '-c', 'ros2 fog doctor || :',
-                 options=('--cap-add', 'NET_ADMIN', '--device', '/dev/net/tun'))
+    assert 'providers of all clouds' in said
     for check in ('Python packages', 'programs', 'root', 'TUN', 'WireGuard', 'nftables'):
         assert f'[ ok ] {check}: ' in said, said
-
-
-def test_image_has_the_providers_of_all_clouds(robot: Callable[..., str]) -> None:
-    robot('python', '-c', 'import azure.identity, boto3, google.auth, kubernetes')
-
-
-def test_image_has_the_sources_alone(robot: Callable[..., str]) -> None:
-    packages = {path.parent.name for path in ROOT.glob('*/__init__.py')} - {'test'}
-    assert set(robot('ls', '-A', '/opt/fogros2').split()) == {
-        '.venv', 'LICENSE', 'README.md', 'package.xml', 'pyproject.toml', 'setup.cfg', 'setup.py',
-        'launch', 'packaging', 'resource', 'ros2_embedded', 'tools', *packages}
+    assert 'I heard' in said

@@ -19,13 +19,12 @@ import shutil
 import subprocess
 import sys
 import uuid
-import zipfile
 
 import pytest
 
 from fogros2 import plan, process
 from fogros2.errors import PrerequisiteError
-from fogros2.host import bootstrap, installer, locked, modules, wheels, workspace
+from fogros2.host import bootstrap, wheels, workspace
 from fogros2.model import Command, MachineSpec
 from fogros2.provider.container import debian_root
 from fogros2.shell.ssh import SSHShell
@@ -216,45 +215,6 @@ def test_compiled_programs_are_built_there(
     assert bytes.fromhex(read.stdout) == ELF_MACHINE
     said = shell.run(Command((str(program),)), timeout=30.0).stdout
     assert said == 'compiled there\n'
-
-
-def wheel(folder: Path, tag: str) -> str:
-    """Write a wheel of NumPy's name that says what it is for, and return its hash for pip."""
-    path = folder / f'numpy-9.9-{tag}.whl'
-    files = {
-        'numpy.py': f'__version__ = "9.9"\ntag = "{tag}"\n',
-        'numpy-9.9.dist-info/METADATA': 'Metadata-Version: 2.1\nName: numpy\nVersion: 9.9\n',
-        'numpy-9.9.dist-info/WHEEL': f'Wheel-Version: 1.0\nRoot-Is-Purelib: false\nTag: {tag}\n'}
-    with zipfile.ZipFile(path, 'w') as archive:
-        for name, text in files.items():
-            archive.writestr(name, text)
-        archive.writestr('numpy-9.9.dist-info/RECORD', ''.join(
-            f'{name},,\n' for name in [*files, 'numpy-9.9.dist-info/RECORD']))
-    return f'--hash=sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}'
-
-
-def test_modules_are_those_for_its_processor(
-    shell: SSHShell, computer: BareComputer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    index = tmp_path / 'index'
-    index.mkdir()
-    hashes = [wheel(index, f'cp311-cp311-manylinux_2_17_{name}')
-              for name in (platform.machine(), ARCHITECTURE)]
-    pins = tmp_path / 'locked.txt'
-    pins.write_text(f"numpy==9.9 {' '.join(hashes)}\n")
-    monkeypatch.setattr(locked, 'FILE', pins)
-    shell.run(Command(('mkdir', '-p', '/tmp/index')), timeout=30.0)
-    shell.sync(index, '/tmp/index', excludes=(), timeout=60.0)
-    environment = {'PIP_NO_INDEX': '1', 'PIP_FIND_LINKS': '/tmp/index'}
-    there = modules.answer(shell.run(modules.ask(['numpy'], {}, ()), timeout=60.0).stdout)
-    assert (there.architecture, there.missing) == (ARCHITECTURE, ('numpy',))
-    assert modules.copy(there) is None  # this computer's own does not run there
-    shell.run(installer.pinned_install(
-        modules.pinned(there.missing), '/tmp/modules', environment, ()), timeout=300.0)
-    told = shell.run(Command(('python3', '-c', (
-        'import sys; sys.path.insert(0, "/tmp/modules/site"); import numpy; print(numpy.tag)'))),
-        timeout=60.0).stdout
-    assert told == f'cp311-cp311-manylinux_2_17_{ARCHITECTURE}\n'
 
 
 def test_package_that_cannot_be_installed_is_named_first(

@@ -145,22 +145,17 @@ HERE = '[127.0.0.1]:{port} {key}\n'
 
 @pytest.mark.parametrize('text', [
     f'@cert-authority *.example {KEY}\n@revoked * {KEY}\n{HERE}',
-    f'{HERE}@revoked * {KEY}\n',
-    f'@revoked * ssh-rsa AAAAB3NzaC1yc2EAAAADAQABAAAAgQC7\n{HERE}',
     f'[127.0.0.1]:{{port}} ssh-ed25519 AAAAdamaged\n\\\\ nonsense\n{HERE}',
     f'[127.0.0.1]:{{port}} {KEY}\n{HERE}',
     '[127.0.0.*]:{port},other {key}\n',
-    '127.0.0.1 {key}\n',
     f'127.0.0.1 {KEY}\n{HERE}',
     # what OpenSSH refuses
     f'{HERE}@revoked * {{key}}\n',
     '@revoked [127.0.0.1]:{port} {key}\n',
     f'[127.0.0.1]:{{port}} {KEY}\n',
     '@cert-authority * {key}\n',
-    '!127.0.0.1,other {key}\n',
     f'127.0.0.1 {KEY}\n',
-    '[127.0.0.1]:1 {key}\n',
-    ''])
+    '[127.0.0.1]:1 {key}\n'])
 def test_known_hosts_means_what_it_means_to_openssh(server, home, text):
     configured(home, server)
     (home / '.ssh/known_hosts').write_text(text.format(port=server.port, key=server.host_key))
@@ -173,9 +168,8 @@ def test_known_hosts_means_what_it_means_to_openssh(server, home, text):
 
 
 @pytest.mark.parametrize(('words', 'error'), [
-    (('-h', '-n', '127.0.0.1'), ''), (('-h',), ''),
-    (('-h', '-n', 'other'), 'the certificate of .* is for other'),
-    (('-h', '-V', '-2d:-1d'), 'is not valid now')])
+    (('-h', '-n', '127.0.0.1'), ''),
+    (('-h', '-n', 'other'), 'the certificate of .* is for other')])
 def test_certificate_of_a_host_is_what_it_is_to_openssh(tmp_path, home, words, error):
     authority, key = keygen(tmp_path / 'ca'), keygen(tmp_path / 'certified')
     subprocess.run(['ssh-keygen', '-q', '-s', authority, '-I', 'id', *words, f'{key}.pub'],
@@ -276,8 +270,7 @@ def test_agent_of_ssh_config_is_asked(server, home, agent, monkeypatch):
 # -- login shells that print ----------------------------------------------------------------------
 
 @pytest.mark.parametrize('talk', [
-    'echo domain 7', 'echo 1234; echo two', 'printf "ready> "', 'printf "\\\\n\\\\n"', 'cd /tmp',
-    'echo warning >&2', 'seq 100000'])
+    'echo 1234; echo two', 'printf "ready> "', 'cd /tmp', 'echo warning >&2', 'seq 100000'])
 def test_what_a_login_shell_prints_is_no_output(tmp_path, home, talk):
     there = tmp_path / 'there'
     with private_sshd(tmp_path / 'sshd', TALK.format(talk) + f'SetEnv HOME={there} SHLVL=2\n') \

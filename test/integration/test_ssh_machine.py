@@ -14,7 +14,6 @@ import uuid
 import pytest
 
 from fogros2.provider.container import root as container_root
-from fogros2.waiting import wait_until
 from rigs.bare_computer import bare_computer
 from rigs.colcon_workspace import colcon_workspace
 from rigs.launched import embedded, launching, ros2
@@ -26,15 +25,6 @@ pytestmark = [
 
 #: Other runs of these tests may be under way on the same computer.
 RUN = uuid.uuid4().hex[:6]
-#: Removes a computer's own modules. Its /usr is an overlay: this computer keeps them.
-FORGET_MODULES = """
-for name in numpy av cv2; do
-    while at=$(python3 -c "from importlib.util import find_spec; found = find_spec('$name')
-print((found.submodule_search_locations or [found.origin])[0])" 2>/dev/null); do
-        rm -r "$at"
-    done
-done
-"""
 COLCON = shutil.which('colcon', path=os.pathsep.join(
     [os.path.dirname(sys.executable), os.environ.get('PATH', '')]))
 
@@ -79,18 +69,6 @@ def example(computer, **arguments):
             *(f'{name}:={value}' for name, value in given.items())]
 
 
-def nothing_runs(computer):
-    """Return what is still there of a launch: nothing, and the computer is on."""
-    found = [name for name in computer.run('ls /sys/class/net').stdout.split()
-             if name.startswith('fog')]
-    found += computer.run('ls -d /run/fogros2 2>/dev/null || :').stdout.split()
-    found += computer.run(
-        'for p in /proc/[0-9]*; do '
-        'tr "\\0" " " <$p/cmdline 2>/dev/null | grep -E "agent.py|talker|wireguard-go|ros2 " '
-        '| grep -v "^sh " || :; done').stdout.splitlines()
-    return found
-
-
 def sent_since(computer, marker):
     return computer.run(
         f'find /home/{computer.user}/.local -type f -newer {marker} 2>/dev/null || :'
@@ -103,7 +81,7 @@ def test_bare_computer_gets_missing_packages_once(computer, launch, home):
     assert f'I heard: [Hello World from {computer.name}' in first.text
     assert ('ROS 2 installed by pip' in first.text) == embedded()
     assert 'WARNING' not in first.text and first.errors == []
-    assert nothing_runs(computer) == []
+    assert computer.leftovers() == []
 
     # known_hosts says who it is as well as host_key=, and nothing is sent again
     computer.run('touch /tmp/marker')
@@ -115,35 +93,7 @@ def test_bare_computer_gets_missing_packages_once(computer, launch, home):
     assert 'I heard' in second.text
     assert '(there already)' in second.text
     assert sent_since(computer, '/tmp/marker') == []
-    assert nothing_runs(computer) == []
-
-
-def test_a_killed_launch_is_cleared_up_by_its_agent(computer, launch, tmp_path):
-    path = tmp_path / 'killed.launch.py'
-    path.write_text(textwrap.dedent(f"""
-        from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
-
-
-        def generate_launch_description():
-            machine = SSHInstance(
-                '{computer.address}', '{computer.user}', key='{computer.key}',
-                host_key='{computer.host_key}', name='killed-{RUN}', robot_timeout=6)
-            return FogROSLaunchDescription([
-                CloudNode(machine=machine, package='fogros2_examples', executable='talker'),
-            ])
-        """))
-    killed = launch(str(path))
-    killed.wait_for('process started')
-    running = ' '.join(nothing_runs(computer))
-    assert 'agent.py' in running and 'talker' in running and f'killed-{RUN}' in running
-    killed.kill()
-    # the agent's own folder stays with its log, root's and the user's alone
-    wait_until(lambda: nothing_runs(computer) in ([], [f'killed-{RUN}']), timeout=60,
-               what='the agent to end everything')
-    deleted = ros2('fog', 'delete', f'killed-{RUN}', '--yes')
-    assert deleted.returncode == 0, deleted.stderr
-    assert ros2('fog', 'gc').returncode == 0
-    assert nothing_runs(computer) == []
+    assert computer.leftovers() == []
 
 
 NODE = """\
@@ -211,44 +161,8 @@ def test_kept_computer_gets_only_changed_workspace_files(
     assert 'found the second text, speed 2.5, blue' in second.text
     assert 'kept from before' in second.text
     assert 'workspace' in second.text and '(1 files, ' in second.text
-    assert nothing_runs(computer) == []
+    assert computer.leftovers() == []
     assert name not in listed()
-
-
-@pytest.mark.skipif(not embedded(), reason='with ROS 2 the computer has all that the robot has')
-def test_streams_bring_what_they_import_once(computer, launch, tmp_path):
-    path = tmp_path / 'video.launch.py'
-    path.write_text(textwrap.dedent(f"""
-        from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance, StreamTopic
-        from launch.actions import Shutdown
-        from launch_ros.actions import Node
-
-
-        def generate_launch_description():
-            machine = SSHInstance(
-                '{computer.address}', '{computer.user}', key='{computer.key}',
-                host_key='{computer.host_key}', name='video-{RUN}', bootstrap='pip')
-            return FogROSLaunchDescription([
-                CloudNode(machine=machine, package='fogros2_examples', output='screen',
-                          executable='image_processor', on_exit=Shutdown(), stream_topics=[
-                              ('/camera', 'h264'), StreamTopic('/annotated', 'h264', 'to_robot')]),
-                Node(package='fogros2_examples', executable='camera',
-                     on_exit=Shutdown()),
-            ])
-        """))
-    computer.run(FORGET_MODULES)
-    for turn, how in enumerate(('av, cv2 sent', 'there from before')):
-        computer.run('touch /tmp/marker')
-        seen = launch(str(path))
-        seen.wait_for('images/s')
-        seen.interrupt()
-        assert seen.ended() == 0, seen.text
-        assert f'({how})' in seen.text
-        assert 'after it was taken' in seen.text
-        assert seen.text.count('WARNING') == 1 and seen.errors == [], seen.text  # of the Ctrl-C
-        sent = [path for path in sent_since(computer, '/tmp/marker') if '/modules-' in path]
-        assert bool(sent) == (turn == 0)
-        assert nothing_runs(computer) == []
 
 
 #: A package that reads a parameter file out of its share folder.

@@ -131,17 +131,13 @@ def test_keys_of_every_type_log_in(server, tmp_path, kind):
 
 
 def test_the_user_s_own_keys_are_tried(server, home):
-    (home / '.ssh/id_ed25519').write_text((server.folder / 'id').read_text())
-    (home / '.ssh/id_ed25519').chmod(0o600)
-    endpoint = dataclasses.replace(server.endpoint, key_file=None)
-    with contextlib.closing(SSHShell(endpoint, name='planner')) as shell:
-        assert shell.run(Command(('true',)), timeout=60.0).returncode == 0
-
-
-def test_missing_key_is_reported(server, home):
     endpoint = dataclasses.replace(server.endpoint, key_file=None)
     with pytest.raises(AuthenticationError, match='no key to log in'):
         SSHShell(endpoint, name='planner').run(Command(('true',)), timeout=60.0)
+    (home / '.ssh/id_ed25519').write_text((server.folder / 'id').read_text())
+    (home / '.ssh/id_ed25519').chmod(0o600)
+    with contextlib.closing(SSHShell(endpoint, name='planner')) as shell:
+        assert shell.run(Command(('true',)), timeout=60.0).returncode == 0
 
 
 def test_a_port_where_nobody_listens_refuses_at_once():
@@ -182,9 +178,14 @@ def test_server_of_another_kind_is_refused(greeting, capfd):
 
 def test_a_lost_connection_is_opened_again(server, shell):
     shell.run(Command(('true',)), timeout=60.0)
-    for _ in range(3):
+    for _ in range(2):
         server.cut()
         assert shell.run(Command(('echo', 'again')), timeout=60.0).stdout == 'again\n'
+    server.stop()
+    with pytest.raises(ConnectError, match='refuses connections'):
+        shell.run(Command(('true',)), timeout=60.0)
+    server.start()
+    assert shell.run(Command(('true',)), timeout=60.0).returncode == 0
 
 
 def test_a_connection_lost_under_a_command_is_an_error(server, shell, tmp_path):

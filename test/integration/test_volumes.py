@@ -120,9 +120,12 @@ def test_volume_of_an_ssh_host_is_a_folder_with_a_lock(
         refused = ros2('fog', 'volume', 'delete', volume, '--host', 'lab', '--yes')
         assert refused.returncode == 1 and 'a launch uses the volume' in refused.stderr
 
+        running = ' '.join(computer.leftovers())
+        assert 'agent.py' in running and 'talker' in running and first in running
         run.kill()
-        wait_until(lambda: computer.run('[ ! -e /data ]', check=False).returncode == 0,
-                   timeout=60.0, what='the agent to end the launch')
+        wait_until(lambda: computer.leftovers() == [] and computer.run(
+            '[ ! -e /data ]', check=False).returncode == 0,
+            timeout=60.0, what='the agent to end the launch')
         again = start(launch_file(tmp_path, machine, second, volume))
         again.wait_for('Publishing')
         assert computer.run('cat /data/model').stdout == 'kept\n'
@@ -130,7 +133,8 @@ def test_volume_of_an_ssh_host_is_a_folder_with_a_lock(
         assert again.ended() == 0, again.text
         wait_until(lambda: computer.run('[ ! -e /data ]', check=False).returncode == 0,
                    timeout=10.0, what='/data to go')
-    ros2('fog', 'delete', first, '--yes')
+    assert ros2('fog', 'delete', first, '--yes').returncode == 0
+    assert computer.leftovers() == []
     listed = ros2('fog', 'volume', 'list', '--host', 'lab')
     assert volume in listed.stdout
     assert ros2('fog', 'volume', 'delete', '--host', 'lab', volume, '--yes').returncode == 0

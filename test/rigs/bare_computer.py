@@ -60,10 +60,13 @@ class BareComputer:
                     sudo=self.engine.sudo, what=f'run {script!r} on {self.name}'),
             timeout=60.0, check=check)
 
-    def processes(self) -> list[str]:
-        """Return the command lines of all that runs there."""
-        return self.run('cat /proc/[0-9]*/cmdline 2>/dev/null | tr "\\0" " " || :').stdout.split(
-            '\n')
+    def leftovers(self) -> list[str]:
+        """Return what is there of a launch: interfaces, the agents' folders, processes."""
+        return self.run(
+            'ls /sys/class/net | grep ^fog || :; ls -d /run/fogros2 2>/dev/null || :; '
+            'for p in /proc/[0-9]*; do '
+            'tr "\\0" " " <$p/cmdline 2>/dev/null | grep -E "agent.py|talker|wireguard-go|ros2 " '
+            '| grep -v "^sh " || :; done').stdout.splitlines()
 
 
 @contextlib.contextmanager
@@ -88,7 +91,7 @@ def bare_computer(
     archive = container_root.Archive()
     container_entry.add(
         archive, user=USER, number=1000, authorized_key=key.with_suffix('.pub').read_text(),
-        environment={}, agent_config={})
+        agent_config={})
     container_root.accounts(archive, USER, 1000)
     engine = container_engine.named('podman')
     words = [

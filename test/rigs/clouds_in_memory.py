@@ -7,7 +7,6 @@ import abc
 import base64
 from collections.abc import Iterator, Mapping, Sequence
 import contextlib
-import json
 import re
 import threading
 from typing import Any, ClassVar
@@ -16,9 +15,6 @@ import pytest
 
 from fogros2.provider.vm.provider import VmProvider
 from fogros2.waiting import wait_until
-
-#: A time tag that no program of FogROS2 has written.
-DAMAGED = 'yesterday, or so'
 
 
 class Memory(abc.ABC):
@@ -122,10 +118,6 @@ class Memory(abc.ABC):
     @abc.abstractmethod
     def vanish(self) -> None:
         """Let all machines end, and nothing else."""
-
-    @abc.abstractmethod
-    def retag(self, tags: Mapping[str, str]) -> None:
-        """Change tags of what is beside machines."""
 
 
 def _counted(fault: Any, met: threading.Event) -> Any:
@@ -254,14 +246,6 @@ class Aws(Memory):
         """Terminate the instances."""
         self._rig.ec2().terminate_instances(InstanceIds=self._rig.left()['instances'])
 
-    def retag(self, tags: Mapping[str, str]) -> None:
-        """Change the tags of groups and keys."""
-        ec2 = self._rig.ec2()
-        ids = [*self._rig.left()['groups'],
-               *(pair['KeyPairId'] for pair in ec2.describe_key_pairs()['KeyPairs'])]
-        ec2.create_tags(Resources=ids, Tags=[
-            {'Key': key, 'Value': value} for key, value in tags.items()])
-
 
 class Azure(Memory):
     """The simulated Azure."""
@@ -334,11 +318,6 @@ class Azure(Memory):
         """Evict the machines."""
         for vm in self.served.vms():
             self.served.evict(vm['id'])
-
-    def retag(self, tags: Mapping[str, str]) -> None:
-        """Change the tags of groups."""
-        for group in self.served.groups.values():
-            group['tags'] = {**group['tags'], **tags}
 
 
 class Gcp(Memory):
@@ -413,11 +392,6 @@ class Gcp(Memory):
         project = self.served.project  # which shows an instance for a while that has ended
         wait_until(lambda: not self.served.instances and not [*project._lingering('instance')],
                    timeout=60.0, what='the instances to end')
-
-    def retag(self, tags: Mapping[str, str]) -> None:
-        """Change the tags in the descriptions of rules."""
-        for rule in self.served.own_firewalls:
-            rule['description'] = json.dumps({**json.loads(rule['description']), **tags})
 
 
 MEMORIES: Mapping[str, type[Memory]] = {one.name: one for one in (Aws, Azure, Gcp)}

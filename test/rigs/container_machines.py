@@ -42,12 +42,16 @@ def cloud_network(engine: str) -> Iterator[str]:
         yield name
 
 
+def key_in(folder: Path) -> Path:
+    """Return a new private key in a folder."""
+    path = folder / 'id'
+    run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f', str(path))), timeout=60.0)
+    return path
+
+
 @pytest.fixture
 def key(tmp_path: Path) -> Path:
-    path = tmp_path / 'id'
-    run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-f', str(path))),
-                timeout=60.0)
-    return path
+    return key_in(tmp_path)
 
 
 @dataclasses.dataclass
@@ -123,10 +127,26 @@ class Cloud:
             yield machine, shell
 
 
-@pytest.fixture
-def cloud(cloud_network: str, key: Path) -> Iterator[Cloud]:
-    made = Cloud(ContainerProvider(), key, {'network': cloud_network}, [], [])
+@contextlib.contextmanager
+def cloud_in(network: str, key: Path) -> Iterator[Cloud]:
+    """Have machines in a network for the time of the block, and check that nothing is left."""
+    made = Cloud(ContainerProvider(), key, {'network': network}, [], [])
     yield made
     for machine_id in made.ids:
         made.provider.destroy(machine_id)
     wait_until(lambda: not made.traces(), timeout=60.0, what='all traces to be gone')
+
+
+@pytest.fixture
+def cloud(cloud_network: str, key: Path) -> Iterator[Cloud]:
+    with cloud_in(cloud_network, key) as made:
+        yield made
+
+
+@pytest.fixture(scope='module')
+def clouds(
+    cloud_network: str, tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Cloud]:
+    """Return what ``cloud`` returns, for machines that several tests look at."""
+    with cloud_in(cloud_network, key_in(tmp_path_factory.mktemp('clouds'))) as made:
+        yield made

@@ -91,3 +91,19 @@ def test_host_cannot_name_another_host_as_a_machines(host: Host, name: object) -
     host.answers(name)
     with pytest.raises(ProviderError, match="the host '127.0.0.1' reports a machine wrongly"):
         host.create()
+
+
+@pytest.mark.parametrize('report', [
+    {'id': 'podman:data', 'user': ''}, {'id': 'podman:fogros2-volume-a@ssh:x', 'user': ''},
+    {'id': 'podman:fogros2-volume-a\n', 'user': ''}, {'id': 'podman:fogros2-volume-a'}, 7])
+def test_host_reports_its_own_volumes_alone(
+    host: Host, monkeypatch: pytest.MonkeyPatch, report: object,
+) -> None:
+    find = host.provider._find_host
+    monkeypatch.setattr(host.provider, '_find_host', lambda on: find(host.spec.options['on']))
+    host.answers([{'id': 'podman:fogros2-volume-a', 'user': 'x'}])
+    volume, = host.provider.volumes(['lab'])
+    assert (volume.name, volume.region, volume.user) == ('a', 'lab', 'x')
+    host.answers([report])
+    with pytest.raises(ProviderError, match="the host '127.0.0.1' reports a machine wrongly"):
+        list(host.provider.volumes(['lab']))

@@ -275,12 +275,11 @@ def test_no_account_can_connect_to_a_sync() -> None:
     assert (done.stdout, done.returncode, failures) == (b'from the machine\n', 7, [])
 
 
-@FAMILIES
-def test_no_account_takes_up_the_dashboard_s_threads(root: None, address: str) -> None:
+def test_no_account_takes_up_the_dashboard_s_threads(root: None) -> None:
     dashboard = Dashboard(None)  # type: ignore[arg-type]
     threading.Thread(target=dashboard.serve, daemon=True).start()
     before = threading.active_count()
-    with stranger(MANY, str(dashboard.port), address) as child:
+    with stranger(MANY, str(dashboard.port), '127.0.0.1') as child:
         assert child.stdout and child.stdout.readline() == b'150\n'
         assert threading.active_count() == before
         with socket.create_connection(('127.0.0.1', dashboard.port)) as own:
@@ -289,12 +288,11 @@ def test_no_account_takes_up_the_dashboard_s_threads(root: None, address: str) -
     dashboard.close()
 
 
-@FAMILIES
-def test_no_account_starts_programs_through_the_tunnel(root: None, address: str) -> None:
+def test_no_account_starts_programs_through_the_tunnel(root: None) -> None:
     shell = FakeShell(streams=[])
     made = Tunnel(shell, ('127.0.0.1', 9))
     threading.Thread(target=made.serve, daemon=True).start()
-    with stranger(MANY, str(made.port), address) as child:
+    with stranger(MANY, str(made.port), '127.0.0.1') as child:
         assert child.stdout and child.stdout.readline() == b'150\n'
     assert shell.opened == []
     made.close()
@@ -346,26 +344,24 @@ def test_no_account_stands_for_bridge_or_application(
     assert answer.startswith(b'HTTP/1.1 ' + status) and b'of another account' not in answer
 
 
-@FAMILIES
 def test_no_account_takes_up_the_door_for_guests(
-    root: None, address: str, tmp_path: Path,
+    root: None, tmp_path: Path,
 ) -> None:
     (tmp_path / 'guests').write_text('[]')
     door = Door(SimpleNamespace(state=tmp_path / 'guests'),  # type: ignore[arg-type]
                 {'address': '127.0.0.1', 'port': 0, 'agent': __file__})
     threading.Thread(target=door.serve_forever, daemon=True).start()
-    with stranger(MANY, str(door.server_address[1]), address) as child:
+    with stranger(MANY, str(door.server_address[1]), '127.0.0.1') as child:
         assert child.stdout and child.stdout.readline() == b'150\n'
     door.shutdown()
     door.server_close()
 
 
-@FAMILIES
-def test_no_account_gets_the_page_of_a_browser(root: None, address: str) -> None:
+def test_no_account_gets_the_page_of_a_browser(root: None) -> None:
     """Every account can read the ticket on the command line of the browser."""
     with contextlib.closing(Ticket('http://127.0.0.1:9/#token')) as ticket:
         place = urllib.parse.urlsplit(ticket.url)
-        with stranger(ASK, str(place.port), address, place.path) as child:
+        with stranger(ASK, str(place.port), '127.0.0.1', place.path) as child:
             assert child.stdout and child.stdout.readline() == b"b''\n"
         # the ticket is not used up either
         with contextlib.closing(http.client.HTTPConnection(place.netloc, timeout=60)) as own:

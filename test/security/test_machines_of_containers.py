@@ -14,15 +14,15 @@ import threading
 
 import pytest
 
-from fogros2.model import Command
+from fogros2.model import Command, Machine
 from fogros2.process import run
 from fogros2.provider import container
 from fogros2.provider.container import machine as container_machine
 from fogros2.shell.ssh import SSHShell
 from fogros2.waiting import wait_until
-from rigs.container_machines import Cloud, cloud, cloud_network, engine, key
+from rigs.container_machines import Cloud, cloud, cloud_network, clouds, engine, key
 
-__all__ = ['cloud', 'cloud_network', 'engine', 'key']
+__all__ = ['cloud', 'cloud_network', 'clouds', 'engine', 'key']
 
 #: Podman's default network, which publishes ports.
 DEFAULT = 'podman'
@@ -190,54 +190,63 @@ def attack(robot: Robot, shell: SSHShell, network: str, *targets: str) -> str:
          *(f'{host} {robot.port}' for host in hosts), *targets), sudo=True), timeout=90).stdout
 
 
-def test_machine_reaches_no_port_of_the_robot(cloud: Cloud, robot: Robot) -> None:
-    published = 20000 + os.getpid() % 10000  # below the ports that programs get
-    with cloud.machine(options={'network': '', 'ports': [f'{published}:22']}) as (other, _), \
-            cloud.machine(options={'network': ''}) as (_, shell):
-        assert other.shell is not None
-        _, gateway, _ = bridge_of(DEFAULT)
-        said = attack(robot, shell, DEFAULT, f'{other.shell.host} 22', f'{gateway} {published}')
-        assert robot.heard == []
-        # the other machine itself answers, but not at the port that the robot lends it
-        assert said.splitlines() == [
-            f'{state} SOCK_STREAM answered by {other.shell.host} 22'
-            for state in ('plain', 'stolen address', 'stolen link address')]
+@pytest.fixture(scope='module')
+def published() -> int:
+    """Return a port below those that programs get."""
+    return 20000 + os.getpid() % 10000
 
 
-def test_machine_asks_dns_and_pings_the_robot(cloud: Cloud, cloud_network: str) -> None:
-    gateway = bridge_of(cloud_network)[1]
-    with cloud.machine() as (_, shell):
-        shell.run(Command(('ping', '-c1', '-W5', gateway)), timeout=60)
-        assert int(shell.run(Command(('python3', '-c', ASK, gateway)), timeout=60).stdout) > 11
+@pytest.fixture(scope='module')
+def pair(clouds: Cloud, published: int) -> Iterator[tuple[Machine, SSHShell, SSHShell]]:
+    """Return a machine with a published port and its shell, and the shell of another machine."""
+    with clouds.machine(options={'network': '', 'ports': [f'{published}:22']}) as (one, far), \
+            clouds.machine(options={'network': ''}) as (_, shell):
+        yield one, far, shell
 
 
-def test_started_machine_reaches_no_port_either(
+def test_machine_gets_dns_and_no_token_from_a_cloud(
+        pair: tuple[Machine, SSHShell, SSHShell]) -> None:
+    """Another machine has the address of clouds' metadata services, and this computer a route."""
+    service, far, shell = pair
+    assert service.shell is not None
+    far.run(Command(('ip', 'address', 'add', f'{METADATA}/32', 'dev', 'lo'), sudo=True),
+            timeout=60)
+    far.run(Command(('sh', '-c', 'python3 -c "$1" >/dev/null 2>&1 &', 'sh', SERVICE), sudo=True),
+            timeout=60)
+    route = METADATA, 'via', service.shell.host
+    run(Command(('ip', 'route', 'add', *route), sudo=True), timeout=60)
+    try:
+        ask = Command(('python3', '-c', ASK_SERVICE, METADATA))
+        wait_until(lambda: run(ask, timeout=60).stdout.split() == ['80', '53'], timeout=60,
+                   what='the service')
+        assert shell.run(ask, timeout=60).stdout.split() == ['53']
+    finally:
+        run(Command(('ip', 'route', 'del', *route), sudo=True), timeout=60)
+
+
+def test_machine_reaches_no_port_of_the_robot(
+        pair: tuple[Machine, SSHShell, SSHShell], robot: Robot, published: int) -> None:
+    other, _, shell = pair
+    assert other.shell is not None
+    _, gateway, _ = bridge_of(DEFAULT)
+    said = attack(robot, shell, DEFAULT, f'{other.shell.host} 22', f'{gateway} {published}')
+    assert robot.heard == []
+    # the other machine itself answers, but not at the port that the robot lends it
+    assert said.splitlines() == [
+        f'{state} SOCK_STREAM answered by {other.shell.host} 22'
+        for state in ('plain', 'stolen address', 'stolen link address')]
+
+
+def test_started_machine_reaches_dns_and_no_other_port(
         cloud: Cloud, robot: Robot, cloud_network: str) -> None:
     machine = cloud.reached(cloud.create(cloud.spec(on_exit='stop')))
     cloud.provider.stop(machine.id)
     name = container.filter_name(container_machine.directory(machine.id.split(':')[2]))
     assert name not in cloud.traces(), 'the filter stays'
     cloud.provider.start(machine.id)
+    gateway = bridge_of(cloud_network)[1]
     with cloud.shell(cloud.reached(machine.id)) as shell:
+        shell.run(Command(('ping', '-c1', '-W5', gateway)), timeout=60)
+        assert int(shell.run(Command(('python3', '-c', ASK, gateway)), timeout=60).stdout) > 11
         attack(robot, shell, cloud_network)
         assert robot.heard == []
-
-
-def test_machine_gets_dns_and_no_token_from_a_cloud(cloud: Cloud) -> None:
-    """Another machine has the address of clouds' metadata services, and this computer a route."""
-    with cloud.machine(options={'network': ''}) as (service, far), \
-            cloud.machine(options={'network': ''}) as (_, shell):
-        assert service.shell is not None
-        far.run(Command(('ip', 'address', 'add', f'{METADATA}/32', 'dev', 'lo'), sudo=True),
-                timeout=60)
-        far.run(Command(('sh', '-c', 'python3 -c "$1" >/dev/null 2>&1 &', 'sh', SERVICE),
-                        sudo=True), timeout=60)
-        route = METADATA, 'via', service.shell.host
-        run(Command(('ip', 'route', 'add', *route), sudo=True), timeout=60)
-        try:
-            ask = Command(('python3', '-c', ASK_SERVICE, METADATA))
-            wait_until(lambda: run(ask, timeout=60).stdout.split() == ['80', '53'], timeout=60,
-                       what='the service')
-            assert shell.run(ask, timeout=60).stdout.split() == ['53']
-        finally:
-            run(Command(('ip', 'route', 'del', *route), sudo=True), timeout=60)

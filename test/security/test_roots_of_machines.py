@@ -82,52 +82,45 @@ def processes(machine_id: str) -> list[str]:
     return said.split()[1:]
 
 
-@pytest.mark.parametrize('account', [FIRST_ACCOUNT, NOBODY])
-def test_no_account_looks_into_a_machine_s_root(cloud: Cloud, account: int) -> None:
+def test_no_account_looks_into_a_machine_s_root(cloud: Cloud) -> None:
     with cloud.machine() as (machine, shell):
         # the machine's user has a process, as the nodes are
         shell.run(Command(('sh', '-c', 'sleep 600 >/dev/null 2>&1 &')), timeout=60.0)
+        number = int(shell.run(Command(('id', '-u')), timeout=60.0).stdout)
+        assert number in login_ids.IDS
+        with contextlib.suppress(KeyError):
+            pytest.fail(f'{pwd.getpwuid(number)} has it')
         roots = [f'/proc/{pid}/root' for pid in processes(machine.id)]
         top = folder_of(machine.id)
         own = str(top / 'root')
         assert python(LOOK, '0', own, *roots).stdout.splitlines() == [own, *roots]
-        # what the id of the account itself may look into is its own: /proc/PID/root is not
-        assert python(LOOK, str(account), own, *roots).stdout == ''
+        for account in (FIRST_ACCOUNT, NOBODY):
+            # what the id of the account itself may look into is its own: /proc/PID/root is not
+            assert python(LOOK, str(account), own, *roots).stdout == ''
         modes = [stat.S_IMODE(int(said, 16)) for said in process.run(
             Command(('stat', '-c', '%f', str(top), str(top.parent)), sudo=True),
             timeout=60.0).stdout.split()]
         assert modes == [0o700, 0o700]
 
 
-@pytest.mark.parametrize('on_exit', ['delete', 'stop'])
-def test_setuid_file_and_device_of_a_machine_are_none_here(cloud: Cloud, on_exit: str) -> None:
-    with cloud.machine(on_exit=on_exit) as (machine, _):
-        if on_exit == 'stop':
-            # as after a boot, which keeps no mount
-            cloud.provider.stop(machine.id)
-            process.run(Command(('umount', str(folder_of(machine.id))), sudo=True), timeout=60.0,
-                        check=False)
-            cloud.provider.start(machine.id)
-        with cloud.shell(cloud.reached(machine.id)) as shell:
-            shell.run(Command(('sh', '-ec', 'cp -L /usr/bin/id /opt/id; chmod 4755 /opt/id; '
-                               'mknod -m 666 /opt/null c 1 3'), sudo=True), timeout=60.0)
+def test_setuid_file_and_device_of_a_machine_are_none_here(cloud: Cloud) -> None:
+    machine_id = cloud.create(cloud.spec(on_exit='stop'))
+    opt = folder_of(machine_id) / 'root/opt'
+    for name in ('id', 'id2'):
+        with cloud.shell(cloud.reached(machine_id)) as shell:
+            shell.run(Command(('sh', '-ec', f'cp -L /usr/bin/id /opt/{name}; '
+                               f'chmod 4755 /opt/{name}; mknod -m 666 /opt/null{name} c 1 3'),
+                              sudo=True), timeout=60.0)
             # programs of the system get their rights there
             assert shell.run(Command(('sudo', '-n', 'id', '-u')), timeout=60.0).stdout == '0\n'
-        opt = str(folder_of(machine.id) / 'root/opt')
-        assert python(RUN, opt, 'id').stdout == f'{NOBODY}\n'
-        assert 'PermissionError' in python(OPEN, opt, 'null').stderr
-
-
-def test_each_machine_has_a_login_id_of_its_own(cloud: Cloud) -> None:
-    numbers = set()
-    for _ in range(2):
-        with cloud.machine() as (_, shell):
-            numbers.add(int(shell.run(Command(('id', '-u')), timeout=60.0).stdout))
-    assert len(numbers) == 2
-    for number in numbers:
-        assert number in login_ids.IDS
-        with contextlib.suppress(KeyError):
-            pytest.fail(f'{pwd.getpwuid(number)} has it')
+        assert python(RUN, str(opt), name).stdout == f'{NOBODY}\n'
+        assert 'PermissionError' in python(OPEN, str(opt), f'null{name}').stderr
+        if name == 'id':
+            # as after a boot, which keeps no mount
+            cloud.provider.stop(machine_id)
+            process.run(Command(('umount', str(folder_of(machine_id))), sudo=True), timeout=60.0,
+                        check=False)
+            cloud.provider.start(machine_id)
 
 
 def test_login_id_is_in_no_subordinate_range(tmp_path: Path) -> None:
@@ -135,7 +128,9 @@ def test_login_id_is_in_no_subordinate_range(tmp_path: Path) -> None:
     first = login_ids.login_id('token', [])
     path.write_text(f'# a line\nalice:{first - 5}:10\n')
     second = login_ids.login_id('token', [path, tmp_path / 'missing'])
-    assert second != first and second in login_ids.IDS
+    another = login_ids.login_id('another token', [])
+    assert len({first, second, another}) == 3 and all(
+        number in login_ids.IDS for number in (first, second, another))
     path.write_text(f'alice:100000:{2 ** 31}\n')
     with pytest.raises(PrerequisiteError, match='no user id'):
         login_ids.login_id('token', [path])

@@ -23,7 +23,7 @@ from fogros2.deploy.steps.containers import Containers
 from fogros2.describe import values
 from fogros2.describe.machines import ContainerInstance
 from fogros2.errors import ConfigurationError, DdsError, PrerequisiteError, Unsupported
-from fogros2.host import container_scripts, containers, docker_lines
+from fogros2.host import containers, docker_lines
 from fogros2.host.containers import Container, parse
 from fogros2.model import Command, MachineSpec, NodeSpec, Result
 from fogros2.provider import Provider
@@ -50,6 +50,9 @@ from rigs import deploying
      Container('image', ('-p', '3000:3000', '-v', '/a:/b', '-e', 'A=b', '-P', '-w', '/x'))),
     ("docker run -e 'A=b c' --restart always image sh -c 'echo hi'",
      Container('image', ('-e', 'A=b c'), ('sh', '-c', 'echo hi'), restart='always')),
+    # the beginning of a pasted line
+    ('sudo -n -H docker run image', Container('image')),
+    ('docker run \\\n  --rm \\\n  image  # the agent', Container('image')),
 ])
 def test_a_line_is_understood(line, meant):
     assert parse(line) == meant
@@ -100,12 +103,6 @@ def test_what_takes_more_of_a_shell_is_refused(more, named):
     machine = ContainerInstance(name='m')
     with pytest.raises(ConfigurationError, match=named):
         machine.add_docker_container(f'docker run image {more}')
-
-
-@pytest.mark.parametrize('line', ['sudo -E docker run image', 'sudo -n -H docker run image',
-                                  'docker run \\\n  --rm \\\n  image  # the agent'])
-def test_beginning_of_a_pasted_line_is_left_out(line):
-    assert parse(line) == Container('image')
 
 
 @pytest.mark.parametrize(('line', 'named'), [
@@ -581,8 +578,3 @@ def test_a_computer_that_stays_keeps_no_container(monkeypatch, survives, used):
     there._job.undo.close()
     removed = containers.remove('abc') in shell.commands
     assert removed == (survives and used)
-
-
-def test_scripts_are_shell():
-    for script in ('FIND', 'IMAGE', 'RUN', 'FOLLOW', 'NODE', 'INSIDE', 'REMOVE'):
-        subprocess.run(['sh', '-n'], input=getattr(container_scripts, script).encode(), check=True)

@@ -40,13 +40,13 @@ def test_everything_that_a_container_takes(context):
         ros_workspace='/robot/ws', launch_foxglove=True, name='planner',
         on_exit='keep', lifetime='1h30m', robot_timeout=30, bootstrap='none',
         environment={'A': '1'}, image='ros:jazzy',
-        engine='docker', network='net', ip='198.51.100.7', cpus=1.5, memory='2g',
+        engine='docker', network='net', cpus=1.5, memory='2g',
         ports=['8080:80'], mounts=['/a:/b'], user='me',
         gpus='all', devices=['/dev/video0'], containers=True, isolated='true')
     machine.add_docker_container('docker run hello-world')
     spec = machine.spec(context)
     assert spec.options == {
-        'image': 'ros:jazzy', 'engine': 'docker', 'network': 'net', 'ip': '198.51.100.7',
+        'image': 'ros:jazzy', 'engine': 'docker', 'network': 'net',
         'cpus': 1.5, 'memory': '2g', 'ports': ['8080:80'], 'mounts': ['/a:/b'], 'user': 'me',
         'gpus': 'all', 'devices': ['/dev/video0'], 'containers': True, 'isolated': True}
     assert (spec.workspace, spec.on_exit, spec.lifetime) == ('/robot/ws', 'keep', 5400)

@@ -38,12 +38,6 @@ from fogros2.provider.container.options import Options
 REQUEST = CreateRequest('0123-token', 'ssh-ed25519 AAAA me', {'fogros2-name': 'm'}, 51820)
 
 
-def archive() -> bytes:
-    made = io.BytesIO()
-    tarfile.open(fileobj=made, mode='w').close()
-    return made.getvalue()
-
-
 def content(data: bytes) -> dict[str, tarfile.TarInfo]:
     with tarfile.open(fileobj=io.BytesIO(data)) as tar:
         return {member.name: member for member in tar.getmembers()}
@@ -92,21 +86,14 @@ def etc(tmp_path: Path) -> Path:
 def test_settings_hold_what_is_allowed_and_nothing_else(etc):
     archive = container_root.Archive()
     container_root.settings(archive, str(etc))
-    names = {name for name, member in content(archive.data()).items() if not member.isdir()}
-    assert names == {
+    members = content(archive.data())
+    assert {name for name, member in members.items() if not member.isdir()} == {
         'etc/nsswitch.conf', 'etc/ssl/certs/ca.crt', 'etc/skel/.bashrc',
         'etc/apt/sources.list.d/a.list', 'etc/profile.d/ros.sh', 'etc/profile',
         'etc/pam.d/common-password', 'etc/localtime',
     }
-
-
-def test_settings_keep_links_and_programs(etc):
-    archive = container_root.Archive()
-    container_root.settings(archive, str(etc))
-    found = content(archive.data())
-    assert found['etc/localtime'].linkname == '/usr/share/zoneinfo/UTC'
-    assert found['etc/profile'].mode == 0o755
-    assert found['etc/nsswitch.conf'].mode == 0o644
+    assert members['etc/localtime'].linkname == '/usr/share/zoneinfo/UTC'
+    assert (members['etc/profile'].mode, members['etc/nsswitch.conf'].mode) == (0o755, 0o644)
 
 
 def test_large_folder_is_mounted_only_if_all_of_it_is_public(etc):
@@ -155,12 +142,6 @@ def test_the_skeleton_of_this_computer_holds_no_home_and_no_key():
     assert found['tmp'].mode == 0o1777
 
 
-def test_system_mounts_are_system_folders():
-    allowed = ('/usr', '/bin', '/sbin', '/lib', '/var/lib/dpkg', '/etc/')
-    assert '/usr' in container_root.system_mounts()
-    assert all(mount.startswith(allowed) for mount in container_root.system_mounts())
-
-
 def test_outermost_folders_are_mounted_once():
     assert container_root.outermost(
         ['/a/b/c', '/a/b', '/a/bc', '/usr/lib/x', '/lib/y', '/', '/a/b/']) == ['/a/b', '/a/bc']
@@ -204,18 +185,9 @@ def test_a_root_that_can_t_be_overlaid_is_refused(monkeypatch):
 
 @pytest.mark.parametrize('given, words', [
     ({'imag': 'x'}, "no option 'imag' .*did you mean 'image'"),
-    ({'colour': 'x'}, 'there are: image, engine'),
     ({'engine': 'lxc'}, "no container engine 'lxc'"),
     ({'engine': 'docker'}, "can't use this computer's own root"),
-    ({'cpus': 'two'}, 'takes a number above 0'),
-    ({'cpus': 0}, 'takes a number above 0'),
-    ({'memory': True}, 'takes a string'),
-    ({'ports': '80:80'}, 'takes a list of strings'),
-    ({'env': ['A=b']}, 'takes names and strings'),
-    ({'env': {'A B': 'c'}}, "can't carry the variable 'A B'"),
-    ({'env': {'A': 'c\nPermitRootLogin yes'}}, "can't carry the variable"),
     ({'user': 'Me; rm'}, "can't be a user name"),
-    ({'ip': '198.51.100.7'}, "give network='...' too"),
     ({'mounts': ['relative']}, "it takes '/path'"),
     ({'mounts': ['/a/../b']}, "it takes '/path'"),
     ({'mounts': ['/no/such/folder']}, "doesn't exist"),
@@ -223,9 +195,7 @@ def test_a_root_that_can_t_be_overlaid_is_refused(monkeypatch):
     ({'memory': 'lots'}, "'lots' is no amount of memory .memory= takes '2g'"),
     ({'ports': ['80:http']}, "ports= can't hold '80:http' .it takes '8080:80'"),
     ({'ports': ['99999:80']}, "ports= can't hold '99999:80'"),
-    ({'ip': 'here', 'network': 'n'}, "'here' is no IPv4 address .ip= takes"),
     ({'devices': ['/dev/no-such']}, "no device '/dev/no-such'"),
-    ({'network': '-x'}, "option 'network' can't be '-x'"),
 ])
 def test_options_that_make_no_sense_are_refused(given, words):
     with pytest.raises(ConfigurationError, match=words):
@@ -235,13 +205,12 @@ def test_options_that_make_no_sense_are_refused(given, words):
 def test_options_are_taken_as_they_are_meant(tmp_path):
     options = Options.parse({
         'image': 'ros:jazzy', 'cpus': 2, 'memory': '1g', 'ports': ['80:80'], 'gpus': 'all',
-        'mounts': [str(tmp_path)], 'env': {'A': 'b'}, 'network': 'n', 'ip': '198.51.100.7',
-        'devices': None,
+        'mounts': [str(tmp_path)], 'network': 'n', 'devices': None,
     })
     words = list(container_options.common_flags(
         Engine('docker'), MachineSpec('m', 'container', on_exit='stop'), REQUEST, options))
     for pair in (('--cpus', '2'), ('--memory', '1g'), ('-p', '80:80'), ('--gpus', 'all'),
-                 ('--network', 'n'), ('--ip', '198.51.100.7'), ('--hostname', 'm'),
+                 ('--network', 'n'), ('--hostname', 'm'),
                  ('--name', 'fogros2-m'), ('--device', '/dev/net/tun'),
                  ('--label', 'fogros2-name=m'),
                  ('--cap-add', 'NET_ADMIN')):
@@ -346,14 +315,9 @@ def test_other_flags_are_tried_where_control_groups_mislead(monkeypatch):
     assert next(container_engine.candidates(guess)) == worked
     assert container_engine.named('podman') == worked
     assert list(container_engine.candidates(Engine('docker'))) == [Engine('docker')]
-
-
-@pytest.mark.parametrize('message, trouble', [
-    ('Error: crun: invalid file system type on `/sys/fs/cgroup`: OCI runtime error', True),
-    ('Error: the container name "x" is already in use', False),
-])
-def test_runtime_errors_are_recognised(message, trouble):
-    assert container_engine.is_runtime_trouble(ProviderError(message)) is trouble
+    assert container_engine.is_runtime_trouble(ProviderError(
+        'crun: invalid file system type on `/sys/fs/cgroup`: OCI runtime error'))
+    assert not container_engine.is_runtime_trouble(ProviderError('the name is already in use'))
 
 
 def test_limits_never_ask_for_more_than_there_is():
@@ -371,27 +335,13 @@ def test_options_of_the_engine_are_passed_on(options):
     Options.parse(options)
 
 
-@pytest.mark.parametrize('said', [
-    '[{"name": "n", "subnets": [{"subnet": "198.51.100.0/28", "gateway": "198.51.100.1"},'
-    ' {"subnet": "fd00::/64"}]}]',
-    '[{"Name": "n", "IPAM": {"Config": [{"Subnet": "198.51.100.0/28"}]}}]'])
-def test_address_outside_of_the_network_is_refused(monkeypatch, said):
-    monkeypatch.setattr(Engine, 'call', lambda self, *words, **more: Result(0, said, ''))
-    engine = Engine('podman')
-    container_options.check_network(engine, Options(network='n', ip='198.51.100.7'))
-    with pytest.raises(ConfigurationError, match='10.0.0.7 is no.*are in 198.51.100.0/28'):
-        container_options.check_network(engine, Options(network='n', ip='10.0.0.7'))
-    monkeypatch.setattr(Engine, 'call', lambda self, *words, **more: Result(125, '', 'no such'))
-    with pytest.raises(ConfigurationError, match="no network 'n'.*network ls"):
-        container_options.check_network(engine, Options(network='n', ip='198.51.100.7'))
-
-
 @pytest.mark.parametrize('stderr, hint', [
     ('Error: mounting overlay failed: invalid argument', 'image='),
     ('Error: write /x: no space left on device', 'disk is full'),
     ('sudo: a password is required', 'sudo -v'),
     ('Error: stat /dev/net/tun: no such file or directory', 'modprobe tun'),
-    ('Error: IPAM error: ip address 198.51.100.7 is already allocated', 'choose another'),
+    ('Error: port 8080 is already allocated', 'choose another'),
+    ('the packet filter takes no rules for bridges', 'nf_tables'),
 ])
 def test_an_engine_s_failure_has_a_remedy(stderr, hint):
     error = container_engine.translate(CommandError(
@@ -421,31 +371,11 @@ def entry_files(**changes) -> bytes:
     archive = container_root.Archive()
     container_entry.add(archive, **{
         'user': 'fog', 'number': 2013265999, 'authorized_key': 'ssh-ed25519 AAAA me',
-        'environment': {'A': 'b c'},
         'agent_config': {'machine': 'm', 'end_command': []}, **changes})
     return archive.data()
 
 
-def test_the_first_process_is_a_shell_script(tmp_path):
-    for config in ({}, {'machine': 'm'}):
-        script = tmp_path / 'entry.sh'
-        script.write_text(text(entry_files(agent_config=config), 'opt/fogros2/entry.sh'))
-        subprocess.run(['sh', '-n', str(script)], check=True)
-
-
-def test_an_engine_inside_is_told_what_it_can_not_do(tmp_path):
-    data = entry_files(nested=True)
-    settings = text(data, 'etc/containers/containers.conf.d/fogros2.conf')
-    assert 'cgroups = "disabled"' in settings and 'runtime = "crun"' in settings
-    script = tmp_path / 'entry.sh'
-    script.write_text(text(data, 'opt/fogros2/entry.sh'))
-    subprocess.run(['sh', '-n', str(script)], check=True)
-    assert '/proc/sys/net' in script.read_text()
-    assert 'containers' not in text(entry_files(), 'opt/fogros2/entry.sh')
-    assert not any(name.startswith('etc/containers') for name in content(entry_files()))
-
-
-def test_the_agent_gets_its_configuration_alone():
+def test_first_process_gets_key_and_agent():
     data = entry_files()
     config = json.loads(text(data, 'opt/fogros2/agent.json'))
     assert config['end_command'] == ['kill', '-TERM', '1']
@@ -454,16 +384,11 @@ def test_the_agent_gets_its_configuration_alone():
     assert stat.S_IMODE(found['opt/fogros2/agent.json'].mode) == 0o600
     assert 'opt/fogros2/agent.py' in found
     assert 'agent.py' not in text(entry_files(agent_config={}), 'opt/fogros2/entry.sh')
-
-
-def test_the_ssh_server_takes_our_key_alone():
-    data = entry_files()
-    config = text(data, 'opt/fogros2/sshd_config').splitlines()
-    for line in ('PasswordAuthentication no', 'KbdInteractiveAuthentication no', 'AllowUsers fog',
-                 'PermitRootLogin no', 'PrintMotd no', 'UseDNS no'):
-        assert line in config
-    assert any(line.startswith('SetEnv') and '"A=b c"' in line for line in config)
+    settings = text(data, 'opt/fogros2/sshd_config').splitlines()
+    assert {'PasswordAuthentication no', 'KbdInteractiveAuthentication no', 'AllowUsers fog',
+            'PermitRootLogin no'} <= set(settings)
     assert text(data, 'opt/fogros2/authorized_keys') == 'ssh-ed25519 AAAA me\n'
+    assert not any(name.startswith('etc/containers') for name in found)
 
 
 def test_host_key_cannot_redirect_the_robot(tmp_path, monkeypatch):
@@ -486,15 +411,6 @@ def test_host_key_cannot_redirect_the_robot(tmp_path, monkeypatch):
     assert provider._host_key(engine, entry) is None
     path.write_text('ssh-ed25519 AAAA+/= fogros2\n')
     assert provider._host_key(engine, entry) == 'ssh-ed25519 AAAA+/='
-
-
-@pytest.mark.parametrize('image', ['docker.io/library/ros:jazzy', ''])
-def test_machine_has_the_image_of_its_container(image):
-    entry = {'Id': 'c' * 64, 'Created': '2026-01-01T00:00:00Z', 'State': {'Status': 'running'},
-             'NetworkSettings': {'Networks': {}}, 'Config': {'Image': image, 'Labels': {
-                 container_machine.ATTEMPT: 'token', container_machine.MACHINE: 'planner'}}}
-    made = container_machine.machine_of(container_engine.named('podman'), entry, None)
-    assert (made.name, made.image, made.key, made.disk_gb) == ('planner', image, '', None)
 
 
 def test_a_download_of_an_image_can_be_cancelled(monkeypatch):
@@ -528,12 +444,6 @@ def test_docker_machine_gets_its_packet_filter_at_once(monkeypatch):
     name = container_machine.directory('0123-token').name
     assert commands[-1].argv[-1] == f'fogros2-{name}' and commands[-1].sudo
     assert json.loads(commands[-1].input) == {'pid': 77}
-
-
-def test_failing_packet_filter_has_a_remedy():
-    error = container_engine.translate(CommandError(Command(('podman',)), Result(
-        126, '', 'the packet filter takes no rules for bridges'), 'here'))
-    assert 'nf_tables' in error.hint
 
 
 def test_isolated_machine_sees_nothing_of_this_computers_system(tmp_path):

@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 
 from fogros2.errors import ConfigurationError
-from fogros2.provider.options import convert, known
+from fogros2.provider.options import convert
 
 
 @pytest.mark.parametrize(('value', 'default', 'result'), [
@@ -28,9 +28,3 @@ def test_a_value_comes_in_the_kind_of_its_default(value, default, result):
 def test_another_kind_is_refused_by_name(value, default, expected):
     with pytest.raises(ConfigurationError, match=f"'x' can't be .*{expected}"):
         convert('x', value, default)
-
-
-def test_options_left_open_are_left_out_and_unknown_ones_named():
-    assert known({'size': None, 'disk': 3}, ['size', 'disk'], 'a machine') == {'disk': 3}
-    with pytest.raises(ConfigurationError, match="'sise'.*did you mean 'size'"):
-        known({'sise': 1}, ['size', 'disk'], 'a machine')

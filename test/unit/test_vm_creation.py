@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The order in which a creation asks for capacity."""
+"""The order in which a creation asks for capacity, and what an attempt leaves."""
 
 from __future__ import annotations
 
+import logging
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from fogros2.model import CreateRequest, MachineSpec
-from fogros2.provider.vm.cloud import CloudError, Place
+from fogros2.provider import TAG_NAME, TAG_ROBOT
+from fogros2.provider.vm.cloud import CloudError, Place, TAG_ATTEMPT, TAG_MADE, VmCloud
 from fogros2.provider.vm.creation import Creation
 from fogros2.provider.vm.options import VmOptions
 
@@ -38,3 +40,22 @@ def test_full_zone_is_tried_once_for_each_type() -> None:
     with pytest.raises(CloudError, match='full'):
         creation.run(['north'])
     assert tried == [(kind, zone) for kind in ('small', 'large', 'huge') for zone in ('a', 'b')]
+
+
+def test_leftovers_are_old_or_of_dead_launches(caplog: pytest.LogCaptureFixture) -> None:
+    now = 1e9
+    made = {'old': '0', 'no time': None, 'new': '999999950', 'dead': '999999950',
+            'of another robot': '0', 'with a machine': '0', 'damaged': 'nan', 'dead, damaged': '-'}
+    tags = [{TAG_ATTEMPT: attempt, TAG_NAME: f'{attempt} one', **({} if at is None else {
+        TAG_MADE: at})} for attempt, at in made.items()]
+    next(one for one in tags if one[TAG_ATTEMPT] == 'of another robot')[TAG_ROBOT] = (
+        'neighbour-0-00000000')
+    adapter: Any = SimpleNamespace(
+        title='Meadow', attempts=lambda region: ['with a machine'],
+        remains=lambda region: [*tags, {TAG_MADE: '0'}])
+    with caplog.at_level(logging.WARNING):
+        names = VmCloud.leftovers(adapter, 'north', now, {'dead', 'dead, damaged'})
+    assert names == {attempt: f'{attempt} one' for attempt in (
+        'old', 'no time', 'dead', 'dead, damaged')}
+    (record,) = caplog.records
+    assert "'damaged one' has the damaged tag fogros2-made='nan'" in record.message

@@ -54,7 +54,6 @@ def test_wrong_volumes_are_refused(given: dict[str, str], error: str) -> None:
 
 
 @pytest.mark.parametrize(('provider', 'more', 'error'), [
-    ('hosted', {}, "provider 'hosted' has no volumes"),
     ('joined', {}, "provider 'joined' has no volumes"),
     ('ssh', {'workspace': '/data/ws'}, 'would hide the workspace'),
     ('aws', {'wanted': {'region': 'nearest'}}, 'may be at another cloud'),

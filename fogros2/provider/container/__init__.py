@@ -17,7 +17,6 @@ import contextlib
 import json
 import os
 from pathlib import Path
-import stat
 import tempfile
 from typing import Any, ClassVar, Optional
 
@@ -122,9 +121,6 @@ printf '%s\\n' "$@" >"$top/topics"
 
 _UNSHARE = 'rm -rf "$1"; rmdir "${1%/*}" "${1%/*/*}" 2>/dev/null'
 
-#: Maximum size of a host key's file in bytes.
-_KEY_BYTES = 4096
-_READ_PLAIN = f'[ -f "$1" ] && [ ! -L "$1" ] && head -c {_KEY_BYTES} -- "$1"'
 #: Maximum size of the part of a machine's log that is read, in bytes.
 _LOG_BYTES = 1 << 20
 _READ_LOG = f'"$@" 2>/dev/null | head -c {_LOG_BYTES}'
@@ -184,7 +180,6 @@ class ContainerProvider(Provider):
             raise PrerequisiteError(
                 f'{engine.name} needs root on this computer, and {trouble[0]}', trouble[1])
         container_engine.answers(engine)
-        container_options.check_network(engine, options)
         if options.image:
             container_engine.check_architecture(engine, options.image)
         else:
@@ -228,7 +223,7 @@ class ContainerProvider(Provider):
         engine = next(ways)
         create = self._create_from_image if options.image else self._create_from_root
         for name in request.with_volumes:
-            _check_free(engine, name, spec.name)
+            _check_free(engine, name, container_machine.container_name(spec.name, request.tags))
         with _sharing(spec, request.token):
             while True:
                 try:
@@ -424,8 +419,10 @@ class ContainerProvider(Provider):
     def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
         """Return nothing: the engine has mounted the volume, whose size has no limit."""
         engine, _, report = _inspected(machine_id)
-        machine = container_machine.labels_of(report)[container_machine.MACHINE]
-        _check_free(engine, name, machine)  # of two launches at once, each may have created one
+        labels = container_machine.labels_of(report)
+        machine = labels[container_machine.MACHINE]
+        # of two launches at once, each may have created one
+        _check_free(engine, name, container_machine.container_name(machine, labels))
         if not _users_of(engine, container_machine.volume_name(name)):
             raise made_without(machine, name)
         return Attached()
@@ -454,12 +451,11 @@ class ContainerProvider(Provider):
                         sudo=engine.sudo, what='reading the host key'),
                 timeout=60.0, check=False).stdout
             text = _after(log, container_entry.HOST_KEY_MARK)
-        elif os.geteuid() == 0:
-            text = read_plain(path)
         else:
-            text = process.run(
-                Command(('sh', '-c', _READ_PLAIN, 'sh', str(path)), sudo=True), timeout=10.0,
-                check=False).stdout
+            # the machine can replace the file by a link to a file of this computer, or by a pipe
+            text = process.run(Command(
+                ('dd', f'if={path}', 'iflag=nofollow,nonblock', 'bs=4096', 'count=1'), sudo=True),
+                timeout=10.0, check=False).stdout
         key = ' '.join(text.split()[:2])
         if not untrusted.HOST_KEY.fullmatch(key):
             return None
@@ -490,14 +486,14 @@ def _users_of(engine: Engine, volume: str) -> list[str]:
     return [name.removeprefix(container_machine.container_name('')) for name in names]
 
 
-def _check_free(engine: Engine, name: str, machine: str = '') -> None:
+def _check_free(engine: Engine, name: str, container: str = '') -> None:
     """
-    Check that no other machine has a volume.
+    Check that no other container has a volume.
 
     :raises NameTaken: one has.
     """
     for user in _users_of(engine, container_machine.volume_name(name)):
-        if user != machine:
+        if container_machine.container_name(user) != container:
             raise NameTaken(f"the machine '{user}' has the volume '{name}'",
                             f'end its launch, or: ros2 fog delete {user}')
 
@@ -555,25 +551,9 @@ def _entry(
     archive = Archive()
     container_entry.add(
         archive, user=options.user, number=number, authorized_key=request.authorized_key,
-        environment=options.env, agent_config=request.agent_config,
+        agent_config=request.agent_config,
         nested=container_options.runs_containers(spec, options))
     return archive
-
-
-def read_plain(path: Path) -> str:
-    """
-    Return the first bytes of a file in a machine's root, '' if there is no such file.
-
-    The machine can replace the file by a link to a file of this computer, or by a pipe.
-    """
-    try:
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError:
-        return ''
-    with os.fdopen(handle, 'rb') as file:
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
-            return ''
-        return file.read(_KEY_BYTES).decode(errors='replace')
 
 
 def _after(log: str, mark: str) -> str:

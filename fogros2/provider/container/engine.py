@@ -34,7 +34,7 @@ _HINTS = {
     'exec format error': f'the image has to be for {os.uname().machine} processors',
     'rlimit|cgroup': 'see `ros2 fog doctor`',
     '/dev/net/tun': 'sudo modprobe tun',
-    'address already|already allocated': 'that address or port is taken: choose another',
+    'address already|already allocated': 'that port is taken: choose another',
     'no such network|network.*not found|not found.*network':
         'podman network ls (or docker network ls) shows those there are',
 }

@@ -141,13 +141,13 @@ PidFile none
 LogLevel ERROR
 AcceptEnv LANG LC_*
 Subsystem sftp internal-sftp
-SetEnv {environment}
+SetEnv LANG=C.UTF-8 PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
 """
 
 
 def add(
     archive: Archive, *, user: str, number: int, authorized_key: str,
-    environment: Mapping[str, str], agent_config: Mapping[str, Any], nested: bool = False,
+    agent_config: Mapping[str, Any], nested: bool = False,
 ) -> None:
     """
     Add the script of the first process, and the files that it needs, to a machine's root.
@@ -168,13 +168,7 @@ def add(
     archive.folder(FOLDER)
     archive.file(f'{FOLDER}/entry.sh', _ENTRY.format(
         agent=start_agent, nested=_NESTED if nested else '', **names).encode(), 0o755)
-    variables = {
-        'LANG': 'C.UTF-8',
-        'PATH': '/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin',
-        **environment,
-    }
-    words = ' '.join(f'"{name}={value}"' for name, value in variables.items())
-    archive.file(f'{FOLDER}/sshd_config', _SSHD.format(environment=words, **names).encode())
+    archive.file(f'{FOLDER}/sshd_config', _SSHD.format(**names).encode())
     archive.file(f'{FOLDER}/authorized_keys', f'{authorized_key.strip()}\n'.encode())
     if agent_config:
         config = {'user': user, **agent_config}

@@ -9,19 +9,28 @@ robot reaches the container at ports that the engine publishes on the host.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
 import functools
 import gzip
 import hashlib
 from pathlib import Path
+import re
 from typing import Any, ClassVar, Optional, TypedDict
 
 from fogros2 import errors, model, plugin_system, untrusted
 from fogros2.errors import FogError, MachineNotFound, ProviderError, Unsupported
-from fogros2.model import Command, CreateRequest, Endpoint, Machine, MachineSpec, MachineState
-from fogros2.provider import Capabilities, Provider, TAG_NAME
+from fogros2.model import (
+    Command,
+    CreateRequest,
+    Endpoint,
+    Machine,
+    MachineSpec,
+    MachineState,
+    Volume,
+)
+from fogros2.provider import Attached, Capabilities, Provider, TAG_NAME
 from fogros2.provider.container import ContainerProvider
 from fogros2.provider.container.entry import END_COMMAND
 from fogros2.provider.container.machine import HOSTED, ID
@@ -33,6 +42,8 @@ from fogros2.shell.command_line import checked
 from fogros2.store import robot_id, Store
 
 _SCHEME = 'hosted:'
+#: The container provider's id of a volume, which ends with its name.
+_VOLUME = re.compile('(?:podman|docker):fogros2-volume-([a-z0-9-]+)')
 #: Seconds for one call on the host; a creation may download an image.
 _TIMEOUT, _CREATE_TIMEOUT = 90.0, 1900.0
 #: Errors of the host that stay what they are; all others are a ProviderError.
@@ -83,6 +94,11 @@ class _Machine(TypedDict):
     tags: dict[str, str]
 
 
+class _Volume(TypedDict):
+    id: str
+    user: str
+
+
 @functools.lru_cache(maxsize=1)
 def program() -> tuple[bytes, str]:
     """Return the archive of the modules that a host runs, and its hash."""
@@ -119,7 +135,7 @@ class HostedProvider(Provider):
 
     name: ClassVar[str] = 'hosted'
     capabilities: ClassVar[Capabilities] = dataclasses.replace(
-        ContainerProvider.capabilities, keeps_volumes=False, ports=False)
+        ContainerProvider.capabilities, ports=False)
 
     def __init__(self) -> None:
         self._ssh: Provider = plugin_system.load('fogros2.provider', 'ssh')()
@@ -294,6 +310,28 @@ class HostedProvider(Provider):
     def start(self, machine_id: str) -> None:
         """Start a stopped container again."""
         self._call_of(machine_id, 'start')
+
+    def volumes(self, hosts: Sequence[str] = ()) -> Iterator[Volume]:
+        """Yield the volumes of the engines on these computers, which nobody else lists."""
+        for name in hosts:
+            host = self._find_host({'host': name})
+            with self._reading(host):
+                reports = self._call(host, 'volumes')
+                untrusted.checked(reports, list[_Volume])
+                for report in reports:
+                    identity = untrusted.matched(_VOLUME, report['id'])
+                    yield Volume(f'{_SCHEME}{identity}@{host}', _VOLUME.sub(r'\1', identity),
+                                 self.name, name, user=report['user'])
+
+    def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
+        """Return nothing: the engine on the host has mounted the volume."""
+        host, identity = _parse(machine_id)
+        self._call(host, 'attach', id=identity, name=name, size_gb=size_gb)
+        return Attached()
+
+    def delete_volume(self, volume_id: str) -> None:
+        """Remove a volume from its host."""
+        self._call_of(volume_id, 'delete_volume')
 
 
 def _parse(machine_id: str) -> tuple[str, str]:

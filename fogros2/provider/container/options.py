@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 import dataclasses
-import ipaddress
-import json
 import os
 from pathlib import Path
 import re
@@ -45,14 +43,12 @@ class Options:
     :param engine: auto, podman or docker.
     :param user: login user, created with sudo rights and no password.
     :param network: a network of the engine; '' for its default.
-    :param ip: fixed address in that network.
     :param cpus: number of CPUs, such as 1.5.
     :param memory: such as '2g'.
     :param gpus: 'all' or a number, as in ``docker run --gpus``.
     :param devices: such as '/dev/video0'.
     :param ports: such as '8080:80' or '8080:80/udp'.
     :param mounts: read-only folders: 'path' or 'path:path on the machine'.
-    :param env: environment variables of every login.
     :param containers: whether the machine may run containers.
     :param isolated: whether the machine gets the root of a new system instead of this computer's.
     """
@@ -61,14 +57,12 @@ class Options:
     engine: str = 'auto'
     user: str = 'fog'
     network: str = ''
-    ip: str = ''
     cpus: float = 0.0
     memory: str = ''
     gpus: str = ''
     devices: tuple[str, ...] = ()
     ports: tuple[str, ...] = ()
     mounts: tuple[str, ...] = ()
-    env: Mapping[str, str] = dataclasses.field(default_factory=dict)
     containers: bool = False
     isolated: bool = False
 
@@ -95,7 +89,7 @@ def _check_values(options: Options) -> None:
         raise ConfigurationError(
             f"'{options.user}' can't be a user name",
             'user= takes small letters, digits, - and _, beginning with a letter')
-    for name in ('image', 'network', 'ip', 'memory', 'gpus'):
+    for name in ('image', 'network', 'memory', 'gpus'):
         word = getattr(options, name)
         # The engine would parse it as an option.
         if word.startswith('-') or any(c.isspace() for c in word):
@@ -105,18 +99,12 @@ def _check_values(options: Options) -> None:
                                            options.memory):
         raise ConfigurationError(f"'{options.memory}' is no amount of memory",
                                  "memory= takes '2g' or '512m'")
-    if options.ip:
-        _check_address(options)
     for port in options.ports:
         _check_port(port)
     for device in options.devices:
         if not os.path.exists(device.split(':')[0]):
             raise ConfigurationError(f"there is no device '{device.split(':')[0]}' here",
                                      "devices= takes such as '/dev/video0'")
-    for name, value in options.env.items():
-        if not re.fullmatch(r'[A-Za-z_][A-Za-z0-9_]*', name) or '"' in value or '\n' in value:
-            raise ConfigurationError(f"env= can't carry the variable {name!r}",
-                                     'a name has letters, digits and _, a value one line')
     for mount in options.mounts:
         source = mount.split(':')[0]
         if mount.count(':') > 1 or not os.path.isabs(source) or '/..' in mount:
@@ -125,16 +113,6 @@ def _check_values(options: Options) -> None:
         if not os.path.exists(source):
             raise ConfigurationError(f"'{source}' of mounts= doesn't exist",
                                      'make it, or correct the path: it is one on this computer')
-
-
-def _check_address(options: Options) -> None:
-    try:
-        ipaddress.IPv4Address(options.ip)
-    except ValueError:
-        raise ConfigurationError(f"'{options.ip}' is no IPv4 address",
-                                 "ip= takes such as '10.89.0.7'") from None
-    if not options.network:
-        raise ConfigurationError('ip= fixes an address in a network', "give network='...' too")
 
 
 def _check_port(port: str) -> None:
@@ -146,39 +124,6 @@ def _check_port(port: str) -> None:
     if not numbers or not all(0 < number < 65536 for number in numbers):
         raise ConfigurationError(f"ports= can't hold '{port}'",
                                  "it takes '8080:80' or '8080:80/udp', numbers from 1 to 65535")
-
-
-def check_network(engine: Engine, options: Options) -> None:
-    """
-    Check that the network of a fixed address exists, and contains the address.
-
-    :raises ConfigurationError: it does not.
-    """
-    if not options.ip:
-        return
-    result = engine.call('network', 'inspect', options.network, what='looking at the network',
-                         check=False)
-    if result.returncode != 0:
-        raise ConfigurationError(f"{engine.name} has no network '{options.network}'",
-                                 f'{engine.name} network ls shows those there are')
-    subnets = network_subnets(result.stdout)
-    if subnets and not any(ipaddress.ip_address(options.ip) in subnet for subnet in subnets):
-        raise ConfigurationError(
-            f"{options.ip} is no address of the network '{options.network}'",
-            f"its addresses are in {', '.join(map(str, subnets))}")
-
-
-def network_subnets(output: str) -> list[ipaddress.IPv4Network]:
-    """Return the IPv4 subnets in the report of podman or docker about a network."""
-    subnets = []
-    for network in json.loads(output):
-        parts = [*(network.get('subnets') or ()), *(
-            (network.get('IPAM') or {}).get('Config') or ())]
-        for part in parts:
-            text = str(part.get('subnet') or part.get('Subnet') or '')
-            if '.' in text:
-                subnets.append(ipaddress.IPv4Network(text, strict=False))
-    return subnets
 
 
 def common_flags(
@@ -204,8 +149,6 @@ def common_flags(
     yield from container_engine.limits()
     if options.network:
         yield from ('--network', options.network)
-    if options.ip:
-        yield from ('--ip', options.ip)
     if options.cpus:
         yield from ('--cpus', f'{options.cpus:g}')
     if options.memory:

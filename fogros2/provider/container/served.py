@@ -30,9 +30,8 @@ def answer(provider: ContainerProvider, call: str, arguments: Mapping[str, Any])
         spec = MachineSpec(**arguments['spec'])
         provider.check(spec)
         return provider.create(spec, CreateRequest(**arguments['request']))
-    if call == 'find':
-        return list(provider.find(arguments['tags']))
-    return getattr(provider, call)(arguments['id'])
+    result = getattr(provider, call)(*arguments.values())
+    return list(result) if call in ('find', 'volumes') else result
 
 
 def main() -> None:
