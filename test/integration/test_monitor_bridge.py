@@ -26,7 +26,6 @@ from geometry_msgs.msg import Twist
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 import numpy
-from rcl_interfaces.msg import ParameterDescriptor
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -199,14 +198,10 @@ def test_topic_is_subscribed_to_while_a_viewer_shows_it(bench):
     first.wish(unsubscribe='/words')
     second.close()
     bench.listeners('/words', 0)
-
-
-def test_topics_come_and_go(bench):
-    viewer = bench.viewer()
     publisher = bench.node.create_publisher(String, '/late', 10)
-    viewer.until('channel', '/late')
+    first.until('channel', '/late')
     bench.node.destroy_publisher(publisher)
-    viewer.until('gone', '/late')
+    first.until('gone', '/late')
 
 
 def test_late_viewer_gets_latched_messages(bench):
@@ -235,7 +230,7 @@ def test_early_viewer_gets_later_latched_messages(bench):
         other.try_shutdown()
 
 
-def test_viewers_publish(bench):
+def test_viewers_publish_what_is_possible(bench):
     heard: list[Any] = []
     bench.node.create_subscription(Twist, '/cmd_vel', heard.append, 10)
     viewer = bench.viewer()
@@ -252,10 +247,7 @@ def test_viewers_publish(bench):
 
     bench.until(publish, 'what a viewer published')
     assert (heard[0].linear.x, heard[0].angular.z) == (0.25, -1.0)
-
-
-def test_message_that_cannot_be_published_is_reported(bench):
-    viewer = bench.viewer()
+    # what cannot be published is reported
     viewer.wish(publish='/x', schemaName='no_such_msgs/msg/Thing', definition='string data',
                 message={'data': ''})
     assert 'no_such_msgs' in viewer.until('status')['status']
@@ -309,15 +301,16 @@ def memory(process: subprocess.Popen[str]) -> float:
     return int(re.search(r'VmRSS:\s+(\d+)', status)[1]) / 1000
 
 
-@pytest.mark.parametrize('seconds', [8.0, pytest.param(30.0, marks=pytest.mark.soak)])
-def test_twenty_viewers_do_not_slow_down_the_robot(
-        bench, seconds, tmp_path):
+@pytest.mark.parametrize('viewers, seconds', [
+    (6, 6.0), pytest.param(20, 30.0, marks=pytest.mark.soak)])
+def test_many_viewers_do_not_slow_down_the_robot(bench, viewers, seconds, tmp_path):
     token = tmp_path / 'token'
     token.write_text('sesame\n')
     gate, url = bench.gate(token)
     publishing = Publishing(bench)
     try:
-        crowd = bench.run_node('crowd.mjs', f'{url}?token=sesame', '20', '/small', '/big')
+        crowd = bench.run_node('crowd.mjs', f'{url}?token=sesame', str(viewers), '/small',
+                               '/big')
         assert crowd.stdout.readline() == 'ready\n'
         # what is kept for the one that doesn't read is full by then
         publishing.undisturbed(seconds / 2)
@@ -330,7 +323,7 @@ def test_twenty_viewers_do_not_slow_down_the_robot(
     assert max(after[0] - before[0], after[1] - before[1]) < 30
     assert max(after) < 150
     assert got[0] < min(got[1:])
-    # the other nineteen have all but what was on its way, and a busy computer drops some
+    # the others have all but what was on its way, and a busy computer drops some
     assert min(got[1:]) > 0.5 * seconds * RATE
 
 
@@ -395,7 +388,6 @@ class Robot:
         bench.node.create_service(Trigger, '/stop', self._stop)
         bench.node.declare_parameter('speed', 0.5)
         bench.node.declare_parameter('names', ['a', 'b'])
-        bench.node.declare_parameter('fixed', 1, ParameterDescriptor(read_only=True))
         self._context = Context()
         rclpy.init(context=self._context, domain_id=int(os.environ['ROS_DOMAIN_ID']))
         self.silent = Node('silent', context=self._context)
@@ -486,16 +478,6 @@ def test_viewer_with_the_token_uses_all_of_a_robot(robot, bench, tmp_path):
         assert told['status'] == 1 and told['error']
 
 
-def test_values_that_a_node_refuses_are_reported(robot, bench):
-    viewer = bench.viewer()
-    assert parameters(bench, viewer, '/bench.speed') == {'/bench.speed': 0.5}
-    for name, value, why in (
-            ('fixed', 2, 'read-only'), ('speed', 'fast', 'another type'), ('x', 1, 'unknown')):
-        viewer.wish(set=[{'name': f'/bench.{name}', 'value': value}])
-        assert why in viewer.until('status')['status']
-    assert bench.node.get_parameter('fixed').value == 1
-
-
 def test_viewer_follows_parameters(robot, bench):
     viewer = bench.viewer()
     viewer.wish(follow=['/bench.speed', '/late.rate'])
@@ -543,24 +525,19 @@ def test_node_that_does_not_answer_blocks_no_viewer(robot, bench):
     patient.until('withdrawn', '/never')
 
 
-def test_bridge_ends_while_calls_wait(robot, bench):
+def test_bytes_that_are_no_request_are_refused(robot, bench):
     viewer = bench.viewer()
+    viewer.until('service', '/enable')
+    for payload in (b'', b'\0\1\0\0', b'\xff' * 40, bytes(REQUEST + 1)):
+        viewer.wish(call='/enable', payload=base64.b64encode(payload).decode())
+        assert viewer.until('called', '/enable')['failure'], payload[:40]
+    assert robot.enabled == []
+    # the bridge ends while a call waits
     viewer.until('service', '/never')
     viewer.wish(call='/never', request={})
     parameters(bench, viewer, '/bench.speed')
     bench.bridge.send_signal(signal.SIGINT)
     assert bench.bridge.wait(20) == 0
-
-
-@pytest.mark.parametrize('payload', [
-    b'', b'\0\1\0\0', b'\xff' * 40, bytes(REQUEST + 1)], ids=['empty', 'head', 'junk', 'large'])
-def test_bytes_that_are_no_request_are_refused(robot, bench, payload):
-    viewer = bench.viewer()
-    for name in ('/stop', '/enable'):
-        viewer.until('service', name)
-        viewer.wish(call=name, payload=base64.b64encode(payload).decode())
-        assert viewer.until('called', name)['failure']
-    assert robot.enabled == []
 
 
 def test_bridge_that_takes_no_messages_changes_nothing(robot, bench):

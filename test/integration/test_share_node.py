@@ -170,9 +170,8 @@ def stranger(folder: Path, *data: bytes) -> Iterator[list[bool]]:
 
 
 @pytest.mark.parametrize('data', [
-    b'[' * 3000, b'\x00\xff\n', b'{"topic": 3}\n',
-    encode('/chat', Form('std_msgs/msg/String', True, 0), 999_999_999),
-], ids=['nested', 'binary', 'mapping', 'too-large'])
+    b'[' * 3000, encode('/chat', Form('std_msgs/msg/String', True, 0), 999_999_999),
+], ids=['no-message', 'too-large'])
 def test_hijacked_relay_is_left_and_others_go_on(
     robot: Callable[[str], Robot], data: bytes,
 ) -> None:
