@@ -16,6 +16,7 @@ from fogros2.errors import ConfigurationError
 from fogros2.model import NodeSpec
 from fogros2_features.streams import collection
 
+
 def test_nodes_are_handed_out_once() -> None:
     streams = collection.Streams()
     names = [(machine, spec.name) for machine, spec in streams.add([('/camera', 'h264')], 'a')]

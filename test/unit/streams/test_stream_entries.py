@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from fogros2.errors import ConfigurationError, PrerequisiteError
-from fogros2_features.streams.entries import nodes, remappings, stream, StreamTopic
-from fogros2_features.streams.republish import Theora
+from fogros2_features.streams.entries import nodes, stream, StreamTopic
 from fogros2_features.streams.transport import Stream
+
 
 def test_entries() -> None:
     assert stream(('/camera', 'h264'), 'm') == Stream('/camera', 'h264', target='m')
