@@ -12,7 +12,7 @@ from collections.abc import Callable
 import struct
 from typing import Any
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy
 import pytest
@@ -103,6 +103,7 @@ def ros_cloud(header: Header, layout: Layout, data: bytes) -> PointCloud2:
         row_step=layout.row_step, is_dense=layout.is_dense, data=array.array('B', data))
 
 
+@settings(deadline=None)
 @given(header=headers, one=pictures)
 def test_image_is_what_rclpy_makes_and_reads(header: Header, one: Picture) -> None:
     made = Image(header=ros(header), height=one.height, width=one.width, encoding=one.encoding,
@@ -114,6 +115,7 @@ def test_image_is_what_rclpy_makes_and_reads(header: Header, one: Picture) -> No
         assert deserialize_message(data, Image) == made
 
 
+@settings(deadline=None)
 @given(header=headers, form=texts, data=octets)
 def test_packet_is_what_rclpy_makes_and_reads(header: Header, form: str, data: bytes) -> None:
     made = CompressedImage(header=ros(header), format=form, data=array.array('B', data))
@@ -123,6 +125,7 @@ def test_packet_is_what_rclpy_makes_and_reads(header: Header, form: str, data: b
     assert header_of(big) == (header.sec * 10 ** 9 + header.nanosec, header.frame_id)
 
 
+@settings(deadline=None)
 @given(data=octets)
 def test_piece_is_what_rclpy_makes_and_reads(data: bytes) -> None:
     made = UInt8MultiArray(data=array.array('B', data))
@@ -131,6 +134,7 @@ def test_piece_is_what_rclpy_makes_and_reads(data: bytes) -> None:
     assert deserialize_message(message.in_pieces(data), UInt8MultiArray) == made
 
 
+@settings(deadline=None)
 @given(header=headers, layout=layouts, data=octets)
 def test_cloud_is_what_rclpy_makes_and_reads(
     header: Header, layout: Layout, data: bytes,
