@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import threading
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -29,7 +28,6 @@ from std_msgs.msg import Empty, UInt8MultiArray, UInt64MultiArray
 from image_transport_h264 import annexb, message
 from image_transport_h264.acknowledgement import wait_for_all_acked
 from image_transport_h264.codec import Encoder, peek, Settings
-from image_transport_h264.lazy import LazyNode, MOST_CAUSES
 from rigs.bench import Bench, BEST_EFFORT, RELIABLE
 
 ROOT = Path(__file__).parents[2]
@@ -307,17 +305,6 @@ def test_camera_info_goes_along(bench: Bench) -> None:
 
     bench.until(lambda: infos and seen, 'image and camera info', meanwhile=both)
     assert infos[0] == info
-
-
-def test_number_of_warnings_is_limited() -> None:
-    """A sender could otherwise fill the log with names of encodings."""
-    lines: list[str] = []
-    node: Any = SimpleNamespace(
-        _complained=set(), _complaining=threading.Lock(),
-        get_logger=lambda: SimpleNamespace(warning=lines.append))
-    for number in range(10 * MOST_CAUSES):
-        LazyNode.complain(node, f'encoding {number}', 'image not sent')
-    assert len(lines) == MOST_CAUSES
 
 
 def bad(**fields: Any) -> bytes:
