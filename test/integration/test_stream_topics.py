@@ -94,7 +94,7 @@ def points(cloud):
     return numpy.stack([values[name] for name in 'xyz'], -1).astype(float)
 
 
-def found():
+def obstacle_figures():
     # how far the obstacles of some scans are from the scans' points
     both = [one for one in obstacles if one in scans]
     errors = []
@@ -123,7 +123,7 @@ finally:
         'seen': len(seen), 'both': len(both), 'traffic': vpn_traffic(),
         'same': all(seen[one] == taken[one] for one in both),
         'kinds': sorted(set(seen.values())), 'obstacles': len(obstacles),
-        'clouds': clouds and found()}), flush=True)
+        'clouds': clouds and obstacle_figures()}), flush=True)
 """
 
 
