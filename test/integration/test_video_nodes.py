@@ -143,8 +143,8 @@ def test_no_subscriber_no_work(bench: Bench) -> None:
                 and node.count_subscribers('/camera/h264') == 0, 'the end of the work')
 
 
-def test_late_viewer_gets_a_keyframe(bench: Bench) -> None:
-    """Hours of P-pictures away from the next key, a new reader gets one at once."""
+def test_late_viewer_and_a_request_get_a_keyframe(bench: Bench) -> None:
+    """Hours of P-pictures away from the next key, it comes at once."""
     bench.pair('-p', 'gop:=1000000')
     publish = source(bench)
     seen = bench.heard(Image, '/seen/camera')
@@ -161,13 +161,6 @@ def test_late_viewer_gets_a_keyframe(bench: Bench) -> None:
     bench.until(lambda: len(seen) >= before + 5, 'images', meanwhile=publish)
     numbers = [one.header.stamp.sec for one in seen[-5:]]
     assert numbers == sorted(numbers)
-
-
-def test_a_key_is_sent_when_asked_for(bench: Bench) -> None:
-    bench.start('encoder', '-r', 'image:=/camera', '-p', 'gop:=1000000')
-    packets = bench.heard(CompressedImage, '/camera/h264')
-    publish = source(bench)
-    bench.until(lambda: len(packets) >= 10, 'packets', meanwhile=publish)
     ask = bench.node.create_publisher(Empty, '/camera/h264/keyframe', RELIABLE)
     bench.until(ask.get_subscription_count, 'the encoder', meanwhile=publish)
     begin = len(packets)
