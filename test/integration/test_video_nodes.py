@@ -106,7 +106,7 @@ def test_the_other_codecs(bench: Bench, codec: str) -> None:
     assert numpy.abs(a - b).max() == 0 if codec != 'jpeg' else numpy.abs(a - b).mean() < 4
 
 
-def test_a_mistyped_topic_gets_the_nearest(bench: Bench) -> None:
+def test_mistyped_topic_and_unknown_codec_are_reported(bench: Bench) -> None:
     bench.node.create_publisher(Image, '/camera/image_raw', RELIABLE)
     lines = bench.start('encoder', '-r', 'image:=/camera/imag_raw')
     renamed = bench.start('encoder', '-r', 'image:=/fogros2/m/camera/imge_raw',
@@ -123,6 +123,11 @@ def test_a_mistyped_topic_gets_the_nearest(bench: Bench) -> None:
     assert any('no images on /camera/imge_raw (did you mean /camera/image_raw?)' in line
                for line in renamed)
     assert not any('no images' in line for line in right)
+    wrong = bench.start('encoder', '-p', 'codec:=vhs')
+    process = bench.processes.pop()[0]
+    assert process.wait(60) != 0
+    bench.until(lambda: any("'vhs' is not one of h264, jpeg, png, raw" in line for line in wrong),
+                'a line that says so')
 
 
 def test_no_subscriber_no_work(bench: Bench) -> None:
@@ -138,6 +143,12 @@ def test_no_subscriber_no_work(bench: Bench) -> None:
     subscription = node.create_subscription(Image, '/seen/camera', seen.append, RELIABLE)
     bench.until(lambda: seen, 'an image', meanwhile=publish)
     assert node.count_subscribers('/camera') == node.count_subscribers('/camera/h264') == 1
+    # camera info goes along
+    infos, info = bench.heard(CameraInfo, '/seen/camera_info'), CameraInfo(width=WIDTH)
+    camera = node.create_publisher(CameraInfo, '/camera_info', 10)
+    info.header.stamp.sec, info.distortion_model, info.k[0] = 77, 'plumb_bob', 123.5
+    bench.until(lambda: infos, 'camera info', meanwhile=lambda: camera.publish(info))
+    assert infos[0] == info
     node.destroy_subscription(subscription)
     bench.until(lambda: node.count_subscribers('/camera') == 0
                 and node.count_subscribers('/camera/h264') == 0, 'the end of the work')
@@ -284,22 +295,6 @@ def test_wait_for_acknowledgement_lets_threads_run(bench: Bench) -> None:
     assert wait_for_all_acked(publisher, 20.0)
 
 
-def test_camera_info_goes_along(bench: Bench) -> None:
-    bench.pair()
-    infos, seen = bench.heard(CameraInfo, '/seen/camera_info'), bench.heard(Image, '/seen/camera')
-    publisher, publish = bench.node.create_publisher(CameraInfo, '/camera_info', 10), source(bench)
-    info = CameraInfo(width=WIDTH, height=HEIGHT, distortion_model='plumb_bob')
-    info.header.stamp.sec = 77
-    info.k[0] = 123.5
-
-    def both() -> None:
-        publish()
-        publisher.publish(info)
-
-    bench.until(lambda: infos and seen, 'image and camera info', meanwhile=both)
-    assert infos[0] == info
-
-
 def bad(**fields: Any) -> bytes:
     """Return a serialized image with other fields."""
     made = image(0)
@@ -338,14 +333,6 @@ def test_malformed_messages_are_dropped_with_a_warning(bench: Bench) -> None:
     bench.until(lambda: len(seen) >= after + 5, 'good images', meanwhile=camera)
     for *_, lines, text in kinds:
         assert sum(text in line for line in lines) == 1, lines
-
-
-def test_unknown_codec_is_reported(bench: Bench) -> None:
-    lines = bench.start('encoder', '-p', 'codec:=vhs')
-    process = bench.processes.pop()[0]
-    assert process.wait(60) != 0
-    bench.until(lambda: any("'vhs' is not one of h264, jpeg, png, raw" in line
-                            for line in lines), 'a line that says so')
 
 
 def test_a_second_interrupt_while_it_ends_changes_nothing(bench: Bench) -> None:
