@@ -7,9 +7,8 @@ decoding them. A slow viewer loses its oldest messages, without effect on other 
 stream of ``image_transport_h264`` is sent as ``foxglove.CompressedVideo``.
 
 Parameters: ``address``, ``port`` (0: any free port; the log has the port), ``topics`` (patterns of
-the names of topics, services and parameters to show), ``client_publish`` (whether viewers may
-publish, call services and set parameters) and ``backlog`` (number of messages to keep for a slow
-viewer).
+the names of topics, services and parameters to show) and ``client_publish`` (whether viewers may
+publish, call services and set parameters).
 
 Protocol: https://github.com/foxglove/ws-protocol, implemented by ``foxglove-sdk``.
 """
@@ -64,7 +63,6 @@ class BridgeNode(GraphNode, ServerListener):
         port = int(self.declare_parameter('port', 8765).value)
         self._patterns = list(self.declare_parameter('topics', ['*']).value)
         self._publish = bool(self.declare_parameter('client_publish', True).value)
-        backlog = int(self.declare_parameter('backlog', BACKLOG).value)
         self._offered: dict[str, str] = {}
         self._service_calls = Services(self)
         self._node_parameters = Parameters(self._service_calls, self._shows, self.refuse)
@@ -74,7 +72,7 @@ class BridgeNode(GraphNode, ServerListener):
             capabilities=[Capability.Parameters, *(
                 [Capability.ClientPublish, Capability.Services] if self._publish else [])],
             supported_encodings=['cdr'], asset_handler=assets.read, context=self.viewers,
-            message_backlog_size=backlog)
+            message_backlog_size=BACKLOG)
         self._look()
         self.create_subscription(ParameterEvent, '/parameter_events', self._tell_change, 1000)
         self.create_timer(LOOK, self._look)

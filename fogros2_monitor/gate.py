@@ -12,8 +12,7 @@ reason, so that refused clients cannot fill the disk.
 The gate forwards a request for a page to the web application if the machine has one. Otherwise
 its own page links to hosted applications.
 
-The gate uses only the standard library: it also guards ROS 2's own ``foxglove_bridge``, on
-machines that have nothing else of this package.
+The gate uses only the standard library, so that it starts at once.
 """
 
 from __future__ import annotations

@@ -5,5 +5,5 @@ from __future__ import annotations
 
 from fogros2.host.modules import Module
 
-_FOXGLOVE = (Module('foxglove', ('foxglove-sdk',), (0, 30), replaced_by='foxglove_bridge'),)
+_FOXGLOVE = (Module('foxglove', ('foxglove-sdk',), (0, 30)),)
 NEEDS = {'bridge': _FOXGLOVE, 'record': _FOXGLOVE}

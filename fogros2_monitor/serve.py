@@ -9,8 +9,7 @@ Start the bridge on a machine, with its gate and the web application.
 ``--public PORT``       also open this port to other computers, over TLS
 ``--image IMAGE``       image of the web application, '' for none
 
-The bridge is ROS 2's own ``foxglove_bridge`` if it is installed, otherwise
-:mod:`~fogros2_monitor.bridge`. The bridge needs no token, so it listens on a random address and
+The bridge (:mod:`~fogros2_monitor.bridge`) needs no token, so it listens on a random address and
 port of 127.0.0.0/8 that no web page can guess. Viewers connect to the gate's ports. Gate and
 application end when this process ends, even if it is killed.
 """
@@ -18,7 +17,6 @@ application end when this process ends, even if it is killed.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 import json
 import os
 from pathlib import Path
@@ -27,57 +25,13 @@ import socket
 import subprocess
 import sys
 
-from ament_index_python.packages import get_package_prefix, PackageNotFoundError
-
 from fogros2.errors import FogError
 from fogros2_monitor import credentials
 from fogros2_monitor.addresses import application_port
 from fogros2_monitor.application import say
 
-#: The parameter ``topics`` of ``foxglove_bridge``, which takes regular expressions.
-_WHITELISTS = ('topic_whitelist', 'service_whitelist', 'param_whitelist')
 #: Address of the web application; it is no secret, as the application has no data and no token.
 _LOOPBACK = '127.0.0.1'
-
-
-def foxglove_bridge() -> str:
-    """Return the path of ROS 2's bridge, '' if it is not installed."""
-    try:
-        path = os.path.join(
-            get_package_prefix('foxglove_bridge'), 'lib', 'foxglove_bridge', 'foxglove_bridge')
-    except PackageNotFoundError:
-        return ''
-    return path if os.access(path, os.X_OK) else ''
-
-
-def regular_expression(pattern: str) -> str:
-    r"""
-    Convert a pattern with ``*`` and ``?`` to a regular expression of ECMAScript.
-
-    >>> regular_expression('/camera/*')
-    '/camera/.*'
-    """
-    return ''.join({'*': '.*', '?': '.'}.get(c, c if c.isalnum() or c in '/_' else f'\\{c}')
-                   for c in pattern)
-
-
-def command(
-    address: str, port: int, theirs: str, patterns: Sequence[str], ros_arguments: Sequence[str],
-) -> list[str]:
-    """
-    Return the command line of the bridge.
-
-    :param address: loopback address to listen on, with ``port``.
-    :param theirs: path of ``foxglove_bridge``; '': use our own bridge.
-    :param patterns: patterns of the names to show.
-    :param ros_arguments: further arguments after ``--ros-args``.
-    """
-    program = [theirs] if theirs else [sys.executable, '-m', 'fogros2_monitor.bridge']
-    names, values = (('topics',), list(patterns)) if not theirs else (
-        _WHITELISTS, [regular_expression(pattern) for pattern in patterns])
-    return [*program, '--ros-args', *ros_arguments, '-p', f'address:={address}',
-            '-p', f'port:={port}', *(word for name in names for word in (
-                '-p', f'{name}:={json.dumps(values)}'))]
 
 
 def hidden_place() -> tuple[str, int]:
@@ -143,8 +97,10 @@ def main() -> None:
         [sys.executable, '-m', 'fogros2_monitor.gate', '--to', f'{address}:{port}',
          '--until-eof', *gate], stdin=end)
     os.close(end)
-    words = command(address, port, foxglove_bridge(), ours.topic or ['*'], words[at + 1:])
-    os.execv(words[0], words)
+    os.execv(sys.executable, [
+        sys.executable, '-m', 'fogros2_monitor.bridge', '--ros-args', *words[at + 1:],
+        '-p', f'address:={address}', '-p', f'port:={port}',
+        '-p', f'topics:={json.dumps(ours.topic or ["*"])}'])
 
 
 if __name__ == '__main__':

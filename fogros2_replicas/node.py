@@ -37,6 +37,7 @@ from fogros2_replicas import figures
 from fogros2_replicas.calls import Action, Answer, Calls
 from fogros2_replicas.pairs import Header, header_of, Pair
 from image_transport_h264 import memory
+from image_transport_h264.lazy import printable
 
 #: Seconds between two looks at the graph, between two writes of the figures, and after which
 #: missing names are reported. Requests of one replica that may be without an answer, and names and
@@ -253,7 +254,7 @@ class FirstAnswer(Node):
 
     def complain(self, text: str) -> None:
         """Log an error once."""
-        text = _printable(text)
+        text = printable(text)
         if text not in self._complained and len(self._complained) < WARNINGS:
             self._complained.add(text)
             self.get_logger().error(text)
@@ -284,7 +285,7 @@ class FirstAnswer(Node):
                              and not name.startswith('/fogros2/')} - self._complained)
             if shared and len(self._complained) < WARNINGS:
                 self._complained.update(shared)
-                self.get_logger().warning(_printable(
+                self.get_logger().warning(printable(
                     f"{', '.join(shared)}: the node '{node[0]}' of each replica has this name; "
                     'declare it in services= or topics=, or expect all of them at once'))
 
@@ -333,11 +334,6 @@ class FirstAnswer(Node):
             os.replace(f'{self._path}.new', f'{self._path}.json')
         except OSError as error:  # such as a full disk; the services go on
             self.complain(f'figures of replicas are not written: {error}')
-
-
-def _printable(text: str) -> str:
-    """Return a text without what controls a terminal: it has names of other computers' nodes."""
-    return ''.join(c if c.isprintable() else '?' for c in text)
 
 
 def _reader(message: Any) -> Read:

@@ -199,16 +199,13 @@ class Decoder:
     """
     Decode packets of one topic, in the order of their arrival.
 
-    :param show_damage: continue after losses and damage, with smears in the pictures, instead of
-        waiting for the next keyframe.
     :param encoding: encoding of pictures whose packets have no tag, from other encoders.
     :param max_pixels: larger pictures are refused before they take memory.
     """
 
     def __init__(
-        self, *, show_damage: bool = False, encoding: str = 'bgr8', max_pixels: int = MAX_PIXELS,
+        self, *, encoding: str = 'bgr8', max_pixels: int = MAX_PIXELS,
     ) -> None:
-        self.show_damage = show_damage
         self.encoding = encoding
         self.max_pixels = max_pixels
         self._codec: Optional[VideoCodecContext] = None
@@ -249,26 +246,26 @@ class Decoder:
         kinds = annexb.kinds(coded)
         if tag is None:
             key = annexb.IDR in kinds
-        elif tag.checksum != zlib.crc32(coded) and not self.show_damage:
+        elif tag.checksum != zlib.crc32(coded):
             raise Damaged('a packet whose checksum is another', 'damage')
         else:
             if self._is_old(tag):
                 return None
             key = tag.key
-        if not key and not self.show_damage:
+        if not key:
             self._check_order(tag)
         self._check_sizes(coded)
         if key and (self.needs_key or self._codec is None
                     or (tag is not None and not _same_picture(tag, self._last))):
             self._codec = None  # a new codec: no reference to an older stream or another size
         if self._codec is None:
-            self._codec = _decoder(self.show_damage)
+            self._codec = _decoder()
         try:
             frames = self._codec.decode(av.Packet(coded))
         except (FFmpegError, ValueError) as error:
             self._codec = None
             raise Damaged(f'H.264: {error}', 'damage') from error
-        if len(frames) != 1 or (frames[0].is_corrupt and not self.show_damage):
+        if len(frames) != 1 or frames[0].is_corrupt:
             self._codec = None
             raise Damaged(f'{len(frames)} whole pictures in a packet', 'damage')
         picture = self._picture(frames[0], tag)
@@ -471,12 +468,12 @@ def _works(name: str) -> bool:
         numpy.abs(shown.rows().astype(int) - picture.rows()).mean()) < 4
 
 
-def _decoder(show_damage: bool) -> VideoCodecContext:
+def _decoder() -> VideoCodecContext:
     codec = CodecContext.create('h264', 'r')
     assert isinstance(codec, VideoCodecContext)
     # Frame threads would delay pictures; slice threads do not.
     codec.thread_type, codec.thread_count = 'SLICE', min(4, os.cpu_count() or 1)
-    codec.options = {'flags': '+low_delay' + ('+output_corrupt' if show_damage else '')}
+    codec.options = {'flags': '+low_delay'}
     return codec
 
 

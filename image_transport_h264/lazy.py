@@ -52,6 +52,11 @@ def best_effort(qos: QoSProfile) -> QoSProfile:
     return _qos(qos.depth, ReliabilityPolicy.BEST_EFFORT)
 
 
+def printable(text: str) -> str:
+    """Return a text of another computer without what controls a terminal."""
+    return ''.join(c if c.isprintable() else '?' for c in text)
+
+
 def run(kind: Callable[[], LazyNode]) -> None:
     """Run a node until a signal; exit with status 1 if its worker failed."""
     interrupted = False
@@ -150,8 +155,8 @@ class LazyNode(Node):
             if cause in self._complained or len(self._complained) >= MOST_CAUSES:
                 return
             self._complained.add(cause)
-        message = ''.join(c if c.isprintable() else '?' for c in message)
-        self.get_logger().warning(f'{message} (further ones of this kind go unmentioned)')
+        self.get_logger().warning(
+            f'{printable(message)} (further ones of this kind go unmentioned)')
 
     def offer(
         self, kind: Any, topic: str, qos: QoSProfile, changed: Callable[[], None],

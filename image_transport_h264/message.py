@@ -126,10 +126,3 @@ def ffmpeg_packet(kind: Any, header: Header, packet: Packet) -> Any:
         data=octets(packet.data))
     made.header.stamp.sec, made.header.stamp.nanosec, made.header.frame_id = header
     return made
-
-
-def compressed_video(kind: Any, header: Header, packet: Packet) -> Any:
-    """Return a packet as ``foxglove_msgs/CompressedVideo``."""
-    made = kind(frame_id=header.frame_id, format='h264', data=octets(packet.data))
-    made.timestamp.sec, made.timestamp.nanosec, _ = header
-    return made

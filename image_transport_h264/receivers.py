@@ -101,12 +101,9 @@ class VideoReceiver(Receiver):
 
     def __init__(self, node: LazyNode, stream: str, publish: Publish) -> None:
         self._node, self._publish = node, publish
-        show = node.declare_parameter('show_damage', False, ParameterDescriptor(
-            description='show pictures that losses have left smears in', read_only=True)).value
         encoding = node.declare_parameter('encoding', 'bgr8', ParameterDescriptor(
             description="of images from encoders that aren't FogROS2's", read_only=True)).value
-        self._decoder = Decoder(show_damage=bool(show), encoding=str(encoding),
-                                max_pixels=_max_pixels(node))
+        self._decoder = Decoder(encoding=str(encoding), max_pixels=_max_pixels(node))
         self._identity = secrets.randbits(63)
         self._asked = -1e9
         self._requests = node.create_publisher(Empty, f'{stream}/{KEY_REQUEST}', REQUEST_QOS)

@@ -9,7 +9,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 import dataclasses
 import threading
 import time
-from typing import Any
+from typing import Any, Optional
 
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.parameter import Parameter
@@ -19,8 +19,8 @@ from std_msgs.msg import Empty, UInt8MultiArray, UInt64MultiArray
 
 from image_transport_h264 import message, stills
 from image_transport_h264.budget import Budget
-from image_transport_h264.cdr import CdrError, Header
-from image_transport_h264.codec import CodecError, Encoder, Packet, Settings
+from image_transport_h264.cdr import CdrError
+from image_transport_h264.codec import CodecError, Encoder, Settings
 from image_transport_h264.control import Control
 from image_transport_h264.lazy import (
     FEEDBACK_QOS,
@@ -182,18 +182,13 @@ class VideoSender(Sender):
         self._video = node.offer(CompressedImage, stream, STREAM_QOS, self._matched)
         self.publishers = [self._video]
         self._budget = Budget(node, stream, self.listeners)
-        self._others: list[tuple[Publisher, Any, Callable[[Any, Header, Packet], Any]]] = []
-        # Also publish the packets as the messages of other packages, where these are installed.
-        base = stream.rpartition('/')[0]
-        for package, name, topic, make in (
-            ('ffmpeg_image_transport_msgs', 'FFMPEGPacket', 'ffmpeg', message.ffmpeg_packet),
-            ('foxglove_msgs', 'CompressedVideo', 'foxglove', message.compressed_video),
-        ):
-            kind = message.installed(package, name)
-            if kind is not None:
-                publisher = node.offer(kind, f'{base}/{topic}', STREAM_QOS, self._matched)
-                self._others.append((publisher, kind, make))
-                self.publishers.append(publisher)
+        # Also publish the packets for viewers such as rviz, where their message is installed.
+        self._ffmpeg: Optional[Publisher] = None
+        self._ffmpeg_packet = message.installed('ffmpeg_image_transport_msgs', 'FFMPEGPacket')
+        if self._ffmpeg_packet is not None:
+            self._ffmpeg = node.offer(self._ffmpeg_packet, f"{stream.rpartition('/')[0]}/ffmpeg",
+                                      STREAM_QOS, self._matched)
+            self.publishers.append(self._ffmpeg)
         self._slices = SliceSender(node, stream, self._matched)
         self._pieces = node.create_publisher(
             UInt8MultiArray, f'{stream}/{PIECES}', PIECES_QOS)
@@ -291,14 +286,11 @@ class VideoSender(Sender):
         # Pieces first: after a loss, the packet is then complete one datagram later.
         for piece in again:
             self._node.put_out(self._pieces, message.in_pieces(piece))
-        self._publish(header, packet)
-
-    def _publish(self, header: Header, packet: Packet) -> None:
         self._node.put_out(
             self._video, message.compressed(header, packet.format, packet.data))
-        for publisher, kind, make in self._others:
-            if self._node.subscribers(publisher):
-                self._node.put_out(publisher, make(kind, header, packet))
+        if self._ffmpeg is not None and self._node.subscribers(self._ffmpeg):
+            self._node.put_out(self._ffmpeg, message.ffmpeg_packet(
+                self._ffmpeg_packet, header, packet))
 
 
 def _settings(values: dict[str, Any]) -> Settings:

@@ -38,13 +38,11 @@ class Module:
 
     :param distributions: distributions that contain it; the first is the one to install.
     :param oldest: first numbers of the oldest usable version.
-    :param replaced_by: a ROS package that replaces the module.
     """
 
     name: str
     distributions: tuple[str, ...]
     oldest: tuple[int, ...] = ()
-    replaced_by: str = ''
 
     @property
     def requirement(self) -> str:
@@ -77,11 +75,7 @@ def version(module, names):
 # ONNX Runtime would tell Microsoft that it was imported
 os.environ.setdefault('ORT_DISABLE_TELEMETRY', '1')
 missing = {}
-for name, names, oldest, package in json.loads(sys.argv[1]):
-    if package and any(
-            os.path.exists(prefix + '/share/ament_index/resource_index/packages/' + package)
-            for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(':') if prefix):
-        continue
+for name, names, oldest in json.loads(sys.argv[1]):
     try:
         module = importlib.import_module(name)
         if oldest and [int(n) for n in re.findall(
@@ -167,8 +161,7 @@ def ask(
     :param site: an additional folder, which Python searches first.
     """
     words = ['python3', '-c', _ASK, json.dumps([
-        (one.name, one.distributions, one.oldest, one.replaced_by)
-        for one in map(known().__getitem__, names)])]
+        (one.name, one.distributions, one.oldest) for one in map(known().__getitem__, names)])]
     return among_nodes(
         environment, setup, f'{_path([site]) if site else ""}exec {shlex.join(words)}',
         'look for Python modules')

@@ -9,7 +9,7 @@ import dataclasses
 from typing import ClassVar
 
 from fogros2.deploy.robot import clear
-from fogros2.errors import ConfigurationError, DdsError, MachineNotFound, Unsupported
+from fogros2.errors import DdsError, MachineNotFound, Unsupported
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState, OtherVpn
 from fogros2.provider import Capabilities, Provider
 from fogros2.provider.options import parsed
@@ -41,9 +41,7 @@ class JoinedProvider(Provider):
 
     def check(self, spec: MachineSpec) -> None:
         """Check that the invitation is for this computer, and valid."""
-        if not self._unsealed(spec).interface:
-            raise ConfigurationError(f"the invitation of '{spec.name}' has no place for nodes",
-                                     'invite by a newer version of FogROS2')
+        self._unsealed(spec)
 
     def _text(self, spec: MachineSpec) -> str:
         return parsed(Options, spec.options, 'a joined machine').invitation

@@ -23,7 +23,7 @@ from fogros2.ros_names import check_name, identifier, local_topic
 from fogros2_features.streams.transport import Stream
 
 #: Options of a Stream that are parameters of the decoder, not of the encoder.
-DECODER_PARAMETERS = ('show_damage', 'encoding')
+DECODER_PARAMETERS = ('encoding',)
 #: Options of all streams that use this project's nodes.
 OPTIONS = frozenset({'camera_info', 'priority', *DECODER_PARAMETERS})
 

@@ -28,8 +28,6 @@ from rigs.terminal import screen
 pytestmark = [
     pytest.mark.skipif(program() is None, reason='needs Chromium'),
 ]
-#: Where the last run's screenshots are.
-PICTURES = Path(__file__).parents[2] / '.cache/screenshots'
 MARKUP = '</pre><img src=x onerror="document.title=1"><script>document.title=1</script>'
 LAUNCH_FILE = """
 from fogros2 import CloudGroup, CloudNode, ContainerInstance, FogROSLaunchDescription, StreamTopic
@@ -108,10 +106,6 @@ def test_quiet_dashboard_shows_no_machines(dashboard: Dashboard, browser: Browse
     # other runs on this computer may have machines that come and go
     wait_until(idle, timeout=60.0, what='a dashboard without work')
 
-    browser.open(dashboard.url.partition('#')[0] + '#wrong')
-    browser.reload()
-    browser.until('document.getElementById("link").textContent === "no access"')
-    browser.until('document.body.innerText.includes("token is missing or wrong")')
     assert dashboard.close() == 0
     assert all(url.startswith(('http://127.0.0.1:', 'data:')) for url in browser.requested)
 
@@ -160,19 +154,13 @@ def test_dashboard_shows_a_launch_until_its_end(
         assert browser.ask('document.querySelector("img[src=x]") === null')
         assert browser.ask('document.title') == 'FogROS2'
 
-        for dark in (False, True):
-            browser.prefer(dark=dark)
-            browser.screenshot(PICTURES / f"dashboard-{'dark' if dark else 'light'}.png")
-        browser.prefer(dark=False)
-        browser.size(420, 900)
-        assert browser.ask('document.documentElement.scrollWidth') <= 420
-        browser.size(1400, 1180)
-
         launched.interrupt()
         assert launched.ended() == 0, launched.text
     browser.until(f'/keep\\s+done/.test({article(name)}.innerText)')
     browser.until('document.querySelector(".launch").innerText.includes("launch over")')
-    delete_by_keyboard(browser, name)
+    browser.ask(f'{article(name)}.querySelector("button.delete").click()')
+    browser.until('document.getElementById("ask").open')
+    browser.ask('document.getElementById("ask-yes").click()')
     browser.until(f'{article(name)}.dataset.phase === "gone"', timeout=30)
     assert name not in ros2('fog', 'list').stdout
     assert browser.complaints == []
@@ -208,26 +196,6 @@ def pictures_move(browser: Browser) -> None:
     wait_until(moved, timeout=60.0, what='pictures that move', longest=0.2)
     browser.until('[...document.querySelectorAll("figure .rates b")].every('
                   'e => Number(e.textContent) > 1)', timeout=30)
-
-
-def delete_by_keyboard(browser: Browser, name: str) -> None:
-    """Press the button, think better of it, and press it again."""
-    button = f'{article(name)}.querySelector("button.delete")'
-    browser.ask(f'{button}.focus()')
-    browser.press('Enter', 13)
-    browser.until('document.getElementById("ask").open')
-    assert browser.ask('document.activeElement.textContent') == 'Keep it'
-    said = browser.ask('document.getElementById("ask").innerText')
-    assert name in said and 'everything made for it' in said
-    browser.press('Escape', 27)
-    browser.until('!document.getElementById("ask").open')
-    assert browser.ask(f'{article(name)}.dataset.phase') == 'running'
-    browser.ask(f'{button}.focus()')
-    browser.press('Enter', 13)
-    browser.until('document.getElementById("ask").open')
-    browser.press('Tab', 9)
-    assert browser.ask('document.activeElement.id') == 'ask-yes'
-    browser.press('Enter', 13)
 
 
 @pytest.fixture

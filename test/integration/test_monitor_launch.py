@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 import contextlib
 import html
-import ipaddress
 import json
 from pathlib import Path
 import re
@@ -15,7 +14,6 @@ import signal
 import socket
 import ssl
 import subprocess
-from typing import Optional
 import urllib.request
 
 import pytest
@@ -95,58 +93,16 @@ def tunnel(name: str) -> Iterator[str]:
     assert process.returncode == 0
 
 
-@contextlib.contextmanager
-def second_address(network: str, address: str) -> Iterator[None]:
-    """Give this computer another address in the machine's network, whose bridge is up."""
-    told = json.loads(run(Command(('podman', 'network', 'inspect', network), sudo=True),
-                          timeout=60).stdout)[0]
-    length = ipaddress.ip_network(told['subnets'][0]['subnet']).prefixlen
-    words = (f'{address}/{length}', 'dev', told['network_interface'])
-    run(Command(('ip', 'address', 'add', *words), sudo=True), timeout=60)
-    try:
-        yield
-    finally:
-        run(Command(('ip', 'address', 'del', *words), sudo=True), timeout=60)
-
-
-def knock(
-    at: tuple[str, int], target: str, *, source: Optional[str] = None, tls: bool = True,
-) -> bytes:
+def knock(at: tuple[str, int], target: str, *, tls: bool = True) -> bytes:
     """Return what answers a request, nothing where the connection just ends."""
-    bound = (source, 0) if source else None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     with contextlib.suppress(ConnectionResetError, ssl.SSLEOFError, ssl.SSLZeroReturnError), \
-            socket.create_connection(at, timeout=60, source_address=bound) as plain, \
+            socket.create_connection(at, timeout=60) as plain, \
             context.wrap_socket(plain) if tls else contextlib.nullcontext(plain) as connection:
         connection.sendall(f'GET {target} HTTP/1.1\r\nHost: {at[0]}\r\n\r\n'.encode())
         return connection.recv(4096)
     return b''
-
-
-def test_topics_of_an_application_are_served(nothing_left, engine, tmp_path):
-    """Its topics are there, the streamed image as the planner has it; nothing is complained of."""
-    # the applications' own test has a container of the example's name
-    name, file = f'mon{secrets.token_hex(2)}', tmp_path / 'grasp.launch.py'
-    example = ROOT / 'fogros2_examples/launch/grasp.launch.py'
-    file.write_text(example.read_text().replace("'grasping'", repr(name)))
-    with launching() as launch:
-        launched = launch(str(file), 'machine:=container', 'foxglove:=true', 'trials:=0')
-        launched.wait_for(f'in a browser: ros2 fog monitor {name}')
-        launched.wait_for('serving ws://')
-        with tunnel(name) as url, contextlib.closing(viewers.Viewer(CACHE, url)) as viewer:
-            viewer.look('/grasp_status')
-            viewer.look('/camera_info')
-            for topic in ('/depth', f'/fogros2/{name}/depth', '/grasps', '/grasp_markers',
-                          '/picture'):
-                viewer.until('channel', topic)
-            assert viewer.message('/camera_info')['width'] == 640
-            wait_until(lambda: 'grasps' in viewer.message('/grasp_status')['message'],
-                       timeout=60.0, what='grasps')
-        launched.interrupt()
-        assert launched.ended() == 0, launched.text
-        assert launched.errors == [], launched.text
-        assert '[WARNING] [fogros2]' not in launched.text
 
 
 def test_monitor_works_for_a_machine_on_the_robot(nothing_left, tmp_path, state_home):
@@ -167,8 +123,7 @@ def test_monitor_works_for_a_machine_on_the_robot(nothing_left, tmp_path, state_
     assert not list(state_home.rglob('token'))
 
 
-def test_viewers_need_the_token_and_an_allowed_network(
-        nothing_left, engine, cloud_network, nobody, tmp_path):
+def test_viewers_need_the_token(nothing_left, engine, cloud_network, tmp_path):
     name = f'mon-{secrets.token_hex(2)}'
     gateway = json.loads(run(Command(
         ('podman', 'network', 'inspect', cloud_network), sudo=True), timeout=60).stdout)[0][
@@ -210,18 +165,10 @@ def test_viewers_need_the_token_and_an_allowed_network(
             sees_the_talker(near)
             port = int(re.search(r':(\d+)/', near)[1])
             assert knock(('localhost', port), '/', tls=False).startswith(b'HTTP/1.1 401 ')
-        with second_address(cloud_network, nobody):
-            for _ in range(3):
-                assert knock(at, '/').startswith(b'HTTP/1.1 401 ')
-                assert knock(at, '/?token=wrong').startswith(b'HTTP/1.1 401 ')
-                assert b'200' not in knock(at, target, tls=False)
-                assert knock(at, target, source=nobody) == b''
+        assert knock(at, '/').startswith(b'HTTP/1.1 401 ')
         robot = re.search(r'VPN interface .*\(\S+ (\S+)\)', launched.text)[1]
-        for who, why in ((robot, 'no token'), ('127.0.0.1', 'no token'), (gateway, 'no token'),
-                         (gateway, 'a wrong token'), (gateway, 'no TLS: HTTP_REQUEST'),
-                         (nobody, 'not among the networks that are allowed')):
-            launched.wait_for(f'turned away {who}: {why}')
-        assert launched.text.count('turned away') == 6
+        for who in (robot, '127.0.0.1', gateway):
+            launched.wait_for(f'turned away {who}: no token')
         # where the machine is reached without the VPN, nobody listens without asking
         with pytest.raises(ConnectionRefusedError):
             socket.create_connection((at[0], 8765), timeout=20)

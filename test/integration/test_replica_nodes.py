@@ -132,18 +132,6 @@ def test_first_answer_of_a_service_wins(bench):
     assert [bench.rows()[name]['won'] for name in 'ab'] == [0, 1]
 
 
-def test_services_go_on_where_figures_cannot_be_written(bench):
-    def answer(request, response):
-        response.result.names = ['answered']
-        return response
-
-    (bench.folder / 'first.new').mkdir()  # like a full disk
-    bench.serve('a', Sum, answer)
-    bench.start(['/plan'])
-    bench.said('figures of replicas are not written')
-    assert bench.answer(bench.call(Sum, Sum.Request())).result.names == ['answered']
-
-
 def test_failure_is_answered_when_all_have_failed(bench):
     asked = []
 
@@ -155,10 +143,15 @@ def test_failure_is_answered_when_all_have_failed(bench):
 
     bench.serve('a', Trigger, fails)
     bench.serve('b', Trigger, fails)
+    for node in bench.replicas.values():
+        node.create_publisher(String, '/status', 10)
     bench.start(['/plan'], hedge_after=5000)
     bench.all_live()
     answer = bench.answer(bench.call(Trigger, Trigger.Request()))
     assert not answer.success and answer.message.startswith('no') and len(asked) == 2
+    # a name that replicas share is reported
+    bench.said("/status: the node 'planner' of each replica has this name")
+    assert 'get_parameters' not in ''.join(bench.lines)
 
 
 def test_reported_death_sends_the_request_on(bench):
@@ -205,83 +198,62 @@ def test_outputs_are_forwarded_as_bytes_once_for_each_input(bench):
                                       distortion_model=name))
 
         node.create_subscription(CompressedImage, f'/fogros2/{name}/image', seen, quality)
-    bench.start(topics=[('/image', '/seen', False)])
+    # outputs without stamps come from one replica
+    bench.client.create_publisher(String, '/text', 10)
+    texts = []
+    bench.client.create_subscription(String, '/out', lambda text: texts.append(text.data), 10)
+    outputs = {name: node.create_publisher(String, f'/fogros2/{name}/out', 10)
+               for name, node in bench.replicas.items()}
+    bench.start(topics=[('/text', '/out', False), ('/image', '/seen', False)])
     number = itertools.count(1)
 
     def shoot():
         image = CompressedImage(data=bytes(9))
         image.header.stamp.sec, image.header.frame_id = next(number), 'eye'
         camera.publish(image)
-        return len(came) >= 30
+        for name, output in outputs.items():
+            output.publish(String(data=name))
+        return len(came) >= 30 and len(texts) >= 10
 
     wait_until(shoot, timeout=60.0, what='outputs', longest=0.05)
     stamps = [info.header.stamp.sec for info in came]
     assert stamps == sorted(set(stamps))
     assert {(info.header.frame_id, info.height) for info in came} == {('eye', 9)}
     assert sum(row['won'] for row in bench.rows().values()) > 0
-    assert 'match no' not in ''.join(bench.lines)
+    bench.said('/out: stamps of its messages match no /text')
+    assert '/seen: stamps' not in ''.join(bench.lines) and len(set(texts[3:])) == 1
 
 
-def test_outputs_without_stamps_come_from_one_replica(bench):
-    bench.client.create_publisher(String, '/text', 10)
-    came = []
-    bench.client.create_subscription(String, '/out', lambda text: came.append(text.data), 10)
-    outputs = {name: node.create_publisher(String, f'/fogros2/{name}/out', 10)
-               for name, node in bench.replicas.items()}
-    bench.start(topics=[('/text', '/out', False)])
-
-    def say():
-        for name, output in outputs.items():
-            output.publish(String(data=name))
-        return len(came) >= 10
-
-    wait_until(say, timeout=60.0, what='outputs', longest=0.05)
-    bench.said('stamps of its messages match no /text')
-    assert len(set(came[3:])) == 1
-
-
-def test_type_that_is_missing_here_is_one_error(bench, monkeypatch):
-    bench.serve('a', LoadMap, lambda request, response: response)
-    # the robot lacks the package that the machines have
-    hidden = bench.folder / 'nav_msgs'
-    hidden.mkdir()
-    (hidden / '__init__.py').write_text('raise ImportError("no such package")')
-    bench.start(['/plan'], first=[str(bench.folder)])
-    bench.said("/plan: its type 'nav_msgs/srv/LoadMap' can't be imported on the "
-               'robot')
-    bench.until(bench.rows, 'figures')
-    assert ''.join(bench.lines).count("can't be imported") == 1
-
-
-def test_different_types_are_reported_and_left_out(bench):
+def test_missing_and_different_types_are_reported_and_left_out(bench):
     def answer(request, response):
         response.result.names = ['3']
         return response
 
+    # the robot lacks a package that the machines have
+    hidden = bench.folder / 'nav_msgs'
+    hidden.mkdir()
+    (hidden / '__init__.py').write_text('raise ImportError("no such package")')
+    bench.serve('a', LoadMap, lambda request, response: response, '/load')
     bench.serve('a', Sum, answer)
-    bench.start(['/plan'])
+    bench.start(['/load', '/plan'], first=[str(bench.folder)])
+    bench.said("/load: its type 'nav_msgs/srv/LoadMap' can't be imported on the robot")
     bench.until(lambda: bench.rows() and bench.rows()['a']['state'] == 'live', 'the first one')
     bench.serve('b', SetBool, lambda request, response: response)
     bench.said('/plan: replicas have different types')
     assert bench.answer(bench.call(Sum, Sum.Request())).result.names == ['3']
     assert bench.rows()['b']['state'] == 'absent'
+    assert ''.join(bench.lines).count("can't be imported") == 1
 
 
-def test_names_that_replicas_share_are_reported(bench):
-    for name, node in bench.replicas.items():
-        bench.serve(name, Trigger, lambda request, response: response)
-        node.create_publisher(String, '/status', 10)
-    bench.start(['/plan'])
-    bench.said("/status: the node 'planner' of each replica has this name")
-    assert 'get_parameters' not in ''.join(bench.lines)
-
-
-def test_action_is_refused_with_a_reason(bench):
+def test_services_go_on_beside_an_action_and_without_figures(bench):
+    (bench.folder / 'first.new').mkdir()  # like a full disk
     bench.serve('a', Trigger, lambda request, response: response)
     bench.replicas['a'].create_service(
         Trigger, '/go/_action/send_goal', lambda request, response: response)
-    bench.start(['/go'])
+    bench.start(['/plan', '/go'])
     bench.said('/go is a ROS action, which has goals')
+    bench.said('figures of replicas are not written')
+    assert bench.answer(bench.call(Trigger, Trigger.Request())) is not None
 
 
 # -- the robot is the last replica: here it is b --------------------------------------------------

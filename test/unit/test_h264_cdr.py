@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readers and writers of serialized messages: by value, against rclpy, and with hostile data."""
+"""
+Readers and writers of serialized messages, against rclpy and with damaged data.
+
+``test_fuzzed_inputs.py`` has hostile ones.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ from collections.abc import Callable
 import struct
 from typing import Any
 
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy
 import pytest
@@ -28,8 +32,6 @@ from point_cloud_stream.cloud import CloudError, Field, Layout
 
 HEADER = Header(-3, 999_999_999, 'camera')
 FORMS = {'<': b'\0\1\0\0', '>': b'\0\0\0\0'}
-#: Frame ids of each length modulo four, so that each field is seen at each offset.
-FRAMES = ('', 'a', 'ab', 'abc', 'abcd')
 
 
 def written(order: str, *fields: Any) -> bytes:
@@ -78,64 +80,12 @@ layouts = st.builds(
     st.lists(st.builds(Field, texts, numbers, st.integers(0, 255), numbers),
              max_size=4).map(tuple),
     numbers, numbers, st.booleans(), st.booleans())
-orders = st.sampled_from('<>')
-
-
-def test_image_by_value() -> None:
-    """Each field of an image of two pixels, at the offset that a middleware puts it."""
-    little = bytes.fromhex(
-        '00010000' 'fdffffff' 'ffc99a3b' '07000000' '63616d65726100' '00'  # camera
-        '01000000' '02000000' '06000000' '6d6f6e6f3800' '01' '00' '03000000' '03000000' '0a0b0c')
-    big = bytes.fromhex(
-        '00000000' 'fffffffd' '3b9ac9ff' '00000007' '63616d65726100' '00'
-        '00000001' '00000002' '00000006' '6d6f6e6f3800' '01' '00' '00000003' '00000003' '0a0b0c')
-    for data in (little, big):
-        header, shown = message.picture(data)
-        assert header == HEADER
-        assert (shown.height, shown.width, shown.encoding) == (1, 2, 'mono8')
-        assert (shown.is_bigendian, shown.step, bytes(shown.data)) == (True, 3, b'\n\v\f')
-    assert message.image(HEADER, shown) == little
-
-
-def test_other_messages_by_value() -> None:
-    """The ends of a packet, a piece and a cloud; their headers are an image's."""
-    head = bytes.fromhex('00010000' 'fdffffff' 'ffc99a3b' '02000000' '6100' '0000')
-    header = Header(-3, 999_999_999, 'a')
-    packet = head + bytes.fromhex('05000000' '6832363400' '000000' '02000000' '0a0b')
-    assert message.compressed(header, 'h264', b'\n\v') == packet
-    assert message.coded(packet) == (header, 'h264', b'\n\v')
-    piece = bytes.fromhex('00010000' '00000000' '00000000' '02000000' '0a0b')
-    assert message.in_pieces(b'\n\v') == piece
-    assert message.piece(piece) == b'\n\v'
-    cloud = head + bytes.fromhex(
-        '01000000' '02000000' '01000000'
-        '02000000' '7800' '0000' '04000000' '07' '000000' '01000000'
-        '01' '000000' '08000000' '10000000' '02000000' '0a0b' '01')
-    layout = Layout(1, 2, (Field('x', 4, 7, 1),), 8, 16, True, True)
-    assert clouds.points(header, layout, b'\n\v') == cloud
-    assert clouds.cloud(cloud) == (header, layout, b'\n\v')
 
 
 def test_number_of_eight_bytes_counts_from_the_fifth() -> None:
     data = Writer().numbers('BQ', 7, 8).data()
     assert data == bytes.fromhex('00010000' '07' '00000000000000' '0800000000000000')
     assert Reader(data).numbers('BQ') == (7, 8)
-
-
-@pytest.mark.parametrize('order', FORMS)
-@pytest.mark.parametrize('name', FRAMES)
-@pytest.mark.parametrize('encoding', FRAMES)
-def test_fields_are_found_at_each_offset(order: str, name: str, encoding: str) -> None:
-    header, one = Header(1, 2, name), Picture(3, 4, encoding, 5, b'abc', True)
-    assert message.picture(written(order, *image_fields(header, one))) == (header, one)
-    assert message.coded(written(order, *coded_fields(header, encoding, b'abc'))) == (
-        header, encoding, b'abc')
-    layout = Layout(1, 2, (Field(encoding, 3, 4, 5), Field(name, 6, 7, 8)), 9, 10, True, False)
-    assert clouds.cloud(written(order, *cloud_fields(header, layout, b'abc'))) == (
-        header, layout, b'abc')
-    assert message.piece(written(order, ('I', 0), ('I', 0), encoding.encode())) == (
-        encoding.encode())
-    assert header_of(written(order, *header_fields(header))) == (1_000_000_002, name)
 
 
 def ros(header: Header) -> HeaderMessage:
@@ -153,38 +103,46 @@ def ros_cloud(header: Header, layout: Layout, data: bytes) -> PointCloud2:
         row_step=layout.row_step, is_dense=layout.is_dense, data=array.array('B', data))
 
 
+@settings(deadline=None)
 @given(header=headers, one=pictures)
 def test_image_is_what_rclpy_makes_and_reads(header: Header, one: Picture) -> None:
     made = Image(header=ros(header), height=one.height, width=one.width, encoding=one.encoding,
                  is_bigendian=int(one.is_bigendian), step=one.step,
                  data=array.array('B', bytes(one.data)))
-    assert message.picture(serialize_message(made)) == (header, one)
-    for data in (message.image(header, one), written('>', *image_fields(header, one))):
+    big = written('>', *image_fields(header, one))
+    assert message.picture(serialize_message(made)) == message.picture(big) == (header, one)
+    for data in (message.image(header, one), big):
         assert deserialize_message(data, Image) == made
 
 
+@settings(deadline=None)
 @given(header=headers, form=texts, data=octets)
 def test_packet_is_what_rclpy_makes_and_reads(header: Header, form: str, data: bytes) -> None:
     made = CompressedImage(header=ros(header), format=form, data=array.array('B', data))
-    assert message.coded(serialize_message(made)) == (header, form, data)
+    big = written('>', *coded_fields(header, form, data))
+    assert message.coded(serialize_message(made)) == message.coded(big) == (header, form, data)
     assert deserialize_message(message.compressed(header, form, data), CompressedImage) == made
+    assert header_of(big) == (header.sec * 10 ** 9 + header.nanosec, header.frame_id)
 
 
+@settings(deadline=None)
 @given(data=octets)
 def test_piece_is_what_rclpy_makes_and_reads(data: bytes) -> None:
     made = UInt8MultiArray(data=array.array('B', data))
-    assert message.piece(serialize_message(made)) == data
+    big = written('>', ('I', 0), ('I', 0), data)
+    assert message.piece(serialize_message(made)) == message.piece(big) == data
     assert deserialize_message(message.in_pieces(data), UInt8MultiArray) == made
 
 
+@settings(deadline=None)
 @given(header=headers, layout=layouts, data=octets)
 def test_cloud_is_what_rclpy_makes_and_reads(
     header: Header, layout: Layout, data: bytes,
 ) -> None:
     made = ros_cloud(header, layout, data)
-    assert clouds.cloud(serialize_message(made)) == (header, layout, data)
-    for written_so in (clouds.points(header, layout, data),
-                       written('>', *cloud_fields(header, layout, data))):
+    big = written('>', *cloud_fields(header, layout, data))
+    assert clouds.cloud(serialize_message(made)) == clouds.cloud(big) == (header, layout, data)
+    for written_so in (clouds.points(header, layout, data), big):
         assert deserialize_message(written_so, PointCloud2) == made
 
 
@@ -210,24 +168,7 @@ def test_message_that_ends_anywhere_too_soon_is_refused(
             read(data[:end])
 
 
-@pytest.mark.parametrize('order', FORMS)
-@pytest.mark.parametrize(('read', 'fields'), READERS, ids=READER_NAMES)
-def test_length_beyond_the_data_is_refused(
-    read: Callable[[bytes], Any], fields: list[Any], order: str,
-) -> None:
-    """Each number of four bytes in turn becomes large: none takes memory, or fails otherwise."""
-    data = written(order, *fields)
-    refused = 0
-    for at in range(4, len(data) - 3, 4):
-        for value in (len(data), 2 ** 31, 2 ** 32 - 1):
-            try:
-                read(data[:at] + struct.pack(order + 'I', value) + data[at + 4:])
-            except (CdrError, CloudError):
-                refused += 1
-    assert refused >= 3
-
-
-@pytest.mark.parametrize('form', ['0002', '0003', '0006', '0007', '0009', '000b', '0100', 'ffff'])
+@pytest.mark.parametrize('form', ['0002', '0100'])
 def test_other_form_than_plain_cdr_is_refused(form: str) -> None:
     data = written('<', *image_fields(HEADER, Picture(2, 1, 'mono8', 3, b'abc')))
     with pytest.raises(CdrError, match='form'):
@@ -270,31 +211,3 @@ def test_data_are_read_without_a_copy() -> None:
     _, shown = message.picture(data)
     assert numpy.shares_memory(numpy.frombuffer(shown.data, numpy.uint8),
                                numpy.frombuffer(data, numpy.uint8))
-
-
-@settings(max_examples=300)
-@given(data=st.binary(max_size=200), form=st.sampled_from([*FORMS.values(), b'']))
-@example(data=b'', form=b'')
-def test_any_bytes_are_read_or_refused(data: bytes, form: bytes) -> None:
-    for read, _ in READERS:
-        try:
-            read(form + data)
-        except (CdrError, CloudError):
-            pass
-    header_of(form + data)
-
-
-@settings(max_examples=300)
-@given(order=orders, flips=st.lists(st.tuples(numbers, st.integers(1, 255)), max_size=6),
-       kind=st.sampled_from(READERS))
-def test_damaged_messages_are_read_or_refused(
-    order: str, flips: list[tuple[int, int]], kind: tuple[Callable[[bytes], Any], list[Any]],
-) -> None:
-    read, fields = kind
-    data = bytearray(written(order, *fields))
-    for at, bits in flips:
-        data[at % len(data)] ^= bits
-    try:
-        read(bytes(data))
-    except (CdrError, CloudError):
-        pass

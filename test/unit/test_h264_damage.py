@@ -11,7 +11,6 @@ import pytest
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
 from hypothesis import given, HealthCheck, settings, strategies
 
-from image_transport_h264.annexb import extract, Tag
 from image_transport_h264.codec import CodecError, Decoder, Encoder, Packet, Picture
 
 WIDTH, HEIGHT = 64, 48
@@ -100,46 +99,3 @@ def test_nothing_wrong_is_ever_shown(
         got = decoder.decode(packet.data)
         assert got is not None
         assert bytes(got.data) == expected
-
-
-@LIMITS
-@given(plan=strategies.dictionaries(strategies.integers(0, 13), damage, min_size=1, max_size=8),
-       tagged=strategies.booleans())
-def test_shown_damage_has_the_right_size(
-    plan: dict[int, tuple[object, ...]], tagged: bool,
-) -> None:
-    """With damage shown, and with streams of others, pixels may be wrong and sizes not."""
-    packets = stream('bgr8')
-    decoder = Decoder(show_damage=True)
-    plain = [p.data if tagged else extract(p.data)[1] for p, _ in packets]
-    for data in disturb(plain[:14], plan):
-        try:
-            shown = decoder.decode(data)
-        except CodecError:
-            continue
-        if shown is not None:
-            assert len(shown.data) == shown.step * shown.height
-            # an SPS hit by a stray bit may name another size: it is that size then
-            assert not tagged or (shown.width, shown.height) == (WIDTH, HEIGHT)
-    for data in plain[14:]:
-        got = decoder.decode(data)
-        assert got is not None
-        assert (got.width, got.height) == (WIDTH, HEIGHT)
-
-
-@LIMITS
-@given(strategies.binary(max_size=300))
-def test_any_bytes_at_all(data: bytes) -> None:
-    for decoder in (Decoder(), Decoder(show_damage=True)):
-        for prefix in (b'', b'\0\0\0\1\x65', b'\0\0\1\x06\x05', b'FFV1tag1'):
-            try:
-                decoder.decode(prefix + data)
-            except CodecError:
-                pass
-
-
-@LIMITS
-@given(strategies.binary(max_size=300))
-def test_tags_of_any_bytes(data: bytes) -> None:
-    Tag.unpack(data)
-    extract(data)

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
 pytest.importorskip('cv2', reason='OpenCV (the extra "video") is not installed')
 from image_transport_h264 import stills
-from image_transport_h264.codec import Damaged, Decoder, Encoder
+from image_transport_h264.codec import Decoder, Encoder
 from image_transport_h264.picture import BadPicture, LAYOUTS, Picture
 
 
@@ -74,9 +74,3 @@ def test_refused_picture_names_what_carries_it(
         stills.encode(sent, kind)
     if encoding in LAYOUTS:
         assert Decoder().decode(Encoder().encode(sent).data).encoding == encoding
-
-
-@pytest.mark.parametrize('data', [b'', b'nothing of the kind', b'\xff\xd8\xff\xe0' * 9])
-def test_what_is_no_picture_is_told(data: bytes) -> None:
-    with pytest.raises(Damaged):
-        stills.decode('bgr8; jpeg compressed bgr8', data)

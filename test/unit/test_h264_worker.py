@@ -47,10 +47,3 @@ def test_a_thread_that_ends_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     assert failed.wait(60)
     worker.stop()
     assert told == ['item 7']
-
-
-def test_stopping_is_no_failure() -> None:
-    failed = threading.Event()
-    worker: Worker[int] = Worker('test', lambda item: None, failed.set)
-    worker.stop()
-    assert not failed.is_set()

@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-import struct
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
-from fogros2_replicas.pairs import header_of, HELD, MISSES, Pair, SET_BACK, STREAK
+from fogros2_replicas.pairs import HELD, MISSES, Pair, SET_BACK, STREAK
 
 NAMES = ('a', 'b', 'c')
 
@@ -21,23 +19,6 @@ def pair():
     pair.input(0.0, (1, ''))
     assert pair.output(0.1, 'a', (1, ''))
     return pair
-
-
-@settings(deadline=None)
-@given(st.integers(-2**31, 2**31 - 1), st.integers(0, 999_999_999), st.text(max_size=9),
-       st.binary(max_size=9), st.booleans())
-def test_header_is_read_from_the_bytes(seconds, nanoseconds, frame, rest, little):
-    text = frame.replace('\0', '').encode() + b'\0'
-    data = (b'\0\x01\0\0' if little else b'\0\0\0\0') + struct.pack(
-        '<iII' if little else '>iII', seconds, nanoseconds, len(text)) + text + rest
-    assert header_of(data) == (seconds * 10**9 + nanoseconds, text[:-1].decode())
-
-
-@settings(deadline=None)
-@given(st.binary(max_size=40))
-def test_any_bytes_are_a_header_or_none(data):
-    found = header_of(data)
-    assert found is None or isinstance(found[0], int)
 
 
 def test_first_output_of_a_stamp_is_forwarded(pair):

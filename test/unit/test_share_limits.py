@@ -91,27 +91,3 @@ def test_wrong_transforms_end_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     bench.expire()
     assert [(len(message), message[-1].child_frame_id) for message in bench.sent] == [
         (1, '0'), (limits.MOST, str(limits.MOST - 1))]
-
-
-def test_topic_crosses_when_both_sides_have_its_type_again() -> None:
-    """Fast DDS refuses a second type of a topic in one process."""
-    refused = [True]
-
-    def create(*_: Any) -> Any:
-        if refused:
-            raise RuntimeError('incompatible type')
-        return 'publisher'
-
-    qos = SimpleNamespace(durability=None, reliability=None)
-    publisher = SimpleNamespace(
-        node_name='talker', topic_type='std_msgs/msg/String', qos_profile=qos)
-    node: Any = SimpleNamespace(
-        get_name=lambda: 'limits', get_publishers_info_by_topic=lambda topic: [publisher],
-        get_subscriptions_info_by_topic=lambda topic: [publisher],
-        create_publisher=create, create_subscription=lambda *_, **__: 'subscription')
-    way = limits.Coming(node, '/back', '/chatter', leaving=SimpleNamespace())  # type: ignore[arg-type]
-    with pytest.raises(RuntimeError):
-        way.look()
-    refused.clear()
-    way.look()
-    assert (way.publisher, way.subscription) == ('publisher', 'subscription')

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given, strategies
+from hypothesis import given, settings, strategies
 import pytest
 
 from fogros2_share.wire import decode, DEEPEST, Echoes, encode, Form, LARGEST, LINE
@@ -32,6 +32,7 @@ def test_wrong_header_ends_the_connection(line: str) -> None:
     assert decode(b'/map a_msgs/msg/Grid 1 1 3\n') == ('/map', Form('a_msgs/msg/Grid', True, 1), 3)
 
 
+@settings(deadline=None)
 @given(strategies.one_of(
     strategies.binary(max_size=2 * LINE), strategies.lists(strategies.one_of(
         strategies.text(), strategies.integers().map(str), strategies.just(MAP.kind)),

@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import http.client
 import os
-from pathlib import Path
 import shutil
 import socket
 import threading
@@ -153,24 +152,6 @@ def test_share_reads_token_and_certificate(tmp_path):
             ({'notes': {**NOTES, 'monitor_open': ''}}, ConfigurationError, 'only this robot')):
         with pytest.raises(kind, match=said):
             access.credentials_of(entry(**changes), shell)
-
-
-def test_tunnel_reads_the_token_of_the_bridges_port():
-    shell = FakeShell(handlers={'sh': lambda command: Result(0, 'sesame\n', '')})
-    assert access.token_of(entry(), shell, 9000) == 'sesame'
-    assert [command.argv[2:] for command in shell.commands] == [
-        ('cat "$1"/*/token', 'sh', '/run/fogros2/monitor-9000')]
-    assert shell.commands[0].sudo
-
-
-def test_bridge_of_the_robot_is_found_while_it_listens():
-    folder = addresses.on_robot(Store(), 'planner')
-    with socket.create_server(('127.0.0.1', 0)) as bridge:
-        port = bridge.getsockname()[1]
-        made = credentials.make_token(Path(addresses.folder_of(str(folder), port, '1')))
-        assert access.on_robot('planner') == (port, made.token.read_text().strip())
-        assert access.on_robot('another') is None
-    assert access.on_robot('planner') is None
 
 
 def test_browser_is_led_to_the_page_once_and_in_time(monkeypatch):

@@ -49,16 +49,6 @@ def test_foreign_folder_is_not_emptied(tmp_path):
     assert (tmp_path / 'mine').exists()
 
 
-def test_token_needs_no_openssl(tmp_path, monkeypatch):
-    folder = Path(addresses.folder_of(str(tmp_path / 'new/place'), 8765, 'a1b2c3'))
-    token = credentials.make_token(folder).token.read_text()
-    assert len(token.strip()) == 32
-    assert stat.S_IMODE((tmp_path / 'new').stat().st_mode) == 0o700
-    if shutil.which('openssl') is not None:
-        made = credentials.make(folder, 'planner')
-        assert made.certificate.exists() and made.token.read_text() == token
-
-
 def test_machine_without_openssl_admits_nobody_else(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(process, 'argv', lambda command: ['/no/such/openssl'])
     serve = pytest.importorskip(

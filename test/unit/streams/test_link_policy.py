@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The keywords ``deny_topics`` and ``limit_topics`` of machines."""
+"""The keywords ``bandwidth``, ``deny_topics`` and ``limit_topics`` of machines."""
 
 from __future__ import annotations
 
@@ -21,6 +21,13 @@ from fogros2_features.streams import Streaming
 def policy(**keywords: Any) -> Any:
     machine = ContainerInstance(name='gpu-1', **keywords).spec(LaunchContext())
     return options('streams', machine.features.get('streams', {}))
+
+
+@pytest.mark.parametrize(('given', 'bits'), [
+    (None, 0.0), ('10Mbit/s', 10e6), ('2.5 Mbit/s', 2.5e6), ('500kbit/s', 500e3),
+    ('1Gbit/s', 1e9), ('250000bit/s', 250e3), (10_000_000, 10e6), ('1000000', 1e6)])
+def test_bandwidth_is_read_as_bits_per_second(given: Any, bits: float) -> None:
+    assert policy(bandwidth=given).bandwidth == bits
 
 
 @pytest.mark.parametrize(('given', 'hertz'), [
@@ -45,6 +52,11 @@ def test_link_without_limits_has_no_programs() -> None:
 
 
 @pytest.mark.parametrize(('keywords', 'message'), [
+    ({'bandwidth': 0}, 'bandwidth=0 is no bandwidth from 100 kbit/s'),
+    ({'bandwidth': -1e6}, 'is no bandwidth'),
+    ({'bandwidth': 'fast'}, "write '500kbit/s', '10Mbit/s' or '1Gbit/s'"),
+    ({'bandwidth': '10MB/s'}, "bandwidth='10MB/s' is no bandwidth"),
+    ({'bandwidth': 'nan'}, 'is no bandwidth'),
     ({'deny_topics': ['costmap']}, "'costmap' is not the full name of a topic"),
     ({'deny_topics': ['/tf_static']}, '/tf_static in deny_topics would leave nodes without'),
     ({'limit_topics': {'/tf_static': 1}}, '/tf_static in limit_topics would leave nodes'),
