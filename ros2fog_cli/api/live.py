@@ -14,9 +14,10 @@ import threading
 import time
 from typing import Any, Optional
 
+from fogros2 import feature
 from fogros2.errors import FogError, MachineNotFound
 from fogros2.store import robot_name, Store
-from ros2fog_cli.api import endings, machines, replicas
+from ros2fog_cli.api import endings, machines
 from ros2fog_cli.api.follower import Follower
 from ros2fog_cli.api.graphs import Graphs
 from ros2fog_cli.api.machines import Entry
@@ -50,6 +51,7 @@ class Live:
         self.store = Store()
         self._name, self._regions, self._interval = name, regions, interval
         self._graphs = Graphs(self.store, pictures=pictures) if topics else None
+        self._tables = feature.tables()
         #: Machines by their keys, see :meth:`_key`.
         self._shown: dict[str, Shown] = {}
         self._launches: dict[str, ShownLaunch] = {}
@@ -273,8 +275,9 @@ class Live:
             shown.steps = tuple(step for step in launch.steps
                                 if step.machine == shown.entry.name)
             shown.clock = launch.clocks.get(shown.entry.name)
-            shown.replicas = tuple(replicas.figures(
-                self.store.root / 'launches' / shown.launch, shown.entry.name))
+        folder = self.store.root / 'launches' / shown.launch
+        shown.figures = {name: rows for name, each in self._tables.items()
+                         if (rows := each.figures(folder, shown.entry.name)) is not None}
         if not is_present:
             shown.ended = shown.ended or now
         if not (self.watched and is_present and record is not None and record.launch_alive):
