@@ -11,7 +11,6 @@ import socket
 import struct
 import subprocess
 import sys
-import threading
 import types
 
 import pytest
@@ -244,16 +243,6 @@ read -r _ <{tmp_path}/up
     done = subprocess.run(['unshare', '-n', 'sh', str(script), _PEER, ask], text=True, timeout=60,
                           capture_output=True, env=environment, cwd=tmp_path)
     assert ast.literal_eval(done.stdout) == {'198.51.100.2': 1, lan.HERE: 1}, done.stderr
-
-
-def test_doctor_runs_in_any_thread() -> None:
-    threads = [threading.Thread(target=doctor.examine, kwargs={'lan_seconds': 0})
-               for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
-        assert not thread.is_alive()
 
 
 @pytest.mark.parametrize('program', ['nft', 'sudo'])
