@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import contextlib
 import dataclasses
-import json
 import os
 from pathlib import Path
 import time
@@ -14,7 +13,6 @@ from typing import Any, Optional, TextIO
 
 from fogros2 import journal
 from fogros2.clock import ClockOffset
-from fogros2.store import process_alive
 from ros2fog_cli.api.follower import Follower
 from ros2fog_cli.api.machines import Entry
 
@@ -160,13 +158,3 @@ def _phase(shown: Shown) -> str:
     if record is not None and record.launch_alive:
         return phase(shown.steps) if shown.steps or not record.agent else 'running'
     return shown.entry.state.partition(' ')[0]
-
-
-def process_of(folder: Path) -> tuple[int, bool]:
-    """Return a launch's process id and whether it runs, from the file in its folder."""
-    try:
-        data = json.loads((folder / 'process.json').read_text())
-        pid = int(data['pid'])
-        return pid, process_alive(pid, int(data['pid_start']), str(data.get('boot', '')))
-    except (OSError, ValueError, KeyError, TypeError):
-        return 0, True  # the launch has just started

@@ -69,8 +69,6 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     add_region(parser)
     parser.add_argument('--image-name', metavar='NAME',
                         help="the image's name (default: the machine's, and the time)")
-    parser.add_argument('--no-wait', action='store_true',
-                        help="don't wait until the image is ready")
     add_deletion(parser)
     add_json(parser)
 
@@ -142,9 +140,8 @@ def _make(args: argparse.Namespace, name: str) -> int:
         warn('what is installed on the machine is not known: no launch takes the image by '
              f'itself, but each that names it does ({baking.id})')
     try:
-        if not args.no_wait:
-            with progress.working('making'):
-                images.wait(baking)
+        with progress.working('making'):
+            images.wait(baking)
     except KeyboardInterrupt:
         warn(f'the image goes on being made: {baking.id} (ros2 fog image list shows it)')
         raise
@@ -155,7 +152,7 @@ def _make(args: argparse.Namespace, name: str) -> int:
         print_json(id=baking.id, name=baking.name, provider=baking.provider,
                    dependencies=baking.dependencies)
     else:
-        print(f"{'making' if args.no_wait else 'made'} {baking.name} ({baking.id})")
+        print(f'made {baking.name} ({baking.id})')
     return 0
 
 

@@ -8,15 +8,7 @@ import dataclasses
 import time
 from typing import Any, TYPE_CHECKING
 
-from ros2fog_cli.verb import (
-    add_json,
-    add_name,
-    add_region,
-    number,
-    print_json,
-    VerbExtension,
-    warn,
-)
+from ros2fog_cli.verb import add_json, add_name, add_region, print_json, VerbExtension, warn
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -38,8 +30,6 @@ class StatusVerb(VerbExtension):
         parser.add_argument('--topics', action='store_true',
                             help='with --watch: a node joins the launch and measures the rates '
                                  'of topics across the VPN')
-        parser.add_argument('--interval', type=number, default=1.0, metavar='SECONDS',
-                            help='poll interval of --watch (default: 1)')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the status; return 1 if there are problems or no expected agent answers."""
@@ -49,8 +39,7 @@ class StatusVerb(VerbExtension):
         from ros2fog_cli.api import reach
         if args.watch:
             from ros2fog_cli.api.watching import watch
-            return watch(args.name, interval=args.interval, regions=args.region,
-                         as_json=args.json, topics=args.topics)
+            return watch(args.name, regions=args.region, as_json=args.json, topics=args.topics)
         if args.topics:
             raise ConfigurationError('--topics is for --watch: a rate takes a while',
                                      'add --watch')
@@ -58,7 +47,9 @@ class StatusVerb(VerbExtension):
         folder = store.other_vpns().get(args.name)
         other = other_vpn(folder) if folder is not None else None
         if other is not None and not store.exists(args.name):
-            return show_link(reach.link_of(other), as_json=args.json)
+            return show_link(reach.measure(
+                other.interface.address, other.own, other.machine.public_key, 'wireguard'),
+                as_json=args.json)
         entry = reach.find(args.name, warn, regions=args.region)
         tables = feature.tables()
         status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'clock': None, 'agent': None,

@@ -475,7 +475,8 @@ def test_failed_image_is_reported(quick: None, capsys: pytest.CaptureFixture[str
 
 def test_image_without_dependencies_warns(capsys: pytest.CaptureFixture[str]) -> None:
     machine('slam', tags={TAG_NAME: 'slam', TAG_ROBOT: robot_name()})
-    assert run('image', 'slam', '--no-wait', '--json') == 0
+    Cloud.states = ['available']
+    assert run('image', 'slam', '--json') == 0
     said = capsys.readouterr()
     assert 'no launch takes the image by itself' in said.err
     assert json.loads(said.out)['id'] == 'img-0'
@@ -489,7 +490,8 @@ def test_image_of_an_unreachable_machine_warns(
 
     monkeypatch.setattr(reach.shells, 'connect', lost)
     machine('slam')
-    assert run('image', 'slam', '--no-wait') == 0
+    Cloud.states = ['available']
+    assert run('image', 'slam') == 0
     assert 'may be missing in the image: no route' in capsys.readouterr().err
 
 
