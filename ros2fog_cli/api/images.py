@@ -85,10 +85,9 @@ def wait(baking: Image, *, timeout: float = TIMEOUT) -> Image:
 
 def survey(warn: Warn, *, regions: Optional[Sequence[str]] = None) -> list[Image]:
     """Return the images of all providers; warn about a provider that does not answer."""
-    answers = machines.ask_all(warn, machines.configured(regions),
-                               lambda name: list(machines.load(name, regions).images()))
-    return sorted((image for images in answers for image in images or ()),
-                  key=lambda image: (image.name, image.region, image.id))
+    return sorted(
+        machines.gather(warn, regions, lambda name: machines.load(name, regions).images()),
+        key=lambda image: (image.name, image.region, image.id))
 
 
 def named(images: Sequence[Image], words: Sequence[str]) -> list[Image]:

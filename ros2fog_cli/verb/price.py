@@ -29,7 +29,7 @@ class PriceVerb(VerbExtension):
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
         parser.add_argument('--min-cpu', type=int, metavar='N', help='vCPUs (default: 2)')
-        parser.add_argument('--min-memory', type=float, metavar='GB', help='default: 4')
+        parser.add_argument('--min-memory', type=float, metavar='GB', help='memory (default: 4)')
         parser.add_argument('--gpu', nargs='?', const='1', metavar='N|NAME',
                             help="how many GPUs of NVIDIA's, or one of this name, such as L4")
         parser.add_argument('--gpu-memory', type=float, metavar='GB', help='of each GPU')
