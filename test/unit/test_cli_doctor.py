@@ -110,19 +110,6 @@ def test_cyclone_configuration_of_the_user_is_checked(
     assert doctor.cyclone_uri().verdict == verdict
 
 
-def test_each_cyclone_configuration_is_checked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    good, bad = tmp_path / 'good.xml', tmp_path / 'bad.xml'
-    good.write_text('<CycloneDDS/>')
-    bad.write_text('CycloneDDS')
-    monkeypatch.setenv('CYCLONEDDS_URI', f'<CycloneDDS><a x="1,2"/></CycloneDDS>,file://{good}')
-    assert doctor.cyclone_uri().verdict == 'ok'
-    monkeypatch.setenv('CYCLONEDDS_URI', f'{good},{bad}')
-    check = doctor.cyclone_uri()
-    assert check.verdict == 'failed' and 'bad.xml' in check.detail
-
-
 def test_state_folder_must_be_private(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / 'state'
     monkeypatch.setenv('FOGROS2_STATE_HOME', str(folder))
