@@ -697,23 +697,6 @@ def test_shell_becomes_the_users_shell(
     assert capfd.readouterr().out.startswith('yes 42 (a) ')
 
 
-@pytest.mark.parametrize('verb', ['status', 'logs', 'connect', 'env', 'delete'])
-def test_unknown_machine_is_one_line_and_a_status(
-    verb: str, capsys: pytest.CaptureFixture[str],
-) -> None:
-    words = [verb, 'nowhere'] + (['--yes'] if verb == 'delete' else [])
-    said = run(*words)
-    err = capsys.readouterr().err.splitlines()
-    assert said not in (0, None)
-    text = [line for line in [str(said), *err] if 'nowhere' in line]
-    assert len(text) == 1
-
-
-@pytest.mark.parametrize('verb', ['status', 'env', 'connect'])
-def test_invalid_machine_name_is_refused(verb: str) -> None:
-    assert 'no name for a machine' in str(run(verb, '../up'))
-
-
 @pytest.mark.parametrize(('seconds', 'text'), [
     (None, '-'), (-1, 'over'), (0, '0 s'), (119, '119 s'), (120, '2 min'), (7199, '2 h 00 min'),
     (3600 * 30 + 300, '30 h 05 min'), (86400 * 3 + 7200, '3 d 2 h')])
