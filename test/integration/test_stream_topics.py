@@ -201,7 +201,7 @@ def test_status_shows_the_rate_of_each_stream(cloud_network: str) -> None:
         run.wait_for('process started with pid', times=4)
         status = ros2('fog', 'status', f'{NAME}-rate')
         assert status.returncode == 0, status.stdout + status.stderr
-        rate = re.search(r'^/camera +h264 +robot +\S+ +([0-9.]+)/s ', status.stdout, re.MULTILINE)
+        rate = re.search(r'^/camera \(h264\) +robot +\S+ +([0-9.]+) ', status.stdout, re.MULTILINE)
         assert rate is not None and float(rate[1]) > 1, status.stdout
         assert re.search(r'^/annotated .* nobody subscribes ', status.stdout, re.MULTILINE)
         run.interrupt()

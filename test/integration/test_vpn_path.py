@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import uuid
 
@@ -62,7 +63,8 @@ def test_vpn_leaves_udp_and_returns(cloud_network, spec, monkeypatch):
             return paths[-1:] == [path] and machine.heartbeat.age < 1.0
 
         wait_until(used, timeout=60.0, what=f'answers by {path}')
-        return f'VPN path    {path}\n' in ros2('fog', 'status', machine.spec.name).stdout
+        status = ros2('fog', 'status', machine.spec.name).stdout
+        return re.search(rf'^VPN path +{path}$', status, re.MULTILINE)
 
     try:
         with without_udp(cloud_network):
