@@ -139,6 +139,7 @@ setup(
             'idle = fogros2_features.idle:IdleTimeout',
             'monitor = fogros2_monitor.feature:Monitor',
             'replacement = fogros2_features.replacement:Replacement',
+            'replicas = fogros2_features.replicas.feature:Replicas',
             'results = fogros2_features.results:Results',
             'streams = fogros2_features.streams:Streaming',
             'vpn_path = fogros2_features.vpn_path:VpnPath',

@@ -563,23 +563,14 @@ def main() -> None:
     scenarios = SCENARIOS + (app_scenarios(arguments.ompl_app) if arguments.ompl_app else [])
     from figures import machine as computer
     from figures import today
-    from streaming import Link, UDP
-
-    from fogros2.deploy import Launch
-    from fogros2.model import MachineSpec
+    from streaming import launched
 
     if os.geteuid():
         raise SystemExit('holding a node to a share of a core takes root')
     results: list[Result] = []
     failed: list[str] = []
     begin = time.monotonic()
-    launch = Launch()
-    link: Optional[Link] = None
-    try:
-        machine = launch.up(MachineSpec(
-            f'bench-applications-{os.getpid()}', 'container', features=UDP))
-        prepare(machine)
-        link = Link(launch, machine)
+    with launched(f'bench-applications-{os.getpid()}', prepare) as (launch, machine, link, _):
         jobs = [measured(scenario, arguments.short, launch, machine, link)
                 for scenario in scenarios if arguments.only in scenario.name and not (
                     arguments.short and scenario.name.endswith('Apartment'))]
@@ -593,11 +584,6 @@ def main() -> None:
             except RuntimeError as error:
                 # what was measured before counts all the same
                 failed.append(str(error))
-    finally:
-        if link is not None:
-            link.close()
-        for error in launch.down():
-            print(error, file=sys.stderr)
     print(table(results, f'{computer()}. {NOTE}'))
     print(f'took {(time.monotonic() - begin) / 60:.1f} min\n')
     for name in ('slam', 'grasp', 'planning'):

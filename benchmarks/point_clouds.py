@@ -25,7 +25,7 @@ import tempfile
 import time
 from typing import Any
 
-from streaming import answer_of, end, FOLDER, Link, Output, UDP
+from streaming import answer_of, end, FOLDER, launched, Link, Output
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
@@ -391,9 +391,6 @@ def main() -> None:
     from figures import machine as computer
     from figures import RESULTS, Row, write
 
-    from fogros2.deploy import Launch
-    from fogros2.model import MachineSpec
-
     codecs = alone()
     print(table(codecs, [], ''), flush=True)
     if arguments.codec:
@@ -402,22 +399,10 @@ def main() -> None:
     outcomes: list[Outcome] = []
     # the cloud is handed on twice, the answer crosses once more than measured here
     parts = 2 * hop_alone() + codecs[0][2] + codecs[0][3]
-    launch = Launch()
-    link = None
-    try:
-        machine = launch.up(MachineSpec('bench-points', 'container', features=UDP))
-        prepare(machine)
-        output = Output()
-        machine.subscribe(output.heard)
-        link = Link(launch, machine)
+    with launched('bench-points', prepare) as (launch, machine, link, output):
         for case in CASES:
             outcomes.append(run(case, launch, machine, link, output, count, parts))
             print(outcomes[-1], flush=True)
-    finally:
-        if link is not None:
-            link.close()
-        for error in launch.down():
-            print(error, file=sys.stderr)
     text = table(codecs, outcomes, f'{computer()}; {count} scans in each row of the second table, '
                  f'at {RATE:.0f} Hz, resolution {100 * RESOLUTION:.0f} cm.')
     print(text)

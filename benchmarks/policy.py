@@ -35,10 +35,10 @@ from streaming import (
     FOLDER,
     frames,
     hop_alone,
+    launched,
     Link,
     Output,
     shown,
-    UDP,
 )
 
 HERE = Path(__file__).parent
@@ -341,6 +341,15 @@ def table(outcomes: list[Outcome], note: str) -> str:
     return '\n'.join([*lines, ''])
 
 
+def prepare_policy(machine: Any) -> None:
+    """Put onto the machine what its nodes need."""
+    prepare(machine)
+    for path in (HERE / 'policy.py', HERE / 'applications.py', HERE / 'streaming.py',
+                 *sorted((HERE / 'figures').glob('*.py'))):
+        machine.shell.put(path.read_bytes(), f'{FOLDER}/{path.relative_to(HERE)}', mode=0o644)
+    machine.shell.put(model(), MODEL, mode=0o644)
+
+
 def main() -> None:
     """Measure all cases, write the figures down."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -361,27 +370,13 @@ def main() -> None:
     from figures import machine as computer
     from figures import RESULTS, Row, write
 
-    from fogros2.deploy import Launch
-    from fogros2.model import MachineSpec
-
     less = 10 if arguments.short else 1
     outcomes: list[Outcome] = []
     # three cameras share the cores; each image is handed on twice, as in ``streaming``
     share = len(CAMERAS) / min(len(CAMERAS), os.cpu_count() or 1)
     parts = share * (2 * hop_alone('VGA') + sum(codec_alone('VGA')))
-    launch = Launch()
-    link: Optional[Link] = None
-    try:
-        machine = launch.up(MachineSpec(
-            f'bench-policy-{os.getpid()}', 'container', features=UDP))
-        prepare(machine)
-        for path in (HERE / 'policy.py', HERE / 'applications.py', HERE / 'streaming.py',
-                     *sorted((HERE / 'figures').glob('*.py'))):
-            machine.shell.put(path.read_bytes(), f'{FOLDER}/{path.relative_to(HERE)}', mode=0o644)
-        machine.shell.put(model(), MODEL, mode=0o644)
-        output = Output()
-        machine.subscribe(output.heard)
-        link = Link(launch, machine)
+    with launched(f'bench-policy-{os.getpid()}', prepare_policy) as (
+            launch, machine, link, output):
         for name, count, jpeg in (('WebSocket, JPEG', 300, True), ('WebSocket, raw', 30, False)):
             outcomes.append(websocket(name, launch, machine, link, output, count // less, jpeg))
             print(outcomes[-1], flush=True)
@@ -394,11 +389,6 @@ def main() -> None:
             print(outcomes[-1], flush=True)
         for outcome in outcomes[2:]:
             outcome.limit = parts + 1e3 * (outcome.size * 8 / LINK + 2 * DELAY)
-    finally:
-        if link is not None:
-            link.close()
-        for error in launch.down():
-            print(error, file=sys.stderr)
     text = table(outcomes, f'{computer()}; three VGA cameras at {RATE:.0f} Hz, '
                  f'{LINK / 1e6:.0f} Mbit/s and {1e3 * DELAY:.0f} ms each way; the policy itself '
                  f'takes no time. openpi sends an observation when the last one is answered.')

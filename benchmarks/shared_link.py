@@ -9,7 +9,6 @@ relay that limits the link, answers each image and scan. ``--short`` takes a ten
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
 import math
 import os
@@ -23,7 +22,7 @@ from figures import machine as computer
 from figures import RESULTS, Row, write
 import point_clouds
 import streaming
-from streaming import answer_of, end, FOLDER, HERE, Link, Output, ROOT, UDP
+from streaming import answer_of, end, FOLDER, HERE, launched, Link, Output, ROOT
 
 LINK = 40e6
 LINK_TOPIC = '/fogros2/machine/link_in'
@@ -140,22 +139,11 @@ def main() -> None:
     parser.add_argument('--short', action='store_true')
     parser.add_argument('--count', type=int, default=1800)
     arguments = parser.parse_args()
-    from fogros2.deploy import Launch
-    from fogros2.model import MachineSpec
-
     count = arguments.count // 10 if arguments.short else arguments.count
     outcomes: list[Outcome] = []
     begin = time.monotonic()
     parts = limits()
-    launch = Launch()
-    with contextlib.ExitStack() as stack:
-        stack.callback(lambda: [print(error, file=sys.stderr) for error in launch.down()])
-        machine = launch.up(MachineSpec('bench-link', 'container', features=UDP))
-        point_clouds.prepare(machine)
-        output = Output()
-        machine.subscribe(output.heard)
-        link = Link(launch, machine)
-        stack.callback(link.close)
+    with launched('bench-link', point_clouds.prepare) as (launch, machine, link, output):
         for case, limited in (('budget of 40 Mbit/s', True), ('no budget', False)):
             outcomes += run(case, limited, launch, machine, link, output, count, parts)
     text = table(outcomes, f'{computer()}; {count} images of each camera, {count // 3} scans; '

@@ -15,9 +15,10 @@ from __future__ import annotations
 import argparse
 import array
 from collections import defaultdict, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import dataclasses
+import functools
 import itertools
 import json
 import math
@@ -275,6 +276,31 @@ class Output:
     def last(self, *nodes: str) -> str:
         """Return what nodes wrote last."""
         return '\n'.join(f'{node}: {line}' for node in nodes for line in self.lines[node])
+
+
+@contextlib.contextmanager
+def launched(
+    name: str, prepare: Callable[[Any], None], link: Callable[[Any, Any], Any] = Link,
+    features: Any = UDP,
+) -> Iterator[tuple[Any, Any, Any, Output]]:
+    """
+    Yield a launch, its container machine, the link between and what nodes write; end all.
+
+    :param prepare: puts onto the machine what its nodes need.
+    """
+    from fogros2.deploy import Launch
+    from fogros2.model import MachineSpec
+
+    launch, output = Launch(), Output()
+    try:
+        machine = launch.up(MachineSpec(name, 'container', features=features))
+        prepare(machine)
+        machine.subscribe(output.heard)
+        with contextlib.closing(link(launch, machine)) as way:
+            yield launch, machine, way, output
+    finally:
+        for error in launch.down():
+            print(error, file=sys.stderr)
 
 
 def answer_of(process: subprocess.Popen[str], what: str, timeout: float) -> dict[str, Any]:
@@ -660,9 +686,6 @@ def main() -> None:
         write_down(name, title, *stored(path))
         return None
 
-    from fogros2.deploy import Launch
-    from fogros2.model import MachineSpec
-
     count = arguments.count // 10 if arguments.short else arguments.count
     cases = [case for case in CASES if arguments.only in case.name and not (
         arguments.short and (case.size != 'VGA' or case.delay and not case.loss))]
@@ -673,14 +696,8 @@ def main() -> None:
     limits: dict[str, float] = {}
     failed: list[str] = []
     begin = time.monotonic()
-    launch = Launch()
-    link: Optional[Link] = None
-    try:
-        machine = launch.up(MachineSpec('bench-streaming', 'container', features=UDP))
-        prepare(machine, arguments.video)
-        output = Output()
-        machine.subscribe(output.heard)
-        link = Link(launch, machine)
+    with launched('bench-streaming', functools.partial(prepare, video=arguments.video)) as (
+            launch, machine, link, output):
         for case in cases:
             outcome = tried(case, launch, machine, link, output, count, arguments.video)
             if outcome is None:
@@ -690,11 +707,6 @@ def main() -> None:
             print(outcome, flush=True)
             if case.codec == 'h264' and not case.loss:
                 limits[case.name] = limit(launch, outcome)
-    finally:
-        if link is not None:
-            link.close()
-        for error in launch.down():
-            print(error, file=sys.stderr)
     how = f'{computer()}, {count} images of each at 30 Hz of {scene}'
     outcomes = [dataclasses.replace(o, computer=how, date=today()) for o in outcomes]
     print(table(title, outcomes, limits, how))

@@ -12,6 +12,7 @@ import argparse
 import asyncio
 import contextlib
 import fcntl
+import functools
 import json
 import os
 from pathlib import Path
@@ -125,31 +126,17 @@ class Path10:
 
 def measure(path: str, count: int) -> dict[str, Any]:
     """Return the outcomes of a path's cases by their names."""
-    from streaming import Case, Output, prepare, run
+    from streaming import Case, launched, prepare, run
 
-    from fogros2.deploy import Launch
-    from fogros2.model import MachineSpec
-
-    launch = Launch()
-    link = None
-    try:
-        machine = launch.up(MachineSpec(
-            f'bench-path-{path}', 'container', features={'vpn_path': {'vpn_path': path}}))
-        prepare(machine, '')
-        output = Output()
-        machine.subscribe(output.heard)
-        link = Path10(launch, machine)
-        outcomes = {}
+    outcomes = {}
+    with launched(
+            f'bench-path-{path}', functools.partial(prepare, video=''), Path10,
+            {'vpn_path': {'vpn_path': path}}) as (launch, machine, link, output):
         for name, (delay, loss) in LINKS.items():
             case = Case(f'H.264, {NAMES[path]}{name}', 'h264', delay=delay, loss=loss)
             outcomes[name] = run(case, launch, machine, link, output, count, '')
             print(outcomes[name], flush=True)
-        return outcomes
-    finally:
-        if link is not None:
-            link.close()
-        for error in launch.down():
-            print(error, file=sys.stderr)
+    return outcomes
 
 
 def main() -> None:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
 from decimal import Decimal
+from pathlib import Path
 import threading
 from typing import Any, ClassVar, Optional, Protocol, TYPE_CHECKING
 
@@ -400,6 +401,16 @@ class Feature:
         """
         return ()
 
+    def figures(self, folder: Path, machine: str) -> Optional[Sequence[Mapping[str, Any]]]:
+        """
+        Return the rows of the table from files of the robot, None if the machine has to be asked.
+
+        Live views read them several times a second.
+
+        :param folder: the launch's folder, whether or not it exists.
+        """
+        return None
+
     def row(self, entry: Mapping[str, Any]) -> Sequence[str]:
         """Return a row of the table for people."""
         return ()
@@ -430,6 +441,15 @@ def installed() -> dict[str, Feature]:
     :raises PrerequisiteError: one cannot be loaded.
     """
     return {name: load(name) for name in plugin_system.names(GROUP)}
+
+
+def tables() -> dict[str, Feature]:
+    """
+    Return the features with a table in ``ros2 fog status``, by name.
+
+    :raises PrerequisiteError: one cannot be loaded.
+    """
+    return {name: each for name, each in installed().items() if each.headings}
 
 
 def options(name: str, given: Mapping[str, Any], of: str = 'options') -> Any:

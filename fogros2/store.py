@@ -130,6 +130,16 @@ def this_process() -> dict[str, Any]:
     return {'pid': pid, 'pid_start': process_start(pid) or 0, 'boot': boot_id()}
 
 
+def launch_process(folder: Path) -> tuple[int, bool]:
+    """Return the id of a launch's process, 0 if its folder does not tell, and whether it runs."""
+    try:
+        data = json.loads((folder / 'process.json').read_text())
+        pid = int(data['pid'])
+        return pid, process_alive(pid, int(data['pid_start']), str(data.get('boot', '')))
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0, False
+
+
 @dataclasses.dataclass(frozen=True)
 class Made:
     """

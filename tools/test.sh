@@ -41,7 +41,6 @@ unset RMW_IMPLEMENTATION CYCLONEDDS_URI ROS_DOMAIN_ID ROS_AUTOMATIC_DISCOVERY_RA
     ROS_STATIC_PEERS ROS_LOCALHOST_ONLY FOGROS2_STATE_HOME
 
 ros=$(ros_setup)
-[ -z "$ros" ] || export ROS2_SETUP="$ros"
 
 # Of a whole run, what failed runs once more, alone, until a third test fails again. The closing
 # lines name it.

@@ -69,11 +69,6 @@ class Row:
         return self.value <= self.target if self.better == 'less' else self.value >= self.target
 
 
-def median_of(runs: int, measure: Callable[[], float]) -> float:
-    """Return the median of ``runs`` calls."""
-    return statistics.median(measure() for _ in range(runs))
-
-
 def seconds(action: Callable[[], object]) -> float:
     """Return how long a call takes, in seconds."""
     begin = time.perf_counter()

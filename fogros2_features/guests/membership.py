@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Mapping
-import contextlib
 import dataclasses
-import json
 import os
 from pathlib import Path
 from typing import Optional
@@ -19,8 +17,8 @@ from fogros2.errors import ConfigurationError, DdsError, did_you_mean, VpnError
 from fogros2.model import OtherVpn, Peer, to_json, VpnInterface
 from fogros2.store import (
     boot_id,
+    launch_process,
     OTHER_VPN,
-    process_alive,
     process_start,
     Store,
     write_private,
@@ -117,10 +115,7 @@ def is_up(invitation: Invitation) -> bool:
 
 def is_held(folder: Path) -> bool:
     """Return whether the process that has joined still runs, or this computer joined by hand."""
-    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
-        owner = json.loads((folder / 'process.json').read_text())
-        return process_alive(int(owner['pid']), int(owner['pid_start']), str(owner['boot']))
-    return False
+    return launch_process(folder)[1]
 
 
 def check_rmw(rmw: str) -> None:

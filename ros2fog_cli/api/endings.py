@@ -8,7 +8,6 @@ from concurrent.futures import as_completed, ThreadPoolExecutor
 import contextlib
 import dataclasses
 import functools
-import json
 import math
 from pathlib import Path
 import re
@@ -35,7 +34,7 @@ from fogros2.model import Command, Machine, MachineState
 from fogros2.provider import Provider
 from fogros2.report import Reporter
 from fogros2.shell import Shell
-from fogros2.store import Made, process_alive, Record, robot_id, Store
+from fogros2.store import launch_process, Made, Record, robot_id, Store
 from fogros2.vpn import owner
 from fogros2.waiting import Timeouts, wait_until
 from ros2fog_cli.api import machines, reach
@@ -376,15 +375,13 @@ def stopped_at(
         return None
 
 
-def tidy(warn: machines.Warn, *, regions: Optional[Sequence[str]] = None) -> Iterator[str]:
+def tidy(warn: machines.Warn, *, regions: Optional[Sequence[str]] = None) -> list[str]:
     """
     Let all providers delete the leftovers of machines that deleted themselves.
 
-    Yield a line of text for each deleted resource; warn about a provider that does not answer.
+    Return a line of text for each deleted resource; warn about a provider that does not answer.
     """
-    for lines in machines.ask_all(warn, machines.configured(regions),
-                                  lambda name: machines.load(name, regions).tidy()):
-        yield from lines or ()
+    return machines.gather(warn, regions, lambda name: machines.load(name, regions).tidy())
 
 
 def let_go(record: Record, machine: Optional[Machine], store: Store) -> None:
@@ -416,13 +413,11 @@ def leftovers(store: Store, now: Optional[float] = None) -> list[Path]:
 
 def _dead(folder: Path, now: float) -> bool:
     """Return whether a folder belongs to a dead launch: no process, or an old folder."""
+    pid, alive = launch_process(folder)
+    if pid:
+        return not alive
+    runs = owner.alive(f'fog{folder.name}')
     try:
-        data = json.loads((folder / 'process.json').read_text())
-        return not process_alive(int(data['pid']), int(data['pid_start']),
-                                 str(data.get('boot', '')))
-    except (OSError, ValueError, KeyError, TypeError):
-        runs = owner.alive(f'fog{folder.name}')
-        try:
-            return not runs if runs is not None else now - folder.stat().st_mtime > FOLDER_AGE
-        except OSError:
-            return False
+        return not runs if runs is not None else now - folder.stat().st_mtime > FOLDER_AGE
+    except OSError:
+        return False

@@ -23,8 +23,8 @@ from ros2fog_cli.api.machines import Entry
 
 #: Number of log lines to keep, and longest line in characters.
 LINES, WIDTH = 500, 2000
-#: Pause between two attempts to connect, in seconds.
-RETRY = 5.0
+#: Seconds between two polls of an agent, and between two attempts to connect.
+INTERVAL, RETRY = 1.0, 5.0
 #: Seconds between two looks at the VPN. sudo, where it is needed, logs each look.
 VPN_INTERVAL = 2.0
 #: Bytes to read of a process's command line.
@@ -35,19 +35,18 @@ Changed = Callable[[], None]
 
 class Follower:
     """
-    Poll a machine's agent and VPN in a thread, every ``interval`` seconds.
+    Poll a machine's agent and VPN in a thread.
 
     The results can be read at any time; the thread calls ``changed`` after each change.
 
     :param entry: the machine; :meth:`know` replaces it.
     """
 
-    def __init__(self, entry: Entry, changed: Changed, interval: float = 1.0) -> None:
+    def __init__(self, entry: Entry, changed: Changed) -> None:
         assert entry.record is not None
         self._entry = entry
         self._record: Record = entry.record
         self._changed = changed
-        self._interval = interval
         self._lock = threading.Lock()
         self._lines: deque[dict[str, Any]] = deque(maxlen=LINES)
         self._number = self._seq = 0
@@ -100,7 +99,7 @@ class Follower:
                     client, shell = self._connect(undo)
                     while not self._stopped.is_set():
                         self._ask(client, shell)
-                        self._stopped.wait(self._interval)
+                        self._stopped.wait(INTERVAL)
             except FogError as error:
                 self.problems['agent'] = str(error)
                 self.agent = None

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 import dataclasses
 import time
 from typing import Any, Optional
@@ -55,19 +55,14 @@ def bake(entry: Entry, name: str = '', now: Optional[float] = None) -> Image:
     return Image(made, name, entry.provider, dependencies=dependencies)
 
 
-def wait(
-    baking: Image, *, timeout: float = TIMEOUT,
-    look: Callable[[str, float], None] = lambda state, seconds: None,
-) -> Image:
+def wait(baking: Image, *, timeout: float = TIMEOUT) -> Image:
     """
     Wait until an image is available, and return it.
 
-    :param look: callback with the image's state and the seconds since the call.
     :raises ProviderError: the creation failed, or the image disappeared.
     :raises DeadlineExceeded: the image is not available after ``timeout`` seconds.
     """
     provider = machines.load(baking.provider)
-    begin = time.monotonic()
     seen = False
 
     def probe() -> Optional[Image]:
@@ -78,7 +73,6 @@ def wait(
                 raise ProviderError(f"the image '{baking.name}' was deleted while it was made")
             return None  # a new image may be missing from the list at first
         seen = True
-        look(image.state, time.monotonic() - begin)
         if image.state in FAILED:
             raise ProviderError(f"the image '{baking.name}' ({image.id}) is {image.state}",
                                 f'ros2 fog image delete {image.id}, and try again')
@@ -91,10 +85,9 @@ def wait(
 
 def survey(warn: Warn, *, regions: Optional[Sequence[str]] = None) -> list[Image]:
     """Return the images of all providers; warn about a provider that does not answer."""
-    answers = machines.ask_all(warn, machines.configured(regions),
-                               lambda name: list(machines.load(name, regions).images()))
-    return sorted((image for images in answers for image in images or ()),
-                  key=lambda image: (image.name, image.region, image.id))
+    return sorted(
+        machines.gather(warn, regions, lambda name: machines.load(name, regions).images()),
+        key=lambda image: (image.name, image.region, image.id))
 
 
 def named(images: Sequence[Image], words: Sequence[str]) -> list[Image]:

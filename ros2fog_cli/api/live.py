@@ -14,13 +14,14 @@ import threading
 import time
 from typing import Any, Optional
 
+from fogros2 import feature
 from fogros2.errors import FogError, MachineNotFound
-from fogros2.store import robot_name, Store
-from ros2fog_cli.api import endings, machines, replicas
+from fogros2.store import launch_process, robot_name, Store
+from ros2fog_cli.api import endings, machines
 from ros2fog_cli.api.follower import Follower
 from ros2fog_cli.api.graphs import Graphs
 from ros2fog_cli.api.machines import Entry
-from ros2fog_cli.api.shown import as_json, machine_json, phase, process_of, Shown, ShownLaunch
+from ros2fog_cli.api.shown import as_json, machine_json, phase, Shown, ShownLaunch
 
 #: Seconds between two reads of the store (LOOK), between two polls of the providers with machines
 #: (ASK) and without (ASK_SELDOM), and for which a reader of the state counts as present (PRESENT).
@@ -37,19 +38,18 @@ class Live:
 
     :param name: name of the one machine to watch; None: all machines.
     :param regions: regions to ask, for providers with regions.
-    :param interval: poll interval of agents in seconds.
     :param topics: whether to join launches and measure the rates of topics.
     :param pictures: with ``topics``: whether to take pictures of streams, too.
     """
 
     def __init__(
         self, *, name: Optional[str] = None,
-        regions: Optional[list[str]] = None, interval: float = 1.0, topics: bool = False,
-        pictures: bool = False,
+        regions: Optional[list[str]] = None, topics: bool = False, pictures: bool = False,
     ) -> None:
         self.store = Store()
-        self._name, self._regions, self._interval = name, regions, interval
+        self._name, self._regions = name, regions
         self._graphs = Graphs(self.store, pictures=pictures) if topics else None
+        self._tables = feature.tables()
         #: Machines by their keys, see :meth:`_key`.
         self._shown: dict[str, Shown] = {}
         self._launches: dict[str, ShownLaunch] = {}
@@ -252,7 +252,8 @@ class Live:
         folders = {path.name: path for path in folder.iterdir()} if folder.is_dir() else {}
         for name, path in folders.items():
             launch = self._launches.setdefault(name, ShownLaunch())
-            launch.pid, launch.alive = process_of(path)
+            launch.pid, alive = launch_process(path)
+            launch.alive = alive or not launch.pid  # without a file it has just started
             launch.read(path)
         for name, launch in list(self._launches.items()):
             if name not in folders:
@@ -273,8 +274,9 @@ class Live:
             shown.steps = tuple(step for step in launch.steps
                                 if step.machine == shown.entry.name)
             shown.clock = launch.clocks.get(shown.entry.name)
-            shown.replicas = tuple(replicas.figures(
-                self.store.root / 'launches' / shown.launch, shown.entry.name))
+        folder = self.store.root / 'launches' / shown.launch
+        shown.figures = {name: rows for name, each in self._tables.items()
+                         if (rows := each.figures(folder, shown.entry.name)) is not None}
         if not is_present:
             shown.ended = shown.ended or now
         if not (self.watched and is_present and record is not None and record.launch_alive):
@@ -285,7 +287,7 @@ class Live:
             shown.follower.know(shown.entry)
         elif record.agent and (
                 not (launch and launch.steps) or phase(shown.steps) == 'running'):
-            shown.follower = Follower(shown.entry, self._wake.set, self._interval)
+            shown.follower = Follower(shown.entry, self._wake.set)
 
     # -- as JSON --------------------------------------------------------------------------------
 

@@ -272,6 +272,14 @@ def ask_all(
         return list(pool.map(answer, providers))
 
 
+def gather(
+    warn: Warn, regions: Optional[Sequence[str]], ask: Callable[[str], Iterable[T]],
+) -> list[T]:
+    """Return what ``ask(name)`` yields for all providers that are configured here."""
+    answers = ask_all(warn, configured(regions), lambda name: list(ask(name)))
+    return [each for answer in answers for each in answer or ()]
+
+
 def configured(regions: Optional[Sequence[str]]) -> list[str]:
     """Return the providers to ask for more than the machines that this robot's records name."""
     return [name for name in plugin_system.names('fogros2.provider') if wanted(name, regions)]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Show progress in the terminal: failed steps, and one line for a wait."""
+"""Show progress in the terminal: failed steps, and how long some work takes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import contextlib
 import shutil
 import sys
@@ -39,31 +39,6 @@ def _redraw(text: str = '') -> None:
     """Replace the last line of the terminal."""
     with contextlib.suppress(OSError):
         print(f'\r\x1b[K{one_line(text)}', end='', file=uncleaned(sys.stderr), flush=True)
-
-
-@contextlib.contextmanager
-def line() -> Iterator[Callable[[str], None]]:
-    """Yield a function that shows a text on one terminal line and replaces the previous text."""
-    shown_now, printed_at = '', time.monotonic()
-
-    def show(text: str) -> None:
-        nonlocal shown_now, printed_at
-        if sys.stderr.isatty():
-            _redraw(text)
-            shown_now = text
-        elif text.split(',')[0] != shown_now:
-            # Not a terminal: print each state once, not every second.
-            shown_now, printed_at = text.split(',')[0], time.monotonic()
-            _write(f'{shown_now}\n')
-        elif time.monotonic() - printed_at >= STILL:
-            printed_at = time.monotonic()
-            _write(f'{text}\n')
-
-    try:
-        yield show
-    finally:
-        if shown_now and sys.stderr.isatty():
-            _redraw()
 
 
 class _Working:

@@ -21,7 +21,7 @@ from fogros2.agent_client import AgentClient
 from fogros2.clock import ClockOffset
 from fogros2.errors import AgentError, ConnectError, DdsError, FogError, MachineNotFound
 from fogros2.events import Event
-from fogros2.model import Command, Endpoint, MachineState, OtherVpn, VpnInterface
+from fogros2.model import Command, Endpoint, MachineState, VpnInterface
 from fogros2.shell import Shell
 from fogros2.store import Record, Store
 from fogros2.vpn import Vpn
@@ -297,12 +297,3 @@ def variables_of(folder: Path) -> dict[str, str]:
     vendor = plugin_system.load('fogros2.dds', rmw)()
     return {**vendor.environment(str(folder / vendor.file_name), os.environ),
             'ROS_DOMAIN_ID': (folder / 'domain').read_text()}
-
-
-def link_of(other: OtherVpn) -> Link:
-    """
-    Measure the link of this computer to the machine of another robot.
-
-    :raises FogError: the status of the interface cannot be read.
-    """
-    return measure(other.interface.address, other.own, other.machine.public_key)

@@ -9,11 +9,21 @@ from decimal import Decimal
 import os
 from typing import Any, TextIO
 
+from fogros2 import feature
 from fogros2.report import size
 from fogros2.untrusted import one_line
-from ros2fog_cli.api import replicas
 from ros2fog_cli.api.output import uncleaned
-from ros2fog_cli.api.table import cost, duration, NODES, nodes, shares, table
+from ros2fog_cli.api.table import (
+    agent,
+    cost,
+    CROSSING,
+    crossing,
+    duration,
+    link,
+    NODES,
+    nodes,
+    table,
+)
 
 #: Enter and leave the alternate screen; meanwhile the cursor is hidden and long lines are cut,
 #: as the number of characters is no limit (a character may be two columns wide).
@@ -72,14 +82,14 @@ def frame(
     if machine['nodes']:
         parts.append(('', ''))
         parts += _table(NODES, nodes(machine['nodes']), column=1)
-    if machine['replicas']:
+    for name, each in feature.tables().items():
+        if machine.get(name):
+            parts.append(('', ''))
+            parts += _table(each.headings, list(map(each.row, machine[name])), column=1)
+    topics = crossing(machine['name'], machine.get('streams', ()), machine.get('topics', ()))
+    if topics:
         parts.append(('', ''))
-        parts += _table(replicas.HEADER, list(map(replicas.row, machine['replicas'])), column=1)
-    crossing = _crossing(machine)
-    if crossing:
-        parts.append(('', ''))
-        parts += _table(('TOPIC', 'FROM', 'TO', 'HZ', 'BANDWIDTH', 'SHARE', 'LATENCY'),
-                        crossing, column=0)
+        parts += _table(CROSSING, topics, column=0)
     room = rows - len(parts) - 1
     if lines and room > 0:
         parts.append(('', ''))
@@ -109,44 +119,14 @@ def _about(machine: dict[str, Any], now: float) -> Iterator[tuple[str, str]]:
     remaining = '' if machine['expires'] is None \
         else f", {duration(machine['expires'] - now)} left"
     yield 'launch', launch + remaining
-    vpn, agent = machine['vpn'], machine['agent']
+    vpn, state = machine['vpn'], machine['agent']
     if vpn is not None:
-        shaken = 'none yet' if vpn['handshake'] is None \
-            else f"{duration(max(0.0, now - vpn['handshake']))} ago"
-        latency = '-' if vpn['latency'] is None else f"{vpn['latency']:.2f} ms"
-        yield 'VPN', (f"{vpn['address']} on {vpn['interface']}, handshake {shaken}, "
-                      f'round trip {latency}')
-        yield 'traffic', (
-            f"received {size(vpn['received'])}{_rate(vpn['receiving'])}, "
-            f"sent {size(vpn['sent'])}{_rate(vpn['sending'])}")
+        yield from link(vpn, None if vpn['handshake'] is None
+                        else max(0.0, now - vpn['handshake']))
     if machine['clock'] is not None:
         yield 'clock', machine['clock']['text']
-    if agent is not None:
-        beat = agent['heartbeat_age']
-        yield 'agent', (f"since {duration(max(0.0, now - (agent['since'] or now)))}, "
-                        f"{size(agent['rss'] or 0)}, heartbeat "
-                        + ('-' if beat is None else f'{duration(beat)} ago'))
-
-
-def _crossing(machine: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Return a row for each topic that crosses the VPN to or from a machine."""
-    rows = [(f"{one['topic']} ({one['transport']})", [one['source']], [one['target']], one)
-            for one in machine.get('streams', [])]
-    rows += [(one['topic'], one['from'], one['to'], one) for one in machine.get('topics', [])]
-    return [
-        (name, _hosts(sources), _hosts(targets),
-         '-' if one['rate'] is None else f"{one['rate']:.1f}",
-         '-' if one['bandwidth'] is None else f"{size(one['bandwidth'])}/s", *shares(one))
-        for name, sources, targets, one in rows
-        if machine['name'] in (*sources, *targets)]
-
-
-def _hosts(names: Sequence[str]) -> str:
-    return ', '.join(name or 'robot' for name in names)
-
-
-def _rate(rate: Any) -> str:
-    return '' if rate is None else f' ({size(rate)}/s)'
+    if state is not None:
+        yield agent(now - (state['since'] or now), state['rss'] or 0, state['heartbeat_age'])
 
 
 def _word(state: str) -> str:

@@ -3,19 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import contextlib
 import dataclasses
-import json
 import os
 from pathlib import Path
 import time
 from typing import Any, Optional, TextIO
-from urllib.parse import urlsplit
 
 from fogros2 import journal
 from fogros2.clock import ClockOffset
-from fogros2.store import process_alive
 from ros2fog_cli.api.follower import Follower
 from ros2fog_cli.api.machines import Entry
 
@@ -35,7 +32,8 @@ class Shown:
     ended: float = 0.0
     deleting: bool = False
     trouble: str = ''
-    replicas: tuple[dict[str, Any], ...] = ()
+    #: Rows of features from files of its launch, by the features' names.
+    figures: Mapping[str, Sequence[Mapping[str, Any]]] = dataclasses.field(default_factory=dict)
 
     def is_of(self, entry: Entry) -> bool:
         """
@@ -99,7 +97,7 @@ def machine_json(key: str, shown: Shown) -> dict[str, Any]:
         'address': entry.address, 'place': entry.known.region, 'kind': entry.known.kind,
         'cost_per_hour': None if entry.cost is None else float(entry.cost),
         'on_exit': record.spec.on_exit if record is not None else '',
-        'bridge': urlsplit(record.notes.get('monitor', '') if record else '').port or 0,
+        **entry.notes,
         'steps': steps,
         'vpn': _vpn(follower.vpn) if follower is not None else None,
         'clock': None if follower is None or shown.clock is None
@@ -111,7 +109,7 @@ def machine_json(key: str, shown: Shown) -> dict[str, Any]:
             'name': node['name'], 'state': node['state'], 'pid': node['pid'] or 0,
             'returncode': node['returncode'], 'restarts': node['restarts'],
             'error': node.get('error', '')} for node in agent['nodes']],
-        'replicas': list(shown.replicas),
+        **shown.figures,
         'problems': [f'{part}: {text}' for part, text in sorted(follower.problems.items())]
         if follower is not None else [],
         'log': follower.last if follower is not None else 0,
@@ -160,13 +158,3 @@ def _phase(shown: Shown) -> str:
     if record is not None and record.launch_alive:
         return phase(shown.steps) if shown.steps or not record.agent else 'running'
     return shown.entry.state.partition(' ')[0]
-
-
-def process_of(folder: Path) -> tuple[int, bool]:
-    """Return a launch's process id and whether it runs, from the file in its folder."""
-    try:
-        data = json.loads((folder / 'process.json').read_text())
-        pid = int(data['pid'])
-        return pid, process_alive(pid, int(data['pid_start']), str(data.get('boot', '')))
-    except (OSError, ValueError, KeyError, TypeError):
-        return 0, True  # the launch has just started

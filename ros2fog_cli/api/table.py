@@ -3,25 +3,70 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from decimal import Decimal
 import shutil
 import sys
 from typing import Any, Optional
 
+from fogros2.report import size
 from fogros2.untrusted import one_line
 
 #: Columns of :func:`nodes`.
 NODES = ('NODE', 'STATE', 'PID', 'EXIT', 'RESTARTS')
+#: Columns of :func:`crossing`.
+CROSSING = ('TOPIC', 'FROM', 'TO', 'HZ', 'BANDWIDTH', 'SHARE', 'LATENCY')
 #: Shown for a missing value.
 NONE = '-'
 
 
-def shares(stream: Mapping[str, Any]) -> tuple[str, str]:
-    """Return a stream's share of its link, and its latency."""
-    share, latency = stream.get('share'), stream.get('latency')
-    return ('-' if share is None else f'{share / 1e6:.1f} Mbit/s',
-            '-' if latency is None else f'{1e3 * latency:.0f} ms')
+def link(vpn: Mapping[str, Any], age: Optional[float]) -> Iterator[tuple[str, str]]:
+    """
+    Yield rows about a VPN link, each a name and a text.
+
+    :param age: seconds since its last handshake, None before the first one.
+    """
+    handshake = 'none yet' if age is None else f'{duration(age)} ago'
+    latency = NONE if vpn['latency'] is None else f"{vpn['latency']:.2f} ms"
+    yield 'VPN', (f"{vpn['address']} on {vpn['interface']}, handshake {handshake}, "
+                  f'round trip {latency}')
+    yield 'traffic', (f"received {size(vpn['received'])}{_rate(vpn.get('receiving'))}, "
+                      f"sent {size(vpn['sent'])}{_rate(vpn.get('sending'))}")
+
+
+def agent(age: float, memory: float, heartbeat: Optional[float]) -> tuple[str, str]:
+    """
+    Return the row about an agent, a name and a text.
+
+    :param age: seconds for which it runs; ``heartbeat`` those since the last one, None before it.
+    :param memory: in bytes.
+    """
+    return 'agent', (f'since {duration(max(0.0, age))}, {size(memory)}, heartbeat '
+                     + (NONE if heartbeat is None else f'{duration(heartbeat)} ago'))
+
+
+def crossing(
+    machine: str, streams: Sequence[Mapping[str, Any]], topics: Sequence[Mapping[str, Any]] = (),
+) -> list[tuple[str, ...]]:
+    """Return a row for each topic that crosses the VPN to or from a machine."""
+    rows = [(f"{one['topic']} ({one['transport']})", [one['source']], [one['target']], one)
+            for one in streams]
+    rows += [(one['topic'], one['from'], one['to'], one) for one in topics]
+    return [
+        (name, _hosts(sources), _hosts(targets),
+         one.get('note') or (NONE if one['rate'] is None else f"{one['rate']:.1f}"),
+         NONE if one['bandwidth'] is None else f"{size(one['bandwidth'])}/s",
+         NONE if one.get('share') is None else f"{one['share'] / 1e6:.1f} Mbit/s",
+         NONE if one.get('latency') is None else f"{1e3 * one['latency']:.0f} ms")
+        for name, sources, targets, one in rows if machine in (*sources, *targets)]
+
+
+def _hosts(names: Sequence[str]) -> str:
+    return ', '.join(name or 'robot' for name in names)
+
+
+def _rate(rate: Optional[float]) -> str:
+    return '' if rate is None else f' ({size(rate)}/s)'
 
 
 def nodes(status: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import dataclasses
 from typing import Any, Optional
 
@@ -18,14 +18,12 @@ def survey(
     warn: Warn, *, regions: Optional[Sequence[str]] = None, hosts: Sequence[str] = (),
 ) -> list[Volume]:
     """Return the volumes of all providers; warn about a provider that does not answer."""
-    def ask(name: str) -> list[Volume]:
+    def ask(name: str) -> Iterable[Volume]:
         kind: type[Provider] = plugin_system.load('fogros2.provider', name)
-        if not kind.capabilities.keeps_volumes:
-            return []
-        return list(machines.load(name, regions).volumes(hosts))
+        return machines.load(name, regions).volumes(hosts) \
+            if kind.capabilities.keeps_volumes else ()
 
-    answers = machines.ask_all(warn, machines.configured(regions), ask)
-    return sorted((volume for volumes in answers for volume in volumes or ()),
+    return sorted(machines.gather(warn, regions, ask),
                   key=lambda volume: (volume.name, volume.id))
 
 

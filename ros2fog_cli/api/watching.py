@@ -17,30 +17,29 @@ from fogros2.waiting import wait_until
 from ros2fog_cli.api import output, screen
 from ros2fog_cli.api.live import Live, PRESENT
 
-#: Time-out of the measurement of stream rates, in seconds.
-TIMEOUT = 10.0
+#: Seconds between two drawings, and time-out of the measurement of stream rates.
+INTERVAL, TIMEOUT = 1.0, 10.0
 _WAITING = 'no such machine yet'
 
 
 def watch(
-    name: str, *, interval: float = 1.0, regions: Optional[list[str]] = None,
-    as_json: bool = False, topics: bool = False,
+    name: str, *, regions: Optional[list[str]] = None, as_json: bool = False, topics: bool = False,
 ) -> int:
     """
-    Show a machine's state every ``interval`` seconds; print only changes to a pipe or a file.
+    Show a machine's state every second; print only changes to a pipe or a file.
 
     :param as_json: print a line of JSON for each change instead.
     :param topics: whether a node joins the launch to measure the rates of topics.
     :raises ConfigurationError: ``name`` is no valid machine name.
     """
     check_name(name)
-    live = Live(name=name, regions=regions, interval=max(0.5, interval), topics=topics)
+    live = Live(name=name, regions=regions, topics=topics)
     live.start()
     try:
         if as_json or not sys.stdout.isatty() or os.environ.get('TERM') == 'dumb':
-            _lines(live, name, interval, as_json)
+            _lines(live, name, as_json)
         else:
-            _screen(live, name, interval)
+            _screen(live, name)
     except (KeyboardInterrupt, BrokenPipeError):
         pass  # the user ends the watch
     finally:
@@ -54,7 +53,7 @@ def streams(name: str, *, regions: Optional[list[str]] = None) -> list[dict[str,
 
     A node joins the launch for a few seconds to measure the rates.
     """
-    live = Live(name=name, regions=regions, interval=0.5, topics=True)
+    live = Live(name=name, regions=regions, topics=True)
     rows: list[dict[str, Any]] = []
     begin = time.monotonic()
 
@@ -86,7 +85,7 @@ def _machine(state: dict[str, Any], name: str) -> Optional[dict[str, Any]]:
         'problems': [*machine['problems'], *state.get('graph_trouble', [])]}
 
 
-def _lines(live: Live, name: str, interval: float, as_json: bool) -> None:
+def _lines(live: Live, name: str, as_json: bool) -> None:
     last: Optional[str] = None
     version = -1
     while True:
@@ -103,7 +102,6 @@ def _lines(live: Live, name: str, interval: float, as_json: bool) -> None:
             print(text if as_json else f'{time.strftime("%H:%M:%S")} {text}', flush=True)
         if _unheard():
             raise BrokenPipeError
-        time.sleep(interval)
 
 
 def _unheard() -> bool:
@@ -113,7 +111,7 @@ def _unheard() -> bool:
     return any(events & select.POLLERR for _, events in poll.poll(0))
 
 
-def _screen(live: Live, name: str, interval: float) -> None:
+def _screen(live: Live, name: str) -> None:
     paint = screen.painter(sys.stdout)
     with screen.alternate(sys.stdout) as draw:
         while True:
@@ -126,6 +124,6 @@ def _screen(live: Live, name: str, interval: float) -> None:
             else:
                 shown = screen.frame(machine, live.log(machine['key'], 0), state['now'],
                                      columns=columns, rows=rows - 1, paint=paint)
-            foot = f'{time.strftime("%H:%M:%S")}, each {interval:g} s; Ctrl-C leaves'
+            foot = f'{time.strftime("%H:%M:%S")}; Ctrl-C leaves'
             draw([*shown, *[''] * (rows - 1 - len(shown)), paint(foot[:columns], 'dim')])
-            time.sleep(max(0.05, interval - (time.monotonic() - begin)))
+            time.sleep(max(0.05, INTERVAL - (time.monotonic() - begin)))

@@ -11,7 +11,7 @@ from typing import Optional, TYPE_CHECKING, Union
 from ros2cli.plugin_system import PLUGIN_SYSTEM_VERSION, satisfies_version
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
 
 class VerbExtension(abc.ABC):
@@ -81,18 +81,56 @@ def region(text: str) -> str:
     raise argparse.ArgumentTypeError(f"no provider has a region '{text}' ({hint})")
 
 
-def seconds(text: str) -> float:
+def number(text: str) -> float:
     """
-    Parse a number of seconds, 0 or more.
+    Parse a number of seconds, days or rows: 0 or more.
 
     :raises argparse.ArgumentTypeError: it is none.
     """
     try:
-        if 0 <= float(text) < float('inf'):
+        if 0 <= float(text) <= 1e9:
             return float(text)
     except ValueError:
         pass
-    raise argparse.ArgumentTypeError(f"'{text}' is no number of seconds")
+    raise argparse.ArgumentTypeError(f"'{text}' is no number from 0 on")
+
+
+def parse_late(
+    args: argparse.Namespace, words: Sequence[str], verb: str,
+    add_options: Callable[[argparse.ArgumentParser], None], *, usage: Optional[str] = None,
+) -> list[str]:
+    """Parse options among words that argparse has left alone, and return the other words."""
+    parser = argparse.ArgumentParser(prog=f'ros2 fog {verb}', usage=usage)
+    add_options(parser)
+    parser.add_argument('words', nargs='*')
+    others: list[str] = parser.parse_intermixed_args(words, args).words
+    return others
+
+
+def add_command(parser: argparse.ArgumentParser, shell: str) -> None:
+    """
+    Add the argument ``command``; see :func:`command_of`.
+
+    :param shell: what runs without a command.
+    """
+    parser.add_argument('command', nargs=argparse.REMAINDER,
+                        help=f'-- and a command to run instead of {shell}')
+
+
+def command_of(
+    args: argparse.Namespace, verb: str,
+    add_options: Callable[[argparse.ArgumentParser], None] = lambda parser: None,
+) -> list[str]:
+    """Return the command after ``--``; parse the options before it, which argparse took for it."""
+    words: list[str] = args.command
+    if words and words[0].startswith('-') and words[0] != '--':
+        end = words.index('--') if '--' in words else len(words)
+        late = argparse.ArgumentParser(
+            prog=f'ros2 fog {verb} NAME', usage='%(prog)s [OPTIONS] [-- COMMAND ...]')
+        add_options(late)
+        late.parse_args(words[:end], args)
+        words = words[end:]
+    return words[1:] if words[:1] == ['--'] else words
 
 
 def add_overrides(parser: argparse.ArgumentParser) -> None:
@@ -181,12 +219,48 @@ def warn(text: str) -> None:
     say(text, error=True)
 
 
-def agreed(one: str, several: str, number: int) -> bool:
+def add_deletion(parser: argparse.ArgumentParser) -> None:
+    """Add ``--yes`` and ``--dry-run``."""
+    parser.add_argument('--yes', '-y', action='store_true', help="don't ask for confirmation")
+    parser.add_argument('--dry-run', action='store_true', help='print what would be done')
+
+
+def delete_each(
+    doomed: Sequence[tuple[str, str, Callable[[], None]]], kind: str, args: argparse.Namespace,
+) -> int:
+    """
+    Delete what the user agrees to; return 1 if something still exists.
+
+    :param doomed: the name of each, more about it, and the function that deletes it.
+    :param kind: such as 'volume'.
+    :param args: has ``dry_run`` and ``yes``.
+    """
+    from fogros2.errors import FogError
+    from ros2fog_cli.api import progress
+    for name, about, _ in doomed:
+        say(f"{'would delete' if args.dry_run else 'delete'} {name}: {about}")
+    if args.dry_run:
+        return 0
+    if not args.yes and not agreed(kind, len(doomed)):
+        return 1
+    failed = 0
+    with progress.working('deleting'):
+        for name, _, delete in doomed:
+            try:
+                delete()
+                say(f'deleted {name}')
+            except FogError as error:
+                warn(f'{name}: {error}')
+                failed = 1
+    return failed
+
+
+def agreed(kind: str, number: int) -> bool:
     """Ask the user whether to delete ``number`` things; without a terminal, the answer is no."""
     if not sys.stdin.isatty():
         warn('not deleted: there is no terminal to ask at (--yes answers)')
         return False
-    return confirmed(f"Delete {one if number == 1 else f'these {number} {several}'}?")
+    return confirmed(f"Delete {f'this {kind}' if number == 1 else f'these {number} {kind}s'}?")
 
 
 def confirmed(question: str) -> bool:

@@ -5,7 +5,14 @@ from __future__ import annotations
 
 import argparse
 
-from ros2fog_cli.verb import add_name, add_region, VerbExtension, warn
+from ros2fog_cli.verb import (
+    add_command,
+    add_name,
+    add_region,
+    command_of,
+    VerbExtension,
+    warn,
+)
 
 
 class ConnectVerb(VerbExtension):
@@ -15,23 +22,13 @@ class ConnectVerb(VerbExtension):
         """Add the verb's arguments."""
         add_name(parser)
         _add_options(parser)
-        parser.add_argument('command', nargs=argparse.REMAINDER,
-                            help='-- and a command to run instead of a login shell')
+        add_command(parser, 'a login shell')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Connect the terminal to the session; return the exit status of the session."""
         from fogros2.model import Command
         from ros2fog_cli.api import reach
-        words = args.command
-        if words and words[0].startswith('-') and words[0] != '--':
-            # argparse takes options after the name for a part of the command.
-            end = words.index('--') if '--' in words else len(words)
-            late = argparse.ArgumentParser(prog='ros2 fog connect NAME', usage=(
-                '%(prog)s [--region REGION] [--user USER] [-- COMMAND ...]'))
-            _add_options(late)
-            late.parse_args(words[:end], args)
-            words = words[end:]
-        words = words[1:] if words[:1] == ['--'] else words
+        words = command_of(args, 'connect', _add_options)
         entry = reach.find(args.name, warn, regions=args.region)
         with reach.session(entry, args.user) as shell:
             return shell.interactive(Command(tuple(words)) if words else None)

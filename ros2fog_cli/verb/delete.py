@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 
 from ros2fog_cli.verb import (
+    add_deletion,
     add_region,
     agreed,
     complete,
@@ -25,8 +26,7 @@ class DeleteVerb(VerbExtension):
                                    help="names of machines, or 'all' for this robot's")
         complete(name, lambda: [*machine_names(), 'all'])
         add_region(parser)
-        parser.add_argument('--yes', '-y', action='store_true', help="don't ask for confirmation")
-        parser.add_argument('--dry-run', action='store_true', help='print what would be deleted')
+        add_deletion(parser)
         parser.add_argument(
             '--force', action='store_true',
             help='even if a launch runs, or if the computer or its provider does not answer')
@@ -68,7 +68,7 @@ class DeleteVerb(VerbExtension):
             return failed
         for entry in entries:
             endings.check_free(entry, force=args.force)
-        if not args.yes and not agreed('this machine', 'machines', len(entries)):
+        if not args.yes and not agreed('machine', len(entries)):
             return 1
         with progress.working('deleting'):
             for entry, error in endings.delete_all(

@@ -10,9 +10,9 @@ import sys
 from ros2fog_cli.verb import (
     add_json,
     complete,
+    number,
     print_json,
     provider_names,
-    seconds,
     VerbExtension,
 )
 
@@ -30,7 +30,7 @@ class DoctorVerb(VerbExtension):
             '--provider', nargs='+', default=[], metavar='NAME',
             help='provider that must work; others are checked if they are configured'),
                  provider_names)
-        parser.add_argument('--lan-seconds', type=seconds, default=1.5, metavar='SECONDS',
+        parser.add_argument('--lan-seconds', type=number, default=1.5, metavar='SECONDS',
                             help='how long to search the LAN for ROS 2 (0: not at all)')
 
     def main(self, *, args: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from ros2fog_cli.verb import add_json, add_region, print_json, say, VerbExtension, warn
+from ros2fog_cli.verb import add_json, add_region, number, print_json, say, VerbExtension, warn
 
 
 class GcVerb(VerbExtension):
@@ -15,18 +15,15 @@ class GcVerb(VerbExtension):
         """Add the verb's arguments."""
         add_region(parser, several=True)
         parser.add_argument('--dry-run', action='store_true', help='print what would be cleared')
-        parser.add_argument('--keep-stopped', type=float, default=7.0, metavar='DAYS',
+        parser.add_argument('--keep-stopped', type=number, default=7.0, metavar='DAYS',
                             help='how long a stopped machine is kept (default: 7)')
         add_json(parser)
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Clean up; return 1 if something still exists that should be deleted."""
-        from fogros2.errors import ConfigurationError, FogError
+        from fogros2.errors import FogError
         from fogros2.store import Store
         from ros2fog_cli.api import endings, machines, progress
-        if not args.keep_stopped >= 0:
-            raise ConfigurationError(f'--keep-stopped {args.keep_stopped:g} is no number of days',
-                                     'it takes 0 or more')
         store, done = Store(), []
 
         def note(what: str, name: str, reason: str, error: str = '') -> None:

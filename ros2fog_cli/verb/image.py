@@ -8,13 +8,14 @@ import sys
 import time
 
 from ros2fog_cli.verb import (
+    add_deletion,
     add_json,
     add_region,
-    agreed,
     complete,
+    delete_each,
     machine_names,
+    parse_late,
     print_json,
-    say,
     VerbExtension,
     warn,
 )
@@ -46,7 +47,8 @@ class ImageVerb(VerbExtension):
         from fogros2.errors import ConfigurationError
         if args.first == 'create':
             return _create(args)
-        first, rest = args.first, _among(args)
+        first, rest = args.first, parse_late(
+            args, args.rest, 'image', _add_options, usage=_USAGE)
         if first == 'list':
             if rest:
                 raise ConfigurationError("'ros2 fog image list' takes no names",
@@ -65,22 +67,10 @@ class ImageVerb(VerbExtension):
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add_region(parser)
-    parser.add_argument('--dry-run', action='store_true', help='print what would be done')
     parser.add_argument('--image-name', metavar='NAME',
                         help="the image's name (default: the machine's, and the time)")
-    parser.add_argument('--no-wait', action='store_true',
-                        help="don't wait until the image is ready")
-    parser.add_argument('--yes', '-y', action='store_true', help="delete: don't ask")
+    add_deletion(parser)
     add_json(parser)
-
-
-def _among(args: argparse.Namespace) -> list[str]:
-    """Parse the options among the arguments after the first, and return the other arguments."""
-    late = argparse.ArgumentParser(prog='ros2 fog image', usage=_USAGE)
-    _add_options(late)
-    late.add_argument('words', nargs='*')
-    words: list[str] = late.parse_intermixed_args(args.rest, args).words
-    return words
 
 
 def _create(args: argparse.Namespace) -> int:
@@ -150,10 +140,8 @@ def _make(args: argparse.Namespace, name: str) -> int:
         warn('what is installed on the machine is not known: no launch takes the image by '
              f'itself, but each that names it does ({baking.id})')
     try:
-        if not args.no_wait:
-            with progress.line() as show:
-                images.wait(baking, look=lambda state, seconds: show(
-                    f'{baking.name}: {state}, {seconds:.0f} s'))
+        with progress.working('making'):
+            images.wait(baking)
     except KeyboardInterrupt:
         warn(f'the image goes on being made: {baking.id} (ros2 fog image list shows it)')
         raise
@@ -164,28 +152,15 @@ def _make(args: argparse.Namespace, name: str) -> int:
         print_json(id=baking.id, name=baking.name, provider=baking.provider,
                    dependencies=baking.dependencies)
     else:
-        print(f"{'making' if args.no_wait else 'made'} {baking.name} ({baking.id})")
+        print(f'made {baking.name} ({baking.id})')
     return 0
 
 
 def _delete(args: argparse.Namespace, words: list[str]) -> int:
-    from fogros2.errors import FogError
-    from ros2fog_cli.api import images, progress
-    matches = images.named(images.survey(warn, regions=args.region), words)
-    for image in matches:
-        say(f"{'would delete' if args.dry_run else 'delete'} {image.name}: "
-            f'{image.provider} {image.id}, {image.state}')
-    if args.dry_run:
-        return 0
-    if not args.yes and not agreed('this image', 'images', len(matches)):
-        return 1
-    failed = 0
-    with progress.working('deleting'):
-        for image in matches:
-            try:
-                images.delete(image)
-                say(f'deleted {image.name}')
-            except FogError as error:
-                warn(f'{image.name}: {error}')
-                failed = 1
-    return failed
+    import functools
+
+    from ros2fog_cli.api import images
+    return delete_each([
+        (image.name, f'{image.provider} {image.id}, {image.state}',
+         functools.partial(images.delete, image))
+        for image in images.named(images.survey(warn, regions=args.region), words)], 'image', args)

@@ -10,6 +10,7 @@ from ros2fog_cli.verb import (
     add_json,
     cloud_names,
     complete,
+    number,
     print_json,
     region_names,
     VerbExtension,
@@ -17,6 +18,8 @@ from ros2fog_cli.verb import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from fogros2.provider.offers import Offer
 
 
@@ -26,7 +29,7 @@ class PriceVerb(VerbExtension):
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
         parser.add_argument('--min-cpu', type=int, metavar='N', help='vCPUs (default: 2)')
-        parser.add_argument('--min-memory', type=float, metavar='GB', help='default: 4')
+        parser.add_argument('--min-memory', type=float, metavar='GB', help='memory (default: 4)')
         parser.add_argument('--gpu', nargs='?', const='1', metavar='N|NAME',
                             help="how many GPUs of NVIDIA's, or one of this name, such as L4")
         parser.add_argument('--gpu-memory', type=float, metavar='GB', help='of each GPU')
@@ -42,7 +45,7 @@ class PriceVerb(VerbExtension):
             help="of any cloud, 'all' for every one, 'nearest' for that of each cloud (default: "
             'the configured region of each)')
         complete(region, region_names)
-        parser.add_argument('--limit', type=int, default=10, metavar='N',
+        parser.add_argument('--limit', type=number, default=10, metavar='N',
                             help='rows to show, 0 for all (default: 10)')
         parser.add_argument('--replicas', type=int, metavar='N',
                             help='compare the cost of N machines with one on demand')
@@ -56,13 +59,9 @@ class PriceVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the table; a launch would use the first row."""
-        from fogros2.errors import ConfigurationError
         from fogros2.provider import clouds, offers
-        from ros2fog_cli.api import replicas, table
+        from ros2fog_cli.api import table
         from ros2fog_cli.api.interrupts import interruptible
-        if args.limit < 0:
-            raise ConfigurationError(f'--limit {args.limit} is no number of rows',
-                                     '0 shows all of them')
         wanted = offers.wants(
             arch=args.arch, min_cpu=args.min_cpu, min_memory_gb=args.min_memory,
             cpu_type=args.cpu_type, gpu=args.gpu, gpu_memory_gb=args.gpu_memory,
@@ -73,7 +72,7 @@ class PriceVerb(VerbExtension):
                 wanted, () if every else (args.provider,), args.region or (), measure=True,
                 max_round_trip_ms=args.max_round_trip, refresh=args.refresh, cancel=cancel)
         regions = choice.regions
-        shown = choice.offers[:args.limit or None]
+        shown = choice.offers[:int(args.limit) or None]
         if args.json:
             print_json(offers=list(map(to_json, shown)))
         else:
@@ -94,7 +93,7 @@ class PriceVerb(VerbExtension):
             if rest:
                 print(f"{rest} more {'cost' if rest > 1 else 'costs'} as much or more (--limit 0)")
         if args.replicas is not None and not args.json:
-            print(replicas.price(choice.offers, args.replicas, spot=args.spot))
+            print(compared(choice.offers, args.replicas, spot=args.spot))
         for who, reason in choice.left_out:
             warn(f'{who}: {reason}')
         others = clouds.clouds()[1]
@@ -115,6 +114,22 @@ def to_json(offer: Offer) -> dict[str, Any]:
         'spot_price': None if offer.spot_price is None else float(offer.spot_price),
         'round_trip_ms': offer.round_trip_ms,
     }
+
+
+def compared(offers: Sequence[Offer], number: int, *, spot: bool) -> str:
+    """
+    Compare the cost of several machines, the cheapest offers, with that of one on demand.
+
+    :raises ConfigurationError: there are not enough offers, or none on demand.
+    """
+    from fogros2.errors import ConfigurationError
+    costs = sorted(cost for one in offers if (cost := one.cost(spot)) is not None)[:number]
+    alone = min((one.price for one in offers if one.price is not None), default=None)
+    if number < 2 or len(costs) < number or alone is None:
+        raise ConfigurationError(f'--replicas {number}: {len(costs)} offers match',
+                                 'give 2 or more, and search more regions: --region all')
+    return (f"{number} replicas{' on spot machines' if spot else ''} ${sum(costs):.4f} an hour, "
+            f'one machine on demand ${alone:.4f}: {sum(costs) / alone:.2f} times')
 
 
 def _gpus(number: int, name: str, memory: float) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from ros2fog_cli.verb import add_name, VerbExtension
+from ros2fog_cli.verb import add_command, add_name, command_of, VerbExtension
 
 
 class ShellVerb(VerbExtension):
@@ -13,17 +13,10 @@ class ShellVerb(VerbExtension):
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
-        self._parser = parser
         add_name(parser)
-        parser.add_argument('command', nargs=argparse.REMAINDER,
-                            help='-- and a command to run instead of a shell')
+        add_command(parser, 'a shell')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Replace this process by the shell."""
-        if args.command[:1] in (['-h'], ['--help']):
-            # argparse takes options after the name for a part of the command
-            self._parser.print_help()
-            return 0
         from ros2fog_cli.api import joining
-        words = args.command[1:] if args.command[:1] == ['--'] else args.command
-        joining.run(args.name, words)
+        joining.run(args.name, command_of(args, 'shell'))

@@ -11,7 +11,7 @@ from typing import Any, TYPE_CHECKING
 from ros2fog_cli.verb import add_json, add_name, add_region, print_json, VerbExtension, warn
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from fogros2.feature import Feature
     from ros2fog_cli.api.reach import Link
@@ -30,22 +30,16 @@ class StatusVerb(VerbExtension):
         parser.add_argument('--topics', action='store_true',
                             help='with --watch: a node joins the launch and measures the rates '
                                  'of topics across the VPN')
-        parser.add_argument('--interval', type=float, default=1.0, metavar='SECONDS',
-                            help='poll interval of --watch (default: 1)')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the status; return 1 if there are problems or no expected agent answers."""
+        from fogros2 import feature
         from fogros2.errors import ConfigurationError, FogError
-        from fogros2.feature import installed, used
         from fogros2.store import other_vpn, Store
-        from ros2fog_cli.api import reach, replicas
+        from ros2fog_cli.api import reach
         if args.watch:
             from ros2fog_cli.api.watching import watch
-            if not 0.1 <= args.interval <= 3600:
-                raise ConfigurationError(f'--interval {args.interval:g} is out of range',
-                                         'give 0.1 to 3600 seconds')
-            return watch(args.name, interval=args.interval, regions=args.region,
-                         as_json=args.json, topics=args.topics)
+            return watch(args.name, regions=args.region, as_json=args.json, topics=args.topics)
         if args.topics:
             raise ConfigurationError('--topics is for --watch: a rate takes a while',
                                      'add --watch')
@@ -53,11 +47,13 @@ class StatusVerb(VerbExtension):
         folder = store.other_vpns().get(args.name)
         other = other_vpn(folder) if folder is not None else None
         if other is not None and not store.exists(args.name):
-            return show_link(reach.link_of(other), as_json=args.json)
+            return show_link(reach.measure(
+                other.interface.address, other.own, other.machine.public_key, 'wireguard'),
+                as_json=args.json)
         entry = reach.find(args.name, warn, regions=args.region)
-        tables = {name: each for name, each in installed().items() if each.headings}
+        tables = feature.tables()
         status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'clock': None, 'agent': None,
-                                  'streams': [], 'replicas': [], 'features': [],
+                                  'streams': [], 'features': [],
                                   **{name: [] for name in tables}}
         problems: list[str] = []
         idle = reach.let_go(entry) and not entry.gone
@@ -65,8 +61,9 @@ class StatusVerb(VerbExtension):
             # The tag names the launch that created the machine.
             status['launch'] = ''
         elif entry.record is not None:
-            status['replicas'] = replicas.figures(
-                store.root / 'launches' / entry.record.launch, entry.name)
+            folder = store.root / 'launches' / entry.record.launch
+            figures = {name: each.figures(folder, entry.name) for name, each in tables.items()}
+            status.update((name, rows) for name, rows in figures.items() if rows is not None)
             try:
                 link = reach.link(entry.record)
                 status['vpn'] = dataclasses.asdict(link) if link is not None else None
@@ -83,7 +80,8 @@ class StatusVerb(VerbExtension):
                             key: value for key, value in reply.items() if key not in ('id', 'ok')}
                         if status['vpn'] is not None:
                             for name, each in tables.items():
-                                status[name] = each.entries(entry.record, shell)
+                                if figures[name] is None:
+                                    status[name] = each.entries(entry.record, shell)
                     finally:
                         client.close()
             except FogError as error:
@@ -97,8 +95,8 @@ class StatusVerb(VerbExtension):
             status['streams'] = streams(entry.name, regions=args.region)
         if entry.record is not None:
             try:
-                status['features'] = [row for feature, own in used(entry.record.spec)
-                                      for row in feature.status(status, own)]
+                status['features'] = [row for each, own in feature.used(entry.record.spec)
+                                      for row in each.status(status, own)]
             except FogError as error:
                 problems.append(f'features: {error}')
         if args.json:
@@ -122,9 +120,8 @@ def show(
     from decimal import Decimal
 
     from fogros2.clock import ClockOffset
-    from fogros2.report import size
-    from ros2fog_cli.api import machines, replicas
-    from ros2fog_cli.api.table import cost, duration, NODES, nodes, shares, table
+    from ros2fog_cli.api import machines, table
+    from ros2fog_cli.api.table import cost, duration
     now = time.time()
     lines = [
         ('machine', f"{status['name']} ({status['provider']} {status['id'] or '-'})"),
@@ -142,55 +139,36 @@ def show(
     lines += status['features']
     vpn, agent = status['vpn'], status['agent']
     if vpn is not None:
-        latency = '-' if vpn['latency'] is None else f"{vpn['latency']:.2f} ms"
-        handshake = 'none yet' if vpn['handshake_age'] is None \
-            else f"{duration(vpn['handshake_age'])} ago"
-        lines += [
-            ('VPN', f"{vpn['address']} on {vpn['interface']}"),
-            ('handshake', handshake),
-            ('round trip', latency),
-            ('traffic', f"{size(vpn['received'])} received, {size(vpn['sent'])} sent"),
-        ]
+        lines += table.link(vpn, vpn['handshake_age'])
     if status['clock'] is not None:
         lines.append(('clock', str(ClockOffset(**status['clock']))))
     if agent is not None:
-        heartbeat = agent['heartbeat_age']
-        lines += [
-            ('agent', f"since {duration(max(0.0, now - agent['since']))}, "
-                      f"{size(1000 * agent['rss_kb'])}"),
-            ('heartbeat', '-' if heartbeat is None else f'{duration(heartbeat)} ago'),
-        ]
-    width = max(len(name) for name, _ in lines)
-    for name, value in lines:
-        print(f'{name.ljust(width)}  {value}')
-    if agent is not None and agent['nodes']:
-        print()
-        print(table(NODES, nodes(agent['nodes'])))
-    if status['replicas']:
-        print()
-        print(table(replicas.HEADER, list(map(replicas.row, status['replicas']))))
-    for name, feature in tables.items():
-        if status[name]:
+        lines.append(table.agent(now - agent['since'], 1000 * agent['rss_kb'],
+                                 agent['heartbeat_age']))
+    print_rows(lines)
+    parts: list[tuple[Sequence[str], Sequence[Sequence[str]]]] = [
+        (table.NODES, table.nodes(agent['nodes'] if agent is not None else ()))]
+    parts += [(each.headings, list(map(each.row, status[name]))) for name, each in tables.items()]
+    parts.append((table.CROSSING, table.crossing(status['name'], status['streams'])))
+    for headings, rows in parts:
+        if rows:
             print()
-            print(table(feature.headings, list(map(feature.row, status[name]))))
-    if status['streams']:
-        print()
-        print(table(('STREAM', 'BY', 'FROM', 'TO', 'RATE', 'TRAFFIC', 'SHARE', 'LATENCY'), [
-            (one['topic'], one['transport'], one['source'] or 'robot', one['target'] or 'robot',
-             one['note'] or ('-' if one['rate'] is None else f"{one['rate']:.1f}/s"),
-             '-' if one['bandwidth'] is None else f"{size(one['bandwidth'])}/s", *shares(one))
-            for one in status['streams']]))
+            print(table.table(headings, rows))
+
+
+def print_rows(rows: Sequence[tuple[str, str]]) -> None:
+    """Print rows of a name and a text."""
+    width = max(len(name) for name, _ in rows)
+    for name, text in rows:
+        print(f'{name.ljust(width)}  {text}')
 
 
 def show_link(link: Link, *, as_json: bool) -> int:
     """Print the link to another robot's machine; return 0 if the machine answers."""
-    from ros2fog_cli.api.table import duration
+    from ros2fog_cli.api import table
+    fields = dataclasses.asdict(link)
     if as_json:
-        print_json(**dataclasses.asdict(link))
+        print_json(**fields)
     else:
-        answer = 'no answer' if link.latency is None else f'{link.latency:.2f} ms'
-        handshake = 'none' if link.handshake_age is None \
-            else f'{duration(link.handshake_age)} ago'
-        print(f'VPN         {link.address} on {link.interface}\nhandshake   {handshake}\n'
-              f'round trip  {answer}')
+        print_rows(list(table.link(fields, link.handshake_age)))
     return 0 if link.latency is not None else 1

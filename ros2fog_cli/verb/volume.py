@@ -7,11 +7,12 @@ import argparse
 from typing import TYPE_CHECKING
 
 from ros2fog_cli.verb import (
+    add_deletion,
     add_json,
     add_region,
-    agreed,
+    delete_each,
+    parse_late,
     print_json,
-    say,
     VerbExtension,
     warn,
 )
@@ -34,18 +35,21 @@ class VolumeVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """List all volumes, or delete those that are named."""
+        import functools
+
         from fogros2.errors import ConfigurationError
+        from ros2fog_cli.api import machines
         from ros2fog_cli.api import volumes as api
-        late = argparse.ArgumentParser(prog='ros2 fog volume')
-        _add_options(late)
-        late.add_argument('names', nargs='*')
-        names = late.parse_intermixed_args(args.rest, args).names
+        names = parse_late(args, args.rest, 'volume', _add_options)
         if (args.action == 'delete') != bool(names):
             raise ConfigurationError("'ros2 fog volume list' takes no names, 'delete' some",
                                      'ros2 fog volume list shows them')
         volumes = api.survey(warn, regions=args.region, hosts=args.host)
         if args.action == 'delete':
-            return _delete(_named(volumes, names), args)
+            return delete_each([
+                (volume.name, f'{volume.provider} {volume.id}, with its data', functools.partial(
+                    machines.load(volume.provider, args.region).delete_volume, volume.id))
+                for volume in _named(volumes, names)], 'volume', args)
         if args.json:
             print_json(volumes=[api.to_json(volume) for volume in volumes])
         else:
@@ -55,9 +59,9 @@ class VolumeVerb(VerbExtension):
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--host', action='append', default=[],
-                        help='an SSH host whose volumes are meant; may be repeated')
+                        help='an SSH host to ask, too; may be repeated')
     add_region(parser)
-    parser.add_argument('--yes', '-y', action='store_true', help="delete: don't ask")
+    add_deletion(parser)
     add_json(parser)
 
 
@@ -93,21 +97,3 @@ def _named(volumes: Sequence[Volume], words: Sequence[str]) -> list[Volume]:
         chosen += matches
     return chosen
 
-
-def _delete(volumes: Sequence[Volume], args: argparse.Namespace) -> int:
-    from fogros2.errors import FogError
-    from ros2fog_cli.api import machines, progress
-    for volume in volumes:
-        say(f'delete {volume.name} with its data: {volume.provider} {volume.id}')
-    if not args.yes and not agreed('this volume', 'volumes', len(volumes)):
-        return 1
-    failed = 0
-    with progress.working('deleting'):
-        for volume in volumes:
-            try:
-                machines.load(volume.provider, args.region).delete_volume(volume.id)
-                say(f'deleted {volume.name}')
-            except FogError as error:
-                warn(f'{volume.name}: {error}')
-                failed = 1
-    return failed

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from ros2fog_cli.verb import add_name, add_region, seconds, VerbExtension, warn
+from ros2fog_cli.verb import add_name, add_region, number, VerbExtension, warn
 
 
 class WaitVerb(VerbExtension):
@@ -16,7 +16,7 @@ class WaitVerb(VerbExtension):
         add_name(parser)
         add_region(parser)
         parser.add_argument('--gone', action='store_true', help='wait until it is deleted')
-        parser.add_argument('--timeout', type=seconds, default=600.0, metavar='SECONDS',
+        parser.add_argument('--timeout', type=number, default=600.0, metavar='SECONDS',
                             help='fail after this time (default: 600)')
 
     def main(self, *, args: argparse.Namespace) -> int:

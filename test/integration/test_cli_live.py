@@ -11,16 +11,11 @@ import secrets
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
-from fogros2 import process
-from fogros2.model import CreateRequest, MachineSpec
-from fogros2.provider.ssh import SSHProvider
-from fogros2.store import Record, Store
+from fogros2.store import Store
 from fogros2.waiting import wait_until
-from rigs.sshd import private_sshd
 
 ROS2 = [sys.executable, '-c', 'import sys; from ros2cli.cli import main; sys.exit(main())']
 #: A background job of a non-interactive shell ignores SIGINT, and so would its children.
@@ -64,8 +59,38 @@ def launched(
             child.wait(60)
 
 
+def logs_follow(name: str, children: list[subprocess.Popen[bytes]], folder: Path) -> None:
+    """Check that ``logs -f`` ends with Ctrl-C, and with its reader."""
+    log = folder / 'follow.log'
+    with log.open('wb') as output:
+        follower = subprocess.Popen([*WITH_SIGINT, *ROS2, 'fog', 'logs', name, '-f'],
+                                    stdout=output, stderr=subprocess.STDOUT)
+    children.append(follower)
+    wait_until(lambda: log.read_text().count('Publishing') >= 3, timeout=60.0, what='three lines')
+    assert follower.poll() is None
+    follower.send_signal(signal.SIGINT)
+    assert follower.wait(60) in (0, signal.SIGINT, -signal.SIGINT)
+    # a reader that has seen enough ends it as well, without a traceback
+    fog_words = ' '.join(f"'{word}'" for word in [*ROS2, 'fog', 'logs', name, '-f'])
+    enough = subprocess.run(['sh', '-c', f'{fog_words} 2>&1 | head -n 2'], capture_output=True,
+                            text=True, timeout=60)
+    assert len(enough.stdout.splitlines()) == 2 and enough.stderr == ''
+
+
+def another_terminal_joins(name: str) -> None:
+    exports = fog('env', name).stdout
+    listener = f'{sys.executable} -c "from fogros2_examples.listener import main; main()"'
+    heard = subprocess.run(
+        ['sh', '-c', f'{exports}\nexec {listener} --ros-args -p count:=2'], text=True,
+        capture_output=True, timeout=60,
+        env={name: value for name, value in os.environ.items() if name != 'ROS_DOMAIN_ID'})
+    assert heard.returncode == 0, heard.stderr
+    assert f'Hello World from {name}' in heard.stdout + heard.stderr
+
+
 def test_verbs_work_beside_a_running_launch(
-    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]], tmp_path: Path,
+    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]],
+    children: list[subprocess.Popen[bytes]], tmp_path: Path,
 ) -> None:
     name, child, said = launched
     (entry,) = [e for e in json.loads(fog('list', '--json').stdout)['machines']
@@ -93,6 +118,8 @@ def test_verbs_work_beside_a_running_launch(
     assert unwatched.returncode == 1
     assert f"'{name}' has no Foxglove bridge (launch_foxglove=True" in unwatched.stderr
 
+    logs_follow(name, children, tmp_path)
+    another_terminal_joins(name)
     assert fog('wait', name, '--timeout', '30').returncode == 0
     written = fog('ssh-config', name).stdout
     assert str(Store().machine(name) / 'ssh_config') in written
@@ -116,44 +143,11 @@ def test_verbs_work_beside_a_running_launch(
     assert name not in fog('list').stdout
 
 
-def test_logs_follow_until_interrupted(
-    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]],
-    children: list[subprocess.Popen[bytes]], tmp_path: Path,
-) -> None:
-    name, _, _ = launched
-    log = tmp_path / 'follow.log'
-    with log.open('wb') as output:
-        follower = subprocess.Popen([*WITH_SIGINT, *ROS2, 'fog', 'logs', name, '-f'],
-                                    stdout=output, stderr=subprocess.STDOUT)
-    children.append(follower)
-    wait_until(lambda: log.read_text().count('Publishing') >= 3, timeout=60.0, what='three lines')
-    assert follower.poll() is None
-    follower.send_signal(signal.SIGINT)
-    assert follower.wait(60) in (0, signal.SIGINT, -signal.SIGINT)
-    # a reader that has seen enough ends it as well, without a traceback
-    fog_words = ' '.join(f"'{word}'" for word in [*ROS2, 'fog', 'logs', name, '-f'])
-    enough = subprocess.run(['sh', '-c', f'{fog_words} 2>&1 | head -n 2'], capture_output=True,
-                            text=True, timeout=60)
-    assert len(enough.stdout.splitlines()) == 2 and enough.stderr == ''
-
-
-def test_another_terminal_joins_the_launch(
-    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]],
-) -> None:
-    name, _, _ = launched
-    exports = fog('env', name).stdout
-    listener = f'{sys.executable} -c "from fogros2_examples.listener import main; main()"'
-    heard = subprocess.run(
-        ['sh', '-c', f'{exports}\nexec {listener} --ros-args -p count:=2'], text=True,
-        capture_output=True, timeout=60,
-        env={name: value for name, value in os.environ.items() if name != 'ROS_DOMAIN_ID'})
-    assert heard.returncode == 0, heard.stderr
-    assert f'Hello World from {name}' in heard.stdout + heard.stderr
-
-
 def test_verbs_clean_up_after_a_killed_launch(
-    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]],
+    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """The provider's tags are enough to end the machine; gc clears the robot's side."""
     name, child, _ = launched
     os.killpg(child.pid, signal.SIGKILL)
     child.wait(60)
@@ -162,49 +156,10 @@ def test_verbs_clean_up_after_a_killed_launch(
     assert entry['launch_alive'] is False and 'launch gone' in entry['state']
     would = json.loads(fog('gc', '--dry-run', '--json').stdout)['cleared']
     assert [w['reason'] for w in would if w['name'] == name] == ['its launch is gone']
-    assert f'deleted {name}' in fog('delete', name, '--yes').stdout
-    assert not Store().machine(name).exists()
-
-
-def test_gc_works_without_the_store_of_a_killed_launch(
-    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]], tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The provider's tags are enough to end the machine; gc clears the robot's side."""
-    name, child, _ = launched
-    os.killpg(child.pid, signal.SIGKILL)
-    child.wait(60)
     here = os.environ['FOGROS2_STATE_HOME']
     monkeypatch.setenv('FOGROS2_STATE_HOME', str(tmp_path / 'lost'))
     assert '(orphan)' in [line for line in fog('list').stdout.splitlines() if name in line][0]
     assert f'deleted {name}' in fog('delete', name, '--yes').stdout
     monkeypatch.setenv('FOGROS2_STATE_HOME', here)
     assert f'leftovers of {name}' in fog('gc').stdout
-    assert name not in fog('gc').stdout
-
-
-@pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)')
-def test_ssh_machine_without_an_agent_is_deleted_at_once(
-    tmp_path: Path, root_at_login: None,
-) -> None:
-    """Its agent took its program along; what tried to run that took six seconds to give up."""
-    with private_sshd(tmp_path / 'sshd') as server:
-        endpoint = server.endpoint
-        spec = MachineSpec('lab', 'ssh', {
-            'host': endpoint.host, 'port': str(endpoint.port), 'user': endpoint.user,
-            'key': endpoint.key_file, 'host_key': endpoint.host_key})
-        machine_id = SSHProvider().create(spec, CreateRequest('token', '', {}, 51820))
-        gone = tmp_path / 'agent'
-
-        def took(program: str) -> float:
-            Store().save(Record(
-                'lab', 'ssh', spec, machine_id=machine_id, created=time.time(), launch='abc123',
-                shell=endpoint, agent=program and str(gone), agent_program=program))
-            begin = time.monotonic()
-            assert 'deleted lab' in fog('delete', 'lab', '--yes').stdout
-            assert not Store().exists('lab')
-            return time.monotonic() - begin
-
-        # beside one that never had an agent; at the first time on an idle computer
-        wait_until(lambda: took(str(gone / 'agent.py')) - took('') < 5.0, timeout=90.0,
-                   what='two deletions that take as long')
+    assert name not in fog('gc').stdout and not Store().machine(name).exists()

@@ -206,8 +206,7 @@ def watched(tmp_path: Path, nothing_left: None) -> Iterator[Callable[[str], Path
     def watch(name: str) -> Path:
         with open(tmp_path / 'watched', 'wb') as said:
             watching.append(subprocess.Popen(
-                ['ros2', 'fog', 'status', name, '--watch', '--json', '--topics',
-                 '--interval', '0.2'],
+                ['ros2', 'fog', 'status', name, '--watch', '--json', '--topics'],
                 stdin=subprocess.DEVNULL, stdout=said, preexec_fn=os.setpgrp))
         return tmp_path / 'watched'
 

@@ -34,7 +34,7 @@ def machine(name: str, **changes: Any) -> dict[str, Any]:
         'phase': 'running', 'launch': 'abc123', 'launch_pid': 4711, 'launch_alive': True,
         'created': NOW - 3600, 'expires': NOW + 7200, 'ended': None, 'address': '198.51.100.7',
         'place': 'eu-central-1', 'kind': 'g4dn.xlarge', 'cost_per_hour': 0.658,
-        'on_exit': 'delete', 'bridge': 0, 'deleting': False, 'trouble': '', 'problems': [],
+        'on_exit': 'delete', 'deleting': False, 'trouble': '', 'problems': [],
         'replicas': [],
         'agent': {'since': NOW - 3500, 'rss': 16_000_000, 'heartbeat_age': 1.0},
         'vpn': {'address': '198.18.0.2', 'interface': 'fogabc123', 'received': 9_500_000,

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+import re
 import dataclasses
 import ipaddress
 import json
@@ -170,7 +171,8 @@ def test_vpn_leaves_udp_and_returns(cloud, spec, cloud_network, monkeypatch):
                 and cloud.asked[-1] == (22, sources)
 
         wait_until(used, timeout=60.0, what=f'answers by {path}')
-        assert f'VPN path    {path}\n' in ros2('fog', 'status', machine.spec.name).stdout
+        status = ros2('fog', 'status', machine.spec.name).stdout
+        assert re.search(rf'^VPN path +{path}$', status, re.MULTILINE)
         kinds = [made.kind for made in launch.store.load(machine.spec.name).made]
         assert not sources or 'firewall' in kinds, 'nothing would close the port after a kill'
         return answers(machine.machine.shell.host) == bool(sources)

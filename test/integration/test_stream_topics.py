@@ -190,7 +190,7 @@ def test_streams_go_on_when_the_machine_between_goes(
         run = launch(str(path))
         run.wait_for('[last]:')
         status = ros2('fog', 'status', f'{NAME}-b')
-        rate = re.search(rf'^/between +h264 +\S+ +{NAME}-b +([0-9.]+)/s ', status.stdout,
+        rate = re.search(rf'^/between \(h264\) +\S+ +{NAME}-b +([0-9.]+) ', status.stdout,
                          re.MULTILINE)
         assert rate is not None and float(rate[1]) > 1, status.stdout + status.stderr
         process.run(Command((engine, 'rm', '-f', '-t', '0', f'fogros2-{NAME}-a'), sudo=True),

@@ -19,7 +19,7 @@ from fogros2.store import Store
 
 
 class FakeMachine:
-    """A RunningMachine that notes its requests and answers as a test wants."""
+    """A RunningMachine that notes its requests."""
 
     def __init__(self, launch, spec):
         self.launch = launch
@@ -31,7 +31,6 @@ class FakeMachine:
         self.all = []
         self.stops = []
         self.signals = []
-        self.answers = True
         self.exits_on_stop = True
         #: Whether the provider confirms a notice: its answers, of which the last stays.
         self.confirms = [True]
@@ -44,8 +43,7 @@ class FakeMachine:
             self.launch.note('start', self.spec.name, node.name)
             self.all.append(node)
             self.nodes[node.executable or node.arguments[0]] = node
-            if self.answers:
-                self.say('started', node, pid=next(self.pids), cmd=['/there/program'])
+            self.say('started', node, pid=next(self.pids), cmd=['/there/program'])
             on_start = self.launch.on_start
             if on_start is not None:
                 on_start(self, node)

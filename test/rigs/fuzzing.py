@@ -6,7 +6,7 @@ The same seed gives the same inputs. The mutations begin with valid inputs of ea
 words that decide much (limits of numbers, nested brackets, markup). They know no coverage. With
 ``--guided``, Atheris (libFuzzer) makes the inputs, and keeps those that reach new Python code.
 
-    python -m rigs.fuzzing TARGET SEED --count 400 | --seconds 60 [--guided]
+    python -m rigs.fuzzing TARGET [TARGET ...] SEED --count 400 | --seconds 60 [--guided]
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def run_guided(name: str, seed: int, seconds: float, note: Path) -> NoReturn:
             done += 1
             if time.monotonic() >= until:
                 stack.close()
-                report(done, found)
+                report(name, done, found)
                 sys.stdout.flush()
                 os._exit(0)  # libFuzzer has no other end without losing the result
 
@@ -144,9 +144,9 @@ def run_guided(name: str, seed: int, seconds: float, note: Path) -> NoReturn:
     raise AssertionError('libFuzzer ends the process')
 
 
-def report(done: int, found: dict[str, bytes]) -> None:
+def report(target: str, done: int, found: dict[str, bytes]) -> None:
     """Print as JSON how many inputs a target got, what went wrong, and the memory it took."""
-    print(json.dumps({'done': done, 'peak': peak(os.getpid()), 'found': {
+    print(json.dumps({'target': target, 'done': done, 'peak': peak(os.getpid()), 'found': {
         wrong: base64.b64encode(data).decode() for wrong, data in found.items()}}))
 
 
@@ -155,19 +155,21 @@ def _hung(number: int, frame: Optional[FrameType]) -> NoReturn:
 
 
 def main() -> None:
-    """Feed a target, and report."""
+    """Feed targets, and report on each."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('target', choices=TARGETS)
+    parser.add_argument('targets', nargs='+', choices=TARGETS)
     parser.add_argument('seed', type=int)
     parser.add_argument('--count', type=int, default=0)
     parser.add_argument('--seconds', type=float, default=0.0)
     parser.add_argument('--note', type=Path, help='file that always has the current input')
-    parser.add_argument('--guided', action='store_true', help='by coverage; needs --note')
+    parser.add_argument('--guided', action='store_true',
+                        help='by coverage; needs --note, and one target')
     given = parser.parse_args()
     if given.guided:
-        run_guided(given.target, given.seed, given.seconds, given.note)
-    report(*run(given.target, given.seed, count=given.count, seconds=given.seconds,
-                note=given.note))
+        run_guided(given.targets[0], given.seed, given.seconds, given.note)
+    for target in given.targets:
+        report(target, *run(target, given.seed, count=given.count, seconds=given.seconds,
+                            note=given.note))
 
 
 if __name__ == '__main__':

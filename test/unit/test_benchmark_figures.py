@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stored results are what the benchmarks write, each beside the paper's own row."""
+"""Stored results are what the benchmarks write."""
 
 from __future__ import annotations
 
@@ -36,22 +36,3 @@ def test_tables_show_stored_figures(benchmark_modules: Any, tmp_path: Path,
         streaming.write_down(name, page.partition('\n')[0].removeprefix('# '), rows, limits)
     for path in tmp_path.glob('*-table.*'):
         assert path.read_text() == (RESULTS / path.name).read_text(), path.name
-
-
-def test_scenario_is_beside_the_papers_own_row(benchmark_modules: Any) -> None:
-    applications = benchmark_modules('applications')
-    paper = importlib.import_module('figures.paper')
-    scenarios = [*applications.SCENARIOS, *applications.app_scenarios(Path('/app'))]
-    ratios = {scenario.name.rpartition(' ')[2]: round(scenario.ratio, 1) for scenario in scenarios}
-    assert ratios == {'planning': 23.3, 'Apartment': 45.5, 'Cubicles': 23.7, 'Home': 34.2,
-                      'TwistyCool': 35.3}
-    for result in applications.before():
-        row = applications.published(result)
-        if result.table == 'II':
-            assert row is None
-        elif result.table == 'III':
-            assert row is paper.GRASPS[result.codec]
-        else:
-            assert row is paper.PLANS[result.scenario.rpartition(' ')[2]]
-    assert [scenario.asks for scenario in scenarios][-2:] == [
-        ('environment:=/app/Home.cfg',), ('environment:=/app/Twistycool.cfg',)]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable, Iterator, Mapping
 import dataclasses
 from decimal import Decimal
@@ -49,6 +48,7 @@ from ros2fog_cli.api import endings, joining, machines, table
 from ros2fog_cli.api.machines import Entry
 
 NOW = 1_800_000_000.0
+LAB_VPN = VpnInterface('fogabc123m0', '198.18.0.2', '198.18.0.0/24', 51820, '/none')
 
 
 class Memory(FakeProvider):
@@ -118,6 +118,15 @@ def dead() -> dict[str, int]:
     start = process_start(child.pid) or 1
     child.wait()
     return {'pid': child.pid, 'pid_start': start}
+
+
+def lab(monkeypatch: pytest.MonkeyPatch, shell: FakeShell, **changes: Any) -> None:
+    """Let a dead launch have used a host that answers by a shell."""
+    monkeypatch.setattr(endings.shells, 'connect', lambda *_, **__: shell)
+    made = machine('lab', provider='untagged', owned=False)
+    record('lab', **{
+        'provider': 'untagged', 'shell': made.shell, 'agent': '/run/fogros2/lab',
+        'agent_program': '/run/fogros2/lab/agent.py', **dead(), **changes})
 
 
 def run(*words: str) -> Any:
@@ -248,11 +257,12 @@ def test_gc_deletes_machine_whose_id_was_not_saved(capsys: pytest.CaptureFixture
     assert [*Memory.machines] == ['id-of-a-neighbour']
 
 
-@pytest.mark.parametrize('days', ['-1', 'nan'])
-def test_gc_refuses_a_negative_time(days: str) -> None:
-    machine('a', state=MachineState.STOPPED, created=NOW)
-    assert 'is no number of days' in run('gc', f'--keep-stopped={days}')
-    assert [*Memory.machines] == ['id-a']
+@pytest.mark.parametrize('words', [
+    'gc --keep-stopped=-1', 'gc --keep-stopped=nan', 'price --limit=-1', 'wait a --timeout=inf'])
+def test_wrong_number_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as wrong:
+        run(*words.split())
+    assert wrong.value.code == 2 and 'is no number from 0 on' in capsys.readouterr().err
 
 
 def test_stopped_machine_is_not_connected_to() -> None:
@@ -318,12 +328,6 @@ def test_delete_refuses_under_a_running_launch(capsys: pytest.CaptureFixture[str
     assert Store().exists('a')
 
 
-def test_delete_works_without_a_record(capsys: pytest.CaptureFixture[str]) -> None:
-    machine('a')
-    assert run('delete', 'a', '-y') == 0
-    assert not Memory.machines
-
-
 def test_delete_works_with_a_damaged_record() -> None:
     machine('a')
     folder = Store().machine('a')
@@ -387,6 +391,8 @@ def test_machine_of_a_silent_provider_is_not_forgotten() -> None:
     ({'expires': NOW - 600}, None, 'past its lifetime'),
     ({'state': MachineState.STOPPED, 'created': NOW - 30 * 86400}, {'launch': ''}, 'stopped'),
     ({'state': MachineState.STOPPED, 'created': NOW - 3600}, {'launch': ''}, ''),
+    # made, and not started yet
+    ({'state': MachineState.STOPPED}, {'pid': 1, 'pid_start': 1}, 'its launch is gone'),
     ({'state': MachineState.DELETED}, {'launch': ''}, 'gone at its provider'),
 ])
 def test_gc_ends_machines_that_nobody_needs(
@@ -450,10 +456,7 @@ def test_delete_leaves_a_computer_of_another_robot_alone(
 
     asked: list[str] = []
     shell = FakeShell(streams=[Agent()], handlers={'test': lambda c: Result(0, '', '')})
-    monkeypatch.setattr(endings.shells, 'connect', lambda *_, **__: shell)
-    made = machine('lab', provider='untagged', owned=False)
-    record('lab', provider='untagged', shell=made.shell, agent='/run/fogros2/lab',
-           agent_program='/run/fogros2/lab/agent.py', **dead())
+    lab(monkeypatch, shell)
     assert run('delete', 'lab', '--yes') == 0
     assert asked == ['status'] and [c.argv[0] for c in shell.commands] == ['test']
 
@@ -466,10 +469,7 @@ def test_delete_does_not_wait_for_an_agent_that_ended(monkeypatch: pytest.Monkey
         return lambda c: ran.append(' '.join(c.argv)) or Result(status, '', '')
 
     shell = FakeShell(handlers={'test': program(1), 'sh': program(0)})
-    monkeypatch.setattr(endings.shells, 'connect', lambda *_, **__: shell)
-    made = machine('lab', provider='untagged', owned=False)
-    record('lab', provider='untagged', shell=made.shell, agent='/run/fogros2/lab',
-           agent_program='/run/fogros2/lab/agent.py', made=(Made(undo.NODES),), **dead())
+    lab(monkeypatch, shell, made=(Made(undo.NODES),))
     assert run('delete', 'lab', '--yes') == 0
     assert ran.count('test -e /run/fogros2/lab/agent.py') == 2 and len(ran) == 3
     assert shell.opened == [] and shell.closed == 1
@@ -483,29 +483,16 @@ def test_delete_undoes_what_a_launch_has_made_on_a_host(
     shell = FakeShell(handlers={
         'test': lambda c: Result(1, '', ''),
         'sh': lambda c: Result(int(fails and 'containers' in c.what), '', 'no')})
-    monkeypatch.setattr(endings.shells, 'connect', lambda *_, **__: shell)
-    made = machine('lab', provider='untagged', owned=False)
-    vpn = VpnInterface('fogabc123m0', '198.18.0.2', '198.18.0.0/24', 51820, '/none')
-    record('lab', provider='untagged', shell=made.shell, agent='/run/fogros2/lab', last='abc123',
-           agent_program='/run/fogros2/lab/agent.py', vpn=vpn, on_exit='keep', made=tuple(
-               Made(kind) for kind in (
-                   undo.WATCHDOG, undo.VPN, undo.CONTAINERS, undo.NODES)), **dead())
+    lab(monkeypatch, shell, last='abc123', vpn=LAB_VPN, on_exit='keep', made=tuple(
+        map(Made, (undo.WATCHDOG, undo.VPN, undo.CONTAINERS, undo.NODES))))
     assert run('delete', 'lab', '--yes') == int(fails)
     assert [c.what for c in shell.commands if c.argv[0] != 'test'] == [
         'remove its containers', 'take the VPN interface fogabc123m0 down', 'remove the agent']
     assert shell.commands[-1].argv[4:] == (
         '/run/fogros2/lab', 'abc123', '/run/fogros2/lab/start-abc123.json')
     down, = (c for c in shell.commands if 'VPN' in c.what)
-    assert down == next(WireGuard().down(vpn)), 'not left to guests'
+    assert down == next(WireGuard().down(LAB_VPN)), 'not left to guests'
     assert Store().exists('lab') == fails
-
-
-def test_gc_deletes_a_machine_whose_launch_died_before_its_start() -> None:
-    """The engine has made the container: it is stopped, and nobody keeps it."""
-    machine('a', state=MachineState.STOPPED)
-    record('a', None, **dead())
-    assert run('gc') == 0
-    assert 'id-a' not in Memory.machines and not Store().exists('a')
 
 
 def test_gc_closes_the_ports_of_a_kept_machines_launch(
@@ -545,12 +532,9 @@ def test_delete_ends_what_guests_have_kept_on_a_host(monkeypatch: pytest.MonkeyP
     """The launch has left it to them at its own end."""
     shell = FakeShell(handlers={
         'test': lambda c: Result(1, '', ''), 'sh': lambda c: Result(0, '', '')})
-    monkeypatch.setattr(endings.shells, 'connect', lambda *_, **__: shell)
-    made = machine('lab', provider='untagged', owned=False)
-    vpn = VpnInterface('fogabc123m0', '198.18.0.2', '198.18.0.0/24', 51820, '/none')
-    record('lab', provider='untagged', shell=made.shell, vpn=vpn, on_exit='keep', launch='')
+    lab(monkeypatch, shell, agent='', vpn=LAB_VPN, on_exit='keep', launch='')
     assert run('delete', 'lab', '--yes') == 0
-    assert next(WireGuard().down(vpn)) in shell.commands
+    assert next(WireGuard().down(LAB_VPN)) in shell.commands
 
 
 def test_lifetime_of_a_reused_machine_starts_again() -> None:
@@ -691,12 +675,6 @@ def test_shell_becomes_a_command_in_the_launch(
     assert become('--', 'sh', '-c', 'kill -PIPE $$') == -13
 
 
-def test_shell_takes_a_launch_that_runs() -> None:
-    machine('a')
-    record('a', **alive())
-    assert 'no launch is running' in str(run('shell', 'a', '--', 'true'))
-
-
 def test_shell_becomes_the_users_shell(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, joined: Path,
     tmp_path: Path,
@@ -717,35 +695,6 @@ def test_shell_becomes_the_users_shell(
     typed.write_text('echo "$MINE $ROS_DOMAIN_ID $PS1"; exit 4\n')
     assert become(stdin=typed) == 4
     assert capfd.readouterr().out.startswith('yes 42 (a) ')
-
-
-@pytest.mark.parametrize('verb', ['status', 'logs', 'connect', 'env', 'delete'])
-def test_unknown_machine_is_one_line_and_a_status(
-    verb: str, capsys: pytest.CaptureFixture[str],
-) -> None:
-    words = [verb, 'nowhere'] + (['--yes'] if verb == 'delete' else [])
-    said = run(*words)
-    err = capsys.readouterr().err.splitlines()
-    assert said not in (0, None)
-    text = [line for line in [str(said), *err] if 'nowhere' in line]
-    assert len(text) == 1
-
-
-@pytest.mark.parametrize('verb', ['status', 'env', 'connect'])
-def test_invalid_machine_name_is_refused(verb: str) -> None:
-    assert 'no name for a machine' in str(run(verb, '../up'))
-
-
-def test_names_are_completed_without_asking_providers(monkeypatch: pytest.MonkeyPatch) -> None:
-    from ros2fog_cli.verb import add_name
-    monkeypatch.setattr(Memory, 'find', lambda *a: 1 / 0)
-    record('alpha')
-    record('beta')
-    parser = argparse.ArgumentParser()
-    add_name(parser)
-    completer: Any = parser._actions[-1].completer  # type: ignore[attr-defined]
-    assert completer('', parsed_args=None) == ['alpha', 'beta']
-    assert completer('al', parsed_args=None) == ['alpha']
 
 
 @pytest.mark.parametrize(('seconds', 'text'), [

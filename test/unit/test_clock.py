@@ -24,7 +24,7 @@ from fogros2.model import MachineSpec
 from fogros2.report import ClockMeasured, Event
 from fogros2.store import boot_id, process_start, Record, Store
 from fogros2.waiting import wait_until
-from ros2fog_cli.api import doctor, reach, screen
+from ros2fog_cli.api import doctor, reach
 
 
 def about(offset: Optional[ClockOffset], seconds: float, uncertainty: float) -> bool:
@@ -206,11 +206,3 @@ def test_status_and_doctor_show_the_offset_of_a_running_launch(
     assert doctor.clocks().verdict == 'ok' and '20.0 ms' in doctor.clocks().detail
     launched(store, 'slam')
     assert reach.clock(record, store) is None and doctor.clocks().verdict == 'ok'
-
-
-def test_watched_status_has_a_line_for_the_clock() -> None:
-    parts = dict(screen._about({
-        'address': '', 'place': '', 'kind': '', 'launch': 'abc', 'launch_alive': False,
-        'expires': None, 'vpn': None, 'agent': None,
-        'clock': {'text': "70.0 ms ahead of the robot's"}}, 0.0))
-    assert parts['clock'] == "70.0 ms ahead of the robot's"

@@ -38,7 +38,7 @@ def test_launch_folder_stays_as_long_as_the_interface(
     assert len(launch.down()) == refused
     assert folder.exists() == refused
     # what gc sees when this process has gone
-    monkeypatch.setattr(endings, 'process_alive', lambda *noted: False)
+    monkeypatch.setattr(endings, 'launch_process', lambda folder: (1, False))
     assert [found.name for found in endings.leftovers(launch.store)] == [launch.id] * refused
 
 

@@ -137,7 +137,7 @@ def test_fields_of_the_agent_are_on_the_page() -> None:
 
 
 def test_fields_of_watch_are_on_the_page() -> None:
-    found = shown.machine_json('a', shown.Shown(Entry('a', 'memory')))
+    found = shown.machine_json('a', shown.Shown(Entry('a', 'memory'), figures={'replicas': []}))
     assert sorted(fields('### `ros2 fog status --watch`')) == sorted(found)
     row = next(line for line in section('### `ros2 fog status --watch`').splitlines()
                if line.startswith('| `steps`'))

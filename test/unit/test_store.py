@@ -40,7 +40,7 @@ def test_a_record_comes_back_as_it_was_saved(store):
     saved = record(
         shell=Endpoint('ssh', '198.51.100.7', user='fog', host_key='ssh-ed25519 AAAA'),
         vpn=VpnInterface('fog1m0', '198.18.0.2', '198.18.0.0/24', 50000, '/run/k'),
-        machine_id='abc')
+        machine_id='abc', asked={'size': 'cheapest'})
     store.save(saved)
     assert store.load('planner') == saved
 
@@ -159,12 +159,6 @@ def test_after_a_boot_no_process_is_one_from_before(monkeypatch):
     mine = {'pid': os.getpid(), 'pid_start': process_start(os.getpid())}
     assert record(boot=boot_id(), **mine).launch_alive
     assert not record(boot='another boot', **mine).launch_alive
-
-
-def test_options_are_remembered_as_they_were_asked_for(store):
-    spec = MachineSpec('planner', 'fake', {'size': 'small'})
-    store.save(Record('planner', 'fake', spec, asked={'size': 'cheapest'}))
-    assert store.load('planner').asked == {'size': 'cheapest'}
 
 
 def test_a_zombie_counts_as_gone():
