@@ -88,7 +88,7 @@ setup(
         'kubernetes': KUBERNETES,
         'monitor': MONITOR,
         'test': [
-            'apache-libcloud', 'argcomplete',
+            'argcomplete',
             # Debian's are too old, and what is installed for the system counts beside ROS 2
             'azure-mgmt-compute>=30', 'azure-mgmt-network>=25', 'azure-mgmt-resource>=23',
             'colcon-common-extensions',

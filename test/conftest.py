@@ -15,7 +15,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from typing import Any
 import urllib.request
 
@@ -287,22 +286,16 @@ def azure_service(
     hasty: None, loopback_only: None, monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Any]:
     """Serve a simulated Azure on the loopback, and lead the provider there; yields it."""
-    from werkzeug.serving import make_server
-
     from fogros2.provider.azure import cloud
     from fogros2.provider.azure.account import Account
+    from rigs import serving
     from rigs.azure import service
 
     # what a process asks once is another in each test
     monkeypatch.setattr(cloud, '_USUAL', Account())
-    logging.getLogger('werkzeug').setLevel(logging.ERROR)
     azure = service.Service()
-    server = make_server('127.0.0.1', 0, azure, threaded=True)
-    thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
-    thread.start()
-    for name, value in service.environment(f'http://127.0.0.1:{server.server_port}').items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setenv('FOGROS2_ROBOT_ADDRESS', '198.51.100.7')
-    yield azure
-    server.shutdown()
-    server.server_close()
+    with serving.serve(azure) as url:
+        for name, value in service.environment(url).items():
+            monkeypatch.setenv(name, value)
+        monkeypatch.setenv('FOGROS2_ROBOT_ADDRESS', '198.51.100.7')
+        yield azure

@@ -1,17 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Other people's clients of Compute Engine accept the box: Google's own, and libcloud's."""
+"""Google's own client of Compute Engine accepts the box."""
 
 from __future__ import annotations
 
-import json
-import os
-from pathlib import Path
-from types import SimpleNamespace
-
 import pytest
 
-from fogros2.errors import ProviderError
-from fogros2.provider.gcp import failures, instances
 from rigs.gce.catalogue import IMAGES
 
 IMAGE = f'projects/{IMAGES[0][0]}/global/images/family/{IMAGES[0][2]}'
@@ -85,56 +78,3 @@ def test_googles_client_reads_our_firewall_rules(gce, google):
     assert rules['22'].source_ranges == ['198.51.100.7/32']
     assert max(rules['22'].priority, rules['vpn'].priority) < rules['deny'].priority < 65534
     provider.destroy(machine)
-
-
-def test_libcloud_creates_lists_and_deletes(gce, monkeypatch):
-    gce_driver = pytest.importorskip('libcloud.compute.drivers.gce', reason='needs libcloud')
-    # its own way to a token leads to Google
-    monkeypatch.setattr('libcloud.common.google.GoogleOAuth2Credential',
-                        lambda *_, **__: SimpleNamespace(access_token=gce.api.token()))
-    monkeypatch.setattr(gce_driver.GCEConnection, 'host', '127.0.0.1')
-
-    class Driver(gce_driver.GCENodeDriver):
-        def _ex_connection_class_kwargs(self):
-            return {**super()._ex_connection_class_kwargs(),
-                    'port': int(gce.url.rpartition(':')[2])}
-
-    driver = Driver('user', 'key', project='robots', datacenter='us-central1-a', secure=False)
-    node = driver.create_node('planner', 'e2-medium', IMAGES[0][1], ex_labels={'team': 'slam'})
-    assert [(node.name, node.extra['labels']) for node in driver.list_nodes()] == [
-        ('planner', {'team': 'slam'})]
-    assert node.public_ips
-    assert driver.destroy_node(node)
-    assert gce.instances == []
-
-
-def test_answers_that_libcloud_recorded_are_understood():
-    """Of Google itself, failures included; by hand, where its checkout is."""
-    named = os.environ.get('FOGROS2_LIBCLOUD', '')
-    files = [*Path(named, 'libcloud/test/compute/fixtures/gce').glob('*.json')] if named else []
-    if not files:
-        pytest.skip('needs FOGROS2_LIBCLOUD: a folder with a checkout of libcloud')
-    seen = set()
-    for entry in (entry for file in files for entry in objects(json.loads(file.read_text()))):
-        kind = entry.get('kind')
-        seen.add(kind if isinstance(kind, str) else '')
-        if kind == 'compute#instance':
-            assert instances.vm_of('robots', entry).created
-        elif kind == 'compute#machineType':
-            assert instances.machine_type(entry).memory_gb
-        elif kind == 'compute#operation' and entry.get('error'):
-            assert isinstance(failures.failed(entry, 'doing it'), ProviderError)
-        elif isinstance(entry.get('error'), dict) and 'errors' in entry['error'] and not kind:
-            assert 'Google gave no reason' not in str(failures.refused(
-                int(entry['error']['code']), entry, 'asking'))
-            seen.add('refusal')
-    assert {'compute#instance', 'compute#machineType', 'compute#operation', 'refusal'} <= seen
-
-
-def objects(value):
-    """Yield all objects in a JSON value."""
-    if isinstance(value, dict):
-        yield value
-    for item in value.values() if isinstance(value, dict) else value \
-            if isinstance(value, list) else ():
-        yield from objects(item)

@@ -100,14 +100,24 @@ def plain(meadow, monkeypatch):
     return PlainProvider()
 
 
-class TestPlainMeadow(TestMeadow):
+class TestPlainMeadow:
+    """The tests of the contract that depend on what it has no more."""
+
+    billed_when_off, make = True, staticmethod(
+        lambda: (PlainProvider(), {'machine_type': 'cheapest'}))
+    timeout, machine, reached = VmContract.timeout, VmContract.machine, VmContract.reached
+    user_data = TestMeadow.user_data
+    test_life, test_tags, test_data, test_adopted, test_firewall, test_port = (
+        VmContract.test_machine_starts_and_can_be_reached,
+        VmContract.test_machine_has_the_tags_of_its_user,
+        VmContract.test_machine_gets_its_user_data,
+        VmContract.test_adopted_machine_has_the_tags_of_its_launch,
+        VmContract.test_firewall_admits_the_robot_and_closes,
+        VmContract.test_port_opens_and_closes)
 
     @pytest.fixture(autouse=True)
-    def _plain(self, plain):
-        """Refuse what needs a firewall."""
-
-    def make(self):
-        return PlainProvider(), {'machine_type': 'cheapest'}
+    def _service(self, meadow, plain):
+        self.service = meadow
 
 
 def test_open_ssh_port_is_warned_of(plain):
