@@ -20,7 +20,6 @@ from typing import Any, Optional
 import pytest
 from ros2cli.cli import main
 
-from fogros2 import plugin_system
 from fogros2.errors import (
     ConnectError,
     DeadlineExceeded,
@@ -175,24 +174,6 @@ def test_unconfigured_provider_is_not_asked(capsys: pytest.CaptureFixture[str]) 
     record('slam')
     assert run('list') == 0
     assert 'slam' in capsys.readouterr().out
-
-
-def test_unconfigured_provider_is_not_loaded(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:
-    names, load = plugin_system.names, plugin_system.load
-    asked: list[str] = []
-
-    def loaded(group: str, name: str) -> Any:
-        asked.append(f'{group} {name}')
-        return (lambda: False) if group == 'fogros2.configured' else load(group, name)
-
-    monkeypatch.setattr(plugin_system, 'names', lambda group: (
-        ['cloud'] if group == 'fogros2.configured' else names(group)))
-    monkeypatch.setattr(plugin_system, 'load', loaded)
-    assert run('list') == 0
-    assert capsys.readouterr().out == 'no machines\n'
-    assert 'fogros2.provider cloud' not in asked and 'fogros2.configured cloud' in asked
 
 
 # -- what a user sees ---------------------------------------------------------------------

@@ -103,7 +103,7 @@ _FAILURES = {
                      'UnauthorizedException'), Failure(denied=True)),
     **dict.fromkeys(('InvalidInstanceID.NotFound', 'InvalidInstanceID.Malformed',
                      'InvalidKeyPair.NotFound', 'InvalidSnapshot.NotFound',
-                     'InvalidVolume.NotFound', 'InvalidAllocationID.NotFound'),
+                     'InvalidVolume.NotFound'),
                     Failure(gone=True)),
 }
 #: Errors of botocore without an answer: reason ({} is botocore's own), and hint.
