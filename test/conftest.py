@@ -230,8 +230,9 @@ def moto_aws(
 ) -> str:
     """Lead boto3 to an empty AWS of Moto's that has the public images; returns its URL."""
     from moto.core import DEFAULT_ACCOUNT_ID  # type: ignore[attr-defined]
-    from moto.ec2.models import ec2_backends
+    from moto.ec2.models import ec2_backends, instance_types
     from moto.ec2.models.amis import AmiBackend
+    from moto.ec2.models.elastic_block_store import EBSBackend
     from moto.ssm.models import Parameter, ssm_backends
 
     from fogros2.provider.aws import images
@@ -250,6 +251,15 @@ def moto_aws(
         monkeypatch.setenv(name, value)
     for name in ('AWS_PROFILE', 'AWS_SESSION_TOKEN', 'AWS_REGION'):
         monkeypatch.delenv(name, raising=False)
+    # Moto answers with eight hundred types, and makes an RSA key for the disks of each region
+    kinds = ('t3.medium', 't3.large', 't3.xlarge', 'm6g.large', 'g5.xlarge')
+    monkeypatch.setattr(instance_types, 'INSTANCE_TYPES', {
+        kind: instance_types.INSTANCE_TYPES[kind] for kind in kinds})
+    offered = instance_types.INSTANCE_TYPE_OFFERINGS['availability-zone']
+    for region in MOTO_REGIONS:
+        monkeypatch.setitem(offered, region, [
+            one for one in offered[region] if one['InstanceType'] in kinds])
+    monkeypatch.setattr(EBSBackend, '_create_default_encryption_key', lambda self: 'arn:aws:kms')
     create_image = AmiBackend.create_image
 
     def create_with_snapshots(
