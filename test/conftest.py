@@ -253,8 +253,8 @@ def moto_aws(
         monkeypatch.delenv(name, raising=False)
     # Moto answers with eight hundred types, and makes an RSA key for the disks of each region
     kinds = ('t3.medium', 't3.large', 't3.xlarge', 'm6g.large', 'g5.xlarge')
-    monkeypatch.setattr(instance_types, 'INSTANCE_TYPES', {
-        kind: instance_types.INSTANCE_TYPES[kind] for kind in kinds})
+    monkeypatch.setattr(instance_types.InstanceTypeBackend, 'instance_types', [
+        instance_types.InstanceType(kind) for kind in kinds])
     offered = instance_types.INSTANCE_TYPE_OFFERINGS['availability-zone']
     for region in MOTO_REGIONS:
         monkeypatch.setitem(offered, region, [
