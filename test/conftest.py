@@ -15,7 +15,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from typing import Any
 import urllib.request
 
@@ -231,8 +230,9 @@ def moto_aws(
 ) -> str:
     """Lead boto3 to an empty AWS of Moto's that has the public images; returns its URL."""
     from moto.core import DEFAULT_ACCOUNT_ID  # type: ignore[attr-defined]
-    from moto.ec2.models import ec2_backends
+    from moto.ec2.models import ec2_backends, instance_types
     from moto.ec2.models.amis import AmiBackend
+    from moto.ec2.models.elastic_block_store import EBSBackend
     from moto.ssm.models import Parameter, ssm_backends
 
     from fogros2.provider.aws import images
@@ -251,6 +251,15 @@ def moto_aws(
         monkeypatch.setenv(name, value)
     for name in ('AWS_PROFILE', 'AWS_SESSION_TOKEN', 'AWS_REGION'):
         monkeypatch.delenv(name, raising=False)
+    # Moto answers with eight hundred types, and makes an RSA key for the disks of each region
+    kinds = ('t3.medium', 't3.large', 't3.xlarge', 'm6g.large', 'g5.xlarge')
+    monkeypatch.setattr(instance_types.InstanceTypeBackend, 'instance_types', [
+        instance_types.InstanceType(kind) for kind in kinds])
+    offered = instance_types.INSTANCE_TYPE_OFFERINGS['availability-zone']
+    for region in MOTO_REGIONS:
+        monkeypatch.setitem(offered, region, [
+            one for one in offered[region] if one['InstanceType'] in kinds])
+    monkeypatch.setattr(EBSBackend, '_create_default_encryption_key', lambda self: 'arn:aws:kms')
     create_image = AmiBackend.create_image
 
     def create_with_snapshots(
@@ -287,22 +296,16 @@ def azure_service(
     hasty: None, loopback_only: None, monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Any]:
     """Serve a simulated Azure on the loopback, and lead the provider there; yields it."""
-    from werkzeug.serving import make_server
-
     from fogros2.provider.azure import cloud
     from fogros2.provider.azure.account import Account
+    from rigs import serving
     from rigs.azure import service
 
     # what a process asks once is another in each test
     monkeypatch.setattr(cloud, '_USUAL', Account())
-    logging.getLogger('werkzeug').setLevel(logging.ERROR)
     azure = service.Service()
-    server = make_server('127.0.0.1', 0, azure, threaded=True)
-    thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
-    thread.start()
-    for name, value in service.environment(f'http://127.0.0.1:{server.server_port}').items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setenv('FOGROS2_ROBOT_ADDRESS', '198.51.100.7')
-    yield azure
-    server.shutdown()
-    server.server_close()
+    with serving.serve(azure) as url:
+        for name, value in service.environment(url).items():
+            monkeypatch.setenv(name, value)
+        monkeypatch.setenv('FOGROS2_ROBOT_ADDRESS', '198.51.100.7')
+        yield azure

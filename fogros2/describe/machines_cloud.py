@@ -94,7 +94,6 @@ class AWSCloudInstance(VmInstance):
     :param cpu_type: manufacturer of the processor: intel, amd, aws.
     :param iam_instance_profile: name or ARN of the profile with the instance's own AWS rights.
     :param subnet: subnet id; None for one of the default VPC.
-    :param security_groups: ids of groups in addition to the instance's own.
     :param instance_types: further types to try, in this order, if there is no capacity for one.
     """
 
@@ -108,7 +107,6 @@ class AWSCloudInstance(VmInstance):
         cpu_type: Optional[SomeSubstitutionsType] = None,
         iam_instance_profile: Optional[SomeSubstitutionsType] = None,
         subnet: Optional[ByRegion] = None,
-        security_groups: Optional[Sequence[SomeSubstitutionsType]] = None,
         instance_types: Optional[Sequence[SomeSubstitutionsType]] = None,
         **common: Any,
     ) -> None:
@@ -152,7 +150,6 @@ class GCPCloudInstance(VmInstance):
     :param service_account: email address of the account with the machine's own rights. With the
         right to delete the instance, the machine deletes itself when the robot is gone.
     :param network: name of the VPC network.
-    :param labels: Google's labels for everything that is created.
     :param machine_types: further types to try, in this order, if there is no capacity for one.
     """
 
@@ -168,7 +165,6 @@ class GCPCloudInstance(VmInstance):
         accelerators: Optional[SomeSubstitutionsType] = None,
         service_account: Optional[SomeSubstitutionsType] = None,
         network: Optional[SomeSubstitutionsType] = None,
-        labels: Optional[Mapping[str, SomeSubstitutionsType]] = None,
         machine_types: Optional[Sequence[SomeSubstitutionsType]] = None,
         **common: Any,
     ) -> None:

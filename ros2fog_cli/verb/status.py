@@ -48,8 +48,7 @@ class StatusVerb(VerbExtension):
         other = other_vpn(folder) if folder is not None else None
         if other is not None and not store.exists(args.name):
             return show_link(reach.measure(
-                other.interface.address, other.own, other.machine.public_key, 'wireguard'),
-                as_json=args.json)
+                other.interface.address, other.own, other.machine.public_key), as_json=args.json)
         entry = reach.find(args.name, warn, regions=args.region)
         tables = feature.tables()
         status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'clock': None, 'agent': None,

@@ -28,7 +28,9 @@ class VolumeVerb(VerbExtension):
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
-        parser.add_argument('action', choices=('list', 'delete'))
+        parser.add_argument('action', choices=('list', 'delete'), help=(
+            'of all providers that are set up; of Kubernetes the current context, of Google '
+            'Cloud the project of your credentials'))
         _add_options(parser)
         parser.add_argument('rest', nargs=argparse.REMAINDER, metavar='...',
                             help='names or ids of volumes to delete; options may be anywhere')

@@ -158,7 +158,9 @@ def test_machines_at_once_are_as_many(memory):
 
 def test_spot_machine_can_not_be_stopped(memory):
     machine, _ = create(memory, spot=True)
-    assert memory.provider().describe(machine).kind.endswith(' spot')
+    found = memory.provider().describe(machine)
+    assert found.kind.endswith(' spot')
+    assert memory.provider().capabilities_of(found).preemption_notice
     with pytest.raises(Unsupported, match='spot'):
         memory.provider().stop(machine)
     memory.provider().destroy(machine)
@@ -174,7 +176,7 @@ def test_launch_takes_few_requests(memory):
     provider.allow(machine, 22, [])
     provider.destroy(machine)
     gone(memory)
-    assert memory.calls() <= 25
+    assert memory.calls() <= memory.launching
 
 
 def test_launch_that_waits_for_the_boot_changes_no_rule(memory):
@@ -202,10 +204,10 @@ def test_list_of_all_regions_takes_few_requests(memory):
     assert [machine.id for machine in provider.find({})] == [there]
 
 
-@pytest.mark.parametrize('name', MEMORIES)
-def test_cloud_is_described_without_its_library(name):
-    program = ('import sys; from fogros2.plugin_system import load; '
-               f'p = load("fogros2.provider", {name!r}); p(); p.configured(); p.region_names(); '
+def test_clouds_are_described_without_their_libraries():
+    program = ('import sys; from fogros2.plugin_system import load\n'
+               f'for name in {[*MEMORIES]}:\n'
+               '    p = load("fogros2.provider", name); p(); p.configured(); p.region_names()\n'
                'print(sorted({module.split(".")[0] for module in sys.modules} & '
                '{"azure", "boto3", "botocore", "google", "googleapiclient", "msal", "requests"}))')
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-import re
 import dataclasses
 import ipaddress
 import json
+import re
 import shutil
 import socket
 import time

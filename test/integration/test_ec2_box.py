@@ -114,26 +114,17 @@ class Launched:
                 return result
 
 
-def refused(code, action):
-    from botocore.exceptions import ClientError
-    with pytest.raises(ClientError) as caught:
-        action()
-    assert caught.value.response['Error']['Code'] == code, caught.value
-    return str(caught.value)
-
-
 def test_an_instance_is_a_computer(box, key):
     it = Launched(box, key, config={
-        'bootcmd': ['echo "$INSTANCE_ID" >/boot-id'],
-        'write_files': [{'path': '/etc/told', 'content': 'secret', 'permissions': '0600'}],
-        'runcmd': [['sh', '-c', 'cat /etc/told >/ran']]})
+        'bootcmd': [['sh', '-c', 'echo "$INSTANCE_ID" >/boot-id']],
+        'runcmd': [['sh', '-c', 'echo told >/ran']]})
     assert it.made['State']['Name'] == 'pending'
     it.runs()
     # nobody gets in before the group says so
     assert it.ssh('true', deadline=0, seconds=1).returncode == 255
     it.allow()
-    done = it.ssh('cloud-init status --wait; cat /boot-id; sudo cat /ran; echo; id -un; hostname')
-    assert done.stdout.split('\n')[:4] == ['status: done', it.id, 'secret', 'ubuntu']
+    done = it.ssh('cloud-init status --wait; cat /boot-id /ran; id -un; hostname')
+    assert done.stdout.split('\n')[:4] == ['status: done', it.id, 'told', 'ubuntu']
     # its metadata service wants a token
     done = it.ssh("""
         url=http://169.254.169.254/latest
@@ -172,35 +163,6 @@ def test_the_robot_has_no_way_out_and_may_move(box):
         assert on_robot('curl', '-s', box.checkip).stdout.strip() == moved != ROBOT
     finally:
         box.move_robot(back=True)
-
-
-@pytest.mark.soak
-def test_what_ec2_refuses(box, key):
-    words = {'MinCount': 1, 'MaxCount': 1, 'ImageId': ubuntu(box)}
-    ec2 = client(box)
-    top = '/aws/service/canonical/ubuntu/server/24.04/stable/current/arm64/hvm/ebs-gp3/ami-id'
-    said = refused('InvalidParameterValue', lambda: ec2.run_instances(
-        **{**words, 'ImageId': ubuntu(box, name=top)}, InstanceType='t3.medium'))
-    assert "does not match the architecture 'arm64'" in said
-    refused('InvalidParameterValue', lambda: ec2.run_instances(**words, InstanceType='t9.huge'))
-    zones = {z['ZoneName'] for z in ec2.describe_availability_zones()['AvailabilityZones']}
-    offered = {o['Location'] for o in ec2.describe_instance_type_offerings(
-        LocationType='availability-zone', Filters=[
-            {'Name': 'instance-type', 'Values': ['g5.xlarge']}])['InstanceTypeOfferings']}
-    without = sorted(zones - offered)
-    assert without
-    refused('Unsupported', lambda: ec2.run_instances(
-        **words, InstanceType='g5.xlarge', Placement={'AvailabilityZone': without[0]}))
-    refused('InvalidParameterValue', lambda: ec2.run_instances(
-        **words, InstanceType='t3.medium', UserData='#cloud-config\nruncmds: [x]\n'))
-    refused('InvalidKeyPair.NotFound', lambda: ec2.run_instances(
-        **words, InstanceType='t3.medium', KeyName='nobody'))
-    refused('InvalidAMIID.NotFound', lambda: ec2.run_instances(
-        MinCount=1, MaxCount=1, ImageId='ami-0123456789abcdef0', InstanceType='t3.medium'))
-    before = {found.id for found in box.instances()}
-    it = Launched(box, key)
-    refused('DependencyViolation', lambda: it.ec2.delete_security_group(GroupId=it.group))
-    assert {found.id for found in box.instances()} - before == {it.id}
 
 
 STARTER = """

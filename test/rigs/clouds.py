@@ -57,20 +57,13 @@ class Cloud(abc.ABC):
     places: ClassVar[tuple[Mapping[str, Any], Mapping[str, Any]]]
     #: Its words at the end of ``make cloud-check``'s first page.
     checked: ClassVar[str] = ''
-    #: A launch argument with another region, and a resource that ``cloud_check`` announces.
-    elsewhere: ClassVar[str]
-    announced: ClassVar[str]
     #: The most requests of a listing over all regions.
     listing: ClassVar[int]
     #: Actions of requests that create something, and the pattern of the one for a machine.
     creating: ClassVar[frozenset[str]]
     order: ClassVar[str]
-    #: Refusals that stay: code, the other words of ``box.fail``, and words of the message.
-    refusals: ClassVar[Sequence[tuple[str, Mapping[str, Any], str]]]
     #: Mistakes of a user: words of the message, launch arguments, variables.
     mistakes: ClassVar[Sequence[tuple[str, Sequence[str], Mapping[str, str]]]]
-    #: Faults of one step: code, the other words of ``box.fail``, whether the launch has to fail.
-    faults: ClassVar[Sequence[tuple[str, Mapping[str, Any], bool]]]
 
     @abc.abstractmethod
     def open(self, **words: Any) -> Box:
@@ -99,14 +92,6 @@ class Cloud(abc.ABC):
     @abc.abstractmethod
     def described(self, box: Any) -> str:
         """Return all that the cloud tells of its resources, user data left out."""
-
-    @abc.abstractmethod
-    def disturb(self, box: Any) -> None:
-        """Order what passes: a place without room, throttling, and an answer that is lost."""
-
-    @abc.abstractmethod
-    def disturbed(self, calls: Sequence[Call]) -> bool:
-        """Return whether each of these faults has been answered."""
 
     @abc.abstractmethod
     def look(self, box: Any, instance: Instance, name: str) -> None:
@@ -205,27 +190,13 @@ class Aws(Cloud):
     region, kind, price = 'us-east-1', 't3.medium', '0.0416'
     places = ({'region': 'us-east-1'},
               {'region': 'eu-central-1', 'ec2_instance_type': 'c5.large'})
-    elsewhere, announced = 'eu-central-1', 'an EC2 instance'
     listing = 72  # twice, for machines and volumes: the regions, and one request for each
     creating = frozenset({'RunInstances', 'ImportKeyPair', 'CreateSecurityGroup'})
     order = 'Action=RunInstances'
-    refusals = (
-        ('InsufficientInstanceCapacity', {'action': 'RunInstances'}, 't3.medium'),
-        ('UnauthorizedOperation', {'action': 'CreateSecurityGroup'}, 'ec2:CreateSecurityGroup'),
-        ('RequestExpired', {'action': 'DescribeInstances'}, 'clock'))
     mistakes = (
         ('xx-nowhere-1', ['region:=xx-nowhere-1'], {}),
         ('credentials', [], {'AWS_ACCESS_KEY_ID': ''}),
         ('does not answer', [], {'AWS_ENDPOINT_URL': 'http://198.51.100.1:9'}))
-    faults = tuple(
-        (code, {'action': action, 'after': after}, True) for code, action, after in (
-            ('UnauthorizedOperation', 'CreateSecurityGroup', False),
-            ('InvalidParameterValue', 'AuthorizeSecurityGroupIngress', False),
-            ('InvalidParameterValue', 'AuthorizeSecurityGroupIngress', True),
-            ('UnauthorizedOperation', 'ImportKeyPair', False),
-            ('InvalidParameterValue', 'RunInstances', False),
-            ('InvalidParameterValue', 'RunInstances', True),
-            ('UnauthorizedOperation', 'CreateTags', False)))
 
     def open(self, **words: Any) -> Box:
         """Return a box."""
@@ -293,18 +264,6 @@ class Aws(Cloud):
         return repr([getattr(api, f'describe_{what}')() for what in (
             'instances', 'tags', 'security_groups', 'key_pairs', 'volumes')])
 
-    def disturb(self, box: Any) -> None:
-        """Fill two zones, lose an answer, and throttle."""
-        box.fail('InsufficientInstanceCapacity', action='RunInstances', times=2)
-        box.fail('InternalError', action='RunInstances', after=True)
-        # late: boto3 goes slowly for a while after it
-        box.fail('RequestLimitExceeded', action='DeleteKeyPair')
-
-    def disturbed(self, calls: Sequence[Call]) -> bool:
-        """Return whether the same zone was asked again."""
-        return [call.error for call in calls if call.action == 'RunInstances'] == [
-            'InsufficientInstanceCapacity', 'InsufficientInstanceCapacity', 'InternalError', '']
-
     def look(self, box: Any, instance: Instance, name: str) -> None:
         """Check the group, the disk, the tags and the metadata service."""
         api = self._api(box, self.region)
@@ -334,34 +293,15 @@ class Gcp(Cloud):
     region, kind = 'us-central1', 'e2-medium'
     places = ({'region': 'nearest'},
               {'zone': 'europe-west3-b', 'machine_type': 'n2-standard-2'})
-    elsewhere, announced, checked = 'europe-west3', '', 'gcp: project robots, us-central1'
+    checked = 'gcp: project robots, us-central1'
     listing = 2
     creating = frozenset({'instances.insert', 'firewalls.insert'})
     order = '^POST .*/instances '
-    refusals = (
-        ('QUOTA_EXCEEDED', {'action': 'instances.insert'}, 'Quotas'),
-        ('forbidden', {'action': 'firewalls.insert'}, 'doc/gcp.md'),
-        ('accessNotConfigured', {'action': 'instances.aggregatedList'}, 'gcloud services enable'),
-        ('authError', {}, 'gcloud auth'))
     mistakes = (
         ('there are no Google credentials', [], {'GOOGLE_APPLICATION_CREDENTIALS': '/nowhere'}),
         ('does not answer', [], {
             'CLOUDSDK_API_ENDPOINT_OVERRIDES_COMPUTE': 'http://198.51.100.1:9/'}),
         ("can't be the region", ['region:=nowhere'], {}))
-    #: A zone without capacity is one of several, so that all of them have to fail; the deletion
-    #: of the SSH rule is tried again at the launch's end.
-    faults = (
-        ('ZONE_RESOURCE_POOL_EXHAUSTED', {'action': 'instances.insert', 'times': 0}, True),
-        *((code, {'action': action, 'after': after}, action != 'firewalls.delete')
-          for code, action, after in (
-            ('forbidden', 'instances.insert', True), ('forbidden', 'instances.insert', False),
-            ('INTERNAL_ERROR', 'instances.insert', False),
-            ('forbidden', 'instances.setLabels', False), ('forbidden', 'instances.get', False),
-            ('quotaExceeded', 'firewalls.insert', False), ('forbidden', 'firewalls.insert', True),
-            ('QUOTA_EXCEEDED', 'firewalls.insert', False),
-            ('forbidden', 'globalOperations.wait', False),
-            ('forbidden', 'zoneOperations.wait', False),
-            ('forbidden', 'firewalls.delete', False))))
 
     def __init__(self, project: str = 'robots') -> None:
         self._project = project
@@ -400,18 +340,6 @@ class Gcp(Cloud):
         shown = [{**vars(one), 'tags': dict(one.tags)} for one in box.instances()]
         return repr([shown, *map(box.firewall, box.things().get('firewalls', ()))])
 
-    def disturb(self, box: Any) -> None:
-        """Fill a zone, lose the answer of the next, and throttle."""
-        box.fail('ZONE_RESOURCE_POOL_EXHAUSTED', action='instances.insert', zone='us-central1-a')
-        box.fail('backendError', action='instances.insert', after=True, zone='us-central1-b')
-        box.fail('rateLimitExceeded', action='firewalls.delete', times=2)
-
-    def disturbed(self, calls: Sequence[Call]) -> bool:
-        """Return whether the next zone was asked, and asked again."""
-        return [(call.region[-1], call.error) for call in calls
-                if call.action == 'instances.insert'] == [
-                    ('a', ''), ('b', 'backendError'), ('b', '')]
-
     def look(self, box: Any, instance: Instance, name: str) -> None:
         """Check the firewall rules: that for SSH is gone, everybody else is denied."""
         from rigs.gce import catalogue
@@ -440,27 +368,14 @@ class Azure(Cloud):
     needs = ('azure.identity', 'azure.mgmt.compute', 'azure.mgmt.network', 'werkzeug')
     region, kind, price = 'westeurope', 'Standard_B2als_v2', '0.0376'
     places = ({'region': 'westeurope'}, {'region': 'eastus', 'vm_size': 'Standard_D2s_v5'})
-    elsewhere, announced = 'eastus', 'a resource group'
     listing = 3
     creating = frozenset({'PUT'})
     order = '^PUT .*/virtualMachines/[^/]* '
-    refusals = (
-        ('QuotaExceeded', {'method': 'PUT', 'kind': 'virtualMachines'}, 'quota'),
-        ('AuthorizationFailed', {'status': 403, 'method': 'PUT', 'kind': 'resourceGroups'},
-         'doc/azure.md'),
-        ('ExpiredAuthenticationToken', {'status': 401}, 'az login'))
     mistakes = (
         ('no subscription', [], {'AZURE_SUBSCRIPTION_ID': ''}),
         ('does not answer', [], {'FOGROS2_AZURE_ENDPOINT': 'http://198.51.100.1:9'}),
         ('Azure has no Standard_X1', ['vm_size:=Standard_X1'], {}),
         ("can't be the region", ['region:=West-Europe'], {}))
-    #: Without the role of a machine, a schedule of Azure ends it; the launch goes on.
-    faults = tuple(
-        ('SomethingIsWrong', {'status': 400, 'method': 'PUT', 'kind': kind, 'late': late}, True)
-        for kind, late in (
-            ('resourceGroups', False), ('networkSecurityGroups', False),
-            ('publicIPAddresses', True), ('virtualNetworks', False),
-            ('networkInterfaces', False), ('virtualMachines', False), ('virtualMachines', True)))
 
     def open(self, **words: Any) -> Box:
         """Return a box."""
@@ -499,17 +414,6 @@ class Azure(Cloud):
     def described(self, box: Any) -> str:
         """Return all groups and resources."""
         return repr(box.things())
-
-    def disturb(self, box: Any) -> None:
-        """Fail late for want of room, lose an answer, and throttle."""
-        box.fail('TooManyRequests', status=429, method='GET', times=2)
-        box.fail('Lost', status=500, method='PUT', kind='networkInterfaces', after=True)
-        box.fail('TooManyRequests', status=429, method='DELETE')
-
-    def disturbed(self, calls: Sequence[Call]) -> bool:
-        """Return whether all of it was answered."""
-        errors = [call.error for call in calls]
-        return errors.count('TooManyRequests') == 3 and errors.count('Lost') == 1
 
     def reset(self, box: Any) -> None:
         """Let the user be an owner."""

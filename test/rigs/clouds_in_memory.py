@@ -37,6 +37,8 @@ class Memory(abc.ABC):
     steps: ClassVar[Sequence[tuple[str, str]]]
     #: The most requests that list the machines of all regions.
     listing: ClassVar[int]
+    #: The most requests of a launch.
+    launching: ClassVar[int] = 25
     #: Whether a machine that has switched itself off is billed.
     billed_when_off: ClassVar[bool] = True
 
@@ -143,6 +145,7 @@ class Aws(Memory):
         'CreateSecurityGroup', 'AuthorizeSecurityGroupIngress', 'ImportKeyPair', 'RunInstances')
         for how in ('refused', 'lost'))
     listing = 2  # there are two regions
+    launching = 17
 
     def __init__(self, served: Any, patch: pytest.MonkeyPatch) -> None:
         super().__init__(served, patch)
@@ -253,10 +256,10 @@ class Azure(Memory):
     fixture, name = 'azure_service', 'azure'
     options = {'vm_size': 'Standard_B2als_v2', 'region': 'westeurope'}
     more, away = {'vm_sizes': ['Standard_D2s_v5']}, 'eastus'
-    #: Groups and schedules are there at once.
+    #: Groups and schedules are there at once; an address stands for what is made beside it.
     steps = tuple((step, how) for step in (
-        'resourcegroups', 'networksecuritygroups', 'publicipaddresses', 'virtualnetworks',
-        'networkinterfaces', 'virtualmachines', 'schedules')
+        'resourcegroups', 'publicipaddresses', 'networkinterfaces', 'virtualmachines',
+        'schedules')
         for how in ('refused', 'late', 'lost') if how == 'refused' or step != 'schedules'
         and (how == 'lost' or step != 'resourcegroups'))
     listing = 2

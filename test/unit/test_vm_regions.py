@@ -12,17 +12,17 @@ import time
 import pytest
 
 from fogros2.errors import PrerequisiteError, ProviderError
-from fogros2.provider.aws.cloud import api_host, Ec2
+from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.offers import Region
 from fogros2.provider.vm import regions
 
-REGIONS = Ec2.regions.table
-AWS = regions.Regions('AWS', REGIONS, api_host)
+REGIONS, HOST = Ec2.regions.table, 'ec2.{}.amazonaws.com'.format
+AWS = regions.Regions('AWS', REGIONS, HOST)
 
 
 def connector(seconds: dict[str, list[float]]) -> Callable[[str, int, float], float]:
     """Return one that takes these times for each region in turn; inf is no connection."""
-    left = {api_host(name): list(times) for name, times in seconds.items()}
+    left = {HOST(name): list(times) for name, times in seconds.items()}
 
     def connect(host: str, port: int, timeout: float) -> float:
         assert port == 443
@@ -128,7 +128,7 @@ def test_the_nearest_is_measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
         measured.append(names)
         return [Region('eu-west-3', 'Paris', 12.0)]
 
-    own = regions.Regions('AWS', REGIONS, api_host)
+    own = regions.Regions('AWS', REGIONS, HOST)
     monkeypatch.setattr(own, 'ranked', ranked)
     threads = [threading.Thread(target=own.nearest) for _ in range(4)]
     for thread in threads:

@@ -48,11 +48,6 @@ class Account(vm.Account):
             self._known['session'] = session
         #: Instances that this process has created, and when (``time.monotonic``).
         self.made: dict[str, float] = {}
-        #: Security groups that this process has created and not changed since, by attempt: the
-        #: id, and the rule for SSH as sent to EC2.
-        self.doors: dict[str, tuple[str, Mapping[str, Any]]] = {}
-        #: Ids of the disks that are deleted with instances that this process has seen run.
-        self.disks: dict[str, set[str]] = {}
         # boto3 creates clients of one session in one thread only; their use is thread-safe
         self._lock = threading.RLock()
 

@@ -23,12 +23,6 @@ from fogros2.provider.vm.market import CACHE_AGE
 from fogros2.provider.vm.regions import read_table, Regions
 
 
-def api_host(region: str) -> str:
-    """Return the host of a region's EC2 API, which is in the region."""
-    suffix = '.cn' if region.startswith('cn-') else ''
-    return f'ec2.{region}.amazonaws.com{suffix}'
-
-
 class Ec2(Ec2Prices, images.Ec2Images, Ec2Network, Ec2Disks):
     """
     EC2 instances, each with its own security group and key pair.
@@ -39,7 +33,7 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network, Ec2Disks):
     name = 'aws'
     title = 'AWS'
     options = Options
-    regions = Regions('AWS', read_table(__file__), api_host)
+    regions = Regions('AWS', read_table(__file__), 'ec2.{}.amazonaws.com'.format)
     id_form = 'i-[0-9a-f]+'
     base_region = 'us-east-1'
     types_age = CACHE_AGE
@@ -89,7 +83,6 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network, Ec2Disks):
             raise MachineNotFound(f'there is no {vm} in {region} any more')
         if matches[0]['State']['Name'] == 'terminated' and not self._account.just_made(vm):
             raise MachineNotFound(f'{vm} in {region} was terminated')
-        self._account.disks[vm] = instances.own_disks(matches[0])
         return instances.vm_of(region, matches[0])
 
     def is_marked(self, machine: VmId) -> bool:

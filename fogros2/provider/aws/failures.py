@@ -14,7 +14,7 @@ import json
 import re
 from typing import Any, Optional
 
-from fogros2.errors import FogError, PrerequisiteError, ProviderError
+from fogros2.errors import ConfigurationError, FogError, PrerequisiteError, ProviderError
 from fogros2.provider.vm.failures import CodedError, Failure, LENGTH, not_the_cloud, Silent
 
 _LOG_IN = 'aws sso login, or new keys: aws configure'
@@ -63,11 +63,8 @@ _FAILURES = {
         'the account has no default VPC in this region',
         'aws ec2 create-default-vpc, or name a subnet=')),
     'InvalidSubnetID.NotFound': Failure('there is no such subnet in this region',
-                                        'check subnet= and region='),
-    'InvalidGroup.NotFound': Failure('there is no such security group in this VPC',
-                                     'check security_groups= and subnet=', gone=True),
-    'InvalidGroupId.Malformed': Failure('that is no id of a security group',
-                                        'security_groups= takes sg-...', gone=True),
+                                        'check subnet= and region=', ConfigurationError),
+    'InvalidGroup.NotFound': Failure('there is no such security group in this VPC', gone=True),
     'IdempotentParameterMismatch': Failure(
         'another machine was asked for under the same token', 'start the launch again'),
     # how much of it
@@ -106,7 +103,7 @@ _FAILURES = {
                      'UnauthorizedException'), Failure(denied=True)),
     **dict.fromkeys(('InvalidInstanceID.NotFound', 'InvalidInstanceID.Malformed',
                      'InvalidKeyPair.NotFound', 'InvalidSnapshot.NotFound',
-                     'InvalidVolume.NotFound', 'InvalidAllocationID.NotFound'),
+                     'InvalidVolume.NotFound'),
                     Failure(gone=True)),
 }
 #: Errors of botocore without an answer: reason ({} is botocore's own), and hint.

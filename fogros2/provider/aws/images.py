@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 import re
 import time
 from typing import Any, Optional
@@ -12,12 +12,12 @@ from fogros2.errors import ConfigurationError, MachineNotFound
 from fogros2.model import Image
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.aws.clients import Account
-from fogros2.provider.aws.failures import AwsError
 from fogros2.provider.aws.instances import tag_list, tags_of
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import instance_type
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import TAG_BAKED, TAG_USER, VmCloud, VmId, when
+from fogros2.provider.vm.failures import unless_gone
 from fogros2.provider.vm.images import check_baked, image_parts, image_tags
 
 #: Public parameters of AWS's parameter store, by architecture; ROS 2 Jazzy is for Ubuntu 24.04.
@@ -86,18 +86,15 @@ def choose(
 
 
 def _named(account: Account, region: str, kind: MachineType, identity: str) -> Mapping[str, Any]:
-    try:
+    images: Sequence[Mapping[str, Any]] = ()
+    with unless_gone():
         images = account.call(
             'ec2', region, 'describe_images', f'looking for the image {identity}',
             ImageIds=[identity])['Images']
-    except AwsError as error:
-        if not error.gone:
-            raise
-        raise ConfigurationError(str(error.args[0]), error.hint) from error
     if not images:
         raise ConfigurationError(f'there is no image {identity} in {region}',
                                  'an AMI belongs to one region; leave ami_image= out')
-    image: Mapping[str, Any] = images[0]
+    image = images[0]
     if image.get('State', 'available') != 'available':
         raise ConfigurationError(f'the image {identity} in {region} is {image["State"]}',
                                  'ros2 fog image list shows when it is available')

@@ -83,7 +83,6 @@ def run_request(
     """
     options: Options = order.options
     device = str(image.get('RootDeviceName') or '/dev/sda1')
-    groups = [group, *options.security_groups]
     disk = max(options.disk_size, _root_size(image, device))
     words: dict[str, Any] = {
         'ImageId': image['ImageId'],
@@ -107,10 +106,10 @@ def run_request(
     }
     if place.zone:
         words['NetworkInterfaces'] = [{
-            'DeviceIndex': 0, 'SubnetId': place.zone, 'Groups': groups,
+            'DeviceIndex': 0, 'SubnetId': place.zone, 'Groups': [group],
             'AssociatePublicIpAddress': True, 'DeleteOnTermination': True}]
     else:
-        words['SecurityGroupIds'] = groups
+        words['SecurityGroupIds'] = [group]
     if options.iam_instance_profile:
         key = 'Arn' if options.iam_instance_profile.startswith('arn:') else 'Name'
         words['IamInstanceProfile'] = {key: options.iam_instance_profile}
@@ -159,13 +158,6 @@ def address_of(instance: Mapping[str, Any]) -> str:
            for address in interface.get('Ipv6Addresses') or ()]
     return str(instance.get('PublicIpAddress') or next(iter(six), '')
                or instance.get('PrivateIpAddress') or '')
-
-
-def own_disks(instance: Mapping[str, Any]) -> set[str]:
-    """Return the ids of the disks that are deleted with an instance."""
-    return {str(mapping['Ebs']['VolumeId'])
-            for mapping in instance.get('BlockDeviceMappings') or ()
-            if mapping.get('Ebs', {}).get('DeleteOnTermination')}
 
 
 def reason_of(instance: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ is never ended.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Optional
 
@@ -86,19 +86,16 @@ class Ec2Network(VmCloud):
 
     def _open_group(self, region: str, group: str, order: Order) -> None:
         """Open the ports of a new group: the VPN's, and SSH for the order's sources."""
-        port, ssh = order.request.vpn_port, rule('tcp', SSH, order.sources)
-        first, last = FREE_PORTS
+        port, (first, last) = order.request.vpn_port, FREE_PORTS
         with tolerated('InvalidPermission.Duplicate'):
             self._account.call(
                 'ec2', region, 'authorize_security_group_ingress',
                 f"opening the ports of '{order.spec.name}'", GroupId=group, IpPermissions=[
                     {'IpProtocol': 'udp', 'FromPort': port, 'ToPort': port, **ANYONE},
-                    *([ssh] if order.sources else []),
+                    *([rule('tcp', SSH, order.sources)] if order.sources else []),
                     *(rule(protocol, first, order.sources, last)
                       for protocol in (('tcp', 'udp') if order.options.fleet else ()))])
-            if order.sources:
-                self._account.doors[order.attempt] = (group, ssh)
-                self._account.admitted[order.attempt] = sorted(map(cidr, order.sources))
+            self._account.admitted[order.attempt] = sorted(map(cidr, order.sources))
 
     def undo_begin(
         self, region: str, attempt: str, created: Sequence[str],
@@ -143,14 +140,7 @@ class Ec2Network(VmCloud):
         """Let only ``sources`` reach a TCP port, beside the networks of ``ssh_from=``."""
         if port == SSH and self._account.admits(machine.attempt, sorted(map(cidr, sources))):
             return
-        region, door = machine.region, self._account.doors.pop(machine.attempt, None)
-        if door is not None and not sources and port == SSH:
-            # the first change of a group that this process has created: no look-up is needed
-            with tolerated('InvalidPermission.NotFound'):  # another program has changed it
-                self._account.call(
-                    'ec2', region, 'revoke_security_group_ingress', f'closing port {port}',
-                    GroupId=door[0], IpPermissions=[door[1]])
-                return
+        region = machine.region
         groups = self._groups(region, machine.attempt)
         if not groups:
             raise ProviderError(f'the machine in {region} has no security group any more',
@@ -176,15 +166,9 @@ class Ec2Network(VmCloud):
 
         :raises ConfigurationError: there is no such subnet in the region, or in the zone.
         """
-        try:
-            subnets = self._account.call(
-                'ec2', region, 'describe_subnets', 'looking for the subnet',
-                SubnetIds=[subnet])['Subnets']
-        except AwsError as error:
-            if error.code.startswith('InvalidSubnet'):
-                raise ConfigurationError(f"there is no subnet '{subnet}' in {region}",
-                                         'check subnet= and region=') from error
-            raise
+        subnets = self._account.call(
+            'ec2', region, 'describe_subnets', f'looking for the subnet {subnet}',
+            SubnetIds=[subnet])['Subnets']
         if zone not in ('', subnets[0]['AvailabilityZone']):
             raise ConfigurationError(f"the subnet '{subnet}' is not in {zone}, as the volume is",
                                      'name a subnet there, or leave subnet= out')
@@ -218,10 +202,7 @@ class Ec2Network(VmCloud):
                 longest=15.0, hint='ros2 fog delete again later',
                 what=f'{machine.vm} in {machine.region} to be terminated')
         self._account.made.pop(machine.vm, None)
-        self._account.doors.pop(machine.attempt, None)
-        # EC2 reports these for a while, although they are being deleted
-        disks = self._account.disks.pop(machine.vm, set())
-        self.sweep(machine.region, machine.attempt, gone=disks)
+        self.sweep(machine.region, machine.attempt)
 
     def _terminate(self, machine: VmId) -> bool:
         """Terminate an instance; return whether its end has to be awaited."""
@@ -245,9 +226,6 @@ class Ec2Network(VmCloud):
         matches = self._instances(
             machine.region, {TAG_ATTEMPT: machine.attempt}, f'watching {machine.vm} end',
             {'Name': 'instance-id', 'Values': [machine.vm]})
-        for instance in matches:
-            self._account.disks.setdefault(machine.vm, set()).update(
-                instances.own_disks(instance))
         return any(instance['State']['Name'] != 'terminated' for instance in matches)
 
     def _instances(
@@ -258,27 +236,16 @@ class Ec2Network(VmCloud):
             'ec2', region, 'describe_instances', 'Reservations', what,
             Filters=[*instances.tag_filters(tags), *filters]))
 
-    def sweep(self, region: str, attempt: str, *, gone: Collection[str] = ()) -> None:
-        account = self._account
+    def sweep(self, region: str, attempt: str) -> None:
         self._drop_key(region, attempt)
-        ids = [str(entry['ResourceId']) for entry in account.pages(
-            'ec2', region, 'describe_tags', 'Tags', 'looking for what is left',
-            Filters=[{'Name': 'key', 'Values': [TAG_ATTEMPT]},
-                     {'Name': 'value', 'Values': [attempt]}])]
-        # EC2 reports tags a little late; the group's name is reliable
-        self._drop_groups(region, attempt, [each for each in ids if each.startswith('sg-')],
-                          timeout=TIMEOUT)
-        for address in ids:
-            if address.startswith('eipalloc-'):
-                account.remove(region, 'release_address', 'releasing an address',
-                               AllocationId=address)
-        volumes: Iterable[Mapping[str, Any]] = account.call(
-            'ec2', region, 'describe_volumes', 'looking for disks',
-            Filters=[{'Name': f'tag:{TAG_ATTEMPT}', 'Values': [attempt]},
-                     {'Name': 'status', 'Values': ['available', 'error']}],
-        )['Volumes'] if any(name.startswith('vol-') and name not in gone for name in ids) else ()
-        for disk in volumes:
-            account.remove(region, 'delete_volume', 'deleting a disk', VolumeId=disk['VolumeId'])
+        self._drop_groups(region, attempt, (), timeout=TIMEOUT)
+        # an image may have disks that do not end with the instance
+        for disk in self._account.pages(
+                'ec2', region, 'describe_volumes', 'Volumes', 'looking for disks', Filters=[
+                    {'Name': f'tag:{TAG_ATTEMPT}', 'Values': [attempt]},
+                    {'Name': 'status', 'Values': ['available', 'error']}]):
+            self._account.remove(region, 'delete_volume', 'deleting a disk',
+                                 VolumeId=disk['VolumeId'])
 
     def end_attempt(self, region: str, attempt: str) -> bool:
         matches = self._instances(region, {TAG_ATTEMPT: attempt}, 'looking for what was made',

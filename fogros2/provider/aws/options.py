@@ -4,10 +4,8 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 
 from fogros2 import untrusted
-from fogros2.errors import ConfigurationError
 from fogros2.provider.vm.options import VmOptions
 
 
@@ -20,7 +18,6 @@ class Options(VmOptions):
     instance_types: tuple[str, ...] = ()
     iam_instance_profile: str = ''
     subnet: str = ''
-    security_groups: tuple[str, ...] = ()
 
     WHAT = 'a machine at AWS'
     TYPE = 'ec2_instance_type'
@@ -37,11 +34,3 @@ class Options(VmOptions):
         'subnet': (r'subnet-[0-9a-f]+', 'subnet-...'),
         'user': (untrusted.NAME.pattern, "a login name, such as 'ubuntu'"),
     }
-
-    def check(self) -> None:
-        """Check the values."""
-        super().check()
-        for group in self.security_groups:
-            if not re.fullmatch(r'sg-[0-9a-f]+', group):
-                raise ConfigurationError(f"'{group}' is no id of a security group",
-                                         'security_groups= takes sg-...')

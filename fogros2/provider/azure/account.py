@@ -88,6 +88,10 @@ class Account(RestAccount):
         words = [f'/subscriptions/{subscription()}', group and f'resourceGroups/{group}', rest]
         return '/'.join(filter(None, words))
 
+    def vm(self, name: str, rest: str = '') -> str:
+        """Return the path of a machine, whose group has its name."""
+        return self.path(name, f'providers/Microsoft.Compute/virtualMachines/{name}{rest}')
+
     def call(
         self, method: str, path: str, what: str, body: Optional[Mapping[str, Any]] = None, *,
         wait: bool = False, query: Optional[Mapping[str, str]] = None,

@@ -127,11 +127,8 @@ class Azure(prices.AzurePrices, images.AzureImages, AzureDisks):
 
     def _entry(self, vm: str) -> Mapping[str, Any]:
         entry: Mapping[str, Any] = self._account.call(
-            'GET', self._vm(vm), f'looking for {vm}', query={'$expand': 'instanceView'})
+            'GET', self._account.vm(vm), f'looking for {vm}', query={'$expand': 'instanceView'})
         return entry
-
-    def _vm(self, vm: str, rest: str = '') -> str:
-        return self._account.path(vm, f'{_VMS}/{vm}{rest}')
 
     def prepare(self, region: str, order: Order, types: Sequence[str]) -> dict[str, Prepared]:
         """Return image, disk and network of each size that the region has."""
@@ -231,7 +228,7 @@ class Azure(prices.AzurePrices, images.AzureImages, AzureDisks):
             # machines of one network reach each other; its name is long
             tags[machines.TAG_PRIVATE] = f'{private} {"/".join(subnet.split("/")[4:9:2])}'
         what = f"creating '{order.spec.name}' ({place.kind})"
-        self._account.call('PUT', self._vm(name), what,
+        self._account.call('PUT', self._account.vm(name), what,
                            machines.request(place, order, prepared, str(nic['id']), tags))
         entry = self._account.seen[name] = self._allocated(name, what)
         self._guard(name, place.region, order, prepared, entry)
@@ -274,7 +271,7 @@ class Azure(prices.AzurePrices, images.AzureImages, AzureDisks):
             lambda: self._entry(name)['properties']['provisioningState'] == 'Succeeded',
             timeout=600.0, cancel=self.cancel, interval=3.0, longest=10.0, what=f'{name} to run')
         self._account.call(
-            'PUT', self._vm(name, '/extensions/NvidiaGpuDriverLinux'),
+            'PUT', self._account.vm(name, '/extensions/NvidiaGpuDriverLinux'),
             f"installing NVIDIA's driver on {name}", {'location': region, 'properties': {
                 'publisher': 'Microsoft.HpcCompute', 'type': 'NvidiaGpuDriverLinux',
                 'typeHandlerVersion': '1.9', 'autoUpgradeMinorVersion': True}})
@@ -359,7 +356,7 @@ class Azure(prices.AzurePrices, images.AzureImages, AzureDisks):
 
     def set_tags(self, machine: VmId, tags: Mapping[str, str]) -> None:
         self._account.call(
-            'PATCH', self._vm(machine.vm, '/providers/Microsoft.Resources/tags/default'),
+            'PATCH', self._account.vm(machine.vm, '/providers/Microsoft.Resources/tags/default'),
             f'writing tags of {machine.vm}',
             {'operation': 'Merge', 'properties': {'tags': dict(tags)}}, wait=True)
 
@@ -372,11 +369,12 @@ class Azure(prices.AzurePrices, images.AzureImages, AzureDisks):
 
     def stop(self, machine: VmId) -> None:
         self._account.seen.pop(machine.vm, None)
-        self._account.call('POST', self._vm(machine.vm, '/deallocate'), f'stopping {machine.vm}')
+        self._account.call('POST', self._account.vm(machine.vm, '/deallocate'),
+                           f'stopping {machine.vm}')
 
     def start(self, machine: VmId) -> None:
-        self._account.call('POST', self._vm(machine.vm, '/start'), f'starting {machine.vm}',
-                           wait=True)
+        self._account.call('POST', self._account.vm(machine.vm, '/start'),
+                           f'starting {machine.vm}', wait=True)
 
     def end_command(self, machine: VmId, tags: Mapping[str, str]) -> tuple[str, ...]:
         return (*ending.END, endpoint())

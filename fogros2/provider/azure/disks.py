@@ -70,11 +70,11 @@ class AzureDisks(VmCloud):
                      f"detaching the volume '{disk.name}'")
 
     def _attached(self, machine: VmId) -> list[Mapping[str, Any]]:
-        entry = self._account.call('GET', _vm(self._account, machine), f'looking at {machine.vm}')
+        entry = self._account.call('GET', self._account.vm(machine.vm), f'looking at {machine.vm}')
         return list(entry['properties']['storageProfile'].get('dataDisks') or ())
 
     def _attach(self, machine: VmId, disks: list[Mapping[str, Any]], what: str) -> None:
-        self._account.call('PATCH', _vm(self._account, machine), what, {
+        self._account.call('PATCH', self._account.vm(machine.vm), what, {
             'properties': {'storageProfile': {'dataDisks': disks}}}, wait=True)
 
     def delete_disk(self, disk: Disk) -> None:
@@ -82,10 +82,6 @@ class AzureDisks(VmCloud):
 
     def _path(self, disk: str) -> str:
         return self._account.path(_GROUP, f'{_DISKS}/{disk}')
-
-
-def _vm(account: Account, machine: VmId) -> str:
-    return account.path(machine.vm, f'providers/Microsoft.Compute/virtualMachines/{machine.vm}')
 
 
 def _has(attached: Mapping[str, Any], disk: Disk) -> bool:

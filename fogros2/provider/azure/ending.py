@@ -150,8 +150,8 @@ def schedule(account: Account, name: str, region: str, end: float) -> float:
             'location': region, 'properties': {
                 'status': 'Enabled', 'taskType': 'ComputeVmShutdownTask', 'timeZoneId': 'UTC',
                 'dailyRecurrence': {'time': time.strftime('%H%M', time.gmtime(first))},
-                'notificationSettings': {'status': 'Disabled'}, 'targetResourceId': account.path(
-                    name, f'providers/Microsoft.Compute/virtualMachines/{name}')}})
+                'notificationSettings': {'status': 'Disabled'},
+                'targetResourceId': account.vm(name)}})
         return first
 
     def again() -> None:

@@ -17,6 +17,7 @@ from fogros2.provider.gcp.account import Account, ENDPOINT_VARIABLE
 from fogros2.provider.gcp.disks import GoogleDisks
 from fogros2.provider.gcp.failures import GoogleError
 from fogros2.provider.gcp.firewall import GoogleFirewall
+from fogros2.provider.gcp.instances import path_of
 from fogros2.provider.gcp.options import Options
 from fogros2.provider.offers import MachineType
 from fogros2.provider.vm.cloud import (
@@ -151,7 +152,7 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall, GoogleDisks):
         project = vm.partition('/')[0]
         entry: Mapping[str, Any] = {}
         with unless_gone():
-            entry = self._account.call('GET', _path(vm), f'looking for {vm}')
+            entry = self._account.call('GET', path_of(vm), f'looking for {vm}')
         if not entry:
             raise MachineNotFound(f'there is no {vm} any more')
         self._account.labels[vm] = entry['labelFingerprint'], entry.get('labels', {})
@@ -222,14 +223,14 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall, GoogleDisks):
 
     def delete(self, machine: VmId) -> None:
         """Delete an instance with its disk, then its firewall rules."""
-        self._account.remove(_path(machine.vm), f'deleting {machine.vm}')
+        self._account.remove(path_of(machine.vm), f'deleting {machine.vm}')
         self._account.labels.pop(machine.vm, None)
         self._drop_rules(machine.vm.partition('/')[0], machine.attempt)
 
     def end_attempt(self, region: str, attempt: str) -> bool:
         vms = self._instances({TAG_ATTEMPT: attempt})
         for vm in vms:
-            self._account.remove(_path(vm.id), f'deleting {vm.id}')
+            self._account.remove(path_of(vm.id), f'deleting {vm.id}')
         return bool(vms)
 
     def sweep(self, region: str, attempt: str) -> None:
@@ -252,9 +253,10 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall, GoogleDisks):
                     if not any(key == tag or key.startswith(f'{tag}_') for tag in tags)}
             try:
                 self._account.run(
-                    'POST', f'{_path(machine.vm)}/setLabels', f'writing labels of {machine.vm}',
-                    body={'labelFingerprint': fingerprint, 'labels': {
-                        **kept, **instances.RULES.encode(tags)}})
+                    'POST', f'{path_of(machine.vm)}/setLabels',
+                    f'writing labels of {machine.vm}', body={
+                        'labelFingerprint': fingerprint,
+                        'labels': {**kept, **instances.RULES.encode(tags)}})
                 return
             except GoogleError as error:
                 if error.code != 'CONDITION_NOT_MET' or not again:
@@ -262,7 +264,7 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall, GoogleDisks):
 
     def set_ending(self, machine: VmId, spec: MachineSpec) -> None:
         """Change when Google ends an instance, which it takes for stopped instances only."""
-        path, what = _path(machine.vm), f'writing how {machine.vm} ends'
+        path, what = path_of(machine.vm), f'writing how {machine.vm} ends'
         instance = wait_until(
             lambda: state if (state := self._account.call('GET', path, what))['status']
             not in ('PENDING_STOP', 'STOPPING') else None,
@@ -275,13 +277,7 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall, GoogleDisks):
             self._account.run('POST', f'{path}/setScheduling', what, body=words)
 
     def stop(self, machine: VmId) -> None:
-        self._account.call('POST', f'{_path(machine.vm)}/stop', f'stopping {machine.vm}')
+        self._account.call('POST', f'{path_of(machine.vm)}/stop', f'stopping {machine.vm}')
 
     def start(self, machine: VmId) -> None:
-        self._account.run('POST', f'{_path(machine.vm)}/start', f'starting {machine.vm}')
-
-
-def _path(vm: str) -> str:
-    """Return the path of an instance below ``projects/``."""
-    project, zone, name = vm.split('/')
-    return f'{project}/zones/{zone}/instances/{name}'
+        self._account.run('POST', f'{path_of(machine.vm)}/start', f'starting {machine.vm}')

@@ -9,6 +9,7 @@ from decimal import Decimal
 
 from fogros2.provider.gcp import instances
 from fogros2.provider.gcp.account import Account
+from fogros2.provider.gcp.instances import path_of
 from fogros2.provider.vm.cloud import Disk, TAG_VOLUME, VmCloud, VmId, when
 
 #: Machines may have the right to delete what begins with 'fogros2-' (doc/gcp.md).
@@ -42,7 +43,7 @@ class GoogleDisks(VmCloud):
 
     def make_disk(self, machine: VmId, name: str, size_gb: int) -> str:
         project, zone, vm = machine.vm.split('/')
-        kind = str(self._account.call('GET', f'{project}/zones/{zone}/instances/{vm}',
+        kind = str(self._account.call('GET', path_of(machine.vm),
                                       f'looking for {vm}')['machineType']).rpartition('/')[2]
         # two launches at once make one of this name
         self._account.create(
@@ -56,22 +57,17 @@ class GoogleDisks(VmCloud):
         project, zone, name = disk.id.split('/')
         if not disk.vm:
             self._account.run(
-                'POST', f'{_instance(machine)}/attachDisk', f"attaching the volume '{disk.name}'",
+                'POST', f'{path_of(machine.vm)}/attachDisk', f"attaching the volume '{disk.name}'",
                 body={'source': f'projects/{project}/zones/{zone}/disks/{name}',
                       'deviceName': name, 'autoDelete': False, 'mode': 'READ_WRITE'})
         return (f'/dev/disk/by-id/google-{name}',)
 
     def detach_disk(self, machine: VmId, disk: Disk) -> None:
         self._account.run(
-            'POST', f'{_instance(machine)}/detachDisk', f"detaching the volume '{disk.name}'",
+            'POST', f'{path_of(machine.vm)}/detachDisk', f"detaching the volume '{disk.name}'",
             deviceName=disk.id.rpartition('/')[2])
 
     def delete_disk(self, disk: Disk) -> None:
         project, zone, name = disk.id.split('/')
         self._account.remove(f'{project}/zones/{zone}/disks/{name}',
                              f"deleting the volume '{disk.name}'")
-
-
-def _instance(machine: VmId) -> str:
-    project, zone, vm = machine.vm.split('/')
-    return f'{project}/zones/{zone}/instances/{vm}'

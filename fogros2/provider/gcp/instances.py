@@ -31,12 +31,6 @@ _GPU_GB = {'nvidia-tesla-t4': 16, 'nvidia-l4': 24, 'nvidia-tesla-v100': 16,
 _SHORTEST, _LONGEST = 30, 120 * 86400
 
 
-def labels_of(tags: Mapping[str, str], options: Options) -> dict[str, str]:
-    """Return the labels for something that is created; 'Name' is no key of a label."""
-    return {**options.labels, **RULES.encode(
-        {key: value for key, value in tags.items() if key != 'Name'})}
-
-
 def label_filter(tags: Mapping[str, str]) -> str:
     """Return the filter for FogROS2's resources with all of ``tags``."""
     return ' '.join(['(labels.fogros2-attempt:*)', *(
@@ -62,7 +56,9 @@ def insertion(
     options: Options = order.options
     zone, name = f'zones/{place.zone}', own_name(order.attempt)
     disk = max(options.disk_size, image['size'])
-    labels = labels_of({**tags, TAG_DISK: str(disk), _TAG_IMAGE: image['path']}, options)
+    labels = RULES.encode({
+        **{key: value for key, value in tags.items() if key != 'Name'},  # no key of a label
+        TAG_DISK: str(disk), _TAG_IMAGE: image['path']})
     return {
         'name': name,
         'description': f'FogROS2 machine {order.spec.name}',
@@ -117,6 +113,12 @@ def limit(spec: MachineSpec, *, spot: bool, action: str) -> dict[str, Any]:
     if spot or spec.on_exit != 'keep':
         words['instanceTerminationAction'] = action
     return words
+
+
+def path_of(vm: str) -> str:
+    """Return the path of an instance below ``projects/``."""
+    project, zone, name = vm.split('/')
+    return f'{project}/zones/{zone}/instances/{name}'
 
 
 def vm_of(project: str, instance: Mapping[str, Any]) -> Vm:

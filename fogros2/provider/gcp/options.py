@@ -28,7 +28,6 @@ class Options(VmOptions):
     accelerators: str = ''
     service_account: str = ''
     network: str = 'default'
-    labels: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     WHAT = 'a machine at Google'
     DEFAULT_TYPE = 'e2-medium'
@@ -62,13 +61,12 @@ class Options(VmOptions):
         if self.spot and self.max_price is not None:
             raise ConfigurationError('Google takes no limit for a spot price',
                                      'leave max_price= or spot= out')
-        for key, value in {**dict.fromkeys(self.tags, ''), **self.labels}.items():
-            if not re.fullmatch(r'[a-z][a-z0-9_-]{0,62}', key) or key.startswith('fogros2-') \
-                    or not re.fullmatch(r'[a-z0-9_-]{0,63}', value):
+        for key in self.tags:
+            if not re.fullmatch(r'[a-z][a-z0-9_-]{0,62}', key) or key.startswith('fogros2-'):
                 raise ConfigurationError(
-                    f"'{key}: {value}' can't be a label of Google's",
+                    f"'{key}' can't be a label of Google's",
                     'labels have lower-case letters, digits, _ and -, at most 63, begin with a '
-                    "letter, and not with 'fogros2-'; a value in tags= may have any characters")
+                    "letter, and not with 'fogros2-'")
 
     def gpus(self) -> list[dict[str, Any]]:
         """Return the type and number of the attached GPUs, as ``guestAccelerators`` has them."""

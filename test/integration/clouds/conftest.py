@@ -30,9 +30,7 @@ BOX = 'test_ec2_box.py'
 #: in. All else is the cloud's and the box's, the same on either, and takes minutes.
 ON_BOTH = (
     'test_talker_from_nothing_to_nothing', 'test_machines_of_two_places_hear_each_other',
-    'test_fogros2s_form_on_a_simulated_ubuntu_22_04',
     'test_fogros2s_talker_aws_on_a_simulated_ubuntu_22_04',
-    'test_fogros2s_form_of_choosing_region_and_type',
     'test_fogros2s_talker_auto_aws_with_one_line_changed',
     'test_fogros2s_talker_gcp_runs_byte_for_byte')
 

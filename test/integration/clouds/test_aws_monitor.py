@@ -51,6 +51,7 @@ def doors(robot):
             for rule in group['IpPermissions'] if rule['IpProtocol'] == 'tcp']
 
 
+@pytest.mark.soak  # the contract and the launches on containers open ports
 def test_security_group_admits_viewers_until_the_launch_ends(robot, box, name):
     run = robot.launch(robot.write('monitor.launch.py', LAUNCH_FILE.format(name=name)))
     run.wait_for('the certificate has the SHA-256')

@@ -136,13 +136,6 @@ def test_machines_of_two_places_hear_each_other(cloud, robot, box, name):
 
 
 @pytest.mark.soak
-def test_showing_arguments_asks_nothing(cloud, robot, box, name):
-    shown = robot.ros2('launch', 'fogros2_examples', f'talker.{cloud.name}.launch.py', '-s')
-    assert shown.returncode == 0, shown.stdout + shown.stderr
-    assert cloud.asked(box) == []
-
-
-@pytest.mark.soak
 def test_stopped_machine_is_started_again(cloud, robot, box, name):
     run = robot.talker(name, 'on_exit:=stop', 'count:=1')
     assert run.ended() == 0, run.text
@@ -296,30 +289,6 @@ def test_machine_ends_whose_robot_was_killed(cloud, robot, box, name):
                what='nothing to be left')
 
 
-@pytest.mark.soak
-def test_launch_gets_round_what_passes(cloud, robot, box, name):
-    """No room in the first place, throttling, and an answer to what was done that gets lost."""
-    cloud.disturb(box)
-    before = len(box.instances())
-    run = robot.talker(name, 'count:=1')
-    assert run.ended() == 0, run.text
-    assert run.errors == [] and 'Traceback' not in run.text, run.text
-    assert cloud.disturbed(box.calls()), box.calls()
-    assert len(box.instances()) == before + 1
-
-
-@pytest.mark.soak
-def test_fault_at_each_step_leaves_nothing(cloud, robot, box, name):
-    for number, (code, words, fails) in enumerate(cloud.faults):
-        box.fail(code, **words)
-        run = robot.talker(f'{name}-{number}', 'count:=1')
-        assert run.ended() != 0 or not fails, f'{code} {words}: {run.text}'
-        assert 'Traceback' not in run.text, run.text
-        box.heal()
-        wait_until(lambda: not box.alive() and not robot.things(), timeout=60,
-                   what=f'nothing to be left after {code} {words}')
-
-
 def interrupted(cloud, robot, box, name, pattern, seconds):
     """Return a launch that was interrupted while a request was under way."""
     box.slow(pattern, seconds)
@@ -376,14 +345,6 @@ def test_machine_that_appears_after_its_launch_is_cleared(cloud, robot, box, nam
 
 
 @pytest.mark.soak
-def test_refusal_is_said_in_one_line(cloud, robot, box, name):
-    for number, (code, words, said) in enumerate(cloud.refusals):
-        box.fail(code, times=0, **words)
-        assert said in complaint(robot.talker(f'{name}-{number}'))
-        box.heal()
-
-
-@pytest.mark.soak
 def test_known_problems_are_reported_before_creation(cloud, robot, box, name):
     for said, arguments, variables in cloud.mistakes:
         assert said in complaint(robot.talker(name, *arguments, **variables))
@@ -399,22 +360,6 @@ def test_cloud_check_runs_the_talker_and_deletes_it(cloud, robot, box):
         assert re.search(r'-- cost: at most \$0\.\d+ \(\d+ s at \$0\.\d+ an hour\)', done.stdout)
     assert f'{cloud.name} works: 5 messages arrived, and nothing is left.' in done.stdout
     assert box.alive() == [] and not robot.things()
-
-
-@pytest.mark.soak
-def test_cloud_check_asks_before_it_creates_anything(cloud, robot, box):
-    done = robot.run([sys.executable, str(CHECK), cloud.name, '--options',
-                      f'region={cloud.elsewhere}'])
-    assert done.returncode == 1
-    assert re.search(rf"creates 'check-\w+': .*{cloud.announced}.* in {cloud.elsewhere}",
-                     done.stdout, re.DOTALL)
-    assert 'YES=1' in done.stdout and 'Nothing was created.' in done.stdout
-    if cloud.price:
-        assert re.search(r'\$0\.\d+ an hour', done.stdout)
-    assert not cloud.creating & {call.action for call in box.calls()}
-    wrong = robot.run([sys.executable, str(CHECK), cloud.name, '--options', 'regon=x'], YES='1')
-    assert wrong.returncode == 1 and "did you mean 'region'" in wrong.stderr
-    assert 'Traceback' not in wrong.stderr and box.alive() == []
 
 
 def places(robot, box, instance, run, secrets):

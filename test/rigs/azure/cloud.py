@@ -5,17 +5,19 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-import dataclasses
+from email.message import Message
 import hashlib
+import json
 import sys
 import threading
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 from fogros2.errors import FogError
 from rigs.azure import service
-from rigs.azure.metadata import MetadataService
 from rigs.computers import cloud, cloud_config, network
 from rigs.computers.cloud import BY_ITSELF, BY_SPOT, Machine
+from rigs.computers.metadata import MetadataService
 
 
 class Cloud(cloud.Cloud, service.Computers):
@@ -67,8 +69,8 @@ class Cloud(cloud.Cloud, service.Computers):
     def plan(self, machine: Machine) -> dict[str, Any]:
         """Return what customData and the login key say."""
         system = machine.instance['properties']['osProfile']
-        found = dataclasses.asdict(cloud_config.parse(self.user_data(machine)))
-        return {**found, 'instance': machine.instance['properties']['vmId'],
+        return {**cloud_config.parse(self.user_data(machine)),
+                'instance': machine.instance['properties']['vmId'],
                 'user': system['adminUsername'],
                 'keys': [key['keyData'] for key in
                          system['linuxConfiguration']['ssh']['publicKeys']]}
@@ -118,7 +120,7 @@ class Cloud(cloud.Cloud, service.Computers):
         """Serve IMDS: the machine, a token of its identity, and the scheduled events."""
         vm = machine.instance
 
-        def answers(path: str, query: Mapping[str, list[str]]) -> tuple[int, Any]:
+        def answer(path: str, query: Mapping[str, list[str]]) -> tuple[int, Any]:
             if path == 'instance/compute':
                 return 200, {
                     'name': vm['name'], 'location': vm['location'], 'resourceId': vm['id'],
@@ -137,6 +139,14 @@ class Cloud(cloud.Cloud, service.Computers):
                            'Scheduled', 'NotBefore': machine.notice}] if machine.notice else []
                 return 200, {'DocumentIncarnation': len(events), 'Events': events}
             return 404, {'error': 'Not found'}
+
+        def answers(method: str, target: str, headers: Message) -> tuple[int, str]:
+            parts = urlsplit(target)
+            query = parse_qs(parts.query)
+            good = headers.get('Metadata') == 'true' and 'api-version' in query
+            status, value = answer(parts.path.removeprefix('/metadata/'), query) if good else (
+                400, {'error': 'Bad request'})
+            return status, json.dumps(value)
 
         return MetadataService(machine.space, answers)
 

@@ -20,9 +20,7 @@ class Box(server.Box):
 
     def open(self) -> tuple[Any, Any]:
         """Return the computers, and the service in front of them."""
-        cloud = Cloud(self.mark, self.net, boot_delay=float(self.settings['boot_delay']),
-                      mounts=tuple(self.settings['mounts']),
-                      volumes=self.settings['volumes'])
+        cloud = self.computers(Cloud)
         cloud.azure = service.Service(cloud, delay=0.2, ghost=2.0)
         # one lock: the service and the computers change each other's states
         cloud.azure.lock = cloud.lock

@@ -27,6 +27,7 @@ from urllib.parse import parse_qsl, urlsplit
 import uuid
 
 from rigs.azure import catalogue, schema
+from rigs.computers import faults
 from rigs.computers.box import Call
 
 SUBSCRIPTION = '0b1f6471-1bf0-4dda-aec3-cb9272f09590'
@@ -249,15 +250,10 @@ class Service:
     def _fault(self, method: str, kind: str, path: str, body: Any) -> Optional[Fault]:
         body = body if isinstance(body, Mapping) else {}
         size = str(body.get('properties', {}).get('hardwareProfile', {}).get('vmSize', ''))
-        for fault in self.faults:
-            if fault.method in ('', method) and fault.kind.lower() in ('', kind) \
-                    and fault.region in ('', body.get('location')) and fault.size in ('', size) \
-                    and '/operations/' not in path:
-                fault.times -= 1
-                if fault.times == 0:
-                    self.faults.remove(fault)
-                return fault
-        return None
+        return faults.due(self.faults, lambda one: (
+            one.method in ('', method) and one.kind.lower() in ('', kind)
+            and one.region in ('', body.get('location')) and one.size in ('', size)
+            and '/operations/' not in path))
 
     def _route(
         self, method: str, path: str, kind: str, query: Mapping[str, str], body: Any, who: str,

@@ -240,10 +240,6 @@ class Box:
         """Return what the launch gave an instance for its first boot."""
         return bytes.fromhex(self._ask({'do': 'user data', 'instance': instance}))
 
-    def console(self, instance: str) -> str:
-        """Return what an instance's first process has said, until it ends."""
-        return str(self._ask({'do': 'console', 'instance': instance}))
-
     # -- what goes wrong ------------------------------------------------------------------
 
     def heal(self) -> None:

@@ -191,12 +191,6 @@ class Cloud(abc.ABC):
         machine.cutting.daemon = True
         machine.cutting.start()
 
-    def reboot(self, number: str) -> None:
-        """Start an instance's computer again."""
-        machine = self.machines[number]
-        machine.again = True
-        self._press(machine)
-
     def interrupt(self, number: str, *, notice: float, when: str) -> None:
         """Announce that a spot instance is taken away, and take it ``notice`` seconds later."""
         self.machines[number].notice = when
@@ -309,7 +303,7 @@ class Cloud(abc.ABC):
 
     # -- images ---------------------------------------------------------------------------
 
-    def copy(self, number: str, image: str, *, reboot: bool = False) -> None:
+    def copy(self, number: str, image: str) -> None:
         """
         Copy an instance's disk to an image.
 
@@ -319,8 +313,6 @@ class Cloud(abc.ABC):
         machine = self.machines[number]
         with machine.computer.still():
             computer.copy_disk(machine.computer.disk, self.disks / image)
-        if reboot and machine.runs:
-            self.reboot(number)
 
     def forget_image(self, image: str) -> None:
         """Remove an image's disk."""

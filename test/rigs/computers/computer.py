@@ -314,11 +314,6 @@ class Computer:
             if held.returncode == 0:
                 self._engine.call('unpause', self._name, what='let an instance go on')
 
-    def console(self) -> str:
-        """Return what its first process has printed."""
-        result = self._engine.call('logs', self._name, what='read the console', check=False)
-        return result.stdout + result.stderr
-
     def remove(self) -> None:
         """Remove the container; the disk stays."""
         with self._lock:

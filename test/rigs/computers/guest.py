@@ -3,8 +3,8 @@
 What an instance runs as its first process: a small cloud-init, an SSH server, and a way to end.
 
 Standard library alone; it is copied into the instance. The order is that of an Ubuntu image
-(``cloud_init_modules`` and so on in its cloud.cfg): bootcmd, then files, accounts and keys, then
-sshd, then packages, deferred files and the scripts. What belongs to the first boot alone is done
+(``cloud_init_modules`` and so on in its cloud.cfg): bootcmd, then the keys, then sshd, then the
+commands of runcmd. What belongs to the first boot alone is done
 again when the instance's id is another, as after an image was made of it.
 
 With an argument it is a program of the instance: ``status`` as of cloud-init, ``reload``.
@@ -12,24 +12,20 @@ With an argument it is a program of the instance: ``status`` as of cloud-init, `
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import contextlib
-import grp
 import json
 import os
 import pwd
 import select
-import shutil
 import signal
 import subprocess
 import sys
 import time
-from typing import Any, Union
+from typing import Any
 
 PLAN = '/opt/ec2/plan.json'
 STATE = '/var/lib/cloud'
-RUN = '/run/cloud-init'
 SSHD_PID = '/run/sshd.pid'
 PATH = '/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin'
 #: Exit status by which the box knows that the instance wants to start again.
@@ -41,28 +37,17 @@ def say(text: str) -> None:
     print(f'[{time.monotonic():.3f}] {text}', flush=True)
 
 
-def write(path: str, data: bytes, mode: int = 0o644, append: bool = False) -> None:
+def write(path: str, data: bytes, mode: int = 0o644) -> None:
     """Write a file and the folders above it."""
-    os.makedirs(os.path.dirname(path) or '/', exist_ok=True)
-    flags = os.O_WRONLY | os.O_CREAT | (os.O_APPEND if append else os.O_TRUNC)
-    handle = os.open(path, flags, mode)
+    os.makedirs(os.path.dirname(path), exist_ok=True)
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode)
     with os.fdopen(handle, 'wb') as file:
         file.write(data)
     os.chmod(path, mode)
 
 
-def write_files(files: Iterable[Mapping[str, Any]]) -> None:
-    """Write what the user data holds as files."""
-    for entry in files:
-        write(entry['path'], base64.b64decode(entry['content']), int(entry['mode'], 8),
-              entry['append'])
-        user, _, group = entry['owner'].partition(':')
-        shutil.chown(entry['path'], user or 'root', group or user or 'root')
-
-
-def run(command: Union[str, Sequence[str]], **variables: str) -> None:
-    """Run a command of the user data: words, or a line for the shell; its failure is no end."""
-    words = ['/bin/sh', '-c', command] if isinstance(command, str) else command
+def run(words: Sequence[str], **variables: str) -> None:
+    """Run a command of the user data; its failure is no end."""
     try:
         code = subprocess.call(words, stdin=subprocess.DEVNULL, cwd='/',
                                env={**os.environ, **variables})
@@ -70,25 +55,7 @@ def run(command: Union[str, Sequence[str]], **variables: str) -> None:
         say(f'cloud-init: {words[0]}: {error}')
         return
     if code != 0:
-        say(f'cloud-init: exit status {code} of {command!r}')
-
-
-def account(entry: Mapping[str, Any]) -> None:
-    """Make an account of the user data."""
-    name = entry['name']
-    try:
-        pwd.getpwnam(name)
-    except KeyError:
-        run(['useradd', '-m', '-s', entry['shell'], name])
-    for group in entry['groups']:
-        with contextlib.suppress(KeyError):
-            grp.getgrnam(group)
-            run(['usermod', '-aG', group, name])
-    for line in entry['sudo']:
-        with open('/etc/sudoers', 'a') as file:
-            file.write(f'{name} {line}\n')
-    if entry['keys']:
-        authorize(name, entry['keys'])
+        say(f'cloud-init: exit status {code} of {words!r}')
 
 
 def authorize(user: str, keys: Sequence[str]) -> None:
@@ -108,14 +75,13 @@ def authorize(user: str, keys: Sequence[str]) -> None:
 
 def host_keys(plan: Mapping[str, Any]) -> None:
     """Put the host keys of the user data in place, or make some."""
-    if plan['delete_host_keys']:
-        for name in os.listdir('/etc/ssh'):
-            if name.startswith('ssh_host_'):
-                os.unlink(f'/etc/ssh/{name}')
-    for kind, (private, public) in plan['host_keys'].items():
-        write(f'/etc/ssh/ssh_host_{kind}_key', private.encode(), 0o600)
-        write(f'/etc/ssh/ssh_host_{kind}_key.pub', public.encode())
-    if not plan['host_keys']:
+    for name in os.listdir('/etc/ssh'):
+        if name.startswith('ssh_host_'):
+            os.unlink(f'/etc/ssh/{name}')
+    if plan['ssh_keys']:
+        write('/etc/ssh/ssh_host_ed25519_key', plan['ssh_keys']['ed25519_private'].encode(), 0o600)
+        write('/etc/ssh/ssh_host_ed25519_key.pub', plan['ssh_keys']['ed25519_public'].encode())
+    else:
         run(['ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-C', 'root@instance',
              '-f', '/etc/ssh/ssh_host_ed25519_key'])
 
@@ -126,13 +92,10 @@ def first_stage(plan: Mapping[str, Any], new: bool) -> None:
         run(command, INSTANCE_ID=plan['instance'])
     if not new:
         return
-    write_files(entry for entry in plan['files'] if not entry['defer'])
     if plan['hostname']:
         write('/etc/hostname', plan['hostname'].encode() + b'\n')
-    for entry in plan['users']:
-        account(entry)
     host_keys(plan)
-    authorize(plan['user'], [*plan['keys'], *plan['authorized_keys']])
+    authorize(plan['user'], [*plan['keys'], *plan['ssh_authorized_keys']])
 
 
 def last_stage() -> None:
@@ -140,23 +103,10 @@ def last_stage() -> None:
     with open(PLAN) as file:
         plan = json.load(file)
     if new_instance(plan):
-        for name in plan['packages']:
-            if subprocess.call(['dpkg', '-s', name], stdout=subprocess.DEVNULL,
-                               stderr=subprocess.DEVNULL) != 0:
-                run(['apt-get', 'install', '-y', '-q', name])
-        write_files(entry for entry in plan['files'] if entry['defer'])
-        scripts = f'{STATE}/instance/scripts'
-        if plan['runcmd']:
-            import shlex
-            lines = [c if isinstance(c, str) else shlex.join(c) for c in plan['runcmd']]
-            write(f'{scripts}/runcmd', ('#!/bin/sh\n' + '\n'.join(lines) + '\n').encode(), 0o700)
-            run([f'{scripts}/runcmd'])
-        for number, text in enumerate(plan['scripts'], 1):
-            write(f'{scripts}/part-{number:03}', text.encode(), 0o700)
-            run([f'{scripts}/part-{number:03}'])
+        for words in plan['runcmd']:
+            run(words)
         write(f'{STATE}/data/instance-id', plan['instance'].encode())
     write(f'{STATE}/instance/boot-finished', b'done\n')
-    write(f'{RUN}/result.json', b'{"v1": {"errors": []}}\n')
     say('cloud-init: finished')
 
 

@@ -20,12 +20,15 @@ import re
 import signal
 import sys
 import threading
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 from fogros2.errors import FogError
+from rigs import serving
 from rigs.computers import computer, netns, network
 from rigs.computers.cloud import Cloud
 from rigs.computers.network import Network, ROUTER
+
+Computers = TypeVar('Computers', bound=Cloud)
 
 PORT = 5000
 #: Where the robot's network namespace finds names.
@@ -70,6 +73,11 @@ class Box(abc.ABC):
         self.mark = str(settings['mark'])
         self.settings = settings
         self.net = Network(self.mark)
+
+    def computers(self, kind: type[Computers]) -> Computers:
+        """Return the computers, of a cloud's class."""
+        return kind(self.mark, self.net, boot_delay=float(self.settings['boot_delay']),
+                    mounts=tuple(self.settings['mounts']), volumes=self.settings['volumes'])
 
     @abc.abstractmethod
     def open(self) -> tuple[Cloud, Any]:
@@ -116,24 +124,14 @@ class Box(abc.ABC):
         (folder / 'resolv.conf').write_text(f'nameserver {ROUTER}\n')
 
     def _serve(self) -> None:
-        from werkzeug.serving import make_server, WSGIRequestHandler
-
-        class Quiet(WSGIRequestHandler):
-            protocol_version = 'HTTP/1.1'
-
-            def log(self, *_: Any) -> None:
-                """Say nothing."""
-
         self.cloud, self.api = self.open()
         inside = netns.listener(self.net.router, ROUTER, PORT)
         # accepts connections and answers nothing: the nearest region is the quickest to connect
         regions = netns.listener(self.net.router, ROUTER, 443)
         self.slow = Slow(checkip(self.api))
         app = self.slow
-        servers = [
-            make_server('127.0.0.1', 0, app, threaded=True, request_handler=Quiet),
-            make_server(ROUTER, PORT, app, threaded=True, request_handler=Quiet,
-                        fd=os.dup(inside.fileno()))]
+        servers = [serving.server(app),
+                   serving.server(app, ROUTER, PORT, fd=os.dup(inside.fileno()))]
         for server in servers:
             threading.Thread(target=server.serve_forever, args=(0.1,), daemon=True).start()
         threading.Thread(target=_hang_up, args=(regions,), daemon=True).start()
@@ -165,8 +163,6 @@ class Box(abc.ABC):
                 order['script'], check=order['check'])
         elif what == 'user data':
             return self.cloud.user_data(self.cloud.machines[order['instance']]).hex()
-        elif what == 'console':
-            return self.cloud.machines[order['instance']].computer.console()
         elif what == 'move_robot':
             self.net.move_robot(order['address'])
         elif what == 'slow':

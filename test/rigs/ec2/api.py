@@ -18,6 +18,8 @@ import threading
 from typing import Any, Optional
 from urllib.parse import parse_qsl
 
+from rigs.computers import faults
+from rigs.computers.box import Call
 from rigs.ec2 import answers, hooks, market, rules
 from rigs.ec2.answers import Answer, Refusal
 from rigs.ec2.cloud import Cloud
@@ -26,16 +28,6 @@ _SCOPE = re.compile(r'Credential=([^/]+)/\d+/([^/]+)/([^/]+)/aws4_request')
 #: Actions after which the router's rules may have to be others.
 _GUARDING = ('SecurityGroup', 'ModifyInstanceAttribute', 'ModifyNetworkInterface')
 Start = Callable[..., Any]
-
-
-@dataclasses.dataclass(frozen=True)
-class Call:
-    """A request that came in, and the error code that it was answered with, '' for none."""
-
-    service: str
-    region: str
-    action: str
-    error: str = ''
 
 
 @dataclasses.dataclass
@@ -120,14 +112,7 @@ class Api:
 
     def _fault(self, region: str, action: str, params: Mapping[str, Any]) -> Optional[Fault]:
         with self._lock:
-            for fault in self.faults:
-                if fault.fits(region, action, params):
-                    if fault.times:
-                        fault.times -= 1
-                        if fault.times == 0:
-                            self.faults.remove(fault)
-                    return fault
-        return None
+            return faults.due(self.faults, lambda one: one.fits(region, action, params))
 
     def _carry_out(
         self, environ: dict[str, Any], service: str, region: str, action: str,
@@ -150,7 +135,6 @@ class Api:
         rules.check(region, action, params, self._cloud)
         if action == 'RunInstances':
             return self._run(environ, region, params)
-        hooks.REQUEST.no_reboot = str(params.get('NoReboot', '')).lower()
         answer = self._pass_on(environ)
         if any(word in action for word in _GUARDING) and not action.startswith('Describe'):
             self._cloud.protect()

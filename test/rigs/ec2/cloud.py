@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from email.message import Message
+import secrets
 import sys
 import threading
 from typing import Any
@@ -11,7 +13,8 @@ from typing import Any
 from fogros2.errors import FogError
 from rigs.computers import cloud, network
 from rigs.computers.cloud import BY_ITSELF, BY_SPOT, BY_TROUBLE, BY_USER, Machine
-from rigs.ec2 import metadata, told
+from rigs.computers.metadata import MetadataService
+from rigs.ec2 import told
 
 _STATES = {'pending': 0, 'running': 16, 'shutting-down': 32, 'terminated': 48, 'stopping': 64,
            'stopped': 80}
@@ -51,13 +54,22 @@ class Cloud(cloud.Cloud):
         """Return what the security groups let in."""
         return told.allowed(machine.instance, members)
 
-    def serve_metadata(self, machine: Machine) -> metadata.MetadataService:
-        """Serve IMDS."""
-        instance = machine.instance
-        return metadata.MetadataService(
-            machine.space,
-            lambda: told.values(instance, spot=machine.spot, notice=machine.notice),
-            lambda: bool(instance.metadata_options.http_tokens == 'required'))
+    def serve_metadata(self, machine: Machine) -> MetadataService:
+        """Serve IMDS, of version 2 where the instance asks for it: with a token."""
+        instance, token = machine.instance, secrets.token_urlsafe(40)
+
+        def answers(method: str, path: str, headers: Message) -> tuple[int, str]:
+            if method == 'PUT':
+                life = headers.get('X-aws-ec2-metadata-token-ttl-seconds', '')
+                good = path == '/latest/api/token' and life.isdecimal()
+                return (200, token) if good and 1 <= int(life) <= 21600 else (400, '')
+            if instance.metadata_options.http_tokens == 'required' \
+                    and headers.get('X-aws-ec2-metadata-token') != token:
+                return 401, ''
+            text = told.values(instance, machine.notice).get(path.removeprefix('/latest/'))
+            return (404, '') if text is None else (200, text)
+
+        return MetadataService(machine.space, answers)
 
     def at_shutdown(self, machine: Machine) -> str:
         """Return what the instance's attribute says; a spot instance can't be stopped."""
@@ -83,13 +95,13 @@ class Cloud(cloud.Cloud):
         else:
             instance._state.name, instance._state.code = state, _STATES[state]
 
-    def image(self, image: Any, instance: Any, *, reboot: bool) -> None:
+    def image(self, image: Any, instance: Any) -> None:
         """Copy an instance's disk; the image is pending until that is done."""
         image.state = 'pending'
 
         def copy() -> None:
             try:
-                self.copy(str(instance.id), str(image.id), reboot=reboot)
+                self.copy(str(instance.id), str(image.id))
                 image.state = 'available'
             except (FogError, OSError) as error:
                 print(f'{image.id}: {error}', file=sys.stderr, flush=True)

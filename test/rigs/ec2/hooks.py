@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import copy
-import threading
 from typing import Any
 
 from moto.ec2 import models
@@ -19,8 +18,6 @@ from rigs.ec2.market import ENABLED, PublicImage
 
 #: Moto's account.
 ACCOUNT = '123456789012'
-#: Parts of the request that a thread serves which Moto's methods don't get.
-REQUEST = threading.local()
 
 
 def install(cloud: Cloud) -> None:
@@ -78,9 +75,6 @@ def install(cloud: Cloud) -> None:
             cloud.end(str(self.id), 'terminate')
         return before
 
-    def reboot(self: Any) -> None:
-        cloud.reboot(str(self.id))
-
     def create_image(
         self: Any, instance_id: str, name: str, description: str,
         tag_specifications: Sequence[Mapping[str, Any]],
@@ -90,8 +84,7 @@ def install(cloud: Cloud) -> None:
         image = MOTO['image'](self, instance_id, name, description, others)
         for spec in of_snapshot:
             image.ebs_snapshot.add_tags({tag['Key']: tag['Value'] for tag in spec['Tags']})
-        cloud.image(image, self.get_instance(instance_id),
-                    reboot=getattr(REQUEST, 'no_reboot', '') != 'true')
+        cloud.image(image, self.get_instance(instance_id))
         return image
 
     def deregister_image(self: Any, ami_id: str) -> Any:
@@ -115,8 +108,7 @@ def install(cloud: Cloud) -> None:
 
     parts.elastic_block_store.EBSBackend.attach_volume = attach_volume
     parts.elastic_block_store.EBSBackend.detach_volume = detach_volume
-    for name, method in (('start', start), ('stop', stop), ('terminate', terminate),
-                         ('reboot', reboot)):
+    for name, method in (('start', start), ('stop', stop), ('terminate', terminate)):
         setattr(instances.Instance, name, method)
     instances.InstanceBackend.run_instances = run_instances
     amis.AmiBackend.create_image = create_image

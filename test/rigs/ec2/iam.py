@@ -18,7 +18,6 @@ LOOK = (
     'ec2:DescribeSnapshots',
     'ec2:DescribeSpotInstanceRequests',
     'ec2:DescribeSubnets',
-    'ec2:DescribeTags',
     'ec2:DescribeVolumes',
     'ssm:GetParameter',
 )
@@ -49,7 +48,6 @@ CHANGE = (
     'ec2:DeleteSecurityGroup',
     'ec2:DeleteVolume',
     'ec2:ModifyInstanceAttribute',
-    'ec2:ReleaseAddress',
     'ec2:RevokeSecurityGroupIngress',
     'ec2:StartInstances',
     'ec2:StopInstances',

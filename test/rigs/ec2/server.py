@@ -27,9 +27,7 @@ class Box(server.Box):
         from rigs.ec2 import hooks
         from rigs.ec2.api import Api
         from rigs.ec2.cloud import Cloud
-        cloud = Cloud(self.mark, self.net, boot_delay=float(self.settings['boot_delay']),
-                      mounts=tuple(self.settings['mounts']),
-                      volumes=self.settings['volumes'])
+        cloud = self.computers(Cloud)
         hooks.install(cloud)
         return cloud, Api(DomainDispatcherApplication(create_backend_app), cloud)
 

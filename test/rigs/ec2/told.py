@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-import dataclasses
 import json
 from typing import Any
 
@@ -15,41 +14,21 @@ from rigs.computers.computer import USER
 
 def plan(instance: Any) -> dict[str, Any]:
     """Return what the first process of an instance has to do; see ``guest``."""
-    found = dataclasses.asdict(cloud_config.parse(user_data(instance)))
-    return {**found, 'instance': instance.id, 'user': USER, 'keys': _public_keys(instance)}
+    return {**cloud_config.parse(user_data(instance)), 'instance': instance.id, 'user': USER,
+            'keys': _public_keys(instance)}
 
 
-def values(instance: Any, *, spot: bool, notice: str) -> dict[str, bytes]:
+def values(instance: Any, notice: str) -> dict[str, str]:
     """
     Return what the metadata service knows, by path below ``/latest/``.
 
     :param notice: when a spot instance will be taken away, '' while nobody has said so.
     """
-    found = {
-        'meta-data/instance-id': instance.id, 'meta-data/ami-id': instance.image_id,
-        'meta-data/instance-type': instance.instance_type,
-        'meta-data/hostname': instance.private_dns_name,
-        'meta-data/local-ipv4': instance.private_ip_address,
-        'meta-data/placement/availability-zone': str(instance.availability_zone),
+    return {
+        'meta-data/instance-id': instance.id,
         'meta-data/placement/region': instance.region_name,
-        'meta-data/instance-life-cycle': 'spot' if spot else 'on-demand',
-    }
-    if instance.public_ip:
-        found['meta-data/public-ipv4'] = instance.public_ip
-    for key in _public_keys(instance):
-        found['meta-data/public-keys/0/openssh-key'] = key
-    if notice:
-        found['meta-data/spot/instance-action'] = json.dumps(
-            {'action': 'terminate', 'time': notice})
-        found['meta-data/spot/termination-time'] = notice
-    if instance.metadata_options.instance_metadata_tags == 'enabled':
-        for tag in instance.get_tags():
-            found[f"meta-data/tags/instance/{tag['key']}"] = tag['value']
-    found['dynamic/instance-identity/document'] = _document(found)
-    answers = {name: value.encode() for name, value in found.items()}
-    if instance.user_data:
-        answers['user-data'] = user_data(instance)
-    return answers
+        **({'meta-data/spot/instance-action': json.dumps(
+            {'action': 'terminate', 'time': notice})} if notice else {})}
 
 
 def allowed(
@@ -83,15 +62,3 @@ def _public_keys(instance: Any) -> list[str]:
         return []
     material = pair.material_public
     return [material.decode() if isinstance(material, bytes) else str(material)]
-
-
-def _document(found: Mapping[str, str]) -> str:
-    """Return the instance identity document."""
-    return json.dumps({
-        'instanceId': found['meta-data/instance-id'],
-        'imageId': found['meta-data/ami-id'],
-        'instanceType': found['meta-data/instance-type'],
-        'region': found['meta-data/placement/region'],
-        'availabilityZone': found['meta-data/placement/availability-zone'],
-        'privateIp': found['meta-data/local-ipv4'],
-    })

@@ -18,6 +18,7 @@ import sys
 from typing import Any, Optional
 from urllib.parse import parse_qsl
 
+from rigs.computers import faults
 from rigs.computers.box import Call
 from rigs.gce import catalogue, discovery
 from rigs.gce.cloud import GUEST_TOKEN
@@ -188,15 +189,8 @@ class Api:
         return operation
 
     def _fault(self, found: discovery.Route) -> Optional[Fault]:
-        for fault in self.faults:
-            if fault.action in ('', found.name) and all(
-                    found.words.get(key) == value for key, value in fault.params.items()):
-                if fault.times:
-                    fault.times -= 1
-                    if not fault.times:
-                        self.faults.remove(fault)
-                return fault
-        return None
+        return faults.due(self.faults, lambda one: one.action in ('', found.name) and all(
+            found.words.get(key) == value for key, value in one.params.items()))
 
 
 def _without_null(value: Any) -> Any:

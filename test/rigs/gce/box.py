@@ -27,7 +27,7 @@ class GceBox(Box):
     def __init__(self, *, project: str = 'robots', **words: Any) -> None:
         super().__init__(**words)
         self.project = project
-        self._key, _ = keys.new()
+        self._key, _ = keys.pair()
         self._settings.update(key=self._key, project=project)
 
     def environment(self, folder: Path) -> dict[str, str]:
@@ -48,10 +48,6 @@ class GceBox(Box):
                 keys.write(folder / 'here.json', self._key, self.endpoint, self.project)),
             'CLOUDSDK_API_ENDPOINT_OVERRIDES_COMPUTE': f'{self.endpoint}/compute/v1/'}
 
-    def token(self) -> str:
-        """Return a token for a client of a test."""
-        return str(self._ask({'do': 'token'}))
-
     def things(self) -> dict[str, list[str]]:
         """Return the names of what exists in the project, by kind."""
         return {kind: names for kind, names in self._ask({'do': 'things'}).items() if names}
@@ -62,7 +58,7 @@ class GceBox(Box):
 
     def firewall(self, name: str) -> dict[str, Any]:
         """Return a firewall rule."""
-        found: dict[str, Any] = self._ask({'do': 'resource', 'kind': 'firewalls', 'name': name})
+        found: dict[str, Any] = self._ask({'do': 'firewall', 'name': name})
         return found
 
     def fail(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Mapping, Sequence
-import dataclasses
+from email.message import Message
 import json
 import threading
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 from rigs.computers import cloud, cloud_config, network
 from rigs.computers.cloud import Machine
 from rigs.computers.computer import USER
-from rigs.gce.metadata import MetadataService
+from rigs.computers.metadata import MetadataService
 
 #: Token of the service account of an instance.
 GUEST_TOKEN = 'ya29.guest'
@@ -39,8 +39,7 @@ class Cloud(cloud.Cloud):
 
     def plan(self, machine: Machine) -> dict[str, Any]:
         """Return what the user data says."""
-        data = self.user_data(machine)
-        return {**dataclasses.asdict(cloud_config.parse(data)), 'instance': machine.id,
+        return {**cloud_config.parse(self.user_data(machine)), 'instance': machine.id,
                 'user': USER, 'keys': []}
 
     def network_of(self, machine: Machine) -> str:
@@ -74,7 +73,7 @@ class Cloud(cloud.Cloud):
         """Serve the metadata."""
         instance = machine.instance
 
-        def values() -> dict[str, str]:
+        def answers(method: str, path: str, headers: Message) -> tuple[int, str]:
             found = {
                 'instance/name': instance['name'], 'instance/id': instance['id'],
                 'instance/zone': f'projects/1/zones/{instance["zone"].rpartition("/")[2]}',
@@ -83,9 +82,12 @@ class Cloud(cloud.Cloud):
             if instance.get('serviceAccounts'):
                 found['instance/service-accounts/default/token'] = json.dumps(
                     {'access_token': GUEST_TOKEN, 'expires_in': 3599, 'token_type': 'Bearer'})
-            return found
+            if headers.get('Metadata-Flavor') != 'Google':
+                return 403, 'Missing Metadata-Flavor:Google header.'
+            text = found.get(path.removeprefix('/computeMetadata/v1/'))
+            return (404, 'not found') if text is None else (200, text)
 
-        return MetadataService(machine.space, values)
+        return MetadataService(machine.space, answers)
 
     def at_shutdown(self, machine: Machine) -> str:
         """Return that an instance that shuts itself down is stopped."""
@@ -128,7 +130,7 @@ class Hollow(Cloud):
         """Let an instance shut itself down."""
         threading.Thread(target=self.end, args=(number, 'stop', cloud.BY_ITSELF)).start()
 
-    def copy(self, number: str, image: str, *, reboot: bool = False) -> None:
+    def copy(self, number: str, image: str) -> None:
         """Copy nothing."""
 
     def forget_image(self, image: str) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,9 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import rsa
 
 
-def new() -> tuple[str, Any]:
-    """Return a private key (PEM) and its public key."""
+@functools.cache
+def pair() -> tuple[str, Any]:
+    """Return a private key (PEM) and its public key, the same for all boxes of a process."""
     key = rsa.generate_private_key(65537, 2048)
     return key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8,

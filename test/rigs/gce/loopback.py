@@ -6,9 +6,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 import contextlib
 from pathlib import Path
-import threading
 from typing import Any
 
+from rigs import serving
 from rigs.gce import keys
 from rigs.gce.api import Api
 from rigs.gce.cloud import Hollow
@@ -50,26 +50,9 @@ def serve(folder: Path) -> Iterator[Loopback]:
 
     :param folder: gets the key file.
     """
-    from werkzeug.serving import make_server, WSGIRequestHandler
-
-    class Quiet(WSGIRequestHandler):
-        protocol_version = 'HTTP/1.1'
-
-        def log(self, *_: Any) -> None:
-            """Say nothing."""
-
-    private, public = keys.new()
+    private, public = keys.pair()
     api = Api(Project(Hollow(), delay=0.01, linger=0.1), public)
-    server = make_server('127.0.0.1', 0, api, threaded=True, request_handler=Quiet)
-    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
-    thread.start()
-    url = f'http://127.0.0.1:{server.server_port}'
-    try:
+    with contextlib.closing(api.project.cloud), serving.serve(api) as url:
         yield Loopback(api, url, {
             'GOOGLE_APPLICATION_CREDENTIALS': str(keys.write(folder / 'key.json', private, url)),
             'CLOUDSDK_API_ENDPOINT_OVERRIDES_COMPUTE': f'{url}/compute/v1/'})
-    finally:
-        api.project.cloud.close()
-        server.shutdown()
-        thread.join()
-        server.server_close()

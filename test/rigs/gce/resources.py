@@ -198,11 +198,7 @@ class Project:
         """Wait for an operation."""
         return self._operation(words, 20.0)
 
-    def zone_operations_get(self, words: Words, query: Words, body: Any) -> Any:
-        """Return an operation."""
-        return self._operation(words, 0.0)
-
-    global_operations_wait, global_operations_get = zone_operations_wait, zone_operations_get
+    global_operations_wait = zone_operations_wait
 
     # -- lists ----------------------------------------------------------------------------
 
@@ -236,11 +232,6 @@ class Project:
         """Return the project."""
         return {**self._new('project', self.name, self.name), 'quotas': []}
 
-    def zones_list(self, words: Words, query: Words, body: Any) -> Any:
-        """Return the zones."""
-        return self.listed('zone', [self._zone(zone) for zone in catalogue.zones()], query,
-                           f'{self.name}/zones')
-
     def zones_get(self, words: Words, query: Words, body: Any) -> Any:
         """Return a zone."""
         self._known_zone(words['zone'])
@@ -250,45 +241,15 @@ class Project:
         return {**self._new('zone', zone, f'{self.name}/zones/{zone}'), 'status': 'UP',
                 'region': f'{BASE}{self.name}/regions/{zone[:-2]}'}
 
-    def regions_list(self, words: Words, query: Words, body: Any) -> Any:
-        """Return the regions."""
-        return self.listed('region', [
-            {**self._new('region', region, f'{self.name}/regions/{region}'), 'status': 'UP',
-             'zones': [f'{BASE}{self.name}/zones/{region}-{letter}' for letter in letters]}
-            for region, letters in catalogue.ZONES.items()], query, f'{self.name}/regions')
-
     def machine_types_aggregated_list(self, words: Words, query: Words, body: Any) -> Any:
         """Return the machine types of all zones."""
         return self.aggregated('machineType', [
             self._type(zone, entry) for zone in catalogue.zones()
             for entry in catalogue.machine_types(zone).values()], query)
 
-    def machine_types_list(self, words: Words, query: Words, body: Any) -> Any:
-        """Return the machine types of a zone."""
-        zone = words['zone']
-        return self.listed('machineType', [
-            self._type(zone, entry) for entry in catalogue.machine_types(zone).values()], query,
-            f'{self.name}/zones/{zone}/machineTypes')
-
-    def machine_types_get(self, words: Words, query: Words, body: Any) -> Any:
-        """Return a machine type."""
-        found = catalogue.machine_types(words['zone']).get(words['machineType'])
-        if found is None:
-            raise Refusal('notFound', f"The resource '{words['machineType']}' was not found")
-        return self._type(words['zone'], found)
-
     def _type(self, zone: str, entry: Mapping[str, Any]) -> dict[str, Any]:
         path = f'{self.name}/zones/{zone}/machineTypes/{entry["name"]}'
         return {**entry, 'selfLink': BASE + path}
-
-    def disk_types_get(self, words: Words, query: Words, body: Any) -> Any:
-        """Return a type of disks."""
-        if words['diskType'] not in catalogue.DISK_TYPES:
-            raise Refusal('notFound', f"The resource '{words['diskType']}' was not found")
-        zone = words['zone']
-        return {**self._new('diskType', words['diskType'],
-                            f'{self.name}/zones/{zone}/diskTypes/{words["diskType"]}'),
-                'zone': f'{BASE}{self.name}/zones/{zone}'}
 
     def networks_get(self, words: Words, query: Words, body: Any) -> Any:
         """Return the network."""
@@ -300,12 +261,6 @@ class Project:
                 'autoCreateSubnetworks': name == 'default',
                 'subnetworks': [f'{BASE}{self.name}/regions/{region}/subnetworks/{name}'
                                 for region in catalogue.ZONES]}
-
-    def networks_list(self, words: Words, query: Words, body: Any) -> Any:
-        """Return the networks."""
-        return self.listed('network', [
-            self.networks_get({'network': name}, {}, None) for name in ('default', 'robots')],
-            query, f'{self.name}/global/networks')
 
     # -- firewall rules -------------------------------------------------------------------
 
@@ -513,13 +468,6 @@ class Project:
         self._prune()
         return [*self.instances.values(), *self._lingering('instance')]
 
-    def instances_list(self, words: Words, query: Words, body: Any) -> Any:
-        """Return the instances of a zone."""
-        zone = words['zone']
-        return self.listed('instance', [
-            i for i in self._all_instances() if i['zone'].endswith(f'/{zone}')], query,
-            f'{self.name}/zones/{zone}/instances')
-
     def instances_aggregated_list(self, words: Words, query: Words, body: Any) -> Any:
         """Return the instances of all zones, and those that were deleted a moment ago."""
         return self.aggregated('instance', self._all_instances(), query)
@@ -574,12 +522,6 @@ class Project:
             instance['labelFingerprint'] = _print(body['labels'])
 
         return self.start('setLabels', instance, last=last)
-
-    def disks_list(self, words: Words, query: Words, body: Any) -> Any:
-        """Return the disks of a zone."""
-        return self.listed('disk', [disk for disk in self.disks()
-                                    if disk['zone'].endswith(f'/{words["zone"]}')], query,
-                           f'{self.name}/zones/{words["zone"]}/disks')
 
     def disks_aggregated_list(self, words: Words, query: Words, body: Any) -> Any:
         """Return the disks of all zones."""

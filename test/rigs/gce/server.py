@@ -20,9 +20,7 @@ class Box(server.Box):
         from rigs.gce.api import Api
         from rigs.gce.cloud import Cloud
         from rigs.gce.resources import Project
-        cloud = Cloud(self.mark, self.net, boot_delay=float(self.settings['boot_delay']),
-                      mounts=tuple(self.settings['mounts']),
-                      volumes=self.settings['volumes'])
+        cloud = self.computers(Cloud)
         project = Project(cloud, name=self.settings['project'])
         return cloud, Api(project, keys.public(self.settings['key']))
 
@@ -42,7 +40,7 @@ class Box(server.Box):
         return Fault(**words)
 
     def do(self, order: Mapping[str, Any]) -> Any:
-        """Preempt a spot instance, or return resources, or a token of the API."""
+        """Preempt a spot instance, delete all resources, or return their names."""
         if order['do'] == 'interrupt':
             self.api.project.preempt(order['instance'], order['notice'])
         elif order['do'] == 'clear':
@@ -56,11 +54,9 @@ class Box(server.Box):
                                       if not name.startswith('default-')],
                         'images': [name for owner, name in project.images
                                    if owner == project.name]}
-        elif order['do'] == 'resource':
+        elif order['do'] == 'firewall':
             with self.api.project.lock:
-                return getattr(self.api.project, order['kind'])[order['name']]
-        elif order['do'] == 'token':
-            return self.api.token()
+                return self.api.project.firewalls[order['name']]
         else:
             super().do(order)
         return None

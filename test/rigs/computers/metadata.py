@@ -1,27 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine's metadata service: Azure's IMDS at 169.254.169.254, with its header and versions."""
+"""The metadata service of an instance, at 169.254.169.254; a cloud says what it answers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from email.message import Message
 import http.server
-import json
 import threading
-from typing import Any
-from urllib.parse import parse_qs, urlsplit
 
 from rigs.computers import netns
 from rigs.computers.network import METADATA
 
-#: Returns the answer to a path, None for none: status and JSON.
-Answers = Callable[[str, Mapping[str, list[str]]], tuple[int, Any]]
+#: Returns status and text of the answer to a request: method, path with query, headers.
+Answers = Callable[[str, str, Message], tuple[int, str]]
 
 
 class MetadataService:
     """
-    Answers in one machine's namespace.
+    Answers in one instance's namespace.
 
-    :param answers: called for each request, with the path below ``/metadata/``.
+    :param space: the instance's network namespace.
+    :param answers: called for each request: an interruption may be announced at any moment.
     """
 
     def __init__(self, space: str, answers: Answers) -> None:
@@ -29,19 +28,15 @@ class MetadataService:
             timeout = 5.0
 
             def do_GET(self) -> None:
-                """Answer a request that names a version and is no forwarded one."""
-                parts = urlsplit(self.path)
-                query = parse_qs(parts.query)
-                if self.headers.get('Metadata') != 'true' or 'api-version' not in query \
-                        or self.headers.get('X-Forwarded-For'):
-                    status, answer = 400, {'error': 'Bad request'}
-                else:
-                    status, answer = answers(parts.path.removeprefix('/metadata/'), query)
-                data = json.dumps(answer).encode()
+                """Answer a request."""
+                status, text = answers(self.command, self.path, self.headers)
+                data = text.encode()
                 self.send_response(status)
                 self.send_header('Content-Length', str(len(data)))
                 self.end_headers()
                 self.wfile.write(data)
+
+            do_PUT = do_GET
 
             def log_message(self, *args: object) -> None:
                 """Say nothing."""
