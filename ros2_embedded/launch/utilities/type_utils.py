@@ -6,18 +6,10 @@ import collections.abc
 import os
 from typing import Any, List
 
-from embedded_default.lacking import lacking
-
 from .._base import normalize_to_list_of_substitutions, perform_substitutions, Substitution
 from ..launch_context import LaunchContext
 from . import ensure_argument_type
 from .ros_yaml import load
-
-__getattr__ = lacking(
-    __name__, 'AllowedTypesTuple AllowedTypesType AllowedValueType ListTypesTuple ListTypesType '
-    'ListValueType NormalizedScalarType NormalizedSequenceType NormalizedValueType '
-    'ScalarTypesType ScalarValueType SequenceValueType SomeScalarType SomeSequenceType '
-    'SomeValueType StrSomeScalarType StrSomeSequenceType StrSomeValueType')
 
 ScalarTypesTuple = (int, float, bool, str)
 

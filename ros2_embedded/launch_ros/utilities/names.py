@@ -6,7 +6,11 @@ import re
 from typing import Any, Iterable, Iterator, TypeVar
 
 from launch.launch_context import LaunchContext
-from launch.utilities import ensure_argument_type, normalize_to_list_of_substitutions
+from launch.utilities import (
+    ensure_argument_type,
+    normalize_to_list_of_substitutions,
+    perform_substitutions,
+)
 
 __all__ = [
     'add_node_name', 'get_node_name_count', 'is_namespace_absolute', 'is_root_namespace',
@@ -28,6 +32,21 @@ def prefix_namespace(base_ns: str | None, ns: str | None) -> str | None:
     else:
         combined = f"{'' if base_ns == '/' else base_ns}/{ns}"
     return combined if combined in (None, '/') else combined.rstrip('/')
+
+
+def expand_namespace(context: LaunchContext, given: Any) -> str | None:
+    """Return a node's absolute namespace below that of its group, None if neither has one."""
+    namespace = None if given is None else perform_substitutions(
+        context, normalize_to_list_of_substitutions(given))
+    namespace = prefix_namespace(context.launch_configurations.get('ros_namespace'), namespace)
+    return None if namespace is None else make_namespace_absolute(namespace)
+
+
+def expand_remappings(context: LaunchContext, own: Iterable[Any]) -> list[tuple[str, str]]:
+    """Return the remappings of a node's group, and then its own."""
+    return [*context.launch_configurations.get('ros_remaps', ()), *(
+        (perform_substitutions(context, source), perform_substitutions(context, target))
+        for source, target in own)]
 
 
 def is_root_namespace(ns: str) -> bool:
