@@ -119,10 +119,10 @@ def test_help_lists_the_commands(package):
 
 @embedded_alone
 @pytest.mark.parametrize('words', [
-    ('bag', 'record', '-a'), ('topic', 'bw', '/x')])
+    ('bag', 'record', '-a'), ('topic', 'delay', '/x')])
 def test_missing_command_names_ros2(words):
     status, out, err = ros2(*words)
-    name = 'bag' if words[0] == 'bag' else 'topic bw'
+    name = 'bag' if words[0] == 'bag' else 'topic delay'
     assert (status, out) == (1, '') and err.startswith(
         f"'ros2 {name}' is not part of the embedded default; ROS 2 Jazzy has it: https://")
     assert '\n  bag ' not in ros2('-h')[1]

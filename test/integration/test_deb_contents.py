@@ -198,19 +198,6 @@ def test_python_knows_each_file(files: dict[str, tuple[tarfile.TarInfo, bytes]])
     assert about['Name'] == 'fogros2'
 
 
-def test_plugins_are_announced(files: dict[str, tuple[tarfile.TarInfo, bytes]]) -> None:
-    text = metadata_of(files, 'entry_points.txt').decode()
-    for group in ('fogros2.provider', 'fogros2.vpn', 'ros2cli.command', 'ros2launch.option',
-                  'launch.frontend.launch_extension'):
-        assert f'[{group}]' in text
-
-
-@pytest.mark.parametrize('name', ['postinst', 'prerm', 'postrm'])
-def test_scripts_are_shell_scripts(deb: ModuleType, name: str) -> None:
-    assert deb.SCRIPTS[name].startswith('#!/bin/sh\nset -e\n')
-    subprocess.run(['sh', '-n'], input=deb.SCRIPTS[name], text=True, check=True)
-
-
 def test_the_helper_has_all_that_it_imports(
     files: dict[str, tuple[tarfile.TarInfo, bytes]], tmp_path: Path,
 ) -> None:
