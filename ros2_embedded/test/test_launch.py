@@ -461,33 +461,13 @@ def test_launch_utilities_normalize_and_check():
         launch.utilities.ensure_argument_type(1, [str, float], 'x', 'me')
 
 
-def test_smaller_helpers_of_launch_work():
-    from launch.utilities import type_utils
-    from launch_ros.utilities.namespace_utils import is_namespace_absolute, is_root_namespace
-    from launch_ros.utilities.track_node_names import add_node_name, get_node_name_count
-    assert launch.utilities.is_a(Asked(), launch.Event)
-    assert type_utils.coerce_list(['1', '2'], int) == [1, 2]
-    for wrong in ('1', [1, 2]):
-        with pytest.raises(TypeError):
-            type_utils.coerce_list(wrong)
-    assert type_utils.is_valid_scalar_type(int) and not type_utils.is_valid_scalar_type(list)
-    assert type_utils.is_instance_of_valid_type([1, 'a'], can_be_str=True)
-    assert type_utils.is_normalized_substitution([TextSubstitution(text='a')])
-    assert is_namespace_absolute('/a') and is_root_namespace('/')
-    assert 'Condition' in launch.Condition().describe()
-    context = LaunchContext()
-    assert get_node_name_count(context, '/a') == 0
-    for _ in range(2):
-        add_node_name(context, '/a')
-    assert get_node_name_count(context, '/a') == 2
-
-
 def test_module_paths_of_ros2_can_be_imported():
     code = textwrap.dedent('''
         import launch_ros.actions.push_ros_namespace, launch.actions.shutdown_action
         import launch.conditions.if_condition, launch.event_handlers.on_process_io
         import launch.events.process.process_started, launch_ros.substitutions.find_package
         import launch.utilities.class_tools_impl, launch_ros.actions.load_composable_nodes
+        import launch_ros.utilities.namespace_utils, launch_ros.utilities.track_node_names
         from launch.actions.execute_process import ExecuteProcess
         from launch.substitutions.launch_configuration import LaunchConfiguration
         import launch

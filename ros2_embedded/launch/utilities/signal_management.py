@@ -21,6 +21,7 @@ class AsyncSafeSignalManager:
     :raises ValueError: on entering outside of the main thread.
     """
 
+    __current: AsyncSafeSignalManager | None = None
     __real_set_wakeup_fd = staticmethod(signal.set_wakeup_fd)
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -39,14 +40,15 @@ class AsyncSafeSignalManager:
             self.__writer.close()
             raise
         self.__loop.add_reader(self.__reader.fileno(), self.__on_readable)
-        self.__intercepted = signal.set_wakeup_fd
+        self.__before = AsyncSafeSignalManager.__current, signal.set_wakeup_fd
+        AsyncSafeSignalManager.__current = self
         signal.set_wakeup_fd = self.__replace_next_fd
         return self
 
     def __exit__(self, *exc_info: Any) -> None:
         self.__loop.remove_reader(self.__reader.fileno())
         self.__real_set_wakeup_fd(self.__next_fd)
-        signal.set_wakeup_fd = self.__intercepted
+        AsyncSafeSignalManager.__current, signal.set_wakeup_fd = self.__before
         self.__reader.close()
         self.__writer.close()
 

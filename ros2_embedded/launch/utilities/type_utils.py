@@ -54,9 +54,6 @@ def is_instance_of(value: Any, data_type: Any = None, *, can_be_str: bool = Fals
         isinstance(item, (kind, str) if can_be_str else kind) for item in items)
 
 
-is_instance_of_valid_type = is_instance_of
-
-
 def coerce_to_type(value: str, data_type: Any = None, *, can_be_str: bool = False) -> Any:
     """
     Read a text as the type; without one, as rcl reads YAML.

@@ -13,9 +13,8 @@ from launch.utilities import (
 )
 
 __all__ = [
-    'add_node_name', 'get_node_name_count', 'is_namespace_absolute', 'is_root_namespace',
-    'make_namespace_absolute', 'normalize_remap_rule', 'normalize_remap_rules',
-    'prefix_namespace']
+    'add_node_name', 'get_node_name_count', 'is_namespace_absolute', 'make_namespace_absolute',
+    'normalize_remap_rule', 'normalize_remap_rules', 'prefix_namespace']
 
 OptionalText = TypeVar('OptionalText', str, None)
 
@@ -47,10 +46,6 @@ def expand_remappings(context: LaunchContext, own: Iterable[Any]) -> list[tuple[
     return [*context.launch_configurations.get('ros_remaps', ()), *(
         (perform_substitutions(context, source), perform_substitutions(context, target))
         for source, target in own)]
-
-
-def is_root_namespace(ns: str) -> bool:
-    return ns == '/'
 
 
 def is_namespace_absolute(ns: str) -> bool:
