@@ -124,9 +124,8 @@ def test_grasp_planning(launch, tmp_path):
 
 
 def test_grasp_planner_survives_bad_images(launch):
-    """Images that are none, then one that is."""
+    """Images that are none, then one that is; the unit tests have all kinds of bad ones."""
     from geometry_msgs.msg import PoseArray
-    import numpy
     import rclpy
     from sensor_msgs.msg import CameraInfo, Image
     from std_msgs.msg import Header
@@ -161,15 +160,10 @@ def test_grasp_planner_survives_bad_images(launch):
         return len(answers[name].poses)
 
     try:
-        good = depth_message(depth, '32FC1', Header())
-        colour = depth_message(depth, '32FC1', Header())
-        colour.encoding = 'bgr8'
-        assert answered(colour) == 0
+        assert answered(Image(encoding='bgr8')) == 0
         assert answered(depth_message(0 * depth, '16UC1', Header())) == 0
-        assert answered(depth_message(numpy.nan * depth, '32FC1', Header())) == 0
-        assert answered(Image(encoding='32FC1', width=320, height=240, step=1280)) == 0
         assert answered(depth_message(depth[:100], '32FC1', Header())) == 0
-        assert answered(good) > 0
+        assert answered(depth_message(depth, '32FC1', Header())) > 0
     finally:
         node.destroy_node()
         rclpy.shutdown()
@@ -177,7 +171,7 @@ def test_grasp_planner_survives_bad_images(launch):
         said = planner.communicate(timeout=60)[0]
     assert planner.returncode == 0, said
     for words in ("'bgr8' is no encoding of depth", '0 of 76800 pixels have a depth',
-                  '0 bytes are no image', 'camera_info is of 320x240 pixels'):
+                  'camera_info is of 320x240 pixels'):
         assert words in said, said
 
 
