@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 import sys
 
-from setuptools import Distribution, find_packages, setup
+from setuptools import find_packages, setup
 
 NAME = 'ros2-embedded'
 VERSION = '0.4.0'
@@ -30,16 +30,6 @@ def ros2_found() -> str | None:
 ROS_PACKAGES = (
     'launch', 'launch_ros', 'launch_xml', 'launch_yaml', 'rosidl_runtime_py', 'ros2cli',
     'ros2launch', 'ros2run', 'ros2pkg', 'ros2topic', 'ros2node', 'ros2service', 'ros2param')
-MANIFEST = """<?xml version="1.0"?>
-<package format="3">
-  <name>{name}</name>
-  <version>{version}</version>
-  <description>Part of FogROS2's embedded default.</description>
-  <maintainer email="fogros2@example.org">FogROS2</maintainer>
-  <license>Apache-2.0</license>
-  <export><build_type>ament_python</build_type></export>
-</package>
-"""
 
 #: Where CMake looks after the folder of ROS 2's own wheel of ament_cmake.
 NO_BUILD_FOLDER = 'ament_cmake/share/cmake/ament_cmake'
@@ -53,24 +43,14 @@ def index_entries() -> list[tuple[str, list[str]]]:
     entries: list[tuple[str, list[str]]] = []
     markers = Path('build', 'index')
     for name in ROS_PACKAGES:
-        manifest = markers / 'share' / name / 'package.xml'
-        (HERE / manifest).parent.mkdir(parents=True, exist_ok=True)
-        (HERE / manifest).write_text(MANIFEST.format(name=name, version=VERSION))
-        marker = markers / 'packages' / name
+        marker = markers / name
         (HERE / marker).parent.mkdir(parents=True, exist_ok=True)
         (HERE / marker).write_text('')
-        entries.append((f'share/{name}', [str(manifest)]))
         entries.append(('share/ament_index/resource_index/packages', [str(marker)]))
     config = Path('build', 'ament_cmakeConfig.cmake')
     (HERE / config).write_text(NO_BUILD)
     entries.append((NO_BUILD_FOLDER, [str(config)]))
     return entries
-
-
-class Embedded(Distribution):
-    """A distribution whose data files are installed with editable wheels, too."""
-
-    has_data = Distribution.has_data_files
 
 
 def verbs(command: str, **classes: str) -> list[str]:
@@ -83,13 +63,11 @@ if (found := ros2_found()) is not None:
     sys.exit(f'{NAME} is for interpreters without ROS 2; this one has {found}: use that')
 
 setup(
-    distclass=Embedded,
     name=NAME,
     version=VERSION,
     description="FogROS2's launch, launch_ros and ros2 where ROS 2 isn't installed",
     license='Apache-2.0',
     python_requires='>=3.10',
-    package_dir={'': '.'},  # editable: one .pth line, new packages are found at once
     packages=find_packages(str(HERE), exclude=['test', 'test.*', 'build', 'build.*']),
     package_data={'': ['py.typed', '*.xml']},
     data_files=index_entries(),
@@ -107,18 +85,10 @@ setup(
             'service = ros2cli.command.verbs:ServiceCommand',
             'param = ros2cli.command.verbs:ParamCommand',
         ],
-        'ros2cli.extension_point': [
-            'ros2cli.command = ros2cli.command:CommandExtension',
-            'ros2topic.verb = ros2cli.verb:VerbExtension',
-            'ros2node.verb = ros2cli.verb:VerbExtension',
-            'ros2service.verb = ros2cli.verb:VerbExtension',
-            'ros2param.verb = ros2cli.verb:VerbExtension',
-            'ros2pkg.verb = ros2cli.verb:VerbExtension',
-        ],
         'ros2topic.verb': verbs(
             'topic', list='ListVerb', info='InfoVerb')
         + ['echo = ros2cli.verb.topic_echo:EchoVerb', 'pub = ros2cli.verb.topic_pub:PubVerb',
-           'hz = ros2cli.verb.topic_rate:HzVerb', 'bw = ros2cli.verb.topic_rate:BwVerb'],
+           'hz = ros2cli.verb.topic_rate:HzVerb'],
         'ros2node.verb': verbs('node', list='ListVerb', info='InfoVerb'),
         'ros2service.verb': verbs('service', list='ListVerb', call='CallVerb'),
         'ros2param.verb': verbs('param', list='ListVerb', get='GetVerb', set='SetVerb'),

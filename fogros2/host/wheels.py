@@ -2,9 +2,9 @@
 """
 Pack the robot's installed distributions as wheels that can be sent to a machine.
 
-Nothing is downloaded: the list of files of an installed distribution is enough to make a wheel. A
-distribution that is installed for development is built from its sources. What colcon installs has
-no list of files; only this project's packages, whose files are known, can be packed then.
+Nothing is downloaded: the list of files of an installed distribution is enough to make a wheel.
+What colcon installs has no list of files; only this project's packages, whose files are known, can
+be packed then. The list of a distribution that is installed for development has no modules.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ import tempfile
 import threading
 import time
 from typing import Optional
-import urllib.parse
 import zipfile
 
 from fogros2 import process, store
@@ -264,48 +263,21 @@ def _by_colcon(distribution: metadata.Distribution) -> bool:
     return locked.name_of(distribution.name) == OWN and distribution.read_text('WHEEL') is None
 
 
-def _sources(distribution: metadata.Distribution) -> Optional[Path]:
-    """Return the folder of a distribution installed for development, None for others."""
-    text = distribution.read_text('direct_url.json')
-    url = json.loads(text) if text else {}
-    if not url.get('dir_info', {}).get('editable'):
-        return None
-    return Path(urllib.parse.unquote(urllib.parse.urlsplit(url['url']).path))
-
-
 def _key(distributions: list[metadata.Distribution]) -> str:
     """Return a hash over the contents of all distributions and over the interpreter."""
     digest = hashlib.sha256(repr(sys.version_info[:2]).encode() + platform.machine().encode())
     for distribution in distributions:
         digest.update(f'{distribution.name} {distribution.version}\n'.encode())
-        sources = _sources(distribution)
-        if sources is None:
-            if _by_colcon(distribution):
-                for name, path in _installed_by_colcon(distribution, ''):
-                    digest.update(name.encode() + path.read_bytes())
-            # RECORD contains the hash of each file.
-            digest.update((distribution.read_text('RECORD') or '').encode())
-            continue
-        for path in _programs(sources):
-            digest.update(path.read_bytes())
+        if _by_colcon(distribution):
+            for name, path in _installed_by_colcon(distribution, ''):
+                digest.update(name.encode() + path.read_bytes())
+        # RECORD contains the hash of each file.
+        digest.update((distribution.read_text('RECORD') or '').encode())
     return digest.hexdigest()[:16]
-
-
-def _programs(sources: Path) -> list[Path]:
-    """Return the Python files of a source folder that are sent, sorted."""
-    paths = []
-    for folder, folders, names in os.walk(sources):
-        # A virtual environment may have a hundred times as many files.
-        folders[:] = set(folders) - {'.venv', '.venv-ros', '.git', 'build', '.cache', 'test'}
-        paths += [Path(folder, name) for name in names if name.endswith('.py')]
-    return sorted(paths)
 
 
 def _wheel(distribution: metadata.Distribution, target: Path) -> str:
     """Write the wheel of an installed distribution to a folder; return its file name."""
-    sources = _sources(distribution)
-    if sources is not None:
-        return _build(sources, target)
     stem = f'{distribution.name.replace("-", "_")}-{distribution.version}'
     if _by_colcon(distribution):
         info = f'{stem}.dist-info'
@@ -315,10 +287,13 @@ def _wheel(distribution: metadata.Distribution, target: Path) -> str:
             f'{info}/WHEEL': 'Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n',
             f'{info}/entry_points.txt': distribution.read_text('entry_points.txt') or '',
         })
-    if not distribution.files or distribution.read_text('WHEEL') is None:
+    url = json.loads(distribution.read_text('direct_url.json') or '{}')
+    if not distribution.files or distribution.read_text('WHEEL') is None \
+            or url.get('dir_info', {}).get('editable'):
         raise PrerequisiteError(
-            f'{distribution.name} {distribution.version} was not installed by pip and has no list '
-            'of its files', 'install it again from the folder that it came from'
+            f'{distribution.name} {distribution.version} was installed for development, or not '
+            'by pip, and has no list of its files',
+            'install it again from the folder that it came from, without -e'
             if locked.name_of(distribution.name) in (OWN, EMBEDDED) else
             f'pip install --force-reinstall {distribution.name}')
     tags = re.findall(r'^Tag: (\S+)$', distribution.read_text('WHEEL') or '', re.MULTILINE)
@@ -405,22 +380,6 @@ def _installed_by_colcon(
             if path.is_file() and path.suffix != '.pyc' and (
                     folder != marker or path.name in names):
                 yield f'{data}/data/{path.relative_to(prefix)}', path
-
-
-def _build(sources: Path, target: Path) -> str:
-    """Build a wheel from a copy of a checkout, in which setuptools leaves files."""
-    with tempfile.TemporaryDirectory(dir=target, prefix='.build-') as aside:
-        copy, out = Path(aside, 'copy'), Path(aside, 'out')
-        shutil.copytree(sources, copy, symlinks=True, ignore=shutil.ignore_patterns(
-            '.git', '.venv', '.venv-ros', '.cache', 'build', '*.egg-info', '__pycache__', 'test',
-            'benchmarks', 'install', 'log'))
-        process.run(Command(
-            (sys.executable, '-m', 'pip', 'wheel', '-q', '--no-deps', '--no-build-isolation',
-             '--disable-pip-version-check', '-w', str(out), str(copy)),
-            what=f'build the wheel of {sources}'), timeout=300)
-        wheel = next(out.glob('*.whl'))
-        os.rename(wheel, target / wheel.name)
-    return wheel.name
 
 
 def _forget_old(folder: Path, *, keep: Path) -> None:

@@ -27,15 +27,14 @@ class NotEmbeddedError(RuntimeError):
             'https://docs.ros.org/en/jazzy/Installation.html')
 
 
-def lacking(where: str, names: str,
-            error: type[Exception] = ImportError) -> Callable[[str], Any]:
-    """Give a ``__getattr__``, by default a module's, for names that only ROS 2 has there."""
+def lacking(where: str, names: str) -> Callable[[str], Any]:
+    """Give a module's ``__getattr__`` for names that only ROS 2 has there."""
     LACKING[where] = names.split()
 
     def look_up(name: str) -> Any:
         if name in LACKING[where]:
-            # by default no AttributeError: an import statement wouldn't show its text
-            raise error(str(NotEmbeddedError(f'{where}.{name}')))
+            # no AttributeError: an import statement wouldn't show its text
+            raise ImportError(str(NotEmbeddedError(f'{where}.{name}')))
         raise AttributeError(f"'{where}' has no attribute '{name}'")
     return look_up
 

@@ -92,7 +92,7 @@ class Condition:
         return False if self._predicate is None else self._predicate(context)
 
 
-_TRUTHS = {'true': True, '1': True, 'false': False, '0': False}
+TRUTHS = {'true': True, '1': True, 'false': False, '0': False}
 
 
 class InvalidConditionExpressionError(ValueError):
@@ -106,12 +106,12 @@ def evaluate_condition_expression(context: LaunchContext, expression: list[Subst
     :raises InvalidConditionExpressionError: for anything else.
     """
     text = perform_substitutions(context, expression).strip().lower()
-    if text not in _TRUTHS:
+    if text not in TRUTHS:
         origin = ' + '.join(str(sub) for sub in expression)
         raise InvalidConditionExpressionError(
-            f"invalid condition expression, expected one of [{', '.join(_TRUTHS)}] "
+            f"invalid condition expression, expected one of [{', '.join(TRUTHS)}] "
             f"but got '{text}', expanded from '{origin}'")
-    return _TRUTHS[text]
+    return TRUTHS[text]
 
 
 class IfCondition(Condition):
@@ -128,6 +128,7 @@ class UnlessCondition(IfCondition):
 
     def _predicate_func(self, context: LaunchContext) -> bool:
         return not super()._predicate_func(context)
+
 
 class LaunchDescriptionEntity:
     """Something that launch visits, with other entities below it."""
@@ -271,25 +272,20 @@ class InvalidLaunchFileError(Exception):
     """
     No loader could read a launch file.
 
-    :param path: the file, if there is one error, which gets its place in it.
+    :param likely_errors: the errors of the loaders that were tried.
     """
 
     def __init__(
-        self, extension: str = '', *, likely_errors: list[Exception] | None = None, path: str = ''
+        self, *, likely_errors: list[Exception] | None = None, path: str = ''
     ) -> None:
-        text = 'The launch file may have a syntax error, or its format is unknown'
-        if path and likely_errors and len(likely_errors) == 1:
-            self.__cause__ = error = likely_errors[0]
+        texts = []
+        for error in likely_errors or ():
             line = vars(error).get('line') or ([None] + [
                 frame.lineno for frame in traceback.extract_tb(error.__traceback__)
                 if frame.filename == path])[-1]
             place = f'{path}, line {line}' if line else path
             # YAML's errors have several lines.
-            text = f"{place}: {type(error).__name__}: {' '.join(str(error).split())}"
-        elif extension and likely_errors:
-            kind = 'multiple exceptions' if len(likely_errors) > 1 else 'exception'
-            text = '\n - '.join([
-                f'Caught {kind} when trying to load file of format [{extension}]:',
-                *(f'{type(error).__name__}: {error}' for error in likely_errors)])
-            self.__cause__ = likely_errors[0]
-        super().__init__(text)
+            texts.append(f"{place}: {type(error).__name__}: {' '.join(str(error).split())}")
+            self.__cause__ = error
+        super().__init__('\n'.join(texts) or (
+            'The launch file may have a syntax error, or its format is unknown'))

@@ -24,12 +24,6 @@ class _Locals:
         raise AttributeError(f"can't set attribute '{name}', locals are read-only")
 
 
-def _pop(stack: list[dict[str, Any]], name: str) -> dict[str, Any]:
-    if not stack:
-        raise RuntimeError(f'{name} stack unexpectedly empty')
-    return stack.pop()
-
-
 class LaunchContext:
     """
     Events, handlers, configurations, environment and local variables of a launch.
@@ -71,7 +65,7 @@ class LaunchContext:
         self.__locals_stack.append(dict(self.__locals))
 
     def _pop_locals(self) -> None:
-        self.__locals = _pop(self.__locals_stack, 'locals')
+        self.__locals = self.__locals_stack.pop()
 
     def extend_globals(self, extensions: dict[str, Any]) -> None:
         """Add local variables that outlive the handling of an event."""
@@ -92,7 +86,7 @@ class LaunchContext:
         self.__environment_stack.append(dict(os.environ))
 
     def _pop_environment(self) -> None:
-        self.__set_environment(_pop(self.__environment_stack, 'environment'))
+        self.__set_environment(self.__environment_stack.pop())
 
     def _reset_environment(self) -> None:
         self.__set_environment(self.__environment_reset)
@@ -106,15 +100,11 @@ class LaunchContext:
         self.__launch_configurations_stack.append(dict(self.launch_configurations))
 
     def _pop_launch_configurations(self) -> None:
-        self.launch_configurations = _pop(
-            self.__launch_configurations_stack, 'launch_configurations')
+        self.launch_configurations = self.__launch_configurations_stack.pop()
 
     @property
     def environment(self) -> MutableMapping[str, str]:
         return os.environ
-
-    def would_handle_event(self, event: Any) -> bool:
-        return any(handler.matches(event) for handler in self._event_handlers)
 
     def register_event_handler(
         self, event_handler: Any, append: bool = False

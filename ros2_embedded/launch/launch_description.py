@@ -87,17 +87,15 @@ class _NoLaunch(LaunchContext):
 
 
 class LaunchDescriptionSource:
-    """A launch description, or the location to load it from by the method described."""
+    """A launch description, or the location to load it from."""
 
     def __init__(
         self, launch_description: LaunchDescription | None = None,
-        location: SomeSubstitutionsType = '<string>',
-        method: str = 'unspecified mechanism from a script'
+        location: SomeSubstitutionsType = '<string>'
     ) -> None:
         self.__launch_description = launch_description
         self.__expanded_location: str | None = None
         self.__location = normalize_to_list_of_substitutions(location)
-        self.method = method
         self.__logger = launch.logging.get_logger(__name__)
 
     def try_get_launch_description_without_context(self) -> LaunchDescription | None:

@@ -52,7 +52,6 @@ class LaunchService:
         debug: bool = False
     ) -> None:
         launch.logging.launch_config.level = logging.DEBUG if debug else logging.INFO
-        self.__debug = debug
         self.__logger = launch.logging.get_logger('launch')
         self.__context = LaunchContext(argv=argv, noninteractive=noninteractive)
         self.__context.register_event_handler(OnIncludeLaunchDescription())
@@ -95,9 +94,7 @@ class LaunchService:
                 if self.__loop is not None:
                     raise RuntimeError('LaunchService cannot be run multiple times concurrently.')
                 loop = _get_loop()
-                if self.__debug:
-                    loop.set_debug(True)
-                self.__context._set_asyncio_loop(loop)
+                self.__context.asyncio_loop = loop
                 # A queue belongs to the loop that it was first waited for in.
                 before, queue = self.__context._event_queue, asyncio.Queue[Event]()
                 while not before.empty():
@@ -136,14 +133,12 @@ class LaunchService:
                 yield loop
         finally:
             with self.__loop_lock:
-                self.__context._set_asyncio_loop(None)
+                self.__context.asyncio_loop = None
                 self.__loop = None
                 self.__shutting_down = False
 
     async def _process_one_event(self) -> None:
-        await self.__process_event(await self.__context._event_queue.get())
-
-    async def __process_event(self, event: Event) -> None:
+        event = await self.__context._event_queue.get()
         self.__logger.debug(f"processing event: '{event}'")
         for handler in tuple(self.__context._event_handlers):
             if not handler.matches(event):
@@ -195,7 +190,8 @@ class LaunchService:
                         awaited += self.__context._completion_futures
                     done, _ = await asyncio.wait(
                         awaited, return_when=asyncio.FIRST_COMPLETED)
-                    self.__raise_first_exception(done)
+                    for future in done:
+                        future.result()
                 except KeyboardInterrupt:
                     continue
                 except asyncio.CancelledError:
@@ -211,14 +207,6 @@ class LaunchService:
     def __on_loop_exception(self, loop: Loop, context: dict[str, Any]) -> None:
         self.__return_code = 1
         loop.default_exception_handler(context)
-
-    def __raise_first_exception(self, done: Iterable[asyncio.Future[Any]]) -> None:
-        exceptions = [exc for exc in (future.exception() for future in done) if exc is not None]
-        if exceptions:
-            self.__logger.debug('An exception was raised in an async action/event')
-            for exc in exceptions[1:]:
-                self.__logger.error(exc)
-            raise exceptions[0]
 
     def run(self, *, shutdown_when_idle: bool = True) -> int:
         """Run as :meth:`run_async` does, and block meanwhile."""

@@ -2,17 +2,16 @@
 """Parameters of nodes as launch files describe them."""
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Any
 
 from embedded_default.lacking import lacking
-from launch import LaunchContext, SomeSubstitutionsType, SomeSubstitutionsType_types_tuple
+from launch import LaunchContext, SomeSubstitutionsType
 from launch.frontend.parse_substitution import parse_substitution
 from launch.substitutions import SubstitutionFailure
-from launch.utilities import ensure_argument_type, perform_substitutions
 from launch.utilities import normalize_to_list_of_substitutions as normalize
+from launch.utilities import perform_substitutions
 from launch.utilities.type_utils import normalize_typed_substitution, perform_typed_substitution
 
 __getattr__ = lacking(__name__, 'Parameter')
@@ -53,24 +52,16 @@ class ParameterFile:
     """
 
     __evaluated: Path | None = None
-    __created_tmp_file = False
 
     def __init__(
-        self, param_file: SomeSubstitutionsType | os.PathLike[str] | bytes, *,
-        allow_substs: bool = False
+        self, param_file: SomeSubstitutionsType, *, allow_substs: bool = False
     ) -> None:
-        ensure_argument_type(
-            param_file, SomeSubstitutionsType_types_tuple + (os.PathLike, bytes), 'param_file',
-            'ParameterFile()')
-        ensure_argument_type(allow_substs, bool, 'allow_subst', 'ParameterFile()')
-        # Bytes are iterable, but no substitutions.
-        self.__param_file: Any = param_file if isinstance(param_file, (os.PathLike, bytes)) else (
-            normalize(param_file))
+        self.__param_file = normalize(param_file)
         self.allow_substs = allow_substs
 
     @property
     def param_file(self) -> Any:
-        """The path once evaluated, before that as it was given."""
+        """The path once evaluated, before that its substitutions."""
         return self.__evaluated or self.__param_file
 
     def evaluate(self, context: LaunchContext) -> Path:
@@ -81,10 +72,7 @@ class ParameterFile:
         """
         if self.__evaluated is not None:
             return self.__evaluated
-        path = self.__param_file
-        if isinstance(path, list):
-            path = perform_substitutions(context, path)
-        path = Path(os.fsdecode(path))
+        path = Path(perform_substitutions(context, self.__param_file))
         if self.allow_substs:
             import yaml
             text = perform_substitutions(context, parse_substitution(path.read_text()))
@@ -95,14 +83,13 @@ class ParameterFile:
                     'The substituted parameter file is not a valid yaml file') from exc
             with NamedTemporaryFile(mode='w', prefix='launch_params_', delete=False) as file:
                 path = Path(file.name)
-                self.__created_tmp_file = True
                 file.write(text)
         self.__evaluated = path
         return path
 
     def cleanup(self) -> None:
         """Remove the temporary file, if there is one."""
-        if self.__created_tmp_file and self.__evaluated is not None:
+        if self.allow_substs and self.__evaluated is not None:
             self.__evaluated.unlink(missing_ok=True)
             self.__evaluated = None
 

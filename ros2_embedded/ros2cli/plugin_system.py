@@ -62,6 +62,3 @@ class Extension:
 
     NAME: str | None = None
     EXTENSION_POINT_VERSION = '0.1'
-
-    def __init__(self) -> None:
-        satisfies_version(PLUGIN_SYSTEM_VERSION, '^0.1')

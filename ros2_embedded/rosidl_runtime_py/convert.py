@@ -22,7 +22,7 @@ def _abbreviated(value: Any, kind: str) -> str:
 
 
 def message_to_yaml(msg: Any, *, truncate_length: int | None = None, no_arr: bool = False,
-                    no_str: bool = False, flow_style: bool = False) -> str:
+                    no_str: bool = False) -> str:
     """
     Write a message as YAML.
 
@@ -38,18 +38,16 @@ def message_to_yaml(msg: Any, *, truncate_length: int | None = None, no_arr: boo
 
     Dumper.add_representer(OrderedDict, lambda dumper, data: dumper.represent_mapping(
         'tag:yaml.org,2002:map', data.items()))
-    text: str = yaml.dump(
+    return str(yaml.dump(
         message_to_ordereddict(
             msg, truncate_length=truncate_length, no_arr=no_arr, no_str=no_str),
-        Dumper=Dumper, allow_unicode=True, width=sys.maxsize, default_flow_style=flow_style)
-    return text
+        Dumper=Dumper, allow_unicode=True, width=sys.maxsize, default_flow_style=False))
 
 
 def message_to_ordereddict(msg: Any, *, truncate_length: int | None = None, no_arr: bool = False,
                            no_str: bool = False) -> 'OrderedDict[str, Any]':
     """Convert a message to a dictionary; see :func:`message_to_yaml`."""
-    converted: OrderedDict[str, Any] = _convert(msg, None, truncate_length, no_arr, no_str)
-    return converted
+    return OrderedDict(_convert(msg, None, truncate_length, no_arr, no_str))
 
 
 def _convert(value: Any, kind: str | None, *how: Any) -> Any:

@@ -5,11 +5,14 @@ import importlib
 from typing import Any
 
 from ament_index_python import has_resource
+from embedded_default.lacking import lacking
+
+__getattr__ = lacking(__name__, 'get_action get_interface is_action')
 
 
-def _import(identifier: str, kind: str | None) -> Any:
+def _import(identifier: str, kind: str) -> Any:
     parts = identifier.split('/')
-    if len(parts) == 2 and kind is not None:
+    if len(parts) == 2:
         parts.insert(1, kind)
     if len(parts) != 3 or parts[1] not in ('msg', 'srv', 'action'):
         raise ValueError(f"'{identifier}' is not of the form package/kind/Name")
@@ -17,16 +20,6 @@ def _import(identifier: str, kind: str | None) -> Any:
     if not has_resource('rosidl_interfaces', parts[0]):
         raise ModuleNotFoundError(f"No package '{parts[0]}' with interfaces is installed")
     return getattr(importlib.import_module('.'.join(parts[:2])), parts[2])
-
-
-def get_interface(identifier: str) -> Any:
-    """
-    Give the class of ``package/kind/Name``.
-
-    :raises ModuleNotFoundError: if there is no such package.
-    :raises AttributeError: if it has no such interface.
-    """
-    return _import(identifier, None)
 
 
 def get_message(identifier: str) -> Any:
@@ -55,18 +48,6 @@ def get_service(identifier: str) -> Any:
     return interface
 
 
-def get_action(identifier: str) -> Any:
-    """
-    Give the class of ``package/action/Name`` or ``package/Name``; see :func:`get_message`.
-
-    :raises ValueError: it is no action.
-    """
-    interface = _import(identifier, 'action')
-    if not is_action(interface):
-        raise ValueError(f"Expected the full name of an action, got '{identifier}'")
-    return interface
-
-
 def is_message(interface: Any) -> bool:
     """Say whether it is a message's class."""
     return hasattr(interface, '_fields_and_field_types')
@@ -75,8 +56,3 @@ def is_message(interface: Any) -> bool:
 def is_service(interface: Any) -> bool:
     """Say whether it is a service's class."""
     return hasattr(interface, 'Request') and hasattr(interface, 'Response')
-
-
-def is_action(interface: Any) -> bool:
-    """Say whether it is an action's class."""
-    return hasattr(interface, 'Goal') and hasattr(interface, 'Result')

@@ -2,7 +2,6 @@
 """Workspaces of ``ament_python`` packages built by colcon: set-up, run, launch, overlay."""
 
 import os
-from pathlib import Path
 import shutil
 import subprocess
 import sys
@@ -77,33 +76,19 @@ def workspace(root, name, text, setup=''):
             (f'{name}/__init__.py', ''), (f'{name}/node.py', NODE),
             ('say.launch.py', LAUNCH_FILE)):
         (package / path).write_text(textwrap.dedent(content.format(name=name, text=text)))
-    run(f'{setup}\n{COLCON} build', root)
+    run(f'{setup}\n{COLCON} build --base-paths src', root)
     return f'. {root}/install/setup.bash'
 
 
-@pytest.fixture(scope='module')
-def underlay(tmp_path_factory):
-    root = tmp_path_factory.mktemp('underlay')
-    return root, workspace(root, 'fog_colcon_test', 'underlay')
-
-
-def test_package_is_built_found_run_and_launched(underlay):
-    root, setup = underlay
-    prefix = f'{root}/install/fog_colcon_test'
-    assert run(f'{setup}; ros2 pkg prefix fog_colcon_test', root) == f'{prefix}\n'
-    assert run(f'{setup}; ros2 pkg executables fog_colcon_test', root) == 'fog_colcon_test say\n'
-    assert run(f'{setup}; ros2 run fog_colcon_test say', root) == 'underlay from /sayer\n'
-    out = run(f'{setup}; ros2 launch fog_colcon_test say.launch.py', root)
-    assert '] underlay from /renamed' in out
-
-
-def test_overlay_hides_the_package_of_its_underlay(underlay, tmp_path):
-    root, setup = underlay
+def test_packages_of_workspaces_are_found_run_and_launched(tmp_path):
+    """That of an overlay hides the one below it, which stays as it was by itself."""
+    root = tmp_path / 'below'
+    setup = workspace(root, 'fog_colcon_test', 'underlay')
     over = workspace(tmp_path, 'fog_colcon_test', 'overlay', setup)
-    assert run(f'{over}; ros2 run fog_colcon_test say', tmp_path) == 'overlay from /sayer\n'
-    found = run(f'{over}; ros2 pkg prefix fog_colcon_test; ros2 pkg prefix rclpy', tmp_path)
-    prefix, rclpy = found.splitlines()
-    assert prefix == f'{tmp_path}/install/fog_colcon_test'
-    assert Path(rclpy) not in (root, tmp_path)
-    # by itself the underlay is as it was
+    found = run(f'{over}; ros2 pkg prefix fog_colcon_test; ros2 pkg executables fog_colcon_test\n'
+                'ros2 run fog_colcon_test say', tmp_path)
+    assert found.splitlines() == [f'{tmp_path}/install/fog_colcon_test', 'fog_colcon_test say',
+                                  'overlay from /sayer']
     assert run(f'{setup}; ros2 run fog_colcon_test say', root) == 'underlay from /sayer\n'
+    assert '] overlay from /renamed' in run(
+        f'{over}; ros2 launch fog_colcon_test say.launch.py', tmp_path)

@@ -264,40 +264,22 @@ def test_service_runs_twice_and_takes_events_of_threads():
     assert notes == [1, 2]
 
 
-def test_launch_runs_beside_other_coroutines():
-    async def both():
-        service = LaunchService(noninteractive=True)
+def test_launch_runs_and_ends_in_the_loop_of_others():
+    """Also where the loop is paused before the shutdown."""
+    service = LaunchService(noninteractive=True)
+
+    async def begin():
         service.include_launch_description(LaunchDescription([LogInfo(msg='in loop')]))
         task = asyncio.get_running_loop().create_task(
             service.run_async(shutdown_when_idle=False))
         while service.task is None:
             await asyncio.sleep(0.01)
-        assert service.task is task
-        await service.shutdown()
-        return await task
-
-    loop = asyncio.new_event_loop()
-    asyncio.set_event_loop(loop)
-    try:
-        assert loop.run_until_complete(both()) == 0
-    finally:
-        loop.close()
-        asyncio.set_event_loop(asyncio.new_event_loop())
-
-
-def test_launch_shuts_down_while_its_loop_is_paused():
-    async def begin():
-        service.include_launch_description(LaunchDescription([]))
-        task = asyncio.get_running_loop().create_task(
-            service.run_async(shutdown_when_idle=False))
-        while service.event_loop is None:
-            await asyncio.sleep(0.01)
+        assert service.task is task and service.event_loop is not None
         return task
 
     loop = asyncio.new_event_loop()
     asyncio.set_event_loop(loop)
     try:
-        service = LaunchService(noninteractive=True)
         task = loop.run_until_complete(begin())
         loop.run_until_complete(service.shutdown())
         assert loop.run_until_complete(task) == 0
@@ -395,7 +377,7 @@ def test_circular_include_is_reported(tmp_path, capsys, name, content):
     ('launch.actions', 'OpaqueCoroutine'), ('launch.conditions', 'LaunchConfigurationEquals'),
     ('launch.substitutions', 'AnonName'), ('launch_ros.actions', 'SetUseSimTime'),
     ('launch_ros.substitutions', 'Parameter'), ('launch.event_handlers', 'OnExecutionComplete'),
-    ('launch.utilities.type_utils', 'SomeValueType'), ('launch.events', 'ExecutionComplete'),
+    ('launch.events', 'ExecutionComplete'),
     ('launch_ros.parameter_descriptions', 'Parameter'), ('rosidl_runtime_py', 'message_to_csv')])
 def test_missing_class_names_ros2(tmp_path, capsys, module, name):
     path = tmp_path / 'asks.launch.py'
@@ -479,33 +461,13 @@ def test_launch_utilities_normalize_and_check():
         launch.utilities.ensure_argument_type(1, [str, float], 'x', 'me')
 
 
-def test_smaller_helpers_of_launch_work():
-    from launch.utilities import type_utils
-    from launch_ros.utilities.namespace_utils import is_namespace_absolute, is_root_namespace
-    from launch_ros.utilities.track_node_names import add_node_name, get_node_name_count
-    assert launch.utilities.is_a(Asked(), launch.Event)
-    assert type_utils.coerce_list(['1', '2'], int) == [1, 2]
-    for wrong in ('1', [1, 2]):
-        with pytest.raises(TypeError):
-            type_utils.coerce_list(wrong)
-    assert type_utils.is_valid_scalar_type(int) and not type_utils.is_valid_scalar_type(list)
-    assert type_utils.is_instance_of_valid_type([1, 'a'], can_be_str=True)
-    assert type_utils.is_normalized_substitution([TextSubstitution(text='a')])
-    assert is_namespace_absolute('/a') and is_root_namespace('/')
-    assert 'Condition' in launch.Condition().describe()
-    context = LaunchContext()
-    assert get_node_name_count(context, '/a') == 0
-    for _ in range(2):
-        add_node_name(context, '/a')
-    assert get_node_name_count(context, '/a') == 2
-
-
 def test_module_paths_of_ros2_can_be_imported():
     code = textwrap.dedent('''
         import launch_ros.actions.push_ros_namespace, launch.actions.shutdown_action
         import launch.conditions.if_condition, launch.event_handlers.on_process_io
         import launch.events.process.process_started, launch_ros.substitutions.find_package
         import launch.utilities.class_tools_impl, launch_ros.actions.load_composable_nodes
+        import launch_ros.utilities.namespace_utils, launch_ros.utilities.track_node_names
         from launch.actions.execute_process import ExecuteProcess
         from launch.substitutions.launch_configuration import LaunchConfiguration
         import launch

@@ -5,6 +5,7 @@ What launch and launch_ros of ROS 2 Jazzy got after the end of 2024, through its
 An installation of ROS 2 that is older skips these tests.
 """
 
+import importlib.util
 import os
 from pathlib import Path
 import re
@@ -50,9 +51,9 @@ def matched(package):
 
 def installed(package):
     """Return the installed version; None for the embedded default, which has its own."""
-    manifest = Path(get_package_share_directory(package), 'package.xml').read_text()
-    if 'embedded default' in manifest:
+    if importlib.util.find_spec('embedded_default'):
         return None
+    manifest = Path(get_package_share_directory(package), 'package.xml').read_text()
     return re.search(r'<version>(\d+)\.(\d+)\.(\d+)</version>', manifest).groups()
 
 

@@ -245,8 +245,8 @@ def launch_file(path):
 
 
 @pytest.mark.parametrize('name, content', [
-    ('a.launch.xml', XML), ('a.xml', XML), ('a_launch.yaml', YAML), ('a.launch.yml', YAML),
-    ('a.launch', XML)], ids=lambda value: value.partition('\n')[0])
+    ('a.xml', XML), ('a_launch.yaml', YAML), ('a.launch', XML)],
+    ids=lambda value: value.partition('\n')[0])
 def test_xml_and_yaml_launch_files_run(context, tmp_path, monkeypatch, capsys, name, content):
     monkeypatch.delenv('FOG_XML', raising=False)
     (tmp_path / name).write_text(content)

@@ -111,23 +111,20 @@ def test_topic_pub_publishes_and_ends(worker):
 
 @ours
 def test_first_message_reaches_the_awaited_subscription():
-    for number in range(2):
-        topic = f'/first{number}'
-        reader = subprocess.Popen(
-            ['ros2', 'topic', 'echo', '--once', topic, 'std_msgs/msg/String'],
-            stdout=subprocess.PIPE, text=True)
-        ros2('topic', 'pub', '--once', topic, 'std_msgs/msg/String', '{data: go}')
-        try:
-            assert reader.communicate(timeout=60)[0] == 'data: go\n---\n'
-        finally:
-            reader.kill()
-            reader.wait()
+    reader = subprocess.Popen(
+        ['ros2', 'topic', 'echo', '--once', '/first', 'std_msgs/msg/String'],
+        stdout=subprocess.PIPE, text=True)
+    ros2('topic', 'pub', '--once', '/first', 'std_msgs/msg/String', '{data: go}')
+    try:
+        assert reader.communicate(timeout=60)[0] == 'data: go\n---\n'
+    finally:
+        reader.kill()
+        reader.wait()
 
 
-@pytest.mark.parametrize('options', [(), ('-r', '5', '-w', '0')])
-def test_topic_pub_repeats_until_interrupted(worker, options):
+def test_topic_pub_repeats_until_interrupted(worker):
     process = subprocess.Popen(
-        ['ros2', 'topic', 'pub', *options, '/cell/orders', 'std_msgs/msg/String', '{data: again}'],
+        ['ros2', 'topic', 'pub', '/cell/orders', 'std_msgs/msg/String', '{data: again}'],
         stdout=subprocess.DEVNULL,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
     try:
@@ -149,11 +146,9 @@ def test_sigterm_ends_a_waiting_command(command):
         assert len(said.splitlines()) == 1
 
 
-def test_topic_hz_and_bw_measure(worker):
+def test_topic_hz_measures(worker):
     rate = ros2('topic', 'hz', '/cell/chatter', until='window: ', status=None)
     assert 15 < float(rate.split('average rate: ')[1].split()[0]) < 25
-    width = ros2('topic', 'bw', '/cell/chatter', until='Message size mean: ', status=None)
-    assert 'Subscribed to [/cell/chatter]' in width
 
 
 def test_node_list_and_info_show_nodes(worker):

@@ -124,9 +124,8 @@ def test_grasp_planning(launch, tmp_path):
 
 
 def test_grasp_planner_survives_bad_images(launch):
-    """Images that are none, then one that is."""
+    """Images that are none, then one that is; the unit tests have all kinds of bad ones."""
     from geometry_msgs.msg import PoseArray
-    import numpy
     import rclpy
     from sensor_msgs.msg import CameraInfo, Image
     from std_msgs.msg import Header
@@ -161,15 +160,10 @@ def test_grasp_planner_survives_bad_images(launch):
         return len(answers[name].poses)
 
     try:
-        good = depth_message(depth, '32FC1', Header())
-        colour = depth_message(depth, '32FC1', Header())
-        colour.encoding = 'bgr8'
-        assert answered(colour) == 0
+        assert answered(Image(encoding='bgr8')) == 0
         assert answered(depth_message(0 * depth, '16UC1', Header())) == 0
-        assert answered(depth_message(numpy.nan * depth, '32FC1', Header())) == 0
-        assert answered(Image(encoding='32FC1', width=320, height=240, step=1280)) == 0
         assert answered(depth_message(depth[:100], '32FC1', Header())) == 0
-        assert answered(good) > 0
+        assert answered(depth_message(depth, '32FC1', Header())) > 0
     finally:
         node.destroy_node()
         rclpy.shutdown()
@@ -177,7 +171,7 @@ def test_grasp_planner_survives_bad_images(launch):
         said = planner.communicate(timeout=60)[0]
     assert planner.returncode == 0, said
     for words in ("'bgr8' is no encoding of depth", '0 of 76800 pixels have a depth',
-                  '0 bytes are no image', 'camera_info is of 320x240 pixels'):
+                  'camera_info is of 320x240 pixels'):
         assert words in said, said
 
 
@@ -248,24 +242,19 @@ def test_motion_planner_survives_bad_requests(launch):
     assert planner.returncode == 0, said
 
 
-@pytest.mark.parametrize(('name', 'asked', 'said'), [
-    ('planning', 'environment:=attic', 'environment:=attic: there is no such file here (apart'),
-    ('slam', 'rate:=0', "slam_camera: 'rate' is 0: it has to be from 0.01 to 1000")])
-def test_impossible_request_fails_the_launch(name, asked, said, launch):
-    run = launch('fogros2_examples', f'{name}.launch.py', 'machine:=robot', asked)
+def test_impossible_request_fails_the_launch(launch):
+    run = launch('fogros2_examples', 'slam.launch.py', 'machine:=robot', 'rate:=0')
     assert run.ended() == 1, run.text
-    assert said in run.text
+    assert "slam_camera: 'rate' is 0: it has to be from 0.01 to 1000" in run.text
     # the other node may be interrupted while it starts
-    assert not re.search(r'\[(slam_camera|grasp_camera|planning_client)-\d+\] Traceback', run.text)
+    assert not re.search(r'\[slam_camera-\d+\] Traceback', run.text)
 
 
 @pytest.mark.parametrize(('node', 'asked', 'said'), [
-    ('slam.camera.SlamCamera', 'frames:=-1', "'frames' is -1: it has to be from 1 to 2330"),
     ('slam.camera.SlamCamera', 'frames:=99999', "'frames' is 99999: it has to be from 1 to 2330"),
     ('slam.camera.SlamCamera', 'width:=0', "'width' is 0: it has to be from 64 to 4096"),
-    ('slam.camera.SlamCamera', 'picture:=/no/x.png', "'picture' is /no/x.png: there is no folder"),
-    ('slam.camera.SlamCamera', 'results:=/no/x', "'results' is /no/x: there is no folder /no"),
     ('slam.camera.SlamCamera', 'picture:=x.txt', "'picture' is x.txt: it has to end in .png, "),
+    ('slam.camera.SlamCamera', 'results:=/no/x', "'results' is /no/x: there is no folder /no"),
     ('grasp.grasp_camera.GraspCamera', 'trials:=-1', "'trials' is -1: it has to be 0 at least"),
     ('grasp.grasp_camera.GraspCamera', 'encoding:=rgb8', "'encoding' is 'rgb8': it has to be 16"),
     ('planning.planning_client.PlanningClient', 'picture:=/no/x.png', 'there is no folder /no'),
@@ -288,19 +277,20 @@ def test_node_checks_its_parameters_first(node, asked, said):
         rclpy.shutdown()
 
 
-@pytest.mark.parametrize(('package', 'executable'), [
-    ('fogros2' if path.parts[-3] in ('fogros2_replicas', 'fogros2_share') else path.parts[-3],
-     path.name)
-    for path in sorted(ROOT.glob('*/scripts/*'))
-    if path.is_file() and path.parts[-3] != 'fogros2_monitor'])
-def test_starting_node_can_be_interrupted(package, executable, tmp_path):
+def test_starting_nodes_can_be_interrupted(tmp_path):
     """As by another one's end: it has nothing to say, and nobody looks for a fault of its."""
     (tmp_path / 'rclpy.py').write_text('import signal\nsignal.raise_signal(signal.SIGINT)\n')
-    done = subprocess.run(
-        [sys.executable, Path(get_package_prefix(package), 'lib', package, executable)],
-        env={**os.environ, 'PYTHONPATH': f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"},
-        capture_output=True, text=True, timeout=30)
-    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+    kinds = {}  # most scripts differ by names alone
+    for path in sorted(ROOT.glob('*/scripts/*')):
+        if path.is_file() and path.parts[-3] != 'fogros2_monitor':
+            kinds[re.sub(r'""".*"""|(?<=from )[\w.]+', '', path.read_text())] = path
+    assert 1 < len(kinds) < 8
+    for path in kinds.values():
+        done = subprocess.run(
+            [sys.executable, path],
+            env={**os.environ, 'PYTHONPATH': f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"},
+            capture_output=True, text=True, timeout=30)
+        assert (done.returncode, done.stdout, done.stderr) == (0, '', ''), path
 
 
 def test_impossible_request_creates_no_machine(launch, engine):

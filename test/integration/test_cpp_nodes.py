@@ -132,7 +132,6 @@ finally:
 
 @pytest.mark.parametrize(('there', 'back', 'options'), [
     ('republished_compressed', 'theora', {'jpeg_quality': 60}),
-    ('theora', 'republished_compressed', {'out.theora.quality': 20}),
     ('ffmpeg', 'ffmpeg', {})])
 def test_images_cross_by_image_transport(
     tmp_path: Path, cloud_network: str, there: str, back: str, options: dict[str, int],

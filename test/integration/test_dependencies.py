@@ -21,7 +21,6 @@ import zipfile
 import pytest
 
 from fogros2.deploy import Launch
-from fogros2.errors import CommandError
 from fogros2.host.installer import apt_install
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
@@ -192,10 +191,3 @@ def test_apt_installs_after_a_dpkg_that_was_killed(packages, tmp_path):
         assert (tmp_path / 'files/usr/bin/fogt-hello').exists()
     finally:
         debian_root.remove(tmp_path / 'files')
-
-
-def test_package_that_does_not_exist_is_named(spec):
-    launch = Launch()
-    with pytest.raises(CommandError, match='fogt-none'):
-        launch.up(dataclasses.replace(spec, apt=('fogt-none',)))
-    assert launch.down() == []

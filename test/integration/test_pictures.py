@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command that takes the pictures of the pages; the terminal's shows what a launch prints."""
+"""The picture of a terminal shows what a launch prints."""
 
 from __future__ import annotations
 
@@ -12,19 +12,10 @@ import sys
 import pytest
 
 from rigs import pictures
-from rigs.browser import program
 from rigs.launched import embedded
 
 pytestmark = [pytest.mark.usefixtures('nothing_left', 'engine')]
 DOC = pictures.ROOT / 'doc'
-
-
-def take(what: str, folder: Path) -> None:
-    """Take a picture by the command that ``make pictures`` runs."""
-    done = subprocess.run([sys.executable, '-m', 'rigs.pictures', what, '--folder', str(folder)],
-                          cwd=pictures.ROOT / 'test', capture_output=True, text=True,
-                          stdin=subprocess.DEVNULL)
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def shown(picture: Path) -> set[str]:
@@ -36,18 +27,12 @@ def shown(picture: Path) -> set[str]:
 
 
 def test_terminal_picture_shows_what_a_launch_prints(tmp_path: Path) -> None:
-    take('terminal', tmp_path)
+    done = subprocess.run(
+        [sys.executable, '-m', 'rigs.pictures', 'terminal', '--folder', str(tmp_path)],
+        cwd=pictures.ROOT / 'test', capture_output=True, text=True, stdin=subprocess.DEVNULL)
+    assert done.returncode == 0, done.stdout + done.stderr
     lines = shown(tmp_path / 'terminal.svg')
     assert {'$ ros# launch ./bringup.launch.py', '[INFO] [fogros#]: planner: delete # s'} <= lines
     assert any('I heard: [Hello World from planner' in line for line in lines)
     if embedded():
         assert lines == shown(DOC / 'terminal.svg'), 'make pictures takes it anew'
-
-
-@pytest.mark.skipif(program() is None, reason='needs Chromium')
-def test_dashboard_picture_has_two_streams(tmp_path: Path) -> None:
-    cv2 = pytest.importorskip('cv2', reason='the extra "video" is not installed')
-    take('dashboard', tmp_path)
-    new, old = (cv2.imread(str(folder / 'dashboard.png')) for folder in (tmp_path, DOC))
-    assert new.shape[1] == old.shape[1] == 1400
-    assert abs(new.shape[0] - old.shape[0]) < 100

@@ -19,7 +19,7 @@ from fogros2.waiting import wait_until
 from fogros2_examples.meshes import box, joined
 from fogros2_examples.planning.picture import between
 from fogros2_examples.planning.racing import Racer
-from fogros2_examples.planning.scene import apartment, MADE, pose, Scene
+from fogros2_examples.planning.scene import MADE, pose, Scene
 
 
 def depth(first, second):
@@ -98,8 +98,7 @@ def test_each_failure_to_plan_has_its_own_end(racer):
     assert racer.plan(start, goal, seconds=120)['end'] == 'found'
 
 
-def test_same_seed_finds_the_same_path(racer):
-    racer.enter(apartment())
+def test_same_seed_finds_the_same_path():
     one = Racer(workers=1)
     try:
         scene = box_room(wall=False)

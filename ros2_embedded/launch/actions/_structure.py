@@ -167,7 +167,6 @@ class TimerAction(_base.Action):
         self.__canceled = False
         self._canceled_future: asyncio.Future[Any] | None = None
         self.__cancel_on_shutdown = normalize_typed_substitution(cancel_on_shutdown, bool)
-        self.__logger = launch.logging.get_logger(__name__)
 
     @classmethod
     def parse(cls, entity: Entity, parser: Parser) -> _base.ParsedAction:
@@ -205,8 +204,6 @@ class TimerAction(_base.Action):
         self._completed_future = context.asyncio_loop.create_future()
         self._canceled_future = context.asyncio_loop.create_future()
         if self.__canceled:
-            self.__logger.debug(
-                f'timer {self} not waiting because it was canceled before being executed')
             self._completed_future.set_result(None)
             return None
         if '_TimerAction__event_handler_has_been_installed' not in vars(context):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import codecs
+import contextlib
 import functools
 import logging
 import os
@@ -261,21 +262,10 @@ class ExecuteLocal(process.ProcessAction):
             raise RuntimeError('Signal event received before subprocess transport available.')
         name = self.__process_event_args['name']
         if self._subprocess_protocol.complete.done():
-            self.__logger.debug(
-                f"signal '{event.signal_name}' not set to '{name}' because it is already closing")
             return
         self.__logger.info(f"sending signal '{event.signal_name}' to process[{name}]")
-        try:
-            if event.signal_name == 'SIGKILL':
-                self._subprocess_transport.kill()
-            else:
-                self._subprocess_transport.send_signal(signal.Signals[event.signal_name])
-        except ProcessLookupError:
-            self.__logger.debug(
-                f"signal '{event.signal_name}' not sent to '{name}' because it has closed already")
-
-    def __on_process_stdin(self, event: process.ProcessIO) -> None:
-        self.__logger.warning(f"in ExecuteProcess('{id(self)}').__on_process_stdin_event()")
+        with contextlib.suppress(ProcessLookupError):
+            self._subprocess_transport.send_signal(signal.Signals[event.signal_name])
 
     def __log(self, logger: logging.Logger, lines: Iterator[str]) -> None:
         for line in lines:
@@ -393,8 +383,7 @@ class ExecuteLocal(process.ProcessAction):
                 matcher=lambda event: isinstance(event, process.SignalProcess),
                 entities=OpaqueFunction(function=self.__on_signal_process_event)),
             OnProcessIO(
-                target_action=self, on_stdin=self.__on_process_stdin,
-                on_stdout=lambda event: self.__log(
+                target_action=self, on_stdout=lambda event: self.__log(
                     self.__stdout_logger, self.__stdout_buffer.lines(event.text)),
                 on_stderr=lambda event: self.__log(
                     self.__stderr_logger, self.__stderr_buffer.lines(event.text))),

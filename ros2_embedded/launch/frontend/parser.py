@@ -2,6 +2,7 @@
 """Finds the parser for a launch file, and builds what its entities describe."""
 from __future__ import annotations
 
+import functools
 import importlib
 import os
 from typing import Any, Iterable
@@ -31,25 +32,20 @@ class Parser:
     substitutions, ``launch.frontend.parser`` parsers beside those for XML and YAML.
     """
 
-    extensions_loaded = False
-    frontend_parsers: dict[str, type[Parser]] | None = None
-
-    @classmethod
-    def load_launch_extensions(cls) -> None:
+    @staticmethod
+    @functools.cache
+    def load_launch_extensions() -> None:
         """Import, once, all that exposes actions and substitutions."""
-        if not Parser.extensions_loaded:
-            Parser.extensions_loaded = True
-            importlib.import_module('launch_ros')
-            load_entry_points('launch.frontend.launch_extension')
+        importlib.import_module('launch_ros')
+        load_entry_points('launch.frontend.launch_extension')
 
-    @classmethod
-    def _parsers(cls) -> dict[str, type[Parser]]:
-        if Parser.frontend_parsers is None:
-            parsers = {name: importlib.import_module(f'launch_{name}').Parser
-                       for name in ('xml', 'yaml')}
-            parsers.update(load_entry_points('launch.frontend.parser'))
-            Parser.frontend_parsers = dict(sorted(parsers.items()))
-        return Parser.frontend_parsers
+    @staticmethod
+    @functools.cache
+    def _parsers() -> dict[str, type[Parser]]:
+        parsers = {name: importlib.import_module(f'launch_{name}').Parser
+                   for name in ('xml', 'yaml')}
+        parsers.update(load_entry_points('launch.frontend.parser'))
+        return dict(sorted(parsers.items()))
 
     def parse_action(self, entity: Entity) -> Action:
         self.load_launch_extensions()
@@ -99,16 +95,14 @@ class Parser:
             with open(file) as opened:
                 return cls.load(opened)
         name = getattr(file, 'name', '')
-        claiming = cls.get_parsers_from_filename(name)
         errors: list[Exception] = []
-        for parser in claiming or cls._parsers().values():
+        for parser in cls.get_parsers_from_filename(name) or cls._parsers().values():
             try:
                 return parser.load(file)
             except Exception as exc:  # noqa: BLE001 - Each format has its own errors.
                 errors.append(exc)
                 file.seek(0)
-        extension = os.path.splitext(name)[1][1:] if claiming else ''
-        raise InvalidFrontendLaunchFileError(extension, likely_errors=errors, path=name)
+        raise InvalidFrontendLaunchFileError(likely_errors=errors, path=name)
 
     @classmethod
     def get_file_extensions(cls) -> set[str]:

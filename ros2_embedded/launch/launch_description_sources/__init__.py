@@ -45,15 +45,13 @@ def get_launch_description_from_python_launch_file(
 
 
 def get_launch_description_from_frontend_launch_file(
-    frontend_launch_file_path: str, *, parser: type[Parser] = Parser
+    frontend_launch_file_path: str
 ) -> LaunchDescription:
-    entity, reader = parser.load(frontend_launch_file_path)
-    return reader.parse_description(entity)
+    entity, parser = Parser.load(frontend_launch_file_path)
+    return parser.parse_description(entity)
 
 
-def get_launch_description_from_any_launch_file(
-    launch_file_path: str, *, parser: type[Parser] = Parser
-) -> LaunchDescription:
+def get_launch_description_from_any_launch_file(launch_file_path: str) -> LaunchDescription:
     """
     Return what a launch file describes.
 
@@ -80,11 +78,10 @@ def get_launch_description_from_any_launch_file(
 
 class _FileSource(LaunchDescriptionSource):
 
-    _method: str
     _load: Callable[[str], LaunchDescription]
 
     def __init__(self, launch_file_path: SomeSubstitutionsType) -> None:
-        super().__init__(None, launch_file_path, self._method)
+        super().__init__(None, launch_file_path)
 
     def _get_launch_description(self, location: str) -> LaunchDescription:
         return self._load(location)
@@ -92,21 +89,15 @@ class _FileSource(LaunchDescriptionSource):
 
 class AnyLaunchDescriptionSource(_FileSource):
 
-    _method = 'interpreted launch file'
     _load = staticmethod(get_launch_description_from_any_launch_file)
 
 
 class PythonLaunchDescriptionSource(_FileSource):
 
-    _method = 'interpreted python launch file'
     _load = staticmethod(get_launch_description_from_python_launch_file)
 
 
 class FrontendLaunchDescriptionSource(_FileSource):
     """A launch file that a frontend reads, whichever it is."""
 
-    _method = 'interpreted frontend launch file'
-    _parser = Parser
-
-    def _get_launch_description(self, location: str) -> LaunchDescription:
-        return get_launch_description_from_frontend_launch_file(location, parser=self._parser)
+    _load = staticmethod(get_launch_description_from_frontend_launch_file)

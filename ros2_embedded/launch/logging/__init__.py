@@ -6,16 +6,15 @@ Importing this makes all loggers created later handle their own records only.
 """
 from __future__ import annotations
 
+import contextlib
 import datetime
 import logging
+import logging.handlers
 import os
 import sys
 from typing import Any
-import warnings
 
-from . import handlers
-
-__all__ = ['get_logger', 'get_output_loggers', 'handlers', 'launch_config', 'reset']
+__all__ = ['get_logger', 'get_output_loggers', 'launch_config', 'reset']
 
 _FORMATS = {
     'SCREEN': '[{levelname}] [{name}]: {msg}',
@@ -37,29 +36,33 @@ def _get_logging_directory() -> str:
 
 
 def _make_log_dir(base: str) -> str:
-    while True:
-        stamp = datetime.datetime.now().strftime('%Y-%m-%d-%H-%M-%S-%f')
-        directory = os.path.join(base, f'{stamp}-{os.uname().nodename}-{os.getpid()}')
-        try:
-            os.makedirs(directory)
-        except FileExistsError:
-            continue
-        latest = os.path.join(base, 'latest')
-        try:
-            if os.path.islink(latest):
-                os.unlink(latest)
-            os.symlink(directory, latest, target_is_directory=True)
-        except OSError as exc:
-            warnings.warn(
-                f'Cannot create a symlink to latest log directory: {exc}', stacklevel=2)
-        return directory
+    stamp = datetime.datetime.now().strftime('%Y-%m-%d-%H-%M-%S-%f')
+    directory = os.path.join(base, f'{stamp}-{os.uname().nodename}-{os.getpid()}')
+    os.makedirs(directory)
+    latest = os.path.join(base, 'latest')
+    with contextlib.suppress(OSError):  # another launch may do the same
+        if os.path.islink(latest):
+            os.unlink(latest)
+        os.symlink(directory, latest, target_is_directory=True)
+    return directory
 
 
-def _formatter(kind: str) -> logging.Formatter:
-    """Make the formatter for 'SCREEN' or 'LOG', as the environment wants it."""
-    override = os.environ.get(f'OVERRIDE_LAUNCH_{kind}_FORMAT', '')
-    text = override.encode('latin1').decode('unicode_escape') or _FORMATS[kind]
-    return logging.Formatter(text, style='{')
+class _Formatter(logging.Formatter):
+    """
+    Formats records for 'SCREEN' or 'LOG' as the environment wants it, and some loggers' otherwise.
+
+    :param own: the formatters of these loggers, by their names.
+    """
+
+    def __init__(self, kind: str) -> None:
+        override = os.environ.get(f'OVERRIDE_LAUNCH_{kind}_FORMAT', '')
+        super().__init__(
+            override.encode('latin1').decode('unicode_escape') or _FORMATS[kind], style='{')
+        self.own: dict[str, logging.Formatter] = {}
+
+    def format(self, record: logging.LogRecord) -> str:
+        own = self.own.get(record.name)
+        return super().format(record) if own is None else own.format(record)
 
 
 class LaunchConfig:
@@ -73,7 +76,7 @@ class LaunchConfig:
         self._log_dir: str | None = None
         self.file_handlers: dict[str, Any] = {}
         self.screen_handler: Any = None
-        self.log_handler_factory: Any = handlers.WatchedFileHandler
+        self.log_handler_factory: Any = logging.handlers.WatchedFileHandler
         self.level = logging.INFO
 
     @property
@@ -99,18 +102,15 @@ class LaunchConfig:
 
     def get_screen_handler(self) -> Any:
         if self.screen_handler is None:
-            self.screen_handler = handlers.StreamHandler(sys.stdout)
-            self.screen_handler.setFormatter(_formatter('SCREEN'))
+            self.screen_handler = logging.StreamHandler(sys.stdout)
+            self.screen_handler.setFormatter(_Formatter('SCREEN'))
         return self.screen_handler
-
-    def get_log_file_path(self, file_name: str = 'launch.log') -> str:
-        return os.path.join(self.log_dir, file_name)
 
     def get_log_file_handler(self, file_name: str = 'launch.log') -> Any:
         if file_name not in self.file_handlers:
             handler = self.log_handler_factory(
-                self.get_log_file_path(file_name), encoding='utf-8')
-            handler.setFormatter(_formatter('LOG'))
+                os.path.join(self.log_dir, file_name), encoding='utf-8')
+            handler.setFormatter(_Formatter('LOG'))
             self.file_handlers[file_name] = handler
         return self.file_handlers[file_name]
 
@@ -137,7 +137,7 @@ def _add(logger: logging.Logger, handler: Any, own_format: str | None = None) ->
     if handler not in logger.handlers:
         logger.addHandler(handler)
         if own_format is not None:
-            handler.setFormatterFor(logger, logging.Formatter(own_format, style='{'))
+            handler.formatter.own[logger.name] = logging.Formatter(own_format, style='{')
 
 
 def _normalize_output_configuration(config: Any) -> dict[str, set[str]]:

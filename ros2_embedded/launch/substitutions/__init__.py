@@ -11,7 +11,7 @@ from typing import Any, Iterable, Sequence
 from embedded_default.lacking import lacking
 import launch.logging
 
-from .._base import SomeSubstitutionsType, Substitution, TextSubstitution
+from .._base import SomeSubstitutionsType, Substitution, TextSubstitution, TRUTHS
 from ..frontend.expose import expose_substitution
 from ..launch_context import LaunchContext
 from ..utilities import normalize_to_list_of_substitutions, perform_substitutions
@@ -352,9 +352,8 @@ class EqualsSubstitution(AndSubstitution):
     def perform(self, context: LaunchContext) -> str:
         left = perform_substitutions(context, self.left)
         right = perform_substitutions(context, self.right)
-        truths = {'true': True, '1': True, 'false': False, '0': False}
-        if left.lower() in truths and right.lower() in truths:
-            return _text(truths[left.lower()] == truths[right.lower()])
+        if left.lower() in TRUTHS and right.lower() in TRUTHS:
+            return _text(TRUTHS[left.lower()] == TRUTHS[right.lower()])
         try:
             return _text(math.isclose(float(left), float(right)))
         except ValueError:

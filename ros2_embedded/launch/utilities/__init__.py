@@ -16,15 +16,9 @@ from ..launch_context import LaunchContext
 from .signal_management import AsyncSafeSignalManager
 
 __all__ = [
-    'AsyncSafeSignalManager', 'ensure_argument_type', 'is_a', 'is_a_subclass',
-    'isclassinstance', 'normalize_to_list_of_entities', 'normalize_to_list_of_substitutions',
+    'AsyncSafeSignalManager', 'ensure_argument_type', 'is_a_subclass',
+    'normalize_to_list_of_entities', 'normalize_to_list_of_substitutions',
     'perform_substitutions', 'visit_all_entities_and_collect_futures']
-
-is_a = isinstance
-
-
-def isclassinstance(obj: object) -> bool:
-    return hasattr(obj, '__class__')
 
 
 def is_a_subclass(obj: object, entity_type: type) -> bool:

@@ -27,7 +27,6 @@ class AsyncSafeSignalManager:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.__loop = loop
         self.__handlers: dict[int, Callable[[int], None]] = {}
-        self.__outer: AsyncSafeSignalManager | None = None
         self.__next_fd = -1
 
     def __enter__(self) -> AsyncSafeSignalManager:
@@ -41,18 +40,15 @@ class AsyncSafeSignalManager:
             self.__writer.close()
             raise
         self.__loop.add_reader(self.__reader.fileno(), self.__on_readable)
-        self.__outer = AsyncSafeSignalManager.__current
+        self.__before = AsyncSafeSignalManager.__current, signal.set_wakeup_fd
         AsyncSafeSignalManager.__current = self
-        if self.__outer is None:
-            signal.set_wakeup_fd = self.__replace_next_fd
+        signal.set_wakeup_fd = self.__replace_next_fd
         return self
 
     def __exit__(self, *exc_info: Any) -> None:
         self.__loop.remove_reader(self.__reader.fileno())
         self.__real_set_wakeup_fd(self.__next_fd)
-        if self.__outer is None:
-            signal.set_wakeup_fd = self.__real_set_wakeup_fd
-        AsyncSafeSignalManager.__current = self.__outer
+        AsyncSafeSignalManager.__current, signal.set_wakeup_fd = self.__before
         self.__reader.close()
         self.__writer.close()
 

@@ -6,18 +6,10 @@ import collections.abc
 import os
 from typing import Any, List
 
-from embedded_default.lacking import lacking
-
 from .._base import normalize_to_list_of_substitutions, perform_substitutions, Substitution
 from ..launch_context import LaunchContext
 from . import ensure_argument_type
 from .ros_yaml import load
-
-__getattr__ = lacking(
-    __name__, 'AllowedTypesTuple AllowedTypesType AllowedValueType ListTypesTuple ListTypesType '
-    'ListValueType NormalizedScalarType NormalizedSequenceType NormalizedValueType '
-    'ScalarTypesType ScalarValueType SequenceValueType SomeScalarType SomeSequenceType '
-    'SomeValueType StrSomeScalarType StrSomeSequenceType StrSomeValueType')
 
 ScalarTypesTuple = (int, float, bool, str)
 
@@ -60,9 +52,6 @@ def is_instance_of(value: Any, data_type: Any = None, *, can_be_str: bool = Fals
         return True
     return is_list == isinstance(value, list) and all(
         isinstance(item, (kind, str) if can_be_str else kind) for item in items)
-
-
-is_instance_of_valid_type = is_instance_of
 
 
 def coerce_to_type(value: str, data_type: Any = None, *, can_be_str: bool = False) -> Any:

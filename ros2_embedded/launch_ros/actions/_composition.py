@@ -17,7 +17,7 @@ from ..descriptions import ComposableNode
 from ..parameter_descriptions import ParameterFile
 from ..ros_adapters import call_service, get_ros_node
 from ..utilities import parameters as ros_parameters
-from ..utilities.names import add_node_name, make_namespace_absolute, prefix_namespace
+from ..utilities.names import add_node_name, expand_namespace, expand_remappings
 from .node import Node
 
 
@@ -105,10 +105,6 @@ class LoadComposableNodes(launch.Action):
         self.__logger.info(
             f"Loaded node '{response.full_node_name}' in container '{container}'")
 
-    def _load_in_sequence(self, load_node_requests: list[Any], context: LaunchContext) -> None:
-        for request in load_node_requests:
-            self._load_node(request, context)
-
     def execute(self, context: LaunchContext) -> Entities | None:
         if isinstance(self.__target_container, ComposableNodeContainer):
             container = self.__target_container.node_name
@@ -122,9 +118,13 @@ class LoadComposableNodes(launch.Action):
         requests = [
             request for node in self.__composable_node_descriptions
             if (request := get_composable_node_load_request(node, context)) is not None]
-        if requests:
-            context.add_completion_future(context.asyncio_loop.run_in_executor(
-                None, self._load_in_sequence, requests, context))
+
+        def load_in_sequence() -> None:
+            for request in requests:
+                self._load_node(request, context)
+
+        context.add_completion_future(
+            context.asyncio_loop.run_in_executor(None, load_in_sequence))
         return None
 
 
@@ -137,26 +137,16 @@ def get_composable_node_load_request(
     if condition is not None and not condition.evaluate(context):
         return None
     from composition_interfaces.srv import LoadNode
-    configurations = context.launch_configurations
     request = LoadNode.Request()
     request.package_name = perform_substitutions(context, node.package)
     request.plugin_name = perform_substitutions(context, node.node_plugin)
     if node.node_name is not None:
         request.node_name = perform_substitutions(context, node.node_name)
-    namespace = prefix_namespace(
-        configurations.get('ros_namespace'),
-        None if node.node_namespace is None else (
-            perform_substitutions(context, node.node_namespace)))
+    namespace = expand_namespace(context, node.node_namespace)
     if namespace is not None:
-        namespace = make_namespace_absolute(namespace)
         request.node_namespace = namespace
-    remappings = [f'{source}:={target}' for source, target in configurations.get(
-        'ros_remaps', ())]
-    remappings += [
-        f'{perform_substitutions(context, source)}:={perform_substitutions(context, target)}'
-        for source, target in node.remappings or ()]
-    if remappings:
-        request.remap_rules = remappings
+    request.remap_rules = [f'{source}:={target}' for source, target in expand_remappings(
+        context, node.remappings or ())]
 
     def messages(parameters: list[Any]) -> list[Any]:
         return [parameter.to_parameter_msg() for parameter in ros_parameters.to_parameters_list(
@@ -166,10 +156,7 @@ def get_composable_node_load_request(
     parameters: list[Any] = [
         ros_parameters.normalize_parameter_dict({given[0]: given[1]}) if isinstance(given, tuple)
         else ParameterFile(Path(given).resolve())
-        for given in configurations.get('global_params', ())]
-    parameters += node.parameters or ()
-    if parameters:
-        request.parameters = messages(parameters)
-    if node.extra_arguments is not None:
-        request.extra_arguments = messages(list(node.extra_arguments))
+        for given in context.launch_configurations.get('global_params', ())]
+    request.parameters = messages([*parameters, *(node.parameters or ())])
+    request.extra_arguments = messages([*(node.extra_arguments or ())])
     return request

@@ -136,14 +136,9 @@ class Node(ExecuteProcess):
             self.__expanded_node_name = perform_substitutions(
                 context, normalize(self.__node_name))
             names.check_node_name(self.__expanded_node_name)
-        namespace: str | None = None
-        if self.__node_namespace is not None:
-            namespace = perform_substitutions(
-                context, normalize(self.__node_namespace))
-        namespace = names.prefix_namespace(
-            context.launch_configurations.get('ros_namespace'), namespace)
+        namespace = names.expand_namespace(context, self.__node_namespace)
         if namespace is not None:
-            self.__expanded_node_namespace = names.make_namespace_absolute(namespace)
+            self.__expanded_node_namespace = namespace
             self.__extend_cmd('-r', LocalSubstitution("ros_specific_arguments['ns']"))
             names.check_namespace(self.__expanded_node_namespace)
 
@@ -165,12 +160,8 @@ class Node(ExecuteProcess):
                 self.__logger.warning(f'Parameter file path is not a file: {parameter}')
 
     def __expand_remappings(self, context: LaunchContext) -> None:
-        rules = list(context.launch_configurations.get('ros_remaps') or ())
-        rules += [
-            (perform_substitutions(context, source), perform_substitutions(context, target))
-            for source, target in self.__remappings]
-        if rules:
-            self.__expanded_remappings = rules
+        rules = names.expand_remappings(context, self.__remappings)
+        self.__expanded_remappings = rules or None
         for source, target in rules:
             self.__extend_cmd('-r', f'{source}:={target}')
 

@@ -18,6 +18,12 @@ from ..utilities import normalize_parameters, normalize_remap_rules
 __getattr__ = lacking(__name__, 'ComposableLifecycleNode Parameter')
 
 
+class _Described(Action):
+    """What launch files say of a composable node as they do of actions."""
+
+    _texts = {'package': 'pkg', 'plugin': 'plugin', 'name': 'name', 'namespace': 'namespace?'}
+
+
 class ComposableNode:
     """
     A node for a container to load.
@@ -43,12 +49,7 @@ class ComposableNode:
 
     @classmethod
     def parse(cls, parser: Parser, entity: Entity) -> tuple[type[ComposableNode], dict[str, Any]]:
-        _, kwargs = Action.parse(entity, parser)
-        for name, attribute in (('package', 'pkg'), ('plugin', 'plugin'), ('name', 'name')):
-            kwargs[name] = parser.parse_substitution(entity.get_attr(attribute))
-        namespace = entity.get_attr('namespace', optional=True)
-        if namespace is not None:
-            kwargs['namespace'] = parser.parse_substitution(namespace)
+        _, kwargs = _Described.parse(entity, parser)
         parameters = entity.get_attr('param', data_type=List[Entity], optional=True)
         if parameters is not None:
             kwargs['parameters'] = parse_nested_parameters(parameters, parser)

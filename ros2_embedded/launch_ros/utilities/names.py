@@ -6,12 +6,15 @@ import re
 from typing import Any, Iterable, Iterator, TypeVar
 
 from launch.launch_context import LaunchContext
-from launch.utilities import ensure_argument_type, normalize_to_list_of_substitutions
+from launch.utilities import (
+    ensure_argument_type,
+    normalize_to_list_of_substitutions,
+    perform_substitutions,
+)
 
 __all__ = [
-    'add_node_name', 'get_node_name_count', 'is_namespace_absolute', 'is_root_namespace',
-    'make_namespace_absolute', 'normalize_remap_rule', 'normalize_remap_rules',
-    'prefix_namespace']
+    'add_node_name', 'get_node_name_count', 'is_namespace_absolute', 'make_namespace_absolute',
+    'normalize_remap_rule', 'normalize_remap_rules', 'prefix_namespace']
 
 OptionalText = TypeVar('OptionalText', str, None)
 
@@ -30,8 +33,19 @@ def prefix_namespace(base_ns: str | None, ns: str | None) -> str | None:
     return combined if combined in (None, '/') else combined.rstrip('/')
 
 
-def is_root_namespace(ns: str) -> bool:
-    return ns == '/'
+def expand_namespace(context: LaunchContext, given: Any) -> str | None:
+    """Return a node's absolute namespace below that of its group, None if neither has one."""
+    namespace = None if given is None else perform_substitutions(
+        context, normalize_to_list_of_substitutions(given))
+    namespace = prefix_namespace(context.launch_configurations.get('ros_namespace'), namespace)
+    return None if namespace is None else make_namespace_absolute(namespace)
+
+
+def expand_remappings(context: LaunchContext, own: Iterable[Any]) -> list[tuple[str, str]]:
+    """Return the remappings of a node's group, and then its own."""
+    return [*context.launch_configurations.get('ros_remaps', ()), *(
+        (perform_substitutions(context, source), perform_substitutions(context, target))
+        for source, target in own)]
 
 
 def is_namespace_absolute(ns: str) -> bool:

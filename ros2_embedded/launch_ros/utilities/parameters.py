@@ -2,8 +2,8 @@
 """
 Parameters of nodes: normalized, evaluated, and as rclpy's.
 
-Normalized ones have flat names, and texts as substitutions. A plain text stays a text whatever it
-looks like, so it is quoted as in YAML: what substitutions become is read as rcl reads YAML.
+Normalized ones have flat names. A plain text stays a text whatever it looks like; what
+substitutions become is read as rcl reads YAML.
 """
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ from launch.substitutions import TextSubstitution
 from launch.utilities import ensure_argument_type, perform_substitutions
 from launch.utilities import normalize_to_list_of_substitutions as normalize
 from launch.utilities.ros_yaml import dump, load
+from launch.utilities.type_utils import is_substitution
 
 from ..parameter_descriptions import ParameterFile, ParameterValue
 
 #: By tuples of substitutions.
 ParametersDict = dict[tuple[Any, ...], Any]
 
+_SCALARS = (bool, int, float, str)
 _WRAP = ('If the parameter is meant to be a string, try wrapping it in '
          'launch_ros.parameter_descriptions.ParameterValue(value, value_type=str)')
 
@@ -45,25 +47,16 @@ def as_argument(value: Any) -> str:
 
 
 def _normalize_array(value: Sequence[Any]) -> tuple[Any, ...]:
-    kinds = set()
     value = [os.fspath(item) if isinstance(item, os.PathLike) else item for item in value]
     for item in value:
         ensure_argument_type(
             item, (float, int, str, bool, *SomeSubstitutionsType_types_tuple), 'subvalue')
-        kinds.add(next(
-            kind for kind in (Substitution, str, bool, int, float, object)
-            if isinstance(item, kind)))
-    if kinds in ({int}, {bool}):
-        return tuple(value)
-    if kinds and kinds <= {int, float}:
-        return tuple(float(item) for item in value)
-    if Substitution in kinds and kinds <= {str, Substitution}:
+    if is_substitution(value):
         # One text made of several pieces, not an array.
         return tuple(normalize(value))
-    return tuple(
-        normalize(
-            dump(item) if isinstance(item, (float, int, bool, str)) else item)
-        for item in value)
+    if {type(item) for item in value} == {int, float}:
+        return tuple(float(item) for item in value)
+    return tuple(item if isinstance(item, _SCALARS) else normalize(item) for item in value)
 
 
 def normalize_parameter_dict(
@@ -83,7 +76,7 @@ def normalize_parameter_dict(
         if isinstance(value, Mapping):
             normalized.update(normalize_parameter_dict(value, _prefix=name))
         elif isinstance(value, (str, os.PathLike)):
-            normalized[name] = tuple(normalize(dump(os.fspath(value))))
+            normalized[name] = os.fspath(value)
         elif isinstance(value, Substitution):
             normalized[name] = (value,)
         elif isinstance(value, (ParameterValue, float, bool, int, bytes)):
@@ -116,7 +109,7 @@ def normalize_parameters(parameters: Sequence[Any]) -> Sequence[Any]:
 
 def _uniform(name: str, items: Sequence[Any]) -> Any:
     kind = type(items[0]) if items else None
-    if kind not in (bool, int, float, str) or not all(isinstance(i, kind) for i in items):
+    if kind not in _SCALARS or not all(isinstance(i, kind) for i in items):
         raise TypeError(
             'Expected a non-empty sequence, with items of uniform type. Allowed sequence item '
             f'types are bool, int, float, str. Got inconsistent input for "{name}"')
@@ -130,7 +123,7 @@ def _from_text(name: str, text: str) -> Any:
     except yaml.YAMLError as exc:
         raise TypeError(
             f'Unable to parse the value of parameter {name} as yaml. {_WRAP}') from exc
-    if type(value) in (bool, int, float, str, bytes):
+    if type(value) in (*_SCALARS, bytes):
         return value
     if not isinstance(value, Sequence):
         raise TypeError(
@@ -143,14 +136,13 @@ def _from_text(name: str, text: str) -> Any:
 def _evaluate(context: LaunchContext, name: str, value: Any) -> Any:
     if isinstance(value, ParameterValue):
         return value.evaluate(context)
-    if not isinstance(value, tuple) or not value:
-        ensure_argument_type(value, (float, int, str, bool, bytes), 'value')
+    if not isinstance(value, tuple):
         return value
-    if isinstance(value[0], Substitution):
+    if value and isinstance(value[0], Substitution):
         return _from_text(name, perform_substitutions(context, value))
-    if isinstance(value[0], Sequence):
-        return _uniform(name, [load(perform_substitutions(context, item)) for item in value])
-    return value
+    return _uniform(name, [
+        load(perform_substitutions(context, item)) if isinstance(item, list) else item
+        for item in value])
 
 
 def evaluate_parameter_dict(

@@ -15,11 +15,10 @@ from ros2cli.plugin_system import Extension, instantiate_extensions
 _LACKING = {
     'ros2cli.command': 'action bag component control daemon doctor extension_points extensions '
                        'interface lifecycle multicast security test trace wtf',
-    'ros2node.verb': '',
     'ros2param.verb': 'delete describe dump load',
     'ros2pkg.verb': 'create xml',
     'ros2service.verb': 'echo find info type',
-    'ros2topic.verb': 'delay find type',
+    'ros2topic.verb': 'bw delay find type',
 }
 
 
@@ -28,8 +27,6 @@ class CommandExtension(Extension):
     A command; entry point group ``ros2cli.command``.
 
     The first line of its docstring is its help. :meth:`main` is required.
-
-    :raises PluginException: if the extension is for another version.
     """
 
     def add_arguments(self, parser: Any, cli_name: str, *, argv: Any = None) -> None:

@@ -30,13 +30,10 @@ class DirectNode:
     def __init__(self, args: Any, *, node_name: str | None = None,
                  enough: Callable[[Any], bool] | None = None) -> None:
         import rclpy
-        from rclpy.parameter import Parameter
         os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(_PROFILES))
         rclpy.init(args=[])
         self.node = rclpy.create_node(
-            node_name or f'{NODE_NAME_PREFIX}_{os.getpid()}', start_parameter_services=False,
-            parameter_overrides=[
-                Parameter('use_sim_time', value=getattr(args, 'use_sim_time', False))])
+            node_name or f'{NODE_NAME_PREFIX}_{os.getpid()}', start_parameter_services=False)
         self._discover(getattr(args, 'spin_time', None), enough)
 
     def _discover(self, seconds: float | None, enough: Callable[[Any], bool] | None) -> None:
@@ -80,5 +77,4 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument('--spin-time', type=float, default=None,
                         help='Spin time in seconds to wait for discovery '
                              f'(default: until nothing changes, at most {LONGEST:g})')
-    parser.add_argument(
-        '-s', '--use-sim-time', action='store_true', help='Enable ROS simulation time')
+    parser.add_argument('--no-daemon', action='store_true', help='Changes nothing here')

@@ -6,8 +6,4 @@ from ros2cli.plugin_system import Extension
 
 
 class VerbExtension(Extension):
-    """
-    A verb; its ``main(*, args)`` returns the exit status, or a text for standard error.
-
-    :raises PluginException: if the extension is for another version.
-    """
+    """A verb; its ``main(*, args)`` returns the exit status, or a text for standard error."""

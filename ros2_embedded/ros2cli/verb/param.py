@@ -38,62 +38,52 @@ def call(node: Any, node_name: str, method: str, *arguments: Any) -> Any:
     return future.result()
 
 
-def _strategy(args: Any, name: str | None) -> NodeStrategy:
-    """Discover until there is a node of that name; with None, all nodes."""
-    if name is None:
-        return NodeStrategy(args)
-    return NodeStrategy(
-        args, enough=lambda node: name in get_node_names(node, args.include_hidden_nodes))
-
-
 class ListVerb(VerbExtension):
     """Output a list of available parameters."""
 
+    NODES: str | None = '?'
+
     def add_arguments(self, parser: Any, cli_name: str) -> None:
         add_arguments(parser)
-        parser.add_argument('node_name', nargs='?', help='Name of the ROS node')
+        parser.add_argument('node_name', nargs=self.NODES, help='Name of the ROS node')
         parser.add_argument('--include-hidden-nodes', action='store_true',
                             help='Consider hidden nodes as well')
 
     def main(self, *, args: Any) -> Any:
-        wanted = f"/{args.node_name.removeprefix('/')}" if args.node_name else None
-        with _strategy(args, wanted) as strategy:
-            names = get_node_names(strategy, args.include_hidden_nodes)
-            if wanted is not None:
-                if wanted not in names:
-                    return 'Node not found'
-                names = [wanted]
-            for name in dict.fromkeys(names):
-                try:
-                    listed = call(strategy.node, name, 'list_parameters').result.names
-                except RuntimeError as error:
-                    print(error, file=sys.stderr)
-                    continue
-                if listed and not args.node_name:
+        if not args.node_name:
+            with NodeStrategy(args) as strategy:
+                for name in dict.fromkeys(get_node_names(strategy, args.include_hidden_nodes)):
                     print(f'{name}:')
-                for parameter in sorted(listed):
-                    print(f'  {parameter}')
-
-
-class GetVerb(VerbExtension):
-    """Get parameter."""
-
-    def add_arguments(self, parser: Any, cli_name: str) -> None:
-        add_arguments(parser)
-        parser.add_argument('node_name', help='Name of the ROS node')
-        parser.add_argument('--include-hidden-nodes', action='store_true',
-                            help='Consider hidden nodes as well')
-        parser.add_argument('parameter_name', help='Name of the parameter')
-
-    def main(self, *, args: Any) -> Any:
+                    self.do(strategy.node, name, args)
+            return None
         name = f"/{args.node_name.removeprefix('/')}"
-        with _strategy(args, name) as strategy:
-            if name not in get_node_names(strategy, args.include_hidden_nodes):
-                return 'Node not found'
-            return self.do(strategy.node, name, args)
+
+        def exists(node: Any) -> bool:
+            return name in get_node_names(node, args.include_hidden_nodes)
+
+        with NodeStrategy(args, enough=exists) as strategy:
+            return self.do(strategy.node, name, args) if exists(strategy) else 'Node not found'
 
     def do(self, node: Any, name: str, args: Any) -> Any:
-        """Do it, now that the node is there."""
+        """Do it with a node that exists."""
+        try:
+            listed = call(node, name, 'list_parameters').result.names
+        except RuntimeError as error:
+            print(error, file=sys.stderr)
+        else:
+            print(*(f'  {parameter}' for parameter in sorted(listed)), sep='\n')
+
+
+class GetVerb(ListVerb):
+    """Get parameter."""
+
+    NODES = None
+
+    def add_arguments(self, parser: Any, cli_name: str) -> None:
+        super().add_arguments(parser, cli_name)
+        parser.add_argument('parameter_name', help='Name of the parameter')
+
+    def do(self, node: Any, name: str, args: Any) -> Any:
         from rclpy.parameter import Parameter, parameter_value_to_python
         values = call(node, name, 'get_parameters', [args.parameter_name]).values
         if not values:

@@ -50,13 +50,10 @@ def _publish(node: Any, args: Any) -> str | None:
     publisher = node.create_publisher(kind, args.topic_name, qos_from_arguments(args))
     wanted = args.wait_matching_subscriptions
     wanted = int(args.times != 0) if wanted is None else wanted
-    waited = 0
-    while publisher.get_subscription_count() < wanted:
-        if waited % 10 == 0:
-            print(f'Waiting for at least {wanted} matching subscription(s)...')
-        waited += 1
-        rclpy.spin_once(node, timeout_sec=_WAIT)  # raises when a signal has come
     if wanted:
+        print(f'Waiting for at least {wanted} matching subscription(s)...')
+        while publisher.get_subscription_count() < wanted:
+            rclpy.spin_once(node, timeout_sec=_WAIT)  # raises when a signal has come
         time.sleep(_WAIT)  # until the subscriptions know this publisher, too
     message = kind()
     try:
