@@ -369,6 +369,8 @@ class Outcome:
     What a case came to: times in ms, bytes per image, CPU in percent of a core.
 
     :param fps: images that arrived, by the time in which all were taken.
+    :param cpu_robot: of the encoder, ``cpu_cloud`` of the decoder.
+    :param busy: percent of all cores that anything used: camera, both ends, viewer and the VPN.
     :param computer: on which computer and of what images it was measured, ``date`` the day.
     """
 
@@ -384,6 +386,7 @@ class Outcome:
     worst: float
     cpu_robot: float
     cpu_cloud: float
+    busy: Optional[float] = None
     computer: str = ''
     date: str = ''
 
@@ -413,6 +416,12 @@ def cpu(*programs: str) -> float:
         except OSError:
             continue
     return ticks / os.sysconf('SC_CLK_TCK')
+
+
+def busy() -> tuple[int, int]:
+    """Return the ticks that all cores were busy and that they had, since the computer's start."""
+    ticks = [int(each) for each in Path('/proc/stat').read_text().split('\n')[0].split()[1:9]]
+    return sum(ticks) - ticks[3] - ticks[4], sum(ticks)
 
 
 def run(case: Case, launch: Any, machine: Any, link: Link, output: Output, count: int,
@@ -450,8 +459,10 @@ def run(case: Case, launch: Any, machine: Any, link: Link, output: Output, count
             # FFmpeg's own program encodes
             names = [('theora.py\0encode', 'libtheora'), ('theora.py\0decode',)]
         begin = time.monotonic(), link.sent(), cpu(*names[0]), cpu(*names[1])
+        before = busy()
         told = answer_of(source, 'the camera', count / RATE + 120)
         seconds = time.monotonic() - begin[0]
+        used, had = (after - each for each, after in zip(before, busy()))
         load = [100 * (cpu(*names[i]) - begin[2 + i]) / seconds for i in (0, 1)]
         sent = link.sent() - begin[1]
     finally:
@@ -480,7 +491,7 @@ def run(case: Case, launch: Any, machine: Any, link: Link, output: Output, count
     return Outcome(
         case, received / told['seconds'], at(0.5), at(0.95), at(0.99), told['sent'] - received,
         sent / (told['sent'] + WARM_UP), quality['psnr'], quality['ssim'], quality['worst'],
-        load[0], load[1])
+        load[0], load[1], 100 * used / had)
 
 
 def tried(case: Case, launch: Any, machine: Any, link: Link, output: Output, count: int,
@@ -564,8 +575,8 @@ def table(title: str, outcomes: list[Outcome], limits: dict[str, float], note: s
     """Return the side-by-side table as Markdown."""
     lines = [f'# {title}', '', note, '',
              '| | delay each way, ms | FPS | round trip, ms: median | p95 | p99 | limit | lost | '
-             'bytes/image | PSNR, dB | worst | SSIM | CPU robot, % | CPU cloud, % | the paper |',
-             '|---' * 15 + '|']
+             'bytes/image | PSNR, dB | worst | SSIM | CPU encoder, % | CPU decoder, % | '
+             'all cores busy, % | the paper |', '|---' * 16 + '|']
     for o in outcomes:
         most = limits.get(o.case.name)
         lines.append(
@@ -573,7 +584,8 @@ def table(title: str, outcomes: list[Outcome], limits: dict[str, float], note: s
             f'{o.p95:.1f} | {o.p99:.1f} | '
             f"{'' if most is None else f'{most:.1f}'} | {o.lost} | {o.size:.0f} | "
             f'{o.psnr:.1f} | {o.worst:.1f} | {o.ssim:.3f} | {o.cpu_robot:.0f} | '
-            f'{o.cpu_cloud:.0f} | {o.case.published} |')
+            f"{o.cpu_cloud:.0f} | {'' if o.busy is None else f'{o.busy:.0f}'} | "
+            f'{o.case.published} |')
     return '\n'.join([*lines, ''])
 
 
