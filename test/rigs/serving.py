@@ -29,7 +29,7 @@ def serve(app: Any, port: int = 0, **words: Any) -> Iterator[str]:
     thread = threading.Thread(target=one.serve_forever, args=(0.02,), daemon=True)
     thread.start()
     try:
-        yield f'http://127.0.0.1:{one.server_port}'
+        yield f'http://127.0.0.1:{one.port}'
     finally:
         one.shutdown()
         thread.join()

@@ -121,7 +121,7 @@ def test_supervisor_leaves_the_folder_to_another_agent(agent: Detached) -> None:
 @pytest.mark.parametrize('status', [0, 1, 'signal'])
 def test_agent_of_a_container_always_starts_again(tmp_path: Path, status: object) -> None:
     archive = root.Archive()
-    entry.add(archive, user='fog', number=1000, authorized_key='', environment={},
+    entry.add(archive, user='fog', number=1000, authorized_key='',
               agent_config={'machine': 'planner'})
     with tarfile.open(fileobj=io.BytesIO(archive.data())) as tar:
         member = tar.extractfile('opt/fogros2/entry.sh')

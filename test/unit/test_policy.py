@@ -184,7 +184,7 @@ def test_nothing_is_reported_to_microsoft(tmp_path, program):
     for name in ('HOME', 'TMPDIR', 'XDG_CACHE_HOME', 'XDG_STATE_HOME', 'XDG_DATA_HOME'):
         environment[name] = str(tmp_path / 'home')
     words = [model, *NAMES] if program is LOADS else [
-        json.dumps([['onnxruntime', ['onnxruntime'], [], '']])]
+        json.dumps([['onnxruntime', ['onnxruntime'], []]])]
     subprocess.run([sys.executable, '-c', program, *words], env=environment, check=True,
                    timeout=60)
     assert not list((tmp_path / 'home').rglob('*'))

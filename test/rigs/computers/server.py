@@ -135,7 +135,7 @@ class Box(abc.ABC):
         for server in servers:
             threading.Thread(target=server.serve_forever, args=(0.1,), daemon=True).start()
         threading.Thread(target=_hang_up, args=(regions,), daemon=True).start()
-        say({'ok': True, 'value': {'port': servers[0].server_port, 'robot': self.net.robot}})
+        say({'ok': True, 'value': {'port': servers[0].port, 'robot': self.net.robot}})
         for line in sys.stdin:
             try:
                 say({'ok': True, 'value': self._do(json.loads(line))})
