@@ -285,10 +285,12 @@ def test_wait_for_acknowledgement_lets_threads_run(bench: Bench) -> None:
     try:
         publisher.publish(CompressedImage(format='jpeg'))
         waiting.start()
-        # with the lock held, this thread continues after the answer only
-        waiting.join(0.1)
-        assert not answers
-        waiting.join()
+        # with the lock held, this thread would continue after the answer only
+        turns = 0
+        while waiting.is_alive():
+            waiting.join(0.05)
+            turns += 1
+        assert turns > 3
         assert answers == [False]
     finally:
         decoder.send_signal(signal.SIGCONT)
