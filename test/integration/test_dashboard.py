@@ -161,7 +161,7 @@ def test_dashboard_shows_a_launch_until_its_end(
     browser.ask(f'{article(name)}.querySelector("button.delete").click()')
     browser.until('document.getElementById("ask").open')
     browser.ask('document.getElementById("ask-yes").click()')
-    browser.until(f'{article(name)}.dataset.phase === "gone"', timeout=30)
+    browser.until(f'{article(name)}.dataset.phase === "gone"', timeout=120)
     assert name not in ros2('fog', 'list').stdout
     assert browser.complaints == []
     assert all(url.startswith(('http://127.0.0.1:', 'blob:http://127.0.0.1:', 'data:'))
