@@ -16,29 +16,18 @@ from rigs.launched import launching
 
 pytestmark = [pytest.mark.usefixtures('nothing_left', 'engine')]
 
-LAUNCH = """
-from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
-
-
-def generate_launch_description():
-    machine = ContainerInstance(name='{name}', ros_workspace='', network='{network}',
-                                record=['/chatter'], fetch_to='{home}')
-    return FogROSLaunchDescription([CloudNode(
-        machine=machine, package='fogros2_examples', executable='talker', output='screen')])
-"""
-
 
 def test_recording_is_at_home_when_the_launch_has_ended(
     tmp_path: Path, cloud_network: str,
 ) -> None:
     name = f'records-{uuid.uuid4().hex[:6]}'
-    path, home = tmp_path / 'record.launch.py', tmp_path / 'home'
-    path.write_text(LAUNCH.format(name=name, network=cloud_network, home=home))
+    home = tmp_path / 'home'
     with launching() as start:
-        run = start(str(path))
+        run = start('fogros2_examples', 'talker.recorded.launch.py', f'name:={name}',
+                    f'network:={cloud_network}', f'fetch_to:={home}')
         run.wait_for('recording /chatter to ')
         run.said.clear()
-        run.wait_for('Publishing', times=4)
+        run.wait_for('Publishing', times=8)  # the recorder may find the topic late
         run.interrupt()
         assert run.ended() == 0, run.text
     file, = home.glob(f'{name}-*/recordings/*.mcap')
