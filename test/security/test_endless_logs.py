@@ -23,8 +23,8 @@ case $* in
 *logs*) echo 'fogros2-host-key: ssh-ed25519 AAAA fogros2'; exec yes {word} ;;
 esac
 """
-ENTRY = {'Id': '0123456789ab', 'State': {'ExitCode': 1}, 'Config': {'Labels': {
-    'fogros2-token': '0123-token', 'fogros2-directory': ''}}}
+ENTRY = {'Id': '0123456789ab', 'State': {'ExitCode': 1}, 'Config': {
+    'Image': 'ros', 'Labels': {'fogros2-token': '0123-token'}}}
 ENGINE = Engine('podman', sudo=False)
 
 

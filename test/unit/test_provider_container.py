@@ -395,7 +395,7 @@ def test_host_key_cannot_redirect_the_robot(tmp_path, monkeypatch):
     monkeypatch.setattr(container_machine, 'ROOTS', tmp_path)
     monkeypatch.setattr(os, 'geteuid', lambda: 0)
     entry = {'Id': 'c' * 64, 'Config': {'Labels': {
-        container_machine.ATTEMPT: 'token', container_machine.DIRECTORY: 'x'}}}
+        container_machine.ATTEMPT: 'token'}}}
     path = container_machine.host_key_file('token')
     path.parent.mkdir(parents=True)
     provider, engine = container.ContainerProvider(), container_engine.named('podman')
@@ -498,13 +498,35 @@ def test_packages_of_a_container_image_are_its_own(options, own):
 
 def test_request_may_create_while_a_program_works_at_it():
     provider, token = container.ContainerProvider(), secrets.token_hex(8)
+    # the engine's command, which has no token
+    words = list(container_options.common_flags(
+        Engine('podman'), MachineSpec('m', 'container'),
+        dataclasses.replace(REQUEST, token=token), Options()))
     assert not provider.may_create(token, 0.0)
-    engine = subprocess.Popen(
-        ['sh', '-c', 'echo; read line', 'podman', 'run', f'--label={token}'],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    engine = subprocess.Popen(['sh', '-c', 'echo; read line', 'podman', 'run', *words],
+                              stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     try:
         assert engine.stdout is not None and engine.stdout.readline()
         assert provider.may_create(token, 1e9)
+        assert provider.tidy([token]) == []
     finally:
         engine.communicate(b'')
     assert not provider.may_create(token, 0.0)
+
+
+def test_folder_of_a_killed_creation_goes(monkeypatch, tmp_path):
+    monkeypatch.setattr(container_machine, 'ROOTS', tmp_path / 'roots')
+    monkeypatch.setattr(container.packet_filter, 'unset', lambda name: 'true')
+    monkeypatch.setattr(os, 'geteuid', lambda: 0)
+    provider = container.ContainerProvider()
+    monkeypatch.setattr(provider, '_containers', lambda tags: [
+        (Engine('podman'), {'Config': {'Labels': {container_machine.ATTEMPT: 'with-container'}}})])
+    tops = {token: container_machine.directory(token) for token in (
+        'with-container', 'killed', 'fresh')}
+    for token, top in tops.items():
+        (top / 'root').mkdir(parents=True)
+        os.utime(top, None if token == 'fresh' else (0, 0))
+    assert provider.tidy() == [f"the folder {tops['killed']}"]
+    # of a launch that is known to have died
+    assert provider.tidy(['fresh', 'with-container']) == [f"the folder {tops['fresh']}"]
+    assert [top.exists() for top in tops.values()] == [True, False, False]

@@ -223,6 +223,17 @@ def test_find_asks_the_hosts_of_the_records(
     assert [machine.id for machine in HostedProvider().find({})] == [found.id]
 
 
+def test_leftovers_on_hosts_go(on: dict[str, Any], shell: FakeShell, state_home: Path) -> None:
+    assert HostedProvider().tidy(['0123-token']) == []
+    Store().save(Record('planner', 'hosted', spec_on(on)))
+    shell.said = json.dumps({'result': ['the folder x']})  # type: ignore[attr-defined]
+    assert HostedProvider().tidy(['0123-token']) == ['the folder x on 127.0.0.1']
+    assert asked(shell) == {'call': 'tidy', 'given': {'dead': ['0123-token']}}
+    shell.said = json.dumps({'result': [{}]})  # type: ignore[attr-defined]
+    with pytest.raises(ProviderError, match='may be hijacked'):
+        HostedProvider().tidy()
+
+
 def test_host_that_is_off_hides_no_machine_of_another(
     on: dict[str, Any], shell: FakeShell, state_home: Path,
 ) -> None:

@@ -12,11 +12,12 @@ options in launch files. ``served`` is a program for a computer that hosts machi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 import contextlib
 import json
 import os
 from pathlib import Path
+import re
 import tempfile
 from typing import Any, ClassVar, Optional
 
@@ -31,7 +32,7 @@ from fogros2.errors import (
     Unsupported,
 )
 from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState, Volume
-from fogros2.provider import Attached, Capabilities, made_without, Provider
+from fogros2.provider import Attached, Capabilities, made_without, Provider, SETTLED
 from fogros2.provider.container import debian_root, hidden_files, login_ids, packet_filter
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import entry as container_entry
@@ -60,8 +61,9 @@ search=
 failed() {
     code=$?
     [ $code -eq 0 ] && return
-    # it writes into the folder
+    # it writes into the folder, and a hook of the engine waits for its result
     [ -n "$search" ] && kill "$search" 2>/dev/null && wait "$search" || :
+    rm -f "$top/shown"
     [ -s "$top/cid" ] && "$engine" rm -f -v "$(cat "$top/cid")" >/dev/null 2>&1
     sh -c "$clean"
     exit $code
@@ -73,6 +75,7 @@ until install -d -m 700 "${top%/*}" && mkdir -m 700 "$top" 2>/dev/null; do
     tries=$((tries + 1))
 done
 trap failed EXIT
+trap 'exit 143' HUP INT TERM
 mount --bind -o nosuid,nodev "$top" "$top"
 mkdir "$top/root" "$top/hooks"
 IFS= read -r label
@@ -87,7 +90,9 @@ printf '%s' "$shown" >"$top/shown"
 python3 -IS -c "$look" "$top" </dev/null >/dev/null 2>&1 &
 search=$!
 tar -xpf - --numeric-owner -C "$top/root"
-"$@"
+# a signal interrupts 'wait' alone
+"$@" &
+wait $!
 """
 
 # Podman forgets the folder of a container's hooks when the container has started.
@@ -333,6 +338,13 @@ class ContainerProvider(Provider):
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
         """Yield the containers of both engines that have all of ``tags`` as labels."""
+        for engine, entry in self._containers(tags):
+            running = container_machine.state_of(entry) is MachineState.RUNNING
+            yield container_machine.machine_of(
+                engine, entry, self._host_key(engine, entry) if running else None)
+
+    def _containers(self, tags: Mapping[str, str]) -> Iterator[tuple[Engine, Mapping[str, Any]]]:
+        """Yield the engines' reports of the containers that have all of ``tags`` as labels."""
         filters = [f'--filter=label={container_machine.ATTEMPT}',
                    *(f'--filter=label={key}={value}' for key, value in tags.items())]
         engines = list(container_engine.installed())
@@ -349,18 +361,31 @@ class ContainerProvider(Provider):
             # Without docker's service, its socket may still exist; it has no containers.
             listed = result.stdout.split()
             if listed:
-                for entry in engine.inspect(listed):
-                    running = container_machine.state_of(entry) is MachineState.RUNNING
-                    yield container_machine.machine_of(
-                        engine, entry, self._host_key(engine, entry) if running else None)
+                yield from ((engine, entry) for entry in engine.inspect(listed))
 
     def may_create(self, token: str, age: float) -> bool:
         """Return whether an engine still works at a request: it may outlive its launch."""
-        for path in Path('/proc').glob('[0-9]*/cmdline'):
-            with contextlib.suppress(OSError):
-                if token.encode() in path.read_bytes():
-                    return True
-        return False
+        return _in_use(container_machine.directory(token))
+
+    def tidy(self, dead: Collection[str] = ()) -> list[str]:
+        """Remove the folders of machines without a container: their creations were killed."""
+        ended = {container_machine.directory(token) for token in dead}
+        if container_machine.ROOTS.is_dir():
+            listed = process.run(
+                Command(('find', str(container_machine.ROOTS), '-mindepth', '1', '-maxdepth', '1',
+                         '-mmin', f'+{SETTLED / 60:g}'), sudo=True, what='look for old folders'),
+                timeout=30.0, check=False).stdout.splitlines()
+            ended |= {Path(line) for line in listed if re.fullmatch('.*/[0-9a-f]{16}', line)}
+        # in this order: a creation ends with a container
+        ended = {top for top in ended if not _in_use(top)}
+        if ended:
+            ended -= {container_machine.directory(
+                container_machine.labels_of(entry)[container_machine.ATTEMPT])
+                for _, entry in self._containers({})}
+        for top in ended:
+            process.run(Command(('sh', '-c', clean(top)), sudo=True, what=f'remove {top}'),
+                        timeout=60.0)
+        return [f'the folder {top}' for top in sorted(ended)]
 
     def destroy(self, machine_id: str) -> None:
         """Remove a container and its root; return when both are removed."""
@@ -442,9 +467,9 @@ class ContainerProvider(Provider):
         identity = str(entry['Id'])[:12]
         if identity in self._host_keys:
             return self._host_keys[identity]
-        labels = container_machine.labels_of(entry)
-        path = container_machine.host_key_file(labels[container_machine.ATTEMPT])
-        if not labels.get(container_machine.DIRECTORY):
+        path = container_machine.host_key_file(
+            container_machine.labels_of(entry)[container_machine.ATTEMPT])
+        if entry['Config'].get('Image'):
             # the machine writes its log, so only its beginning is read
             log = process.run(
                 Command(('sh', '-c', _READ_LOG, 'sh', *engine.argv('logs', identity)),
@@ -477,6 +502,15 @@ class ContainerProvider(Provider):
             or container_engine.last_line(f'{log.stderr}\n{log.stdout}')
         raise ProviderError(f'container {identity} could not start: {reason}',
                             'it needs sshd, sudo, rsync and python3, or apt-get and a network')
+
+
+def _in_use(top: Path) -> bool:
+    """Return whether a program works at a machine with this folder."""
+    for path in Path('/proc').glob('[0-9]*/cmdline'):
+        with contextlib.suppress(OSError):
+            if top.name.encode() in path.read_bytes():
+                return True
+    return False
 
 
 def _users_of(engine: Engine, volume: str) -> list[str]:

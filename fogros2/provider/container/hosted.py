@@ -9,7 +9,7 @@ robot reaches the container at ports that the engine publishes on the host.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
 import functools
@@ -17,7 +17,7 @@ import gzip
 import hashlib
 from pathlib import Path
 import re
-from typing import Any, ClassVar, Optional, TypedDict
+from typing import Any, ClassVar, Optional, TypedDict, TypeVar
 
 from fogros2 import errors, model, plugin_system, untrusted
 from fogros2.errors import FogError, MachineNotFound, ProviderError, Unsupported
@@ -41,6 +41,7 @@ from fogros2.shell import connect, Shell
 from fogros2.shell.command_line import checked
 from fogros2.store import robot_id, Store
 
+T = TypeVar('T')
 _SCHEME = 'hosted:'
 #: The container provider's id of a volume, which ends with its name.
 _VOLUME = re.compile('(?:podman|docker):fogros2-volume-([a-z0-9-]+)')
@@ -274,6 +275,30 @@ class HostedProvider(Provider):
         :raises Unsupported: it knows no host.
         :raises FogError: a host does not answer, after the machines of all others.
         """
+        yield from (machine for machine in self._everywhere('find', self._machine, tags=tags)
+                    if HOSTED in machine.tags)
+
+    def tidy(self, dead: Collection[str] = ()) -> list[str]:
+        """Remove what is left of machines on the hosts that this robot's records name."""
+        def read(host: str, words: Any) -> str:
+            with self._reading(host):
+                untrusted.checked(words, str)
+            return f'{words} on {self._host(host)[0].name}'
+
+        with contextlib.suppress(Unsupported):
+            return list(self._everywhere('tidy', read, dead=list(dead)))
+        return []
+
+    def _everywhere(
+        self, call: str, read: Callable[[str, Any], T], **given: Any,
+    ) -> Iterator[T]:
+        """
+        Call a method that returns a list on the hosts that this robot's records name.
+
+        :param read: checks and converts an item, which the host with this id has sent.
+        :raises Unsupported: it knows no host.
+        :raises FogError: a host does not answer, after the answers of all others.
+        """
         known = [*self._asked, *(
             record.spec.options['on'] for record in (
                 *Store().machines(), *(record for record, _ in Store().requests()))
@@ -287,15 +312,15 @@ class HostedProvider(Provider):
                 host = self._find_host(on)
                 if host in asked:
                     continue
-                answer = self._call(host, 'find', tags=tags)
+                answer = self._call(host, call, **given)
                 with self._reading(host):
                     untrusted.checked(answer, list[Any])
-                machines = [self._machine(host, report) for report in answer]
+                items = [read(host, item) for item in answer]
             except FogError as error:
                 failure = error
                 continue
             asked.add(host)
-            yield from (machine for machine in machines if HOSTED in machine.tags)
+            yield from items
         if failure is not None:
             raise failure
 

@@ -21,6 +21,7 @@ from fogros2.provider.container.engine import Engine
 ATTEMPT = 'fogros2-token'
 LOGIN = 'fogros2-login'
 MACHINE = 'fogros2-machine'
+#: The name of its folder, by which ``may_create`` recognises the engine's command.
 DIRECTORY = 'fogros2-directory'
 ENDS_STOPPED = 'fogros2-ends-stopped'
 VPN_PORT = 'fogros2-vpn-port'

@@ -18,6 +18,7 @@ from fogros2.provider.container.engine import Engine
 from fogros2.provider.container.entry import FOLDER
 from fogros2.provider.container.machine import (
     container_name,
+    directory,
     DIRECTORY,
     ENDS_STOPPED,
     LOGIN,
@@ -133,7 +134,7 @@ def common_flags(
     yield from ('--name', container_name(spec.name, request.tags), '--hostname', spec.name)
     labels = {
         **request.tags, LOGIN: options.user, MACHINE: spec.name,
-        DIRECTORY: '' if options.image else 'root', VPN_PORT: str(request.vpn_port),
+        DIRECTORY: directory(request.token).name, VPN_PORT: str(request.vpn_port),
     }
     if spec.on_exit == 'stop':
         labels[ENDS_STOPPED] = 'yes'
