@@ -295,14 +295,16 @@ def due(
             yield Due('leftovers of' if entry.gone else 'machine', entry.name, reason,
                       functools.partial(delete, entry, store, report))
         elif record is not None and not record.damage and not record.launch_alive:
+            # the record of a copied state folder lists ports of another computer's launch
+            machine = entry.machine if entry.own else None
             if dead:
                 reason = 'its launch is gone'
-            elif entry.machine is not None and any(made.kind in PORTS for made in record.made):
+            elif machine is not None and any(made.kind in PORTS for made in record.made):
                 reason = 'its launch could not close a port'
             else:
                 continue
             yield Due('leftovers of', entry.name, reason,
-                      functools.partial(let_go, record, entry.machine, store))
+                      functools.partial(let_go, record, machine, store))
     for record, age in store.requests():
         yield Due('machine', record.name, 'its provider had not answered the request for it',
                   functools.partial(end_request, record, age, store))
@@ -348,8 +350,9 @@ def why_end(
     if entry.gone:
         return 'gone at its provider' if entry.machine_id else 'its launch is gone'
     assert entry.machine is not None
-    if record is not None and record.launch and record.spec.on_exit == 'delete':
-        # also if it was made and not started yet
+    if record is not None and record.launch and (
+            record.spec.on_exit == 'delete' or record.machine_id is None):
+        # also if it was made and not started yet; without an id, no launch can keep it
         return 'its launch is gone'
     if entry.machine.state is MachineState.STOPPED:
         since = stopped_at if stopped_at is not None else entry.created
@@ -388,7 +391,7 @@ def let_go(record: Record, machine: Optional[Machine], store: Store) -> None:
     """
     Clean up after a dead launch whose machine is kept; the machine stays.
 
-    :param machine: as the provider reports it; None if it did not answer.
+    :param machine: as the provider reports it; None if its ports are not this robot's to close.
     :raises FogError: a resource could not be cleaned up.
     """
     with store.lock(record.name):

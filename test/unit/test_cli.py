@@ -391,7 +391,8 @@ def test_machine_of_a_silent_provider_is_not_forgotten() -> None:
     ({'expires': NOW - 600}, None, 'past its lifetime'),
     ({'state': MachineState.STOPPED, 'created': NOW - 30 * 86400}, {'launch': ''}, 'stopped'),
     ({'state': MachineState.STOPPED, 'created': NOW - 3600}, {'launch': ''}, ''),
-    # made, and not started yet
+    # made, and not started yet; and of a launch that did not learn its id
+    ({}, {'pid': 1, 'pid_start': 1, 'on_exit': 'stop', 'machine_id': None}, 'its launch is gone'),
     ({'state': MachineState.STOPPED}, {'pid': 1, 'pid_start': 1}, 'its launch is gone'),
     ({'state': MachineState.DELETED}, {'launch': ''}, 'gone at its provider'),
 ])
@@ -510,6 +511,11 @@ def test_gc_closes_the_ports_of_a_kept_machines_launch(
     assert closed == [('id-a', 8766, ()), ('id-a', 2222, ())]
     after = Store().load('a')
     assert (after.launch, after.notes, after.made) == ('', {}, (Made(undo.NODES),))
+    # of a copied state folder: another robot's launch may use the port
+    machine('a', robot='other-1')
+    record('a', on_exit='keep', made=ports, **dead())
+    assert run('gc') == 0 and run('gc') == 0
+    assert len(closed) == 2
 
 
 def test_gc_tries_ports_again_that_could_not_be_closed(

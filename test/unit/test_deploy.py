@@ -437,8 +437,16 @@ def test_ssh_port_stays_closed_after_the_launch_has_left(launch, provider, monke
     assert allowed == [(FAKE_ENDPOINT.port, ['198.51.100.7/32'])]
     assert launch.store.load('planner').made[-1].kind == undo.SSH_PORT
     mine.undo.close()
+    allowed.clear()
     with pytest.raises(Cancelled):
         connection.open_outside()
+    # nor a login that is still under way
+    monkeypatch.setattr(connecting, 'POLL_INTERVAL', 0.0)
+    monkeypatch.setattr(provider, 'robot_address', lambda: '198.51.100.8/32')
+    monkeypatch.setattr(provider, 'describe', lambda _: Machine(
+        '', '', '', MachineState.RUNNING))
+    connection._check()
+    assert allowed == []
 
 
 def test_a_machine_that_boots_slowly_has_the_time_of_its_boot(launch, provider, monkeypatch):
@@ -450,6 +458,8 @@ def test_a_machine_that_boots_slowly_has_the_time_of_its_boot(launch, provider, 
     assert 270 < connection._timeout() <= 280
     mine.record = dataclasses.replace(mine.record, host_key='its own')
     assert connection._timeout() == 60.0
+    mine.failed = False
+    assert connection._timeout() == connecting.LOGIN_TIMEOUT
 
 
 def test_failing_repair_is_reported_ever_more_seldom(launch, events, monkeypatch):

@@ -219,7 +219,8 @@ class Connection(Step):
             self._job.record
         if self._context.other_vpn is not None:
             return min(timeouts.ssh, VPN_TIMEOUT)
-        if not provider.capabilities.owned:
+        if not provider.capabilities.owned or not self._job.failed:
+            # while a machine that is up waits for its login, nobody chooses the path of its VPN
             return min(timeouts.ssh, LOGIN_TIMEOUT)
         boots = provider.capabilities.one_time_host_key and not record.host_key
         remaining = timeouts.boot - (time.time() - record.armed) if boots else 0.0
@@ -247,7 +248,7 @@ class Connection(Step):
         # a failed look-up is retried at the next check; the login's error is reported in the end
         with contextlib.suppress(FogError):
             if provider.robot_address() != self._allowed:
-                self._open_port()
+                self.open_outside()
 
     def _renew_host_key(self, endpoint: Endpoint) -> None:
         job = self._job
