@@ -227,7 +227,7 @@ ContainerProvider().create(spec, CreateRequest(
 
 
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGINT])
-def test_a_launch_that_ends_while_it_creates_leaves_all_or_nothing(cloud, number):
+def test_launch_that_ends_while_it_creates_leaves_all_or_nothing(cloud, number):
     """Tests that ``find`` knows what exists, and that ``destroy`` deletes all of it."""
     spec, token = cloud.spec(), str(uuid.uuid4())
     child = subprocess.Popen(

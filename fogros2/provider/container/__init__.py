@@ -32,7 +32,7 @@ from fogros2.errors import (
     Unsupported,
 )
 from fogros2.model import Command, CreateRequest, Machine, MachineSpec, MachineState, Volume
-from fogros2.provider import Attached, Capabilities, made_without, Provider, SETTLED
+from fogros2.provider import Attached, Capabilities, made_without, Provider, SETTLED, TAG_ROBOT
 from fogros2.provider.container import debian_root, hidden_files, login_ids, packet_filter
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import entry as container_entry
@@ -439,7 +439,8 @@ class ContainerProvider(Provider):
             for name in listed:
                 if name.startswith(prefix):
                     yield Volume(f'{engine.name}:{name}', name[len(prefix):], self.name,
-                                 engine.name, user=', '.join(_users_of(engine, name)))
+                                 engine.name, user=', '.join(map(
+                                     container_machine.name_of, _users_of(engine, name))))
 
     def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
         """Return nothing: the engine has mounted the volume, whose size has no limit."""
@@ -513,11 +514,11 @@ def _in_use(top: Path) -> bool:
     return False
 
 
-def _users_of(engine: Engine, volume: str) -> list[str]:
-    """Return the machines whose containers have a volume."""
-    names = engine.call('ps', '-a', f'--filter=volume={volume}', '--format', '{{.Names}}',
-                        what='looking at a volume').stdout.split()
-    return [name.removeprefix(container_machine.container_name('')) for name in names]
+def _users_of(engine: Engine, volume: str) -> list[dict[str, Any]]:
+    """Return the engine's reports of the containers that have a volume."""
+    listed = engine.call('ps', '-aq', f'--filter=volume={volume}',
+                         what='looking at a volume').stdout.split()
+    return engine.inspect(listed) if listed else []
 
 
 def _check_free(engine: Engine, name: str, container: str = '') -> None:
@@ -527,9 +528,13 @@ def _check_free(engine: Engine, name: str, container: str = '') -> None:
     :raises NameTaken: one has.
     """
     for user in _users_of(engine, container_machine.volume_name(name)):
-        if container_machine.container_name(user) != container:
-            raise NameTaken(f"the machine '{user}' has the volume '{name}'",
-                            f'end its launch, or: ros2 fog delete {user}')
+        if str(user['Name']).lstrip('/') != container:
+            machine, labels = container_machine.name_of(user), container_machine.labels_of(user)
+            robot = labels.get(TAG_ROBOT) if container_machine.HOSTED in labels else None
+            raise NameTaken(
+                f"the machine '{machine}'{f' of the robot {robot}' if robot else ''} has the "
+                f"volume '{name}'",
+                f"end its launch, or{' there' if robot else ''}: ros2 fog delete {machine}")
 
 
 @contextlib.contextmanager

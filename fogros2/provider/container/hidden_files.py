@@ -36,7 +36,8 @@ PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
 [ -e "$1/shown" ] || exit 0
 tries=0
 until [ -e "$1/hidden" ]; do
-    [ -e "$1/shown" ] && [ $((tries += 1)) -lt 3000 ] || { echo 'the search for hidden files did not end' >&2; exit 1; }
+    [ -e "$1/shown" ] && [ $((tries += 1)) -lt 3000 ] ||
+        { echo 'the search for hidden files did not end' >&2; exit 1; }
     sleep 0.02
 done
 [ -s "$1/hidden" ] || exit 0

@@ -104,6 +104,11 @@ def labels_of(entry: Mapping[str, Any]) -> dict[str, str]:
     return dict(entry['Config']['Labels'] or {})
 
 
+def name_of(entry: Mapping[str, Any]) -> str:
+    """Return the name of a container's machine; the container's own if it is no machine's."""
+    return labels_of(entry).get(MACHINE) or str(entry['Name']).lstrip('/')
+
+
 def address_of(entry: Mapping[str, Any]) -> str:
     """Return the container's first address, or ''."""
     networks = (entry.get('NetworkSettings') or {}).get('Networks') or {}

@@ -18,8 +18,8 @@ from fogros2.provider.container.engine import Engine
 from fogros2.provider.container.entry import FOLDER
 from fogros2.provider.container.machine import (
     container_name,
-    directory,
     DIRECTORY,
+    directory,
     ENDS_STOPPED,
     LOGIN,
     MACHINE,
