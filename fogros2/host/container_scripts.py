@@ -58,8 +58,11 @@ if [ -n "$rmw" ]; then
         if [ -n "$lacks" ]; then
             adding=fogros2-adding-$$
             trap '$as_root $engine rm -f $adding >/dev/null 2>&1' EXIT
+            # dash runs no EXIT trap for a signal, and a signal interrupts 'wait' alone
+            trap 'exit 143' HUP INT TERM
             $as_root $engine run --name $adding --user 0:0 --network host --log-driver none \\
-                "$image" sh -ec "$install" "ros-$distro-$(echo "$rmw" | tr _ -)" >&2
+                "$image" sh -ec "$install" "ros-$distro-$(echo "$rmw" | tr _ -)" >&2 &
+            wait $!
             command=$($as_root $engine image inspect -f '{{json .Config.Cmd}}' "$image")
             user=$($as_root $engine image inspect -f '{{.Config.User}}' "$image")
             [ "$command" != null ] || command='[]'

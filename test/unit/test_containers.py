@@ -414,7 +414,8 @@ case $1-$2 in
     create-*) echo looking ;;
     inspect-*) echo 0 ;;
     cp-*) for last in $HAS; do [ "$2" != "looking:$last" ] || exit 0; done; exit 1 ;;
-    run-*) echo 'what apt says' ;;
+    run-*) echo 'what apt says'
+        [ -z "$ABANDONED" ] || kill -s TERM 0 ;;
 esac
 """
 
@@ -474,6 +475,15 @@ def test_an_image_without_the_middleware_gets_it_once(engine):
     assert told[-1] == f'{engine} rm -f {adding}'
     name, told = done(fetch, THERE=f'ros:rolling {made}', DISTRO='rolling', HAS=set_up)
     assert name == made and not any(' run ' in line for line in told)
+
+
+def test_container_of_an_abandoned_layer_goes(engine):
+    command = containers.fetch('ros:rolling', 'rmw_cyclonedds_cpp')
+    ended = subprocess.run(command.argv, start_new_session=True, env={
+        **os.environ, 'THERE': 'ros:rolling', 'DISTRO': 'rolling',
+        'HAS': '/opt/ros/rolling/setup.sh', 'ABANDONED': 'yes'})
+    assert ended.returncode == 143
+    assert notes()[-1].startswith(f'{engine} rm -f fogros2-adding-')
 
 
 @pytest.mark.parametrize(('command', 'user', 'kept'), [

@@ -75,6 +75,7 @@ until install -d -m 700 "${top%/*}" && mkdir -m 700 "$top" 2>/dev/null; do
     tries=$((tries + 1))
 done
 trap failed EXIT
+# dash runs no EXIT trap for a signal, and a signal interrupts 'wait' alone
 trap 'exit 143' HUP INT TERM
 mount --bind -o nosuid,nodev "$top" "$top"
 mkdir "$top/root" "$top/hooks"
@@ -90,7 +91,6 @@ printf '%s' "$shown" >"$top/shown"
 python3 -IS -c "$look" "$top" </dev/null >/dev/null 2>&1 &
 search=$!
 tar -xpf - --numeric-owner -C "$top/root"
-# a signal interrupts 'wait' alone
 "$@" &
 wait $!
 """

@@ -62,6 +62,7 @@ _KEEP = _FOLDER + """\
 mkdir -p "${folder%/*}"
 aside=$(mktemp -d "$folder.XXXXXX")
 trap 'rm -rf -- "$aside"' EXIT
+trap 'exit 143' HUP INT TERM
 tar -xzf - --no-same-owner -C "$aside"
 mv -T "$aside" "$folder" 2>/dev/null || [ -d "$folder" ]
 """
