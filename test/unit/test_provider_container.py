@@ -496,7 +496,9 @@ def test_packages_of_a_container_image_are_its_own(options, own):
     assert container.ContainerProvider().has_own_packages(spec) is own
 
 
-def test_request_may_create_while_a_program_works_at_it():
+def test_request_may_create_while_a_program_works_at_it(monkeypatch, tmp_path):
+    monkeypatch.setattr(container_machine, 'ROOTS', tmp_path)
+    monkeypatch.setattr(os, 'geteuid', lambda: 0)
     provider, token = container.ContainerProvider(), secrets.token_hex(8)
     # the engine's command, which has no token
     words = list(container_options.common_flags(

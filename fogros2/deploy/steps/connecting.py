@@ -220,7 +220,7 @@ class Connection(Step):
         if self._context.other_vpn is not None:
             return min(timeouts.ssh, VPN_TIMEOUT)
         if not provider.capabilities.owned or not self._job.failed:
-            # while a machine that is up waits for its login, nobody chooses the path of its VPN
+            # the login to a machine that is up delays the next choice of its VPN's path
             return min(timeouts.ssh, LOGIN_TIMEOUT)
         boots = provider.capabilities.one_time_host_key and not record.host_key
         remaining = timeouts.boot - (time.time() - record.armed) if boots else 0.0

@@ -368,15 +368,17 @@ class ContainerProvider(Provider):
         return _in_use(container_machine.directory(token))
 
     def tidy(self, dead: Collection[str] = ()) -> list[str]:
-        """Remove the folders of machines without a container: their creations were killed."""
-        ended = {container_machine.directory(token) for token in dead}
-        if container_machine.ROOTS.is_dir():
-            listed = process.run(
-                Command(('find', str(container_machine.ROOTS), '-mindepth', '1', '-maxdepth', '1',
-                         '-mmin', f'+{SETTLED / 60:g}'), sudo=True, what='look for old folders'),
-                timeout=30.0, check=False).stdout.splitlines()
-            ended |= {Path(line) for line in listed if re.fullmatch('.*/[0-9a-f]{16}', line)}
-        # in this order: a creation ends with a container
+        """Remove the folders of machines without a container, such as of a killed creation."""
+        roots = container_machine.ROOTS
+        if not roots.is_dir() and not container_machine.SHARED.is_dir():
+            return []
+        listed = process.run(
+            Command(('find', str(roots), '-mindepth', '1', '-maxdepth', '1', '-mmin',
+                     f'+{SETTLED / 60:g}'), sudo=True), timeout=30.0, check=False).stdout
+        ended = {*map(container_machine.directory, dead), *(
+            Path(line) for line in listed.splitlines()
+            if re.fullmatch('.*/[0-9a-f]{16}', line))}
+        # before the search for containers: a creation that ends meanwhile leaves one
         ended = {top for top in ended if not _in_use(top)}
         if ended:
             ended -= {container_machine.directory(
