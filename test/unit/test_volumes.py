@@ -14,7 +14,7 @@ import pytest
 
 from fogros2.errors import Cancelled, ConfigurationError, FogError, NameTaken
 from fogros2.model import MachineSpec, Volume
-from fogros2.provider import container, ssh
+from fogros2.provider import container, ssh, TAG_ROBOT
 from fogros2.provider.container import machine as container_machine
 from fogros2.provider.kubernetes import claims, names
 from fogros2_features.volumes import Volumes
@@ -76,14 +76,22 @@ def test_a_name_of_several_volumes_deletes_none() -> None:
 
 @pytest.mark.parametrize(('containers', 'error'), [
     ('fogros2-one', ''),
-    ('fogros2-two fogros2-one', "'two' has the volume 'models'"),
+    ('fogros2-two fogros2-one', "'two' has the volume 'models' .*or: ros2 fog delete two"),
+    ('fogros2-two-1a2b3c4d', "'two' of the robot lab-1 has .*there: ros2 fog delete two"),
     ('', "'one' of an earlier launch has no volume 'models'"),
 ])
 def test_container_has_a_volume_alone(
     monkeypatch: pytest.MonkeyPatch, containers: str, error: str,
 ) -> None:
     """Of two launches at once, each may have created a container; a kept one may lack it."""
-    engine = SimpleNamespace(call=lambda *_, **__: SimpleNamespace(stdout=containers))
+    def report(name: str) -> dict[str, Any]:
+        _, machine, *hosted = name.split('-')
+        return {'Name': f'/{name}', 'Config': {'Labels': {
+            container_machine.MACHINE: machine, TAG_ROBOT: 'lab-1',
+            **dict(zip([container_machine.HOSTED], hosted))}}}
+
+    engine = SimpleNamespace(call=lambda *_, **__: SimpleNamespace(stdout=containers),
+                             inspect=lambda names: [report(name) for name in names])
     monkeypatch.setattr(container, '_inspected', lambda machine_id: (
         engine, 'id', {'Config': {'Labels': {container_machine.MACHINE: 'one'}}}))
     with pytest.raises(NameTaken, match=error) if error else contextlib.nullcontext():
