@@ -126,10 +126,12 @@ name=$1 gpus=$2 workspace=$3 grace=$4 inside=$5; shift 5
 asked= late=
 passed_on() {
     asked=1
-    first=$($as_root $engine inspect -f '{{.State.Pid}}' "$name" 2>/dev/null)
+    state=$($as_root $engine inspect -f '{{.State.Pid}} {{.State.Status}}' "$name" 2>/dev/null)
+    first=${state%% *}
     node=$(cat "/proc/$first/task/$first/children" 2>/dev/null)
     if [ -n "$node" ]; then $as_root kill -s "$1" $node
-    else
+    elif [ "$state" = '0 created' ] || [ "$state" = '0 configured' ] \\
+            || grep -qs . "/proc/$first/cmdline"; then
         # it is starting: its first process reacts only to SIGKILL
         $as_root $engine kill "$name" >/dev/null 2>&1
         $as_root $engine rm -f "$name" >/dev/null 2>&1

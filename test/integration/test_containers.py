@@ -243,6 +243,17 @@ def test_node_in_an_image_receives_signals(
     assert there(launch) == []
 
 
+def test_node_in_an_image_keeps_exit_code_of_first_signal(image, launch, tmp_path):
+    process = node(image, launch, tmp_path, 'sh', '-c',
+                   "trap 'exit 4' INT USR1 TERM; echo up; while :; do busybox sleep 0.01; done")
+    assert process.stdout.readline() == 'up\n'
+    for asked in (signal.SIGINT, signal.SIGUSR1, signal.SIGTERM):
+        process.send_signal(asked)
+    process.communicate(timeout=60)
+    assert process.returncode == 4
+    assert there(launch) == []
+
+
 @pytest.mark.parametrize('moment', ['variables-*', 'container-there'])
 def test_node_interrupted_before_its_start_ends(image, launch, tmp_path, moment):
     process = node(image, launch, tmp_path, 'sh', '-c', 'exec busybox sleep 1000')
