@@ -136,8 +136,13 @@ class Graphs:
         for launch, one in launches.items():
             graph = self._graph(launch, one)
             if graph is not None:
-                graph.know({record.name: nodes for record, nodes in machines
-                            if record.launch == launch}, pictures=self._pictures)
+                # streams are named after the launch's other machines too
+                known: dict[str, Sequence[str]] = {
+                    record.name: () for record in self._store.machines()
+                    if record.launch == launch}
+                known.update((record.name, nodes) for record, nodes in machines
+                             if record.launch == launch)
+                graph.know(known, pictures=self._pictures)
         trouble = [why for launch, (_, why) in self._refused.items()
                    if launch in launches and launch not in self._graphs]
         return {

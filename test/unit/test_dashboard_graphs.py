@@ -59,13 +59,16 @@ def test_output_of_a_graph_program_is_collected(
 ) -> None:
     instead(monkeypatch, PROGRAM)
     record = launched()
+    # a machine that is not looked at, and one of another launch
+    for name, launch in (('b', 'abc123'), ('c', 'def456')):
+        Store().save(Record(name, 'memory', MachineSpec(name, 'memory'), launch=launch))
 
     def told() -> Any:
         state = several.update([(record, ('talker',))])
         return state if state['topics'] else None
 
     state = wait_until(told, timeout=60.0, what='its word')
-    assert state['topics'] == [{'a': ['talker']}, '42'] and state['graph_trouble'] == []
+    assert state['topics'] == [{'a': ['talker'], 'b': []}, '42'] and state['graph_trouble'] == []
     camera, odd = state['streams']
     assert (camera['id'], camera['picture'], odd['note']) == ('abc123 /camera', 7, 'bayer')
     assert several.picture('abc123 /camera') == b'jpeg'
