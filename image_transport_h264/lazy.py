@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-import signal
 import threading
 from typing import Any, Optional
 
@@ -16,7 +15,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from image_transport_h264 import memory
+from image_transport_h264 import ending, memory
 from image_transport_h264.acknowledgement import wait_for_all_acked
 from image_transport_h264.worker import Worker
 
@@ -59,29 +58,19 @@ def printable(text: str) -> str:
 
 def run(kind: Callable[[], LazyNode]) -> None:
     """Run a node until a signal; exit with status 1 if its worker failed."""
-    interrupted = False
-
-    def interrupt(number: int, frame: object) -> None:
-        nonlocal interrupted
-        interrupted = True
-        raise KeyboardInterrupt
-
     memory.keep()
-    signal.signal(signal.SIGINT, interrupt)
-    rclpy.init()
+    ending.init()
     node: Optional[LazyNode] = None
     try:
         node = kind()
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy shuts down already, in its own thread; do not do it twice
+    except ExternalShutdownException:
+        pass
     except Exception:
-        # an interrupt while rclpy converts a message, or before it waits, is an error of these
-        if not interrupted and rclpy.ok():
+        # a signal before the node is complete, or while it publishes, is an error of rclpy
+        if rclpy.ok():
             raise
     finally:
-        # A second Ctrl-C must not interrupt the clean-up.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
         failed = node is not None and node.failed
         if node is not None:
             node.destroy_node()

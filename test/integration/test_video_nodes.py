@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
-from typing import Any
+from typing import Any, Optional
 
 import pytest
 
@@ -357,47 +357,50 @@ def test_a_second_interrupt_while_it_ends_changes_nothing(bench: Bench) -> None:
         decoder.send_signal(signal.SIGCONT)
 
 
-#: A node of image_transport_h264 in whose callback an interrupt, or the end of the input, becomes
-#: an error, as an interrupt does in ROS 2's rclpy while it converts an image.
-CONVERTING = """
+#: A node whose callback raises an error: as rclpy does after a signal, or without one.
+FAILING = """
 import sys
+import threading
 from image_transport_h264.lazy import LazyNode, run
 
 
-class Converting(LazyNode):
+class Failing(LazyNode):
     def __init__(self):
-        super().__init__('converting')
-        self.create_timer(0.001, self.convert)
+        super().__init__('failing')
+        self.ended = threading.Event()
+        self.context.on_shutdown(self.ended.set)
+        self.create_timer(0.001, self.fail_once)
 
-    def convert(self):
+    def fail_once(self):
         print('begins', flush=True)
-        try:
-            sys.stdin.read()
-        except KeyboardInterrupt:
-            pass
+        if len(sys.argv) > 1:
+            self.ended.wait()
+        print('goes on', file=sys.stderr)
         raise TypeError('Unable to convert call argument')
 
 
-run(Converting)
+run(Failing)
 """
 
 
-@pytest.mark.parametrize(('interrupted', 'status'), [(True, 0), (False, 1)])
-def test_error_after_an_interrupt_is_no_failure(
-    bench: Bench, interrupted: bool, status: int,
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, None])
+def test_signal_ends_node_after_its_callback(
+    bench: Bench, number: Optional[signal.Signals],
 ) -> None:
-    with subprocess.Popen([sys.executable, '-c', CONVERTING], env=bench.environment, text=True,
-                          stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                          stderr=subprocess.STDOUT) as node:
-        assert node.stdin is not None and node.stdout is not None
+    with subprocess.Popen([sys.executable, '-c', FAILING, *['signal'] * bool(number)],
+                          env=bench.environment, text=True,
+                          stdout=subprocess.PIPE, stderr=subprocess.PIPE) as node:
+        assert node.stdout is not None
         assert node.stdout.readline() == 'begins\n'
-        if interrupted:
-            node.send_signal(signal.SIGINT)
-        else:
-            node.stdin.close()
-        said = node.stdout.read()
-        assert node.wait(60) == status
-        assert ('Traceback' in said) is (not interrupted), said
+        if number:
+            node.send_signal(number)
+        try:
+            _, output = node.communicate(timeout=60)
+        finally:
+            node.kill()
+        assert 'goes on' in output
+        assert ('Traceback' in output) is (number is None), output
+        assert node.returncode == (number is None)
 
 
 #: A node that is interrupted, or fails, before it is there.
