@@ -29,9 +29,10 @@ class InviteVerb(VerbExtension):
         parser.add_argument('--key', required=True,
                             help='what `ros2 fog key` prints on the other computer')
         parser.add_argument('--for', dest='seconds', default='1h', metavar='TIME',
-                            help='how long it may join, such as 10m or 2h (default: 1h)')
+                            help='validity of the invitation, such as 10m or 2h (default: 1h)')
         parser.add_argument('--address', metavar='HOST',
-                            help='where it reaches the machine (default: as the provider says)')
+                            help='address at which the other computer reaches the machine '
+                                 '(default: the one that the provider reports)')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the invitation, which only the other computer can open."""
@@ -43,13 +44,14 @@ class InviteVerb(VerbExtension):
 
 
 class RevokeVerb(VerbExtension):
-    """Remove a computer that was invited from a machine; without WHO, all of them."""
+    """Withdraw the access of invited computers to a machine."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
         add_name(parser)
         parser.add_argument('who', nargs='?', metavar='WHO',
-                            help='name, VPN address or key, as `ros2 fog status` shows them')
+                            help='name, VPN address or key of one, as in `ros2 fog status` '
+                                 '(default: all invited computers)')
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print who was removed."""
@@ -81,7 +83,7 @@ class JoinVerb(VerbExtension):
 
 
 class LeaveVerb(VerbExtension):
-    """Leave a machine that this computer has joined; its nodes here have to end before."""
+    """Leave a machine that this computer has joined; first end its nodes here."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""

@@ -9,7 +9,7 @@ from ros2fog_cli.verb import VerbExtension, warn
 
 
 class BugreportVerb(VerbExtension):
-    """Print what a report of a bug needs of this computer, without secrets."""
+    """Print the facts about this computer for a bug report, without secrets."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add no arguments."""

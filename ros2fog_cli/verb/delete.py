@@ -29,9 +29,9 @@ class DeleteVerb(VerbExtension):
         add_deletion(parser)
         parser.add_argument(
             '--force', action='store_true',
-            help='even if a launch runs, or if the computer or its provider does not answer')
+            help='delete even if a launch runs, or if the machine or its provider does not answer')
         parser.add_argument('--any-robot', action='store_true',
-                            help="also machines of other robots with that name, or with 'all'")
+                            help="include other robots' machines: of that name, or 'all'")
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Delete the machines; return 1 if something still exists."""

@@ -79,7 +79,7 @@ def _create(args: argparse.Namespace) -> int:
         description='Build the image for pods, with all in it that a launch from this terminal '
                     'would install, and push it.')
     parser.add_argument('--registry', required=True,
-                        help="where to push it, such as 'registry.example/robots'")
+                        help="registry to push the image to, such as 'registry.example/robots'")
     parser.add_argument('--base', default='', help='base image')
     parser.add_argument('--workspace', help='workspace whose dependencies are installed (default: '
                                             "the sourced one; '' for none)")

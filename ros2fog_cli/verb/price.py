@@ -31,15 +31,15 @@ class PriceVerb(VerbExtension):
         parser.add_argument('--min-cpu', type=int, metavar='N', help='vCPUs (default: 2)')
         parser.add_argument('--min-memory', type=float, metavar='GB', help='memory (default: 4)')
         parser.add_argument('--gpu', nargs='?', const='1', metavar='N|NAME',
-                            help="how many GPUs of NVIDIA's, or one of this name, such as L4")
-        parser.add_argument('--gpu-memory', type=float, metavar='GB', help='of each GPU')
+                            help='number of NVIDIA GPUs, or the name of a GPU, such as L4')
+        parser.add_argument('--gpu-memory', type=float, metavar='GB', help='memory of each GPU')
         parser.add_argument('--arch', help="x86_64, arm64 or any (default: this computer's)")
         parser.add_argument('--cpu-type', choices=('intel', 'amd', 'aws'),
-                            help="the processor's maker")
-        parser.add_argument('--max-price', metavar='DOLLARS', help='an hour, at the most')
+                            help='maker of the processor')
+        parser.add_argument('--max-price', metavar='DOLLARS', help='maximum price of an hour')
         parser.add_argument('--max-round-trip', type=float, metavar='MS',
                             help='search all regions within this time from here')
-        parser.add_argument('--spot', action='store_true', help='spot prices count')
+        parser.add_argument('--spot', action='store_true', help='include spot prices')
         region = parser.add_argument(
             '--region', nargs='*', metavar='REGION',
             help="of any cloud, 'all' for every one, 'nearest' for that of each cloud (default: "
@@ -53,7 +53,7 @@ class PriceVerb(VerbExtension):
                             help='do not use prices of the last 24 hours')
         provider = parser.add_argument(
             '--provider', metavar='PROVIDER', default='all',
-            help="whose prices (default: 'all' that are set up)")
+            help="provider of the prices (default: 'all' that are set up)")
         complete(provider, cloud_names)
         add_json(parser)
 

@@ -20,12 +20,12 @@ class RegionsVerb(VerbExtension):
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
-        complete(parser.add_argument('region', nargs='*', help='these alone'), region_names)
+        complete(parser.add_argument('region', nargs='*', help='only these regions'), region_names)
         parser.add_argument('--all', action='store_true',
-                            help='also those that an account has to enable first')
+                            help='also list regions that an account has to enable first')
         complete(parser.add_argument(
             '--provider', metavar='PROVIDER',
-            help='whose regions (default: the first one that is set up)'), provider_names)
+            help='provider to ask (default: the first one that is set up)'), provider_names)
         add_json(parser)
 
     def main(self, *, args: argparse.Namespace) -> int:

@@ -14,7 +14,7 @@ class SshConfigVerb(VerbExtension):
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
         complete(parser.add_argument('name', nargs='*',
-                                     help='these machines alone (default: all that run)'),
+                                     help='only these machines (default: all that run)'),
                  machine_names)
 
     def main(self, *, args: argparse.Namespace) -> int:

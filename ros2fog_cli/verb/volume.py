@@ -61,7 +61,7 @@ class VolumeVerb(VerbExtension):
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--host', action='append', default=[],
-                        help='an SSH host to ask, too; may be repeated')
+                        help='SSH host to ask as well; may be repeated')
     add_region(parser)
     add_deletion(parser)
     add_json(parser)
