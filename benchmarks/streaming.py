@@ -386,7 +386,7 @@ class Outcome:
     worst: float
     cpu_robot: float
     cpu_cloud: float
-    busy: Optional[float] = None
+    busy: float = math.nan
     computer: str = ''
     date: str = ''
 
@@ -584,7 +584,7 @@ def table(title: str, outcomes: list[Outcome], limits: dict[str, float], note: s
             f'{o.p95:.1f} | {o.p99:.1f} | '
             f"{'' if most is None else f'{most:.1f}'} | {o.lost} | {o.size:.0f} | "
             f'{o.psnr:.1f} | {o.worst:.1f} | {o.ssim:.3f} | {o.cpu_robot:.0f} | '
-            f"{o.cpu_cloud:.0f} | {'' if o.busy is None else f'{o.busy:.0f}'} | "
+            f"{o.cpu_cloud:.0f} | {'' if math.isnan(o.busy) else f'{o.busy:.0f}'} | "
             f'{o.case.published} |')
     return '\n'.join([*lines, ''])
 

@@ -36,7 +36,9 @@ _PACKAGES = (
     r'file /run/lock/subsys', r'file /usr/local/(lib/python3[.\d]*|share/fonts)(/.*)?')
 #: The records of ROS 2 and sudo, and what pytest keeps of its last three runs.
 _TOOLS = (rf'file /home/{USER}/(\.ros|\.sudo_as_admin_successful)(/.*)?', r'file /run/sudo(/.*)?',
-          rf'file /tmp/pytest-of-({USER}|root)(/.*)?')
+          rf'file /tmp/pytest-of-({USER}|root)(/.*)?',
+          # of LTTng, which rclpy's tracing loads: one for each of its versions and users
+          r'file /dev/shm/lttng-ust-wait-\d+(-\d+)?')
 #: The folders of FogROS2's own state, as long as they are empty, and the robot's id, which stays.
 _STATE = (rf'file /home/{USER}/\.local(/state(/fogros2(/(machines|launches))?)?)?',
           rf'file /home/{USER}/\.config(/fogros2(/robot\.json)?)?')
@@ -45,8 +47,8 @@ _OTHERS = re.compile('|'.join((*_PODMAN, *_PACKAGES, *_TOOLS, *_STATE)), re.DOTA
 NOT_COUNTED = (
     "Not counted as left behind: the project's folder, the user's cache, podman's own (storage, "
     'locks, an empty control group, its firewall chains), what scripts of packages make, the logs '
-    "of ROS 2, FogROS2's state folder while it is empty, the file of the robot's id, and the "
-    'folder in which pytest keeps its last runs.')
+    "of ROS 2, LTTng's files of each user that has run a node, FogROS2's state folder while it is "
+    "empty, the file of the robot's id, and the folder in which pytest keeps its last runs.")
 #: Seconds for processes that are ending by themselves.
 _GRACE = 15.0
 _COMMANDS = {

@@ -90,6 +90,8 @@ def settings(name: str, to: Endpoint, folder: Path) -> str:
 def include(store: Store) -> str:
     """Return the line for the user's configuration."""
     root = glob.escape(str(store.root.absolute())).replace('\\', 4 * '\\')
+    # newer versions of OpenSSH expand '%h'; older ones take '%%' as it is
+    root = root.replace('%', '?')
     return f"Include {_path(f'{root}/machines/*/{FILE}')}"
 
 
