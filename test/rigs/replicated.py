@@ -53,7 +53,7 @@ client.wait_for_service()
 number = by = 0
 while rclpy.ok():
     number += 1
-    dies = by if number % {BETWEEN} == 0 else -1
+    dies = by if number % {BETWEEN} == 0 and by != {ROBOT} else -1  # none is left after it
     begin = time.monotonic()
     future = client.call_async(ListParameters.Request(prefixes=[str(number), str(dies)]))
     rclpy.spin_until_future_complete(node, future, timeout_sec=30)
