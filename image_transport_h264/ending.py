@@ -32,7 +32,8 @@ def init() -> None:
 
 
 def _ignore_further(*_: object) -> None:
-    # Python restores the default handlers before it ends.
+    # SIG_IGN stays to the end of the process. Python replaces its handlers by the default ones
+    # before that, and a second signal would kill the process.
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 

@@ -90,7 +90,7 @@ def settings(name: str, to: Endpoint, folder: Path) -> str:
 def include(store: Store) -> str:
     """Return the line for the user's configuration."""
     root = glob.escape(str(store.root.absolute())).replace('\\', 4 * '\\')
-    # newer versions of OpenSSH expand '%h'; older ones take '%%' as it is
+    # OpenSSH 10 expands '%h', and 9 does not read '%%' as '%'; both match it by '?'
     root = root.replace('%', '?')
     return f"Include {_path(f'{root}/machines/*/{FILE}')}"
 
