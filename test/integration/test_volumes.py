@@ -165,3 +165,20 @@ def test_two_volumes_at_once_get_no_common_path(tmp_path: Path) -> None:
         ('unshare', '-m', 'flock', str(path), 'sh', '-ec', volumes._MOUNT, 'sh', 'models',
          str(path), 'root', 'fogt-none', str(folder)), sudo=True), timeout=60.0, check=False)
     assert (result.returncode, result.stderr) == (1, f'{path} has another volume\n')
+
+
+def test_volume_has_its_locks_until_it_is_unmounted(tmp_path: Path) -> None:
+    path, programs, name = tmp_path / 'data', tmp_path / 'bin', f'models-{uuid.uuid4().hex[:6]}'
+    programs.mkdir()
+    umount = programs / 'umount'
+    umount.write_text(f'#!/bin/sh\n[ -e /run/lo.volume-{name} ] && exec /usr/bin/umount "$@"\n')
+    umount.chmod(0o755)
+    result = process.run(Command(('unshare', '-m', 'sh', '-ec', """
+sh -ec "$1" sh "$2" "$3" root lo "$4"
+mountpoint -q "$3"
+PATH=$5:$PATH sh -ec "$6" sh "$2" "$3" lo yes
+mountpoint -q "$3" || echo unmounted
+""", 'sh', volumes._MOUNT, name, str(path), str(tmp_path / 'models'), str(programs),
+        volumes._UNMOUNT), sudo=True), timeout=60.0, check=False)
+    assert (result.returncode, result.stdout) == (0, 'unmounted\n'), result.stderr
+    wait_until(lambda: not path.exists(), timeout=10.0, what='the folder to go')
