@@ -94,8 +94,8 @@ else
 fi
 [ "$(stat -c %u -- "$path")" = "$(id -u "$user")" ] || chown -Rh -- "$user:" "$path"
 """
-# $1 name, $2 path, $3 interface, $4 not empty: unmount it. All files are on the disk then. The mark
-# goes last, because the process with the locks unmounts when it is gone.
+# $1 name, $2 path, $3 interface, $4 not empty: unmount it. All files are on the disk then.
+# The mark goes last, because the process with the locks unmounts when it is gone.
 _UNMOUNT = """\
 [ -e "/run/$3.volume-$1" ] || exit 0  # another launch's
 if [ -n "$4" ] && mountpoint -q -- "$2"; then
