@@ -28,6 +28,27 @@ if TYPE_CHECKING:
 GROUP = 'fogros2.feature'
 
 
+@dataclasses.dataclass(frozen=True)
+class Cost:
+    """
+    What a machine costs its launch.
+
+    :param price: US dollars per hour, None if unknown.
+    :param seconds: for which it has run in the launch, 0 before it exists.
+    :param ended: whether it costs nothing any more.
+    """
+
+    spec: MachineSpec
+    price: Optional[Decimal]
+    seconds: float = 0.0
+    ended: bool = False
+
+    @property
+    def spent(self) -> Decimal:
+        """US dollars so far, 0 if the price is unknown."""
+        return (self.price or Decimal(0)) * Decimal(self.seconds) / 3600
+
+
 class RunningMachine(Protocol):
     """
     A machine that is up, as features see it.
@@ -52,10 +73,6 @@ class RunningMachine(Protocol):
     @property
     def lost(self) -> str:
         """Why the machine is gone or must not be used any more, '' while it is there."""
-
-    @property
-    def cost(self) -> tuple[Optional[Decimal], Decimal]:
-        """US dollars per hour, None if unknown, and what its launch has spent so far."""
 
     def run(self, command: Command, *, timeout: float) -> str:
         """
@@ -182,6 +199,14 @@ class RunningLaunch(Protocol):
         """The machines that nodes need so far, by name."""
 
     @property
+    def costs(self) -> Sequence[Cost]:
+        """The costs of all machines, as ``Feature.lifetime`` gets them."""
+
+    @property
+    def folder(self) -> Path:
+        """The launch's folder on the robot, which ends with the launch."""
+
+    @property
     def interface(self) -> str:
         """The name of the robot's VPN interface."""
 
@@ -306,17 +331,17 @@ class Feature:
         """
 
     def lifetime(
-        self, spec: MachineSpec, price: Optional[Decimal], spent: Decimal, own: Any, *,
-        made: bool,
+        self, spec: MachineSpec, costs: Sequence[Cost], own: Any, *, made: bool,
     ) -> float:
         """
         Return the most seconds that a machine may have from now on.
 
-        Called when its choices are made, when its provider confirms the price, and before its
-        first node starts.
+        Called when its choices are made, when its provider confirms the price, before its first
+        node starts, and before the launch creates another machine. A later call may shorten the
+        time, and never makes it longer.
 
-        :param price: US dollars per hour, None if the provider tells none.
-        :param spent: what the launch has spent on machines of this name so far, in US dollars.
+        :param costs: of this machine and all others of the launch: those that have ended, those
+            that run, and those that will be created.
         :param made: whether the machine exists.
         :raises FogError: there is no such time.
         """

@@ -12,6 +12,7 @@ from typing import Optional
 
 from fogros2 import feature, model, plan
 from fogros2.errors import FogError
+from fogros2.feature import Cost
 from fogros2.model import MachineSpec
 from fogros2.provider import Provider
 from fogros2.provider.cheapest import Cheapest
@@ -31,9 +32,10 @@ class Choices:
         self._lock = threading.Lock()
         self._resolved: dict[str, MachineSpec] = {}
         self._places: dict[str, list[MachineSpec]] = {}
-        #: Of each machine that exists, and of those that have ended.
-        self._costs: dict[str, tuple[Decimal, float, Optional[float]]] = {}
-        self._ended: list[tuple[str, Decimal, float]] = []
+        #: Of each machine that exists or will be created, with the time when it began, and of
+        #: those that have ended.
+        self._costs: dict[str, tuple[Cost, Optional[float]]] = {}
+        self._ended: list[Cost] = []
 
     def resolved(self, spec: MachineSpec) -> MachineSpec:
         """
@@ -50,8 +52,7 @@ class Choices:
         with step(self._report, spec.name, 'choices') as detail:
             chosen = provider.resolve(spec)
             detail += provider.choices(spec, chosen)
-            price = self.price(chosen)
-            if price is not None:
+            if price := self.price(chosen):
                 detail.append(plan.price(price))
         self._resolved[key] = chosen
         return chosen
@@ -82,52 +83,45 @@ class Choices:
         except FogError:
             return None  # the price is only displayed; a price limit was checked before
 
-    def limited(
-        self, spec: MachineSpec, price: Optional[Decimal], *, made: bool = False,
-    ) -> MachineSpec:
+    def limited(self, spec: MachineSpec, *, made: bool = False) -> MachineSpec:
         """
-        Return a spec with the lifetime that its features allow.
+        Return a spec that is ``expected`` with the lifetime that its features allow.
 
-        :param price: US dollars per hour, None if unknown.
         :param made: whether the machine exists.
         :raises FogError: they allow none.
         """
-        _, spent = self.spent(spec.name)
+        costs = self.costs()
         return dataclasses.replace(spec, lifetime=min([spec.lifetime, *(
-            each.lifetime(spec, price, spent, own, made=made)
-            for each, own in feature.used(spec))]))
+            each.lifetime(spec, costs, own, made=made) for each, own in feature.used(spec))]))
 
-    def begin(self, name: str, price: Optional[Decimal]) -> None:
-        """Start to count a machine's cost; a later call changes the price, not the start."""
-        if price is None:
-            return
+    def expect(self, spec: MachineSpec, price: Optional[Decimal]) -> None:
+        """
+        Count a machine, before it exists too; a later call changes spec and price.
+
+        :param price: US dollars per hour, None if unknown.
+        """
         with self._lock:
-            begin = time.monotonic()
-            if name in self._costs:
-                before, since, end = self._costs[name]
-                if end is None:
-                    begin = since
-                else:
-                    self._ended.append((name, before, end - since))
-            self._costs[name] = (price, begin, None)
+            _, begin = self._costs.get(spec.name, (None, None))
+            self._costs[spec.name] = Cost(spec, price), begin
+
+    def begin(self, name: str) -> None:
+        """Let an expected machine cost from now on; idempotent."""
+        with self._lock:
+            cost, begin = self._costs[name]
+            self._costs[name] = cost, time.monotonic() if begin is None else begin
 
     def end(self, name: str) -> None:
         """Stop to count a machine's cost; idempotent."""
         with self._lock:
-            known = self._costs.get(name)
-            if known is not None and known[2] is None:
-                self._costs[name] = (known[0], known[1], time.monotonic())
+            cost, begin = self._costs.pop(name, (None, None))
+            if cost is not None and begin is not None:
+                self._ended.append(dataclasses.replace(
+                    cost, seconds=time.monotonic() - begin, ended=True))
 
-    def spent(self, name: str) -> tuple[Optional[Decimal], Decimal]:
-        """Return a machine's US dollars per hour, None if unknown, and its cost so far."""
-        costs = [(price, price * Decimal(seconds) / 3600)
-                 for each, price, seconds in self.cost() if each == name]
-        return (costs[-1][0] if costs else None), sum((cost for _, cost in costs), Decimal(0))
-
-    def cost(self) -> list[tuple[str, Decimal, float]]:
-        """Return (name, US dollars per hour, seconds) of each machine with a known price."""
+    def costs(self) -> list[Cost]:
+        """Return what all machines of the launch cost, in the order of their names."""
         now = time.monotonic()
         with self._lock:
             return sorted([*self._ended, *(
-                (name, price, (now if end is None else end) - begin)
-                for name, (price, begin, end) in self._costs.items())], key=lambda one: one[0])
+                dataclasses.replace(cost, seconds=0.0 if begin is None else now - begin)
+                for cost, begin in self._costs.values())], key=lambda cost: cost.spec.name)

@@ -38,6 +38,8 @@ class Context:
     :param programs: the (package, executable) pairs that are known to run on the machine.
     :param images: the container images that nodes on the machine are known to run in.
     :param other_vpn: the VPN of another robot in which the machine is; None: the launch's.
+    :param shorten_others: shortens the lifetimes of the launch's other machines where features
+        allow less since this machine costs, too.
     """
 
     launch: str
@@ -57,6 +59,7 @@ class Context:
     programs: Sequence[tuple[str, str]] = ()
     images: Sequence[str] = ()
     other_vpn: Optional[OtherVpn] = None
+    shorten_others: Callable[[], None] = lambda: None
 
     @property
     def capabilities(self) -> Capabilities:

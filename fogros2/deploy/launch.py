@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent import futures
 from concurrent.futures import Future, ThreadPoolExecutor
 import dataclasses
-from decimal import Decimal
 import functools
 import os
 import secrets
@@ -26,6 +25,7 @@ from fogros2.deploy.robot_vpn import choose_interface, RobotVpn
 from fogros2.deploy.running import RunningMachine
 from fogros2.deploy.undo import UndoStack
 from fogros2.errors import Cancelled, ConfigurationError, DdsError, FogError, StoreError
+from fogros2.feature import Cost
 from fogros2.journal import Journal
 from fogros2.model import DdsInterface, MachineSpec, OtherVpn
 from fogros2.provider import Provider
@@ -124,20 +124,28 @@ class Launch:
                   programs=programs.get(spec.name, ()), images=images.get(spec.name, ()),
                   report=self.report)
         with ThreadPoolExecutor(max(1, len(specs)), 'fog-choose') as pool:
-            for choice in [pool.submit(self._choose, spec) for spec in specs]:
-                choice.result()
+            choices = [pool.submit(self._choose, spec) for spec in specs]
+            chosen = [choice.result() for choice in choices]
+        # each counts what all cost
+        for spec in filter(None, chosen):
+            self._choices.limited(spec)
 
-    def _choose(self, spec: MachineSpec) -> None:
-        """Make the open choices of a spec; check that wheels and workspace fit its processor."""
+    def _choose(self, spec: MachineSpec) -> Optional[MachineSpec]:
+        """Make the open choices of a spec; return it unless a kept machine may fit."""
         place = self._places(spec)[0]
         before = self._before(spec)
         if before is None or before.provider != place.provider:
-            self._check_choices(place)
+            return self._check_choices(place)
+        kept = dataclasses.replace(place, options=before.spec.options)
+        self._choices.expect(kept, self._choices.price(kept))
+        return None
 
-    def _check_choices(self, place: MachineSpec) -> None:
+    def _check_choices(self, place: MachineSpec) -> MachineSpec:
+        """Make the open choices of a spec; check that wheels and workspace fit its processor."""
         chosen = self._choices.resolved(place)
-        self._choices.limited(chosen, self._choices.price(chosen))
+        self._choices.expect(chosen, self._choices.price(chosen))
         check_architecture(chosen, self.provider(place.provider))
+        return chosen
 
     def _places(self, spec: MachineSpec) -> list[MachineSpec]:
         """Return the specs to try; a kept machine with the same requirements stays where it is."""
@@ -169,13 +177,9 @@ class Launch:
                 self._providers[name].cancel = self.cancel
             return self._providers[name]
 
-    def cost(self) -> list[tuple[str, Decimal, float]]:
-        """
-        Return the cost of each machine with a known price, ended machines included.
-
-        Each item is (name, US dollars per hour, seconds that this launch has used the machine).
-        """
-        return self._choices.cost()
+    def costs(self) -> list[Cost]:
+        """Return what each machine costs, those that have ended or will be created included."""
+        return self._choices.costs()
 
     def use_dds(self, name: str) -> None:
         """
@@ -360,7 +364,8 @@ class Launch:
             cancel=self.cancel, ending=self._ending, provider=self.provider(spec.provider),
             choices=self._choices, vpn=self.robot_vpn(), dds=self.dds(),
             index=self._indices[spec.name], others=others, other_vpn=self.join(spec),
-            programs=self._programs.get(spec.name, ()), images=self._images.get(spec.name, ()))
+            programs=self._programs.get(spec.name, ()), images=self._images.get(spec.name, ()),
+            shorten_others=functools.partial(self._shorten, spec.name))
 
     def up(self, spec: MachineSpec) -> RunningMachine:
         """
@@ -383,10 +388,21 @@ class Launch:
         try:
             machine = self._bring_up(spec)
         except BaseException as error:
+            self._choices.end(spec.name)
             mine.set_exception(error)
             raise
         mine.set_result(machine)
+        # others may have begun since its agent got its lifetime
+        machine.shorten()
         return machine
+
+    def _shorten(self, but: str) -> None:
+        """Shorten the lifetimes of machines that are up, where features allow less now."""
+        with self._lock:
+            ups = [up for name, up in self._ups.items() if name != but]
+        for up in ups:
+            if up.done() and up.exception() is None:
+                up.result().shorten()
 
     def retire(self, name: str) -> None:
         """
@@ -412,7 +428,7 @@ class Launch:
                     raise
                 self.report(Warned(spec.name, f"'{spec.name}': {error.args[0]}",
                                    f'the launch tries the next offer, of {following.provider}'))
-                self._check_choices(following)
+                self._choices.limited(self._check_choices(following))
         return bring_up(self.context(last), last)
 
     @property

@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 import contextlib
 import dataclasses
-from decimal import Decimal
 import threading
+import time
 from typing import Any, Optional
 
 from fogros2 import plan
@@ -49,6 +49,8 @@ class MachineJob(Site):
         self.spec = spec
         #: The lifetime that the launch asks for, in seconds.
         self._lifetime = spec.lifetime
+        #: When the agent ends the machine, by ``time.monotonic``.
+        self.expires = 0.0
         self.name = spec.name
         self.record = Record(spec.name, spec.provider, spec, asked=spec.options)
         self._saving = threading.Lock()
@@ -82,14 +84,21 @@ class MachineJob(Site):
         """Report a step of this machine around a block; see :func:`fogros2.report.step`."""
         return step(self._context.report, self.name, name)
 
-    def limit(self, price: Optional[Decimal], *, made: bool = False) -> None:
+    def limit(self, *, made: bool = False) -> None:
         """
         Let features limit the lifetime, from now on; see :meth:`fogros2.feature.Feature.lifetime`.
 
-        :param price: US dollars per hour, None if unknown.
+        :raises FogError: they allow none, or another machine does not answer.
         """
         self.spec = self._context.choices.limited(
-            dataclasses.replace(self.spec, lifetime=self._lifetime), price, made=made)
+            dataclasses.replace(self.spec, lifetime=self._lifetime), made=made)
+        self._context.shorten_others()
+
+    def restart_lifetime(self, seconds: float) -> None:
+        """Note that the agent gets a lifetime which starts now."""
+        self.spec = dataclasses.replace(self.spec, lifetime=seconds)
+        self.expires = time.monotonic() + seconds
+        self.save(spec=self.spec, armed=time.time())
 
     def makes(self, kind: str, port: int = 0, **changes: Any) -> None:
         """Push the undo of what the next step makes, and record it with other changes."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import contextlib
-from decimal import Decimal
+import dataclasses
 import threading
+import time
 from typing import Any, Optional
 
 from fogros2 import feature
@@ -49,6 +50,7 @@ class RunningMachine(Step):
         self._modules = modules
         self._containers = containers
         self._lock = threading.Lock()
+        self._shortening = threading.Lock()
         self._callback: Optional[EventCallback] = None
         self._lost = ''
         #: Why the machine was ended while its launch goes on: its events are ignored since.
@@ -65,11 +67,6 @@ class RunningMachine(Step):
     def lost(self) -> str:
         """Why the machine is gone or must not be used any more, '' while it is there."""
         return self._lost
-
-    @property
-    def cost(self) -> tuple[Optional[Decimal], Decimal]:
-        """US dollars per hour, None if unknown, and what its launch has spent so far."""
-        return self._context.choices.spent(self.spec.name)
 
     @property
     def directory(self) -> str:
@@ -180,6 +177,8 @@ class RunningMachine(Step):
 
     def _gone(self, reason: str) -> None:
         """Report, once, that the provider has ended the machine; close the connection."""
+        # before anything else, which may create the machine anew
+        self._context.choices.end(self.spec.name)
         self._report_end(reason)
         self.agent.close()
 
@@ -237,6 +236,29 @@ class RunningMachine(Step):
             callback = self._callback
         if callback is not None:
             callback({'event': 'given_up', 'reason': reason})
+
+    def shorten(self) -> None:
+        """
+        Shorten the lifetime if features allow less now; another machine costs, too.
+
+        :raises FogError: the agent does not answer.
+        """
+        job = self._job
+        with self._shortening:
+            seconds = job.expires - time.monotonic()
+            try:
+                allowed = self._context.choices.limited(
+                    dataclasses.replace(job.spec, lifetime=seconds), made=True).lifetime
+                if self._lost or self._ended or self._ending or allowed > seconds - 1.0:
+                    return
+                self.agent.request(
+                    'configure', timeout=self._context.timeouts.agent,
+                    launch=self._context.launch, again=True, lifetime=allowed)
+            except FogError:
+                if self._lost or self._ended or self._ending:
+                    return
+                raise
+            job.restart_lifetime(allowed)
 
     def lose_after(self, seconds: float) -> None:
         """Count a silent machine as lost after this time, even if its provider says it runs."""

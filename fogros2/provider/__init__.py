@@ -247,8 +247,12 @@ class Provider(abc.ABC):
         return False
 
     def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
-        """Return the price of a machine with a resolved spec in US dollars, None if unknown."""
-        return None
+        """
+        Return the price of a machine with a resolved spec in US dollars, None if unknown.
+
+        A launch pays nothing for a computer that exists already.
+        """
+        return None if self.capabilities.owned else Decimal(0)
 
     # -- a machine's life -----------------------------------------------------------------------
 

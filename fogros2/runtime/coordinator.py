@@ -16,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import copy
 import functools
+from pathlib import Path
 import threading
 from typing import Any, Optional, TYPE_CHECKING, Union
 
@@ -343,6 +344,16 @@ class Coordinator:
         return self._sessions
 
     @property
+    def costs(self) -> Sequence[feature.Cost]:
+        """The costs of all machines."""
+        return self.launch.costs()
+
+    @property
+    def folder(self) -> Path:
+        """The launch's folder on the robot."""
+        return self.launch.store.launch(self.launch.id)
+
+    @property
     def interface(self) -> str:
         """The name of the robot's VPN interface."""
         return f'fog{self.launch.id}'
@@ -542,7 +553,7 @@ class Coordinator:
         await _all_done({request for session in sessions for request in session.requests})
         for error in await self._in_thread(self.launch.down):
             self._fail(error)
-        for line in cost.lines(self.launch.cost()):
+        for line in cost.lines(self.costs):
             self._logger.info(line)
 
     def _taken_down(self, task: asyncio.Task[None]) -> None:

@@ -6,20 +6,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from decimal import Decimal
 
+from fogros2.feature import Cost
 
-def lines(machines: Sequence[tuple[str, Decimal, float]]) -> list[str]:
-    """
-    Return a line for each machine, and a line with the sum of several.
 
-    :param machines: name, US dollars per hour, seconds.
-    """
+def lines(machines: Sequence[Cost]) -> list[str]:
+    """Return a line for each machine with a price, and a line with the sum of several."""
     costs = []
     total = Decimal(0)
-    for name, price, seconds in machines:
-        hours = Decimal(seconds) / 3600
-        total += price * hours
-        costs.append(f'{name}: {short(hours)} h at ${price.normalize():f} an hour, '
-                     f'${short(price * hours)}')
+    for one in machines:
+        if one.price and one.seconds:
+            total += one.spent
+            costs.append(
+                f'{one.spec.name}: {short(Decimal(one.seconds) / 3600)} h at '
+                f'${one.price.normalize():f} an hour, ${short(one.spent)}')
     if len(costs) > 1:
         costs.append(f'all machines: ${short(total)}')
     return costs

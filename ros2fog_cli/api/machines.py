@@ -105,8 +105,8 @@ class Entry:
         ends = [float(tag)] if tag.isdecimal() and len(tag) < 13 else []
         record = self.record
         if record is not None and record.armed:
-            # If a launch reused the machine, this is later than the tag of the creation.
-            ends.append(record.armed + record.spec.lifetime)
+            # A launch may have reused the machine, or shortened the lifetime, since the creation.
+            ends = [record.armed + record.spec.lifetime]
         elif record is not None and record.created and not ends:
             ends.append(record.created + record.spec.lifetime)
         # a robot whose clock is wrong may note an end that is long before the beginning

@@ -372,7 +372,6 @@ class FakeRunning:
     interface = VpnInterface('foga', '198.18.7.2', '198.18.7.0/24', 51820, '/key')
     vpn_address = interface.address
     lost = ''
-    cost: tuple[Optional[Decimal], Decimal] = (None, Decimal(0))
 
     def __init__(self, shell: Any = None, *, spec: Optional[MachineSpec] = None) -> None:
         self.spec = spec or MachineSpec('a', 'fake')

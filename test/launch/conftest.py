@@ -106,7 +106,7 @@ class FakeLaunch:
         self.start_error = None
         self.prepare_error = None
         self.down_errors = []
-        self.costs = []
+        self.spent = []
 
     def __call__(self, *, report, environment, cancel):
         self.report = report
@@ -173,8 +173,8 @@ class FakeLaunch:
         self.note('down')
         return self.down_errors
 
-    def cost(self):
-        return self.costs
+    def costs(self):
+        return self.spent
 
 
 @pytest.fixture

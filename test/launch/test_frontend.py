@@ -165,7 +165,7 @@ EXAMPLES = {'text': ('nearest', 'nearest'), 'number': ('2', 2), 'bool': ('true',
 #: Where not every value will do.
 CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'on_loss_after': '5m',
            'checkpoint': '$HOME/map', 'checkpoint_interval': '5m', 'max_replacements': '2',
-           'bandwidth': '10Mbit/s',
+           'bandwidth': '10Mbit/s', 'launch_budget': '$20',
            'name': 'planner', 'budget': '5 USD', 'idle_timeout': '5m', 'vpn_path': 'stream',
            'fetch_to': '/results', 'fetch_limit': '2GB'}
 LISTS = {'fetch': ('~/bags, /var/map', ['~/bags', '/var/map']),

@@ -33,6 +33,8 @@ from fogros2 import (
     StreamTopic,
 )
 from fogros2.errors import AgentError, ProviderError
+from fogros2.feature import Cost
+from fogros2.model import MachineSpec
 from fogros2.runtime import remote_run
 from fogros2_features.replacement import session
 from fogros2_testing.plugins import instead
@@ -378,7 +380,7 @@ def test_node_for_a_machine_that_has_ended_does_not_start(
 # -- money ----------------------------------------------------------------------------------------
 
 def test_a_launch_says_what_it_cost(run, fake, talker, capfd):
-    fake.costs = [('planner', Decimal('0.0416'), 5400.0)]
+    fake.spent = [Cost(MachineSpec('planner', 'aws'), Decimal('0.0416'), 5400.0, True)]
     fake.on_start = lambda machine, node: machine.say(
         'exited', node, returncode=0, respawns=False)
     machine = ContainerInstance(name='planner', ros_workspace='')

@@ -15,6 +15,7 @@ from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.steps.creating import Creation
 from fogros2.errors import ConfigurationError, NameTaken, ProviderError, WorkspaceError
+from fogros2.feature import Cost
 from fogros2.model import MachineSpec
 from fogros2.report import StepDone, StepFailed, StepStarted, Warned
 from fogros2.store import Store
@@ -108,6 +109,19 @@ def test_a_replacement_gets_what_is_left_of_a_budget(launch, provider, monkeypat
     provider.machines.clear()
     with pytest.raises(ConfigurationError, match='pays for 300 s'):
         create(launch, spec)
+
+
+def test_machines_of_a_launch_end_when_all_have_spent_its_budget(launch, provider):
+    first, second = (dataclasses.replace(SPEC, name=name, lifetime=1e6) for name in ('a', 'b'))
+    # one machine has the keyword; both count before any is created
+    first = dataclasses.replace(first, features={'budget': {'launch_budget': '0.2 USD'}})
+    launch.prepare([first, second])
+    for spec in (first, second):
+        assert create(launch, spec).spec.lifetime == pytest.approx(720.0, abs=1.0)
+    late = dataclasses.replace(second, name='late', options={'size': 'large'})
+    with pytest.raises(ConfigurationError, match=r'the launch has \$0.20 .* pays for 240 s'):
+        launch.prepare([late])
+    assert provider.calls.count('create') == 2
 
 
 def test_choice_without_a_match_ends_the_launch_at_once(
@@ -206,7 +220,7 @@ def test_kept_machine_fits_though_today_differs(
     mine = create(again)
     assert mine.reused and 'resolve' not in provider.calls and 'create' not in provider.calls
     assert mine.spec.options == {'size': 'small'}
-    assert again.cost()[0][:2] == ('planner', Decimal('0.5'))
+    assert [(one.spec.name, one.price) for one in again.costs()] == [('planner', Decimal('0.5'))]
     mine.failed = False
     mine.undo.close()
     assert list(provider.find({})) == []
@@ -246,10 +260,10 @@ def test_a_machine_s_cost_runs_until_it_has_ended(launch, provider, monkeypatch)
     monkeypatch.setattr(choosing.time, 'monotonic', lambda: now[0])
     mine = create(launch)
     now[0] += 60
-    assert launch.cost() == [('planner', Decimal('0.5'), 60.0)]
+    assert launch.costs() == [Cost(mine.spec, Decimal('0.5'), 60.0)]
     mine.undo.close()
     now[0] += 60
-    assert launch.cost() == [('planner', Decimal('0.5'), 60.0)]
+    assert launch.costs() == [Cost(mine.spec, Decimal('0.5'), 60.0, ended=True)]
 
 
 def test_provider_knows_what_will_be_installed(launch, provider, monkeypatch):

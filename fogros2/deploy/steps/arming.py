@@ -161,9 +161,8 @@ class Arming(Step):
         """
         context, job, address = self._context, self._job, self._job.interface.address
         key, (port, peer) = secrets.token_hex(32), job.heartbeats
-        price, _ = context.choices.spent(job.name)
-        job.limit(price, made=True)
-        job.save(spec=job.spec)
+        job.limit(made=True)
+        job.restart_lifetime(job.spec.lifetime)
         try:
             job.agent.request(
                 'configure', timeout=context.timeouts.agent, launch=context.launch, again=True,

@@ -56,15 +56,15 @@ class Creation(Step):
                 detail.append('kept from before')
             else:
                 self._create()
-            price = context.choices.price(job.spec)
-            context.choices.begin(job.name, price)
+            context.choices.begin(job.name)
             machine = context.provider.reachable(
                 job.machine_id, name=job.name, timeout=context.timeouts.boot, known=kept)
-            if machine.cost_per_hour is not None:
-                price = machine.cost_per_hour
-                context.choices.begin(job.name, price)
-            job.limit(price, made=True)
-            if price is not None:
+            price = machine.cost_per_hour
+            if price is None:
+                price = context.choices.price(job.spec)
+            context.choices.expect(job.spec, price)
+            job.limit(made=True)
+            if price:
                 detail.append(plan.price(price))
             job.save(shell=machine.shell, spec=job.spec)
             detail.append(machine.shell.host if machine.shell else machine.id[:20])
@@ -107,7 +107,8 @@ class Creation(Step):
         self._check_alike(before.asked, machine)
         # the earlier choices still hold; everything else comes from this launch
         job.spec = dataclasses.replace(job.spec, options=before.spec.options)
-        job.limit(context.choices.price(job.spec), made=True)
+        context.choices.expect(job.spec, context.choices.price(job.spec))
+        job.limit(made=True)
         job.record = dataclasses.replace(before, spec=job.spec)
         job.former = before.last or before.launch
         return machine
@@ -148,7 +149,8 @@ class Creation(Step):
     def _create(self) -> None:
         context, job = self._context, self._job
         job.spec = context.choices.resolved(job.spec)
-        job.limit(context.choices.price(job.spec))
+        context.choices.expect(job.spec, context.choices.price(job.spec))
+        job.limit()
         token = str(uuid.uuid4())
         context.store.delete(job.name)
         job.record = dataclasses.replace(job.record, spec=job.spec)
@@ -235,7 +237,8 @@ class Creation(Step):
                     context.provider.stop(job.record.machine_id)
                 job.save(launch='', pid=0, pid_start=0, robot_vpn=None, notes={})
         finally:
-            context.choices.end(job.name)
+            if mode != 'keep':
+                context.choices.end(job.name)
 
     def _delete(self) -> None:
         """Delete the machine and its record; find that of a failed creation by its tags."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 import contextlib
+from decimal import Decimal
 import json
 import os
 from pathlib import Path
@@ -209,6 +210,10 @@ class ContainerProvider(Provider):
         options = Options.parse(spec.options)
         return () if options.image or options.isolated else (
             *container_root.system_mounts(), *container_root.environment_mounts(*spec.workspaces))
+
+    def cost_per_hour(self, spec: MachineSpec) -> Decimal:
+        """Return 0: a machine on this computer costs nothing."""
+        return Decimal(0)
 
     def has_own_packages(self, spec: MachineSpec) -> bool:
         """Return whether the machine starts from a container image."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
+from decimal import Decimal
 import functools
 import gzip
 import hashlib
@@ -144,6 +145,10 @@ class HostedProvider(Provider):
         #: By their ids at the provider of SSH machines: hosts, with their machines there.
         self._hosts: dict[str, tuple[Machine, Shell]] = {}
         self._asked: list[Mapping[str, Any]] = []
+
+    def cost_per_hour(self, spec: MachineSpec) -> Decimal:
+        """Return 0: the host exists already."""
+        return Decimal(0)
 
     # -- the host -------------------------------------------------------------------------------
 
