@@ -19,12 +19,13 @@ from fogros2.waiting import wait_until
 from fogros2_testing.plugins import install
 from rigs.launched import launching, ros2
 
-pytestmark = [pytest.mark.usefixtures('nothing_left', 'engine')]
+pytestmark = [pytest.mark.usefixtures('nothing_left')]
 
 #: A container costs a cent in a second, and may be made for a short time.
 PROVIDER = """
 from decimal import Decimal
 
+from fogros2 import ContainerInstance
 from fogros2.provider.container import ContainerProvider
 from fogros2_features import budget
 
@@ -36,61 +37,58 @@ class PricedProvider(ContainerProvider):
 
     def cost_per_hour(self, spec):
         return Decimal(36)
-"""
-LAUNCH = """
-from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
-from launch.actions import TimerAction
 
 
 class Priced(ContainerInstance):
     provider = 'priced'
+"""
+#: The second machine comes when the first one is up.
+LATER = """
+from launch.actions import TimerAction
 
-
-def node(name, **words):
-    machine = Priced(name=name, network={network!r}, ros_workspace='', **words)
-    return CloudNode(machine=machine, package='fogros2_examples', executable='talker')
+from fogros2 import CloudNode, FogROSLaunchDescription
+from fogt_priced import Priced
 
 
 def generate_launch_description():
-    return FogROSLaunchDescription([
-        node({name!r} + '-a', launch_budget={budget!r}, {words}), {second}])
+    first, second = (CloudNode(
+        machine=Priced(name={name!r} + end, network={network!r}, ros_workspace='',
+                       robot_timeout=600, **words),
+        package='fogros2_examples', executable='talker')
+        for end, words in (('-a', {{'launch_budget': '2 USD'}}), ('-b', {{}})))
+    return FogROSLaunchDescription([first, TimerAction(period=0.1, actions=[second])])
 """
-TOGETHER, LATER = "node({name!r} + '-b')", "TimerAction(period=0.1, actions=[node({name!r} + '-b')])"
-
-
-def write(folder: Path, network: str, name: str, budget: str, second: str, words: str) -> str:
-    path = folder / 'budget.launch.py'
-    path.write_text(LAUNCH.format(network=network, name=name, budget=budget, words=words,
-                                  second=second.format(name=name)))
-    return str(path)
 
 
 @pytest.fixture
-def priced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Return how the names of machines begin; the provider 'priced' is installed."""
+    site = tmp_path / 'site'
     monkeypatch.setenv('PYTHONPATH', install(
-        tmp_path / 'site', 'fogros2.provider', 'priced', PROVIDER, 'PricedProvider'))
+        site, 'fogros2.provider', 'priced', PROVIDER, 'PricedProvider'))
+    with open(site / 'fogt_priced-0.dist-info/entry_points.txt', 'a') as points:
+        points.write('[fogros2.machine]\npriced = fogt_priced:Priced\n')
+    return f'budget-{uuid.uuid4().hex[:6]}'
 
 
-def machines(engine: str, name: str) -> list[str]:
-    done = subprocess.run(argv(Command((
-        engine, 'ps', '--format', '{{.Names}}', '--filter', f'name=fogros2-{name}'), sudo=True)),
-        check=True, capture_output=True, text=True, timeout=60)
-    return done.stdout.split()
+def podman(*words: str) -> str:
+    done = subprocess.run(argv(Command(('podman', *words), sudo=True)), check=True,
+                          capture_output=True, text=True, timeout=60)
+    return done.stdout
 
 
 def test_launch_with_a_replacement_ends_within_its_budget(
-    tmp_path: Path, cloud_network: str, engine: str, priced: None,
+    name: str, cloud_network: str,
 ) -> None:
-    name = f'budget-{uuid.uuid4().hex[:6]}'
-    path = write(tmp_path, cloud_network, name, '1.60', TOGETHER,
-                 "on_interrupt='replace', max_replacements=1, robot_timeout=10")
+    where = f'priced,network={cloud_network}'
     with launching() as start:
-        run = start(path)
-        run.wait_for('process started with pid', times=2)
-        subprocess.run(argv(Command((engine, 'rm', '-f', '-t', '0', f'fogros2-{name}-a'),
-                                    sudo=True)), check=True, capture_output=True, timeout=60)
+        run = start('fogros2_examples', 'talker.budget.launch.py', f'name:={name}',
+                    'budget:=1.60', '--machine', f'*-hearer={where}',
+                    '--machine', f'*-speaker={where},on_interrupt=replace,robot_timeout=10')
+        run.wait_for('I heard: [Hello World')
+        podman('rm', '-f', '-t', '0', f'fogros2-{name}-speaker')
         run.wait_for('a new machine runs the nodes')
-        shown = json.loads(ros2('fog', 'status', f'{name}-b', '--json').stdout)
+        shown = json.loads(ros2('fog', 'status', f'{name}-hearer', '--json').stdout)
         (what, text), = shown['features']
         assert what == 'launch budget' and re.fullmatch(r'\$[01]\.\d\d left of \$1\.60', text)
         run.wait_for("80% of the launch's budget of $1.60 is spent")
@@ -103,11 +101,11 @@ def test_launch_with_a_replacement_ends_within_its_budget(
 
 
 def test_machines_of_a_killed_launch_end_within_its_budget(
-    tmp_path: Path, cloud_network: str, engine: str, priced: None,
+    name: str, cloud_network: str, tmp_path: Path,
 ) -> None:
-    """The first machine is alone at first, and its time is shorter when the second one comes."""
-    name = f'budget-{uuid.uuid4().hex[:6]}'
-    path = write(tmp_path, cloud_network, name, '2', LATER, 'robot_timeout=600')
+    """The first machine is alone at first, and has less time when the second one comes."""
+    path = tmp_path / 'later.launch.py'
+    path.write_text(LATER.format(name=name, network=cloud_network))
     store = Store()
 
     def ends(which: str) -> float:
@@ -115,14 +113,14 @@ def test_machines_of_a_killed_launch_end_within_its_budget(
         return record.armed + record.spec.lifetime
 
     with launching() as start:
-        run = start(path)
-        run.wait_for('process started with pid', times=1)
+        run = start(str(path))
+        run.wait_for('process started with pid')
         alone = ends('a')
         run.wait_for('process started with pid', times=2)
-        shared = ends('a')
-        assert shared < alone - 20.0 and abs(ends('b') - shared) < 3.0
+        together = ends('a')
+        assert together < alone - 20.0 and abs(ends('b') - together) < 3.0
         run.kill()
-    wait_until(lambda: not machines(engine, name), timeout=alone - time.time(),
-               what='the end of both')
-    assert time.time() < shared + 10.0
+    wait_until(lambda: name not in podman('ps', '--format', '{{.Names}}'),
+               timeout=alone - time.time(), interval=0.5, what='the end of both')
+    assert time.time() < together + 10.0
     assert ros2('fog', 'gc').returncode == 0

@@ -104,9 +104,10 @@ def test_nodes_run_on_the_robot_without_a_machine(launch, words):
 @pytest.mark.parametrize('option', ['-s', '-p'])
 def test_showing_a_launch_file_creates_nothing(option, state_home, capsys):
     for name in (
-            'talker.auto_aws.launch.py', 'talker.aws.launch.py', 'talker.container.launch.py',
-            'talker.container.launch.xml', 'talker.kube.launch.py', 'talker.ssh.launch.py',
-            'talker.volume.launch.py', 'two_clouds.launch.py', 'video.container.launch.yaml'):
+            'talker.auto_aws.launch.py', 'talker.aws.launch.py', 'talker.budget.launch.py',
+            'talker.container.launch.py', 'talker.container.launch.xml', 'talker.kube.launch.py',
+            'talker.ssh.launch.py', 'talker.volume.launch.py', 'two_clouds.launch.py',
+            'video.container.launch.yaml'):
         assert not main(argv=['launch', str(example(name)), option]), name
         shown = capsys.readouterr().out
         assert option == '-p' or "'count':" in shown, name
