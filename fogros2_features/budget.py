@@ -145,10 +145,9 @@ def _budgets(costs: Sequence[Cost]) -> Iterator[tuple[str, Decimal, Sequence[Cos
 
     :raises ConfigurationError: two machines disagree about the launch's.
     """
-    options: dict[str, Own] = {one.spec.name: feature.options(
-        'budget', one.spec.features.get('budget', {})) for one in costs}
-    shared = {own.launch_budget: name for name, own in options.items()
-              if own.launch_budget is not None}
+    given: list[tuple[str, Own]] = [(one.spec.name, feature.options(
+        'budget', one.spec.features.get('budget', {}))) for one in costs]
+    shared = {own.launch_budget: name for name, own in given if own.launch_budget is not None}
     if len(shared) > 1:
         raise ConfigurationError(
             'machines of this launch have different budgets for it: ' + ', '.join(
@@ -156,7 +155,7 @@ def _budgets(costs: Sequence[Cost]) -> Iterator[tuple[str, Decimal, Sequence[Cos
             'give one to one machine or the same to all')
     for budget in shared:
         yield '', budget, costs
-    for name, own in options.items():
+    for name, own in dict(given).items():
         if own.budget is not None:
             yield name, own.budget, [one for one in costs if one.spec.name == name]
 

@@ -85,7 +85,7 @@ class Choices:
 
     def limited(self, spec: MachineSpec, *, made: bool = False) -> MachineSpec:
         """
-        Return a spec that is ``expected`` with the lifetime that its features allow.
+        Return a spec with the lifetime that its features allow; see ``expect``.
 
         :param made: whether the machine exists.
         :raises FogError: they allow none.
