@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 WARNING = Decimal('0.8')
 #: The least seconds that a machine is created for: it takes minutes to come up.
 LEAST = 600.0
+#: Seconds that are kept back: a cloud bills before ``create`` returns and while a machine ends.
+ENDING = 60.0
 #: Seconds between two looks at what is spent.
 INTERVAL = 5.0
 #: In a launch's folder: what its budgets have left.
@@ -81,7 +83,7 @@ class Budget(Feature):
                 continue
             rest = budget - _spent(paid)
             rate = sum(one.price or Decimal(0) for one in paid if not one.ended)
-            seconds = float(rest / rate) * 3600
+            seconds = float(rest / rate) * 3600 - ENDING
             if seconds < (1.0 if made else LEAST):
                 raise ConfigurationError(
                     f'{whose} has {_dollars(max(rest, Decimal(0)))} of its budget of '

@@ -73,19 +73,20 @@ def test_choices_are_made_once_and_shown_with_the_price(
 
 def test_a_budget_limits_the_lifetime_by_the_price(launch, provider, monkeypatch):
     spec = dataclasses.replace(SPEC, features={'budget': {'budget': '2 USD'}})
-    assert create(launch, spec).spec.lifetime == pytest.approx(4 * 3600.0, abs=1.0)
-    assert launch.store.load('planner').spec.lifetime == pytest.approx(4 * 3600.0, abs=1.0)
+    # a minute is kept back
+    assert create(launch, spec).spec.lifetime == pytest.approx(4 * 3600.0 - 60.0, abs=1.0)
+    assert launch.store.load('planner').spec.lifetime == pytest.approx(14340.0, abs=1.0)
     # what the provider confirms counts
     describe = provider.describe
     monkeypatch.setattr(provider, 'describe', lambda machine_id: dataclasses.replace(
         describe(machine_id), cost_per_hour=Decimal(4)))
     other = dataclasses.replace(spec, name='other', lifetime=1e6)
-    assert create(launch, other).spec.lifetime == pytest.approx(1800.0, abs=1.0)
+    assert create(launch, other).spec.lifetime == pytest.approx(1740.0, abs=1.0)
 
 
 @pytest.mark.parametrize(('size', 'budget', 'said'), [
     ('medium', '5 USD', "price of 'planner' is unknown"),
-    ('large', '0.3', r'has \$0.30 of its budget of \$0.30 left, which pays for 540 s')])
+    ('large', '0.3', r'has \$0.30 of its budget of \$0.30 left, which pays for 480 s')])
 def test_budget_that_can_not_be_kept_is_refused_first(launch, provider, size, budget, said):
     spec = dataclasses.replace(SPEC, options={'size': size},
                                features={'budget': {'budget': budget}})
@@ -99,15 +100,15 @@ def test_a_replacement_gets_what_is_left_of_a_budget(launch, provider, monkeypat
     monkeypatch.setattr(choosing.time, 'monotonic', lambda: clock[0])
     spec = dataclasses.replace(SPEC, features={'budget': {'budget': '1'}})
     mine = create(launch, spec)
-    assert mine.spec.lifetime == 7200.0
+    assert mine.spec.lifetime == 7140.0
     provider.destroy(mine.machine_id)
     clock[0] += 5400.0
     launch.store.delete('planner')
-    assert create(launch, spec).spec.lifetime == 1800.0
+    assert create(launch, spec).spec.lifetime == 1740.0
     clock[0] += 1500.0
     launch.store.delete('planner')
     provider.machines.clear()
-    with pytest.raises(ConfigurationError, match='pays for 300 s'):
+    with pytest.raises(ConfigurationError, match='pays for 240 s'):
         create(launch, spec)
 
 
@@ -117,9 +118,9 @@ def test_machines_of_a_launch_end_when_all_have_spent_its_budget(launch, provide
     first = dataclasses.replace(first, features={'budget': {'launch_budget': '0.2 USD'}})
     launch.prepare([first, second])
     for spec in (first, second):
-        assert create(launch, spec).spec.lifetime == pytest.approx(720.0, abs=1.0)
+        assert create(launch, spec).spec.lifetime == pytest.approx(660.0, abs=1.0)
     late = dataclasses.replace(second, name='late', options={'size': 'large'})
-    with pytest.raises(ConfigurationError, match=r'the launch has \$0.20 .* pays for 240 s'):
+    with pytest.raises(ConfigurationError, match=r'the launch has \$0.20 .* pays for 180 s'):
         launch.prepare([late])
     assert provider.calls.count('create') == 2
 
