@@ -74,11 +74,12 @@ class Budget(Feature):
             if machine not in ('', spec.name):
                 continue
             whose = f"'{machine}'" if machine else 'the launch'
-            if price is None:
-                raise ConfigurationError(
-                    f"the price of '{spec.name}' is unknown: the budget of {whose} can't be kept",
-                    'leave the budget out, or use a machine whose price `ros2 fog list` would '
-                    'show')
+            for one in paid:
+                if one.price is None:
+                    raise ConfigurationError(
+                        f"the price of '{one.spec.name}' is unknown: the budget of {whose} can't "
+                        'be kept', 'leave the budget out, or use a machine whose price '
+                        '`ros2 fog list` would show')
             if not price:
                 continue
             rest = budget - _spent(paid)

@@ -249,8 +249,11 @@ class RunningMachine(Step):
             try:
                 allowed = self._context.choices.limited(
                     dataclasses.replace(job.spec, lifetime=seconds), made=True).lifetime
-                if self._lost or self._ended or self._ending or allowed > seconds - 1.0:
-                    return
+            except FogError:
+                return  # its time is over
+            if self._lost or self._ended or self._ending or allowed > seconds - 1.0:
+                return
+            try:
                 self.agent.request(
                     'configure', timeout=self._context.timeouts.agent,
                     launch=self._context.launch, again=True, lifetime=allowed)
