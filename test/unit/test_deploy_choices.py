@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 from decimal import Decimal
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -13,8 +14,9 @@ from fogros2.deploy import choosing, Launch
 from fogros2.deploy import launch as launches
 from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob
+from fogros2.deploy.running import RunningMachine
 from fogros2.deploy.steps.creating import Creation
-from fogros2.errors import ConfigurationError, NameTaken, ProviderError, WorkspaceError
+from fogros2.errors import AgentError, ConfigurationError, NameTaken, ProviderError, WorkspaceError
 from fogros2.feature import Cost
 from fogros2.model import MachineSpec
 from fogros2.report import StepDone, StepFailed, StepStarted, Warned
@@ -123,6 +125,39 @@ def test_machines_of_a_launch_end_when_all_have_spent_its_budget(launch, provide
     with pytest.raises(ConfigurationError, match=r'the launch has \$0.20 .* pays for 180 s'):
         launch.prepare([late])
     assert provider.calls.count('create') == 2
+
+
+def test_machine_that_runs_gets_less_time_when_another_costs(launch, provider):
+    spec = dataclasses.replace(SPEC, lifetime=1e6, features={'budget': {'launch_budget': '1'}})
+    first = create(launch, spec)
+    first.restart_lifetime(first.spec.lifetime)
+    first.heartbeat = SimpleNamespace(age=0.0)
+    first.interface, first.shell = SimpleNamespace(address='198.18.7.2'), None
+    requests, answers = [], [AgentError('silent')]
+
+    def request(command, *, lifetime=None, **arguments):
+        if command == 'configure':
+            requests.append(lifetime)
+            if answers:
+                raise answers.pop()
+
+    first.agent = SimpleNamespace(request=request)
+    running = RunningMachine(launch.context(spec), first, None, None)
+    running.shorten()
+    assert requests == []
+    create(launch, dataclasses.replace(spec, name='other', features={}))
+    # the launch creates no other machine before the agent knows
+    with pytest.raises(AgentError):
+        running.shorten()
+    running.shorten()
+    running.shorten()
+    assert requests == pytest.approx([3540.0, 3540.0], abs=2.0)
+    record = launch.store.load('planner')
+    assert record.armed + record.spec.lifetime == pytest.approx(time.time() + 3540.0, abs=2.0)
+    create(launch, dataclasses.replace(spec, name='third', features={}))
+    running.end('nobody uses it')
+    running.shorten()
+    assert len(requests) == 2
 
 
 def test_choice_without_a_match_ends_the_launch_at_once(
