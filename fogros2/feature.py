@@ -17,7 +17,15 @@ import threading
 from typing import Any, ClassVar, Optional, Protocol, TYPE_CHECKING
 
 from fogros2 import plugin_system
-from fogros2.model import Command, Endpoint, Machine, MachineSpec, NodeSpec, VpnInterface
+from fogros2.model import (
+    Command,
+    CreateRequest,
+    Endpoint,
+    Machine,
+    MachineSpec,
+    NodeSpec,
+    VpnInterface,
+)
 from fogros2.shell import Shell
 from fogros2.store import Record
 
@@ -347,9 +355,9 @@ class Feature:
         """
         return spec.lifetime
 
-    def volumes(self, own: Any) -> Mapping[str, tuple[str, int]]:
-        """Return the volumes that a machine is created with, as ``CreateRequest.with_volumes``."""
-        return {}
+    def request(self, request: CreateRequest, own: Any) -> CreateRequest:
+        """Return the request for a new machine, with what the feature needs of the provider."""
+        return request
 
     def check_node(self, spec: MachineSpec, node: NodeSpec, own: Any) -> None:
         """
@@ -374,14 +382,6 @@ class Feature:
         another robot's VPN.
         """
         return contextlib.nullcontext()
-
-    def application(self, own: Any) -> str:
-        """
-        Return the container image of a web application that serves HTTP on port 8080, '' for none.
-
-        Providers whose machines run no containers may run it beside the machine.
-        """
-        return ''
 
     def machine(self, running: RunningMachine, own: Any) -> contextlib.AbstractContextManager[Any]:
         """

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import dataclasses
 from decimal import Decimal
 import enum
@@ -51,7 +51,6 @@ class MachineSpec:
     :param environment: variables of every node on the machine.
     :param containers: ``docker run`` command lines that start before the nodes.
     :param apt: Debian packages to install; ``pip`` Python packages, in pip's syntax.
-    :param share: topics that it has in common with machines of other robots on its host.
     :param features: the values of features' keywords, by feature; JSON types only.
     :param wanted: for a machine of any cloud, the requirements for which the launch has chosen
         ``provider`` and ``options``.
@@ -70,7 +69,6 @@ class MachineSpec:
     containers: tuple[str, ...] = ()
     apt: tuple[str, ...] = ()
     pip: tuple[str, ...] = ()
-    share: tuple[str, ...] = ()
     features: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     wanted: Optional[Mapping[str, Any]] = None
 
@@ -223,6 +221,8 @@ class CreateRequest:
         providers that run one beside the machine (``Capabilities.application_port``); '' for none.
     :param with_volumes: by name, where volumes appear on the machine, and the GB of a new one; for
         providers with the capability ``keeps_volumes``.
+    :param common: names of what its programs may exchange with machines of other launches on its
+        host, for providers with ``share_folders``.
     """
 
     token: str
@@ -233,6 +233,7 @@ class CreateRequest:
     dependencies: str = ''
     application: str = ''
     with_volumes: Mapping[str, tuple[str, int]] = dataclasses.field(default_factory=dict)
+    common: Sequence[str] = ()
 
 
 @dataclasses.dataclass(frozen=True)

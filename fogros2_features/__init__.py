@@ -2,5 +2,5 @@
 """
 Features of machines, each a module with one :class:`fogros2.feature.Feature`.
 
-``replicas`` alone is an action and no feature.
+``replicas`` is an action, and ``hosts`` a provider.
 """

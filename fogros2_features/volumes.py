@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 import contextlib
+import dataclasses
 import itertools
 import re
 from typing import Optional, TYPE_CHECKING
@@ -17,7 +18,7 @@ from typing import Optional, TYPE_CHECKING
 from fogros2 import plugin_system
 from fogros2.errors import ConfigurationError, Unsupported
 from fogros2.feature import Feature, RunningMachine
-from fogros2.model import Command, MachineSpec
+from fogros2.model import Command, CreateRequest, MachineSpec
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
@@ -141,9 +142,11 @@ class Volumes(Feature):
                 raise ConfigurationError(f"the volume '{name}' at {path} would hide the workspace",
                                          'choose another folder')
 
-    def volumes(self, own: Mapping[str, tuple[str, int]]) -> Mapping[str, tuple[str, int]]:
-        """Return the volumes."""
-        return own
+    def request(
+        self, request: CreateRequest, own: Mapping[str, tuple[str, int]],
+    ) -> CreateRequest:
+        """Have the machine created with the volumes."""
+        return dataclasses.replace(request, with_volumes=own)
 
     @contextlib.contextmanager
     def machine(

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import dataclasses
 from typing import Any, ClassVar, Optional, TYPE_CHECKING
 
 from fogros2 import plugin_system
 from fogros2.errors import Unsupported
 from fogros2.feature import Feature
-from fogros2.model import MachineSpec
+from fogros2.model import CreateRequest, MachineSpec
 from fogros2_monitor import addresses, networks
 
 if TYPE_CHECKING:
@@ -50,9 +51,10 @@ class Monitor(Feature):
             raise Unsupported(f"'{spec.name}' can't open a port of its host for monitor_allow",
                               "leave it out, and use 'ros2 fog monitor'")
 
-    def application(self, own: Optional[Sequence[str]]) -> str:
-        """Return the image of Lichtblick."""
-        return '' if own is None else addresses.IMAGE
+    def request(self, request: CreateRequest, own: Optional[Sequence[str]]) -> CreateRequest:
+        """Have Lichtblick run beside the machine."""
+        return request if own is None else dataclasses.replace(
+            request, application=addresses.IMAGE)
 
     def beside(self, spec: MachineSpec, own: Optional[Sequence[str]]) -> Sequence[Any]:
         """Return the action that starts the bridge."""

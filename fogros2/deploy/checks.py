@@ -9,7 +9,7 @@ from typing import Optional
 
 from fogros2 import feature, plan
 from fogros2 import shell as shells
-from fogros2.errors import ConfigurationError, FogError, Unsupported
+from fogros2.errors import ConfigurationError, FogError
 from fogros2.host import bootstrap, containers, undeclared, workspace
 from fogros2.host.programs import check_program
 from fogros2.model import MachineSpec
@@ -68,10 +68,6 @@ def check(
         raise ConfigurationError(
             f"'{spec.name}' is a computer that exists already: no launch switches it off",
             "use on_exit='delete' to leave nothing there, or 'keep'")
-    if spec.share and not provider.capabilities.share_folders:
-        raise Unsupported(
-            f"'{spec.name}' can't share topics: it has no host with machines of other robots",
-            "use ContainerInstance(on=SSHInstance('gpu-box')), or leave share= out")
     for line in spec.containers:
         containers.check(containers.parse(line), rmw)
     if spec.containers or images:

@@ -9,7 +9,6 @@ import os
 import shlex
 from typing import Any, NoReturn, Optional, TYPE_CHECKING, Union
 
-from fogros2 import ros_names
 from fogros2.describe import features, names, values, variables
 from fogros2.describe.kinds import check, options_of, parameters_of
 from fogros2.errors import ConfigurationError, did_you_mean
@@ -56,8 +55,6 @@ class CloudInstance:
     :param apt: Debian packages that the machine needs, such as 'libzbar0'.
     :param pip: Python packages that the machine needs, in pip's syntax ('pyzbar>=0.1.9'). If the
         system has the same package, the system's version is used.
-    :param share: topics, such as '/map', that pass between this launch and those of other robots
-        whose machines are on the same host and list them too; serialized, with their QoS.
     :param options: the provider's own options; subclasses set it.
     :param unknown: keywords of features, see doc/developers/features.md.
     :raises ConfigurationError: an unknown keyword (the hint names the nearest), or a wrong value.
@@ -77,7 +74,6 @@ class CloudInstance:
         environment: Optional[Mapping[str, SomeSubstitutionsType]] = None,
         apt: Optional[Sequence[SomeSubstitutionsType]] = None,
         pip: Optional[Sequence[SomeSubstitutionsType]] = None,
-        share: Optional[Sequence[SomeSubstitutionsType]] = None,
         options: Optional[Mapping[str, Any]] = None,
         **unknown: object,
     ) -> None:
@@ -100,7 +96,7 @@ class CloudInstance:
         self._options = {k: v for k, v in (options or {}).items() if v is not None}
         self._containers: list[SomeSubstitutionsType] = []
         self._lists = {name: _listed(name, parameters) for name, parameters in (
-            ('apt', apt), ('pip', pip), ('share', share))}
+            ('apt', apt), ('pip', pip))}
         self._spec: Optional[MachineSpec] = None
         self._running: Optional[RunningMachine] = None
         # values that are known already are checked where they are written
@@ -274,7 +270,6 @@ class CloudInstance:
                     for key, value in self._environment.items()}, context.environment),
                 containers=tuple(values.resolve(context, line) for line in self._containers),
                 apt=self._wanted(context, 'apt'), pip=self._wanted(context, 'pip'),
-                share=self._wanted(context, 'share'),
                 features=features.by_feature({
                     key: self._converted(context, key, value)
                     for key, value in self._features.items()}), **settings)
@@ -400,13 +395,12 @@ def checked(machine: SomeMachine) -> SomeMachine:
 
 
 
-_LIST_CHECKS = {'apt': dependencies.check_apt, 'pip': dependencies.check_pip,
-                'share': ros_names.check_name}
+_LIST_CHECKS = {'apt': dependencies.check_apt, 'pip': dependencies.check_pip}
 
 
 def _listed(program: str, content: Any) -> list[Union[values.Items, values.List]]:
     """
-    Read a value of ``apt=``, ``pip=`` or ``share=``; check the items that are known already.
+    Read a value of ``apt=`` or ``pip=``; check the items that are known already.
 
     :raises ConfigurationError: not a list, or a wrong item.
     """

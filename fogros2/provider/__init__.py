@@ -71,8 +71,8 @@ class Capabilities:
     :param agent_program: path on the machine of that agent's program.
     :param agent_sent: the launch sends that program over the first connection, and the machine
         waits for it from its boot on.
-    :param share_folders: folders on the machine by which its relay of shared topics meets those of
-        other robots: its own, and the folder of all; empty if the provider has none.
+    :param share_folders: folders on the machine by which its programs meet those of other machines
+        on its host: its own, and the folder of all; empty if the provider has none.
     :param application_port: TCP port on the machine's loopback where ``create`` serves the
         request's application, 0 if it serves none.
     :param preemption_notice: command that the agent runs as root every few seconds. Exit status 0

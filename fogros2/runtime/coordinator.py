@@ -319,11 +319,6 @@ class Coordinator:
                 changed=self._open_gate, preempted=self._preempted,
                 busy=functools.partial(private.waiting_events, self._context),
                 starting=functools.partial(self.parts.starting, spec.name), robot=self)
-            if spec.share and any(one.spec.share for one in self._sessions.values()):
-                # two relays would send each other's messages round and round
-                raise ConfigurationError(
-                    f"'{spec.name}' is the second machine of this launch with share=",
-                    'one machine shares topics for all nodes of a launch')
             self._sessions[spec.name] = session
             self._new.append(session)
             self.launch.expect([spec.name])

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import dataclasses
 import functools
-import json
 from typing import Any, cast, Optional, TYPE_CHECKING
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
@@ -136,7 +135,7 @@ class RemoteProcess:
     def _helpers(
         self, coordinator: Coordinator, session: Session,
     ) -> list[LaunchDescriptionEntity]:
-        """Return containers, relay and features' programs of a machine, with its first process."""
+        """Return containers and features' programs of a machine, with its first process."""
         if session.has_helpers or session.interrupted:
             return []
         session.has_helpers = True
@@ -146,13 +145,6 @@ class RemoteProcess:
             from fogros2.host import containers
             helpers.append(process_on(containers.follow(
                 containers.parse(line), number, coordinator.launch.id), name))
-        if session.spec.share:
-            folders = coordinator.launch.provider(
-                session.spec.provider).capabilities.share_folders
-            helpers.append(process_on(NodeSpec(
-                id=f'share-{name}', name='share', package='fogros2', executable='share',
-                respawn=True, respawn_delay=1.0, arguments=(json.dumps({
-                    'topics': session.spec.share, 'folders': folders}),)), name))
         helpers += [process_on(one, name) if isinstance(one, NodeSpec) else one
                     for each, own in feature.used(session.spec)
                     for one in each.beside(session.spec, own)]

@@ -49,7 +49,8 @@ class Streaming(Feature):
 
     def check(self, spec: MachineSpec, own: Policy) -> None:
         """Check that the machine shares no topic that is denied or limited."""
-        if both := sorted({*spec.share} & {*own.names(spec.name)}):
+        shared = spec.features.get('share', {}).get('share', ())
+        if both := sorted({*shared} & {*own.names(spec.name)}):
             raise ConfigurationError(
                 f"'{spec.name}' has {', '.join(both)} in share= and in deny_topics or "
                 'limit_topics',

@@ -20,9 +20,9 @@ from fogros2 import process
 from fogros2.errors import Cancelled, NameTaken, PrerequisiteError, ShellError
 from fogros2.model import Command, MachineSpec, MachineState
 from fogros2.provider import Attached
-from fogros2.provider.container.hosted import HostedProvider
 from fogros2.shell.ssh import SSHShell
 from fogros2.waiting import wait_until
+from fogros2_features.hosts.hosted import HostedProvider
 from fogros2_testing import ProviderContract, request_for
 from rigs.container_machines import key
 from rigs.fleet import Fleet, fleet, heard, LAUNCH
@@ -165,7 +165,7 @@ def test_cancelled_creation_leaves_nothing(host: Fleet, key: Path, delay: float)
     def settled() -> bool:
         for machine in host.provider().find({'fogros2-name': 'planner'}):
             provider.destroy(machine.id)
-        busy = process.run(Command(('pgrep', '-f', 'container.served')), timeout=60.0,
+        busy = process.run(Command(('pgrep', '-f', 'hosts.served')), timeout=60.0,
                            check=False).stdout
         return not busy and not host.traces()
 

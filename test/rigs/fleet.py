@@ -15,7 +15,7 @@ from typing import Any
 from fogros2.model import Command, MachineSpec
 from fogros2.process import run
 from fogros2.provider.container import machine as container_machine
-from fogros2.provider.container.hosted import HostedProvider
+from fogros2_features.hosts.hosted import HostedProvider
 from rigs import networks
 from rigs.launched import embedded, Launched
 from rigs.sshd import private_sshd, PrivateSshd

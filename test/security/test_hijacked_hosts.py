@@ -12,8 +12,8 @@ import pytest
 
 from fogros2.errors import ProviderError
 from fogros2.model import MachineSpec, Result
-from fogros2.provider.container import hosted
-from fogros2.provider.container.hosted import HostedProvider
+from fogros2_features.hosts import hosted
+from fogros2_features.hosts.hosted import HostedProvider
 from fogros2_testing import FakeShell, request_for
 
 ID = 'podman:0123456789ab:0123-token'

@@ -155,9 +155,9 @@ def test_token_of_a_machine_is_on_no_command_line(
 
 def test_shared_folder_of_another_machine_gives_no_rights(cloud: Cloud) -> None:
     """A guest on one machine could run what root on another machine has put there."""
-    with cloud.machine(share=('/map',)) as (machine, _):
-        said = process.run(Command(('podman', 'exec', machine.id.split(':')[1], 'findmnt', '-J',
-                                    '-o', 'TARGET,OPTIONS'), sudo=True), timeout=60.0).stdout
-        options = {each['target']: each['options'].split(',') for top in
-                   json.loads(said)['filesystems'] for each in (top, *top.get('children', ()))}
+    machine = cloud.reached(cloud.create(cloud.spec(), common=['/map']))
+    said = process.run(Command(('podman', 'exec', machine.id.split(':')[1], 'findmnt', '-J',
+                                '-o', 'TARGET,OPTIONS'), sudo=True), timeout=60.0).stdout
+    options = {each['target']: each['options'].split(',') for top in
+               json.loads(said)['filesystems'] for each in (top, *top.get('children', ()))}
     assert {'ro', 'nosuid', 'nodev', 'noexec'} <= set(options['/opt/fogros2/shared'])

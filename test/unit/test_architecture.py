@@ -48,6 +48,8 @@ NAMED_PLUGINS = {
     ('fogros2.deploy.robot', 'fogros2.vpn.helped'),
     ('fogros2.deploy.robot_vpn', 'fogros2.vpn.helped'),
     ('fogros2_features.guests.membership', 'fogros2.vpn.helped'),
+    ('fogros2_features.hosts.hosted', 'fogros2.provider.container'),
+    ('fogros2_features.hosts.served', 'fogros2.provider.container'),
     ('fogros2_monitor.application', 'fogros2.provider.container'),
     ('ros2fog_cli.api.doctor', 'fogros2.dds.cyclonedds'),
     ('ros2fog_cli.api.doctor', 'fogros2.provider.container'),
@@ -79,7 +81,7 @@ MOVED = (
     'StreamTopic', 'image_transport', 'republish(ers)?', r'[Cc]heckpoint\w*', r'[Rr]eplacer\w*',
     r'Replacement\w*', 'drained', r'\w*[Gg]uest\w*', '[Ii]nvit(e|ed|ations?)', 'JoinedMachine',
     r'[Ff]oxglove\w*', r'\w*[Mm]onitor(ed|_\w+)?', '[Dd]ashboard',
-    r'[Rr]eplic\w*', 'first_answer')
+    r'[Rr]eplic\w*', 'first_answer', 'HostedProvider', 'served', 'shared topics')
 CLOUDS = {'aws', 'azure', 'gcp', 'kubernetes'}
 #: All of the core but the import of types.
 BUT_TYPES = r'fogros2(?! import ros_types$)'

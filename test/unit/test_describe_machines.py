@@ -11,6 +11,7 @@ import sys
 
 import pytest
 
+from fogros2 import feature
 from fogros2.describe.machines import (
     CloudInstance,
     ContainerInstance,
@@ -82,7 +83,8 @@ def test_shared_topics(context):
     context.launch_configurations.update(topic='/map')
     machine = ContainerInstance(
         name='planner', share=[LaunchConfiguration('topic'), '/tf_static', '/map'])
-    assert machine.spec(context).share == ('/map', '/tf_static')
+    given = machine.spec(context).features['share']
+    assert feature.options('share', given) == ('/map', '/tf_static')
     for wrong in ('map', '/map/', '', '/a b', '/map*'):
         with pytest.raises(ConfigurationError, match='full name of a topic'):
             ContainerInstance(share=[wrong])

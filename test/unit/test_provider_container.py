@@ -241,8 +241,8 @@ def test_nested_containers_get_their_right_on_request(
 @pytest.mark.skipif(os.geteuid() != 0, reason='root alone sees the folders')
 def test_relays_of_one_user_meet_in_folders_of_their_own(monkeypatch, tmp_path):
     monkeypatch.setattr(container_machine, 'SHARED', tmp_path / 'shared')
-    spec = MachineSpec('m', 'container', share=('/map',))
-    words = list(container_options.common_flags(Engine('podman'), spec, REQUEST, Options()))
+    spec, request = MachineSpec('m', 'container'), dataclasses.replace(REQUEST, common=['/map'])
+    words = list(container_options.common_flags(Engine('podman'), spec, request, Options()))
     folder = container_machine.share_folder('0123-token')
     # a machine writes into its own folder alone
     assert f'{folder}/own:/opt/fogros2/share' in words
@@ -250,19 +250,21 @@ def test_relays_of_one_user_meet_in_folders_of_their_own(monkeypatch, tmp_path):
     # docker's flag -v takes ro alone
     assert ('type=volume,volume-nocopy,volume-opt=type=none,volume-opt=device='
             f'{folder.parent},"volume-opt=o=bind,ro,nosuid,nodev,noexec",dst=/opt/fogros2/shared'
-            ) in container_options.common_flags(Engine('docker'), spec, REQUEST, Options())
+            ) in container_options.common_flags(Engine('docker'), spec, request, Options())
     assert not any('fogros2/share' in word for word in container_options.common_flags(
-        Engine('podman'), MachineSpec('m', 'container'), REQUEST, Options()))
-    with pytest.raises(ProviderError), container._sharing(spec, '0123-token'):
+        Engine('podman'), spec, REQUEST, Options()))
+    with pytest.raises(ProviderError), container._sharing(request):
         raise ProviderError('no image')
     assert list(tmp_path.iterdir()) == []
-    with container._sharing(spec, '0123-token'):
+    with container._sharing(request):
         assert [stat.S_IMODE(path.stat().st_mode) for path in (
             folder / 'own', folder, folder.parent, folder.parent.parent,
             folder / 'topics')] == [0o1777, 0o755, 0o755, 0o700, 0o644]
         assert (folder / 'topics').read_text() == '/map\n'
-    with container._sharing(spec, 'other-token'), pytest.raises(ProviderError):
-        with container._sharing(spec, 'third-token'):
+    other, third = (dataclasses.replace(request, token=f'{name}-token')
+                    for name in ('other', 'third'))
+    with container._sharing(other), pytest.raises(ProviderError):
+        with container._sharing(third):
             raise ProviderError('no more memory')
     names = {container_machine.directory(token).name for token in ('0123-token', 'other-token')}
     assert {path.name for path in folder.parent.iterdir()} == names

@@ -34,11 +34,11 @@ from fogros2.model import (
     to_json,
 )
 from fogros2.provider.container import engine as container_engine
-from fogros2.provider.container import hosted
 from fogros2.provider.container import machine as container_machine
-from fogros2.provider.container.hosted import HostedProvider, program, result_of
 from fogros2.shell.local import LocalShell
 from fogros2.store import Record, Store
+from fogros2_features.hosts import hosted
+from fogros2_features.hosts.hosted import HostedProvider, program, result_of
 from fogros2_testing import FakeShell, request_for
 
 ID = 'podman:0123456789ab:0123-token'
@@ -276,7 +276,7 @@ def test_program_holds_no_more_than_it_imports() -> None:
     data, _ = program()
     with tarfile.open(fileobj=io.BytesIO(data)) as tar:
         names = tar.getnames()
-    assert 'fogros2/provider/container/served.py' in names
+    assert 'fogros2_features/hosts/served.py' in names
     assert not [name for name in names if '/aws' in name or '/deploy' in name]
     assert len(data) < 300_000
 
@@ -304,4 +304,4 @@ def test_host_runs_the_program_with_its_own_python(on: dict[str, Any], here: Pat
             ('sh', '-ec', hosted._KEEP, 'sh', key), input=data), timeout=30.0)
     kept, = (here / 'fogros2').iterdir()
     assert kept.name == f'host-{key}'
-    assert {path.name for path in kept.iterdir()} == {'fogros2'}
+    assert {path.name for path in kept.iterdir()} == {'fogros2', 'fogros2_features'}

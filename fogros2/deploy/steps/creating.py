@@ -167,16 +167,14 @@ class Creation(Step):
         }
         can = context.capabilities
         key = self._login_key() if can.owned and can.shell_kind == 'ssh' else ''
+        request = CreateRequest(
+            token=token, authorized_key=key, tags=tags, vpn_port=plan.machine_port(context.launch),
+            agent_config=config, dependencies=dependencies)
+        for each, own in feature.used(job.spec):
+            request = each.request(request, own)
         self._asked = True
         try:
-            machine_id = context.provider.create(job.spec, CreateRequest(
-                token=token, authorized_key=key, tags=tags,
-                vpn_port=plan.machine_port(context.launch), agent_config=config,
-                dependencies=dependencies, with_volumes={
-                    name: volume for each, own in feature.used(job.spec)
-                    for name, volume in each.volumes(own).items()},
-                application=next(filter(None, (
-                    each.application(own) for each, own in feature.used(job.spec))), '')))
+            machine_id = context.provider.create(job.spec, request)
         except FogError as error:
             # after a refusal, no machine has to be looked for
             self._asked = not error.refused

@@ -6,8 +6,7 @@ Run machines on this computer: containers of podman or docker, each with an SSH 
 machine without an image, ``hidden_files`` leaves out what only root may read, ``login_ids``
 chooses the id of its user, ``entry`` makes its first process. ``packet_filter`` keeps machines
 from this computer's ports. ``machine`` reads the reports of the engine, ``options`` parses the
-options in launch files. ``served`` is a program for a computer that hosts machines of others, and
-``hosted`` the robot's end of it.
+options in launch files.
 """
 
 from __future__ import annotations
@@ -111,7 +110,7 @@ shift 5
 "$@" || { code=$?; kill "$search" 2>/dev/null; exit $code; }
 """
 
-# The machine's login user has any number; the first process gives it the folder 'own'. The topics
+# The machine's login user has any number; the first process gives it the folder 'own'. The names
 # stay root's. Only machines of one user of this computer meet: no other user enters the outermost
 # folder. The end of the last machine removes the outer folders.
 _SHARE = """\
@@ -234,7 +233,7 @@ class ContainerProvider(Provider):
         create = self._create_from_image if options.image else self._create_from_root
         for name in request.with_volumes:
             _check_free(engine, name, container_machine.container_name(spec.name, request.tags))
-        with _sharing(spec, request.token):
+        with _sharing(request):
             while True:
                 try:
                     identity = create(engine, spec, request, options)
@@ -545,14 +544,14 @@ def _check_free(engine: Engine, name: str, container: str = '') -> None:
 
 
 @contextlib.contextmanager
-def _sharing(spec: MachineSpec, token: str) -> Iterator[None]:
-    """Make the folder of a machine's relay, if it shares topics; remove it if the block fails."""
-    folder = str(container_machine.share_folder(token))
+def _sharing(request: CreateRequest) -> Iterator[None]:
+    """Make the folder that other machines here see, if it needs one; remove it after an error."""
+    folder = str(container_machine.share_folder(request.token))
     with contextlib.ExitStack() as failed:
-        if spec.share:
+        if request.common:
             failed.callback(process.run, Command(('sh', '-c', _UNSHARE, 'sh', folder), sudo=True),
                             timeout=10.0, check=False)
-            process.run(Command(('sh', '-ec', _SHARE, 'sh', folder, *spec.share), sudo=True),
+            process.run(Command(('sh', '-ec', _SHARE, 'sh', folder, *request.common), sudo=True),
                         timeout=10.0)
         yield
         failed.pop_all()
@@ -613,7 +612,7 @@ def filter_name(top: Path) -> str:
 
 
 def clean(top: Path) -> str:
-    """Return shell text that removes a machine's packet filter, root and folder of its relay."""
+    """Return shell text that removes a machine's packet filter, root and shared folder."""
     return (f'{packet_filter.unset(filter_name(top))}; umount -l {top} 2>/dev/null; '
             f'rm -rf -- {top} {container_machine.SHARED}/*/{top.name}; rmdir -- {top.parent} '
             f'{container_machine.SHARED}/* {container_machine.SHARED} 2>/dev/null; true')

@@ -60,7 +60,7 @@ if [ "$user" != root ] && ! grep -q "^$user .*NOPASSWD: ALL" /etc/sudoers; then
 fi
 {nested}mkdir -p /run/sshd /etc/ssh /{agent_directory}
 chown "$user" /{agent_directory} && chmod 700 /{agent_directory}
-# other accounts here must not speak for the machine to relays of other machines
+# other accounts here must not speak for the machine to other machines
 [ ! -d /{folder}/share ] || {{ chown "$user" /{folder}/share && chmod 711 /{folder}/share; }}
 grep -qw "$(hostname)" /etc/hosts 2>/dev/null \\
     || printf '127.0.0.1 localhost\\n127.0.1.1 %s\\n' "$(hostname)" >> /etc/hosts

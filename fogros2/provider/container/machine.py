@@ -31,7 +31,7 @@ _OURS = (ATTEMPT, LOGIN, MACHINE, DIRECTORY, ENDS_STOPPED, VPN_PORT)
 
 #: Roots of machines without an image; the engine removes each with its container.
 ROOTS = Path('/var/lib/fogros2')
-#: Folders by which relays of shared topics meet: of each user of this computer, of each machine.
+#: Folders by which machines here meet: of each user of this computer, of each machine.
 SHARED = Path('/var/lib/fogros2-share')
 #: A machine's id: its engine, its container's id, its token.
 ID = re.compile(r'(podman|docker):([0-9a-f]{12}):([A-Za-z0-9_-]{1,64})')
@@ -73,7 +73,7 @@ def token_label(token: str) -> str:
 
 
 def share_folder(token: str) -> Path:
-    """Return the folder of the relay of a machine; the one above is of all machines that meet."""
+    """Return the folder of a machine that others see; the one above is of all that meet."""
     return SHARED / str(os.getuid()) / directory(token).name
 
 

@@ -29,7 +29,7 @@ from fogros2.provider.container.machine import (
 )
 from fogros2.provider.options import parsed
 
-#: Folders on the machine by which relays of shared topics meet: its own, and that of all.
+#: Folders on the machine by which programs of several machines meet: its own, and that of all.
 SHARE_FOLDERS = (f'/{FOLDER}/share', f'/{FOLDER}/shared')
 APPARMOR = Path('/sys/kernel/security/apparmor')
 
@@ -162,7 +162,7 @@ def common_flags(
         yield from ('--device', device)
     for port in options.ports:
         yield from ('-p', port)
-    if spec.share:
+    if request.common:
         folder, (own, others) = share_folder(request.token), SHARE_FOLDERS
         yield from ('-v', f'{folder}/own:{own}', *data_mount(engine, folder.parent, others))
     for mount in options.mounts:

@@ -74,7 +74,7 @@ def test_wrong_policy_is_refused(keywords: Any, message: str) -> None:
 
 
 def test_shared_topic_is_neither_denied_nor_limited() -> None:
-    spec = MachineSpec('a', 'container', share=('/map', '/news'))
+    spec = MachineSpec('a', 'container', features={'share': {'share': ['/map', '/news']}})
     Streaming().check(spec, policy(deny_topics=['/costmap']))
     with pytest.raises(ConfigurationError, match="'a' has /map in share= and in deny_topics or"):
         Streaming().check(spec, policy(limit_topics={'/map': 1}))

@@ -50,14 +50,17 @@ _VOLUME = re.compile('(?:podman|docker):fogros2-volume-([a-z0-9-]+)')
 _TIMEOUT, _CREATE_TIMEOUT = 90.0, 1900.0
 #: Errors of the host that stay what they are; all others are a ProviderError.
 _KINDS = ('ConfigurationError', 'PrerequisiteError', 'MachineNotFound', 'NameTaken', 'Unsupported')
-#: The folders of modules that the host runs.
-_SENT = ('', 'agent/', 'agent_client/', 'shell/', 'provider/', 'provider/container/')
+#: The modules that the host runs, below the folder of the packages.
+_SENT = (*(f'fogros2/{folder}*.py' for folder in (
+    '', 'agent/', 'agent_client/', 'shell/', 'provider/', 'provider/container/')),
+    'fogros2_features/__init__.py', 'fogros2_features/hosts/__init__.py',
+    'fogros2_features/hosts/served.py')
 _FOLDER = 'folder=${XDG_CACHE_HOME:-$HOME/.cache}/fogros2/host-$1\n'
 # The machines show the host's ROS 2, if it has one. Exit status 75: the host lacks the modules.
 _SERVE = _FOLDER + """\
 cd "$folder" 2>/dev/null || exit 75
 for setup in /opt/ros/*/setup.sh; do [ ! -e "$setup" ] || . "$setup"; done
-exec python3 -m fogros2.provider.container.served
+exec python3 -m fogros2_features.hosts.served
 """
 _KEEP = _FOLDER + """\
 mkdir -p "${folder%/*}"
@@ -105,9 +108,9 @@ class _Volume(TypedDict):
 @functools.lru_cache(maxsize=1)
 def program() -> tuple[bytes, str]:
     """Return the archive of the modules that a host runs, and its hash."""
-    archive, top = Archive(), Path(model.__file__).parent
-    for path in sorted(path for folder in _SENT for path in top.glob(f'{folder}*.py')):
-        archive.file(f'fogros2/{path.relative_to(top)}', path.read_bytes())
+    archive, top = Archive(), Path(model.__file__).parents[1]
+    for path in sorted(path for pattern in _SENT for path in top.glob(pattern)):
+        archive.file(str(path.relative_to(top)), path.read_bytes())
     data = gzip.compress(archive.data(), mtime=0)
     return data, hashlib.sha256(data).hexdigest()[:16]
 
@@ -231,8 +234,7 @@ class HostedProvider(Provider):
             identity = self._call(
                 host, 'create', _CREATE_TIMEOUT,
                 spec={'name': spec.name, 'provider': ContainerProvider.name, 'options': options,
-                      'on_exit': spec.on_exit, 'containers': spec.containers,
-                      'share': spec.share},
+                      'on_exit': spec.on_exit, 'containers': spec.containers},
                 request=dataclasses.replace(request, tags={**request.tags, HOSTED: robot}))
         except errors.ShellError as error:
             error.refused = False  # the host may go on without the connection
