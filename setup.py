@@ -146,6 +146,12 @@ setup(
             'vpn_path = fogros2_features.vpn_path:VpnPath',
             'volumes = fogros2_features.volumes:Volumes',
         ],
+        'fogros2.public': [
+            'Foxglove = fogros2_monitor.action:Foxglove',
+            'JoinedMachine = fogros2_features.guests.machine:JoinedMachine',
+            'Replicated = fogros2_features.replicas.action:Replicated',
+            'StreamTopic = fogros2_features.streams.entries:StreamTopic',
+        ],
         'fogros2.modules': [
             'fogros2 = fogros2_monitor.needs:NEEDS',
             'fogros2_examples = fogros2_examples.needs:NEEDS',

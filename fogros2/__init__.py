@@ -2,14 +2,17 @@
 """
 Run nodes of a ROS 2 launch file on machines in the cloud, created at launch.
 
-The public names for launch files are here. Each is imported at its first use: ``import fogros2``
-alone loads neither launch nor an SDK.
+The public names for launch files are here, also those of features, which are entry points in the
+group ``fogros2.public``. Each is imported at its first use: ``import fogros2`` alone loads neither
+launch nor an SDK.
 """
 
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
+
+from fogros2 import plugin_system
 
 if TYPE_CHECKING:
     from fogros2.actions.cloud_group import CloudGroup
@@ -37,21 +40,17 @@ if TYPE_CHECKING:
     )
     from fogros2.errors import FogError
     from fogros2.runtime.interruption import MachineInterrupted
-    from fogros2_features.guests.machine import JoinedMachine
-    from fogros2_features.replicas.action import Replicated
-    from fogros2_features.streams.entries import StreamTopic
-    from fogros2_monitor.action import Foxglove
 
-#: Written out for type checkers, which do not run the module.
-__all__ = [
-    'AWSCloudInstance', 'AzureCloudInstance', 'CheapestInstance', 'CloudGroup',
-    'CloudInstance', 'CloudNode', 'ComposableNodeContainer', 'ContainerInstance', 'FogError',
-    'FogMachine', 'FogROSLaunchDescription', 'Foxglove', 'GCPCloudInstance', 'JoinedMachine',
-    'KubeInstance', 'LifecycleNode', 'MachineInterrupted', 'Node', 'Replicated', 'SSHInstance',
-    'StreamTopic', 'cheapest', 'ec2_instance_type_selection', 'find_cheapest',
-    'find_cheapest_ec2_instance_type', 'find_nearest_aws_region', 'nearest_aws_region_now',
-    'region_ami_selection',
-]
+    # written out for type checkers, which do not run the module
+    __all__ = [
+        'AWSCloudInstance', 'AzureCloudInstance', 'CheapestInstance', 'CloudGroup',
+        'CloudInstance', 'CloudNode', 'ComposableNodeContainer', 'ContainerInstance', 'FogError',
+        'FogMachine', 'FogROSLaunchDescription', 'GCPCloudInstance', 'KubeInstance',
+        'LifecycleNode', 'MachineInterrupted', 'Node', 'SSHInstance', 'cheapest',
+        'find_cheapest', 'find_cheapest_ec2_instance_type', 'find_nearest_aws_region',
+        'nearest_aws_region_now',
+    ]
+
 #: The public names of each module.
 _NAMES = {
     'actions.cloud_group': 'CloudGroup',
@@ -69,20 +68,22 @@ _NAMES = {
     'runtime.interruption': 'MachineInterrupted',
 }
 _MODULES = {
-    'Foxglove': 'fogros2_monitor.action',
-    'JoinedMachine': 'fogros2_features.guests.machine',
-    'Replicated': 'fogros2_features.replicas.action',
-    'StreamTopic': 'fogros2_features.streams.entries',
-    **{name: f'fogros2.{module}' for module, names in _NAMES.items() for name in names.split()}}
+    name: f'fogros2.{module}' for module, names in _NAMES.items() for name in names.split()}
 #: Modules that FogROS2 has in a package ``utils``: ``from fogros2 import region_ami_selection``.
 _FORMERLY_UTILS = ('ec2_instance_type_selection', 'region_ami_selection')
+_GROUP = 'fogros2.public'
 
 
-def __getattr__(name: str) -> object:
+def __getattr__(name: str) -> Any:
+    value: Any
     if name in _FORMERLY_UTILS:
         value = importlib.import_module('fogros2.describe.choices')
     elif name in _MODULES:
         value = getattr(importlib.import_module(_MODULES[name]), name)
+    elif name == '__all__':
+        value = [*_MODULES, *_FORMERLY_UTILS, *plugin_system.names(_GROUP)]
+    elif name[:1].isupper() and name in plugin_system.names(_GROUP):  # no module
+        value = plugin_system.load(_GROUP, name)
     else:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
     globals()[name] = value
@@ -90,4 +91,4 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__getattr__('__all__')})

@@ -74,8 +74,6 @@ SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_c
 #: Found by their entry points, or started by the user: the core imports none of them.
 ABOVE = ('fogros2_features', 'fogros2_monitor', 'fogros2_replicas', 'fogros2_share',
          'fogros2_testing', 'ros2fog_cli', 'rigs')
-#: The table of public names, which users import from one place.
-PUBLIC = CORE / '__init__.py'
 #: Names of features that the core had, and clouds may have. Only ever add some.
 MOVED = (
     'StreamTopic', 'image_transport', 'republish(ers)?', r'[Cc]heckpoint\w*', r'[Rr]eplacer\w*',
@@ -214,7 +212,7 @@ def test_exceptions_name_what_exists() -> None:
     ('image_transport_h264', (*ABOVE, 'fogros2', 'point_cloud_stream'))])
 def test_package_imports_nothing_above_it(folder: str, above: tuple[str, ...]) -> None:
     pattern = rf"^\s*(from|import) ({'|'.join(above)})\b"
-    for path in (path for path in python_files(ROOT / folder) if path != PUBLIC):
+    for path in python_files(ROOT / folder):
         assert not re.search(pattern, path.read_text(), re.MULTILINE), path
 
 
@@ -228,7 +226,7 @@ def test_core_names_no_keyword_of_a_feature() -> None:
 
 
 def test_core_names_nothing_that_has_moved_to_a_feature() -> None:
-    for path in (path for path in python_files(CORE) if path != PUBLIC):
+    for path in python_files(CORE):
         if not CLOUDS & {*path.parts}:
             assert not re.search(rf"\b({'|'.join(MOVED)})\b", text(path)), path
 
