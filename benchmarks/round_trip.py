@@ -108,7 +108,7 @@ def main() -> None:
             ['ip', '-o', 'route', 'get', address], check=True, capture_output=True,
             text=True).stdout.split()
         own, device = bridge[bridge.index('src') + 1], bridge[bridge.index('dev') + 1]
-        folder = launch.store.launch(launch.id)
+        folder = launch.store.launch_folder(launch.id)
         (folder / 'bridge.xml').write_text(vendor.render(
             [DdsInterface(device, 10), DdsInterface('lo')], [address]))
         bare.shell.put(vendor.render(

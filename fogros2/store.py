@@ -222,7 +222,7 @@ class Store:
     def __init__(self, root: Optional[Path] = None) -> None:
         self.root = root or state_home()
 
-    def launch(self, launch_id: str) -> Path:
+    def launch_folder(self, launch_id: str) -> Path:
         """Return a launch's folder (0700); create it if needed."""
         return _make_folder(self.root / 'launches' / launch_id)
 

@@ -3,7 +3,7 @@
 The agent on a cloud machine: starts the nodes, keeps their log, ends the machine in time.
 
 It runs on Python 3.10 or newer with only the standard library, before anything is installed. It
-travels as one file, ``agent.py``, which :func:`fogros2.agent_client.program.joined` makes of the
+travels as one file, ``agent.py``, which :mod:`fogros2.agent_client.program` makes of the
 modules, in this order:
 
 - ``protocol``: the requests, and the checks of configurations;
@@ -18,6 +18,6 @@ modules, in this order:
 A module may import the standard library, the modules before it, and types of ``fogros2.events``.
 """
 
-#: The modules in reading order; the joined file has them in this order.
+#: The modules in reading order; the one file has them in this order.
 MODULES = (
     'protocol', 'journal', 'loop', 'watchdog', 'processes', 'programs', 'nodes', 'server')

@@ -9,6 +9,6 @@ The robot's end of the agent's protocol.
 
 from fogros2.agent_client.connection import AgentClient, EventCallback
 from fogros2.agent_client.heartbeat import Heartbeat, interval_for
-from fogros2.agent_client.program import joined
+from fogros2.agent_client.program import agent_program
 
-__all__ = ['AgentClient', 'EventCallback', 'Heartbeat', 'interval_for', 'joined']
+__all__ = ['AgentClient', 'EventCallback', 'Heartbeat', 'agent_program', 'interval_for']

@@ -13,7 +13,7 @@ _HEADER = '#!/usr/bin/env python3\n# SPDX-License-Identifier: Apache-2.0\n'
 
 
 @functools.lru_cache(maxsize=1)
-def joined() -> str:
+def agent_program() -> str:
     """
     Return the modules of ``fogros2.agent`` as one program.
 

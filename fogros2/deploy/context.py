@@ -27,7 +27,7 @@ class Context:
     """
     What the steps of one machine use; only the machine's number and programs are its own.
 
-    :param launch: id of the launch.
+    :param launch_id: of the launch.
     :param environment: the user's environment variables.
     :param failures: errors of undo steps.
     :param cancel: when set, every wait of the deployment raises Cancelled.
@@ -42,7 +42,7 @@ class Context:
         allow less since this machine costs, too.
     """
 
-    launch: str
+    launch_id: str
     environment: Mapping[str, str]
     store: Store
     report: Reporter

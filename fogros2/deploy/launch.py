@@ -242,7 +242,7 @@ class Launch:
                 vendor, user = self.dds(), self.user_environment
                 check_robot()
                 vpn = self.robot_vpn()
-                path = self.store.launch(self.id) / vendor.file_name
+                path = self.store.launch_folder(self.id) / vendor.file_name
                 with step(self.report, '', 'middleware') as detail:
                     detail.append(vendor.rmw)
                     lan = vendor.parse_lan(run(
@@ -280,7 +280,7 @@ class Launch:
         peers = [other.interface.address for other in self._joined.values()] + [
             self._address(index) for name, index in self._indices.items()
             if name not in self._joined] if vendor.asks_machines else []
-        write_private(self.store.launch(self.id) / vendor.file_name, vendor.render(
+        write_private(self.store.launch_folder(self.id) / vendor.file_name, vendor.render(
             [*self._interfaces, *more], peers, self.user_environment, quiet=bool(more)).encode())
 
     def join(self, spec: MachineSpec) -> Optional[OtherVpn]:
@@ -304,7 +304,7 @@ class Launch:
         """Return the robot's VPN; its interface need not be up yet."""
         with self._lock:
             if self._vpn is None:
-                folder = self.store.launch(self.id)
+                folder = self.store.launch_folder(self.id)
                 self.undo.add('VPN interface', self._clear)
                 # `ros2 fog gc` reads this to recognise the folder of a killed launch
                 write_private(
@@ -323,7 +323,7 @@ class Launch:
 
     def _clear(self) -> None:
         """Remove what the launch has made on the robot, as for a launch that died."""
-        folder = self.store.launch(self.id)
+        folder = self.store.launch_folder(self.id)
         if self._vpn is not None and self._vpn.end():
             clear(folder)
         else:
@@ -359,7 +359,7 @@ class Launch:
 
         self.expect([spec.name])
         return Context(
-            launch=self.id, environment=self.user_environment, store=self.store,
+            launch_id=self.id, environment=self.user_environment, store=self.store,
             report=self.report, failures=self._failures, timeouts=self.timeouts,
             cancel=self.cancel, ending=self._ending, provider=self.provider(spec.provider),
             choices=self._choices, vpn=self.robot_vpn(), dds=self.dds(),

@@ -252,7 +252,7 @@ class MachineJob(Site):
                 # answered when the nodes have ended; an agent out of reach ends them by itself
                 self.agent.request(
                     'release', timeout=self.timeout(self._context.timeouts.command),
-                    silent=SILENCE_TIMEOUT, launch=self._context.launch,
+                    silent=SILENCE_TIMEOUT, launch=self._context.launch_id,
                     on_exit=self.spec.on_exit, exit=not self.capabilities.agent_program)
             except FogError as error:
                 self._released = False

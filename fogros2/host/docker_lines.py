@@ -111,9 +111,9 @@ def _pieces(pattern: re.Pattern[str], text: str) -> Iterator[tuple[str, str]]:
             yield kind, match[kind]
 
 
-def joined(line: str) -> str:
+def unfold(line: str) -> str:
     """
-    Join the continued lines of a launch file in XML or YAML before launch reads it.
+    Unfold the continued lines of a launch file in XML or YAML before launch reads it.
 
     For launch, a backslash makes the next character plain; and XML has a space for a newline in an
     attribute, so that a backslash stands alone.

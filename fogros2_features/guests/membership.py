@@ -76,7 +76,7 @@ def join(
         domain=invitation.domain, ports=vendor.ports,
         asked=addresses_of(vendor.asked(environment)))
     private = base64.b64encode(key).decode()
-    store.launch(invitation.number)
+    store.launch_folder(invitation.number)
     try:
         _write(folder, invitation, other, vendor, environment, owner)
         if helped.made(interface):

@@ -75,9 +75,9 @@ class JoinVerb(VerbExtension):
         """Print lines for ``eval "$(ros2 fog join INVITATION)"``."""
         from fogros2.store import Store
         from fogros2_features.guests import membership
-        from ros2fog_cli.api import joining, output, reach
+        from ros2fog_cli.api import output, reach, terminals
         folder = membership.join(args.invitation, Store(), agreed=confirmed)
-        print(*joining.shell_lines(folder, reach.variables_of(folder)), sep='\n',
+        print(*terminals.shell_lines(folder, reach.variables_of(folder)), sep='\n',
               file=output.uncleaned(sys.stdout))
         return 0
 

@@ -60,7 +60,8 @@ class Interruptible(Session):
                 self, launch, self._loop, in_thread=self._in_thread, fail=self._fail,
                 is_over=lambda: context.is_shutdown, logger=self._logger)
             self.checkpoints = Checkpoints(
-                self, context, launch.store.launch(launch.id) / 'checkpoints' / self.spec.name,
+                self, context,
+                launch.store.launch_folder(launch.id) / 'checkpoints' / self.spec.name,
                 f'.before-{launch.id}', launch.cancel, in_thread=self._in_thread,
                 logger=self._logger)
 

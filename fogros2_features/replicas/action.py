@@ -112,7 +112,7 @@ class Replicated(Action):
             session.rename({one: local_topic(one, name) for one in public},
                            others='the other replicas')
         first = starting.first_answer(
-            coordinator.launch.store.launch(coordinator.launch.id), sessions, services,
+            coordinator.launch.store.launch_folder(coordinator.launch.id), sessions, services,
             [(*pair, pair[0] in forwarded) for pair in pairs], hedge_after, deadline, context)
         for group in groups:
             if isinstance(group, _Last):

@@ -20,11 +20,11 @@ class EnvVerb(VerbExtension):
     def main(self, *, args: argparse.Namespace) -> int:
         """Print lines for ``eval "$(ros2 fog env NAME)"``."""
         from fogros2.store import Store
-        from ros2fog_cli.api import joining, output
-        folder, variables = joining.launch_of(args.name, Store())
+        from ros2fog_cli.api import output, terminals
+        folder, variables = terminals.launch_of(args.name, Store())
         if args.json:
             print_json(variables=variables)
         else:
-            print(*joining.shell_lines(folder, variables), sep='\n',
+            print(*terminals.shell_lines(folder, variables), sep='\n',
                   file=output.uncleaned(sys.stdout))
         return 0

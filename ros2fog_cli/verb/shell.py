@@ -18,5 +18,5 @@ class ShellVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Replace this process by the shell."""
-        from ros2fog_cli.api import joining
-        joining.run(args.name, command_of(args, 'shell'))
+        from ros2fog_cli.api import terminals
+        terminals.run(args.name, command_of(args, 'shell'))

@@ -23,7 +23,7 @@ from typing import Any, Optional
 import pytest
 
 from fogros2.agent.processes import SWEEP
-from fogros2.agent_client import AgentClient, Heartbeat, joined
+from fogros2.agent_client import agent_program, AgentClient, Heartbeat
 from fogros2.errors import AgentError, ConnectError
 from fogros2.model import Command, NodeSpec
 from fogros2.waiting import wait_until
@@ -94,7 +94,7 @@ class PipeShell:
 def program(folder: Path) -> Path:
     """Write the agent's program into a folder."""
     path = folder / 'joined-agent.py'
-    path.write_text(joined())
+    path.write_text(agent_program())
     return path
 
 

@@ -59,7 +59,7 @@ def test_launch_stops_the_daemon_of_its_terminals_before_its_vpn():
     seen = []
     try:
         environment = launch.robot_environment()
-        folder = launch.store.launch(launch.id)
+        folder = launch.store.launch_folder(launch.id)
         ros2_daemon.install(folder, sys.executable)
         server = SimpleXMLRPCServer(
             ('127.0.0.1', int((folder / ros2_daemon.PORT_FILE).read_text())), Ros2cliHandler,

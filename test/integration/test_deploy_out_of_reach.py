@@ -17,7 +17,7 @@ import uuid
 
 import pytest
 
-from fogros2.agent_client import AgentClient, joined
+from fogros2.agent_client import agent_program, AgentClient
 from fogros2.deploy import Launch, undo
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.steps import arming
@@ -78,7 +78,7 @@ def test_end_does_not_wait_for_an_unreachable_machine(cloud_network):
 def arm(start, machine, robot):
     """Return the machine's agent, or why it isn't to be had."""
     context, job = robot
-    job.record = dataclasses.replace(job.record, last=context.launch)
+    job.record = dataclasses.replace(job.record, last=context.launch_id)
     job.machine, job.shell = machine, LocalShell(Endpoint('local'), name=job.name)
     # an install that takes 30 s was seen once: show what it waits for
     waiting = threading.Timer(20, lambda: print(run(Command(
@@ -122,7 +122,7 @@ def test_of_two_robots_that_come_at_once_one_gets_the_computer(root, tmp_path):
         (_, error), = refused.items()
         assert isinstance(error, AgentError), error
         assert error.hint and name in str(error) or 'belongs to launch' in str(error), error
-        assert agent.request('status')['launch'] == contexts[winner].launch
+        assert agent.request('status')['launch'] == contexts[winner].launch_id
         robots[winner][1].undo.close()
         assert not os.path.exists(f'/run/fogros2/{name}')
 
@@ -139,7 +139,7 @@ def test_agent_is_removed_where_python_is_a_wrapper(root, tmp_path, monkeypatch)
     config = {'machine': 'wrapped', 'launch': 'first', 'directory': folder, 'user': 'root'}
     run(Command(('sh', '-ec', arming._INSTALL, 'sh', '/run/fogros2', folder, f'{folder}/agent.py',
                  f'{folder}/start-first.json', 'root'),
-                input=json.dumps(config).encode() + b'\n' + joined().encode()), timeout=30)
+                input=json.dumps(config).encode() + b'\n' + agent_program().encode()), timeout=30)
     program = Path('/proc', Path(folder, 'agent.pid').read_text().strip(), 'cmdline')
     assert b'agent.py' in program.read_bytes()
     run(Command(('sh', '-ec', undo._REMOVE, 'sh', folder, 'first',

@@ -96,7 +96,7 @@ def test_each_machine_runs_a_copy_under_its_own_names(run, fake, first):
             '__node:=planner', f'out:={prefix}/detections', f'/plan:={prefix}/plan',
             f'/image:={prefix}/image', f'/detections:={prefix}/detections']
     settings, = first
-    assert settings.pop('folder') == str(fake.store.launch('abcdef'))
+    assert settings.pop('folder') == str(fake.store.launch_folder('abcdef'))
     assert settings == {
         'name': 'first_answer_plan', 'services': ['/plan'], 'hedge_after': 'p95',
         'topics': [['/image', '/detections', False]],
@@ -136,7 +136,7 @@ def test_end_and_start_of_a_node_are_reported(run, fake, tmp_path):
 
     def reader(context):
         # before any node starts: a line that nobody reads is lost
-        read.append(os.open(fake.store.launch('abcdef') / 'first_answer_plan.events',
+        read.append(os.open(fake.store.launch_folder('abcdef') / 'first_answer_plan.events',
                             os.O_RDWR | os.O_NONBLOCK))
 
     def on_start(machine, node):

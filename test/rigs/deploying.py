@@ -37,7 +37,7 @@ def job(
     failures: list[Any] = []
     cancel, ending = threading.Event(), threading.Event()
     fields: dict[str, Any] = {
-        'launch': '0a0b0c', 'environment': {}, 'store': Store(folder), 'report': report,
+        'launch_id': '0a0b0c', 'environment': {}, 'store': Store(folder), 'report': report,
         'failures': failures, 'timeouts': Timeouts(), 'cancel': cancel, 'ending': ending,
         'provider': machines, 'choices': Choices(lambda name: machines, report),
         'vpn': RobotVpn(ROBOT, FakeVpn(), report=report, timeout=30.0,

@@ -219,7 +219,7 @@ def _agent() -> Iterator[Target]:
     with tempfile.TemporaryDirectory(prefix='fogt-fuzz-') as folder:
         if os.geteuid() == 0:
             os.chown(folder, NOBODY, NOBODY)
-        Path(folder, 'agent.py').write_text(agent_client.joined())
+        Path(folder, 'agent.py').write_text(agent_client.agent_program())
         Path(folder, 'config').write_text(json.dumps({'directory': f'{folder}/agent'}))
         nobody: Any = {'user': NOBODY, 'group': NOBODY, 'extra_groups': []} \
             if os.geteuid() == 0 else {}

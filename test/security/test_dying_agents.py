@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from fogros2.agent_client import joined
+from fogros2.agent_client import agent_program
 from fogros2.provider.container import entry, root
 from fogros2.waiting import wait_until
 
@@ -41,7 +41,7 @@ class Detached:
     def __init__(self, folder: Path) -> None:
         self.directory = folder / 'planner'
         program = folder / 'agent.py'
-        program.write_text(joined())
+        program.write_text(agent_program())
         config = folder / 'start.json'
         config.write_text(json.dumps({
             'machine': 'planner', 'launch': 'abc123', 'directory': str(self.directory)}))

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from fogros2.agent_client import joined
+from fogros2.agent_client import agent_program
 from fogros2.errors import MachineNotFound
 from fogros2.model import Machine, MachineState
 from fogros2.provider.ssh import SSHProvider
@@ -29,7 +29,7 @@ class Agent:
     def __init__(self, folder: Path, **config: Any) -> None:
         self.directory = folder / 'agent'
         program, path = folder / 'agent.py', folder / 'config.json'
-        program.write_text(joined())
+        program.write_text(agent_program())
         path.write_text(json.dumps({
             'machine': 'planner', 'launch': 'abc123', 'directory': str(self.directory),
             'robot_timeout': 60, **config}))

@@ -22,7 +22,7 @@ from typing import Any, Optional
 import pytest
 
 from fogros2.agent.protocol import BEAT, sign
-from fogros2.agent_client import Heartbeat, joined
+from fogros2.agent_client import agent_program, Heartbeat
 from fogros2.waiting import wait_until
 
 LAUNCH = 'abc123'
@@ -39,7 +39,7 @@ class Machine:
         self.directory = folder / 'agent'
         self.ended = folder / 'ended'
         self.program = folder / 'agent.py'
-        self.program.write_text(joined())
+        self.program.write_text(agent_program())
         self.log = folder / 'log'
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(('127.0.0.1', 0))

@@ -12,7 +12,7 @@ import sys
 import pytest
 
 from fogros2 import agent
-from fogros2.agent_client import joined
+from fogros2.agent_client import agent_program
 
 
 def names(statements: list[ast.stmt]) -> list[str]:
@@ -29,12 +29,12 @@ def names(statements: list[ast.stmt]) -> list[str]:
 
 
 def test_joined_modules_share_no_name():
-    counts = Counter(names(ast.parse(joined(), feature_version=(3, 10)).body))
+    counts = Counter(names(ast.parse(agent_program(), feature_version=(3, 10)).body))
     assert counts and max(counts.values()) == 1, counts.most_common(3)
 
 
 def test_joined_program_imports_the_standard_library_only():
-    for node in ast.walk(ast.parse(joined())):
+    for node in ast.walk(ast.parse(agent_program())):
         if isinstance(node, ast.Import):
             assert {name.name for name in node.names} <= sys.stdlib_module_names
         elif isinstance(node, ast.ImportFrom):
@@ -59,7 +59,7 @@ def test_joined_program_does_what_its_modules_do():
 
     folder = Path(agent.__file__).parent
     parts = [tree((folder / f'{name}.py').read_text()) for name in agent.MODULES]
-    assert tree(joined()) == sum(parts, [])
+    assert tree(agent_program()) == sum(parts, [])
 
 
 @pytest.mark.parametrize(('arguments', 'status'), [
@@ -67,7 +67,7 @@ def test_joined_program_does_what_its_modules_do():
     (['connect', '--directory', '/nowhere'], 3)])
 def test_joined_program_runs_alone(tmp_path, arguments, status):
     path = tmp_path / 'agent.py'
-    path.write_text(joined())
+    path.write_text(agent_program())
     done = subprocess.run(
         [sys.executable, '-IS', str(path), *arguments], capture_output=True, timeout=30)
     assert done.returncode == status and b'Traceback' not in done.stderr

@@ -25,7 +25,7 @@ import time
 import pytest
 import yaml
 
-from fogros2.agent_client import joined
+from fogros2.agent_client import agent_program
 from fogros2.deploy.steps import arming
 from fogros2.errors import ConfigurationError, MachineNotFound, PrerequisiteError, ProviderError
 from fogros2.model import CreateRequest, MachineSpec, MachineState
@@ -473,11 +473,11 @@ def test_booted_instance_starts_the_agent_that_it_gets(booted):
                       'lifetime': 600.0})
     top = booted(told)
     program = top / 'opt/fogros2/agent.py'
-    send = ['sh', '-ec', arming._SEND, 'sh', str(program), str(len(joined()))]
+    send = ['sh', '-ec', arming._SEND, 'sh', str(program), str(len(agent_program()))]
     # a connection that is lost meanwhile
-    assert subprocess.run(send, input=joined()[:-100], text=True).returncode
+    assert subprocess.run(send, input=agent_program()[:-100], text=True).returncode
     assert not program.exists()
-    subprocess.run(send, input=joined(), text=True, check=True)
+    subprocess.run(send, input=agent_program(), text=True, check=True)
     server = top / 'run/fogros2/agent.sock'
     wait_until(server.exists, timeout=60.0, what='the agent')
     answer = subprocess.run(
@@ -486,7 +486,7 @@ def test_booted_instance_starts_the_agent_that_it_gets(booted):
     status = json.loads(answer.stdout.splitlines()[0])
     assert status['ok'] and status['machine'] == 'planner', status
     assert oct((top / 'opt/fogros2/agent.json').stat().st_mode)[-3:] == '600'
-    assert program.read_text() == joined()
+    assert program.read_text() == agent_program()
     # a signal ends the agent in order; without another one, nothing would end the instance
     os.kill(status['pid'], signal.SIGTERM)
     wait_until(lambda: not Path(f"/proc/{status['pid']}").exists(), timeout=60, what='its end')

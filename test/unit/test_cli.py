@@ -44,7 +44,7 @@ from fogros2.vpn.wireguard import WireGuard
 from fogros2_testing.fakes import FakeProvider, FakeShell, FakeStream
 from fogros2_testing.plugins import instead
 from rigs import recorded_agent
-from ros2fog_cli.api import endings, joining, machines, table
+from ros2fog_cli.api import endings, machines, table, terminals
 from ros2fog_cli.api.machines import Entry
 
 NOW = 1_800_000_000.0
@@ -524,7 +524,7 @@ def test_gc_tries_ports_again_that_could_not_be_closed(
     monkeypatch.setattr(Memory, 'allow', Mock(side_effect=[ProviderError('busy'), None]))
     machine('a')
     record('a', on_exit='keep', made=(Made(undo.SSH_PORT, 22),), **dead())
-    folder = Store().launch('abc123')
+    folder = Store().launch_folder('abc123')
     assert run('gc') == 1 and 'busy' in capsys.readouterr().out
     after = Store().load('a')
     assert (after.launch, after.made) == ('', (Made(undo.SSH_PORT, 22),))
@@ -594,11 +594,11 @@ def test_leftover_launch_folders_are_found_by_their_process() -> None:
     rebooted = {**alive(), 'boot': 'another'}
     for name, about in (('aaaaaa', alive()), ('bbbbbb', dead()), ('cccccc', None),
                         ('eeeeee', rebooted)):
-        folder = store.launch(name)
+        folder = store.launch_folder(name)
         if about is not None:
             (folder / 'process.json').write_text(json.dumps(about))
     record('a', launch='dddddd', **dead())
-    store.launch('dddddd')
+    store.launch_folder('dddddd')
     assert [left.name for left in endings.leftovers(store)] == ['bbbbbb', 'eeeeee']
     later = time.time() + endings.FOLDER_AGE + 60
     assert [left.name for left in endings.leftovers(store, later)] == [
@@ -612,7 +612,7 @@ def test_env_lets_a_terminal_join(capsys: pytest.CaptureFixture[str],
     machine('a')
     record('a', **alive())
     assert 'no launch is running' in str(run('env', 'a'))
-    path = Store().launch('abc123') / 'dds.xml'
+    path = Store().launch_folder('abc123') / 'dds.xml'
     path.write_text('<x/>')
     path.with_name('domain').write_text('42')
     path.with_name('rmw').write_text('rmw_cyclonedds_cpp')
@@ -627,7 +627,7 @@ def test_env_lets_a_terminal_join(capsys: pytest.CaptureFixture[str],
         'RMW_IMPLEMENTATION'] == 'rmw_cyclonedds_cpp'
     # ROS 2's own ros2 has a daemon, which gets a port of this launch
     found = importlib.util.find_spec('os')
-    monkeypatch.setattr(joining.importlib.util, 'find_spec', lambda name: found)
+    monkeypatch.setattr(terminals.importlib.util, 'find_spec', lambda name: found)
     assert run('env', 'a') == 0
     shown = subprocess.run(['sh', '-c', f'{capsys.readouterr().out}\ncommand -v ros2'],
                            capture_output=True, text=True, check=True).stdout.strip()
@@ -644,7 +644,7 @@ def joined(monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
     machine('a')
     record('a', **alive())
-    folder = Store().launch('abc123')
+    folder = Store().launch_folder('abc123')
     for name, text in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '42'), ('dds.xml', '<x/>')):
         (folder / name).write_text(text)
     return folder
@@ -667,7 +667,7 @@ def test_shell_becomes_a_command_in_the_launch(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, joined: Path, daemon: bool,
 ) -> None:
     found = importlib.util.find_spec('os' if daemon else 'no_such_module')
-    monkeypatch.setattr(joining.importlib.util, 'find_spec', lambda name: found)
+    monkeypatch.setattr(terminals.importlib.util, 'find_spec', lambda name: found)
     script = 'echo "$ROS_DOMAIN_ID $RMW_IMPLEMENTATION"; command -v ros2; exit 5'
     assert become('--', 'sh', '-c', script) == 5
     first, where = capfd.readouterr().out.splitlines()

@@ -28,7 +28,7 @@ def complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Complete:
     for name in ('planner', 'mapper'):
         Store().save(Record(name, 'container', MachineSpec(name, 'container')))
     own = VpnInterface('foga1b2c3', '198.18.7.224', '198.18.7.0/24', 0, '')
-    write_private(Store().launch('a1b2c3') / OTHER_VPN, to_json(
+    write_private(Store().launch_folder('a1b2c3') / OTHER_VPN, to_json(
         OtherVpn(Peer('slam', '', '198.18.7.2'), own, own, 7224)).encode())
 
     def complete(line: str) -> list[str]:

@@ -64,7 +64,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Any]]:
         armed=time.time(), agent_program=__file__,
         vpn=interface, robot_vpn=dataclasses.replace(interface, name='fogabc123')))
     for name, content in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '7')):
-        write_private(store.launch('abc123') / name, content.encode())
+        write_private(store.launch_folder('abc123') / name, content.encode())
     found: list[tuple[str, Any]] = []
 
     def answer(command: Command) -> Result:
@@ -143,7 +143,7 @@ def test_what_cannot_be_joined_admits_nobody(
 ) -> None:
     key = change.pop('key', OTHER)
     if 'rmw' in change:
-        write_private(Store().launch('abc123') / 'rmw', change.pop('rmw').encode())
+        write_private(Store().launch_folder('abc123') / 'rmw', change.pop('rmw').encode())
     changes: Any = change
     Store().save(dataclasses.replace(Store().load('planner'), **changes))
     assert words in fog('invite', 'planner', '--key', key)
@@ -270,7 +270,7 @@ def test_published_port_is_part_of_the_machines_filter() -> None:
 
 def test_leave_names_the_nearest_machine() -> None:
     own = VpnInterface('foga1b2c3', '198.18.7.224', '198.18.7.0/24', 0, '')
-    write_private(Store().launch('a1b2c3') / OTHER_VPN, to_json(
+    write_private(Store().launch_folder('a1b2c3') / OTHER_VPN, to_json(
         OtherVpn(Peer('slam', '', '198.18.7.2'), own, own, 7224)).encode())
     assert main(argv=['fog', 'leave', 'slan']) == (
         "this computer has not joined a machine 'slan' (did you mean 'slam'?)")

@@ -80,7 +80,7 @@ def record(name: str, *, alive: bool = True, **changes: Any) -> Record:
 
 def steps(*lines: tuple[str, str, str]) -> None:
     """Write a journal of the launch: machine, step and event."""
-    path = Store().launch('abc123') / 'steps.jsonl'
+    path = Store().launch_folder('abc123') / 'steps.jsonl'
     path.write_text(''.join(json.dumps({
         'time': 1.0, 'machine': name, 'step': step, 'event': event, 'seconds': 1.0, 'detail': ''})
         + '\n' for name, step, event in lines))

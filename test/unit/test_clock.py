@@ -172,7 +172,7 @@ def test_launch_reports_changes_alone() -> None:
 
 def launched(store: Store, name: str, *lines: str) -> Record:
     """Return the record of a machine of this very process's launch, with that journal."""
-    (store.launch('abc123') / journal.FILE).write_text('\n'.join(lines))
+    (store.launch_folder('abc123') / journal.FILE).write_text('\n'.join(lines))
     record = Record(name, 'container', MachineSpec(name, 'container'), launch='abc123',
                     pid=os.getpid(), pid_start=process_start(os.getpid()) or 0, boot=boot_id())
     return store.save(record)

@@ -534,7 +534,7 @@ def beside(
 ) -> Containers:
     context, job = deploying.job(
         Store().root, MachineSpec('m', 'fake', containers=lines), provider=provider,
-        images=images, launch='abc')
+        images=images, launch_id='abc')
     job.record = dataclasses.replace(job.record, last='abc')
     job.shell = shell
     return Containers(context, job)

@@ -42,7 +42,7 @@ def several() -> Iterator[Graphs]:
 
 
 def launched(launch: str = 'abc123', **changes: Any) -> Record:
-    folder = Store().launch(launch)
+    folder = Store().launch_folder(launch)
     (folder / 'rmw').write_text('rmw_cyclonedds_cpp')
     (folder / 'domain').write_text('42')
     return Record('a', 'memory', MachineSpec('a', 'memory'), launch=launch, **{

@@ -80,7 +80,7 @@ def when(live: Live, name: str, fits: Callable[[dict[str, Any]], bool]) -> dict[
 
 def test_machine_is_shown_from_its_steps_to_its_end(live: Live) -> None:
     assert live.state(0, 5.0)['machines'] == []
-    folder = Store().launch('abc123')
+    folder = Store().launch_folder('abc123')
     (folder / 'process.json').write_text(json.dumps(alive()))
     keep = Journal(silent, folder)
     keep(StepStarted('', 'VPN interface'))

@@ -34,7 +34,7 @@ def test_launch_folder_stays_as_long_as_the_interface(
     down = Command(('false' if refused else 'true',), what='take it down')
     monkeypatch.setattr(FakeVpn, 'down', lambda self, interface: iter([down]))
     launch.robot_vpn().ensure()
-    folder = launch.store.launch(launch.id)
+    folder = launch.store.launch_folder(launch.id)
     assert len(launch.down()) == refused
     assert folder.exists() == refused
     # what gc sees when this process has gone

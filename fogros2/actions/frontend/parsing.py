@@ -67,7 +67,7 @@ def fog_machine(entity: Entity, parser: Parser) -> Parsed:
 def _container(entity: Entity, parser: Parser) -> dict[str, Any]:
     """Read ``<docker_container cmd="docker run redis"/>``, or ``image=`` and its keywords."""
     parameters = {'cmd': kinds.Keyword('cmd', 'text'), **kinds.parameters_of(described)}
-    contents = {name: value(entity, parser, keyword, docker_lines.joined if name == 'cmd' else str)
+    contents = {name: value(entity, parser, keyword, docker_lines.unfold if name == 'cmd' else str)
                 for name, keyword in parameters.items()}
     complete(entity, parameters)
     arguments = {name: values.items(content) if parameters[name].kind == 'list' else content

@@ -9,7 +9,7 @@ import secrets
 from typing import Any, Optional
 
 from fogros2 import model, plan
-from fogros2.agent_client import AgentClient, Heartbeat, interval_for, joined
+from fogros2.agent_client import agent_program, AgentClient, Heartbeat, interval_for
 from fogros2.deploy.machine_job import AGENT_FOLDER, Step
 from fogros2.deploy.undo import first_config, NODES, WATCHDOG
 from fogros2.errors import (
@@ -71,7 +71,7 @@ class Arming(Step):
         notice = context.provider.capabilities_of(job.machine).preemption_notice
         config = {
             **plan.agent_config(
-                job.spec, context.launch, job.directory, job.machine.end_command),
+                job.spec, context.launch_id, job.directory, job.machine.end_command),
             'user': endpoint.user if endpoint else '',
             # fixed before any node starts, even if there is none
             'notice': list(notice),
@@ -92,7 +92,7 @@ class Arming(Step):
             else:
                 job.save(agent=job.directory, agent_program=program)
                 if job.capabilities.agent_sent:
-                    source = joined().encode()
+                    source = agent_program().encode()
                     job.run(Command(
                         ('sh', '-ec', _SEND, 'sh', program, str(len(source))), sudo=True,
                         input=source, what='send the agent'))
@@ -111,7 +111,7 @@ class Arming(Step):
     def _rearm(self) -> None:
         # a later call may get through; the current step reports a lasting failure
         with contextlib.suppress(FogError):
-            self._job.agent.request('configure', launch=self._context.launch, again=True)
+            self._job.agent.request('configure', launch=self._context.launch_id, again=True)
 
     def _install(self, program: str, config: Mapping[str, Any]) -> None:
         job = self._job
@@ -121,7 +121,7 @@ class Arming(Step):
             job.run(Command(
                 ('sh', '-ec', _INSTALL, 'sh', AGENT_FOLDER, job.directory, program,
                  first_config(job.record), str(config['user'])),
-                sudo=True, input=line + b'\n' + joined().encode(),
+                sudo=True, input=line + b'\n' + agent_program().encode(),
                 what='start the agent'))
         except CommandError as error:
             if '"kind":"running"' in error.result.stdout:
@@ -165,7 +165,7 @@ class Arming(Step):
         job.restart_lifetime(job.spec.lifetime)
         try:
             job.agent.request(
-                'configure', timeout=context.timeouts.agent, launch=context.launch, again=True,
+                'configure', timeout=context.timeouts.agent, launch=context.launch_id, again=True,
                 lifetime=job.spec.lifetime,
                 heartbeat={'bind': address, 'port': port, 'peer': peer, 'key': key},
                 environment={

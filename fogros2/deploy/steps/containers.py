@@ -55,7 +55,7 @@ class Containers(Step):
                 job.shell.put(text.encode(), path, mode=0o600, timeout=timeouts.command)
             for number, (container, image) in enumerate(zip(lines, images)):
                 job.run(
-                    containers.run(container, number, self._context.launch, image, job.dds_file,
+                    containers.run(container, number, self._context.launch_id, image, job.dds_file,
                                    variables), timeout=timeouts.install)
             detail.append(f'{len(lines)}')
 
@@ -75,7 +75,7 @@ class Containers(Step):
         """
         images = self._get(node.image for node in nodes if node.image)
         return [node if not node.image else containers.inside(
-            node, images[node.image], self._context.launch, self._job.spec.workspace or '',
+            node, images[node.image], self._context.launch_id, self._job.spec.workspace or '',
             self._job.dds_file, self._job.spec.environment)
             for node in nodes]
 

@@ -157,7 +157,7 @@ class Creation(Step):
         job.undoing('end', self._end)
         self._claim(token)
         config = {
-            **plan.agent_config(job.spec, context.launch, job.directory, ()),
+            **plan.agent_config(job.spec, context.launch_id, job.directory, ()),
             'boot_timeout': context.timeouts.boot + context.timeouts.ssh,
         } if context.capabilities.agent_directory else {}
         dependencies = self._dependencies()
@@ -168,8 +168,8 @@ class Creation(Step):
         can = context.capabilities
         key = self._login_key() if can.owned and can.shell_kind == 'ssh' else ''
         request = CreateRequest(
-            token=token, authorized_key=key, tags=tags, vpn_port=plan.machine_port(context.launch),
-            agent_config=config, dependencies=dependencies)
+            token=token, authorized_key=key, tags=tags, dependencies=dependencies,
+            vpn_port=plan.machine_port(context.launch_id), agent_config=config)
         for each, own in feature.used(job.spec):
             request = each.request(request, own)
         self._asked = True
@@ -190,7 +190,7 @@ class Creation(Step):
     def _tags(self) -> dict[str, str]:
         """Return the tags that change with the launch that uses the machine."""
         spec = self._job.spec
-        return {TAG_LAUNCH: self._context.launch, TAG_ON_EXIT: spec.on_exit,
+        return {TAG_LAUNCH: self._context.launch_id, TAG_ON_EXIT: spec.on_exit,
                 TAG_EXPIRES: str(int(time.time() + spec.lifetime))}
 
     def _dependencies(self) -> str:
@@ -207,7 +207,7 @@ class Creation(Step):
         context, job = self._context, self._job
         job.save(
             token=token, created=job.record.created or time.time(), armed=time.time(),
-            launch=context.launch, last=context.launch, robot=robot_id(), **this_process(),
+            launch=context.launch_id, last=context.launch_id, robot=robot_id(), **this_process(),
             robot_vpn=context.vpn.interface, carried='', notes={})
 
     def _login_key(self) -> str:

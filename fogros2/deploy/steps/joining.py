@@ -40,9 +40,9 @@ class Joining(Step):
         """Choose the machine's interface; record it before it is created."""
         context, job = self._context, self._job
         self._former = job.record.vpn
-        port = job.record.vpn.port if job.record.vpn else plan.machine_port(context.launch)
+        port = job.record.vpn.port if job.record.vpn else plan.machine_port(context.launch_id)
         job.interface = plan.machine_interface(
-            context.launch, context.vpn.interface.network, context.index, port,
+            context.launch_id, context.vpn.interface.network, context.index, port,
             f'{job.directory}/vpn.key',
             '' if context.capabilities.owned else f'{job.directory}/agent.pid')
         job.save(vpn=job.interface)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import json
 from typing import Any
 
-from fogros2.agent_client import joined
+from fogros2.agent_client import agent_program
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container.root import Archive
 
@@ -173,5 +173,5 @@ def add(
     if agent_config:
         config = {'user': user, **agent_config}
         config['end_command'] = config.get('end_command') or list(END_COMMAND)
-        archive.file(f'{FOLDER}/agent.py', joined().encode())
+        archive.file(f'{FOLDER}/agent.py', agent_program().encode())
         archive.file(f'{FOLDER}/agent.json', json.dumps(config).encode(), 0o600)

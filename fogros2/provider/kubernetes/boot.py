@@ -42,9 +42,9 @@ while time.monotonic() < last and not os.listdir('/run/fogros2'):
 ALIVE_PORT = 7398
 ALIVE = f"""\
 import socket
-door = socket.create_server(('', {ALIVE_PORT}))
+server = socket.create_server(('', {ALIVE_PORT}))
 while True:
-    door.accept()[0].close()
+    server.accept()[0].close()
 """
 
 SCRIPT = r"""

@@ -23,7 +23,7 @@ def fog(robot, *words, **variables):
     return done.stdout
 
 
-def doors(box):
+def changed_ports(box):
     """Return what the requests since the last look have opened and closed."""
     asked = [call.action for call in box.calls() if call.action.endswith('GroupIngress')]
     box.forget_calls()
@@ -35,7 +35,7 @@ def test_beside_a_launch_the_way_in_is_the_vpn(robot, box, name):
     run.wait_for(f'I heard: [Hello World from {name} ')
     # what follows goes by the closed port's other way in
     run.wait_for('port 22 closed')
-    doors(box)
+    changed_ports(box)
     (entry,) = [e for e in json.loads(fog(robot, 'list', '--json'))['machines']
                 if e['name'] == name]
     assert (entry['place'], entry['kind'], entry['state']) == ('us-east-1', 't3.medium', 'running')
@@ -50,7 +50,7 @@ def test_beside_a_launch_the_way_in_is_the_vpn(robot, box, name):
     assert logs.returncode == 0 and 'Publishing' in logs.stderr, logs.stdout + logs.stderr
     status = json.loads(fog(robot, 'status', name, '--json'))
     assert status['problems'] == [] and status['agent']['nodes'][0]['state'] == 'running'
-    assert doors(box) == []
+    assert changed_ports(box) == []
     refused = robot.ros2('fog', 'delete', name, '--yes', **HERE)
     assert refused.returncode != 0 and 'has the machine' in refused.stdout + refused.stderr
     run.interrupt()
@@ -61,9 +61,9 @@ def test_a_kept_machine_is_entered_through_its_firewall(robot, box, name):
     run = robot.launch('fogros2_examples', 'talker.aws.launch.py', f'name:={name}',
                        'on_exit:=keep', 'count:=1')
     assert run.ended() == 0, run.text
-    doors(box)
+    changed_ports(box)
     here = fog(robot, 'connect', name, '--', 'sh', '-c', 'echo $SSH_CONNECTION').split()[0]
-    assert doors(box)[-1] == 'RevokeSecurityGroupIngress'
+    assert changed_ports(box)[-1] == 'RevokeSecurityGroupIngress'
     # the robot's address changes: it lets itself in from where it is now
     there = box.move_robot()
     try:

@@ -44,7 +44,7 @@ def knock(box, at, target, timeout=15.0):
     return (done.stdout or done.stderr).strip()
 
 
-def doors(robot):
+def open_ports(robot):
     (group,) = [group for group in robot.api().describe_security_groups()['SecurityGroups']
                 if group['GroupName'] != 'default']
     return [(rule['FromPort'], [source['CidrIp'] for source in rule['IpRanges']])
@@ -56,7 +56,7 @@ def test_security_group_admits_viewers_until_the_launch_ends(robot, box, name):
     run = robot.launch(robot.write('monitor.launch.py', LAUNCH_FILE.format(name=name)))
     run.wait_for('the certificate has the SHA-256')
     run.wait_for(f'with its token: ros2 fog monitor {name} --share')
-    wait_until(lambda: doors(robot) == [(8766, ['198.51.100.2/32'])] or None, timeout=60,
+    wait_until(lambda: open_ports(robot) == [(8766, ['198.51.100.2/32'])] or None, timeout=60,
                what='the SSH port to be closed')
     (instance,) = box.alive()
     shared = robot.ros2('fog', 'monitor', name, '--share').stdout.splitlines()[0]
@@ -72,5 +72,5 @@ def test_security_group_admits_viewers_until_the_launch_ends(robot, box, name):
     run.interrupt()
     assert run.ended() == 0, run.text
     assert box.alive()[0].id == instance.id
-    assert doors(robot) == []
+    assert open_ports(robot) == []
     assert robot.ros2('fog', 'delete', name, '--yes').returncode == 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Join the launch of a machine from a terminal of this computer."""
+"""Let terminals of this computer take part in the launch of a machine."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def launch_of(name: str, store: Store) -> tuple[Path, dict[str, str]]:
     if variables is None:
         raise ConfigurationError(f"no launch is running with the machine '{name}'",
                                  'join its nodes while a launch runs')
-    return store.launch(record.launch), variables
+    return store.launch_folder(record.launch), variables
 
 
 def programs(folder: Path) -> Optional[Path]:
@@ -44,7 +44,7 @@ def programs(folder: Path) -> Optional[Path]:
 
 
 def shell_lines(folder: Path, variables: Mapping[str, str]) -> list[str]:
-    """Return lines for a POSIX shell whose nodes join a launch; its end stops their daemon."""
+    """Return lines for a POSIX shell whose nodes are in a launch; its end stops their daemon."""
     lines = [f'export {name}={shlex.quote(value)}' for name, value in sorted(variables.items())]
     if (first := programs(folder)) is not None:
         lines.append(f'export PATH={shlex.quote(str(first))}:"$PATH"')
