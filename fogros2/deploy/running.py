@@ -256,7 +256,7 @@ class RunningMachine(Step):
             try:
                 self.agent.request(
                     'configure', timeout=self._context.timeouts.agent,
-                    launch=self._context.launch, again=True, lifetime=allowed)
+                    launch=self._context.launch_id, again=True, lifetime=allowed)
             except FogError:
                 if self._lost or self._ended or self._ending:
                     return

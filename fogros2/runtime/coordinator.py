@@ -346,7 +346,7 @@ class Coordinator:
     @property
     def folder(self) -> Path:
         """The launch's folder on the robot."""
-        return self.launch.store.launch(self.launch.id)
+        return self.launch.store.launch_folder(self.launch.id)
 
     @property
     def interface(self) -> str:

@@ -98,7 +98,7 @@ def test_user_is_warned_once_and_status_shows_what_is_left(
     monkeypatch.setenv('FOGROS2_STATE_HOME', str(tmp_path))
     costs: list[Cost] = []
     spending = Spending(SimpleNamespace(  # type: ignore[arg-type]
-        costs=costs, folder=Store().launch('0a0b0c'), ended=threading.Event()))
+        costs=costs, folder=Store().launch_folder('0a0b0c'), ended=threading.Event()))
 
     def status(name: str) -> dict[str, str]:
         shown = {'launch': '0a0b0c', 'launch_alive': True, 'name': name}
@@ -115,7 +115,7 @@ def test_user_is_warned_once_and_status_shows_what_is_left(
         "80% of the launch's budget of $10.00 is spent", 'a: 80% of its budget of $5.00 is spent']
     assert status('b') == {'launch budget': '$0.00 left of $10.00'}
     assert status('a') == {'budget': '$0.00 left of $5.00', **status('b')}
-    assert Store().launch('0a0b0c').joinpath(budget.FILE).stat().st_mode & 0o77 == 0
+    assert Store().launch_folder('0a0b0c').joinpath(budget.FILE).stat().st_mode & 0o77 == 0
 
 
 def test_watch_ends_with_the_launch(monkeypatch: pytest.MonkeyPatch) -> None:
