@@ -135,6 +135,7 @@ setup(
         ],
         'fogros2.feature': [
             'budget = fogros2_features.budget:Budget',
+            'containers = fogros2_features.containers:Containers',
             'guests = fogros2_features.guests.feature:Guests',
             'idle = fogros2_features.idle:IdleTimeout',
             'monitor = fogros2_monitor.feature:Monitor',
@@ -190,6 +191,7 @@ setup(
         ],
         'launch.frontend.launch_extension': [
             'fogros2 = fogros2.actions.frontend.elements',
+            'fogros2_containers = fogros2_features.containers.elements',
             'fogros2_replicas = fogros2_features.replicas.elements',
             'fogros2_streams = fogros2_features.streams.elements',
         ],

@@ -65,6 +65,9 @@ class RunningMachine(Protocol):
     :ivar provider: the machine's.
     :ivar shell: copies files; for commands there is ``run``.
     :ivar interface: its end of the launch's VPN, and ``vpn_address`` the address there.
+    :ivar launch: the launch's id.
+    :ivar environment: the variables of its nodes.
+    :ivar dds_file: path of the middleware's configuration there, which ``environment`` names.
     """
 
     spec: MachineSpec
@@ -73,6 +76,9 @@ class RunningMachine(Protocol):
     shell: Shell
     interface: VpnInterface
     vpn_address: str
+    launch: str
+    environment: Mapping[str, str]
+    dds_file: str
 
     @property
     def directory(self) -> str:
@@ -98,6 +104,9 @@ class RunningMachine(Protocol):
 
     def note(self, name: str, text: str) -> None:
         """Let ``ros2 fog`` show a text while the launch runs: see ``Feature.notes``."""
+
+    def makes(self, name: str) -> None:
+        """Record that ``clean_up`` of the feature with this name undoes what it makes next."""
 
     def open_port(self, port: int, sources: Sequence[str]) -> tuple[str, int]:
         """
@@ -323,6 +332,13 @@ class Feature:
     node_options: ClassVar[Callable[..., Any]] = staticmethod(lambda: None)
     #: Whether each machine uses the feature, even without its keywords.
     always: ClassVar[bool] = False
+    #: A keyword of machines that takes a list, and the element of XML and YAML that is one item.
+    #: Machines have a method ``add_ELEMENT``, which adds what ``item`` returns for its arguments.
+    machine_list: ClassVar[tuple[str, str]] = ('', '')
+    item: ClassVar[Callable[..., Any]] = staticmethod(lambda item: item)
+    #: Keywords of machines and of nodes that run containers there. Only the machine knows the
+    #: programs of such nodes: the launch does not look for them here, nor move them.
+    containers: ClassVar[Sequence[str]] = ()
     #: A keyword of nodes, groups and launch descriptions that takes a list, and the element of XML
     #: and YAML that is one item; it parses to a :class:`fogros2.actions.frontend.actions.Item`.
     node_list: ClassVar[tuple[str, str]] = ('', '')
@@ -401,6 +417,14 @@ class Feature:
         :raises FogError: they can't start, and the launch ends.
         """
         return nodes
+
+    def clean_up(self, launch: str) -> Sequence[Command]:
+        """
+        Return commands that remove from a machine what a launch has made there.
+
+        They run, perhaps twice, when the launch leaves a machine that stays, and after its death.
+        """
+        return ()
 
     def session(self, own: Any) -> Optional[Callable[..., Any]]:
         """
@@ -485,6 +509,16 @@ def options(name: str, given: Mapping[str, Any], of: str = 'options') -> Any:
     :raises ConfigurationError: a value is wrong.
     """
     return getattr(plugin_system.load(GROUP, name), of)(**given)
+
+
+def contained(given: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """
+    Return those of a machine's or a node's keywords that run containers, with their values.
+
+    :param given: the values of keywords by feature.
+    """
+    return {keyword: value for name, values in given.items() for keyword, value in values.items()
+            if value and keyword in load(name).containers}
 
 
 def used(spec: MachineSpec) -> Iterator[tuple[Feature, Any]]:

@@ -49,7 +49,6 @@ class MachineSpec:
     :param lifetime: seconds after which the machine ends by itself in any case.
     :param robot_timeout: seconds without the launch's heartbeat after which the nodes stop.
     :param environment: variables of every node on the machine.
-    :param containers: ``docker run`` command lines that start before the nodes.
     :param apt: Debian packages to install; ``pip`` Python packages, in pip's syntax.
     :param features: the values of features' keywords, by feature; JSON types only.
     :param wanted: for a machine of any cloud, the requirements for which the launch has chosen
@@ -66,7 +65,6 @@ class MachineSpec:
     robot_timeout: float = DEFAULT_ROBOT_TIMEOUT
     bootstrap: Bootstrap = 'auto'
     environment: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    containers: tuple[str, ...] = ()
     apt: tuple[str, ...] = ()
     pip: tuple[str, ...] = ()
     features: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
@@ -370,8 +368,6 @@ class NodeSpec:
     :param files: contents of files to send; ``{'file': key}`` in a Text stands for the path.
     :param environment: variables in addition to the machine's own.
     :param respawn_delay: seconds.
-    :param image: container image that the process runs in, '' for the machine itself.
-    :param image_options: options of ``docker run`` for that image.
     :param features: the values of features' keywords of nodes, by feature; JSON types only.
     """
 
@@ -391,8 +387,6 @@ class NodeSpec:
     respawn_max_retries: int = -1
     sigterm_timeout: float = 5.0
     sigkill_timeout: float = 5.0
-    image: str = ''
-    image_options: tuple[str, ...] = ()
     features: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
 
 

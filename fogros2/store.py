@@ -524,7 +524,7 @@ def record_from_json(data: Mapping[str, Any]) -> Record:
     values = {key: value for key, value in data.items() if key in names}
     fields = {f.name for f in dataclasses.fields(MachineSpec)}
     spec: dict[str, Any] = {k: v for k, v in values['spec'].items() if k in fields}
-    for key in ('underlays', 'containers', 'apt', 'pip'):
+    for key in ('underlays', 'apt', 'pip'):
         spec[key] = tuple(spec[key])
     values['spec'] = MachineSpec(**spec)
     for key, kind in (('shell', Endpoint), ('vpn', VpnInterface), ('robot_vpn', VpnInterface)):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Optional, TYPE_CHECKING
 
 from launch import Action, LaunchContext
@@ -25,18 +25,15 @@ class FogMachine(Action):
         runs the machine's nodes on the robot.
     :param given: keywords of that provider's class. If the provider is a substitution, keywords
         that its class lacks may be empty strings.
-    :param containers: keywords of ``add_docker_container``, one mapping for each container.
     :raises ConfigurationError: a value that is known already is wrong.
     """
 
     def __init__(
-        self, provider: SomeSubstitutionsType, given: Mapping[str, Any],
-        containers: Sequence[Mapping[str, Any]] = (), **kwargs: Any,
+        self, provider: SomeSubstitutionsType, given: Mapping[str, Any], **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
         self._provider = provider
         self._given = dict(given)
-        self._containers = list(containers)
         #: The machine; None until the provider is resolved.
         self.machine: Optional[CloudInstance] = None
         if isinstance(provider, str):
@@ -57,9 +54,6 @@ class FogMachine(Action):
             self.machine = keywords.make(provider, {
                 name: value for name, value in self._given.items()
                 if name in parameters or not self._is_empty(context, value)})
-        for container in self._containers:
-            self.machine.add_docker_container(**{
-                name: values.resolve(context, value) for name, value in container.items()})
         return self.machine
 
     @staticmethod

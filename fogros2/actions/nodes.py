@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Optional, TYPE_CHECKING, Union
+from typing import Any, Optional, TYPE_CHECKING
 
 from launch import LaunchContext, LaunchDescriptionEntity
 import launch_ros.actions
@@ -12,13 +12,10 @@ import launch_ros.actions
 from fogros2.describe import features, keywords, values
 from fogros2.describe.machines import checked, CloudInstance
 from fogros2.errors import ConfigurationError
-from fogros2.host import containers
 from fogros2.runtime.coordinator import Coordinator
 from fogros2.runtime.remote_process import RemoteProcess, send, send_components
 
 if TYPE_CHECKING:
-    from launch import SomeSubstitutionsType, Substitution
-
     from fogros2.describe.machines import SomeMachine
 
 
@@ -32,10 +29,6 @@ class Node(launch_ros.actions.Node):
 
     :param machine: the machine, or the name of one that the launch mentions elsewhere; None for
         the robot, or for the machine of an enclosing CloudGroup.
-    :param image: container image that the node runs in on the machine, such as
-        'ros:jazzy-perception', with the machine's network, DDS configuration and workspace.
-    :param image_options: more options for ``docker run``, such as ['--gpus=all']; a substitution
-        separates them by commas.
     :param kwargs: also keywords and lists of features, see doc/developers/features.md.
     :raises ConfigurationError: ``machine`` is no machine, or another option needs one.
     """
@@ -44,42 +37,31 @@ class Node(launch_ros.actions.Node):
     _remote: Optional[RemoteProcess] = None
 
     def __init__(
-        self, *, machine: Optional[SomeMachine] = None,
-        image: Optional[SomeSubstitutionsType] = None,
-        image_options: Union[Sequence[SomeSubstitutionsType], Substitution] = (),
-        **kwargs: Any,
+        self, *, machine: Optional[SomeMachine] = None, **kwargs: Any,
     ) -> None:
         self.lists = features.take_lists(kwargs)
         of_features = features.keywords('node_options')
         own = {name: kwargs.pop(name) for name in of_features if name in kwargs}
         with keywords.refused(type(self), of_features):
             super().__init__(**kwargs)
-        if isinstance(image_options, str) or image_options and image is None:
-            raise ConfigurationError(
-                f'image_options={image_options!r} is no list of options for an image',
-                "such as image='ros:jazzy-perception', image_options=['--gpus=all']")
         if machine is None:
-            needing = {'image': image, **own, **self.lists}
-            for keyword, value in needing.items():
+            for keyword, value in {**own, **self.lists}.items():
                 if value is not None:
                     raise ConfigurationError(
                         f'{keyword}= of a node is for a machine, and this node has none',
                         f'add machine=, or leave {keyword}= out')
             return
-        self._image = image
         self._features = features.own(own, 'node_options')
-        self._image_options = values.items(image_options)
-        if image is not None and isinstance(machine, CloudInstance):
+        contained = any(own.get(keyword) is not None for keyword in features.containers())
+        if contained and isinstance(machine, CloudInstance):
             machine.takes_containers()
         self._remote = send(self, checked(machine))
-        self._remote.has_image = image is not None
+        self._remote.contained = contained
 
     def prepare(self, context: LaunchContext) -> None:
         """Resolve the action and its lists; relative topics are in the node's namespace."""
         remote = self._remote
         if remote is not None:
-            if self._image is not None:
-                self._use_image(context, remote)
             remote.features = features.by_feature(
                 values.resolve(context, self._features), 'node_options')
         super().prepare(context)
@@ -96,20 +78,6 @@ class Node(launch_ros.actions.Node):
             for entity in entities or ():
                 send_components(entity, self._remote.machine, self._remote.own, context)
         return entities
-
-    def _use_image(self, context: LaunchContext, remote: RemoteProcess) -> None:
-        image = values.resolve(context, self._image)
-        options = values.resolve(context, self._image_options)
-        containers.node_container(image, options)
-        if self.shell:
-            raise ConfigurationError(
-                f"a node in the image '{image}' can't run in a shell of the machine",
-                'leave shell= out')
-        if Coordinator.of(context).on_robot(remote.machine):
-            raise ConfigurationError(
-                f"the image '{image}' is for a machine, and the robot runs this node itself",
-                'leave image= out for the robot, or choose another machine')
-        remote.image, remote.image_options = image, options
 
 
 class LifecycleNode(Node, launch_ros.actions.LifecycleNode):

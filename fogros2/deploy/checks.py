@@ -10,7 +10,7 @@ from typing import Optional
 from fogros2 import feature, plan
 from fogros2 import shell as shells
 from fogros2.errors import ConfigurationError, FogError
-from fogros2.host import bootstrap, containers, undeclared, workspace
+from fogros2.host import bootstrap, undeclared, workspace
 from fogros2.host.programs import check_program
 from fogros2.model import MachineSpec
 from fogros2.provider import Provider
@@ -51,15 +51,14 @@ def check_here(
 
 
 def check(
-    spec: MachineSpec, provider: Provider, *, rmw: str, environment: Mapping[str, str],
-    programs: Sequence[tuple[str, str]], images: Sequence[str], report: Reporter,
+    spec: MachineSpec, provider: Provider, *, environment: Mapping[str, str],
+    programs: Sequence[tuple[str, str]], report: Reporter,
 ) -> None:
     """
-    Check a machine's options, rights and containers; report undeclared packages.
+    Check a machine's options, rights and features; report undeclared packages.
 
     :param environment: the user's environment variables.
     :param programs: the (package, executable) pairs that will run there.
-    :param images: the container images that nodes there will run in.
     :raises FogError: the first problem that was found, with its remedy.
     """
     shells.warm(provider.capabilities.shell_kind)
@@ -68,10 +67,6 @@ def check(
         raise ConfigurationError(
             f"'{spec.name}' is a computer that exists already: no launch switches it off",
             "use on_exit='delete' to leave nothing there, or 'keep'")
-    for line in spec.containers:
-        containers.check(containers.parse(line), rmw)
-    if spec.containers or images:
-        provider.check_containers(spec)
     for each, own in feature.used(spec):
         each.check(spec, own)
     chain = [workspace.inspect(path) for path in spec.workspaces]

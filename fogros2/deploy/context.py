@@ -36,7 +36,6 @@ class Context:
     :param index: the machine's number in the VPN.
     :param others: returns the VPN addresses of the other machines that are known now.
     :param programs: the (package, executable) pairs that are known to run on the machine.
-    :param images: the container images that nodes on the machine are known to run in.
     :param other_vpn: the VPN of another robot in which the machine is; None: the launch's.
     :param shorten_others: shortens the lifetimes of the launch's other machines where features
         allow less since this machine costs, too.
@@ -57,7 +56,6 @@ class Context:
     index: int = 0
     others: Callable[[], Sequence[str]] = tuple
     programs: Sequence[tuple[str, str]] = ()
-    images: Sequence[str] = ()
     other_vpn: Optional[OtherVpn] = None
     shorten_others: Callable[[], None] = lambda: None
 

@@ -13,14 +13,13 @@ from concurrent.futures import (
 import contextlib
 from typing import Any
 
-from fogros2 import feature
+from fogros2 import feature, plan
 from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.running import RunningMachine
 from fogros2.deploy.steps import dds, installing
 from fogros2.deploy.steps.arming import Arming
 from fogros2.deploy.steps.connecting import Connection
-from fogros2.deploy.steps.containers import Containers
 from fogros2.deploy.steps.creating import Creation
 from fogros2.deploy.steps.joining import Joined, Joining
 from fogros2.deploy.steps.watching import ClockComparison
@@ -66,7 +65,6 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
             job.cancel.set()
             raise
         modules = installing.Modules(context, job, ros)
-        containers = Containers(context, job)
         vpn_step = pool.submit(joining.join)
         dds_step = pool.submit(dds.configure, context, job)
 
@@ -74,37 +72,31 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
             ros_step.result()
             modules.ensure(context.programs)
 
-        def environment() -> dict[str, str]:
-            vpn_step.result()
-            return {**ros.environment, **dds_step.result(), **job.spec.environment}
-
-        def start_containers() -> None:
-            ros_step.result()
-            containers.start(environment)
-
         _wait_for_all(
             job, ros_step, vpn_step, dds_step,
             pool.submit(installing.send_workspaces, context, job, ros, ros_step.result),
-            pool.submit(install_modules), pool.submit(start_containers))
+            pool.submit(install_modules))
     for name in feature.names(job.spec):
         for link in joining.links(connection):
             carrying = contextlib.ExitStack()
             job.undo.add(name, carrying.close)
             carrying.enter_context(feature.load(name).vpn(
                 link, feature.options(name, job.spec.features.get(name, {}))))
+    environment = plan.extended({**ros.environment, **dds_step.result()}, job.spec.environment)
     with job.step('agent') as detail:
-        arming.start_heartbeat(ros, dds_step.result())
+        arming.start_heartbeat(ros.setup, environment)
         detail.append(f'VPN round trip {(job.heartbeat.round_trip or 0) * 1e3:.2f} ms')
     # pushed now, so that they end after the nodes and before the machine
     features = {name: contextlib.ExitStack() for name in feature.names(job.spec)}
     for name, ending in features.items():
+        job.may_make(name)
         job.undo.add(name, ending.close)
     # a second time, so that the nodes stop first on the way down
     job.makes(NODES)
     dds.start_router(context, job)
     connection.enter_vpn()
     job.undo.callback(ClockComparison(job.name, job.heartbeat, context.report).close)
-    running = RunningMachine(context, job, modules, containers, joining.redial)
+    running = RunningMachine(context, job, modules, environment, joining.redial)
     for name, ending in features.items():
         ending.enter_context(feature.load(name).machine(
             running, feature.options(name, job.spec.features.get(name, {}))))

@@ -67,7 +67,6 @@ class Launch:
         self._ups: dict[str, Future[RunningMachine]] = {}
         self._providers: dict[str, Provider] = {}
         self._programs: dict[str, Sequence[tuple[str, str]]] = {}
-        self._images: dict[str, Sequence[str]] = {}
         self._choices = Choices(self.provider, self.report)
         self._vpn: Optional[RobotVpn] = None
         self._rmw = ''
@@ -104,25 +103,21 @@ class Launch:
     def prepare(
         self, specs: Sequence[MachineSpec],
         programs: Mapping[str, Sequence[tuple[str, str]]] = {},
-        images: Mapping[str, Sequence[str]] = {},
     ) -> None:
         """
         Check everything that can be checked at no cost, and make the open choices.
 
         :param programs: machine name to the (package, executable) pairs that will run there.
-        :param images: machine name to the container images that nodes there will run in.
         :raises FogError: the first problem that was found, with its remedy.
         """
         rmw = self.dds().rmw
         check_robot()
         self._programs.update(programs)
-        self._images.update(images)
         check_names(specs)
         plan.check_rmw(rmw, plan.ament_prefixes(self.user_environment), specs)
         for spec in specs:
-            check(spec, self.provider(spec.provider), rmw=rmw, environment=self.user_environment,
-                  programs=programs.get(spec.name, ()), images=images.get(spec.name, ()),
-                  report=self.report)
+            check(spec, self.provider(spec.provider), environment=self.user_environment,
+                  programs=programs.get(spec.name, ()), report=self.report)
         with ThreadPoolExecutor(max(1, len(specs)), 'fog-choose') as pool:
             choices = [pool.submit(self._choose, spec) for spec in specs]
             chosen = [choice.result() for choice in choices]
@@ -364,7 +359,7 @@ class Launch:
             cancel=self.cancel, ending=self._ending, provider=self.provider(spec.provider),
             choices=self._choices, vpn=self.robot_vpn(), dds=self.dds(),
             index=self._indices[spec.name], others=others, other_vpn=self.join(spec),
-            programs=self._programs.get(spec.name, ()), images=self._images.get(spec.name, ()),
+            programs=self._programs.get(spec.name, ()),
             shorten_others=functools.partial(self._shorten, spec.name))
 
     def up(self, spec: MachineSpec) -> RunningMachine:

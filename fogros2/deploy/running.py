@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import dataclasses
 import threading
@@ -14,7 +14,6 @@ from fogros2 import feature
 from fogros2.agent_client import EventCallback
 from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob, SILENCE_TIMEOUT, Step
-from fogros2.deploy.steps.containers import Containers
 from fogros2.deploy.steps.installing import Modules
 from fogros2.deploy.steps.watching import POLL_INTERVAL, Watch
 from fogros2.deploy.undo import OPEN_PORT
@@ -30,12 +29,13 @@ class RunningMachine(Step):
     A machine of the launch that is up, and the nodes on it.
 
     :param modules: installs what some nodes import.
-    :param containers: downloads the images that some nodes run in.
+    :param environment: the variables of its nodes.
     :param found: called with the provider's report when the machine exists but is silent.
     """
 
     def __init__(
-        self, context: Context, job: MachineJob, modules: Modules, containers: Containers,
+        self, context: Context, job: MachineJob, modules: Modules,
+        environment: Mapping[str, str] = {},
         found: Callable[[Machine], None] = lambda machine: None,
     ) -> None:
         super().__init__(context, job)
@@ -47,8 +47,10 @@ class RunningMachine(Step):
         self.heartbeat = job.heartbeat
         self.interface = job.interface
         self.vpn_address = job.interface.address
+        self.launch = context.launch_id
+        self.dds_file = job.dds_file
+        self.environment = environment
         self._modules = modules
-        self._containers = containers
         self._lock = threading.Lock()
         self._shortening = threading.Lock()
         self._callback: Optional[EventCallback] = None
@@ -99,12 +101,11 @@ class RunningMachine(Step):
         """
         Start nodes; their state changes arrive as events.
 
-        :raises PrerequisiteError: the machine cannot get their imports or their image.
+        :raises PrerequisiteError: the machine cannot get what they need.
         """
-        nodes = self._modules.fitted(self._containers.inside(nodes))
         for each, own in feature.used(self.spec):
             nodes = each.starting(self, nodes, own)
-        self.agent.request('start', nodes=nodes)
+        self.agent.request('start', nodes=self._modules.fitted(nodes))
 
     def watch(
         self, name: str, argv: Sequence[str], interval: float, then: Callable[[str], None],
@@ -132,6 +133,10 @@ class RunningMachine(Step):
     def note(self, name: str, text: str) -> None:
         """Let ``ros2 fog`` show a note; see :class:`fogros2.feature.RunningMachine`."""
         self._job.save(notes={**self._job.record.notes, name: text})
+
+    def makes(self, name: str) -> None:
+        """Record what a feature makes; see :class:`fogros2.feature.RunningMachine`."""
+        self._job.note(name)
 
     def open_port(self, port: int, sources: Sequence[str]) -> tuple[str, int]:
         """

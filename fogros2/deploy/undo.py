@@ -14,9 +14,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import contextlib
 import time
 
-from fogros2 import plugin_system
+from fogros2 import feature, plugin_system
 from fogros2.errors import ConnectError, DeadlineExceeded, FogError, StoreError
-from fogros2.host import containers
 from fogros2.model import Command, Machine
 from fogros2.provider import Provider
 from fogros2.report import Reporter, StepFailed
@@ -132,8 +131,8 @@ def _close_ssh(site: Site, made: Made) -> None:
         site.machine.id, made.port, site.provider.ssh_networks(site.record.spec))
 
 
-#: Kinds of what a launch makes; reports name them.
-WATCHDOG, NODES, VPN, CONTAINERS = 'watchdog', 'nodes', 'VPN', 'containers'
+#: Kinds of what a launch makes; reports name them. The others are names of features.
+WATCHDOG, NODES, VPN = 'watchdog', 'nodes', 'VPN'
 SSH_PORT, OPEN_PORT = 'firewall', 'open port'
 #: Kinds that need the provider alone, and are there while the machine is stopped.
 PORTS = (SSH_PORT, OPEN_PORT)
@@ -141,7 +140,6 @@ _UNDO: Mapping[str, Callable[[Site, Made], object]] = {
     WATCHDOG: _remove_agent,
     NODES: lambda site, made: site.release(),
     VPN: _take_vpn_down,
-    CONTAINERS: lambda site, made: site.clean_up([containers.remove(site.record.last)]),
     SSH_PORT: _close_ssh,
     OPEN_PORT: lambda site, made: site.provider.open_port(site.machine, made.port, ()),
 }
@@ -153,10 +151,13 @@ def unmake(site: Site, made: Made) -> None:
 
     :raises FogError: it may still be there.
     """
-    if made.kind not in _UNDO:  # of another version's launch
+    if made.kind in _UNDO:
+        _UNDO[made.kind](site, made)
+    elif made.kind in plugin_system.names(feature.GROUP):
+        site.clean_up(feature.load(made.kind).clean_up(site.record.last))
+    else:  # of another version's launch
         raise StoreError(f"the record of '{site.record.name}' has '{made.kind}', which this "
                          "version can't undo", 'undo it with the version that made it')
-    _UNDO[made.kind](site, made)
 
 
 def close_ports(site: Site) -> tuple[Made, ...]:

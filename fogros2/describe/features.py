@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 from fogros2 import plugin_system
 from fogros2.describe import values
 from fogros2.describe.kinds import Keyword, marked, parameters_of
 from fogros2.errors import ConfigurationError
-from fogros2.feature import GROUP, options
+from fogros2.feature import Feature, GROUP, options
 
 
 def keywords(of: str = 'options') -> Mapping[str, Keyword]:
@@ -36,8 +36,22 @@ def _keywords(feature: str, of: str) -> Mapping[str, Keyword]:
 
 def node_lists() -> Mapping[str, str]:
     """Return the keywords of nodes and groups that take a list, each with its element's name."""
-    lists = (plugin_system.load(GROUP, name).node_list for name in plugin_system.names(GROUP))
-    return {keyword: element for keyword, element in lists if keyword}
+    return {each.node_list[0]: each.node_list[1] for each in _installed() if each.node_list[0]}
+
+
+def machine_lists() -> Mapping[str, tuple[str, Callable[..., Any]]]:
+    """Return the keywords and the items of machines' lists by the elements' names."""
+    return {each.machine_list[1]: (each.machine_list[0], each.item)
+            for each in _installed() if each.machine_list[1]}
+
+
+def containers() -> set[str]:
+    """Return the keywords of machines and nodes that run containers on the machine."""
+    return {keyword for each in _installed() for keyword in each.containers}
+
+
+def _installed() -> list[type[Feature]]:
+    return [plugin_system.load(GROUP, name) for name in plugin_system.names(GROUP)]
 
 
 def take_lists(arguments: dict[str, Any]) -> dict[str, Any]:

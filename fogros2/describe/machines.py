@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+import functools
 import inspect
 import os
 import shlex
@@ -12,7 +13,8 @@ from typing import Any, NoReturn, Optional, TYPE_CHECKING, Union
 from fogros2.describe import features, names, values, variables
 from fogros2.describe.kinds import check, options_of, parameters_of
 from fogros2.errors import ConfigurationError, did_you_mean
-from fogros2.host import containers, dependencies
+from fogros2.feature import contained
+from fogros2.host import dependencies
 from fogros2.host.workspace import find_workspaces, underlays
 from fogros2.model import Bootstrap, MachineSpec, OnExit
 from fogros2.store import check_name
@@ -94,7 +96,6 @@ class CloudInstance:
         self._values = {name: parameters[name] for name in _CHECKS if parameters[name] is not None}
         self._environment = dict(environment or {})
         self._options = {k: v for k, v in (options or {}).items() if v is not None}
-        self._containers: list[SomeSubstitutionsType] = []
         self._lists = {name: _listed(name, parameters) for name, parameters in (
             ('apt', apt), ('pip', pip))}
         self._spec: Optional[MachineSpec] = None
@@ -110,6 +111,17 @@ class CloudInstance:
                 _CHECKS[key](key, value)
         if isinstance(on_exit, str):
             self._check_findable(on_exit)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a method of features, which adds an item to a list."""
+        element = name.removeprefix('add_')
+        if element == name or element not in features.machine_lists():
+            raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
+        return functools.partial(self._add, *features.machine_lists()[element])
+
+    def _add(self, keyword: str, item: Callable[..., Any], *args: Any, **kwargs: Any) -> None:
+        added = features.own({keyword: [item(*args, **kwargs)]})[keyword]
+        self._features[keyword] = values.Items((*(self._features.get(keyword) or ()), *added))
 
     def _check_findable(self, on_exit: str) -> None:
         if self._made_up and on_exit != 'delete':
@@ -194,39 +206,6 @@ class CloudInstance:
         """
         self._lists['pip'] += _listed('pip', shlex.split(args))
 
-    def add_docker_container(
-        self, cmd: Optional[SomeSubstitutionsType] = None, *, image: str = '', **parts: Any,
-    ) -> None:
-        """
-        Run a container on the machine, from before its nodes start until they have ended.
-
-        ROS nodes in the container communicate with the launch's nodes: by default the container
-        uses the machine's network and the variables and configuration of the middleware.
-
-        :param cmd: a ``docker run`` command line.
-        :param image: instead of ``cmd``, the container's image, with any of ``command``,
-            ``ports``, ``environment``, ``volumes``, ``gpus``, ``restart``, ``name``: see
-            :func:`fogros2.host.containers.described`.
-        :raises ConfigurationError: neither or both were given.
-        """
-        if bool(cmd) == bool(image) or cmd and parts:
-            raise ConfigurationError(
-                'add_docker_container takes a command line, or image= and the rest by name',
-                "such as 'docker run --net=host IMAGE'")
-        if image:
-            try:
-                cmd = containers.described(image, **parts)
-            except TypeError as error:
-                raise ConfigurationError(
-                    f'add_docker_container: {error}',
-                    f"there are: {', '.join(inspect.signature(containers.described).parameters)}"
-                ) from error
-        assert cmd is not None
-        if isinstance(cmd, str):
-            containers.parse(cmd)
-        self._containers.append(cmd)
-        self.takes_containers()
-
     def takes_containers(self) -> None:
         """Note that containers will run on the machine; a provider's class may override it."""
 
@@ -258,6 +237,11 @@ class CloudInstance:
                 workspace = next(iter(chain), None)
             elif workspace:
                 workspace = os.path.abspath(os.path.expanduser(str(workspace)))
+            of_features = features.by_feature({
+                key: self._converted(context, key, value)
+                for key, value in self._features.items()})
+            if contained(of_features):
+                self.takes_containers()
             spec = MachineSpec(
                 name=check_name(str(values.resolve(context, self._name))),
                 provider=self.provider,
@@ -268,11 +252,8 @@ class CloudInstance:
                 environment=variables.to_send({
                     key: str(self._resolved(context, 'environment', value))
                     for key, value in self._environment.items()}, context.environment),
-                containers=tuple(values.resolve(context, line) for line in self._containers),
                 apt=self._wanted(context, 'apt'), pip=self._wanted(context, 'pip'),
-                features=features.by_feature({
-                    key: self._converted(context, key, value)
-                    for key, value in self._features.items()}), **settings)
+                features=of_features, **settings)
             self._check_findable(spec.on_exit)
             self._spec = spec
         return self._spec
@@ -321,7 +302,7 @@ class ContainerInstance(CloudInstance):
     :param gpus: 'all' or a number.
     :param devices: such as '/dev/video0'.
     :param containers: whether it may run containers of its own, which weakens its isolation;
-        None: only if ``add_docker_container`` or a node's ``image`` requires it.
+        None: only if a container beside the nodes, or of one, requires it.
     """
 
     provider = 'container'

@@ -10,6 +10,7 @@ from typing import Any, Optional, TYPE_CHECKING
 
 from fogros2.describe import features, keywords, values
 from fogros2.errors import ConfigurationError, did_you_mean
+from fogros2.feature import contained
 
 if TYPE_CHECKING:
     from launch import LaunchContext
@@ -47,7 +48,10 @@ class Override:
 
         Keywords of every machine are kept; options of a provider only with the same provider.
         """
-        described = self.machine(spec.name).spec(context)
+        machine = self.machine(spec.name)
+        if contained(spec.features):
+            machine.takes_containers()
+        described = machine.spec(context)
         before = spec.options if spec.provider == described.provider else {}
         common = {_FIELDS.get(name, name) for name in self.given
                   if name not in described.options and name not in features.keywords()}

@@ -8,6 +8,4 @@ names the packages that nodes declare, ``installer`` installs packages. ``module
 modules that programs import, ``programs`` checks that the programs of nodes exist, ``undeclared``
 finds imports that nodes do not declare. ``bootstrap`` brings ROS 2, ``relocation`` sets up the
 libraries of its wheels.
-``container_scripts`` has the scripts that run containers, ``docker_lines`` reads the lines that
-describe them, ``containers`` has the commands.
 """

@@ -116,14 +116,13 @@ def _plain(value: object) -> Optional[str]:
 
 def from_action(
     action: ExecuteLocal, context: LaunchContext, base: Mapping[str, str], spec: MachineSpec,
-    launch_id: str, image: str = '', image_options: Sequence[str] = (),
-    own_packages: bool = False, moved: bool = False,
+    launch_id: str, contained: bool = False, own_packages: bool = False, moved: bool = False,
 ) -> NodeSpec:
     """
     Convert a prepared action to a NodeSpec.
 
-    If the node runs in an image, paths of the robot's ROS stay unchanged: only the machine knows
-    the image's content.
+    If the node runs in a container, paths of the robot's ROS stay unchanged: only the machine
+    knows the container's content.
 
     :param base: the environment before the launch changed it; changes are sent.
     :param own_packages: whether the machine may have packages that the robot does not have.
@@ -131,7 +130,8 @@ def from_action(
     :raises ConfigurationError: a package, an executable or a parameter file is missing.
     """
     description = action.process_description
-    texts = Texts(() if image else plan.ament_prefixes(base), None if moved else spec.workspace)
+    texts = Texts(
+        () if contained else plan.ament_prefixes(base), None if moved else spec.workspace)
     final = list(description.final_cmd or ())
     # launch puts the prefix before the command
     count = len(final) - len(description.cmd)
@@ -141,7 +141,7 @@ def from_action(
     if len(first) == 1 and isinstance(first[0], ProgramName) and first[0].package:
         package = perform_substitutions(context, first[0].package)
         executable = final.pop(0)
-        if not image and not own_packages:
+        if not contained and not own_packages:
             check_program(package, executable, texts.prefixes, spec.workspace)
     files: dict[str, Text] = {}
     arguments = [texts.text(argument) for argument in final]
@@ -170,8 +170,6 @@ def from_action(
         respawn_max_retries=private.option(action, 'respawn_max_retries'),
         sigterm_timeout=float(perform_substitutions(context, action.sigterm_timeout)),
         sigkill_timeout=float(perform_substitutions(context, action.sigkill_timeout)),
-        image=image,
-        image_options=tuple(image_options),
     )
 
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 import dataclasses
 import functools
 from typing import Any, cast, Optional, TYPE_CHECKING
@@ -12,6 +12,7 @@ from launch import Action, LaunchContext, LaunchDescriptionEntity
 from launch.actions import ExecuteLocal
 
 from fogros2 import feature, plan
+from fogros2.errors import ConfigurationError
 from fogros2.launch_internals import components, private
 from fogros2.model import NodeSpec
 from fogros2.runtime import node_spec
@@ -38,11 +39,8 @@ class RemoteProcess:
     :param own: the process's items of features' lists, resolved.
     """
 
-    #: Container image that the process runs in, and more options for its ``docker run``; whether
-    #: it has an image, which is known before the image's name.
-    image = ''
-    image_options: Sequence[str] = ()
-    has_image = False
+    #: Whether it may run in a container, see :attr:`fogros2.feature.Feature.containers`.
+    contained = False
     #: The values of features' keywords, by feature.
     features: Mapping[str, Mapping[str, Any]] = {}
     #: Of the action's machine; set by ``prepare`` unless the process runs on the robot.
@@ -74,8 +72,7 @@ class RemoteProcess:
     @property
     def planned(self) -> Planned:
         """The machine, and the program if nothing can change it."""
-        # only its machine knows what is in an image
-        return self.machine, None if self.has_image else node_spec.program_of(self.action)
+        return self.machine, None if self.contained else node_spec.program_of(self.action)
 
     def prepare(self, context: LaunchContext) -> None:
         """Resolve the action, as ExecuteLocal does, and create its NodeSpec."""
@@ -83,28 +80,32 @@ class RemoteProcess:
         if coordinator.on_robot(self.machine):
             self.here = True
             self._own.prepare(context)
+            for keyword, value in feature.contained(self.features).items():
+                raise ConfigurationError(
+                    f"the {keyword} '{value}' is for a machine, and the robot runs this node "
+                    'itself', f'leave {keyword}= out for the robot, or choose another machine')
             return
         self.session = session = coordinator.session(self.machine)
         node_spec.use_names_of_programs(action)
         self._own.prepare(context)
+        contained = feature.contained(self.features)
         private.prefix_output(action, session.spec.name)
         provider = coordinator.launch.provider(session.spec.provider)
         self._node = dataclasses.replace(node_spec.from_action(
             action, context, coordinator.base_environment, session.spec, coordinator.launch.id,
-            self.image, self.image_options,
-            provider.has_own_packages(session.spec), provider.capabilities.account),
-            features=self.features)
+            bool(contained), provider.has_own_packages(session.spec),
+            provider.capabilities.account), features=self.features)
         if not isinstance(action, AddedProcess):
             paths = node_spec.robot_paths(
                 self._node, [context.environment.get('HOME', ''), *(plan.ament_prefixes(
-                    coordinator.base_environment) if self.image else ())],
+                    coordinator.base_environment) if contained else ())],
                 session.spec.workspaces)
             shared = provider.shared_folders(session.spec) if paths else ()
             session.warn_of_paths(
                 self._node, [path for path in paths if not plan.below(path, shared)])
         for each, own in feature.used(session.spec):
             each.check_node(session.spec, self._node, own)
-        if not (self.image or isinstance(action, AddedProcess)):
+        if not (contained or isinstance(action, AddedProcess)):
             self._command = session.command_here(
                 functools.partial(node_spec.robot_command, action, context))
 
@@ -135,20 +136,14 @@ class RemoteProcess:
     def _helpers(
         self, coordinator: Coordinator, session: Session,
     ) -> list[LaunchDescriptionEntity]:
-        """Return containers and features' programs of a machine, with its first process."""
+        """Return features' programs of a machine, with its first process."""
         if session.has_helpers or session.interrupted:
             return []
         session.has_helpers = True
         name = session.spec.name
-        helpers: list[LaunchDescriptionEntity] = []
-        for number, line in enumerate(session.spec.containers):
-            from fogros2.host import containers
-            helpers.append(process_on(containers.follow(
-                containers.parse(line), number, coordinator.launch.id), name))
-        helpers += [process_on(one, name) if isinstance(one, NodeSpec) else one
-                    for each, own in feature.used(session.spec)
-                    for one in each.beside(session.spec, own)]
-        return helpers
+        return [process_on(one, name) if isinstance(one, NodeSpec) else one
+                for each, own in feature.used(session.spec)
+                for one in each.beside(session.spec, own)]
 
     def _come_here(self, context: LaunchContext) -> None:
         """Start the process on the robot, as launch does; its machine no longer runs it."""

@@ -21,6 +21,7 @@ from fogros2.errors import (
     ProviderError,
 )
 from fogros2.events import Event
+from fogros2.feature import contained
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2.ros_names import remapped
 from fogros2.runtime.backlog import Backlog
@@ -98,7 +99,7 @@ class Session:
         self.running: Optional[RunningMachine] = None
         #: True when the machine is up, False when it never will be.
         self.came_up: asyncio.Future[bool] = loop.create_future()
-        #: Whether containers and programs beside the nodes have been requested.
+        #: Whether programs beside the nodes have been requested.
         self.has_helpers = False
         #: New names of topics and services of its nodes, and what goes on without these nodes.
         self.renamed: dict[str, str] = {}
@@ -144,12 +145,7 @@ class Session:
         """The (package, executable) pairs of the processes that wait for the machine."""
         return sorted({
             (run.node.package, run.node.executable) for run in self._waiting
-            if run.node.package and not run.node.image})
-
-    @property
-    def images(self) -> Sequence[str]:
-        """The container images of the processes that wait for the machine."""
-        return sorted({run.node.image for run in self._waiting if run.node.image})
+            if run.node.package and not contained(run.node.features)})
 
     def add(self, instance: CloudInstance) -> None:
         """Add a launch file's object for this machine."""

@@ -234,7 +234,7 @@ class HostedProvider(Provider):
             identity = self._call(
                 host, 'create', _CREATE_TIMEOUT,
                 spec={'name': spec.name, 'provider': ContainerProvider.name, 'options': options,
-                      'on_exit': spec.on_exit, 'containers': spec.containers},
+                      'on_exit': spec.on_exit},
                 request=dataclasses.replace(request, tags={**request.tags, HOSTED: robot}))
         except errors.ShellError as error:
             error.refused = False  # the host may go on without the connection

@@ -10,7 +10,7 @@ from typing import Optional, TYPE_CHECKING
 
 from fogros2.describe.values import parse_duration
 from fogros2.errors import ConfigurationError
-from fogros2.feature import Feature, RunningMachine
+from fogros2.feature import contained, Feature, RunningMachine
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2_features.idle import program
 
@@ -33,7 +33,7 @@ class IdleTimeout(Feature):
 
     def check(self, spec: MachineSpec, own: float) -> None:
         """Check that what uses the machine can be measured, and that nobody needs it later."""
-        if spec.containers:
+        if contained(spec.features):
             raise _not_measured(spec)
         if spec.options.get('fleet'):
             raise ConfigurationError('robots of fleet= use the machine after the launch',
@@ -41,7 +41,7 @@ class IdleTimeout(Feature):
 
     def check_node(self, spec: MachineSpec, node: NodeSpec, own: float) -> None:
         """Check that the node's use can be measured."""
-        if node.image:
+        if contained(node.features):
             raise _not_measured(spec)
 
     def starting(

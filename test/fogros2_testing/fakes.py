@@ -372,8 +372,15 @@ class FakeRunning:
     interface = VpnInterface('foga', '198.18.7.2', '198.18.7.0/24', 51820, '/key')
     vpn_address = interface.address
     lost = ''
+    environment: Mapping[str, str] = {
+        'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp', 'ROS_DOMAIN_ID': '7'}
+    dds_file = f'{directory}/dds.xml'
 
-    def __init__(self, shell: Any = None, *, spec: Optional[MachineSpec] = None) -> None:
+    def __init__(
+        self, shell: Any = None, *, spec: Optional[MachineSpec] = None, launch: str = '0a0b0c',
+    ) -> None:
+        self.launch = launch
+        self.provider: Provider = FakeProvider()
         self.spec = spec or MachineSpec('a', 'fake')
         self.machine = Machine('fake-1', self.spec.name, 'fake', MachineState.RUNNING)
         self.shell: Shell = shell or connect(Endpoint('local'), name=self.spec.name)
@@ -397,6 +404,10 @@ class FakeRunning:
     def note(self, name: str, text: str) -> None:
         """Collect the call."""
         self.calls.append(('note', name, text))
+
+    def makes(self, name: str) -> None:
+        """Collect the call."""
+        self.calls.append(('makes', name))
 
     def open_port(self, port: int, sources: Sequence[str]) -> tuple[str, int]:
         """Collect the call; return the same port of a fake machine."""

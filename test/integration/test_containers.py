@@ -20,14 +20,14 @@ import pytest
 
 from fogros2 import plan
 from fogros2.errors import CommandError, ConfigurationError, DdsError
-from fogros2.host import container_scripts, containers
-from fogros2.host.containers import Container
 from fogros2.model import Command, CreateRequest, MachineSpec, NodeSpec
 from fogros2.process import run, which
 from fogros2.provider.container import ContainerProvider
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import root as container_root
 from fogros2.waiting import wait_until
+from fogros2_features.containers import commands as containers
+from fogros2_features.containers.commands import Container
 from rigs.launched import launching, ros2
 
 
@@ -90,8 +90,8 @@ def started(container: Container, launch: str, folder: Path) -> subprocess.Popen
     (folder / 'variables').write_text(VARIABLES)
     at_machine(containers.run(container, 0, launch, image, str(settings(folder)),
                               str(folder / 'variables')))
-    (folder / containers.FOLLOWER).write_text(container_scripts.FOLLOW)
-    words = containers.follow(container, 0, launch).arguments
+    (folder / containers.FOLLOWER).write_text(containers.follower(launch))
+    words = containers.follow(container, 0).arguments
     return begun([str(word) for word in words], folder)
 
 
@@ -104,8 +104,8 @@ def node(image: str, launch: str, folder: Path, *command: str, **variables: str,
          ) -> subprocess.Popen[str]:
     """Start a node in an image as the agent does."""
     made = containers.inside(
-        NodeSpec('1', 'n-1', arguments=command, image=image, sigkill_timeout=1.5,
-                 image_options=container_engine.limits()),
+        NodeSpec('1', 'n-1', arguments=command, sigkill_timeout=1.5, features={
+            'containers': {'image': image, 'image_options': container_engine.limits()}}),
         image, launch, str(folder), str(settings(folder)), ('COLOUR',))
     for key, text in made.files.items():
         (folder / key).write_text(str(text))

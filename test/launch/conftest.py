@@ -145,8 +145,8 @@ class FakeLaunch:
         self.note('robot environment')
         return {'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp', 'CYCLONEDDS_URI': '<CycloneDDS/>'}
 
-    def prepare(self, specs, programs, images):
-        self.note('prepare', [spec.name for spec in specs], programs, images)
+    def prepare(self, specs, programs):
+        self.note('prepare', [spec.name for spec in specs], programs)
         if self.prepare_error is not None:
             raise self.prepare_error
 

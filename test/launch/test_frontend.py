@@ -168,7 +168,8 @@ CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'on_l
            'bandwidth': '10Mbit/s', 'launch_budget': '$20',
            'name': 'planner', 'budget': '5 USD', 'idle_timeout': '5m', 'vpn_path': 'stream',
            'fetch_to': '/results', 'fetch_limit': '2GB'}
-LISTS = {'fetch': ('~/bags, /var/map', ['~/bags', '/var/map']),
+LISTS = {'docker_containers': ('docker run a, docker run b', ['docker run a', 'docker run b']),
+         'fetch': ('~/bags, /var/map', ['~/bags', '/var/map']),
          'record': ('/tf, /scan', ['/tf', '/scan']),
          'monitor_allow': ('198.51.100.0/28,::1', ['198.51.100.0/28', '::1']),
          'share': ('/map, /tf_static', ['/map', '/tf_static']),
@@ -435,9 +436,10 @@ def test_docker_containers_of_a_machine(run, fake):
     description.add_action(OpaqueFunction(function=lambda context: there.append(
         Coordinator.of(context)._by_name('planner').spec(context))))
     assert run(description) == 0
-    assert there[0].containers == (
+    assert there[0].features == {'containers': {'docker_containers': [
         'docker run --rm redis',
-        "docker run -p 1:2 -p 3:4 -e 'A=b redis' --name db redis serve --fast")
+        "docker run -p 1:2 -p 3:4 -e 'A=b redis' --name db redis serve --fast"]}}
+    assert there[0].options['containers']
 
 
 # -- machines of others --------------------------------------------------------------------------

@@ -25,18 +25,18 @@ def test_executable_of_an_image_is_not_checked_on_the_robot(run, fake, planner):
                   image_options=['--gpus', LaunchConfiguration('gpus', default='all')]),
         CloudNode(machine=planner, package='demo', executable='talker')])) == 0
     (prepared,) = (note[1:] for note in fake.notes if note[0] == 'prepare')
-    assert prepared == (['planner'], {'planner': [('demo', 'talker')]},
-                        {'planner': ['ros:jazzy']})
+    assert prepared == (['planner'], {'planner': [('demo', 'talker')]})
     eyes, talker = fake.machines['planner'].all
-    assert (eyes.package, eyes.executable, eyes.image) == ('elsewhere', 'eyes', 'ros:jazzy')
-    assert eyes.image_options == ('--gpus', 'all')
+    assert (eyes.package, eyes.executable) == ('elsewhere', 'eyes')
+    assert eyes.features == {
+        'containers': {'image': 'ros:jazzy', 'image_options': ['--gpus', 'all']}}
     assert any(re.search(r'"?rate"?: 5', text) for text in eyes.files.values())
-    assert (talker.image, talker.image_options) == ('', ())
+    assert talker.features == {}
 
 
 @pytest.mark.parametrize(('given', 'options'), [
-    ('', ()), ('--gpus=all', ('--gpus=all',)), ('-v, /a b:/c:ro', ('-v', '/a b:/c:ro')),
-    ("['-e', 'A=1,2']", ('-e', 'A=1,2'))])
+    ('', []), ('--gpus=all', ['--gpus=all']), ('-v, /a b:/c:ro', ['-v', '/a b:/c:ro']),
+    ("['-e', 'A=1,2']", ['-e', 'A=1,2'])])
 def test_image_options_may_be_one_argument(run, fake, planner, given, options):
     fake.on_start = ends
     assert run(LaunchDescription([
@@ -44,7 +44,7 @@ def test_image_options_may_be_one_argument(run, fake, planner, given, options):
         CloudNode(machine=planner, package='demo', executable='talker', image='ros:jazzy',
                   image_options=LaunchConfiguration('options'))])) == 0
     (talker,) = fake.machines['planner'].all
-    assert talker.image_options == options
+    assert talker.features['containers']['image_options'] == options
 
 
 @pytest.mark.parametrize(('provider', 'given', 'mounts'), [
@@ -70,7 +70,6 @@ def test_idle_machine_runs_no_containers(run, fake, caplog):
 @pytest.mark.parametrize(('overrides', 'more', 'why'), [
     (['*=robot'], {}, 'the robot runs this node itself'),
     ([], {'shell': True}, 'in a shell of the machine'),
-    ([], {'image_options': ['-v']}, "image_options=['-v']"),
 ])
 def test_invalid_image_is_reported(run, fake, planner, caplog, overrides, more, why):
     node = CloudNode(

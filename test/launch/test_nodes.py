@@ -190,8 +190,8 @@ def load(text, name='test.launch.xml'):
     return parser.parse_description(entity)
 
 
-def fogros_launch(text):
-    return load(f'<launch><fogros_launch>{MACHINE}{text}</fogros_launch></launch>')
+def fogros_launch(text, machine=MACHINE):
+    return load(f'<launch><fogros_launch>{machine}{text}</fogros_launch></launch>')
 
 
 @pytest.mark.parametrize('text', [
@@ -241,9 +241,10 @@ def test_xml_node_takes_the_settings_of_a_cloud_node(run, fake, streams):
             image_options="--gpus=all, --ipc=host">
         <stream_topic topic="/map" transport="h264"/>
         <param name="rate" value="3"/>
-      </node>''')) == 0
-    (spec,) = [spec for spec in fake.machines['planner'].all if spec.image]
-    assert spec.image == 'ros:jazzy' and spec.image_options == ('--gpus=all', '--ipc=host')
+      </node>''', MACHINE.replace('/>', ' containers="true"/>'))) == 0
+    (spec,) = [spec for spec in fake.machines['planner'].all if spec.features]
+    assert spec.features == {'containers': {
+        'image': 'ros:jazzy', 'image_options': ['--gpus=all', '--ipc=host']}}
     assert '/map:=/fogros2/planner/map' in spec.arguments
 
 

@@ -62,6 +62,14 @@ def elsewhere(description, *texts):
     return found
 
 
+def test_container_machine_instead_may_run_containers():
+    machine = AWSCloudInstance(name='planner', ros_workspace='')
+    machine.add_docker_container('docker run redis')
+    made = spec('planner=container', machine)
+    assert made.options['containers'] and made.features == {
+        'containers': {'docker_containers': ['docker run redis']}}
+
+
 # -- what is made instead ------------------------------------------------------------------------
 
 def test_another_provider_keeps_what_holds_for_any_machine():

@@ -11,16 +11,16 @@ from typing import Any
 import pytest
 
 from fogros2.dds.cyclonedds import CycloneDds
-from fogros2.deploy.steps.containers import Containers
 from fogros2.errors import FogError
 from fogros2.host import inspection, installer, modules, wheels
 from fogros2.model import Result, SyncReport
 from fogros2.shell import host_key, sync
 from fogros2.untrusted import InvalidMessage
 from fogros2.vpn import addresses
+from fogros2_features.containers.engine import Engine
 from fogros2_features.replacement import snapshots
 from fogros2_monitor import access
-from fogros2_testing import FakeShell
+from fogros2_testing import FakeRunning, FakeShell
 
 DIGITS = '9' * 5000
 #: What a machine may print in place of what was asked for.
@@ -55,10 +55,8 @@ def checkpoints(answer: str, folder: Path) -> None:
 
 
 def images(answer: str, _: Path) -> None:
-    step: Any = SimpleNamespace(
-        _images={}, _ensure_engine=lambda: None, _job=SimpleNamespace(run=lambda *_, **__: answer),
-        _context=SimpleNamespace(timeouts=SimpleNamespace(install=1.0)))
-    Containers._image(step, 'image')
+    engine = Engine(FakeRunning(Machine(answer)))
+    engine._image('image', '')
 
 
 def installed(answer: str, _: Path) -> None:

@@ -14,7 +14,8 @@ import sys
 
 import pytest
 
-from fogros2.describe import features
+from fogros2.describe import features, keywords
+from fogros2.describe.machines import ContainerInstance
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE = ROOT / 'fogros2'
@@ -79,7 +80,8 @@ MOVED = (
     'StreamTopic', 'image_transport', 'republish(ers)?', r'[Cc]heckpoint\w*', r'[Rr]eplacer\w*',
     r'Replacement\w*', 'drained', r'\w*[Gg]uest\w*', '[Ii]nvit(e|ed|ations?)', 'JoinedMachine',
     r'[Ff]oxglove\w*', r'\w*[Mm]onitor(ed|_\w+)?', '[Dd]ashboard',
-    r'[Rr]eplic\w*', 'first_answer', 'HostedProvider', 'served', 'shared topics')
+    r'[Rr]eplic\w*', 'first_answer', 'HostedProvider', 'served', 'shared topics',
+    r'\w*docker_(containers?|lines)', 'container_scripts', 'has_image')
 CLOUDS = {'aws', 'azure', 'gcp', 'kubernetes'}
 #: All of the core but the import of types.
 BUT_TYPES = r'fogros2(?! import ros_types$)'
@@ -219,8 +221,10 @@ def test_package_imports_nothing_above_it(folder: str, above: tuple[str, ...]) -
 def test_core_names_no_keyword_of_a_feature() -> None:
     lists = features.node_lists()
     # words such as fetch have other uses
+    machines = features.machine_lists()
     pattern = '|'.join(rf'{keyword}\b' if '_' in keyword else f'{keyword}=' for keyword in {
-        *features.keywords(), *features.keywords('node_options'), *lists, *lists.values()})
+        *features.keywords(), *features.keywords('node_options'), *lists, *lists.values(),
+        *machines} - {*keywords.keywords(ContainerInstance)} | {*features.keywords()})
     for path in python_files(CORE):
         assert not re.search(rf'\b({pattern})', text(path)), path
 

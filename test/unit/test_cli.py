@@ -485,7 +485,7 @@ def test_delete_undoes_what_a_launch_has_made_on_a_host(
         'test': lambda c: Result(1, '', ''),
         'sh': lambda c: Result(int(fails and 'containers' in c.what), '', 'no')})
     lab(monkeypatch, shell, last='abc123', vpn=LAB_VPN, on_exit='keep', made=tuple(
-        map(Made, (undo.WATCHDOG, undo.VPN, undo.CONTAINERS, undo.NODES))))
+        map(Made, (undo.WATCHDOG, undo.VPN, 'containers', undo.NODES))))
     assert run('delete', 'lab', '--yes') == int(fails)
     assert [c.what for c in shell.commands if c.argv[0] != 'test'] == [
         'remove its containers', 'take the VPN interface fogabc123m0 down', 'remove the agent']

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
 import dataclasses
 import os
 from pathlib import Path
 import subprocess
-from typing import Optional
+from types import SimpleNamespace
+from typing import Any
 
 from launch import LaunchContext, LaunchDescription
 from launch.launch_description_sources import get_launch_description_from_any_launch_file
@@ -19,19 +20,28 @@ from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.dds.fastdds import FastDds
 from fogros2.dds.zenoh import Zenoh
 from fogros2.deploy import Launch
-from fogros2.deploy.steps.containers import Containers
 from fogros2.describe import values
 from fogros2.describe.machines import ContainerInstance
 from fogros2.errors import ConfigurationError, DdsError, PrerequisiteError, Unsupported
-from fogros2.host import containers, docker_lines
-from fogros2.host.containers import Container, parse
 from fogros2.model import Command, MachineSpec, NodeSpec, Result
-from fogros2.provider import Provider
 from fogros2.provider.container import ContainerProvider
-from fogros2.shell import Shell
 from fogros2.store import Store
-from fogros2_testing.fakes import FakeProvider, FakeShell
+from fogros2_features.containers import commands as containers
+from fogros2_features.containers import Containers, docker_lines
+from fogros2_features.containers.commands import Container, parse
+from fogros2_features.containers.engine import Engine
+from fogros2_testing.fakes import FakeProvider, FakeRunning, FakeShell
 from rigs import deploying
+
+
+def of(*lines: str) -> dict[str, Any]:
+    """Return the features of a machine with containers."""
+    return {'containers': {'docker_containers': list(lines)}}
+
+
+def in_image(image: str, *options: str) -> dict[str, Any]:
+    """Return the features of a node in an image."""
+    return {'containers': {'image': image, 'image_options': options}}
 
 
 @pytest.mark.parametrize(('line', 'meant'), [
@@ -154,8 +164,9 @@ def test_line_continues_in_a_launch_file(tmp_path, name, text):
     description = get_launch_description_from_any_launch_file(str(tmp_path / name))
     context = LaunchContext()
     context.launch_configurations['v'] = '7'
-    [given] = description.entities[-1]._containers
-    container = parse(values.resolve(context, given['cmd']))
+    [line] = description.entities[-1].machine.spec(context).features['containers'][
+        'docker_containers']
+    container = parse(line)
     assert container == Container('image:7', ('-v', '\0${HOME}\0/maps:/maps'))
 
 
@@ -168,6 +179,16 @@ def test_wrong_line_is_refused_when_the_file_is_read(tmp_path, name, text):
     (tmp_path / name).write_text(text)
     with pytest.raises(Exception, match='has > b where a shell'):
         get_launch_description_from_any_launch_file(str(tmp_path / name))
+
+
+def test_container_belongs_to_a_machine(tmp_path):
+    with pytest.raises(AttributeError, match="'ContainerInstance' object has no .*'add_dockers'"):
+        ContainerInstance(name='m').add_dockers('docker run a')
+    path = tmp_path / 'a.launch.xml'
+    path.write_text('<launch><docker_container cmd="docker run a"/></launch>')
+    (alone,) = get_launch_description_from_any_launch_file(str(path)).entities
+    with pytest.raises(ConfigurationError, match='a docker_container runs on a machine'):
+        alone.execute(LaunchContext())
 
 
 def test_parts_make_a_line():
@@ -183,8 +204,9 @@ def test_each_launch_has_names_of_its_own():
     named, unnamed = Container('r.io/a/b:1', name='my eyes'), Container('r.io/a/b:1')
     assert containers.called(named, 0, 'abcdef') == 'fogros2-abcdef-0-my-eyes'
     assert containers.called(unnamed, 1, 'abcdef') == 'fogros2-abcdef-1-b-1'
-    node = containers.follow(unnamed, 1, 'abcdef')
-    assert (node.name, node.arguments[-2]) == ('b-1', 'fogros2-abcdef-1-b-1')
+    node = containers.follow(unnamed, 1)
+    assert (node.name, node.arguments[-2]) == ('b-1', '1-b-1')
+    assert 'name=fogros2-abcdef-$1 ' in containers.follower('abcdef')
 
 
 def test_arguments_of_a_machine_are_checked_at_once():
@@ -204,7 +226,7 @@ def test_machine_without_containers_is_refused_first(monkeypatch):
     # a computer without sudo makes no machine, and this test makes none
     monkeypatch.setattr('fogros2.deploy.launch.check_robot', lambda: None)
     launch = Launch()
-    spec = MachineSpec('m', 'container', containers=('docker run image',))
+    spec = MachineSpec('m', 'container', features=of('docker run image'))
     with pytest.raises(Unsupported, match='rights that an engine needs'):
         launch.prepare([spec])
     launch.down()
@@ -227,10 +249,10 @@ def test_node_in_an_image_has_the_arguments_of_the_node():
     node = NodeSpec(
         '1', 'eyes-1', 'demo', 'talker', ('--ros-args', '--params-file', ({'file': 'p'},)),
         prefix=('nice', '-n', '5'), files={'p': 'a: 1'},
-        environment={'COLOUR': 'red', 'no-name': ''}, cwd='/data', respawn=True, image='demo:1',
-        image_options=('--gpus=all', '-v', '/a:/b'))
+        environment={'COLOUR': 'red', 'no-name': ''}, cwd='/data', respawn=True,
+        features={**in_image('demo:1', '--gpus=all', '-v', '/a:/b'), 'mine': {'a': 1}})
     made = containers.inside(node, 'demo:1', 'abcdef', '/ws', '/run/dds.xml', {'MORE': '1'})
-    assert (made.package, made.executable, made.image) == ('', '', '')
+    assert (made.package, made.executable, made.features) == ('', '', {'mine': {'a': 1}})
     assert (made.cwd, made.prefix) == (None, ())
     assert (made.respawn, made.environment) == (True, node.environment)
     outer, inner = made.arguments[1], made.arguments[6]
@@ -274,11 +296,13 @@ def test_container_machine_has_the_requested_rights():
             provider.check_containers(machine.spec(LaunchContext()))
 
 
-@pytest.mark.parametrize('wrong', [
-    {'image_options': ['--gpus=all']}, {'image': 'a', 'image_options': '--gpus=all'}])
-def test_what_an_image_is_told_belongs_to_one(wrong):
-    with pytest.raises(ConfigurationError, match='image_options'):
-        CloudNode(machine='m', package='p', executable='e', **wrong)
+def test_image_options_are_a_list_for_an_image():
+    for wrong in ('--gpus=all', ['-v']):
+        with pytest.raises(ConfigurationError, match='image_options'):
+            CloudNode(machine='m', package='p', executable='e', image='a', image_options=wrong)
+    node = NodeSpec('1', 'n', features={'containers': {'image_options': ['--gpus=all']}})
+    with pytest.raises(ConfigurationError, match=r"image_options=\['--gpus=all'\] is no list"):
+        Containers().check_node(MachineSpec('m', 'container'), node, ())
 
 
 @pytest.mark.parametrize('options', ['--gpus=all, --init', '$(var options)'])
@@ -288,10 +312,10 @@ def test_an_image_is_an_attribute_in_xml(tmp_path, options):
         image_options="{options}"/></launch>""")
     description: LaunchDescription = get_launch_description_from_any_launch_file(str(path))
     (node,) = description.entities
-    assert node._image == 'ros:jazzy'
     context = LaunchContext()
     context.launch_configurations['options'] = '--gpus=all, --init'
-    assert values.resolve(context, node._image_options) == ['--gpus=all', '--init']
+    assert values.resolve(context, node._features) == {
+        'image': 'ros:jazzy', 'image_options': ['--gpus=all', '--init']}
 
 
 # --- DDS -----------------------------------------------------------------------------------------
@@ -374,23 +398,16 @@ def test_container_gets_variables_of_the_middleware(vendor, variables):
     assert containers.dds_variables(environment) == variables
 
 
-def test_containers_start_once_their_configuration_is_there(engine, monkeypatch):
+def test_containers_start_with_the_middleware_of_the_machine(engine, monkeypatch):
     monkeypatch.setenv('THERE', 'ros:jazzy web')
     shell = FakeShell(handlers={'sh': here})
-    there = beside(shell, 'docker run ros:jazzy', 'docker run -p 80:80 web')
-
-    def environment() -> dict[str, str]:
-        assert not any(' run ' in line for line in notes()), 'a container runs already'
-        assert [line for line in notes() if 'create' in line], 'its image could be fetched before'
-        return {'ROS_DOMAIN_ID': '7'}
-
-    there.start(environment)
-    assert shell.files['/run/fogros2/m/container-variables'] == (
-        b'ROS_DOMAIN_ID=7\n', 0o600)
+    beside(shell).start([parse('docker run ros:jazzy'), parse('docker run -p 80:80 web')])
+    assert shell.files['/var/lib/agent/container-variables'] == (
+        b'RMW_IMPLEMENTATION=rmw_fastrtps_cpp\nROS_DOMAIN_ID=7\n', 0o600)
     first, second = (line for line in notes() if ' run ' in line)
     assert first.endswith(
-        ' --label fogros2-launch=abc --env-file /run/fogros2/m/container-variables --network host'
-        ' --ipc host -v /run/fogros2/m/dds.xml:/run/fogros2/m/dds.xml:ro ros:jazzy')
+        ' --label fogros2-launch=abc --env-file /var/lib/agent/container-variables --network host'
+        ' --ipc host -v /var/lib/agent/dds.xml:/var/lib/agent/dds.xml:ro ros:jazzy')
     assert second.endswith(' --label fogros2-launch=abc -p 80:80 web')
     # no middleware is brought to an image that has a network, or a middleware, of its own
     assert sum(' create ' in line for line in notes()) == 1
@@ -497,7 +514,7 @@ def test_layer_keeps_command_and_user_of_image(engine, command, user, kept):
 
 
 def test_a_node_gets_its_gpus_and_nothing_is_downloaded_for_it(engine, tmp_path):
-    node = NodeSpec('1', 'eyes', 'demo', 'talker', image='demo:1', image_options=('--gpus=1',))
+    node = NodeSpec('1', 'eyes', 'demo', 'talker', features=in_image('demo:1', '--gpus=1'))
     made = containers.inside(node, 'demo:1', 'abc', str(tmp_path), '/run/dds.xml')
     for key, script in made.files.items():
         (tmp_path / key).write_text(str(script))
@@ -528,63 +545,79 @@ def here(command: Command) -> Result:
     return Result(said.returncode, said.stdout, said.stderr)
 
 
-def beside(
-        shell: Shell, *lines: str, images: Sequence[str] = (),
-        provider: Optional[Provider] = None,
-) -> Containers:
-    context, job = deploying.job(
-        Store().root, MachineSpec('m', 'fake', containers=lines), provider=provider,
-        images=images, launch_id='abc')
-    job.record = dataclasses.replace(job.record, last='abc')
-    job.shell = shell
-    return Containers(context, job)
+def beside(shell: FakeShell) -> Engine:
+    return Engine(FakeRunning(shell, launch='abc'))
 
 
 def test_a_wrong_image_is_one_clear_line(engine, monkeypatch):
     monkeypatch.setenv('WRONG', 'docker.io/library/no-such:1')
-    node = NodeSpec('1', 'n', 'p', 'e', image='no-such:1')
+    node = NodeSpec('1', 'n', 'p', 'e', features=in_image('no-such:1'))
     with pytest.raises(PrerequisiteError) as error:
         beside(FakeShell(handlers={'sh': here})).inside([node])
     assert str(error.value) == (
-        "'m' can't get the image 'no-such:1': Error: docker.io/library/no-such:1: manifest "
+        "'a' can't get the image 'no-such:1': Error: docker.io/library/no-such:1: manifest "
         'unknown (is its name right, and may anybody download it?)')
 
 
-def test_images_of_nodes_are_fetched_once_in_advance(engine, monkeypatch):
+def test_image_of_several_nodes_is_fetched_once(engine, monkeypatch):
     monkeypatch.setenv('THERE', 'localhost/a:1')
     shell = FakeShell(handlers={'sh': here})
-    containers_there = beside(shell, images=['localhost/a:1'])
-    containers_there.start(dict)
+    there = beside(shell)
+    nodes = [NodeSpec('1', 'n', 'p', 'e', features=in_image('localhost/a:1')),
+             NodeSpec('2', 'plain', 'p', 'e')]
+    first, plain = there.inside(nodes)
     asked = len(shell.commands)
-    (node,) = containers_there.inside([NodeSpec('1', 'n', 'p', 'e', image='localhost/a:1')])
-    assert 'localhost/a:1' in node.arguments and len(shell.commands) == asked
+    (second,) = there.inside(nodes[:1])
+    assert 'localhost/a:1' in first.arguments and second == first and plain == nodes[1]
+    assert len(shell.commands) == asked > 0
 
 
 def test_a_node_that_comes_late_has_to_fit_its_machine_too():
     shell = FakeShell()
-    there = beside(shell, provider=ContainerProvider())
-    assert there.inside([NodeSpec('1', 'n', 'p', 'e')]) == [NodeSpec('1', 'n', 'p', 'e')]
-    there._job.spec = MachineSpec('m', 'container')
+    running = FakeRunning(shell, spec=MachineSpec('m', 'container'))
+    running.provider = ContainerProvider()
     with pytest.raises(Unsupported, match='containers=True'):
-        there.inside([NodeSpec('1', 'n', 'p', 'e', image='a')])
+        Engine(running).inside([NodeSpec('1', 'n', 'p', 'e', features=in_image('a'))])
     assert shell.commands == []
 
 
 def test_machine_without_engine_and_apt_is_reported():
     shell = FakeShell(handlers={'sh': lambda command: Result(
         127 if 'apt-get' in command.argv[-1] else 0, '\n', 'sh: 2: apt-get: not found')})
-    with pytest.raises(PrerequisiteError, match="'m' has neither podman nor docker.*apt-get"):
-        beside(shell, 'docker run image').start(dict)
+    with pytest.raises(PrerequisiteError, match="'a' has neither podman nor docker.*apt-get"):
+        beside(shell).start([parse('docker run image')])
+
+
+def test_containers_are_recorded_before_they_are_made():
+    running = FakeRunning(FakeShell(handlers={'sh': lambda command: Result(0, 'podman\n', '')}))
+    feature = Containers()
+    with feature.machine(running, ()):
+        assert running.calls == []
+        feature.starting(running, [NodeSpec('1', 'n', 'p', 'e', features=in_image('a'))], ())
+        assert running.calls == [('makes', 'containers')]
+    assert feature.clean_up('abc') == [containers.remove('abc')]
 
 
 @pytest.mark.parametrize(('survives', 'used'), [(True, True), (True, False), (False, True)])
 def test_a_computer_that_stays_keeps_no_container(monkeypatch, survives, used):
-    shell = FakeShell(handlers={'sh': lambda command: Result(0, 'podman\n', '')})
     monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(owned=not survives))
-    there = beside(shell)
-    there.start(dict)
+    _, job = deploying.job(Store().root, MachineSpec('m', 'fake'))
+    job.record = dataclasses.replace(job.record, last='abc')
+    job.shell = shell = FakeShell()
+    job.may_make('containers')
     if used:
-        there.inside([NodeSpec('1', 'n', 'p', 'e', image='a')])
-    there._job.undo.close()
-    removed = containers.remove('abc') in shell.commands
-    assert removed == (survives and used)
+        job.note('containers')
+    job.undo.close()
+    assert shell.commands == ([containers.remove('abc')] if survives and used else [])
+
+
+@pytest.mark.parametrize(('rmw', 'wrong'), [
+    ('rmw_cyclonedds_cpp', False), ('rmw_zenoh_cpp', True)])
+def test_container_of_another_middleware_is_refused_early(rmw, wrong):
+    launch = SimpleNamespace(
+        spec=lambda name: MachineSpec(name, 'container', features=of(GQCNN)),
+        environment={'RMW_IMPLEMENTATION': rmw})
+    part = Containers().in_launch(launch)
+    with pytest.raises(DdsError) if wrong else contextlib.nullcontext():
+        part.beside((), 'm')
+    assert not part.beside((), None)

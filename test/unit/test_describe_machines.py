@@ -52,8 +52,9 @@ def test_everything_that_a_container_takes(context):
         'gpus': 'all', 'devices': ['/dev/video0'], 'containers': True, 'isolated': True}
     assert (spec.workspace, spec.on_exit, spec.lifetime) == ('/robot/ws', 'keep', 5400)
     assert (spec.robot_timeout, spec.bootstrap, spec.environment) == (30, 'none', {'A': '1'})
-    assert spec.features == {'monitor': {'launch_foxglove': True}}
-    assert spec.containers == ('docker run hello-world',)
+    assert spec.features == {
+        'containers': {'docker_containers': ['docker run hello-world']},
+        'monitor': {'launch_foxglove': True}}
 
 
 def test_ssh(context):

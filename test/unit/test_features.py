@@ -127,8 +127,8 @@ def check(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Return a function that checks a machine with features."""
     monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(shell_kind='local'))
     return lambda **given: checks.check(
-        MachineSpec('a', 'fake', features=given), FakeProvider(), rmw='', environment={},
-        programs=(), images=(), report=silent)
+        MachineSpec('a', 'fake', features=given), FakeProvider(), environment={},
+        programs=(), report=silent)
 
 
 class Counting(Feature):

@@ -269,7 +269,8 @@ def test_each_start_of_nodes_lets_the_time_begin_anew():
 
 
 @pytest.mark.parametrize('how', [
-    {'containers': ['--image x']}, {'options': {'fleet': ['key']}}])
+    {'features': {'containers': {'docker_containers': ['docker run x']}}},
+    {'options': {'fleet': ['key']}}])
 def test_machine_whose_use_is_unknown_has_no_idle_timeout(how):
     with pytest.raises(ConfigurationError, match='computes|use the machine after'):
         IdleTimeout().check(MachineSpec('a', 'container', **how), 60.0)

@@ -32,7 +32,7 @@ def store(tmp_path):
 
 
 def record(name='planner', **changes):
-    spec = MachineSpec(name, 'container', {'ports': ['80:80']}, containers=('docker run x',))
+    spec = MachineSpec(name, 'container', {'ports': ['80:80']}, apt=('x',))
     return Record(name, 'container', spec, **changes)
 
 

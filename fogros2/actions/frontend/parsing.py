@@ -20,10 +20,8 @@ from fogros2.actions.frontend.entity import (
     value,
 )
 from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, LifecycleNode, Node
-from fogros2.describe import features, keywords, kinds, values
+from fogros2.describe import features, keywords
 from fogros2.errors import ConfigurationError, did_you_mean
-from fogros2.host import docker_lines
-from fogros2.host.containers import described, parse
 from fogros2.launch_internals.parsers import scoped
 
 if TYPE_CHECKING:
@@ -54,31 +52,16 @@ def fog_machine(entity: Entity, parser: Parser) -> Parsed:
         parameters = {name: keyword for each in keywords.providers() if _loads(each)
                       for name, keyword in keywords.keywords(keywords.machine_class(each)).items()}
     contents = {name: value(entity, parser, keyword) for name, keyword in parameters.items()}
-    containers = [_container(child, parser) for child in children(entity, 'docker_container')]
+    items = features.machine_lists()
+    _, lists = separate(
+        parser.parse_action(child) for item in items for child in children(entity, item))
     what = f"a fog_machine of the provider '{provider}'" if isinstance(provider, str) else ''
-    complete(entity, (*parameters, 'provider', 'docker_container', *CONDITIONS), what)
+    complete(entity, (*parameters, 'provider', *items, *CONDITIONS), what)
     if contents['name'] is None:
         raise ConfigurationError('a fog_machine needs a name', 'its nodes say machine="that name"')
-    kwargs.update(provider=provider, containers=containers, given={
-        name: content for name, content in contents.items() if content is not None})
+    kwargs.update(provider=provider, given={**{
+        name: content for name, content in contents.items() if content is not None}, **lists})
     return FogMachine, kwargs
-
-
-def _container(entity: Entity, parser: Parser) -> dict[str, Any]:
-    """Read ``<docker_container cmd="docker run redis"/>``, or ``image=`` and its keywords."""
-    parameters = {'cmd': kinds.Keyword('cmd', 'text'), **kinds.parameters_of(described)}
-    contents = {name: value(entity, parser, keyword, docker_lines.unfold if name == 'cmd' else str)
-                for name, keyword in parameters.items()}
-    complete(entity, parameters)
-    arguments = {name: values.items(content) if parameters[name].kind == 'list' else content
-                 for name, content in contents.items() if content is not None}
-    line = arguments.get('cmd')
-    if (line is None) == ('image' not in arguments) or (line is not None and len(arguments) > 1):
-        raise ConfigurationError('a docker_container takes a cmd, or an image and what it needs',
-                                 'cmd="docker run --net=host IMAGE", or image="IMAGE"')
-    if isinstance(line, str):
-        parse(line)
-    return arguments
 
 
 def _loads(provider: str) -> bool:
@@ -99,12 +82,9 @@ def node(entity: Entity, parser: Parser, cls: type[Node]) -> Parsed:
     """Read an element of ``cls`` as launch_ros does, with the keywords of a machine."""
     _, kwargs = cls.parse(entity, parser)
     kwargs['machine'] = _machine(entity, parser)
-    parameters = {'image': kinds.Keyword('image', 'text'),
-                  'image_options': kinds.Keyword('image_options', 'list'),
-                  **features.keywords('node_options')}
+    parameters = features.keywords('node_options')
     contents = {name: value(entity, parser, keyword) for name, keyword in parameters.items()}
-    kwargs.update({name: values.items(content) if name == 'image_options' else content
-                   for name, content in contents.items() if content is not None})
+    kwargs.update({name: content for name, content in contents.items() if content is not None})
     items = features.node_lists().values()
     _, lists = separate(
         parser.parse_action(child) for item in items for child in children(entity, item))

@@ -8,6 +8,5 @@ The steps of one machine, in their order; each imports only those before it.
 ``joining``     bring up the machine's end of the VPN
 ``installing``  ROS 2, the workspaces, and Python modules that programs import
 ``dds``         configuration of the middleware, and its routers
-``containers``  containers beside the nodes, and images that nodes run in
 ``watching``    compare clocks, and ask the provider about a silent machine, while the launch runs
 """

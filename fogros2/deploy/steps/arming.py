@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import contextlib
 import secrets
 from typing import Any, Optional
@@ -20,7 +20,6 @@ from fogros2.errors import (
     FogError,
     VpnError,
 )
-from fogros2.host import bootstrap
 from fogros2.model import Command
 from fogros2.waiting import Periodic, wait_until
 
@@ -153,10 +152,11 @@ class Arming(Step):
 
     # -- with nodes -----------------------------------------------------------------------------
 
-    def start_heartbeat(self, ros: bootstrap.RosInstall, dds: Mapping[str, str]) -> None:
+    def start_heartbeat(self, setup: Sequence[str], environment: Mapping[str, str]) -> None:
         """
         Send the agent the environment of nodes, and start the heartbeat.
 
+        :param setup: setup files that nodes need.
         :raises VpnError: no heartbeat was answered through the VPN.
         """
         context, job, address = self._context, self._job, self._job.interface.address
@@ -168,10 +168,7 @@ class Arming(Step):
                 'configure', timeout=context.timeouts.agent, launch=context.launch_id, again=True,
                 lifetime=job.spec.lifetime,
                 heartbeat={'bind': address, 'port': port, 'peer': peer, 'key': key},
-                environment={
-                    'FOGROS2_VPN_ADDRESS': address,
-                    **plan.extended({**ros.environment, **dds}, job.spec.environment)},
-                setup=list(ros.setup))
+                environment={'FOGROS2_VPN_ADDRESS': address, **environment}, setup=list(setup))
         except AgentError as error:
             if 'in use' in str(error):
                 raise VpnError(

@@ -220,7 +220,7 @@ class ContainerProvider(Provider):
 
     def check_containers(self, spec: MachineSpec) -> None:
         """Check that the machine is created with the rights to run containers."""
-        if not container_options.runs_containers(spec, Options.parse(spec.options)):
+        if not Options.parse(spec.options).containers:
             raise Unsupported(f"'{spec.name}' was created without the rights for containers",
                               'set containers=True where the machine is described')
 
@@ -597,7 +597,7 @@ def _entry(
     container_entry.add(
         archive, user=options.user, number=number, authorized_key=request.authorized_key,
         agent_config=request.agent_config,
-        nested=container_options.runs_containers(spec, options))
+        nested=options.containers)
     return archive
 
 

@@ -172,7 +172,7 @@ def common_flags(
         yield from ('-v', f'{volume_name(name)}:{path}')
     if spec.on_exit != 'stop':
         yield '--rm'
-    if runs_containers(spec, options):
+    if options.containers:
         yield from nested_flags(engine)
 
 
@@ -185,11 +185,6 @@ def data_mount(engine: Engine, folder: Path, target: str) -> tuple[str, str]:
     return '--mount', (
         f'type=volume,volume-nocopy,volume-opt=type=none,volume-opt=device={folder},'
         f'"volume-opt=o=bind,{options}",dst={target}')
-
-
-def runs_containers(spec: MachineSpec, options: Options) -> bool:
-    """Return whether a machine will run containers."""
-    return options.containers or bool(spec.containers)
 
 
 def nested_flags(engine: Engine) -> Iterator[str]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scripts for ``sh`` on a machine that run containers, see :mod:`fogros2.host.containers`."""
+"""Scripts for ``sh`` on a machine that run containers, see ``commands``."""
 
 # Finds the engine, and calls it as root, because the login user may not be in docker's group.
 ENGINE = """\
@@ -90,7 +90,7 @@ $as_root $engine run -d --name "$name" "$@" >/dev/null
 # Stops the container on a signal, and exits with its exit status. This script restarts the
 # container, not the engine, so that a stopped container stays stopped.
 FOLLOW = ENGINE + """\
-name=$1 restart=$2 since=; tries=0 asked=
+name=fogros2-@LAUNCH@-$1 restart=$2 since=; tries=0 asked=
 trap 'asked=1; $as_root $engine stop -t 5 "$name" >/dev/null 2>&1' INT TERM
 while :; do
     $as_root $engine logs -f $since "$name" & logs=$!

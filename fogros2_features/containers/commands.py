@@ -20,13 +20,14 @@ import shlex
 from typing import Any, Union
 
 from fogros2.errors import ConfigurationError, DdsError, did_you_mean
-from fogros2.host import container_scripts as scripts
-from fogros2.host import docker_lines
 from fogros2.host.installer import APT
 from fogros2.model import Command, NodeSpec, Text
+from fogros2_features.containers import docker_lines, scripts
 
-#: Program in the agent's folder that follows a container; its arguments are the container's name
-#: and the restart policy.
+#: The feature's name.
+NAME = 'containers'
+#: Program in the agent's folder that follows a container; its arguments are the end of the
+#: container's name, and the restart policy.
 FOLLOWER = 'follow-container'
 #: Label of containers with the launch's id.
 LABEL = 'fogros2-launch'
@@ -262,8 +263,17 @@ def dds_variables(environment: Mapping[str, str]) -> str:
 
 def called(container: Container, number: int, launch: str) -> str:
     """Return the engine's name of a container, which is unique among launches."""
+    return f'fogros2-{launch}-{_called(container, number)}'
+
+
+def _called(container: Container, number: int) -> str:
     what = container.name or posixpath.basename(container.image).partition('@')[0]
-    return f'fogros2-{launch}-{number}-' + re.sub(r'[^A-Za-z0-9_.-]', '-', what)[:40]
+    return f'{number}-' + re.sub(r'[^A-Za-z0-9_.-]', '-', what)[:40]
+
+
+def image_of(node: NodeSpec) -> Mapping[str, Any]:
+    """Return a node's keywords ``image`` and ``image_options``, those that it has."""
+    return node.features.get(NAME, {})
 
 
 def node_container(image: str, options: Sequence[str]) -> Container:
@@ -332,11 +342,16 @@ def run(
         what=f"start the container '{container.image}'")
 
 
-def follow(container: Container, number: int, launch: str) -> NodeSpec:
+def follower(launch: str) -> str:
+    """Return the program that follows the containers of a launch."""
+    return scripts.FOLLOW.replace('@LAUNCH@', launch)
+
+
+def follow(container: Container, number: int) -> NodeSpec:
     """Return the process that follows a running container."""
-    name = called(container, number, launch)
+    name = _called(container, number)
     return NodeSpec(
-        id=f'container-{name}', name=name.split('-', 3)[3],
+        id=f'container-{name}', name=name.partition('-')[2],
         arguments=('sh', '-c', f'exec sh "$FOGROS2_AGENT_DIRECTORY/{FOLLOWER}" "$0" "$@"', name,
                    container.restart), sigterm_timeout=15.0)
 
@@ -353,7 +368,8 @@ def inside(
     :param configuration: see ``dds_options``.
     :param variables: names of the launch file's variables for the machine's nodes.
     """
-    container = node_container(node.image, node.image_options)
+    given = image_of(node)
+    container = node_container(given['image'], given.get('image_options', ()))
     candidates = {*_DDS_VARIABLES, *_NODE_VARIABLES, *variables, *node.environment}
     names = sorted(name for name in candidates if _VARIABLE.fullmatch(name))
     options: list[Text] = [
@@ -365,7 +381,8 @@ def inside(
     grace = max(0.1, node.sigkill_timeout - 1.0)
     name = f'fogros2-{launch}-' + re.sub(r'[^A-Za-z0-9_.-]', '-', node.name)[:60]
     return dataclasses.replace(
-        node, package='', executable='', prefix=(), cwd=None, image='', image_options=(),
+        node, package='', executable='', prefix=(), cwd=None,
+        features={name: each for name, each in node.features.items() if name != NAME},
         files={**node.files, _OUTER: scripts.NODE.replace('@VARIABLES@', ' '.join(names)),
                _INNER: scripts.INSIDE},
         arguments=(
