@@ -110,6 +110,7 @@ setup(
         'fogros2.provider': [
             'aws = fogros2.provider.aws.provider:AWSProvider',
             'azure = fogros2.provider.azure.provider:AzureProvider',
+            'cheapest = fogros2_features.prices.provider:Cheapest',
             'container = fogros2.provider.container:ContainerProvider',
             'gcp = fogros2.provider.gcp.provider:GCPProvider',
             'hosted = fogros2_features.hosts.hosted:HostedProvider',
@@ -120,7 +121,7 @@ setup(
         'fogros2.machine': [
             'aws = fogros2.describe.machines_cloud:AWSCloudInstance',
             'azure = fogros2.describe.machines_cloud:AzureCloudInstance',
-            'cheapest = fogros2.describe.machines_cloud:CheapestInstance',
+            'cheapest = fogros2_features.prices.machine:CheapestInstance',
             'container = fogros2.describe.machines:ContainerInstance',
             'gcp = fogros2.describe.machines_cloud:GCPCloudInstance',
             'joined = fogros2_features.guests.machine:JoinedMachine',
@@ -147,11 +148,20 @@ setup(
             'vpn_path = fogros2_features.vpn_path:VpnPath',
             'volumes = fogros2_features.volumes:Volumes',
         ],
+        'fogros2.market': [
+            'prices = fogros2_features.prices.market:Market',
+        ],
         'fogros2.public': [
+            'CheapestInstance = fogros2_features.prices.machine:CheapestInstance',
             'Foxglove = fogros2_monitor.action:Foxglove',
             'JoinedMachine = fogros2_features.guests.machine:JoinedMachine',
             'Replicated = fogros2_features.replicas.action:Replicated',
             'StreamTopic = fogros2_features.streams.entries:StreamTopic',
+            'cheapest = fogros2_features.prices.machine:cheapest',
+            'ec2_instance_type_selection = fogros2_features.prices.choices',
+            'find_cheapest = fogros2_features.prices.choices:find_cheapest',
+            'find_cheapest_ec2_instance_type = '
+            'fogros2_features.prices.choices:find_cheapest_ec2_instance_type',
         ],
         'fogros2.modules': [
             'fogros2 = fogros2_monitor.needs:NEEDS',
@@ -161,6 +171,9 @@ setup(
         ],
         'fogros2.monitor': [
             'graph = fogros2_monitor:GRAPH',
+        ],
+        'fogros2.price': [
+            'replicas = fogros2_features.replicas.price',
         ],
         'fogros2.shell': [
             'guest = fogros2_features.guests.shell:GuestShell',
@@ -218,7 +231,7 @@ setup(
             'doctor = ros2fog_cli.verb.doctor:DoctorVerb',
             'env = ros2fog_cli.verb.env:EnvVerb',
             'gc = ros2fog_cli.verb.gc:GcVerb',
-            'image = ros2fog_cli.verb.image:ImageVerb',
+            'image = fogros2_features.images.verbs:ImageVerb',
             'invite = fogros2_features.guests.verbs:InviteVerb',
             'join = fogros2_features.guests.verbs:JoinVerb',
             'key = fogros2_features.guests.verbs:KeyVerb',
@@ -227,13 +240,13 @@ setup(
             'logs = ros2fog_cli.verb.logs:LogsVerb',
             'monitor = fogros2_monitor.verbs:MonitorVerb',
             'plan = ros2fog_cli.verb.plan:PlanVerb',
-            'price = ros2fog_cli.verb.price:PriceVerb',
+            'price = fogros2_features.prices.verbs:PriceVerb',
             'regions = ros2fog_cli.verb.regions:RegionsVerb',
             'revoke = fogros2_features.guests.verbs:RevokeVerb',
             'shell = ros2fog_cli.verb.shell:ShellVerb',
             'ssh-config = ros2fog_cli.verb.ssh_config:SshConfigVerb',
             'status = ros2fog_cli.verb.status:StatusVerb',
-            'volume = ros2fog_cli.verb.volume:VolumeVerb',
+            'volume = fogros2_features.volumes.verbs:VolumeVerb',
             'wait = ros2fog_cli.verb.wait:WaitVerb',
         ],
     },

@@ -9,7 +9,7 @@ launch nor an SDK.
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 from typing import Any, TYPE_CHECKING
 
 from fogros2 import plugin_system
@@ -19,12 +19,7 @@ if TYPE_CHECKING:
     from fogros2.actions.fog_machine import FogMachine
     from fogros2.actions.launch_description import FogROSLaunchDescription
     from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, LifecycleNode, Node
-    from fogros2.describe.choices import (
-        find_cheapest,
-        find_cheapest_ec2_instance_type,
-        find_nearest_aws_region,
-        nearest_aws_region_now,
-    )
+    from fogros2.describe.choices import find_nearest_aws_region, nearest_aws_region_now
     from fogros2.describe.machines import (
         CloudInstance,
         ContainerInstance,
@@ -33,8 +28,6 @@ if TYPE_CHECKING:
     from fogros2.describe.machines_cloud import (
         AWSCloudInstance,
         AzureCloudInstance,
-        cheapest,
-        CheapestInstance,
         GCPCloudInstance,
         KubeInstance,
     )
@@ -43,11 +36,10 @@ if TYPE_CHECKING:
 
     # written out for type checkers, which do not run the module
     __all__ = [
-        'AWSCloudInstance', 'AzureCloudInstance', 'CheapestInstance', 'CloudGroup',
-        'CloudInstance', 'CloudNode', 'ComposableNodeContainer', 'ContainerInstance', 'FogError',
+        'AWSCloudInstance', 'AzureCloudInstance', 'CloudGroup', 'CloudInstance', 'CloudNode',
+        'ComposableNodeContainer', 'ContainerInstance', 'FogError',
         'FogMachine', 'FogROSLaunchDescription', 'GCPCloudInstance', 'KubeInstance',
-        'LifecycleNode', 'MachineInterrupted', 'Node', 'SSHInstance', 'cheapest',
-        'find_cheapest', 'find_cheapest_ec2_instance_type', 'find_nearest_aws_region',
+        'LifecycleNode', 'MachineInterrupted', 'Node', 'SSHInstance', 'find_nearest_aws_region',
         'nearest_aws_region_now',
     ]
 
@@ -57,32 +49,29 @@ _NAMES = {
     'actions.fog_machine': 'FogMachine',
     'actions.launch_description': 'FogROSLaunchDescription',
     'actions.nodes': 'CloudNode ComposableNodeContainer LifecycleNode Node',
-    'describe.choices':
-        'find_cheapest find_cheapest_ec2_instance_type find_nearest_aws_region '
-        'nearest_aws_region_now',
+    'describe.choices': 'find_nearest_aws_region nearest_aws_region_now',
     'describe.machines': 'CloudInstance ContainerInstance SSHInstance',
     'describe.machines_cloud':
-        'AWSCloudInstance AzureCloudInstance CheapestInstance GCPCloudInstance KubeInstance '
-        'cheapest',
+        'AWSCloudInstance AzureCloudInstance GCPCloudInstance KubeInstance',
     'errors': 'FogError',
     'runtime.interruption': 'MachineInterrupted',
 }
 _MODULES = {
     name: f'fogros2.{module}' for module, names in _NAMES.items() for name in names.split()}
-#: Modules that FogROS2 has in a package ``utils``: ``from fogros2 import region_ami_selection``.
-_FORMERLY_UTILS = ('ec2_instance_type_selection', 'region_ami_selection')
+#: Module that FogROS2 has in a package ``utils``: ``from fogros2 import region_ami_selection``.
+_FORMERLY_UTILS = 'region_ami_selection'
 _GROUP = 'fogros2.public'
 
 
 def __getattr__(name: str) -> Any:
     value: Any
-    if name in _FORMERLY_UTILS:
+    if name == _FORMERLY_UTILS:
         value = importlib.import_module('fogros2.describe.choices')
     elif name in _MODULES:
         value = getattr(importlib.import_module(_MODULES[name]), name)
     elif name == '__all__':
-        value = [*_MODULES, *_FORMERLY_UTILS, *plugin_system.names(_GROUP)]
-    elif name[:1].isupper() and name in plugin_system.names(_GROUP):  # no module
+        value = [*_MODULES, _FORMERLY_UTILS, *plugin_system.names(_GROUP)]
+    elif not importlib.util.find_spec(f'fogros2.{name}') and name in plugin_system.names(_GROUP):
         value = plugin_system.load(_GROUP, name)
     else:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

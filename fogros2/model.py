@@ -156,26 +156,6 @@ class Machine:
 
 
 @dataclasses.dataclass(frozen=True)
-class Image:
-    """
-    A disk image made from a machine, for later machines.
-
-    :param id: opaque to the core; contains its location.
-    :param dependencies: hash of the installed dependencies; a launch uses an image with its hash.
-    """
-
-    id: str
-    name: str
-    provider: str
-    region: str = ''
-    created: Optional[float] = None
-    size_gb: Optional[int] = None
-    state: str = ''
-    dependencies: str = ''
-    tags: Mapping[str, str] = dataclasses.field(default_factory=dict)
-
-
-@dataclasses.dataclass(frozen=True)
 class Volume:
     """
     A disk or folder that outlives the machines that use it.

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 #: What messages call the plugins of a group whose name does not end so.
-_KINDS = {'fogros2.machine': 'provider', 'fogros2.vpn': 'VPN', 'fogros2.dds': 'DDS vendor'}
+_KINDS = {'fogros2.machine': 'provider', 'fogros2.market': 'feature', 'fogros2.vpn': 'VPN',
+          'fogros2.dds': 'DDS vendor'}
 
 
 @functools.lru_cache(maxsize=1)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Features of machines, each a module with one :class:`fogros2.feature.Feature`.
+Features of machines, each a module or package with one :class:`fogros2.feature.Feature`.
 
-``replicas`` is an action, and ``hosts`` a provider.
+``images`` and ``prices`` have verbs, ``prices`` and ``hosts`` a provider; ``replicas`` is an action.
 """

@@ -15,7 +15,7 @@ from typing import Any
 
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.model import MachineSpec
-from fogros2.provider.offers import MachineType
+from fogros2.provider.machine_types import MachineType
 from fogros2.provider.vm.cloud import Order, Place, Vm, VmCloud, VmId
 from fogros2.provider.vm.options import VmOptions
 from fogros2.provider.vm.provider import VmProvider

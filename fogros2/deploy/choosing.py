@@ -15,7 +15,6 @@ from fogros2.errors import FogError
 from fogros2.feature import Cost
 from fogros2.model import MachineSpec
 from fogros2.provider import Provider
-from fogros2.provider.cheapest import Cheapest
 from fogros2.report import Reporter, step
 
 
@@ -61,19 +60,19 @@ class Choices:
         """
         Return the specs to try while there is no capacity, one after the other.
 
-        For a machine of any cloud, they are the cheapest offers, requested once for each launch.
+        A provider that stands for others is asked for them once for each launch.
 
         :raises FogError: nothing fits.
         """
         provider = self._provider(spec.provider)
-        if not isinstance(provider, Cheapest):
+        if not provider.capabilities.places:
             return [spec]
         if spec.name not in self._places:
             with step(self._report, spec.name, 'offers') as detail:
-                offers = provider.places(spec)
-                detail += [str(offer) for offer, _ in offers[:2]]
-                detail += [f'{len(offers) - 2} more'] * (len(offers) > 2)
-            self._places[spec.name] = [place for _, place in offers]
+                places = provider.places(spec)
+                detail += [words for words, _ in places[:2]]
+                detail += [f'{len(places) - 2} more'] * (len(places) > 2)
+            self._places[spec.name] = [place for _, place in places]
         return self._places[spec.name]
 
     def price(self, spec: MachineSpec) -> Optional[Decimal]:

@@ -13,7 +13,6 @@ from fogros2 import plan, plugin_system, process, ros2_daemon
 from fogros2.errors import PrerequisiteError
 from fogros2.model import Command
 from fogros2.provider import Provider
-from fogros2.provider.cheapest import Cheapest
 from fogros2.report import Reporter, silent, step
 from fogros2.store import delete_folder, Record, Store
 from fogros2.vpn import helped, Vpn
@@ -35,8 +34,6 @@ def provider(name: str) -> Provider:
 
     :raises ConfigurationError: there is no such provider.
     """
-    if name == Cheapest.name:
-        return Cheapest()
     instance: Provider = plugin_system.load('fogros2.provider', name)()
     return instance
 

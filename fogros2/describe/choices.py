@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Choose a region, an image or an instance type when the launch is executed.
+Choose a region or an image when the launch is executed.
 
 Each function returns launch substitutions and makes no request. A machine with such an option
 makes the requests in a thread, when it comes up. The exception is ``nearest_aws_region_now``.
 
-The names and keywords of FogROS2's package ``utils`` are among them (there
-``region_ami_selection`` and ``ec2_instance_type_selection``).
+The names and keywords of FogROS2's module ``utils.region_ami_selection`` are among them.
 """
 
 from __future__ import annotations
@@ -20,9 +19,7 @@ from launch import LaunchContext, Substitution
 
 from fogros2 import plugin_system
 from fogros2.describe import values
-from fogros2.errors import ConfigurationError
-from fogros2.provider import clouds, offers, Provider
-from fogros2.provider.cheapest import WANTS
+from fogros2.provider import Provider
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
@@ -108,74 +105,7 @@ def find_nearest_region_and_ami(
         'the image for that region', lambda region: images[region], {'region': region})
 
 
-def find_cheapest_ec2_instance_type(
-    region_name: SomeSubstitutionsType, cpu_architecture: str = 'x86_64', default_cores: int = 2,
-    default_threads_per_core: int = 1, gpu: bool = False,
-) -> Choice:
-    """
-    Choose the cheapest EC2 instance type of a region as FogROS2 does.
-
-    It has exactly so many cores and threads. ``ec2_instance_type='cheapest'`` of a machine, and
-    :func:`find_cheapest`, take minimums.
-
-    :param region_name: such as 'eu-central-1', or 'nearest'.
-    :param gpu: whether it has a GPU.
-    """
-    return Choice('the cheapest type there', functools.partial(_type, wanted={
-        'arch': cpu_architecture, 'min_cpu': 0, 'min_memory_gb': 0, 'gpu': gpu,
-        'cores': default_cores, 'threads_per_core': default_threads_per_core}),
-        {'region': region_name})
-
-
-def find_cheapest(
-    regions: Optional[Sequence[SomeSubstitutionsType]] = None, *, provider: str = 'aws',
-    max_round_trip_ms: Optional[float] = None, **wanted: Any,
-) -> tuple[Choice, Choice]:
-    """
-    Choose the cheapest machine of a cloud that meets the requirements.
-
-    :param regions: candidates; None for all regions that the account may use.
-    :param provider: the cloud, such as 'azure'.
-    :param max_round_trip_ms: maximum of the measured time to the region and back.
-    :param wanted: ``arch``, ``min_cpu``, ``min_memory_gb``, ``cpu_type``, ``gpu``,
-        ``gpu_memory_gb``, ``max_price``, ``spot``, with the meaning of AWSCloudInstance.
-    :returns: region and type. :class:`~fogros2.CheapestInstance` compares all clouds.
-    :raises ConfigurationError: an unknown keyword.
-    """
-    for name in wanted:
-        if name not in WANTS:
-            raise ConfigurationError(
-                f"find_cheapest takes no '{name}'",
-                f"it takes regions, provider, max_round_trip_ms, {', '.join(WANTS)}")
-    ask = functools.partial(
-        _cheapest, provider=provider, max_round_trip_ms=max_round_trip_ms, wanted=wanted)
-    # one request answers both
-    offer = Choice('the cheapest offer', ask, {'regions': values.items(regions)})
-    return (Choice('the region of the cheapest offer', lambda offer: offer.split(' ')[0],
-                   {'offer': offer}),
-            Choice('the type of the cheapest offer', lambda offer: offer.split(' ')[1],
-                   {'offer': offer}))
-
-
-# The provider is loaded only when a request is made.
-
-def _aws() -> Provider:
-    provider: Provider = plugin_system.load('fogros2.provider', 'aws')()
-    return provider
-
-
 def _nearest(regions: Optional[Sequence[str]]) -> str:
-    return _aws().nearest(regions or ())
-
-
-def _type(region: str, wanted: Mapping[str, Any]) -> str:
-    return _aws().offers(offers.wants(**wanted), [region]).chosen.type.name
-
-
-def _cheapest(
-    regions: Optional[Sequence[str]], provider: str,
-    max_round_trip_ms: Optional[float], wanted: Mapping[str, Any],
-) -> str:
-    offer = clouds.compare(offers.wants(**wanted), (provider,), regions or [clouds.ALL],
-                           max_round_trip_ms=max_round_trip_ms).chosen
-    return f'{offer.region} {offer.type.name}'
+    # loaded only when a request is made
+    provider: Provider = plugin_system.load('fogros2.provider', 'aws')()
+    return provider.nearest(regions or ())

@@ -2,10 +2,9 @@
 """
 The plugin interface to computers: a cloud, a cluster, a container engine, an existing host.
 
-In reading order: ``offers`` (types of machines and their prices), ``options`` (reading a launch
-file's options), this module, then a module or package for each provider:
-``ssh``, ``container``, ``kubernetes``, ``vm`` (shared by virtual machines), ``aws``,
-``gcp``, ``azure``, ``clouds`` (the offers of all), ``cheapest`` (a machine of any cloud).
+In reading order: ``machine_types`` (of regions), ``options`` (reading a launch file's options),
+this module, then a module or package for each provider: ``ssh``, ``container``, ``kubernetes``,
+``vm`` (shared by virtual machines), ``aws``, ``gcp``, ``azure``.
 """
 
 from __future__ import annotations
@@ -21,14 +20,12 @@ from typing import ClassVar, Optional
 from fogros2.errors import MachineNotFound, NameTaken, ProviderError, Unsupported
 from fogros2.model import (
     CreateRequest,
-    Image,
     Machine,
     MachineSpec,
     MachineState,
     OtherVpn,
-    Volume,
 )
-from fogros2.provider.offers import Offer, Offers, Region, Wants
+from fogros2.provider.machine_types import Region
 from fogros2.waiting import wait_until
 
 #: Tags that the core puts on every resource; the provider's copy of them is the truth.
@@ -61,11 +58,10 @@ class Capabilities:
     :param one_time_host_key: other programs may have read the host key that ``describe`` reports.
         The launch then has the machine generate another one, and calls ``pin``.
     :param stop: ``stop`` and ``start`` keep a machine's disk.
-    :param images: ``bake``, ``images`` and ``delete_image`` work.
     :param choices: ``resolve`` may change a spec.
     :param adopt: ``adopt`` changes how an existing machine ends.
     :param regions: it has regions: ``region_names``, ``regions``, ``search_in``.
-    :param prices: ``offers`` lists types of machines with prices, and ``taking`` takes one.
+    :param places: it stands for other providers: ``places`` names them for a spec.
     :param agent_directory: folder on the machine of the agent that ``create`` starts at boot; ''
         if the launch starts the agent over the first connection.
     :param agent_program: path on the machine of that agent's program.
@@ -77,7 +73,8 @@ class Capabilities:
         request's application, 0 if it serves none.
     :param preemption_notice: command that the agent runs as root every few seconds. Exit status 0
         means that the provider is about to reclaim the machine; the output has reason and time.
-    :param keeps_volumes: it has disks or folders that outlive machines.
+    :param keeps_volumes: it has disks or folders that outlive machines, ``with_volumes`` of a
+        request, and the methods by which the feature ``volumes`` attaches them.
     """
 
     shell_kind: str = 'ssh'
@@ -88,11 +85,10 @@ class Capabilities:
     firewall: bool = False
     one_time_host_key: bool = False
     stop: bool = False
-    images: bool = False
     choices: bool = False
     adopt: bool = False
     regions: bool = False
-    prices: bool = False
+    places: bool = False
     agent_directory: str = ''
     agent_program: str = ''
     agent_sent: bool = False
@@ -200,6 +196,16 @@ class Provider(abc.ABC):
         :raises FogError: nothing fits, or the provider does not answer.
         """
         return spec
+
+    def places(self, spec: MachineSpec) -> list[tuple[str, MachineSpec]]:
+        """
+        Return specs to try while there is no capacity, each with words for people (``places``).
+
+        Called before ``resolve``; each spec names the provider that creates the machine.
+
+        :raises FogError: nothing fits, or no provider answers.
+        """
+        return []
 
     def other_vpn(self, spec: MachineSpec) -> Optional[OtherVpn]:
         """
@@ -456,77 +462,7 @@ class Provider(abc.ABC):
         """
         raise Unsupported(f"provider '{self.name}' has no one-time host keys")
 
-    # -- images ---------------------------------------------------------------------------------
-
-    def bake(self, machine_id: str, name: str, dependencies: str) -> str:
-        """
-        Start to make an image of a machine, and return its id; ``images`` reports its state.
-
-        :param dependencies: see :class:`~fogros2.model.Image`.
-        :raises Unsupported: the provider keeps no images.
-        """
-        raise self._no_images()
-
-    def images(self) -> Iterable[Image]:
-        """
-        Yield the images that were made of machines.
-
-        :raises Unsupported: the provider keeps none.
-        """
-        raise self._no_images()
-
-    def delete_image(self, image_id: str) -> None:
-        """
-        Delete an image and its disk snapshots; idempotent.
-
-        :raises Unsupported: the provider keeps none.
-        """
-        raise self._no_images()
-
-    def _no_images(self) -> Unsupported:
-        return Unsupported(f"provider '{self.name}' keeps no images of machines",
-                           'AWS, Azure and Google Cloud do; for pods: ros2 fog image create')
-
-    # -- volumes --------------------------------------------------------------------------------
-
-    def volumes(self, hosts: Sequence[str] = ()) -> Iterable[Volume]:
-        """
-        Yield the volumes (``keeps_volumes``).
-
-        :param hosts: computers with an SSH server whose volumes are meant, too.
-        :raises Unsupported: the provider has none, or lists none.
-        """
-        raise self.no_volumes()
-
-    def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
-        """
-        Attach a volume to a running machine; make it if there is none of this name.
-
-        Idempotent. ``create`` has refused a volume that another machine uses.
-
-        :raises NameTaken: another machine has got the volume since, or a kept machine has none.
-        :raises Unsupported: the provider has no volumes.
-        """
-        raise self.no_volumes()
-
-    def detach(self, machine_id: str, name: str) -> None:
-        """Detach a volume that the machine no longer uses; idempotent."""
-
-    def delete_volume(self, volume_id: str) -> None:
-        """
-        Delete a volume and its data; idempotent.
-
-        :raises NameTaken: a machine uses it.
-        :raises Unsupported: the provider has none.
-        """
-        raise self.no_volumes()
-
-    def no_volumes(self) -> Unsupported:
-        """Return the error for a volume at this provider."""
-        return Unsupported(f"provider '{self.name}' has no volumes",
-                           'AWS, Azure, Google Cloud, Kubernetes, containers and SSH hosts do')
-
-    # -- regions and prices ---------------------------------------------------------------------
+    # -- regions --------------------------------------------------------------------------------
 
     @classmethod
     def region_names(cls) -> Sequence[str]:
@@ -555,29 +491,7 @@ class Provider(abc.ABC):
 
     def search_in(self, regions: Sequence[str]) -> None:
         """
-        Let ``find``, ``images`` and ``tidy`` search these regions (``regions``).
+        Let ``find`` and ``tidy`` search these regions (``regions``).
 
         :param regions: names; 'all' stands for every region of the account.
         """
-
-    def offers(
-        self, wanted: Wants, regions: Sequence[str] = (), *, refresh: bool = False,
-    ) -> Offers:
-        """
-        Return the types of machines that meet requirements, the cheapest first (``prices``).
-
-        :param regions: names, 'all' or 'nearest'; none for the configured one.
-        :param refresh: do not use cached prices.
-        :raises ConfigurationError: nothing fits.
-        :raises FogError: no region answers.
-        :raises Unsupported: the provider has no price list.
-        """
-        raise Unsupported(f"provider '{self.name}' has no price list")
-
-    def taking(self, spec: MachineSpec, offer: Offer) -> MachineSpec:
-        """
-        Return the spec of a machine of this provider that takes an offer (``prices``).
-
-        :param spec: of a machine of any cloud; the result has its options as ``wanted``.
-        """
-        raise Unsupported(f"provider '{self.name}' has no price list")

@@ -183,6 +183,9 @@ class SSHProvider(Provider):
         """Return a folder, whose size has no limit."""
         return Attached(folder=f'{_VOLUMES}/{name}')
 
+    def detach(self, machine_id: str, name: str) -> None:
+        """Do nothing: the folder stays where it is."""
+
     def delete_volume(self, volume_id: str) -> None:
         """Delete a folder unless a launch holds its lock."""
         host, _, name = volume_id.removeprefix(_SCHEME).rpartition('/')

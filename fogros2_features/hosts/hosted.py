@@ -362,6 +362,9 @@ class HostedProvider(Provider):
         self._call(host, 'attach', id=identity, name=name, size_gb=size_gb)
         return Attached()
 
+    def detach(self, machine_id: str, name: str) -> None:
+        """Do nothing: the machine's end frees the volume."""
+
     def delete_volume(self, volume_id: str) -> None:
         """Remove a volume from its host."""
         self._call_of(volume_id, 'delete_volume')

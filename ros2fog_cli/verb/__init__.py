@@ -183,12 +183,6 @@ def provider_names() -> list[str]:
     return plugin_system.names('fogros2.provider')
 
 
-def cloud_names() -> list[str]:
-    """Return 'all' and the providers with prices."""
-    from fogros2.provider.clouds import clouds
-    return ['all', *sum(clouds(), [])]
-
-
 def add_json(parser: argparse.ArgumentParser) -> None:
     """Add ``--json``."""
     parser.add_argument('--json', action='store_true', help='print JSON, for programs')

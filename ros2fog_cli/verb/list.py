@@ -21,19 +21,19 @@ class ListVerb(VerbExtension):
         """Print the table, or JSON."""
         from concurrent.futures import ThreadPoolExecutor
 
+        from fogros2 import feature
         from ros2fog_cli.api import machines, table
-        from ros2fog_cli.api import volumes as api
-        with ThreadPoolExecutor(1, 'fog-volumes') as pool:
-            # what is wrong with a provider, the list of machines says
-            asked = pool.submit(api.survey, lambda text: None, regions=args.region)
+        with ThreadPoolExecutor(1, 'fog-list') as pool:
+            asked = {name: pool.submit(each.listed, args.region)
+                     for name, each in feature.installed().items()}
             entries = machines.survey(warn, regions=args.region)
-            volumes = asked.result()
+            others = {name: each for name, one in asked.items() if (each := one.result())}
         now = time.time()
         if args.json:
             print_json(machines=[entry.to_json(now) for entry in entries],
-                       volumes=[api.to_json(volume) for volume in volumes])
+                       **{name: rows for name, (rows, _) in others.items()})
             return 0
-        kept = api.total(volumes, table.cost)
+        kept = '\n'.join(line for _, line in others.values() if line)
         if not entries:
             print('\n'.join(filter(None, ('no machines', kept))))
             return 0

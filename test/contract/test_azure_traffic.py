@@ -18,6 +18,7 @@ import pytest
 
 from fogros2.model import MachineSpec
 from fogros2.provider.azure.provider import AzureProvider
+from fogros2_features.images.keepers import image_keeper
 from fogros2_testing import request_for
 from rigs.azure import service, traffic
 
@@ -39,9 +40,9 @@ def exchanges(azure_service):
         provider.adopt(machine, usual, {'fogros2-launch': 'l2'})
         provider.stop(machine)
         provider.start(machine)
-        image = provider.bake(machine, 'mine', 'abc')
-        assert list(provider.images())
-        provider.delete_image(image)
+        image = image_keeper(provider).bake(machine, 'mine', 'abc')
+        assert list(image_keeper(provider).images())
+        image_keeper(provider).delete_image(image)
         provider.destroy(machine)
         azure_service.rights = service.CONTRIBUTOR
         for other in (spec('cheap', 'Standard_B2als_v2', spot=True),

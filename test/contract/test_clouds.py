@@ -14,6 +14,7 @@ from fogros2.errors import NameTaken, ProviderError, Unsupported
 from fogros2.model import MachineSpec
 from fogros2.provider import TAG_ON_EXIT
 from fogros2.waiting import wait_until
+from fogros2_features.volumes.keepers import volume_keeper
 from fogros2_testing import request_for, VmContract
 from fogros2_testing.provider_contract import PUBLIC_KEY
 from rigs.clouds_in_memory import MEMORIES
@@ -51,8 +52,8 @@ class TestClouds(VmContract):
 
 
 def wait_free(provider):
-    wait_until(lambda: not [one for one in provider.volumes() if one.user], timeout=30.0,
-               what='the volume to be free')
+    wait_until(lambda: not [one for one in volume_keeper(provider).volumes() if one.user],
+               timeout=30.0, what='the volume to be free')
 
 
 def with_volume(memory, name, **options):
@@ -61,35 +62,36 @@ def with_volume(memory, name, **options):
     provider = memory.provider()
     machine_id = provider.create(spec, request)
     provider.reachable(machine_id, name=name, timeout=30.0)
-    return machine_id, provider.attach(machine_id, 'models', 60)
+    return machine_id, volume_keeper(provider).attach(machine_id, 'models', 60)
 
 
 def test_volume_leads_the_next_machine_to_its_zone(memory):
     provider = memory.provider()
+    keeper = volume_keeper(provider)
     one, attached = with_volume(memory, 'one')
-    assert attached.devices and provider.attach(one, 'models', 60) == attached
-    (volume,) = provider.volumes()
+    assert attached.devices and keeper.attach(one, 'models', 60) == attached
+    (volume,) = keeper.volumes()
     assert (volume.name, volume.size_gb, volume.user in one) == ('models', 60, True)
     assert volume.cost_per_month > 4
     # another launch, and the verb
     with pytest.raises(NameTaken, match="'models' .* is in use by"):
         with_volume(memory, 'two')
     with pytest.raises(NameTaken, match="'models' .* is in use by"):
-        provider.delete_volume(volume.id)
+        keeper.delete_volume(volume.id)
     provider.destroy(one)
     wait_free(provider)
     # of two regions, the volume's is taken
     two, _ = with_volume(memory, 'two', region=memory.away,
                          regions=[volume.region, volume.id.split(':')[1].split('/')[0]][1:])
-    assert [(one.id, one.user in two) for one in provider.volumes()] == [(volume.id, True)]
-    provider.detach(two, 'models')
-    provider.detach(two, 'models')
+    assert [(one.id, one.user in two) for one in keeper.volumes()] == [(volume.id, True)]
+    keeper.detach(two, 'models')
+    keeper.detach(two, 'models')
     wait_free(provider)
     provider.destroy(two)
     assert provider.tidy() == []
-    provider.delete_volume(volume.id)
-    wait_until(lambda: not list(provider.volumes()), timeout=30.0, what='no volume')
-    provider.delete_volume(volume.id)
+    keeper.delete_volume(volume.id)
+    wait_until(lambda: not list(keeper.volumes()), timeout=30.0, what='no volume')
+    keeper.delete_volume(volume.id)
 
 
 def test_two_launches_that_make_a_volume_at_once_keep_one(memory):
@@ -98,7 +100,7 @@ def test_two_launches_that_make_a_volume_at_once_keep_one(memory):
     two = provider.create(spec, request_for(spec))
     provider.reachable(two, name='two', timeout=30.0)
     one, _ = with_volume(memory, 'one')
-    adapter = vars(provider)['_cloud']
+    adapter = provider.cloud
     list_disks, delete_disk = type(adapter).disks, type(adapter).delete_disk
     # the first look came before the other launch's volume, others while it is made
     looks = iter([lambda disks: [], *2 * [lambda disks: [
@@ -112,9 +114,9 @@ def test_two_launches_that_make_a_volume_at_once_keep_one(memory):
         looks, list)(list_disks(own, region, name)))
     memory.patch.setattr(type(adapter), 'delete_disk', delete)
     with pytest.raises(NameTaken, match='is in use by'):
-        provider.attach(two, 'models', 60)
+        volume_keeper(provider).attach(two, 'models', 60)
     memory.patch.setattr(type(adapter), 'disks', list_disks)
-    assert [volume.user in one for volume in provider.volumes()] == [True]
+    assert [volume.user in one for volume in volume_keeper(provider).volumes()] == [True]
 
 
 def create(memory, name='planner', **options):

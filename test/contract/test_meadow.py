@@ -16,11 +16,11 @@ import pytest
 
 from fogros2.errors import ConfigurationError, FogError, ProviderError, Unsupported
 from fogros2.model import MachineSpec
-from fogros2.provider.offers import wants
 from fogros2.provider.vm import account
 from fogros2.provider.vm.cloud import attempt_of, VmCloud
-from fogros2.provider.vm.market import Market
 from fogros2.provider.vm.user_data import END_COMMAND
+from fogros2_features.prices.market import Market, seller
+from fogros2_features.prices.offers import wants
 from fogros2_testing import request_for, VmContract
 from rigs.meadow import provider as adapter
 from rigs.meadow.provider import Meadow, MeadowError, MeadowProvider
@@ -144,7 +144,7 @@ def test_cheapest_type_has_the_disk_that_is_asked_for(plain):
     assert chosen.options['machine_type'] == 'large'
     with pytest.raises(ConfigurationError, match='a disk of 300 GB'):
         plain.resolve(spec(machine_type='cheapest', disk_size=300))
-    found = plain.offers(wants(arch='any', disk_size=100)).offers
+    found = seller(plain).offers(wants(arch='any', disk_size=100)).offers
     assert [offer.type.name for offer in found] == ['large']
 
 

@@ -27,8 +27,11 @@ from fogros2.errors import (
 )
 from fogros2.model import CreateRequest, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ON_EXIT
-from fogros2.provider.offers import MachineType, Offer, wants
+from fogros2.provider.machine_types import MachineType
 from fogros2.waiting import wait_until
+from fogros2_features.images.keepers import image_keeper
+from fogros2_features.prices.market import seller
+from fogros2_features.prices.offers import Offer, wants
 from fogros2_testing.shell_contract import raised
 
 #: A public key without a known private key; providers check its format.
@@ -259,21 +262,20 @@ class ProviderContract:
 
     def test_baked_image_is_listed_and_deleted(self) -> None:
         provider, _ = self.make()
-        if not provider.capabilities.images:
-            raised(FogError, lambda: provider.bake('a machine', 'image', 'abcd'))
-            raised(Unsupported, lambda: list(provider.images()))
-            raised(Unsupported, lambda: provider.delete_image('image'))
+        try:
+            keeper = image_keeper(provider)
+        except Unsupported:
             return
         with self.machine() as (provider, spec, _, machine_id):
             self.reached(provider, machine_id)
-            image_id = provider.bake(machine_id, spec.name, 'abcd')
+            image_id = keeper.bake(machine_id, spec.name, 'abcd')
             try:
-                image, = (one for one in provider.images() if one.id == image_id)
+                image, = (one for one in keeper.images() if one.id == image_id)
                 assert (image.name, image.dependencies) == (spec.name, 'abcd')
             finally:
-                provider.delete_image(image_id)
-            provider.delete_image(image_id)
-            assert image_id not in [one.id for one in provider.images()]
+                keeper.delete_image(image_id)
+            keeper.delete_image(image_id)
+            assert image_id not in [one.id for one in keeper.images()]
 
     def test_regions_are_known_without_a_request(self) -> None:
         provider, _ = self.make()
@@ -290,14 +292,13 @@ class ProviderContract:
         requirements = wants(arch='any', min_cpu=1, min_memory_gb=0.1)
         spec = MachineSpec('any', 'cheapest', {'min_cpu': 1, 'disk_size': 40})
         offer = Offer('region-1', MachineType('type-1', 2, 1, 4.0, 'x86_64'))
-        if not provider.capabilities.prices:
-            raised(Unsupported, lambda: provider.offers(requirements))
-            raised(Unsupported, lambda: provider.taking(spec, offer))
+        try:
+            chosen = seller(provider).taking(spec, offer)
+        except Unsupported:
             return
-        chosen = provider.taking(spec, offer)
         assert (chosen.provider, chosen.wanted) == (provider.name, spec.options)
         assert {'region-1', 'type-1', 40} == {*chosen.options.values()}
         with contextlib.suppress(FogError):  # a simulated service may have no price list
-            offers = provider.offers(requirements)
+            offers = seller(provider).offers(requirements)
             prices = [offer.price for offer in offers.offers if offer.price is not None]
             assert prices == sorted(prices) and offers.regions

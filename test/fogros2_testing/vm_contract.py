@@ -19,8 +19,9 @@ import pytest
 from fogros2.errors import Cancelled, FogError
 from fogros2.model import MachineSpec
 from fogros2.provider import TAG_NAME, TAG_ON_EXIT
-from fogros2.provider.offers import wants
 from fogros2.waiting import in_thread, wait_until
+from fogros2_features.prices.market import seller
+from fogros2_features.prices.offers import wants
 from fogros2_testing.provider_contract import ProviderContract, PUBLIC_KEY, request_for
 from fogros2_testing.shell_contract import raised
 
@@ -116,15 +117,12 @@ class VmContract(ProviderContract):
     def test_offers_are_sorted_by_price(self) -> None:
         super().test_offers_are_sorted_by_price()
         provider, spec = self.wanted()
-        if provider.capabilities.prices:
-            region = provider.resolve(spec).options['region']
-            requirements = wants(arch='any', min_cpu=1, min_memory_gb=0.1)
-            assert provider.offers(requirements, [region]).offers
+        region = provider.resolve(spec).options['region']
+        requirements = wants(arch='any', min_cpu=1, min_memory_gb=0.1)
+        assert seller(provider).offers(requirements, [region]).offers
 
     def test_machine_has_a_price(self) -> None:
         provider, spec = self.wanted()
-        if not provider.capabilities.prices:
-            return
         price = provider.cost_per_hour(provider.resolve(spec))
         assert price is not None and price > 0
         with self.machine() as (provider, spec, _, machine_id):
@@ -186,7 +184,7 @@ class VmContract(ProviderContract):
     def test_list_that_lags_makes_no_second_machine(self) -> None:
         with self.machine() as (provider, spec, request, machine_id):
             # clouds list a machine some seconds after its creation
-            adapter = vars(provider)['_cloud']
+            adapter = vars(provider)['cloud']
             adapter.find = lambda region, tags: []
             assert provider.create(spec, request) == machine_id
             del adapter.find

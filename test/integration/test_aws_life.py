@@ -28,6 +28,7 @@ from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.aws.failures import AwsError
 from fogros2.provider.aws.provider import AWSProvider
+from fogros2_features.images.keepers import image_keeper
 from fogros2_testing.provider_contract import PUBLIC_KEY
 from rigs.ec2 import iam
 from rigs.ec2.watched import ec2, left, NOTHING, Watched
@@ -138,10 +139,10 @@ def test_a_region_that_is_closed_to_us_hides_no_other(aws, monkeypatch):
 def test_image_is_baked_reused_and_deleted_with_snapshots(aws):
     spec, request = ask()
     machine_id = aws.provider.create(spec, request)
-    first = aws.provider.bake(machine_id, 'planner', 'abcd')
-    again = aws.provider.bake(machine_id, 'planner: new', 'abcd')
+    first = image_keeper(aws.provider).bake(machine_id, 'planner', 'abcd')
+    again = image_keeper(aws.provider).bake(machine_id, 'planner: new', 'abcd')
     assert aws.asked('CreateImage')[0]['NoReboot'] is True
-    found = {image.id: image for image in aws.provider.images()}
+    found = {image.id: image for image in image_keeper(aws.provider).images()}
     assert set(found) == {first, again}
     assert found[first].name == 'planner'
     assert found[first].dependencies == 'abcd'
@@ -158,10 +159,10 @@ def test_image_is_baked_reused_and_deleted_with_snapshots(aws):
         assert (f'aws:{HOME}/{described(new)["ImageId"]}' in found) is ours_taken
         tags = aws.provider.describe(new).tags
         assert tags.get(TAG_DEPENDENCIES, '') == dependencies
-    aws.provider.delete_image(first)
-    aws.provider.delete_image(first)
-    aws.provider.delete_image(again)
-    assert not list(aws.provider.images())
+    image_keeper(aws.provider).delete_image(first)
+    image_keeper(aws.provider).delete_image(first)
+    image_keeper(aws.provider).delete_image(again)
+    assert not list(image_keeper(aws.provider).images())
     kept = {entry['SnapshotId']
             for entry in ec2().describe_snapshots(OwnerIds=['self'])['Snapshots']}
     assert not ours & kept
@@ -170,9 +171,9 @@ def test_image_is_baked_reused_and_deleted_with_snapshots(aws):
 def test_an_image_of_somebody_else_is_not_deleted(aws):
     theirs = ec2().describe_images(Owners=['self'])['Images'][0]['ImageId']
     with pytest.raises(ProviderError, match='no image of FogROS2'):
-        aws.provider.delete_image(f'aws:{HOME}/{theirs}')
+        image_keeper(aws.provider).delete_image(f'aws:{HOME}/{theirs}')
     with pytest.raises(MachineNotFound):
-        aws.provider.delete_image('planner')
+        image_keeper(aws.provider).delete_image('planner')
 
 
 def test_gpu_and_arm_types_get_their_own_images(aws):
@@ -502,9 +503,9 @@ def test_policy_has_exactly_the_calls_that_are_made(aws):
     provider.adopt(machine_id, ask()[0], {})
     provider.start(machine_id)
     assert not provider.reclaims(machine_id)
-    image = provider.bake(machine_id, 'planner', 'abcd')
-    list(provider.images())
-    provider.delete_image(image)
+    image = image_keeper(provider).bake(machine_id, 'planner', 'abcd')
+    list(image_keeper(provider).images())
+    image_keeper(provider).delete_image(image)
     provider.tidy()
     provider.destroy(machine_id)
     aws.refuse('RunInstances', 'InsufficientInstanceCapacity')

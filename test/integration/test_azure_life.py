@@ -30,6 +30,8 @@ from fogros2.provider.azure.account import Account
 from fogros2.provider.azure.provider import AzureProvider
 from fogros2.provider.vm.user_data import LIMIT
 from fogros2.waiting import wait_until
+from fogros2_features.images.keepers import image_keeper
+from fogros2_features.volumes.keepers import volume_keeper
 from fogros2_testing.provider_contract import PUBLIC_KEY
 from rigs.azure import service
 from rigs.azure.service import Fault
@@ -254,19 +256,19 @@ def test_role_of_the_page_has_exactly_the_actions_needed(robot):
     for sources in ([], ['198.51.100.9/32']):
         robot.provider.open_port(machine, 8766, sources)
         robot.provider.allow(machine_id, 22, sources)
-    image_id = robot.provider.bake(machine_id, 'planner', 'abcd')
-    wait_until(lambda: [one.state for one in robot.provider.images()] == ['available'],
-               timeout=60.0, what='the image')
+    image_id = image_keeper(robot.provider).bake(machine_id, 'planner', 'abcd')
+    wait_until(lambda: [one.state for one in image_keeper(robot.provider).images()]
+               == ['available'], timeout=60.0, what='the image')
     robot.provider.stop(machine_id)
     wait_until(lambda: robot.provider.describe(machine_id).state is MachineState.STOPPED,
                timeout=60.0, what='the stop')
     robot.provider.start(machine_id)
-    robot.provider.attach(machine_id, 'models', 1)
+    volume_keeper(robot.provider).attach(machine_id, 'models', 1)
     robot.provider.tidy()
-    robot.provider.delete_image(image_id)
+    image_keeper(robot.provider).delete_image(image_id)
     robot.provider.destroy(machine_id)
-    for volume in robot.provider.volumes():
-        robot.provider.delete_volume(volume.id)
+    for volume in volume_keeper(robot.provider).volumes():
+        volume_keeper(robot.provider).delete_volume(volume.id)
     # Azure asks for these of resources that a request names
     linked = {action for action in role['Actions'] if '/join/' in action or 'GetAccess' in action}
     asked = robot.azure.actions - {''}
@@ -281,9 +283,9 @@ def test_role_of_the_page_has_exactly_the_actions_needed(robot):
 
 def test_image_is_baked_reused_and_deleted(robot):
     machine_id = robot.create()
-    image_id = robot.provider.bake(machine_id, 'planner', 'abcd')
-    wait_until(lambda: [one.state for one in robot.provider.images()] == ['available'],
-               timeout=60.0, what='the image')
+    image_id = image_keeper(robot.provider).bake(machine_id, 'planner', 'abcd')
+    wait_until(lambda: [one.state for one in image_keeper(robot.provider).images()]
+               == ['available'], timeout=60.0, what='the image')
     request = robot.request(dependencies='abcd')
     again = robot.provider.create(robot.spec('mapper'), request)
     assert image_id.split('/')[1] in robot.provider.describe(again).image
@@ -291,7 +293,7 @@ def test_image_is_baked_reused_and_deleted(robot):
     for one in (machine_id, again):
         robot.provider.destroy(one)
     assert len(robot.azure.groups) == 1
-    robot.provider.delete_image(image_id)
+    image_keeper(robot.provider).delete_image(image_id)
     assert robot.azure.groups == {}
 
 
@@ -300,7 +302,7 @@ def test_group_of_somebody_else_is_no_image(robot):
         'name': 'fogros2-image-0123456789ab', 'location': HOME, 'tags': {},
         'properties': {'provisioningState': 'Succeeded'}}
     with pytest.raises(ProviderError, match='no image of FogROS2'):
-        robot.provider.delete_image(f'azure:{HOME}/fogros2-image-0123456789ab')
+        image_keeper(robot.provider).delete_image(f'azure:{HOME}/fogros2-image-0123456789ab')
     assert robot.azure.groups
 
 
@@ -308,7 +310,7 @@ def test_failed_bake_leaves_no_group(robot):
     machine_id = robot.create()
     robot.azure.faults.append(Fault('Wrong', 400, 'PUT', 'galleries'))
     with pytest.raises(ProviderError, match='Wrong'):
-        robot.provider.bake(machine_id, 'planner', 'abcd')
+        image_keeper(robot.provider).bake(machine_id, 'planner', 'abcd')
     wait_until(lambda: len(robot.azure.vms()) == len(robot.azure.groups) == 1, timeout=60.0,
                what='the group to be deleted')
     robot.provider.destroy(machine_id)

@@ -51,11 +51,11 @@ NAMED_PLUGINS = {
     ('fogros2_features.guests.membership', 'fogros2.vpn.helped'),
     ('fogros2_features.hosts.hosted', 'fogros2.provider.container'),
     ('fogros2_features.hosts.served', 'fogros2.provider.container'),
+    ('fogros2_features.images.pods', 'fogros2.provider.kubernetes'),
     ('fogros2_monitor.application', 'fogros2.provider.container'),
     ('ros2fog_cli.api.doctor', 'fogros2.dds.cyclonedds'),
     ('ros2fog_cli.api.doctor', 'fogros2.provider.container'),
     ('ros2fog_cli.api.doctor', 'fogros2.vpn.helped'),
-    ('ros2fog_cli.api.pod_image', 'fogros2.provider.kubernetes'),
 }
 #: Packages with a circle of imports inside. Only ever remove names.
 CIRCULAR: set[str] = set()
@@ -81,7 +81,9 @@ MOVED = (
     r'Replacement\w*', 'drained', r'\w*[Gg]uest\w*', '[Ii]nvit(e|ed|ations?)', 'JoinedMachine',
     r'[Ff]oxglove\w*', r'\w*[Mm]onitor(ed|_\w+)?', '[Dd]ashboard',
     r'[Rr]eplic\w*', 'first_answer', 'HostedProvider', 'served', 'shared topics',
-    r'\w*docker_(containers?|lines)', 'container_scripts', 'has_image')
+    r'\w*docker_(containers?|lines)', 'container_scripts', 'has_image',
+    r'Cheapest\w*', r'find_cheapest\w*', 'Market', 'Wants', 'Offers?', 'bake', 'delete_image',
+    r'(Image|Volume)Keeper')
 CLOUDS = {'aws', 'azure', 'gcp', 'kubernetes'}
 #: All of the core but the import of types.
 BUT_TYPES = r'fogros2(?! import ros_types$)'

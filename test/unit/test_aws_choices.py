@@ -18,15 +18,18 @@ from botocore.stub import ANY, Stubber
 from launch import LaunchContext
 import pytest
 
-from fogros2.describe import choices
+from fogros2 import plugin_system
 from fogros2.errors import ConfigurationError, FogError, PrerequisiteError, ProviderError
+from fogros2.model import MachineSpec
 from fogros2.provider.aws import prices
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.aws.provider import AWSProvider
-from fogros2.provider.offers import MachineType, Wants, wants
-from fogros2.provider.vm import market as markets
-from fogros2.provider.vm.market import Market
+from fogros2.provider.machine_types import MachineType
+from fogros2.provider.vm.cloud import PRICES_AGE
+from fogros2_features.prices import choices
+from fogros2_features.prices.market import CloudSeller, Market, seller
+from fogros2_features.prices.offers import Wants, wants
 from rigs.ec2 import iam
 
 REGION = 'eu-central-1'
@@ -222,8 +225,8 @@ def test_the_architecture_is_this_computer_s(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_as_fogros2_asks(market: Market, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(AWSProvider, 'offers', lambda self, wanted, regions: market.choose(
-        regions, wanted))
+    monkeypatch.setattr(CloudSeller, 'offers', lambda self, wanted, regions, refresh:
+                        market.choose(regions, wanted))
     context = LaunchContext()
     find = choices.find_cheapest_ec2_instance_type
     assert find(REGION).perform(context) == 't2.medium'
@@ -281,7 +284,7 @@ def test_answers_of_aws_are_cached_for_a_day(recorded: Recorded, tmp_path: Path)
     assert asks() == 0
     for path in tmp_path.iterdir():
         assert stat.S_IMODE(path.stat().st_mode) == 0o600 and path.suffix == '.json'
-    now += markets.CACHE_AGE - 1
+    now += PRICES_AGE - 1
     assert asks() == 0
     now += 2
     assert asks() == 4
@@ -378,7 +381,21 @@ def test_prices_without_credentials_measure_no_region(monkeypatch: pytest.Monkey
     monkeypatch.setenv('AWS_EC2_METADATA_DISABLED', 'true')
     monkeypatch.setattr(AWSProvider, 'nearest', measured)
     with pytest.raises(PrerequisiteError, match='there are no AWS credentials'):
-        AWSProvider().offers(wants())
+        seller(AWSProvider()).offers(wants())
+
+
+def test_type_is_not_chosen_without_the_feature(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    points = plugin_system._entry_points
+    monkeypatch.setattr(plugin_system, '_entry_points', lambda group: (
+        {} if group == 'fogros2.market' else points(group)))
+    spec = MachineSpec('planner', 'aws', {'region': REGION, 'ec2_instance_type': 't3.medium'})
+    assert AWSProvider(Ec2(recorded)).resolve(spec) == spec
+    assert AWSProvider(Ec2(recorded)).cost_per_hour(spec) is None
+    spec = MachineSpec('planner', 'aws', {'region': REGION, 'min_cpu': 8})
+    with pytest.raises(ConfigurationError, match="there is no feature 'prices'"):
+        AWSProvider(Ec2(recorded)).resolve(spec)
 
 
 def test_an_unknown_region_of_aws_is_named() -> None:

@@ -29,7 +29,6 @@ from fogros2.errors import (
 )
 from fogros2.model import (
     Endpoint,
-    Image,
     Machine,
     MachineSpec,
     MachineState,
@@ -45,17 +44,18 @@ from fogros2.provider import (
     TAG_NAME,
     TAG_ROBOT,
 )
-from fogros2.provider.offers import MachineType, Offer, Offers, ranked, Region, Wants
+from fogros2.provider.machine_types import MachineType, Region
+from fogros2.provider.vm.images import Image
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.waiting import wait_until
+from fogros2_features.images import baking, pods
+from fogros2_features.prices.offers import Offer, Offers, ranked, Wants
 from fogros2_monitor import access
 from fogros2_testing.fakes import FakeProvider, FakeShell
 from fogros2_testing.plugins import instead
 from ros2fog_cli.api import (
     doctor,
     endings,
-    images,
-    pod_image,
     progress,
     reach,
     table,
@@ -69,7 +69,7 @@ class Cloud(FakeProvider):
     """A cloud in memory."""
 
     name = 'cloud'
-    capabilities = Capabilities(firewall=True, images=True, regions=True)
+    capabilities = Capabilities(firewall=True, regions=True)
     machines: dict[str, Machine] = {}
     baked: list[Image] = []
     asked: list[tuple[Any, ...]] = []
@@ -408,7 +408,7 @@ def test_session_prefers_the_vpn(shells: list[Endpoint]) -> None:
 def test_session_without_firewall_makes_no_rule(
     shells: list[Endpoint], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(Cloud, 'capabilities', Capabilities(images=True, regions=True))
+    monkeypatch.setattr(Cloud, 'capabilities', Capabilities(regions=True))
     machine('slam')
     assert run('connect', 'slam') == 0
     assert [call[0] for call in Cloud.asked if call[0] != 'find'] == ['connect']
@@ -419,7 +419,7 @@ def test_session_without_firewall_makes_no_rule(
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(images, 'LOOK', 0.01)
+    monkeypatch.setattr(baking, 'LOOK', 0.01)
 
 
 @pytest.fixture(autouse=True)
@@ -485,12 +485,12 @@ def test_image_needs_a_running_or_stopped_machine(capsys: pytest.CaptureFixture[
 
 def test_wait_for_an_image_times_out(quick: None) -> None:
     machine('slam')
-    baking = images.bake(Entry('slam', 'cloud', Cloud.machines['id-slam']), 'mine')
+    image = baking.bake(Entry('slam', 'cloud', Cloud.machines['id-slam']), 'mine')
     with pytest.raises(DeadlineExceeded, match="the image 'mine'"):
-        images.wait(baking, timeout=0.2)
+        baking.wait(image, timeout=0.2)
     Cloud.baked.clear()
     with pytest.raises(DeadlineExceeded):
-        images.wait(baking, timeout=0.2)
+        baking.wait(image, timeout=0.2)
 
 
 def test_images_are_listed_and_deleted(capsys: pytest.CaptureFixture[str]) -> None:
@@ -554,7 +554,7 @@ def test_pod_image_has_what_a_launch_installs(
     monkeypatch.setattr('fogros2.process.which', lambda program: None)
     assert 'podman, docker, buildah' in str(run(*words, '--folder', str(tmp_path / 'image')))
     with pytest.raises(PrerequisiteError, match='ros2 is not on PATH'):
-        pod_image.recipe('registry.example', folder='', environment={'PATH': '/nowhere'})
+        pods.recipe('registry.example', folder='', environment={'PATH': '/nowhere'})
 
 
 # -- prices and regions -------------------------------------------------------------------
@@ -579,8 +579,8 @@ def offer(
 
 @pytest.fixture
 def market(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Cloud, 'capabilities', Capabilities(regions=True, prices=True))
-    monkeypatch.setattr(Cloud, 'offers', offer)
+    seller = type('Seller', (Cloud,), {'offers': offer, 'taking': offer})
+    instead(monkeypatch, 'fogros2.provider', {'cloud': seller, 'plain': Plain})
 
 
 def test_prices_of_all_regions_are_compared(

@@ -67,7 +67,7 @@ def complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Complete:
     ('ros2 fog price --provider a', ['all', 'aws', 'azure']),
     ('ros2 fog regions sa-', ['sa-east-1']),
     ('ros2 fog doctor --provider ', [
-        'aws', 'azure', 'container', 'gcp', 'hosted', 'joined', 'kubernetes', 'ssh']),
+        'aws', 'azure', 'cheapest', 'container', 'gcp', 'hosted', 'joined', 'kubernetes', 'ssh']),
     ('ros2 launch --machine ma', ['mapper=']),
     ('ros2 launch --machine mapper=', [
         'mapper=aws', 'mapper=azure', 'mapper=cheapest', 'mapper=container', 'mapper=gcp',

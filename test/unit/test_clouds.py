@@ -20,15 +20,17 @@ from fogros2.deploy import Launch
 from fogros2.deploy import launch as launches
 from fogros2.errors import ConfigurationError, FogError, ProviderError
 from fogros2.model import MachineSpec
-from fogros2.provider import clouds
 from fogros2.provider.azure.provider import AzureProvider
-from fogros2.provider.cheapest import Cheapest
 from fogros2.provider.gcp import prices
 from fogros2.provider.gcp.provider import GCPProvider
-from fogros2.provider.offers import MachineType, Offer, Offers, ranked, Region, Wants, wants
+from fogros2.provider.machine_types import MachineType, Region
 from fogros2.provider.vm import regions
 from fogros2.report import Warned
 from fogros2.store import Store
+from fogros2_features.prices import clouds
+from fogros2_features.prices.market import seller
+from fogros2_features.prices.offers import Offer, Offers, ranked, Wants, wants
+from fogros2_features.prices.provider import Cheapest
 from fogros2_testing.fakes import FakeProvider, FakeVpn
 from fogros2_testing.plugins import instead
 from rigs.gce.catalogue import API_KEY
@@ -44,7 +46,7 @@ class Fake(FakeProvider):
     place = 'north'
     price = Decimal(1)
     size = MachineType('small', 8, 4, 32.0, 'x86_64', 'AMD', 1, 'NVIDIA L4', 22.4)
-    capabilities = FakeProvider.can(regions=True, prices=True)
+    capabilities = FakeProvider.can(regions=True)
     times: dict[str, float] = {}
     here = True
 
@@ -89,16 +91,13 @@ def fakes(monkeypatch: pytest.MonkeyPatch) -> dict[str, Fake]:
     """Install two clouds, one object each; the first is the cheaper one."""
     made: dict[str, Fake] = {'north': North(), 'south': South()}
 
-    def maker(kind: type[Fake]) -> Any:
-        def make() -> Fake:
-            return made[kind.name]
+    def maker(kind: type[Fake]) -> type[Fake]:
         # the class's methods are asked before there is an object
-        make.__dict__.update(capabilities=kind.capabilities, configured=lambda: kind.here,
-                             region_names=kind.region_names)
-        return make
+        return type(kind.name, (kind,), {'__new__': lambda cls: made[kind.name]})
 
     monkeypatch.setattr(Fake, 'times', {'north': 30.0, 'north-2': 80.0, 'south': 12.34})
-    instead(monkeypatch, 'fogros2.provider', {'north': maker(North), 'south': maker(South)})
+    instead(monkeypatch, 'fogros2.provider', {
+        'cheapest': Cheapest, 'north': maker(North), 'south': maker(South)})
     return made
 
 
@@ -161,7 +160,7 @@ def test_one_l4_is_found_in_the_cloud_that_has_it(
     asked = {'arch': 'x86_64', 'min_cpu': 8, 'min_memory_gb': 32, 'gpu': 'L4',
              'max_round_trip_ms': 20.0}
     ((offer, place),) = Cheapest().places(MachineSpec('planner', 'cheapest', asked))
-    assert (offer.type.name, place.provider) == ('g2-standard-8', 'gcp')
+    assert (offer, place.provider) == ('g2-standard-8 of gcp in europe-west3', 'gcp')
 
 
 def test_google_without_a_key_has_an_unknown_price(
@@ -248,7 +247,7 @@ def test_regions_that_are_too_far_are_left_out(fakes: dict[str, Fake]) -> None:
 
 
 def test_prices_load_no_library_of_an_unused_cloud() -> None:
-    program = ('import os, sys; from fogros2.provider import clouds\n'
+    program = ('import os, sys; from fogros2_features.prices import clouds\n'
                'print(clouds.clouds()[1], [name for name in ("boto3", "google.auth", '
                '"azure.identity", "requests", "kubernetes") if name in sys.modules])')
     done = subprocess.run(
@@ -263,10 +262,10 @@ def test_prices_load_no_library_of_an_unused_cloud() -> None:
 def test_cheapest_tries_each_cloud_and_the_cheapest_first(
     fakes: dict[str, Fake], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr('fogros2.provider.cheapest.TRIES', 2)
+    monkeypatch.setattr('fogros2_features.prices.provider.TRIES', 2)
     spec = MachineSpec('planner', 'cheapest', {'min_cpu': 8, 'gpu': 'L4'})
     found = Cheapest().places(spec)
-    assert [str(offer) for offer, _ in found] == [
+    assert [offer for offer, _ in found] == [
         'small of north in north', 'small of south in south']
     assert [(place.provider, place.options, place.wanted) for _, place in found] == [
         ('north', {'size': 'north'}, spec.options), ('south', {'size': 'south'}, spec.options)]
@@ -278,7 +277,7 @@ def test_cheapest_tries_each_cloud_and_the_cheapest_first(
 
 def test_offer_of_a_cloud_becomes_its_options() -> None:
     spec = MachineSpec('planner', 'cheapest', {'min_cpu': 2, 'disk_size': 40, 'spot': True})
-    taken = AzureProvider().taking(spec, Offer(
+    taken = seller(AzureProvider()).taking(spec, Offer(
         'westeurope', MachineType('Standard_D2s_v5', 2, 1, 8.0, 'x86_64')))
     assert (taken.provider, taken.options) == ('azure', {
         'region': 'westeurope', 'vm_size': 'Standard_D2s_v5', 'disk_size': 40, 'spot': True})

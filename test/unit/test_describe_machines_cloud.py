@@ -12,12 +12,12 @@ import pytest
 
 import fogros2
 from fogros2 import AWSCloudInstance, KubeInstance
-from fogros2.describe import choices as later
 from fogros2.describe import keywords, overrides, values
 from fogros2.errors import ConfigurationError
-from fogros2.provider import clouds
 from fogros2.provider.aws.provider import AWSProvider
-from fogros2.provider.offers import MachineType, Offer, Offers, wants
+from fogros2.provider.machine_types import MachineType
+from fogros2_features.prices.market import CloudSeller
+from fogros2_features.prices.offers import Offer, Offers, wants
 
 
 @pytest.fixture
@@ -166,7 +166,7 @@ def asked(monkeypatch):
         return Offers(wanted, (Offer(region, kind, Decimal(1), Decimal(1)),), tuple(regions))
 
     monkeypatch.setattr(AWSProvider, 'nearest', nearest)
-    monkeypatch.setattr(AWSProvider, 'offers', offers)
+    monkeypatch.setattr(CloudSeller, 'offers', offers)
     return noted
 
 
@@ -211,7 +211,7 @@ def test_the_cheapest_of_all(asked, context):
 
 
 def test_machine_of_any_cloud_is_described_without_a_request(context, monkeypatch):
-    monkeypatch.setattr(clouds, 'compare', lambda *_, **__: pytest.fail('a request'))
+    monkeypatch.setattr(CloudSeller, 'offers', lambda *_, **__: pytest.fail('a request'))
     wanted = {'min_cpu': 8, 'gpu': 'L4', 'max_round_trip_ms': 60, 'providers': ['aws', 'azure']}
     context.launch_configurations['cpus'] = '8'
     machine = fogros2.cheapest(
@@ -238,7 +238,7 @@ def test_fogros2_s_own_names(asked, context):
         ('nearest', ('us-east-1', 'eu-north-1')),
         ('offers', wants(arch='x86_64', min_cpu=0, min_memory_gb=0, cores=2, threads_per_core=1),
          ('eu-north-1',))]
-    kind = later.find_cheapest_ec2_instance_type(
+    kind = fogros2.find_cheapest_ec2_instance_type(
         region_name='nearest', cpu_architecture='arm64', default_cores=4,
         default_threads_per_core=2, gpu=True)
     asked.clear()

@@ -22,10 +22,11 @@ from fogros2.provider import TAG_ON_EXIT
 from fogros2.provider.gcp import account, failures, firewall, instances, prices
 from fogros2.provider.gcp.options import Options
 from fogros2.provider.gcp.provider import GCPProvider
-from fogros2.provider.offers import wants
 from fogros2.provider.vm import cloud
 from fogros2.provider.vm.cloud import Order, Place
 from fogros2.waiting import wait_until
+from fogros2_features.prices.market import seller
+from fogros2_features.prices.offers import wants
 from fogros2_testing import request_for
 from rigs.gce.api import Fault
 
@@ -110,7 +111,7 @@ def test_cheapest_without_a_key_says_what_is_missing(gce, monkeypatch):
 
 
 def test_regions_share_one_answer_of_the_catalogue(catalogue):
-    found = GCPProvider().offers(wants(arch='x86_64'), ['europe-west3', 'europe-west1'])
+    found = seller(GCPProvider()).offers(wants(arch='x86_64'), ['europe-west3', 'europe-west1'])
     assert found.chosen.region == 'europe-west3'
     asked = [call for call in catalogue.api.calls if call.action == 'services.skus.list']
     assert len(asked) == 4  # pages

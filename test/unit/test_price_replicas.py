@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from fogros2.errors import ConfigurationError
-from ros2fog_cli.verb import price
+from fogros2_features.replicas import price
 
 
 def offer(price, spot_price):
@@ -22,15 +22,16 @@ OFFERS = [offer('0.10', '0.03'), offer('0.08', '0.02'), offer(None, '0.01'), off
 
 
 def test_cheapest_spot_machines_are_compared_with_one_on_demand():
-    assert price.compared(OFFERS, 3, spot=True) == (
+    assert price.line(OFFERS, SimpleNamespace(replicas=3, spot=True)) == (
         '3 replicas on spot machines $0.0600 an hour, one machine on demand $0.0800: 0.75 times')
 
 
 def test_replicas_on_demand_cost_a_multiple():
-    assert price.compared(OFFERS, 2, spot=False).endswith('$0.0800: 2.25 times')
+    line = price.line(OFFERS, SimpleNamespace(replicas=2, spot=False))
+    assert line.endswith('$0.0800: 2.25 times')
 
 
 @pytest.mark.parametrize('number', [1, 4])
 def test_too_few_offers_are_refused(number):
     with pytest.raises(ConfigurationError, match=f'--replicas {number}: [13] offers match'):
-        price.compared(OFFERS, number, spot=True)
+        price.line(OFFERS, SimpleNamespace(replicas=number, spot=True))

@@ -7,9 +7,11 @@ import ast
 import dataclasses
 from decimal import Decimal
 import functools
+import inspect
 import json
 from pathlib import Path
 import re
+import sys
 from typing import Any, get_type_hints
 from unittest.mock import Mock
 
@@ -19,19 +21,23 @@ from ros2cli.cli import main
 from fogros2 import events, plugin_system
 from fogros2.clock import ClockOffset
 from fogros2.journal import Step
-from fogros2.model import Image, MachineSpec, Volume
+from fogros2.model import MachineSpec, Volume
 from fogros2.provider import Capabilities
-from fogros2.provider.offers import MachineType, Offer
+from fogros2.provider.machine_types import MachineType
+from fogros2.provider.vm.images import Image
 from fogros2.store import Record, Store
 from fogros2_features.guests.listing import Guest
+from fogros2_features.images import baking
+from fogros2_features.prices import verbs as price
+from fogros2_features.prices.offers import Offer
+from fogros2_features.volumes import listing
 from fogros2_replicas import figures
 from fogros2_testing.fakes import FakeProvider
 from fogros2_testing.plugins import instead
-from ros2fog_cli.api import images, output, shown, volumes, watching
+from ros2fog_cli.api import output, shown, watching
 from ros2fog_cli.api.doctor import Check
 from ros2fog_cli.api.machines import Entry
 from ros2fog_cli.api.reach import Link
-from ros2fog_cli.verb import price
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / 'doc' / 'reference' / 'scripts.md').read_text()
@@ -166,22 +172,25 @@ def test_fields_of_regions_are_on_the_page() -> None:
 
 def test_fields_of_images_volumes_and_checks_are_on_the_page() -> None:
     assert sorted(fields('### `ros2 fog image list`')) == sorted(
-        images.to_json(Image('i', 'n', 'p')))
+        baking.to_json(Image('i', 'n', 'p')))
     assert sorted(fields('### `ros2 fog volume list`')) == sorted(
-        volumes.to_json(Volume('i', 'n', 'p')))
+        listing.to_json(Volume('i', 'n', 'p')))
     assert sorted(fields('### `ros2 fog doctor`')) == keys(Check)
 
 
 def test_each_verb_with_json_is_on_the_page() -> None:
-    with_json = {path.stem for path in (ROOT / 'ros2fog_cli' / 'verb').glob('[a-z]*.py')
-                 if 'add_json(' in path.read_text()}
+    modules = {name: sys.modules[plugin_system.load('fogros2.verb', name).__module__]
+               for name in plugin_system.names('fogros2.verb')}
+    with_json = {name for name, module in modules.items()
+                 if 'add_json(' in inspect.getsource(module)}
     assert {heading.split()[0] for heading in re.findall('### `ros2 fog (.*)`', PAGE)} == with_json
 
 
 def test_verbs_end_with_the_statuses_of_the_page(capsys: pytest.CaptureFixture[str]) -> None:
     said = re.findall(r'^\| (\d) \|', section('## Exit statuses'), re.MULTILINE)
     assert said == ['0', '1', '2']
-    for path in (ROOT / 'ros2fog_cli' / 'verb').glob('*.py'):
+    for path in (*(ROOT / 'ros2fog_cli' / 'verb').glob('*.py'),
+                 *(ROOT / 'fogros2_features').glob('*/verbs.py')):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Return) and isinstance(node.value, ast.Constant) \
                     and type(node.value.value) is int:

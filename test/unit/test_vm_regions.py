@@ -13,7 +13,7 @@ import pytest
 
 from fogros2.errors import PrerequisiteError, ProviderError
 from fogros2.provider.aws.cloud import Ec2
-from fogros2.provider.offers import Region
+from fogros2.provider.machine_types import Region
 from fogros2.provider.vm import regions
 
 REGIONS, HOST = Ec2.regions.table, 'ec2.{}.amazonaws.com'.format

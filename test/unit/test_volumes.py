@@ -18,8 +18,8 @@ from fogros2.provider import container, ssh, TAG_ROBOT
 from fogros2.provider.container import machine as container_machine
 from fogros2.provider.kubernetes import claims, names
 from fogros2_features.volumes import Volumes
+from fogros2_features.volumes.verbs import _named
 from fogros2_testing.fakes import FakeRunning
-from ros2fog_cli.verb.volume import _named
 
 
 def test_a_volume_has_a_path_and_a_size() -> None:
@@ -117,7 +117,9 @@ def test_folder_that_cannot_be_deleted_is_not_in_use(tmp_path: Path) -> None:
     assert (result.returncode, result.stderr) == (1, 'denied\n')
 
 
-def test_volume_is_detached_when_its_attachment_is_interrupted() -> None:
+def test_volume_is_detached_when_its_attachment_is_interrupted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The disk may have been attached by then; nothing of it is mounted."""
     calls: list[tuple[str, ...]] = []
 
@@ -126,8 +128,9 @@ def test_volume_is_detached_when_its_attachment_is_interrupted() -> None:
         raise Cancelled('attach')
 
     running: Any = FakeRunning(spec=MachineSpec('a', 'aws', on_exit='stop'))
-    running.provider = SimpleNamespace(
-        attach=attach, detach=lambda *words: calls.append(('detach', *words)))
+    running.provider = None
+    monkeypatch.setattr('fogros2_features.volumes._keeper', lambda provider: SimpleNamespace(
+        attach=attach, detach=lambda *words: calls.append(('detach', *words))))
     with pytest.raises(Cancelled), Volumes().machine(running, {'models': ('/data', 50)}):
         raise AssertionError('no node may start')
     assert calls == [('attach', 'fake-1', 'models'), ('detach', 'fake-1', 'models')]

@@ -16,10 +16,9 @@ from fogros2.provider.aws.disks import Ec2Disks
 from fogros2.provider.aws.network import Ec2Network
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import Ec2Prices
-from fogros2.provider.offers import MachineType
-from fogros2.provider.vm.cloud import Order, Place, Vm, VmId
+from fogros2.provider.machine_types import MachineType
+from fogros2.provider.vm.cloud import Order, Place, PRICES_AGE, Vm, VmId
 from fogros2.provider.vm.failures import unless_gone
-from fogros2.provider.vm.market import CACHE_AGE
 from fogros2.provider.vm.regions import read_table, Regions
 
 
@@ -36,7 +35,7 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network, Ec2Disks):
     regions = Regions('AWS', read_table(__file__), 'ec2.{}.amazonaws.com'.format)
     id_form = 'i-[0-9a-f]+'
     base_region = 'us-east-1'
-    types_age = CACHE_AGE
+    types_age = PRICES_AGE
     configured = staticmethod(login.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:

@@ -9,16 +9,15 @@ import time
 from typing import Any, Optional
 
 from fogros2.errors import ConfigurationError, MachineNotFound
-from fogros2.model import Image
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.instances import tag_list, tags_of
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import instance_type
-from fogros2.provider.offers import MachineType
+from fogros2.provider.machine_types import MachineType
 from fogros2.provider.vm.cloud import TAG_BAKED, TAG_USER, VmCloud, VmId, when
 from fogros2.provider.vm.failures import unless_gone
-from fogros2.provider.vm.images import check_baked, image_parts, image_tags
+from fogros2.provider.vm.images import check_baked, Image, image_parts, image_tags
 
 #: Public parameters of AWS's parameter store, by architecture; ROS 2 Jazzy is for Ubuntu 24.04.
 UBUNTU = {

@@ -12,7 +12,7 @@ from typing import Any, Optional
 
 from fogros2.errors import ProviderError
 from fogros2.provider.aws.clients import Account
-from fogros2.provider.offers import MachineType
+from fogros2.provider.machine_types import MachineType
 from fogros2.provider.vm.cloud import VmCloud
 
 #: The regions that have a pricing API.

@@ -16,5 +16,5 @@ class AWSProvider(VmProvider):
     name = Ec2.name
     adapter = Ec2
     capabilities = dataclasses.replace(
-        VmProvider.capabilities, stop=True, images=True, keeps_volumes=True,
+        VmProvider.capabilities, stop=True, keeps_volumes=True,
         preemption_notice=instances.NOTICE)

@@ -30,6 +30,7 @@ from fogros2.provider.vm.cloud import (
     Order,
     own_name,
     Place,
+    PRICES_AGE,
     TAG_ATTEMPT,
     TAG_MADE,
     TAG_PRICE,
@@ -38,7 +39,6 @@ from fogros2.provider.vm.cloud import (
     VmId,
 )
 from fogros2.provider.vm.failures import unless_gone
-from fogros2.provider.vm.market import CACHE_AGE
 from fogros2.provider.vm.options import ipv4, SSH
 from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import wait_until
@@ -67,7 +67,7 @@ class Azure(prices.AzurePrices, images.AzureImages, AzureDisks):
                       lambda region: f'{region}.handler.control.monitor.azure.com')
     id_form = 'fogros2-[0-9a-f]{16}-[0-9a-f]{8}'
     base_region = 'westeurope'
-    types_age = CACHE_AGE
+    types_age = PRICES_AGE
     configured = staticmethod(login.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:

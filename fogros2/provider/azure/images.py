@@ -13,15 +13,14 @@ import time
 from typing import Any
 
 from fogros2.errors import FogError
-from fogros2.model import Image
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.azure.account import Account
 from fogros2.provider.azure.machines import region_of
 from fogros2.provider.azure.options import Options
-from fogros2.provider.offers import MachineType
+from fogros2.provider.machine_types import MachineType
 from fogros2.provider.vm.cloud import made_at, TAG_BAKED, TAG_MADE, TAG_USER, VmCloud, VmId
 from fogros2.provider.vm.failures import unless_gone
-from fogros2.provider.vm.images import check_baked, image_parts, image_tags
+from fogros2.provider.vm.images import check_baked, Image, image_parts, image_tags
 
 #: Tag of an image's group with what its machines need to have.
 TAG_KIND = 'fogros2-kind'

@@ -12,7 +12,7 @@ from typing import Any, Optional
 from fogros2.errors import ProviderError
 from fogros2.provider.azure.account import Account, endpoint
 from fogros2.provider.azure.machines import region_of
-from fogros2.provider.offers import MachineType
+from fogros2.provider.machine_types import MachineType
 from fogros2.provider.vm.cloud import VmCloud
 
 PRICES_VARIABLE = 'FOGROS2_AZURE_PRICES'

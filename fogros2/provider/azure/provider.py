@@ -16,5 +16,5 @@ class AzureProvider(VmProvider):
     name = Azure.name
     adapter = Azure
     capabilities = dataclasses.replace(
-        VmProvider.capabilities, stop=True, images=True, keeps_volumes=True,
+        VmProvider.capabilities, stop=True, keeps_volumes=True,
         preemption_notice=ending.NOTICE)

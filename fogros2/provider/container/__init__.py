@@ -459,6 +459,9 @@ class ContainerProvider(Provider):
             raise made_without(machine, name)
         return Attached()
 
+    def detach(self, machine_id: str, name: str) -> None:
+        """Do nothing: the machine's end frees the volume."""
+
     def delete_volume(self, volume_id: str) -> None:
         """Remove a volume of an engine, which refuses if any container uses it."""
         kind, _, name = volume_id.partition(':')

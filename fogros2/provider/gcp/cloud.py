@@ -19,19 +19,19 @@ from fogros2.provider.gcp.failures import GoogleError
 from fogros2.provider.gcp.firewall import GoogleFirewall
 from fogros2.provider.gcp.instances import path_of
 from fogros2.provider.gcp.options import Options
-from fogros2.provider.offers import MachineType
+from fogros2.provider.machine_types import MachineType
 from fogros2.provider.vm.cloud import (
     CloudError,
     END_TIMEOUT,
     Order,
     own_name,
     Place,
+    PRICES_AGE,
     TAG_ATTEMPT,
     Vm,
     VmId,
 )
 from fogros2.provider.vm.failures import unless_gone
-from fogros2.provider.vm.market import CACHE_AGE
 from fogros2.provider.vm.regions import read_table, Regions
 from fogros2.waiting import cancellable, wait_until
 
@@ -54,7 +54,7 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall, GoogleDisks):
     #: Project, zone and name.
     id_form = r'[a-z0-9.:-]+/[a-z0-9-]+/fogros2-[0-9a-f]{16}'
     base_region = DEFAULT_REGION
-    types_age = CACHE_AGE
+    types_age = PRICES_AGE
     configured = staticmethod(login.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:

@@ -9,14 +9,13 @@ import time
 from typing import Any
 
 from fogros2.errors import ConfigurationError
-from fogros2.model import Image
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.gcp.account import Account
 from fogros2.provider.gcp.instances import RULES
 from fogros2.provider.gcp.options import Options
 from fogros2.provider.vm.cloud import TAG_BAKED, TAG_USER, VmCloud, VmId, when
 from fogros2.provider.vm.failures import unless_gone
-from fogros2.provider.vm.images import check_baked, image_parts, image_tags
+from fogros2.provider.vm.images import check_baked, Image, image_parts, image_tags
 
 #: Families of images, by architecture; ROS 2 Jazzy is for Ubuntu 24.04.
 UBUNTU = 'projects/ubuntu-os-cloud/global/images/family/ubuntu-2404-lts-'

@@ -12,7 +12,7 @@ from typing import Any
 from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_ON_EXIT
 from fogros2.provider.gcp.options import Options
-from fogros2.provider.offers import MachineType
+from fogros2.provider.machine_types import MachineType
 from fogros2.provider.vm.cloud import Order, own_name, Place, TAG_DISK, Vm, when
 from fogros2.provider.vm.labels import LabelRules
 

@@ -16,5 +16,5 @@ class GCPProvider(VmProvider):
     name = ComputeEngine.name
     adapter = ComputeEngine
     capabilities = dataclasses.replace(
-        VmProvider.capabilities, stop=True, images=True, keeps_volumes=True,
+        VmProvider.capabilities, stop=True, keeps_volumes=True,
         preemption_notice=guest.NOTICE)

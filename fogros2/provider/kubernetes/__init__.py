@@ -338,6 +338,9 @@ class KubernetesProvider(Provider):
             raise made_without(where.job.removeprefix('fogros2-'), name)
         return Attached()
 
+    def detach(self, machine_id: str, name: str) -> None:
+        """Do nothing: the machine's end frees the volume."""
+
     def delete_volume(self, volume_id: str) -> None:
         """Delete a claim, which by its storage class deletes the disk."""
         context, namespace, name = volume_id.removeprefix(f'{self.name}:').rsplit('/', 2)

@@ -6,6 +6,5 @@ In reading order: ``options`` (of every virtual machine), ``host_key`` and ``use
 boot), ``address`` (the robot's public address), ``labels`` (tags by a cloud's character rules),
 ``regions`` (distances), ``cloud`` (the adapter that a cloud implements), ``failures`` (errors of
 clouds that give a code), ``account`` (retries), ``images`` (ids and tags), ``rest`` (requests to a
-REST API), ``market`` (types and prices), ``creation`` (fail-over over regions, types and zones),
-``provider`` (the Provider).
+REST API), ``creation`` (fail-over over regions, types and zones), ``provider`` (the Provider).
 """

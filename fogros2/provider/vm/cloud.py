@@ -18,9 +18,9 @@ from typing import Any, ClassVar, Literal, NamedTuple, Optional, TypeVar
 import uuid
 
 from fogros2.errors import ProviderError, Unsupported
-from fogros2.model import CreateRequest, Image, MachineSpec, MachineState
+from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import SETTLED, TAG_DEPENDENCIES, TAG_NAME, TAG_ROBOT
-from fogros2.provider.offers import MachineType
+from fogros2.provider.machine_types import MachineType
 from fogros2.provider.vm.options import VmOptions
 from fogros2.provider.vm.regions import Regions
 from fogros2.provider.vm.user_data import END_COMMAND
@@ -39,6 +39,8 @@ TAG_SSH_FROM = 'fogros2-ssh-from'
 TAG_BAKED = 'fogros2-baked'
 #: Only on resources beside the machine: seconds since the epoch of their creation.
 TAG_MADE = 'fogros2-made'
+#: Seconds for which prices are used again; for types and zones: ``VmCloud.types_age``.
+PRICES_AGE = 86400.0
 #: Only on disks that outlive machines: the volume's name.
 TAG_VOLUME = 'fogros2-volume'
 _LOGGER = logging.getLogger(__name__)
@@ -283,7 +285,7 @@ class VmCloud(abc.ABC):
 
     def searched_regions(self) -> list[str]:
         """
-        Return the regions of ``find``, ``images`` and ``leftovers`` if the user names none.
+        Return the regions of ``find`` and ``leftovers`` if the user names none.
 
         [''] if one request answers for all regions; these methods then get '' as region.
         """
@@ -475,17 +477,3 @@ class VmCloud(abc.ABC):
 
     def delete_disk(self, disk: Disk) -> None:
         """Delete a volume; idempotent."""
-
-    # -- images ---------------------------------------------------------------------------------
-
-    def bake(self, machine: VmId, name: str, dependencies: str) -> str:
-        """Start to make an image of a machine; return its id."""
-        raise Unsupported(f'FogROS2 makes no images at {self.title}')
-
-    def images(self, region: str) -> Iterable[Image]:
-        """Return the images of a region that FogROS2 has made."""
-        raise Unsupported(f'FogROS2 makes no images at {self.title}')
-
-    def delete_image(self, image_id: str) -> None:
-        """Delete an image and its snapshots; idempotent."""
-        raise Unsupported(f'FogROS2 makes no images at {self.title}')

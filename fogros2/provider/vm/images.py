@@ -1,14 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images of machines that FogROS2 has made: their ids and tags."""
+"""Images of machines that a cloud's adapter has made: their ids and tags."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+import dataclasses
 import re
+from typing import Optional
 
 from fogros2.errors import MachineNotFound, ProviderError
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.vm.cloud import TAG_BAKED, TAG_USER
+
+
+@dataclasses.dataclass(frozen=True)
+class Image:
+    """
+    A disk image made from a machine, for later machines.
+
+    :param id: opaque to the core; contains its location.
+    :param dependencies: hash of the installed dependencies; a launch uses an image with its hash.
+    """
+
+    id: str
+    name: str
+    provider: str
+    region: str = ''
+    created: Optional[float] = None
+    size_gb: Optional[int] = None
+    state: str = ''
+    dependencies: str = ''
+    tags: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def image_tags(name: str, machine: Mapping[str, str], dependencies: str) -> dict[str, str]:

@@ -13,7 +13,6 @@ from typing import Any, ClassVar, Optional, TypeVar
 
 from fogros2.errors import ConfigurationError
 from fogros2.model import MachineSpec
-from fogros2.provider.offers import Wants, wants
 from fogros2.provider.options import convert, parsed
 
 NEAREST, CHEAPEST = 'nearest', 'cheapest'
@@ -158,14 +157,6 @@ class VmOptions:
         return self.named_type == CHEAPEST or not self.named_type and bool(
             self.min_cpu or self.min_memory_gb or self.cpu_type or self.gpu
             or self.gpu_memory_gb or self.arch)
-
-    def wants(self) -> Wants:
-        """Return the requirements of the type."""
-        return wants(
-            arch=self.arch or None, min_cpu=int(self.min_cpu) or None,
-            min_memory_gb=self.min_memory_gb or None, cpu_type=self.cpu_type or None,
-            gpu=int(self.gpu) if self.gpu.isdecimal() else self.gpu or None,
-            gpu_memory_gb=self.gpu_memory_gb or None, max_price=self.max_price, spot=self.spot)
 
     def check(self) -> None:
         """

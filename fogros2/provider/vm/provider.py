@@ -15,7 +15,7 @@ import threading
 import time
 from typing import Any, ClassVar, Optional, TypeVar
 
-from fogros2 import untrusted
+from fogros2 import plugin_system, untrusted
 from fogros2.errors import (
     ConfigurationError,
     FogError,
@@ -27,14 +27,12 @@ from fogros2.errors import (
 from fogros2.model import (
     CreateRequest,
     Endpoint,
-    Image,
     Machine,
     MachineSpec,
     MachineState,
-    Volume,
 )
-from fogros2.provider import Attached, Capabilities, Provider, TAG_NAME
-from fogros2.provider.offers import Offer, Offers, Region, Wants
+from fogros2.provider import Capabilities, Provider, TAG_NAME
+from fogros2.provider.machine_types import Region
 from fogros2.provider.vm.address import RobotAddress
 from fogros2.provider.vm.cloud import (
     attempt_of,
@@ -51,7 +49,6 @@ from fogros2.provider.vm.cloud import (
     VmId,
 )
 from fogros2.provider.vm.creation import Creation
-from fogros2.provider.vm.market import Market
 from fogros2.provider.vm.options import CHEAPEST, ipv4, NEAREST, VmOptions
 from fogros2.provider.vm.user_data import AGENT_DIRECTORY, AGENT_PROGRAM
 from fogros2.waiting import cancellable, wait_until
@@ -61,8 +58,6 @@ T = TypeVar('T')
 #: One for all providers of this process: each machine of a launch would ask again.
 _ROBOT_ADDRESS = RobotAddress()
 ALL = 'all'
-#: Options with the same meaning in every cloud that do not choose the machine.
-EVERYWHERE = ('disk_size', 'spot', 'tags', 'user', 'ssh_from', 'fleet')
 #: Number of regions that are asked at the same time.
 PARALLEL = 20
 #: The name of an attempt, see ``attempt_of``.
@@ -82,12 +77,11 @@ class VmProvider(Provider):
     adapter: ClassVar[type[VmCloud]]
     capabilities: ClassVar[Capabilities] = Capabilities(
         firewall=True, one_time_host_key=True, choices=True, adopt=True, regions=True,
-        prices=True, agent_directory=AGENT_DIRECTORY, agent_program=AGENT_PROGRAM,
-        agent_sent=True)
+        agent_directory=AGENT_DIRECTORY, agent_program=AGENT_PROGRAM, agent_sent=True)
 
     def __init__(self, cloud: Optional[VmCloud] = None) -> None:
         # its calls are not cancelled
-        self._cloud = cloud or self.adapter()
+        self.cloud = cloud or self.adapter()
         self._searched: tuple[str, ...] = ()
 
     @classmethod
@@ -102,24 +96,25 @@ class VmProvider(Provider):
         """Return what ends a call together with the launch; later calls are clean-up."""
         return None if self.cancel is None or self.cancel.is_set() else self.cancel
 
-    def _until(self) -> VmCloud:
-        return self._cloud.until(self._cancel())
+    def until(self) -> VmCloud:
+        """Return the adapter, whose calls end with the launch; clean-up goes on after it."""
+        return self.cloud.until(self._cancel())
 
     # -- before a machine exists ----------------------------------------------------------------
 
     def answers(self) -> str:
-        return self._cloud.whoami(self._base())
+        return self.cloud.whoami(self._base())
 
     def check(self, spec: MachineSpec) -> None:
-        options = self._cloud.options.of(spec)
+        options = self.cloud.options.of(spec)
         if options.ssh_from and not self.capabilities.firewall:
             raise ConfigurationError(
-                f'{self._cloud.title} has no firewall that could keep others out',
+                f'{self.cloud.title} has no firewall that could keep others out',
                 'leave ssh_from= out')
         if options.fleet and self.capabilities.firewall and not ipv4(options.ssh_from):
             raise ConfigurationError('fleet= needs the networks (IPv4) of its robots',
                                      "ssh_from=['198.51.100.0/24'] names one")
-        self._cloud.account(options).check_credentials()
+        self.cloud.account(options).check_credentials()
         region = self._region(options)
         for one in (*((region,) if region != NEAREST else ()), *options.regions):
             options.in_region(one)
@@ -131,34 +126,27 @@ class VmProvider(Provider):
         return (named,) if isinstance(named, str) else tuple(named)
 
     def resolve(self, spec: MachineSpec) -> MachineSpec:
-        options = self._cloud.options.of(spec)
+        options = self.cloud.options.of(spec)
         chosen: dict[str, Any] = {}
         region = self._region(options)
         if region == NEAREST:
             among = options.common_regions()
             region = self.nearest(among or ())
             if not options.regions and not options.named_image:
-                chosen['regions'] = [one for one in self._cloud.regions.neighbours(region)
+                chosen['regions'] = [one for one in self.cloud.regions.neighbours(region)
                                      if among is None or one in among]
         options = options.in_region(region)
         kind, disk = options.named_type, spec.options.get('disk_size') and options.disk_size or 0
-        market = Market(self._cloud.account(options).until(self.cancel))
+        cloud = self.cloud.account(options).until(self.cancel)
         if options.chooses_type:
-            choice = market.choose(
-                [region], dataclasses.replace(options.wants(), disk_gb=disk))
-            kind = choice.chosen.type.name
+            kind, *others = _market(cloud).kinds(region, options, disk)
             # if there is no capacity for the cheapest, the next cheapest are tried
-            chosen[options.TYPES] = list(options.further_types) or [
-                offer.type.name for offer in choice.offers[1:3]]
+            chosen[options.TYPES] = list(options.further_types) or others[:2]
         elif disk:
             self._check_disk(region, options)
         kind = kind or options.DEFAULT_TYPE
         if options.max_price is not None and not options.chooses_type:
-            price = market.price_of(region, kind, spot=options.spot)
-            if price > options.max_price:
-                raise ConfigurationError(
-                    f'{kind} in {region} costs {price} US dollars an hour, more than max_price='
-                    f'{options.max_price}', 'ros2 fog price shows what is cheaper')
+            _market(cloud).check(region, kind, options)
         # a mapping stays: the launch may continue in another region
         if not isinstance(spec.options.get(options.TYPE), Mapping):
             chosen[options.TYPE] = kind
@@ -166,7 +154,7 @@ class VmProvider(Provider):
 
     def _check_disk(self, region: str, options: VmOptions) -> None:
         """Check that no type has a fixed disk that is smaller than ``disk_size``."""
-        for kind in self._cloud.account(options).until(self.cancel).named_types(
+        for kind in self.cloud.account(options).until(self.cancel).named_types(
                 region, options.types):
             if 0 < kind.disk_gb < options.disk_size:
                 raise ConfigurationError(
@@ -175,7 +163,7 @@ class VmProvider(Provider):
 
     def choices(self, spec: MachineSpec, chosen: MachineSpec) -> list[str]:
         """Describe type and region, and what is tried if there is no capacity."""
-        options = self._cloud.options.parse(chosen.options)
+        options = self.cloud.options.parse(chosen.options)
         options = options.in_region(options.region)
         kinds = [kind for kind in options.further_types if kind != options.named_type]
         more = [' or '.join(kinds), *([f'in {" or ".join(options.regions)}']
@@ -184,16 +172,16 @@ class VmProvider(Provider):
                 *([f'without room there {", ".join(filter(None, more))}'] if any(more) else [])]
 
     def architecture(self, spec: MachineSpec) -> str:
-        options = self._cloud.options.parse(spec.options)
+        options = self.cloud.options.parse(spec.options)
         region = self._region(options)
-        arches = {kind.arch for kind in self._cloud.account(options).named_types(
+        arches = {kind.arch for kind in self.cloud.account(options).named_types(
             region, options.in_region(region).types)}
         arch = arches.pop() if len(arches) == 1 else ''
         return 'aarch64' if arch == 'arm64' else arch
 
     def cost_per_hour(self, spec: MachineSpec) -> Optional[Decimal]:
         """Return the price of a machine; its disk and traffic cost extra."""
-        options = self._cloud.options.parse(spec.options)
+        options = self.cloud.options.parse(spec.options)
         region = self._region(options)
         if region == NEAREST:
             return None
@@ -206,18 +194,19 @@ class VmProvider(Provider):
         self, region: str, kind: str, options: VmOptions, cancel: Optional[threading.Event],
     ) -> Optional[Decimal]:
         with contextlib.suppress(FogError):
-            market = Market(self._cloud.account(options).until(cancel, hasty=True))
-            return market.price_of(region, kind, spot=options.spot)
+            price: Decimal = _market(self.cloud.account(options).until(
+                cancel, hasty=True)).price_of(region, kind, spot=options.spot)
+            return price
         return None
 
     # -- a machine's life -----------------------------------------------------------------------
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
-        cancel, options = self.cancel, self._cloud.options.of(spec)
+        cancel, options = self.cancel, self.cloud.options.of(spec)
         if options.chooses_type or self._region(options) == NEAREST:
             spec = self.resolve(spec)
-            options = self._cloud.options.of(spec)
-        cloud, firewall = self._cloud.account(options), self.capabilities.firewall
+            options = self.cloud.options.of(spec)
+        cloud, firewall = self.cloud.account(options), self.capabilities.firewall
         regions = list(dict.fromkeys([self._region(options), *options.regions]))
         zone = ''
         if request.with_volumes:
@@ -239,13 +228,13 @@ class VmProvider(Provider):
     def adopt(self, machine_id: str, spec: MachineSpec, tags: Mapping[str, str]) -> None:
         if not self.capabilities.adopt:
             return
-        machine, cloud = self._id(machine_id), self._until()
+        machine, cloud = self.vm_id(machine_id), self.until()
         cloud.set_tags(machine, tags)
         cloud.set_ending(machine, spec)
 
     def describe(self, machine_id: str) -> Machine:
-        machine = self._id(machine_id)
-        vm = self._until().get(machine.region, machine.vm)
+        machine = self.vm_id(machine_id)
+        vm = self.until().get(machine.region, machine.vm)
         if vm is None:
             return Machine(machine_id, '', self.name, MachineState.PENDING, region=machine.region)
         return dataclasses.replace(self.machine_of(vm), id=machine_id)
@@ -270,7 +259,7 @@ class VmProvider(Provider):
             private_network=vm.private_network, private_ip=private_ip, region=vm.region,
             kind=f'{vm.kind}{_SPOT}' if vm.spot else vm.kind, image=vm.image, key=vm.key,
             disk_gb=int(disk) if disk.isdecimal() and len(disk) < 7 else None, tags=tags,
-            end_command=self._cloud.end_command(machine, tags),
+            end_command=self.cloud.end_command(machine, tags),
             cost_per_hour=_dollars(tags.get(TAG_PRICE, '')), stopped=vm.stopped,
             billed=vm.billed)
 
@@ -284,8 +273,8 @@ class VmProvider(Provider):
         self, machine_id: str, *, name: str, timeout: float, known: Optional[Machine] = None,
     ) -> Machine:
         """Wait until a machine runs and has an address; the polls become rarer."""
-        machine = self._id(machine_id)
-        cloud = self._cloud.until(self.cancel)
+        machine = self.vm_id(machine_id)
+        cloud = self.cloud.until(self.cancel)
 
         def look() -> Optional[Machine]:
             vm = cloud.get(machine.region, machine.vm)
@@ -306,49 +295,49 @@ class VmProvider(Provider):
             what=f"'{name}' ({machine.vm}) to run")
 
     def reclaims(self, machine_id: str) -> bool:
-        return super().reclaims(machine_id) or self._until().is_marked(self._id(machine_id))
+        return super().reclaims(machine_id) or self.until().is_marked(self.vm_id(machine_id))
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
-        cloud = self._until()
-        for vms in self._everywhere(cloud, lambda region: list(cloud.find(region, tags))):
+        cloud = self.until()
+        for vms in self.everywhere(cloud, lambda region: list(cloud.find(region, tags))):
             yield from map(self.machine_of, vms)
 
     def destroy(self, machine_id: str) -> None:
         try:
-            machine = self._id(machine_id)
+            machine = self.vm_id(machine_id)
         except MachineNotFound:
             return
-        self._cloud.delete(machine)
+        self.cloud.delete(machine)
 
     def stop(self, machine_id: str) -> None:
-        machine = self._id(machine_id)
-        vm = self._cloud.get(machine.region, machine.vm)
+        machine = self.vm_id(machine_id)
+        vm = self.cloud.get(machine.region, machine.vm)
         if vm is not None and vm.spot:
             raise Unsupported("a spot instance can't be stopped and started again",
                               "use on_exit='delete' or 'keep', or spot=False")
-        self._cloud.stop(machine)
+        self.cloud.stop(machine)
 
     def start(self, machine_id: str) -> None:
-        machine = self._id(machine_id)
+        machine = self.vm_id(machine_id)
 
         def stopped() -> bool:
-            vm = self._cloud.get(machine.region, machine.vm)
+            vm = self.cloud.get(machine.region, machine.vm)
             return vm is None or vm.state is not MachineState.STOPPING
 
         wait_until(stopped, timeout=END_TIMEOUT, interval=1.0, longest=5.0,
                    what=f'{machine.vm} in {machine.region} to be stopped')
-        self._cloud.start(machine)
+        self.cloud.start(machine)
 
     def tidy(self, dead: Collection[str] = ()) -> list[str]:
         attempts = {attempt_of(token) for token in dead}
 
         def ask(region: str) -> list[str]:
-            names = self._cloud.leftovers(region, time.time(), attempts)
+            names = self.cloud.leftovers(region, time.time(), attempts)
             for attempt in names:
-                self._cloud.sweep(region, attempt)
+                self.cloud.sweep(region, attempt)
             where = f' in {region}' if region else ''
             return [f"firewall and key of '{name}'{where}" for name in names.values()]
-        return [words for notes in self._everywhere(self._cloud, ask) for words in notes]
+        return [words for notes in self.everywhere(self.cloud, ask) for words in notes]
 
     # -- its network ----------------------------------------------------------------------------
 
@@ -364,116 +353,24 @@ class VmProvider(Provider):
         if not self.capabilities.firewall:
             super().allow(machine_id, port, sources)
         # a port is closed even if the launch ends
-        cloud = self._until() if sources else self._cloud
-        cloud.set_firewall(self._id(machine_id), port, _ROBOT_ADDRESS.with_ipv6(sources))
+        cloud = self.until() if sources else self.cloud
+        cloud.set_firewall(self.vm_id(machine_id), port, _ROBOT_ADDRESS.with_ipv6(sources))
 
     def pin(self, machine_id: str, host_key: str) -> None:
-        self._until().set_tags(
-            self._id(machine_id), {TAG_HOST_KEY: ' '.join(host_key.split()[:2])})
+        self.until().set_tags(
+            self.vm_id(machine_id), {TAG_HOST_KEY: ' '.join(host_key.split()[:2])})
 
-    # -- images ---------------------------------------------------------------------------------
-
-    def bake(self, machine_id: str, name: str, dependencies: str) -> str:
-        return self._cloud.bake(self._id(machine_id), name, dependencies)
-
-    def images(self) -> Iterable[Image]:
-        cloud = self._until()
-        by_region = self._everywhere(cloud, lambda region: list(cloud.images(region)))
-        return [image for images in by_region for image in images]
-
-    def delete_image(self, image_id: str) -> None:
-        self._cloud.delete_image(image_id)
-
-    # -- volumes --------------------------------------------------------------------------------
-
-    def volumes(self, hosts: Sequence[str] = ()) -> Iterator[Volume]:
-        for disk in self._disks():
-            yield Volume(self._volume_id(disk), disk.name, self.name, disk.zone or disk.region,
-                         disk.size_gb, disk.vm, self._cloud.gb_month)
-
-    def _disks(self) -> list[Disk]:
-        cloud = self._until()
-        by_region = self._everywhere(cloud, lambda region: list(cloud.disks(region)))
-        return [disk for disks in by_region for disk in disks]
-
-    def _volume_id(self, disk: Disk) -> str:
-        return f'{self.name}:{disk.region}/{disk.id}'
-
-    def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
-        """Attach the first volume of this name; two launches that make one keep the first."""
-        machine = self._id(machine_id)
-        cloud = self._cloud.beside(machine).until(self.cancel)
-        made = '' if _first(cloud.disks(machine.region, name)) else cloud.make_disk(
-            machine, name, size_gb)
-
-        def look(attached: bool) -> Optional[Disk]:
-            disks = list(cloud.disks(machine.region, name))
-            disk = _first(disks)
-            if disk is None:
-                return None
-            if made not in ('', disk.id):
-                if any(one.id == made and not one.ready for one in disks):
-                    return None  # EC2 deletes no disk that it still makes
-                cloud.until(None).delete_disk(dataclasses.replace(disk, id=made))
-                raise _in_use(disk)
-            if disk.vm not in ('', machine.vm):
-                raise _in_use(disk)
-            return disk if disk.ready and (disk.vm or not attached) else None
-
-        def wait(state: str) -> Disk:
-            return wait_until(
-                lambda: look(state == 'attached'), timeout=END_TIMEOUT, cancel=self.cancel,
-                first=0.3, interval=1.0, longest=3.0, what=f"the volume '{name}' to be {state}")
-
-        devices = cloud.attach_disk(machine, wait('ready'))
-        wait('attached')
-        return Attached(devices)
-
-    def detach(self, machine_id: str, name: str) -> None:
-        machine = self._id(machine_id)
-        cloud = self._cloud.beside(machine)
-        for disk in cloud.disks(machine.region, name):
-            if disk.vm == machine.vm:
-                cloud.detach_disk(machine, disk)
-
-    def delete_volume(self, volume_id: str) -> None:
-        for disk in self._disks():
-            if self._volume_id(disk) == volume_id:
-                if disk.vm:
-                    raise _in_use(disk)
-                self._cloud.delete_disk(disk)
-
-    # -- regions and prices ---------------------------------------------------------------------
+    # -- regions --------------------------------------------------------------------------------
 
     def nearest(self, names: Sequence[str] = ()) -> str:
-        return self._cloud.regions.nearest(names)
+        return self.cloud.regions.nearest(names)
 
     def regions(self, names: Sequence[str] = (), *, every: bool = False) -> list[Region]:
-        self._cloud.regions.check(names)
-        return self._cloud.regions.ranked(names, every=every)
+        self.cloud.regions.check(names)
+        return self.cloud.regions.ranked(names, every=every)
 
     def search_in(self, regions: Sequence[str]) -> None:
         self._searched = tuple(regions)
-
-    def offers(
-        self, wanted: Wants, regions: Sequence[str] = (), *, refresh: bool = False,
-    ) -> Offers:
-        cloud = self._cloud.until(self.cancel)
-        # checked first: a measurement takes seconds, and is useless without credentials
-        cloud.check_credentials()
-        names = [name for name in regions if name]
-        if not names:
-            names = [cloud.default_region() or NEAREST]
-        if {ALL, '*'} & set(names):
-            names = cloud.enabled_regions()
-        named = list(dict.fromkeys(
-            self.nearest() if name == NEAREST else name for name in names))
-        return Market(cloud, refresh=refresh).choose(named, wanted, spot_too=True)
-
-    def taking(self, spec: MachineSpec, offer: Offer) -> MachineSpec:
-        kept = {name: spec.options[name] for name in EVERYWHERE if name in spec.options}
-        return dataclasses.replace(spec, provider=self.name, wanted=spec.options, options={
-            **kept, 'region': offer.region, self._cloud.options.TYPE: offer.type.name})
 
     def _named_regions(self) -> list[str]:
         """Return the regions that the user has named: by an option, else FOGROS2_AWS_REGIONS."""
@@ -483,9 +380,9 @@ class VmProvider(Provider):
     def _base(self) -> str:
         """Return a region for requests that belong to no region."""
         regions = [region for region in self._named_regions() if region != ALL]
-        return self._cloud.default_region() or (*regions, self._cloud.base_region)[0]
+        return self.cloud.default_region() or (*regions, self.cloud.base_region)[0]
 
-    def _everywhere(self, cloud: VmCloud, question: Callable[[str], T]) -> Iterable[T]:
+    def everywhere(self, cloud: VmCloud, question: Callable[[str], T]) -> Iterable[T]:
         """
         Ask all regions at the same time; return their answers.
 
@@ -518,11 +415,11 @@ class VmProvider(Provider):
 
         :raises ConfigurationError: nobody has named a region.
         """
-        region = options.region or self._cloud.default_region()
+        region = options.region or self.cloud.default_region()
         if not region:
             raise ConfigurationError(
                 f'no region is named for {options.WHAT}',
-                f"region='{self._cloud.base_region}' or region='nearest' names one")
+                f"region='{self.cloud.base_region}' or region='nearest' names one")
         return region
 
     # -- ids ------------------------------------------------------------------------------------
@@ -530,24 +427,35 @@ class VmProvider(Provider):
     def _text(self, machine: VmId) -> str:
         return f'{self.name}:{"/".join(machine)}'
 
-    def _id(self, text: str) -> VmId:
+    def vm_id(self, text: str) -> VmId:
         """
         Parse a machine's id.
 
         :raises MachineNotFound: not an id of this provider.
         """
-        form = rf'{self.name}:([a-z0-9-]+)/({self._cloud.id_form})/({ATTEMPT.pattern})'
+        form = rf'{self.name}:([a-z0-9-]+)/({self.cloud.id_form})/({ATTEMPT.pattern})'
         match = re.fullmatch(form, text)
         if match is None:
-            raise MachineNotFound(f"'{text}' is no machine at {self._cloud.title}")
+            raise MachineNotFound(f"'{text}' is no machine at {self.cloud.title}")
         return VmId(*match.groups())
 
 
-def _first(disks: Iterable[Disk]) -> Optional[Disk]:
+def _market(cloud: VmCloud) -> Any:
+    """
+    Return the types and prices at a cloud.
+
+    :raises ConfigurationError: the feature that has them is not installed.
+    """
+    return plugin_system.load('fogros2.market', 'prices')(cloud)
+
+
+def first_disk(disks: Iterable[Disk]) -> Optional[Disk]:
+    """Return the volume that counts among several with one name, None for none."""
     return min(disks, key=lambda disk: (not disk.vm, disk.created, disk.id), default=None)
 
 
-def _in_use(disk: Disk) -> NameTaken:
+def disk_in_use(disk: Disk) -> NameTaken:
+    """Return the error for a volume that another machine has."""
     return NameTaken(f"the volume '{disk.name}' in {disk.zone or disk.region} is in use by "
                      f'{disk.vm or "another launch"}', 'end that machine: ros2 fog list shows it')
 
@@ -564,10 +472,10 @@ def _beside(
     for region in regions:
         listed = list(cloud.disks(region))
         disks = [disk for name in names if (
-            disk := _first(one for one in listed if one.name == name)) is not None]
+            disk := first_disk(one for one in listed if one.name == name)) is not None]
         for disk in disks:
             if disk.vm:
-                raise _in_use(disk)
+                raise disk_in_use(disk)
         zones = {disk.zone for disk in disks}
         if len(zones) > 1:
             raise ConfigurationError(

@@ -18,7 +18,7 @@ import time
 from typing import Optional
 
 from fogros2.errors import ConfigurationError, PrerequisiteError, ProviderError
-from fogros2.provider.offers import Region
+from fogros2.provider.machine_types import Region
 
 #: Number of neighbours of a region to try if it has no capacity.
 NEIGHBOURS = 2

@@ -28,7 +28,7 @@ def test_denial_keeps_out_whom_google_admits(provider, robot, box, make, name):
     try:
         assert robot.run(connect).returncode != 0
         # Google's default rules admit it: without our denial, it would reach the SSH server
-        provider._cloud._account.remove(
+        provider.cloud._account.remove(
             f'robots/global/firewalls/{box.things()["instances"][0]}-deny', 'a test')
         assert robot.run(connect).returncode == 0
     finally:
@@ -48,7 +48,7 @@ def test_machine_ends_itself_as_its_rights_allow(cloud, provider, box, make, nam
                    timeout=60, what='the end')
     assert ('disks' in box.things()) == (not account)
     attempt = machine.id.rpartition('/')[2]
-    provider._cloud.sweep('', attempt)
+    provider.cloud.sweep('', attempt)
 
 
 def test_google_ends_a_machine_at_its_lifetime(provider, box, name):

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Optional
 from fogros2.errors import FogError, MachineNotFound, PrerequisiteError
 from fogros2.model import MachineState
 from fogros2.provider import Capabilities, TAG_ON_EXIT
-from fogros2.provider.offers import MachineType
+from fogros2.provider.machine_types import MachineType
 from fogros2.provider.vm.cloud import Order, Place, Vm, VmCloud, VmId
 from fogros2.provider.vm.failures import CodedError, Failure, unless_gone
 from fogros2.provider.vm.labels import LabelRules

@@ -4,6 +4,9 @@ Give machines disks and folders that outlive them.
 
 The provider attaches a volume and keeps two machines apart. The script here makes a file system on
 a new disk, mounts it and unmounts it.
+
+In reading order: ``keepers`` (providers that keep volumes), ``listing`` and ``verbs`` (for
+``ros2 fog``).
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ import contextlib
 import dataclasses
 import itertools
 import re
-from typing import Optional, TYPE_CHECKING
+from typing import Any, Optional, TYPE_CHECKING
 
 from fogros2 import plugin_system
 from fogros2.errors import ConfigurationError, Unsupported
@@ -23,7 +26,8 @@ from fogros2.model import Command, CreateRequest, MachineSpec
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
 
-    from fogros2.provider import Attached
+    from fogros2.provider import Attached, Provider
+    from fogros2_features.volumes.keepers import VolumeKeeper
 
 #: GB of a new volume, and the most.
 SIZE, LARGEST = 50, 16000
@@ -132,7 +136,7 @@ class Volumes(Feature):
         """Check that the provider has volumes, and that none hides the workspace."""
         provider = plugin_system.load('fogros2.provider', spec.provider)
         if own and not provider.capabilities.keeps_volumes:
-            raise provider().no_volumes()
+            _keeper(provider())
         if own and spec.wanted is not None:
             raise Unsupported(
                 f"'{spec.name}' may be at another cloud each time, and a volume stays at one",
@@ -148,6 +152,13 @@ class Volumes(Feature):
         """Have the machine created with the volumes."""
         return dataclasses.replace(request, with_volumes=own)
 
+    def listed(
+        self, regions: Optional[Sequence[str]],
+    ) -> Optional[tuple[Sequence[Mapping[str, Any]], str]]:
+        """Return all volumes, and what they cost together."""
+        from fogros2_features.volumes import listing  # machines have no command line
+        return listing.listed(regions)
+
     @contextlib.contextmanager
     def machine(
         self, running: RunningMachine, own: Mapping[str, tuple[str, int]],
@@ -156,9 +167,10 @@ class Volumes(Feature):
         with contextlib.ExitStack() as undo:
             with running.step('volumes') as detail:
                 for name, (path, size) in own.items():
+                    keeper = _keeper(running.provider)
                     ways: list[Attached] = []
-                    undo.callback(_detach, running, name, path, ways)
-                    attached = running.provider.attach(running.machine.id, name, size)
+                    undo.callback(_detach, running, keeper, name, path, ways)
+                    attached = keeper.attach(running.machine.id, name, size)
                     ways.append(attached)
                     assert running.machine.shell is not None
                     output = running.run(Command(
@@ -169,7 +181,14 @@ class Volumes(Feature):
             yield
 
 
-def _detach(running: RunningMachine, name: str, path: str, ways: Sequence[Attached]) -> None:
+def _keeper(provider: Provider) -> VolumeKeeper:
+    from fogros2_features.volumes.keepers import volume_keeper  # it loads what clouds share
+    return volume_keeper(provider)
+
+
+def _detach(
+    running: RunningMachine, keeper: VolumeKeeper, name: str, path: str, ways: Sequence[Attached],
+) -> None:
     if running.lost:
         return  # its provider detaches a disk when the machine ends
     for attached in ways:  # none, if an interrupt or an error ended 'attach'
@@ -178,7 +197,7 @@ def _detach(running: RunningMachine, name: str, path: str, ways: Sequence[Attach
              attached.folder or ''.join(attached.devices)),
             sudo=True, what=f"unmount the volume '{name}'"), timeout=120.0)
     if running.spec.on_exit != 'delete':  # the end of a machine detaches, too
-        running.provider.detach(running.machine.id, name)
+        keeper.detach(running.machine.id, name)
 
 
 def _read(name: str, value: str) -> tuple[str, int]:

@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 import dataclasses
 from decimal import Decimal
 import platform
 import re
-from typing import Optional, Union
+from typing import Optional, Protocol, runtime_checkable, Union
 
 from fogros2.errors import ConfigurationError
+from fogros2.model import MachineSpec
+from fogros2.provider.machine_types import MachineType
 
 #: Minimum of 'cheapest' if a launch file names none: that of EC2's t3.medium.
 MIN_CPU = 2
@@ -19,51 +21,6 @@ _ARCHITECTURES = {
     'x86_64': 'x86_64', 'amd64': 'x86_64', 'arm64': 'arm64', 'aarch64': 'arm64', 'any': ''}
 #: The GPUs that run CUDA, which a request for a number of GPUs means.
 _CUDA = 'nvidia'
-
-
-@dataclasses.dataclass(frozen=True)
-class Region:
-    """
-    A region and its distance.
-
-    :param place: its city or state, for people.
-    :param milliseconds: median time to connect by TCP, which is one round trip; None if no
-        connection succeeded.
-    :param distance_km: distance on the globe, if no region answered.
-    """
-
-    region: str
-    place: str = ''
-    milliseconds: Optional[float] = None
-    distance_km: Optional[float] = None
-
-
-@dataclasses.dataclass(frozen=True)
-class MachineType:
-    """
-    A type of machine.
-
-    :param vcpus: hardware threads; ``cores`` is the number of physical cores.
-    :param memory_gb: memory in GiB.
-    :param arch: ``x86_64`` or ``arm64``.
-    :param cpu: manufacturer of the processor: Intel, AMD, AWS.
-    :param gpus: number of GPUs, with ``gpu_memory_gb`` GiB each.
-    :param gpu: manufacturer and name, such as 'NVIDIA T4'.
-    :param spot: whether it exists as a spot machine.
-    :param disk_gb: size of the disk that belongs to it; 0 if a machine's disk has any size.
-    """
-
-    name: str
-    vcpus: int
-    cores: int
-    memory_gb: float
-    arch: str
-    cpu: str = ''
-    gpus: int = 0
-    gpu: str = ''
-    gpu_memory_gb: float = 0.0
-    spot: bool = False
-    disk_gb: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,6 +120,34 @@ class Offers:
     def chosen(self) -> Offer:
         """The cheapest offer."""
         return self.offers[0]
+
+
+@runtime_checkable
+class Seller(Protocol):
+    """
+    A source of offers.
+
+    A provider may have these methods; for clouds of virtual machines, this feature has them.
+    """
+
+    def offers(
+        self, wanted: Wants, regions: Sequence[str] = (), *, refresh: bool = False,
+    ) -> Offers:
+        """
+        Return the types of machines that meet requirements, the cheapest first.
+
+        :param regions: names, 'all' or 'nearest'; none for the configured one.
+        :param refresh: do not use cached prices.
+        :raises ConfigurationError: nothing fits.
+        :raises FogError: no region answers.
+        """
+
+    def taking(self, spec: MachineSpec, offer: Offer) -> MachineSpec:
+        """
+        Return the spec of a machine of this provider that takes an offer.
+
+        :param spec: of a machine of any cloud; the result has its options as ``wanted``.
+        """
 
 
 def wants(

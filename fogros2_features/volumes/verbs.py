@@ -40,20 +40,22 @@ class VolumeVerb(VerbExtension):
         import functools
 
         from fogros2.errors import ConfigurationError
+        from fogros2_features.volumes import listing
+        from fogros2_features.volumes.keepers import volume_keeper
         from ros2fog_cli.api import machines
-        from ros2fog_cli.api import volumes as api
         names = parse_late(args, args.rest, 'volume', _add_options)
         if (args.action == 'delete') != bool(names):
             raise ConfigurationError("'ros2 fog volume list' takes no names, 'delete' some",
                                      'ros2 fog volume list shows them')
-        volumes = api.survey(warn, regions=args.region, hosts=args.host)
+        volumes = listing.survey(warn, regions=args.region, hosts=args.host)
         if args.action == 'delete':
             return delete_each([
                 (volume.name, f'{volume.provider} {volume.id}, with its data', functools.partial(
-                    machines.load(volume.provider, args.region).delete_volume, volume.id))
+                    volume_keeper(machines.load(volume.provider, args.region)).delete_volume,
+                    volume.id))
                 for volume in _named(volumes, names)], 'volume', args)
         if args.json:
-            print_json(volumes=[api.to_json(volume) for volume in volumes])
+            print_json(volumes=[listing.to_json(volume) for volume in volumes])
         else:
             _print(volumes)
         return 0

@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import dataclasses
 import time
 from typing import Any, Optional
 
 from fogros2.errors import ConfigurationError, FogError, ProviderError
-from fogros2.model import Command, Image, MachineState
+from fogros2.model import Command, MachineState
 from fogros2.provider import TAG_DEPENDENCIES
+from fogros2.provider.vm.images import Image
 from fogros2.waiting import wait_until
+from fogros2_features.images.keepers import image_keeper
 from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry, Warn
 
@@ -51,7 +53,7 @@ def bake(entry: Entry, name: str = '', now: Optional[float] = None) -> Image:
         stamp = time.strftime('%Y%m%d-%H%M%S', time.gmtime(now))
         name = f'{entry.name}-image-{stamp}'
     dependencies = entry.machine.tags.get(TAG_DEPENDENCIES, '')
-    made = machines.load(entry.provider).bake(entry.machine.id, name, dependencies)
+    made = image_keeper(machines.load(entry.provider)).bake(entry.machine.id, name, dependencies)
     return Image(made, name, entry.provider, dependencies=dependencies)
 
 
@@ -62,7 +64,7 @@ def wait(baking: Image, *, timeout: float = TIMEOUT) -> Image:
     :raises ProviderError: the creation failed, or the image disappeared.
     :raises DeadlineExceeded: the image is not available after ``timeout`` seconds.
     """
-    provider = machines.load(baking.provider)
+    provider = image_keeper(machines.load(baking.provider))
     seen = False
 
     def probe() -> Optional[Image]:
@@ -85,8 +87,11 @@ def wait(baking: Image, *, timeout: float = TIMEOUT) -> Image:
 
 def survey(warn: Warn, *, regions: Optional[Sequence[str]] = None) -> list[Image]:
     """Return the images of all providers; warn about a provider that does not answer."""
+    def ask(name: str) -> Iterable[Image]:
+        return image_keeper(machines.load(name, regions)).images()
+
     return sorted(
-        machines.gather(warn, regions, lambda name: machines.load(name, regions).images()),
+        machines.gather(warn, regions, ask),
         key=lambda image: (image.name, image.region, image.id))
 
 
@@ -111,7 +116,7 @@ def delete(image: Image) -> None:
 
     :raises FogError: the image still exists.
     """
-    provider = machines.load(image.provider)
+    provider = image_keeper(machines.load(image.provider))
     provider.delete_image(image.id)
     if any(one.id == image.id for one in provider.images()):
         raise ProviderError(f'the image {image.id} is still there', 'try again')

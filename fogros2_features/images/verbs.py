@@ -92,12 +92,12 @@ def _create(args: argparse.Namespace) -> int:
     words = parser.parse_args(args.rest)
     from pathlib import Path
 
-    from ros2fog_cli.api import pod_image
-    recipe = pod_image.recipe(words.registry, base=words.base, folder=words.workspace)
+    from fogros2_features.images import pods
+    recipe = pods.recipe(words.registry, base=words.base, folder=words.workspace)
     if words.dry_run or args.dry_run:
         print(recipe.containerfile, end='')
         return 0
-    made = pod_image.build(recipe, Path(words.folder), engine=words.engine,
+    made = pods.build(recipe, Path(words.folder), engine=words.engine,
                            push=not words.no_push, say=warn)
     print(f"{'built' if words.no_push else 'pushed'} {made}")
     registry = made.rpartition(':')[0]
@@ -106,10 +106,11 @@ def _create(args: argparse.Namespace) -> int:
 
 
 def _list(args: argparse.Namespace) -> int:
-    from ros2fog_cli.api import images, table
-    listing = images.survey(warn, regions=args.region)
+    from fogros2_features.images import baking
+    from ros2fog_cli.api import table
+    listing = baking.survey(warn, regions=args.region)
     if args.json:
-        print_json(images=[images.to_json(image) for image in listing])
+        print_json(images=[baking.to_json(image) for image in listing])
     elif not listing:
         print('no images')
     else:
@@ -128,39 +129,40 @@ def _list(args: argparse.Namespace) -> int:
 
 def _make(args: argparse.Namespace, name: str) -> int:
     from fogros2.errors import FogError
-    from ros2fog_cli.api import images, progress, reach
+    from fogros2_features.images import baking
+    from ros2fog_cli.api import progress, reach
     entry = reach.find(name, warn, regions=args.region)
     print(f"{'would make' if args.dry_run else 'make'} an image of {entry.name}: "
           f"{entry.provider} {entry.machine_id or '-'}, {entry.state}", file=sys.stderr)
     if args.dry_run:
         return 0
-    images.flush(entry, warn)
-    baking = images.bake(entry, args.image_name or '')
-    if not baking.dependencies:
+    baking.flush(entry, warn)
+    image = baking.bake(entry, args.image_name or '')
+    if not image.dependencies:
         warn('what is installed on the machine is not known: no launch takes the image by '
-             f'itself, but each that names it does ({baking.id})')
+             f'itself, but each that names it does ({image.id})')
     try:
         with progress.working('making'):
-            images.wait(baking)
+            baking.wait(image)
     except KeyboardInterrupt:
-        warn(f'the image goes on being made: {baking.id} (ros2 fog image list shows it)')
+        warn(f'the image goes on being made: {image.id} (ros2 fog image list shows it)')
         raise
     except FogError as error:
-        warn(f'{baking.name}: {error}')
+        warn(f'{image.name}: {error}')
         return 1
     if args.json:
-        print_json(id=baking.id, name=baking.name, provider=baking.provider,
-                   dependencies=baking.dependencies)
+        print_json(id=image.id, name=image.name, provider=image.provider,
+                   dependencies=image.dependencies)
     else:
-        print(f'made {baking.name} ({baking.id})')
+        print(f'made {image.name} ({image.id})')
     return 0
 
 
 def _delete(args: argparse.Namespace, words: list[str]) -> int:
     import functools
 
-    from ros2fog_cli.api import images
+    from fogros2_features.images import baking
     return delete_each([
         (image.name, f'{image.provider} {image.id}, {image.state}',
-         functools.partial(images.delete, image))
-        for image in images.named(images.survey(warn, regions=args.region), words)], 'image', args)
+         functools.partial(baking.delete, image))
+        for image in baking.named(baking.survey(warn, regions=args.region), words)], 'image', args)

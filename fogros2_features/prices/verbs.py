@@ -8,7 +8,6 @@ from typing import Any, TYPE_CHECKING
 
 from ros2fog_cli.verb import (
     add_json,
-    cloud_names,
     complete,
     number,
     print_json,
@@ -18,9 +17,8 @@ from ros2fog_cli.verb import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from fogros2_features.prices.offers import Offer
 
-    from fogros2.provider.offers import Offer
 
 
 class PriceVerb(VerbExtension):
@@ -47,8 +45,8 @@ class PriceVerb(VerbExtension):
         complete(region, region_names)
         parser.add_argument('--limit', type=number, default=10, metavar='N',
                             help='rows to show, 0 for all (default: 10)')
-        parser.add_argument('--replicas', type=int, metavar='N',
-                            help='compare the cost of N machines with one on demand')
+        for option in options():
+            option.add_arguments(parser)
         parser.add_argument('--refresh', action='store_true',
                             help='do not use prices of the last 24 hours')
         provider = parser.add_argument(
@@ -59,14 +57,15 @@ class PriceVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the table; a launch would use the first row."""
-        from fogros2.provider import clouds, offers
+        from fogros2.provider.vm.provider import ALL
+        from fogros2_features.prices import clouds, offers
         from ros2fog_cli.api import table
         from ros2fog_cli.api.interrupts import interruptible
         wanted = offers.wants(
             arch=args.arch, min_cpu=args.min_cpu, min_memory_gb=args.min_memory,
             cpu_type=args.cpu_type, gpu=args.gpu, gpu_memory_gb=args.gpu_memory,
             max_price=args.max_price, spot=args.spot)
-        every = args.provider == clouds.ALL
+        every = args.provider == ALL
         with interruptible() as cancel:
             choice = clouds.compare(
                 wanted, () if every else (args.provider,), args.region or (), measure=True,
@@ -92,8 +91,10 @@ class PriceVerb(VerbExtension):
             rest = len(choice.offers) - len(shown)
             if rest:
                 print(f"{rest} more {'cost' if rest > 1 else 'costs'} as much or more (--limit 0)")
-        if args.replicas is not None and not args.json:
-            print(compared(choice.offers, args.replicas, spot=args.spot))
+            for option in options():
+                line = option.line(choice.offers, args)
+                if line:
+                    print(line)
         for who, reason in choice.left_out:
             warn(f'{who}: {reason}')
         others = clouds.clouds()[1]
@@ -116,20 +117,21 @@ def to_json(offer: Offer) -> dict[str, Any]:
     }
 
 
-def compared(offers: Sequence[Offer], number: int, *, spot: bool) -> str:
+def options() -> list[Any]:
     """
-    Compare the cost of several machines, the cheapest offers, with that of one on demand.
+    Return the options that other features add: entry points of the group ``fogros2.price``.
 
-    :raises ConfigurationError: there are not enough offers, or none on demand.
+    Each has ``add_arguments(parser)`` and ``line(offers, args)``, a line below the table or ''.
     """
-    from fogros2.errors import ConfigurationError
-    costs = sorted(cost for one in offers if (cost := one.cost(spot)) is not None)[:number]
-    alone = min((one.price for one in offers if one.price is not None), default=None)
-    if number < 2 or len(costs) < number or alone is None:
-        raise ConfigurationError(f'--replicas {number}: {len(costs)} offers match',
-                                 'give 2 or more, and search more regions: --region all')
-    return (f"{number} replicas{' on spot machines' if spot else ''} ${sum(costs):.4f} an hour, "
-            f'one machine on demand ${alone:.4f}: {sum(costs) / alone:.2f} times')
+    from fogros2 import plugin_system
+    return [plugin_system.load('fogros2.price', name)
+            for name in plugin_system.names('fogros2.price')]
+
+
+def cloud_names() -> list[str]:
+    """Return 'all' and the providers with prices."""
+    from fogros2_features.prices.clouds import clouds
+    return ['all', *sum(clouds(), [])]
 
 
 def _gpus(number: int, name: str, memory: float) -> str:

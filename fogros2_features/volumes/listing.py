@@ -5,12 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 import dataclasses
+from decimal import Decimal
 from typing import Any, Optional
 
 from fogros2 import plugin_system
 from fogros2.model import Volume
 from fogros2.provider import Provider
-from ros2fog_cli.api import machines
+from fogros2_features.volumes.keepers import volume_keeper
+from ros2fog_cli.api import machines, table
 from ros2fog_cli.api.machines import Warn
 
 
@@ -20,7 +22,7 @@ def survey(
     """Return the volumes of all providers; warn about a provider that does not answer."""
     def ask(name: str) -> Iterable[Volume]:
         kind: type[Provider] = plugin_system.load('fogros2.provider', name)
-        return machines.load(name, regions).volumes(hosts) \
+        return volume_keeper(machines.load(name, regions)).volumes(hosts) \
             if kind.capabilities.keeps_volumes else ()
 
     return sorted(machines.gather(warn, regions, ask),
@@ -35,11 +37,10 @@ def to_json(volume: Volume) -> dict[str, Any]:
     return {**fields, 'place': place, 'cost_per_month': None if cost is None else float(cost)}
 
 
-def total(volumes: Sequence[Volume], cost: Any) -> str:
-    """
-    Return what volumes cost together, '' without volumes of a known price.
-
-    :param cost: returns a sum of US dollars as people read it.
-    """
+def listed(regions: Optional[Sequence[str]]) -> tuple[list[dict[str, Any]], str]:
+    """Return volumes as JSON data, and what they cost together, '' without a known price."""
+    volumes = survey(lambda text: None, regions=regions)  # the list of machines warns
     costs = [each for volume in volumes if (each := volume.cost_per_month) is not None]
-    return f'volumes: about {cost(sum(costs), 2)} a month (ros2 fog volume list)' if costs else ''
+    return list(map(to_json, volumes)), (
+        f'volumes: about {table.cost(sum(costs, Decimal(0)), 2)} a month (ros2 fog volume list)'
+        if costs else '')

@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Types and prices of a cloud's regions, cached on disk; choose the cheapest."""
+"""
+Types and prices of a cloud's regions, cached on disk; choose the cheapest.
+
+The entry point of the group ``fogros2.market`` is :class:`Market`: virtual machines of clouds get
+by it their types and prices.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
+import dataclasses
 from decimal import Decimal
 import hashlib
 import json
@@ -14,14 +20,18 @@ import threading
 import time
 from typing import Any, Optional, Union
 
-from fogros2.errors import ConfigurationError, FogError, ProviderError, StoreError
-from fogros2.model import to_json
-from fogros2.provider.offers import fits, MachineType, Offer, Offers, ranked, Wants
-from fogros2.provider.vm.cloud import VmCloud
+from fogros2.errors import ConfigurationError, FogError, ProviderError, StoreError, Unsupported
+from fogros2.model import MachineSpec, to_json
+from fogros2.provider import Provider
+from fogros2.provider.machine_types import MachineType
+from fogros2.provider.vm.cloud import PRICES_AGE, VmCloud
+from fogros2.provider.vm.options import NEAREST, VmOptions
+from fogros2.provider.vm.provider import ALL, VmProvider
 from fogros2.store import state_home, write_private
+from fogros2_features.prices.offers import fits, Offer, Offers, ranked, Seller, Wants, wants
 
-#: Seconds for which prices are used again; for types and zones: ``VmCloud.types_age``.
-CACHE_AGE = 86400.0
+#: Options with the same meaning in every cloud that do not choose the machine.
+EVERYWHERE = ('disk_size', 'spot', 'tags', 'user', 'ssh_from', 'fleet')
 #: Maximum number of types in one request for spot prices.
 _NAMED_TYPES = 100
 
@@ -104,7 +114,32 @@ class Market:
                 f'{region}', 'ros2 fog price --region shows the types that a region has')
         return price
 
+    def check(self, region: str, name: str, options: VmOptions) -> None:
+        """
+        Check that a type costs at most ``max_price``.
+
+        :raises ConfigurationError: it costs more.
+        """
+        price = self.price_of(region, name, spot=options.spot)
+        if options.max_price is not None and price > options.max_price:
+            raise ConfigurationError(
+                f'{name} in {region} costs {price} US dollars an hour, more than max_price='
+                f'{options.max_price}', 'ros2 fog price shows what is cheaper')
+
     # -- choosing -------------------------------------------------------------------------
+
+    def kinds(self, region: str, options: VmOptions, disk_gb: int) -> list[str]:
+        """
+        Return the types that meet the requirements of a machine, the cheapest first.
+
+        :raises FogError: as :meth:`choose` does.
+        """
+        wanted = wants(
+            arch=options.arch or None, min_cpu=int(options.min_cpu) or None,
+            min_memory_gb=options.min_memory_gb or None, cpu_type=options.cpu_type or None,
+            gpu=options.gpu or None, gpu_memory_gb=options.gpu_memory_gb or None,
+            max_price=options.max_price, spot=options.spot, disk_size=disk_gb)
+        return [offer.type.name for offer in self.choose([region], wanted).offers]
 
     def offers(self, region: str, wanted: Wants, *, spot_too: bool = False) -> list[Offer]:
         """
@@ -201,7 +236,7 @@ class Market:
         return self._known.get(key)
 
     def _age(self, kind: str) -> float:
-        return self._source.types_age if kind in ('types', 'zones') else CACHE_AGE
+        return self._source.types_age if kind in ('types', 'zones') else PRICES_AGE
 
     def _path(self, key: str) -> Path:
         return (self._cache or state_home() / 'cache' / self._source.name) / f'{key}.json'
@@ -222,3 +257,47 @@ _READ: Mapping[str, Callable[[Any], Any]] = {
 def cheapest_zone(zones: Mapping[str, Decimal], among: Iterable[str]) -> Optional[Decimal]:
     """Return the lowest price in some zones, None if there is none."""
     return min((zones[zone] for zone in among if zone in zones), default=None)
+
+
+class CloudSeller:
+    """The seller for a cloud of virtual machines."""
+
+    def __init__(self, provider: VmProvider) -> None:
+        self._provider = provider
+
+    def offers(
+        self, wanted: Wants, regions: Sequence[str] = (), *, refresh: bool = False,
+    ) -> Offers:
+        """Return the offers of the cloud's regions."""
+        cloud = self._provider.cloud.until(self._provider.cancel)
+        # checked first: a measurement takes seconds, and is useless without credentials
+        cloud.check_credentials()
+        names = [name for name in regions if name]
+        if not names:
+            names = [cloud.default_region() or NEAREST]
+        if {ALL, '*'} & set(names):
+            names = cloud.enabled_regions()
+        named = list(dict.fromkeys(
+            self._provider.nearest() if name == NEAREST else name for name in names))
+        return Market(cloud, refresh=refresh).choose(named, wanted, spot_too=True)
+
+    def taking(self, spec: MachineSpec, offer: Offer) -> MachineSpec:
+        """Return the spec with the options that all clouds have."""
+        kept = {name: spec.options[name] for name in EVERYWHERE if name in spec.options}
+        kind = self._provider.cloud.options.TYPE
+        return dataclasses.replace(
+            spec, provider=self._provider.name, wanted=spec.options,
+            options={**kept, 'region': offer.region, kind: offer.type.name})
+
+
+def seller(provider: Provider) -> Seller:
+    """
+    Return what lists the types of a provider with prices.
+
+    :raises Unsupported: the provider has no price list.
+    """
+    if isinstance(provider, VmProvider):
+        return CloudSeller(provider)
+    if isinstance(provider, Seller):
+        return provider
+    raise Unsupported(f"provider '{provider.name}' has no price list")

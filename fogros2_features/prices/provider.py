@@ -9,11 +9,13 @@ from typing import ClassVar
 from fogros2 import plugin_system
 from fogros2.errors import ConfigurationError, MachineNotFound, Unsupported
 from fogros2.model import CreateRequest, Machine, MachineSpec
-from fogros2.provider import Provider
-from fogros2.provider.clouds import ALL, compare, GROUP
-from fogros2.provider.offers import Offer, Wants, wants
+from fogros2.provider import Capabilities, Provider
+from fogros2.provider.vm.provider import ALL
+from fogros2_features.prices.clouds import compare, GROUP
+from fogros2_features.prices.market import seller
+from fogros2_features.prices.offers import Wants, wants
 
-#: Options that are requirements; see :func:`fogros2.provider.offers.wants`.
+#: Options that are requirements; see :func:`fogros2_features.prices.offers.wants`.
 WANTS = ('arch', 'min_cpu', 'min_memory_gb', 'cpu_type', 'gpu', 'gpu_memory_gb', 'max_price',
          'spot', 'disk_size')
 #: Number of offers to try; the cheapest of each other cloud comes in addition.
@@ -28,6 +30,7 @@ class Cheapest(Provider):
     """
 
     name: ClassVar[str] = 'cheapest'
+    capabilities: ClassVar[Capabilities] = Capabilities(places=True)
 
     def check(self, spec: MachineSpec) -> None:
         """Check the requirements without a request."""
@@ -35,7 +38,7 @@ class Cheapest(Provider):
         for name in spec.options.get('providers') or ():
             plugin_system.load(GROUP, name)
 
-    def places(self, spec: MachineSpec) -> list[tuple[Offer, MachineSpec]]:
+    def places(self, spec: MachineSpec) -> list[tuple[str, MachineSpec]]:
         """
         Return the offers to try, the cheapest first, each with the spec of its machine.
 
@@ -50,9 +53,9 @@ class Cheapest(Provider):
         for number, offer in enumerate(offers):
             if number < TRIES or first[offer.provider] is offer:
                 provider: Provider = plugin_system.load(GROUP, offer.provider)()
-                place = provider.taking(spec, offer)
+                place = seller(provider).taking(spec, offer)
                 provider.check(place)
-                places.append((offer, place))
+                places.append((str(offer), place))
         return places
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
@@ -64,8 +67,12 @@ class Cheapest(Provider):
         raise MachineNotFound(machine_id)
 
     def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
-        """Find no machine."""
-        return ()
+        """
+        Refuse: the chosen clouds find the machines.
+
+        :raises Unsupported: always.
+        """
+        raise Unsupported(f"provider '{self.name}' has no machines of its own")
 
     def destroy(self, machine_id: str) -> None:
         """Do nothing, because no machine exists."""

@@ -14,11 +14,13 @@ from typing import Optional
 from fogros2 import plugin_system
 from fogros2.errors import Cancelled, ConfigurationError, DeadlineExceeded, FogError, ProviderError
 from fogros2.provider import Provider
-from fogros2.provider.offers import Offer, Offers, ranked, Wants
+from fogros2.provider.vm.options import NEAREST
+from fogros2.provider.vm.provider import ALL, VmProvider
 from fogros2.waiting import cancellable, wait_until
+from fogros2_features.prices.market import seller
+from fogros2_features.prices.offers import Offer, Offers, ranked, Seller, Wants
 
 GROUP = 'fogros2.provider'
-ALL, NEAREST = 'all', 'nearest'
 #: Seconds in which each cloud has to answer, for a few regions and for all.
 DEADLINE, DEADLINE_ALL = 30.0, 120.0
 
@@ -30,7 +32,7 @@ def clouds() -> tuple[list[str], list[str]]:
     for name in plugin_system.names(GROUP):
         with contextlib.suppress(FogError):  # a plugin that cannot be loaded has no prices
             kind: type[Provider] = plugin_system.load(GROUP, name)
-            if kind.capabilities.prices:
+            if issubclass(kind, (VmProvider, Seller)):
                 (here if kind.configured() else others).append(name)
     return here, others
 
@@ -120,7 +122,7 @@ def _ask(
             near = next((f'{region} takes {ms:.0f} ms' for region, ms in times.items() if ms),
                         'no region answers')
             raise ConfigurationError(f'{name} has no region within {limit:g} ms', near)
-    result = provider.offers(wanted, regions, refresh=refresh)
+    result = seller(provider).offers(wanted, regions, refresh=refresh)
     if measure and not times:
         times = _round_trips(provider, result.regions)
     return dataclasses.replace(result, offers=tuple(dataclasses.replace(
