@@ -2,5 +2,5 @@
 """
 Features of machines, each a module or package with one :class:`fogros2.feature.Feature`.
 
-``images`` and ``prices`` have verbs, ``prices`` and ``hosts`` a provider; ``replicas`` is an action.
+``images`` and ``prices`` have verbs, ``hosts`` and ``prices`` a provider, ``replicas`` an action.
 """

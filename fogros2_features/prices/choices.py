@@ -14,8 +14,6 @@ from typing import Any, Optional, TYPE_CHECKING
 from fogros2.describe import values
 from fogros2.describe.choices import Choice
 from fogros2.errors import ConfigurationError
-from fogros2.provider.vm.provider import ALL
-from fogros2_features.prices.clouds import compare
 from fogros2_features.prices.offers import wants
 from fogros2_features.prices.provider import WANTS
 
@@ -72,7 +70,10 @@ def find_cheapest(
                    {'offer': offer}))
 
 
+# What clouds share is loaded only when a request is made.
+
 def _type(region: str, wanted: Mapping[str, Any]) -> str:
+    from fogros2_features.prices.clouds import compare
     return compare(wants(**wanted), ('aws',), [region]).chosen.type.name
 
 
@@ -80,6 +81,8 @@ def _cheapest(
     regions: Optional[Sequence[str]], provider: str,
     max_round_trip_ms: Optional[float], wanted: Mapping[str, Any],
 ) -> str:
+    from fogros2.provider.vm.provider import ALL
+    from fogros2_features.prices.clouds import compare
     offer = compare(wants(**wanted), (provider,), regions or [ALL],
                     max_round_trip_ms=max_round_trip_ms).chosen
     return f'{offer.region} {offer.type.name}'

@@ -10,9 +10,6 @@ from fogros2 import plugin_system
 from fogros2.errors import ConfigurationError, MachineNotFound, Unsupported
 from fogros2.model import CreateRequest, Machine, MachineSpec
 from fogros2.provider import Capabilities, Provider
-from fogros2.provider.vm.provider import ALL
-from fogros2_features.prices.clouds import compare, GROUP
-from fogros2_features.prices.market import seller
 from fogros2_features.prices.offers import Wants, wants
 
 #: Options that are requirements; see :func:`fogros2_features.prices.offers.wants`.
@@ -36,7 +33,7 @@ class Cheapest(Provider):
         """Check the requirements without a request."""
         _wants(spec)
         for name in spec.options.get('providers') or ():
-            plugin_system.load(GROUP, name)
+            plugin_system.load('fogros2.provider', name)
 
     def places(self, spec: MachineSpec) -> list[tuple[str, MachineSpec]]:
         """
@@ -44,6 +41,10 @@ class Cheapest(Provider):
 
         :raises FogError: nothing fits, or no cloud answers.
         """
+        # what clouds share is loaded when they are asked
+        from fogros2.provider.vm.provider import ALL
+        from fogros2_features.prices.clouds import compare
+        from fogros2_features.prices.market import seller
         offers = compare(
             _wants(spec), spec.options.get('providers') or (),
             spec.options.get('regions') or [ALL], cancel=self.cancel,
@@ -52,7 +53,7 @@ class Cheapest(Provider):
         places = []
         for number, offer in enumerate(offers):
             if number < TRIES or first[offer.provider] is offer:
-                provider: Provider = plugin_system.load(GROUP, offer.provider)()
+                provider: Provider = plugin_system.load('fogros2.provider', offer.provider)()
                 place = seller(provider).taking(spec, offer)
                 provider.check(place)
                 places.append((str(offer), place))

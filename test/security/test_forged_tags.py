@@ -32,7 +32,7 @@ TAGS = {TAG_NAME: 'planner', TAG_USER: 'ubuntu', TAG_HOST_KEY: 'ssh-ed25519 AA',
 def machine_of(address: str = '203.0.113.1', **tags: str) -> Machine:
     """Return a machine of a cloud as the provider reports it."""
     cloud: Any = SimpleNamespace(end_command=lambda machine, tags: ())
-    provider: Any = SimpleNamespace(_cloud=cloud, _text='/'.join, name='cloud')
+    provider: Any = SimpleNamespace(cloud=cloud, _text='/'.join, name='cloud')
     return VmProvider.machine_of(provider, Vm(
         'i-1', 'region', MachineState.RUNNING, address=address, private_ip=address,
         tags={**TAGS, **tags}))
