@@ -64,12 +64,12 @@ def wait(baking: Image, *, timeout: float = TIMEOUT) -> Image:
     :raises ProviderError: the creation failed, or the image disappeared.
     :raises DeadlineExceeded: the image is not available after ``timeout`` seconds.
     """
-    provider = image_keeper(machines.load(baking.provider))
+    keeper = image_keeper(machines.load(baking.provider))
     seen = False
 
     def probe() -> Optional[Image]:
         nonlocal seen
-        image = next((one for one in provider.images() if one.id == baking.id), None)
+        image = next((one for one in keeper.images() if one.id == baking.id), None)
         if image is None:
             if seen:
                 raise ProviderError(f"the image '{baking.name}' was deleted while it was made")
@@ -116,9 +116,9 @@ def delete(image: Image) -> None:
 
     :raises FogError: the image still exists.
     """
-    provider = image_keeper(machines.load(image.provider))
-    provider.delete_image(image.id)
-    if any(one.id == image.id for one in provider.images()):
+    keeper = image_keeper(machines.load(image.provider))
+    keeper.delete_image(image.id)
+    if any(one.id == image.id for one in keeper.images()):
         raise ProviderError(f'the image {image.id} is still there', 'try again')
 
 
