@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 import datetime
 from decimal import Decimal
+import itertools
 import logging
 import os
 from pathlib import Path
@@ -79,20 +80,29 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                                  'integration' not in item.path.parts))
 
 
+@pytest.fixture(scope='session')
+def own_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Yield one new folder after the other; pytest takes longer for each, as it counts them."""
+    top = tmp_path_factory.mktemp('own', numbered=False)
+    return (top / str(number) for number in itertools.count())
+
+
 @pytest.fixture(autouse=True)
 def state_home(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory,
-    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest, own_folders: Iterator[Path], monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Path]:
     """Give each test a state folder of its own, so that none sees the user's machines."""
     if 'integration' not in request.path.parts:
         # gc deletes the interfaces of dead launches
         monkeypatch.setattr('fogros2.vpn.owner.INTERFACES', Path('/nonexistent'))
-    path = tmp_path_factory.mktemp('state')
+    folder = next(own_folders)
+    path, config = folder / 'state', folder / 'config'
+    for made in (folder, path, config):
+        made.mkdir(0o700)
     monkeypatch.setenv('FOGROS2_STATE_HOME', str(path))
-    monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path_factory.mktemp('config')))
+    monkeypatch.setenv('XDG_CONFIG_HOME', str(config))
     yield path
-    shutil.rmtree(path, ignore_errors=True)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope='session')

@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 from pathlib import Path
 import subprocess
 import sys
+from unittest import mock
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Help texts are as wide as the page.
 COLUMNS = '88'
-#: As ``ros2``: argparse begins a usage with the program's name.
-_ROS2 = "import sys; sys.argv[0] = 'ros2'; from ros2cli.cli import main; sys.exit(main())"
 _PAGE = """\
 # Command line
 
@@ -22,9 +23,12 @@ The output of `ros2 fog -h` and of `-h` of each verb.
 
 def help_of(*words: str) -> str:
     """Return what a command says of itself."""
-    return subprocess.run(
-        [sys.executable, '-c', _ROS2, *words, '-h'], check=True, capture_output=True, text=True,
-        env={**os.environ, 'COLUMNS': COLUMNS}).stdout.replace('\t', '    ')
+    from ros2cli.cli import main
+    # argparse begins a usage with the program's name
+    with mock.patch.dict(os.environ, COLUMNS=COLUMNS), mock.patch.object(sys, 'argv', ['ros2']), \
+            contextlib.redirect_stdout(io.StringIO()) as said, contextlib.suppress(SystemExit):
+        main(argv=[*words, '-h'])
+    return said.getvalue().replace('\t', '    ')
 
 
 def command_line(verbs: list[str]) -> str:
