@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What can't work, through ``ros2 launch``.
+What can't work: the error says what is wrong and what to do, and nothing is left.
 
-Each time there is one line of error that says what is wrong and what to do, an exit status other
-than zero, and nothing is left.
+Through ``ros2 launch`` where it looks at this computer, and by its deployment otherwise.
 """
 
 from __future__ import annotations
@@ -13,12 +12,14 @@ import os
 import shutil
 import subprocess
 import tempfile
-import time
 import uuid
 
 import pytest
 
-from fogros2 import process
+from fogros2 import plan, process
+from fogros2.deploy import Launch
+from fogros2.errors import FogError
+from fogros2.model import MachineSpec
 from fogros2.provider.container import root as container_root
 from fogros2.store import Store
 from rigs.bare_computer import bare_computer
@@ -34,15 +35,12 @@ pytestmark = [
 NAME = f'bad-{uuid.uuid4().hex[:6]}'
 
 LAUNCH = """\
-from fogros2 import plan
-from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription, SSHInstance
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 
 
 def generate_launch_description():
-    machine = {machine}
     return FogROSLaunchDescription([
-        CloudNode(machine=machine, package={package!r}, executable={executable!r}),
-    ])
+        CloudNode(machine={machine}, package='fogros2_examples', executable='talker')])
 """
 
 
@@ -65,9 +63,9 @@ def computer(cloud_network, tmp_path_factory):
 @pytest.fixture
 def write(tmp_path):
     """Return what writes a launch file of one node on one machine."""
-    def make(machine, package='fogros2_examples', executable='talker'):
+    def make(machine):
         path = tmp_path / 'bad.launch.py'
-        path.write_text(LAUNCH.format(machine=machine, package=package, executable=executable))
+        path.write_text(LAUNCH.format(machine=machine))
         return path
     return make
 
@@ -75,15 +73,24 @@ def write(tmp_path):
 @pytest.fixture
 def refused(write):
     """Return what launches such a file, which has to fail well, and what it said."""
-    def launch(machine, *, environment=None, within=50.0, wrap=(), **node):
-        begin = time.monotonic()
+    def launch(machine, *, wrap=()):
         done = subprocess.run(
-            [*wrap, 'ros2', 'launch', str(write(machine, **node))], text=True, timeout=170,
-            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            env={**os.environ, **(environment or {})})
-        assert time.monotonic() - begin < within, done.stdout
+            [*wrap, 'ros2', 'launch', str(write(machine))], text=True, timeout=170,
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
         return one_error(done.returncode, done.stdout)
     return launch
+
+
+def fails(provider, **options):
+    """Bring a machine up, which has to fail; return the error, and the steps that began."""
+    steps = []
+    launch = Launch(report=lambda event: steps.append(event.step))
+    try:
+        with pytest.raises(FogError) as caught:
+            launch.up(MachineSpec(NAME, provider, options))
+    finally:
+        assert launch.down() == []
+    return str(caught.value), steps
 
 
 def one_error(returncode, text):
@@ -95,17 +102,14 @@ def one_error(returncode, text):
     return errors[0], text
 
 
-def container(network, **more):
-    words = {'name': NAME, 'network': network, **more}
-    return f"ContainerInstance({', '.join(f'{k}={v!r}' for k, v in words.items())})"
+def container(network):
+    return f'ContainerInstance(name={NAME!r}, network={network!r})'
 
 
 def ssh(computer, **more):
-    words = {'user': computer.user, 'key': str(computer.key), 'host_key': computer.host_key,
-             'name': NAME, **more}
-    words = {k: v for k, v in words.items() if v is not None}
-    host = words.pop('host', computer.address)
-    return f"SSHInstance({host!r}, {', '.join(f'{k}={v!r}' for k, v in words.items())})"
+    return fails('ssh', **{
+        'host': computer.address, 'user': computer.user, 'key': str(computer.key),
+        'host_key': computer.host_key, **more})
 
 
 def nothing_was_made(text):
@@ -164,25 +168,24 @@ def test_missing_root_is_reported(write, cloud_network):
 
 # -- computers that exist already ---------------------------------------------------------------
 
-def test_unreachable_host_is_reported(refused, computer, nobody):
-    error, text = refused(ssh(computer, host=nobody))
+def test_unreachable_host_is_reported(computer, nobody):
+    error, _ = ssh(computer, host=nobody)
     assert f'{nobody} port 22 does not answer' in error and 'is it on' in error
 
 
-def test_unknown_host_key_is_refused(refused, computer):
-    error, text = refused(ssh(computer, host_key=None))
+def test_unknown_host_key_is_refused(computer):
+    error, steps = ssh(computer, host_key=None)
     assert f"the host key of '{NAME}' ({computer.address}) is unknown" in error
     assert f'known_hosts: {computer.address} {computer.host_key}' in error
-    assert f'{NAME}: watchdog' not in text
+    assert 'watchdog' not in steps
 
 
 @pytest.mark.skipif(process.which('sshd') is None, reason='needs sshd (openssh-server)')
-def test_robot_is_refused_as_its_own_machine(refused, root_at_login, tmp_path):
+def test_robot_is_refused_as_its_own_machine(root_at_login, tmp_path):
     """Its two ends of the VPN would be in one network, where nothing goes through a VPN."""
     with private_sshd(tmp_path / 'sshd') as server:
-        error, text = refused(
-            f"SSHInstance('localhost', {server.endpoint.user!r}, {server.port}, "
-            f'{server.endpoint.key_file!r}, {server.host_key!r}, name={NAME!r})')
+        error, _ = fails('ssh', host='localhost', user=server.endpoint.user, port=server.port,
+                         key=server.endpoint.key_file, host_key=server.host_key)
     assert f"'{NAME}' is this robot itself" in error
     assert f'--machine {NAME}=robot' in error
 
@@ -200,27 +203,24 @@ def occupied(computer, port):
         computer.run('kill $(cat /tmp/pid)')
 
 
-def test_busy_heartbeat_port_is_reported(refused, computer):
+def test_busy_ports_of_a_host_are_reported(computer, monkeypatch):
     with occupied(computer, 7399):
-        error, _ = refused(ssh(computer))
+        error, _ = ssh(computer)
     assert 'UDP port 7399' in error and 'in use already' in error and 'ss -lunp' in error
-
-
-def test_busy_vpn_port_is_reported(refused, computer):
+    monkeypatch.setattr(plan, 'machine_port', lambda launch_id: 51999)
     with occupied(computer, 51999):
-        error, _ = refused(
-            f'{ssh(computer)}\n    plan.machine_port = lambda launch_id: 51999')
+        error, _ = ssh(computer)
     assert 'UDP port 51999' in error and 'in use already' in error and 'launch again' in error
 
 
 # -- what is there already ----------------------------------------------------------------------
 
-def test_damaged_record_is_reported(refused, cloud_network):
+def test_damaged_record_is_reported(cloud_network):
     folder = Store().machine(NAME)
     folder.mkdir(parents=True)
     (folder / 'record.json').write_text('{"name": ')
     try:
-        error, text = refused(container(cloud_network))
+        error, _ = fails('container', network=cloud_network)
         assert f'{folder}/record.json is damaged' in error
         assert f'ros2 fog delete {NAME}' in error
         deleted = subprocess.run(['ros2', 'fog', 'delete', NAME, '--yes'], capture_output=True,
@@ -243,9 +243,9 @@ def test_name_of_another_launch_is_refused(refused, cloud_network, write):
         assert first.ended() == 0, first.text
 
 
-def test_name_of_a_foreign_container_is_refused(refused, cloud_network, tmp_path):
+def test_name_of_a_foreign_container_is_refused(cloud_network, tmp_path):
     """Somebody else's container is in the way: neither taken over nor removed."""
     with bare_computer(f'fogros2-{NAME}', tmp_path / 'computer', cloud_network) as stranger:
-        error, _ = refused(container(cloud_network))
+        error, _ = fails('container', network=cloud_network)
         assert f"'{NAME}'" in error and 'already' in error
         stranger.run('true')

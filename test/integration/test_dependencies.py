@@ -22,12 +22,14 @@ import pytest
 
 from fogros2.deploy import Launch
 from fogros2.host.installer import apt_install
+from fogros2.host.workspace import find_workspaces, underlays
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
 from fogros2.provider.container import debian_root
 from fogros2.report import StepDone
 from fogros2.waiting import wait_until
 from rigs.cluster.images import RootShell
+from rigs.colcon_workspace import colcon_workspace
 from rigs.rosdep import rosdep_source
 
 pytestmark = [
@@ -42,9 +44,14 @@ APT = 'Dir::Etc::sourcelist "/fogt/sources.list";\nDir::Etc::sourceparts "-";\n'
 #: rosdep, and what it imports.
 ROSDEP = ('rosdep2', 'rospkg', 'rosdistro', 'catkin_pkg', 'yaml', 'pyparsing', 'dateutil', 'six',
           'distro', 'packaging', 'docutils')
-#: What the node says of the packages, and of a variable that it needs besides.
-NODE = ('import fogt_one, os, shutil; '
-        'print(fogt_one.name, shutil.which("fogt-hello"), os.environ["PYTHONPATH"], flush=True)')
+#: What the node says: names of all that was asked for, declared and below, and a variable.
+NODE = """
+from fogt_base.text import below
+from fogt_top.text import name
+import fogt_one, fogt_two, os, shutil
+print(name, below, fogt_one.name, fogt_two.name, shutil.which('fogt-hello'),
+      shutil.which('fogt-asked'), os.environ['PYTHONPATH'], flush=True)
+"""
 
 
 def debian_package(folder: Path, name: str, program: str, modules: Sequence[Path] = ()) -> str:
@@ -86,92 +93,86 @@ def packages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
                for spec in map(importlib.util.find_spec, ROSDEP) if spec and spec.origin]
     (folder / 'Packages').write_text(
         debian_package(folder, 'fogt-hello', '#!/bin/sh\n')
+        + debian_package(folder, 'fogt-asked', '#!/bin/sh\n')
         + debian_package(folder, 'python3-rosdep2', '#!/usr/bin/python3\nimport rosdep2.main\n'
                                                     'rosdep2.main.rosdep_main()\n', modules))
     (folder / 'sources.list').write_text('deb [trusted=yes] file:/fogt ./\n')
     (folder / 'apt.conf').write_text(APT)
-    with zipfile.ZipFile(folder / 'fogt_one-1-py3-none-any.whl', 'w') as archive:
-        archive.writestr('fogt_one.py', 'name = "from-pip"')
-        archive.writestr('fogt_one-1.dist-info/METADATA',
-                         'Metadata-Version: 2.1\nName: fogt-one\nVersion: 1\n')
-        archive.writestr('fogt_one-1.dist-info/WHEEL', 'Wheel-Version: 1.0\n'
-                         'Root-Is-Purelib: true\nTag: py3-none-any\n')
-        archive.writestr('fogt_one-1.dist-info/RECORD', '')
+    for name in ('fogt_one', 'fogt_two'):
+        with zipfile.ZipFile(folder / f'{name}-1-py3-none-any.whl', 'w') as archive:
+            archive.writestr(f'{name}.py', f"name = '{name}'")
+            archive.writestr(f'{name}-1.dist-info/METADATA',
+                             f'Metadata-Version: 2.1\nName: {name}\nVersion: 1\n')
+            archive.writestr(f'{name}-1.dist-info/WHEEL', 'Wheel-Version: 1.0\n'
+                             'Root-Is-Purelib: true\nTag: py3-none-any\n')
+            archive.writestr(f'{name}-1.dist-info/RECORD', '')
     yield folder
 
 
 @pytest.fixture
-def spec(cloud_network: str, packages: Path) -> MachineSpec:
+def workspaces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Source two built workspaces, the second of which declares what this computer hasn't."""
+    for name, programs, module in (
+            ('base', {}, "below = 'below'"), ('top', {'node': NODE}, "name = 'top'")):
+        for variable, value in colcon_workspace(
+                tmp_path / name, f'fogt_{name}', programs=programs, module=module).items():
+            monkeypatch.setenv(variable, value)
+    manifest = tmp_path / 'top/install/fogt_top/share/fogt_top/package.xml'
+    manifest.write_text(manifest.read_text().replace('<export>', ''.join(
+        f'<exec_depend>{name}</exec_depend>'
+        for name in ('fogt_apt', 'fogt_pip', 'fogt_unknown', 'std_msgs')) + '<export>'))
+    chain = find_workspaces(os.environ)
+    assert chain == [str(tmp_path / 'top'), str(tmp_path / 'base')]
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f"{os.environ['AMENT_PREFIX_PATH']}:/srv/acme")
+    return chain
+
+
+@pytest.fixture
+def spec(cloud_network: str, packages: Path, workspaces: list[str]) -> MachineSpec:
+    variables = rosdep_source(
+        packages, {'fogt_apt': '[fogt-hello]', 'fogt_pip': '{pip: {packages: [fogt-one]}}'},
+        '/fogt')
     return MachineSpec(
         f'needs-{uuid.uuid4().hex[:6]}', 'container', {
             'network': cloud_network, 'isolated': True,
             'mounts': [f'{packages}:/fogt', f'{packages}/apt.conf:/etc/apt/apt.conf.d/99fogt']},
-        environment={'PIP_NO_INDEX': '1', 'PIP_FIND_LINKS': '/fogt', 'PYTHONPATH': '/mine'},
-        apt=('fogt-hello',), pip=('fogt-one',))
+        workspace=workspaces[0], underlays=underlays(workspaces[0], workspaces), on_exit='keep',
+        environment={'PIP_NO_INDEX': '1', 'PIP_FIND_LINKS': '/fogt', 'PYTHONPATH': '/mine',
+                     **variables},
+        apt=('fogt-asked',), pip=('fogt-two',))
 
 
 def said(machine) -> str:
     """Run the node; return what it printed."""
     heard = []
     machine.subscribe(heard.append)
-    node = NodeSpec(f'n-{time.monotonic_ns()}', 'node', arguments=('python3', '-c', NODE))
+    node = NodeSpec(f'n-{time.monotonic_ns()}', 'node', package='fogt_top', executable='node')
     machine.start([node])
     wait_until(lambda: any(e['event'] == 'exited' and e['node'] == node.id for e in heard),
                timeout=60, what='the node to end')
     return ' '.join(e['text'] for e in heard if e['event'] == 'output' and e['node'] == node.id)
 
 
-def test_node_finds_what_its_machine_was_asked_for(spec):
-    events = []
-    launch = Launch(report=events.append)
-    try:
-        name, program, path = said(launch.up(spec)).split()
-        assert name == 'from-pip' and program == '/usr/bin/fogt-hello'
-        # the user's folder comes first, and takes nothing away
-        assert path.startswith('/mine:') and path.endswith('/last')
-    finally:
-        assert launch.down() == []
-    (detail,) = [e.detail for e in events if isinstance(e, StepDone) and e.step == 'ROS 2']
-    assert 'installed fogt-hello' in detail and 'installed fogt-one by pip' in detail
-
-
-@pytest.fixture
-def workspace(tmp_path: Path) -> Path:
-    """Return a built workspace whose package runs with what this computer doesn't have."""
-    prefix = tmp_path / 'ws' / 'install' / 'needy'
-    for path, text in (
-            ('share/ament_index/resource_index/packages/needy', ''),
-            ('share/needy/package.xml',
-             '<package><name>needy</name><exec_depend>fogt_apt</exec_depend>'
-             '<exec_depend>fogt_pip</exec_depend><exec_depend>fogt_unknown</exec_depend>'
-             '<exec_depend>std_msgs</exec_depend></package>')):
-        (prefix / path).parent.mkdir(parents=True, exist_ok=True)
-        (prefix / path).write_text(text)
-    (tmp_path / 'ws/install/.colcon_install_layout').write_text('isolated')
-    return tmp_path / 'ws'
-
-
-def test_what_the_workspace_runs_with_is_installed_once(spec, packages, workspace):
-    lists = packages / uuid.uuid4().hex[:6]
-    lists.mkdir()
-    variables = rosdep_source(
-        lists, {'fogt_apt': '[fogt-hello]', 'fogt_pip': '{pip: {packages: [fogt-one]}}'},
-        f'/fogt/{lists.name}')
-    spec = dataclasses.replace(
-        spec, apt=(), pip=(), workspace=str(workspace), on_exit='keep',
-        environment={**spec.environment, **variables})
-    details = []
+def test_node_finds_what_it_needs_and_kept_machines_have_it(spec):
+    """Asked for by the launch file, declared by the workspace, and in the workspace below."""
+    details = {'ROS 2': [], 'workspace': []}
     for last in (False, True):
-        launch = Launch(report=lambda event: details.append(event.detail) if (
-            isinstance(event, StepDone) and event.step == 'ROS 2') else None)
+        launch = Launch(report=lambda event: details[event.step].append(event.detail) if (
+            isinstance(event, StepDone) and event.step in details) else None)
         try:
             machine = launch.up(dataclasses.replace(spec, on_exit='delete') if last else spec)
-            assert said(machine).split()[:2] == ['from-pip', '/usr/bin/fogt-hello']
+            *found, path = said(machine).split()
+            assert found == ['top', 'below', 'fogt_one', 'fogt_two', '/usr/bin/fogt-hello',
+                             '/usr/bin/fogt-asked']
+            # the user's folder comes first, and takes nothing away
+            assert path.startswith('/mine:') and path.endswith('/last')
         finally:
             assert launch.down() == []
-    assert 'installed fogt-hello' in details[0] and 'installed fogt-one by pip' in details[0]
-    assert 'the machine may lack fogt_unknown' in details[0]
-    assert details[1] == 'there already'
+    first, again = details['ROS 2']
+    assert 'installed fogt-asked, fogt-hello, installed fogt-two, fogt-one by pip' in first
+    assert 'the machine may lack fogt_unknown' in first
+    assert again == 'there already'
+    assert '/srv/acme stays here' in details['workspace'][0]
 
 
 def test_apt_installs_after_a_dpkg_that_was_killed(packages, tmp_path):

@@ -157,13 +157,3 @@ def test_new_machine_replaces_a_killed_one(launched, engine):
     assert len(run.since(begin, 'process started')) == 2, run.text
     run.interrupt()
     assert run.ended() == 0, run.text
-
-
-def test_launch_ends_with_a_lost_machine(launched, engine):
-    name = f'gone-{RUN}'
-    run = launched(name, 'shutdown')
-    run.wait_for('I heard')
-    remove(engine, name, 'rm', '-f', '-t', '0')
-    assert run.ended() == 1, run.text
-    assert len(run.errors) == 1 and f"the machine '{name}' is gone" in run.errors[0], run.text
-    assert f'noticed: {name} lost True' in run.text and 'Traceback' not in run.text

@@ -725,7 +725,7 @@ def cut(request, launch, provider, monkeypatch):
 
 def test_silence_is_reported_and_its_end(cut, provider):
     link, reported, events = cut
-    link.cut_at = time.monotonic()
+    link.cut_at = time.monotonic() - 4.0  # some seconds ago
     wait_until(lambda: bool(reported), timeout=60, what='a report')
     link.cut_at = None
     wait_until(lambda: len(reported) > 1, timeout=60, what='the end')
@@ -770,7 +770,7 @@ def test_machine_without_any_word_is_lost(cut, provider, monkeypatch):
     provider.failures.update(describe=ProviderError('no network'))
     monkeypatch.setattr(watching, 'POLL_INTERVAL', 60.0)
     monkeypatch.setattr(watching, 'LOSS', 5.5)
-    link.cut_at = time.monotonic()
+    link.cut_at = time.monotonic() - 4.0  # some seconds ago
     wait_until(lambda: link.closed, timeout=60, what='the verdict')
     assert [event['event'] for event in events] == ['lost']
     assert 'it is lost: no answer for ' in events[0]['reason'] and link.asked == ['stop']
@@ -863,7 +863,7 @@ def test_machine_that_its_provider_knows_is_not_lost(cut, provider, monkeypatch)
     link, _, events = cut
     monkeypatch.setattr(watching, 'LOSS', 5.5)
     monkeypatch.setattr(watching, 'POLL_INTERVAL', 0.2)
-    link.cut_at = time.monotonic()
+    link.cut_at = time.monotonic() - 4.0  # some seconds ago
     wait_until(lambda: provider.calls.count('describe') > 5 and link.age > 6.5, timeout=60,
                what='answers of the provider')
     assert events == []
