@@ -9,6 +9,7 @@ comes from a process of its own. So another run of tests, or the user's own robo
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 import contextlib
 import dataclasses
@@ -71,6 +72,8 @@ class Traces:
         self._run = run
         self._state = state
         self._folders = {state}
+        #: How often each process was looked at; reading the variables of all takes long.
+        self._looks = Counter[str]()
         #: The marks of this run's launches and machines.
         self.marks: set[str] = set()
         self._before = {trace.what for trace in self._look()}
@@ -81,8 +84,11 @@ class Traces:
             self.marks |= _known(folder)
 
     def find_folders(self) -> None:
-        """Look for more state folders, which processes of this run have."""
+        """Look for more state folders, which new processes of this run have."""
         for process in _processes():
+            self._looks[process.name] += 1
+            if self._looks[process.name] > 2:  # once it may be about to run its program
+                continue
             variables = _variables(process)
             if variables.get(RUN) == self._run and 'FOGROS2_STATE_HOME' in variables:
                 self._folders.add(Path(variables['FOGROS2_STATE_HOME']))
