@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 import datetime
 from decimal import Decimal
+import gc
 import itertools
 import logging
 import os
@@ -46,6 +47,15 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption('junitprefix', None) == 'fogros2' \
             and config.args_source is pytest.Config.ArgsSource.TESTPATHS:
         config.args[:] = [str(config.rootpath / name) for name in QUICK]
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Look for no garbage among modules and tests, which stay: that takes a fifth of the time."""
+    gc.disable()
+    yield
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

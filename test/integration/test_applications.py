@@ -24,10 +24,7 @@ from rigs.launched import launching
 
 ROOT = Path(__file__).parents[2]
 
-pytestmark = [
-    pytest.mark.usefixtures('nothing_left'),
-    pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH'),
-]
+pytestmark = pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH')
 
 
 @pytest.fixture(autouse=True)
@@ -37,7 +34,7 @@ def surroundings(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def launch():
+def launch(nothing_left):
     with launching() as start:
         yield start
 

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+import contextlib
+import io
 import json
 import os
 from pathlib import Path
@@ -13,57 +15,44 @@ import subprocess
 import sys
 
 import pytest
+from ros2cli.cli import main
 
 from fogros2.store import Store
 from fogros2.waiting import wait_until
-
-ROS2 = [sys.executable, '-c', 'import sys; from ros2cli.cli import main; sys.exit(main())']
-#: A background job of a non-interactive shell ignores SIGINT, and so would its children.
-WITH_SIGINT = [
-    # a group of its own, not a session: sudo's ticket is for the terminal's
-    sys.executable, '-c', 'import os, signal, sys\n'
-    'os.setpgrp()\n'
-    'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
-    'os.execvp(sys.argv[1], sys.argv[1:])']
+from rigs.launched import Launched, launching, ros2, WITH_SIGINT
 
 
 def fog(*words: str, check: bool = True) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run([*ROS2, 'fog', *words], capture_output=True, text=True, timeout=90,
-                          stdin=subprocess.DEVNULL)
+    """Run a verb in this process, which has loaded it all; return what a shell would see."""
+    with contextlib.redirect_stdout(io.StringIO()) as out, \
+            contextlib.redirect_stderr(io.StringIO()) as errors:
+        status = main(argv=['fog', *words])
+        if isinstance(status, str):  # as sys.exit takes it
+            print(status, file=sys.stderr)
+    done = subprocess.CompletedProcess(
+        words, int(bool(status)), out.getvalue(), errors.getvalue())
     assert not check or done.returncode == 0, done.stdout + done.stderr
     return done
 
 
 @pytest.fixture
 def launched(
-    nothing_left: None, engine: str, children: list[subprocess.Popen[bytes]], tmp_path: Path,
-) -> Iterator[tuple[str, subprocess.Popen[bytes], Callable[[], str]]]:
-    """Launch the example; yield the machine's name, the launch, and what it has printed."""
+    nothing_left: None, engine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[tuple[str, Launched]]:
+    """Launch the example; yield the machine's name and the launch."""
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'ros'))
     name = f'cli-{secrets.token_hex(2)}'
-    log = tmp_path / 'launch.log'
-    with log.open('wb') as output:
-        child = subprocess.Popen(
-            [*WITH_SIGINT, *ROS2, 'launch', 'fogros2_examples', 'talker.container.launch.py',
-             f'name:={name}'], stdout=output, stderr=subprocess.STDOUT, cwd=tmp_path,
-            env={**os.environ, 'ROS_LOG_DIR': str(tmp_path / 'ros'), 'PYTHONUNBUFFERED': '1'})
-    children.append(child)
-    said = log.read_text
-    try:
-        wait_until(lambda: 'I heard' in said() or child.poll() is not None, timeout=60.0,
-                   what='the first message')
-        assert 'I heard' in said(), said()
-        yield name, child, said
-    finally:
-        if child.poll() is None:
-            child.send_signal(signal.SIGINT)
-            child.wait(60)
+    with launching() as start:
+        launch = start('fogros2_examples', 'talker.container.launch.py', f'name:={name}')
+        launch.wait_for('I heard')
+        yield name, launch
 
 
 def logs_follow(name: str, children: list[subprocess.Popen[bytes]], folder: Path) -> None:
     """Check that ``logs -f`` ends with Ctrl-C, and with its reader."""
     log = folder / 'follow.log'
     with log.open('wb') as output:
-        follower = subprocess.Popen([*WITH_SIGINT, *ROS2, 'fog', 'logs', name, '-f'],
+        follower = subprocess.Popen([*WITH_SIGINT, 'ros2', 'fog', 'logs', name, '-f'],
                                     stdout=output, stderr=subprocess.STDOUT)
     children.append(follower)
     wait_until(lambda: log.read_text().count('Publishing') >= 3, timeout=60.0, what='three lines')
@@ -71,9 +60,8 @@ def logs_follow(name: str, children: list[subprocess.Popen[bytes]], folder: Path
     follower.send_signal(signal.SIGINT)
     assert follower.wait(60) in (0, signal.SIGINT, -signal.SIGINT)
     # a reader that has seen enough ends it as well, without a traceback
-    fog_words = ' '.join(f"'{word}'" for word in [*ROS2, 'fog', 'logs', name, '-f'])
-    enough = subprocess.run(['sh', '-c', f'{fog_words} 2>&1 | head -n 2'], capture_output=True,
-                            text=True, timeout=60)
+    enough = subprocess.run(['sh', '-c', f'ros2 fog logs {name} -f 2>&1 | head -n 2'],
+                            capture_output=True, text=True, timeout=60)
     assert len(enough.stdout.splitlines()) == 2 and enough.stderr == ''
 
 
@@ -89,10 +77,9 @@ def another_terminal_joins(name: str) -> None:
 
 
 def test_verbs_work_beside_a_running_launch(
-    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]],
-    children: list[subprocess.Popen[bytes]], tmp_path: Path,
+    launched: tuple[str, Launched], children: list[subprocess.Popen[bytes]], tmp_path: Path,
 ) -> None:
-    name, child, said = launched
+    name, launch = launched
     (entry,) = [e for e in json.loads(fog('list', '--json').stdout)['machines']
                 if e['name'] == name]
     assert entry['state'] == 'running' and entry['launch_alive'] and entry['address']
@@ -128,29 +115,28 @@ def test_verbs_work_beside_a_running_launch(
     assert subprocess.run(['ssh', '-F', config, '-o', 'BatchMode=yes', name, 'hostname'],
                           capture_output=True, text=True, timeout=30).stdout.strip() == name
 
-    assert fog('connect', name, '--', 'hostname').stdout.strip() == name
-    assert fog('connect', name, '--', 'sh', '-c', 'exit 7', check=False).returncode == 7
-    assert fog('connect', name, '--user', 'root', '--', 'true', check=False).returncode != 0
+    # which becomes ssh
+    assert ros2('fog', 'connect', name, '--', 'hostname').stdout.strip() == name
+    assert ros2('fog', 'connect', name, '--', 'sh', '-c', 'exit 7').returncode == 7
+    assert ros2('fog', 'connect', name, '--user', 'root', '--', 'true').returncode != 0
 
     refused = fog('delete', name, '--yes', check=False)
     assert refused.returncode == 1 and '--force' in refused.stderr
     assert fog('gc', '--dry-run', '--json').returncode == 0
-    assert child.poll() is None
+    assert launch.child.poll() is None
 
-    child.send_signal(signal.SIGINT)
+    launch.interrupt()
     assert fog('wait', name, '--gone', '--timeout', '60').returncode == 0
-    assert child.wait(60) == 0, said()
+    assert launch.ended() == 0, launch.text
     assert name not in fog('list').stdout
 
 
 def test_verbs_clean_up_after_a_killed_launch(
-    launched: tuple[str, subprocess.Popen[bytes], Callable[[], str]], tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    launched: tuple[str, Launched], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The provider's tags are enough to end the machine; gc clears the robot's side."""
-    name, child, _ = launched
-    os.killpg(child.pid, signal.SIGKILL)
-    child.wait(60)
+    name, launch = launched
+    launch.kill()
     (entry,) = [e for e in json.loads(fog('list', '--json').stdout)['machines']
                 if e['name'] == name]
     assert entry['launch_alive'] is False and 'launch gone' in entry['state']

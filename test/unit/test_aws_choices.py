@@ -32,6 +32,8 @@ from fogros2_features.prices.market import CloudSeller, Market, seller
 from fogros2_features.prices.offers import Wants, wants
 from rigs.ec2 import iam
 
+pytestmark = pytest.mark.usefixtures('boto_models')
+
 REGION = 'eu-central-1'
 NOW = 1_800_000_000.0
 
