@@ -290,13 +290,6 @@ def test_starting_nodes_can_be_interrupted(tmp_path):
         assert (done.returncode, done.stdout, done.stderr) == (0, '', ''), path
 
 
-def test_impossible_request_creates_no_machine(launch, engine):
-    run = launch('fogros2_examples', 'planning.launch.py', 'time:=soon')
-    assert run.ended() == 1, run.text
-    assert "could not convert string to float: 'soon'" in run.text
-    assert 'planner: machine' not in run.text
-
-
 def test_wait_for_a_plan_lasts_for_its_time_out():
     """Not for as long as the planner may take to come up."""
     from nav_msgs.srv import GetPlan

@@ -24,6 +24,7 @@ from launch.events import matches_action
 from launch.events.process import ShutdownProcess, SignalProcess
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 import pytest
 
 from fogros2 import CloudGroup, CloudNode, ContainerInstance, FogROSLaunchDescription
@@ -156,6 +157,14 @@ def test_unknown_machine_name_is_refused(run, fake, planner, capfd):
     assert run(LaunchDescription([talker(planner), talker('planer')])) == 1
     assert "this launch has no machine named 'planer' (did you mean 'planner'?)" in (
         capfd.readouterr().out)
+    assert not fake.noted('up')
+
+
+def test_value_of_another_type_creates_no_machine(run, fake, planner, capfd):
+    rate = ParameterValue(LaunchConfiguration('rate'), value_type=float)
+    node = talker(planner, parameters=[{'rate': rate}])
+    assert run(LaunchDescription([SetLaunchConfiguration('rate', 'soon'), node])) == 1
+    assert "could not convert string to float: 'soon'" in capfd.readouterr().out
     assert not fake.noted('up')
 
 
