@@ -47,36 +47,6 @@ def clean(launch):
     return launch.errors == [] and 'WARNING' not in launch.text and 'Traceback' not in launch.text
 
 
-def test_machine_on_a_node_in_a_group_and_an_include(launch, engine, tmp_path):
-    name = f'node-{RUN}'
-    (tmp_path / 'inner.launch.xml').write_text("""<launch>
-      <node machine="$(var name)" pkg="fogros2_examples" exec="listener" name="inner">
-        <param name="count" value="2"/>
-      </node>
-    </launch>""")
-    (tmp_path / 'outer.launch.xml').write_text("""<launch>
-      <arg name="name"/>
-      <fogros_launch>
-        <fog_machine name="$(var name)" provider="container" ros_workspace=""/>
-        <group>
-          <push_ros_namespace namespace="far"/>
-          <node machine="$(var name)" pkg="fogros2_examples" exec="talker"/>
-          <include file="$(dirname)/inner.launch.xml"/>
-          <node pkg="fogros2_examples" exec="listener" name="outer" on_exit="shutdown">
-            <param name="count" value="6"/>
-          </node>
-        </group>
-      </fogros_launch>
-    </launch>""")
-    run = launch(str(tmp_path / 'outer.launch.xml'), f'name:={name}')
-    assert run.ended() == 0, run.text
-    said = f'I heard: [Hello World from {name} '
-    assert len([line for line in run.said
-                if line.startswith(f'[{name}.listener-') and said in line]) == 2, run.text
-    assert run.text.count(f'[far.outer]: {said}') == 6, run.text
-    assert clean(run), run.text
-
-
 def test_three_hosts_exchange_messages(launch, cloud_network):
     run = launch('fogros2_examples', 'two_clouds.launch.xml', f'name:=speaker-{RUN}',
                  f'second_name:=hearer-{RUN}', f'network:={cloud_network}')
