@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-apt and pip packages on a container machine, from a repository and a folder of this test.
+apt and pip packages, and workspaces over another, on a container machine.
+
+The packages are from a repository and a folder of this test.
 
 The machine has a root of its own, so that nothing that is installed here is there.
 """
