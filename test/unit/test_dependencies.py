@@ -128,67 +128,73 @@ def installed(
     return needs.folder, completed(fill(needs, names))
 
 
-@RUNS_PIP
-def test_pip_chooses_what_fits_the_machines_packages(tmp_path: Path) -> None:
-    """Debian 12's NumPy 1.24 met a SciPy that was made for NumPy 2."""
-    system = tmp_path / 'system'
-    system.mkdir()
-    (system / 'fogt_base.py').write_text('version = 1')
-    info = system / 'fogt_base-1.dist-info'
-    info.mkdir()
+@pytest.fixture(scope='module')
+def accepted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Install packages that are in order; return the home with the wheels, and their folder."""
+    home = tmp_path_factory.mktemp('home')
+    info = home / 'system/fogt_base-1.dist-info'
+    info.mkdir(parents=True)
+    (home / 'system/fogt_base.py').write_text('version = 1')
     (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: fogt_base\nVersion: 1+dfsg\n')
     for version in ('1', '2'):
-        wheel(tmp_path, 'fogt_base', version, fogt_base=f'version = {version}')
-        wheel(tmp_path, 'fogt_user', version, f'fogt-base=={version}', fogt_user=(
+        wheel(home, 'fogt_base', version, fogt_base=f'version = {version}')
+        wheel(home, 'fogt_user', version, f'fogt-base=={version}', fogt_user=(
             f'import fogt_base\nassert fogt_base.version == {version}'))
-    folder, done = installed(tmp_path, 'fogt-user', system=str(system))
+    wheel(home, 'fogt_half', fogt_half='1 / 0', other='')
+    wheel(home, 'fogt_other', **{'fogt_space/other/__init__': ''})
+    wheel(home, 'fogt_one', fogt_one='name = "pip"', colorsys='raise ImportError("pip")',
+          pytest='raise ImportError("pip")')
+    folder, done = installed(home, 'fogt-user', 'fogt-half', 'fogt-other', 'fogt-one',
+                             system=str(home / 'system'))
     assert done.returncode == 0, done.stderr
+    assert Path(folder, 'complete').exists() and not Path(folder, 'pip').exists()
+    return home, folder
+
+
+@RUNS_PIP
+def test_pip_chooses_what_fits_the_machines_packages(accepted: tuple[Path, str]) -> None:
+    """Debian 12's NumPy 1.24 met a SciPy that was made for NumPy 2."""
+    home, folder = accepted
     assert Path(folder, 'site/fogt_user-1.dist-info').exists()
-    folder, done = installed(tmp_path, 'fogt-user==2', system=str(system))
+    _, done = installed(home, 'fogt-user==2', system=str(home / 'system'))
     assert done.returncode != 0 and 'fogt-base==1' in done.stderr
 
 
 @RUNS_PIP
-def test_package_that_cannot_be_imported_is_reported(tmp_path: Path) -> None:
+def test_package_that_cannot_be_imported_is_reported(
+    accepted: tuple[Path, str], tmp_path: Path,
+) -> None:
     wheel(tmp_path, 'fogt_bad', fogt_bad='import numpy_that_is_newer', test='')
-    wheel(tmp_path, 'fogt_half', fogt_half='1 / 0', other='')
-    folder, done = installed(tmp_path, 'fogt-half')
-    assert done.returncode == 0 and Path(folder, 'complete').exists(), done.stderr
     folder, done = installed(tmp_path, 'fogt-bad>=1')
     assert done.stderr.splitlines()[-1] == (
         "'fogt_bad' of fogt-bad>=1 can't be imported there: ModuleNotFoundError: "
         "No module named 'numpy_that_is_newer'")
     assert done.returncode == 1 and not Path(folder, 'site').exists()
     assert not Path(folder, 'complete').exists()
+    # one that fails by itself lacks nothing
+    assert Path(accepted[1], 'site/fogt_half.py').exists()
 
 
 @RUNS_PIP
-def test_part_of_a_namespace_is_imported(tmp_path: Path) -> None:
+def test_part_of_a_namespace_is_imported(accepted: tuple[Path, str], tmp_path: Path) -> None:
     wheel(tmp_path, 'fogt_part', **{'fogt_space/part/__init__': 'import absent_library',
                                     'fogt_space/part/deep/__init__': ''})
-    wheel(tmp_path, 'fogt_other', **{'fogt_space/other/__init__': ''})
-    _, done = installed(tmp_path, 'fogt-other')
-    assert done.returncode == 0, done.stderr
     _, done = installed(tmp_path, 'fogt-part')
     assert done.returncode == 1 and done.stderr.splitlines()[-1].startswith(
         "'fogt_space.part' of fogt-part can't be imported there: ModuleNotFoundError: ")
+    assert Path(accepted[1], 'site/fogt_space/other').exists()
 
 
 @RUNS_PIP
-def test_installed_packages_are_found_after_the_systems(tmp_path: Path) -> None:
-    wheel(tmp_path, 'fogt_one', fogt_one='name = "pip"', colorsys='raise ImportError("pip")',
-          pytest='raise ImportError("pip")')
-    folder, done = installed(tmp_path, 'fogt-one')
-    assert done.returncode == 0, done.stderr
-    assert Path(folder, 'complete').exists() and not Path(folder, 'pip').exists()
-    system = tmp_path / 'system'
-    system.mkdir()
-    (system / 'sitecustomize.py').write_text('import builtins; builtins.before = True')
+def test_installed_packages_are_found_after_the_systems(
+    accepted: tuple[Path, str], tmp_path: Path,
+) -> None:
+    (tmp_path / 'sitecustomize.py').write_text('import builtins; builtins.before = True')
     code = ('import colorsys, fogt_one, pytest, sys; '
             'print(fogt_one.name, before, sys.path[-1].endswith("/site"))')
     found = subprocess.run(
         [sys.executable, '-c', code], capture_output=True, text=True,
-        env={'PYTHONPATH': f'{folder}/last:{system}'})
+        env={'PYTHONPATH': f'{accepted[1]}/last:{tmp_path}'})
     assert found.stdout.split() == ['pip', 'True', 'True'], found.stderr
 
 
