@@ -25,9 +25,8 @@ import foxglove
 from foxglove import MessageSchema, Parameter, Schema, Service, ServiceSchema
 from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, ServerListener
 from rcl_interfaces.msg import ParameterEvent
-import rclpy
 from rclpy.exceptions import NameValidationException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.publisher import Publisher
 
 from fogros2 import ros_types
@@ -37,7 +36,7 @@ from fogros2_monitor.definitions import definition
 from fogros2_monitor.parameters import Parameters, shown
 from fogros2_monitor.services import Services
 from fogros2_monitor.topics import GraphNode, LOOK, Topic
-from image_transport_h264 import memory
+from image_transport_h264 import ending
 
 #: Number of messages to keep for a slow viewer.
 BACKLOG = 64
@@ -49,15 +48,13 @@ WAITING = 4
 
 
 class BridgeNode(GraphNode, ServerListener):
-    """
-    The node that serves the topics of the graph.
+    """The node that serves the topics of the graph."""
 
-    :param executor: runs the requests of viewers, which arrive in threads of the SDK.
-    """
-
-    def __init__(self, executor: SingleThreadedExecutor) -> None:
+    def __init__(self) -> None:
         super().__init__('fogros2_bridge')
-        self._work = executor
+        #: Runs the requests of viewers, which arrive in threads of the SDK.
+        self._work = SingleThreadedExecutor()
+        self._work.add_node(self)
         self._published: dict[tuple[int, int], Publisher] = {}
         address = str(self.declare_parameter('address', '127.0.0.1').value)
         port = int(self.declare_parameter('port', 8765).value)
@@ -218,21 +215,8 @@ class BridgeNode(GraphNode, ServerListener):
 def main() -> None:
     """Run the bridge until a signal."""
     os.environ['TOKIO_WORKER_THREADS'] = str(2 * WAITING)  # read by the SDK
-    memory.keep()
-    rclpy.init()
-    executor = SingleThreadedExecutor()
-    node = BridgeNode(executor)
-    executor.add_node(node)
-    try:
-        while rclpy.ok():
-            try:
-                executor.spin()
-            except RuntimeError as error:  # such as for another type of a topic with Fast DDS
-                node.refuse(str(error))
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        node.destroy_node()
+    # an error may be another type of a topic with Fast DDS
+    ending.run(BridgeNode, BridgeNode.refuse)
 
 
 if __name__ == '__main__':

@@ -17,12 +17,11 @@ import time
 
 import foxglove
 from foxglove.mcap import MCAPWriteOptions
-import rclpy
-from rclpy.executors import ExternalShutdownException
+from rclpy.logging import get_logger
 from rclpy.utilities import remove_ros_args
 
 from fogros2_monitor.topics import GraphNode, LOOK, Topic
-from image_transport_h264 import memory
+from image_transport_h264 import ending
 
 #: Bytes of the disk that stay free.
 FREE = 1_000_000_000
@@ -71,19 +70,12 @@ def main() -> int:
     parser.add_argument('folder', help='of the file; ~ is the home of the user')
     parser.add_argument('topics', nargs='+')
     arguments = parser.parse_args(remove_ros_args(sys.argv)[1:])
-    memory.keep()
     folder = Path(arguments.folder).expanduser()
     folder.mkdir(parents=True, exist_ok=True)
-    rclpy.init()
-    node = RecorderNode(
-        folder / f'{time.strftime("%Y%m%d-%H%M%S")}-{os.getpid()}.mcap', arguments.topics)
+    path = folder / f'{time.strftime("%Y%m%d-%H%M%S")}-{os.getpid()}.mcap'
     try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return 0
+        ending.run(lambda: RecorderNode(path, arguments.topics))
     except DiskFull as error:
-        node.get_logger().error(str(error))
+        get_logger('fogros2_recorder').error(str(error))
         return 1
-    finally:
-        node.destroy_node()
     return 0

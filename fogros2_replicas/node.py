@@ -26,7 +26,6 @@ from typing import Any, Optional
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.client import Client
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -36,7 +35,7 @@ from fogros2 import ros_types
 from fogros2_replicas import figures
 from fogros2_replicas.calls import Action, Answer, Calls
 from fogros2_replicas.pairs import Header, header_of, Pair
-from image_transport_h264 import memory
+from image_transport_h264 import ending
 from image_transport_h264.lazy import printable
 
 #: Seconds between two looks at the graph, between two writes of the figures, and after which
@@ -343,16 +342,6 @@ def _reader(message: Any) -> Read:
 
 def main() -> None:
     """Run until a signal; the only argument is the settings as JSON."""
-    memory.keep()
-    rclpy.init()
-    node = FirstAnswer(json.loads(sys.argv[1]))
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    while rclpy.ok():
-        try:
-            executor.spin()
-        except (KeyboardInterrupt, ExternalShutdownException):
-            break  # rclpy shuts down already
-        except RuntimeError as error:  # a client or a replica vanished while it was answered
-            node.complain(f'not sent: {error}')
-    node.destroy_node()
+    # a client or a replica may vanish while it is answered
+    ending.run(lambda: FirstAnswer(json.loads(sys.argv[1])),
+               lambda node, why: node.complain(f'not sent: {why}'))

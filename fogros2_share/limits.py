@@ -20,14 +20,13 @@ from typing import Any, Optional
 
 import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
 from fogros2 import ros_types
 from fogros2_share.node import DEPTH, form_of, LOOK, others, profile
 from fogros2_share.wire import Echoes, Form
-from image_transport_h264 import memory
+from image_transport_h264 import ending
 
 #: The type whose messages are limited by child frame.
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
@@ -186,13 +185,4 @@ class Limits(Node):
 
 def main() -> None:
     """Run until a signal; the first argument is the topics as JSON."""
-    memory.keep()
-    rclpy.init()
-    node = Limits(json.loads(sys.argv[1]))
-    try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except RuntimeError:
-        if rclpy.ok():  # else rclpy has ended while a message was sent
-            raise
+    ending.run(lambda: Limits(json.loads(sys.argv[1])))

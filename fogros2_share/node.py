@@ -28,13 +28,12 @@ import time
 from typing import Any, cast, Optional
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from fogros2 import ros_types
 from fogros2_share.wire import decode, DEEPEST, Echoes, encode, Form, LARGEST, LINE
-from image_transport_h264 import memory
+from image_transport_h264 import ending
 
 #: In the folder of a machine: its topics in lines, and the folder of its relay, with its socket
 #: and with a file for each other machine.
@@ -180,8 +179,8 @@ class Relay(Node):
                         target=self._follow, args=(folder,), name='fog-share', daemon=True)
                     self._robots[folder].start()
 
-    def close(self) -> None:
-        """End the threads; rclpy has ended."""
+    def destroy_node(self) -> None:
+        """End the threads, then destroy the node."""
         with self._lock:
             for link in (self._server, *self._links):
                 with contextlib.suppress(OSError):  # it may not be connected
@@ -192,6 +191,7 @@ class Relay(Node):
             threads = [thread for thread in self._robots.values() if thread.is_alive()]
         for thread in threads:
             thread.join(2 * CHANGE)
+        super().destroy_node()
 
     def _complain(self, text: str) -> None:
         """Log a warning once."""
@@ -415,13 +415,7 @@ def profile(form: Form, least: int = 1) -> QoSProfile:
 
 def main() -> None:
     """Run until a signal; the first argument is the settings as JSON."""
-    memory.keep()
-    rclpy.init()
     settings = json.loads(sys.argv[1])
     if not os.path.isdir(settings['folders'][0]):
         sys.exit('no topic is shared: this machine was made without share=')
-    node = Relay(settings)
-    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-        rclpy.spin(node)
-    # rclpy shuts down already, in its own thread: not twice
-    node.close()
+    ending.run(lambda: Relay(settings))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Shut rclpy down on SIGINT and SIGTERM, in a thread.
+Run a node, and shut rclpy down on SIGINT and SIGTERM, in a thread.
 
-``rclpy.spin`` then returns, or raises ExternalShutdownException, between two callbacks. Python's
+The executor then returns, or raises ExternalShutdownException, between two callbacks. Python's
 own handler raises KeyboardInterrupt anywhere, such as in ``Condition.__enter__``, which leaves the
 lock acquired. rclpy's handler wakes the executor before it shuts the context down, so that a node
 without timers may wait again, until it is killed.
@@ -10,18 +10,58 @@ without timers may wait again, until it is killed.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import os
 import signal
 import threading
+from typing import Optional, TypeVar
 
 import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from image_transport_h264 import memory
+
+Made = TypeVar('Made', bound=Node)
 _SIGNALS = signal.SIGINT, signal.SIGTERM
 
 
-def init() -> None:
-    """Initialize rclpy, in place of ``rclpy.init``; call this in the main thread."""
+def run(
+    make: Callable[[], Made], refuse: Optional[Callable[[Made, str], None]] = None,
+) -> Optional[Made]:
+    """
+    Run a node until a signal, and destroy it; call this in the main thread.
+
+    :param make: creates the node, perhaps in an executor.
+    :param refuse: handles a RuntimeError of a callback, after which the node goes on.
+    :return: the node, None if the signal came first.
+    """
+    memory.keep()
+    _init()
+    node: Optional[Made] = None
+    try:
+        node = make()
+        executor = node.executor or SingleThreadedExecutor()
+        executor.add_node(node)
+        while rclpy.ok():
+            try:
+                executor.spin()
+            except RuntimeError as error:
+                if refuse is None or not rclpy.ok():
+                    raise
+                refuse(node, str(error))
+    except Exception:
+        # a signal before the node is complete, or while it publishes, is an error of rclpy
+        if rclpy.ok():
+            raise
+    finally:
+        if node is not None:
+            node.destroy_node()
+    return node
+
+
+def _init() -> None:
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer)

@@ -9,13 +9,12 @@ from typing import Any, Optional
 
 import rclpy
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from image_transport_h264 import ending, memory
+from image_transport_h264 import ending
 from image_transport_h264.acknowledgement import wait_for_all_acked
 from image_transport_h264.worker import Worker
 
@@ -58,23 +57,8 @@ def printable(text: str) -> str:
 
 def run(kind: Callable[[], LazyNode]) -> None:
     """Run a node until a signal; exit with status 1 if its worker failed."""
-    memory.keep()
-    ending.init()
-    node: Optional[LazyNode] = None
-    try:
-        node = kind()
-        rclpy.spin(node)
-    except ExternalShutdownException:
-        pass
-    except Exception:
-        # a signal before the node is complete, or while it publishes, is an error of rclpy
-        if rclpy.ok():
-            raise
-    finally:
-        failed = node is not None and node.failed
-        if node is not None:
-            node.destroy_node()
-    if failed:
+    node = ending.run(kind)
+    if node is not None and node.failed:
         raise SystemExit(1)
 
 

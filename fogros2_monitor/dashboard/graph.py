@@ -28,7 +28,6 @@ import time
 from typing import Any, Optional, TYPE_CHECKING
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -46,6 +45,7 @@ from fogros2_monitor.dashboard.ways import (
     streams,
     Topic,
 )
+from image_transport_h264 import ending
 from image_transport_h264.sharing import claim_of, UNLIMITED, VALID
 
 if TYPE_CHECKING:
@@ -205,20 +205,16 @@ def _take_lines(node: GraphNode) -> None:
     rclpy.try_shutdown()
 
 
+def _make() -> GraphNode:
+    node = GraphNode()
+    threading.Thread(target=_take_lines, args=(node,), daemon=True).start()
+    return node
+
+
 def main() -> None:
     """Run until standard input ends."""
     os.nice(5)  # the nodes of the launch have priority
-    rclpy.init(args=[])
-    node = GraphNode()
-    executor = SingleThreadedExecutor()  # before standard input can end: none can be made after
-    executor.add_node(node)
-    threading.Thread(target=_take_lines, args=(node,), daemon=True).start()
-    try:
-        executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        node.destroy_node()
+    ending.run(_make)
 
 
 if __name__ == '__main__':
