@@ -263,11 +263,7 @@ class VideoSender(Sender):
             # wait for the acknowledgement limits the rate to the link's.
             self._budget.sent(len(packet.data), 8.0 * len(packet.data), 0.0)
             whole = message.compressed(header, packet.format, packet.data)
-            if self._slices.replace(self._video):
-                self._slices.send(whole)
-            else:
-                self._node.put_out(self._video, whole)
-                self._node.all_acknowledged(self._video)
+            self._slices.send_to_all(self._video, whole)
             return
         with self._lock:
             protects = self._control.protects(now)

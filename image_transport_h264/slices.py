@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Send large images in slices, as fast as the link carries them.
+Send large images and point clouds in slices, as fast as the link carries them.
 
-DDS sends all fragments of a message at once. On a slow link, most fragments of a large image find
-a full queue, and the repetitions do so too. So the image leaves in slices, each a message of its
-own. The receivers acknowledge each slice, and the acknowledgements clock the next ones, as in TCP.
+DDS sends all fragments of a message at once. On a slow link, most fragments of a large message
+find a full queue, and the repetitions do so too. So the message leaves in slices, each a message
+of its own. The receivers acknowledge each slice, and the acknowledgements clock the next ones, as
+in TCP.
 """
 
 from __future__ import annotations
@@ -31,16 +32,23 @@ from image_transport_h264.rate import MOST_RECEIVERS
 
 #: Bytes of a slice at first and at the least; 10 Mbit/s carry 76 of them in a second.
 LEAST = 1 << 14
-#: Bytes of the largest image.
-LARGEST = 1 << 28
-#: Seconds that a slice takes: below QUICK the next image has larger ones, above SLOW smaller ones.
+#: Bytes of the largest message, and number of senders whose messages are put together at once.
+LARGEST, OPEN = 1 << 28, 4
+#: Seconds that a slice takes: below QUICK the next message has larger slices, above SLOW smaller.
 QUICK, SLOW = 0.004, 0.1
 #: Slices in the link's queue above which fewer are sent; while one waits, the link has no pause.
 QUEUED = 1.25
 #: Factor from one size of slices to the next.
 STEP = 4
-#: Sender's identity, number of the slice, size of the image, place of the slice in it.
-_HEADER = struct.Struct('>QQII')
+#: Sender's identity, number of the slice, size of the message, place of the slice in it.
+HEADER = struct.Struct('>QQII')
+
+#: Seconds since a message's first slice left, and of the quickest recent slice; 0: unknown.
+Arrived = Callable[[float, float], None]
+
+
+def _ignore(*_: float) -> None:
+    """Do nothing."""
 
 
 class SliceSender:
@@ -49,12 +57,15 @@ class SliceSender:
 
     :param stream: the topic whose messages are sent.
     :param changed: callback for a change of the subscribers.
+    :param largest: bytes of the largest slice.
     """
 
-    def __init__(self, node: LazyNode, stream: str, changed: Callable[[], None]) -> None:
-        self._node = node
+    def __init__(self, node: LazyNode, stream: str, changed: Callable[[], None],
+                 largest: int = LARGEST) -> None:
+        self._node, self._changed, self._largest = node, changed, largest
+        self._known = 0
         self._publisher = node.offer(
-            UInt8MultiArray, f'{stream}/{SLICES}', SLICES_QOS, changed)
+            UInt8MultiArray, f'{stream}/{SLICES}', SLICES_QOS, self._matched)
         node.create_subscription(
             UInt64MultiArray, f'{stream}/{ACKNOWLEDGED}', self._heard, SLICES_QOS)
         self._identity = secrets.randbits(63)
@@ -62,6 +73,8 @@ class SliceSender:
         self._size = LEAST
         self._pace = Pace(QUEUED)
         self._under_way: deque[tuple[int, Sent]] = deque()
+        #: Of the messages under way, the last slice, when the first one left, and the callback.
+        self._messages: deque[tuple[int, float, Arrived]] = deque()
         #: The last acknowledgement of each receiver: number of the slice, and when it came (s).
         self._heard_of: dict[int, tuple[int, float]] = {}
         #: Which receiver sets the pace: the slowest one, unless it hangs.
@@ -72,43 +85,81 @@ class SliceSender:
         """Return whether all subscribers of the whole messages take slices too."""
         return self._node.subscribers(self._publisher) >= self._node.subscribers(whole)
 
-    def send(self, data: bytes) -> None:
-        """Publish a message, and wait until most has arrived; give up one that does not arrive."""
-        begin, self._pacemaker = time.monotonic(), min
+    def send_to_all(self, whole: Publisher, data: bytes, leaves: Callable[[int], None] = _ignore,
+                    arrived: Arrived = _ignore) -> None:
+        """Send in slices, or whole if a subscriber of the whole messages takes no slices."""
+        if self.replace(whole):
+            self.send(data, leaves, arrived)
+            return
+        leaves(len(data))
+        begin = time.monotonic()
+        self._node.put_out(whole, data)
+        self._node.all_acknowledged(whole)
+        arrived(time.monotonic() - begin, 0.0)
+
+    def send(self, data: bytes, leaves: Callable[[int], None] = _ignore,
+             arrived: Arrived = _ignore) -> None:
+        """
+        Publish a message, and wait until most has arrived; give up one that does not arrive.
+
+        :param leaves: called with the bytes of each slice before it leaves; may wait.
+        :param arrived: called when all receivers have the message, or when it is given up.
+        """
+        begin = time.monotonic()
         # all of a size, as the pace compares their times
-        size = -(-len(data) // -(-len(data) // self._size))
+        count = -(-len(data) // self._size)
+        size = -(-len(data) // count)
+        with self._news:
+            self._pacemaker = min
+            self._messages.append((self._number + count, begin, arrived))
         for place in range(0, len(data), size):
             part = data[place:place + size]
+            leaves(len(part))
             with self._news:
                 self._number += 1
                 self._under_way.append((self._number, self._pace.sent(time.monotonic())))
             self._node.put_out(self._publisher, message.in_pieces(
-                _HEADER.pack(self._identity, self._number, len(data), place) + part))
+                HEADER.pack(self._identity, self._number, len(data), place) + part))
             with self._news:
                 if self._news.wait_for(self._pace.may_send, LONGEST):
                     continue
-                # a receiver that hangs keeps the rest of the image from no other one
+                # a receiver that hangs keeps the rest of the message from no other one
                 self._pacemaker = max
                 self._settle(time.monotonic())
                 if not self._pace.may_send():
                     # the link is cut or slower than before, or nobody listens any more
                     self._under_way.clear()
+                    if self._heard_of and self._messages:
+                        self._messages.pop()[2](LONGEST, 0.0)
+                    self._messages.clear()
                     self._pace = Pace(QUEUED)
                     self._adapt(math.inf)
                     return
         seconds = (time.monotonic() - begin) * size / len(data)
-        if len(data) > self._size or seconds > SLOW:  # larger than the image would change nothing
+        if count > 1 or seconds > SLOW:  # larger than the message would change nothing
             self._adapt(seconds)
 
     def _adapt(self, seconds: float) -> None:
-        """Choose the size of the next image's slices by the time that one took."""
+        """Choose the size of the next message's slices by the time that one took."""
         size = self._size * STEP if seconds < QUICK else self._size // STEP
-        if QUICK <= seconds <= SLOW or not LEAST <= size <= LARGEST:
+        if QUICK <= seconds <= SLOW or not LEAST <= size <= self._largest:
             return
         with self._news:
             # times of slices of another size say nothing about these
             self._size, self._pace = size, Pace(QUEUED)
             self._under_way.clear()
+
+    def _matched(self) -> None:
+        before, self._known = self._known, self._node.subscribers(self._publisher)
+        if self._known < before:
+            # do not wait for the receiver that has gone; the others acknowledge again
+            with self._news:
+                self._pacemaker = max
+                self._settle(time.monotonic())
+                self._messages.clear()
+                self._heard_of.clear()
+                self._news.notify()
+        self._changed()
 
     def _heard(self, feedback: UInt64MultiArray) -> None:
         """Take an acknowledgement."""
@@ -127,18 +178,57 @@ class SliceSender:
             self._news.notify()
 
     def _settle(self, now: float) -> None:
-        """Report slices that have arrived to the pace."""
-        arrived = self._pacemaker(
+        """Report slices that have arrived to the pace, and messages to their senders."""
+        last = self._pacemaker(
             (number for number, _ in self._heard_of.values()), default=0)
-        while self._under_way and self._under_way[0][0] <= arrived:
+        while self._under_way and self._under_way[0][0] <= last:
             self._pace.acknowledged(self._under_way.popleft()[1], now)
+        while self._messages and self._messages[0][0] <= last:
+            _, begin, arrived = self._messages.popleft()
+            arrived(now - begin, self._pace.quickest)
 
 
 @dataclasses.dataclass
-class _Image:
-    sender: int
+class _Message:
     size: int
+    number: int
     data: bytearray
+
+
+class Assembler:
+    """
+    Put messages together from slices, which come in order; of each sender the newest message.
+
+    :param largest: bytes of all messages together.
+    """
+
+    def __init__(self, largest: int = LARGEST) -> None:
+        self._largest = largest
+        self._messages: dict[int, _Message] = {}
+
+    def add(self, part: bytes) -> tuple[int, int, Optional[bytes]]:
+        """
+        Return sender and number of a slice, and the message that it completes.
+
+        :raises struct.error: the slice is too short.
+        """
+        sender, number, size, place = HEADER.unpack_from(part)
+        entry = self._messages.pop(sender, None)
+        if place == 0 and size <= self._largest:
+            entry = _Message(size, number, bytearray())
+        # Of a message that begins before the subscription, or that lacks a slice, drop the rest.
+        if entry is None or (size, number, place) != (entry.size, entry.number, len(entry.data)):
+            return sender, number, None
+        entry.data += part[HEADER.size:]
+        entry.number += 1
+        if len(entry.data) >= size:
+            return sender, number, bytes(entry.data) if len(entry.data) == size else None
+        self._messages[sender] = entry
+        if len(self._messages) > OPEN:
+            del self._messages[next(iter(self._messages))]
+        if sum(len(each.data) for each in self._messages.values()) > self._largest:
+            self._messages.clear()
+        return sender, number, None
 
 
 class SliceReceiver:
@@ -146,36 +236,26 @@ class SliceReceiver:
     Receive messages in slices, and acknowledge these.
 
     :param whole: called with each complete serialized message.
+    :param largest: bytes of the largest one.
     """
 
-    def __init__(self, node: LazyNode, stream: str, whole: Callable[[bytes], None]) -> None:
+    def __init__(self, node: LazyNode, stream: str, whole: Callable[[bytes], None],
+                 largest: int = LARGEST) -> None:
         self._node, self._whole = node, whole
         self._feedback = node.create_publisher(
             UInt64MultiArray, f'{stream}/{ACKNOWLEDGED}', SLICES_QOS)
         self._identity = secrets.randbits(63)
-        self._image: Optional[_Image] = None
+        self._assembler = Assembler(largest)
         self.tap = Tap(node, UInt8MultiArray, f'{stream}/{SLICES}', SLICES_QOS, self._take,
                        adapt=False)
 
     def _take(self, coded: Any) -> None:
         try:
-            data = message.piece(coded)
-            sender, number, size, place = _HEADER.unpack_from(data)
+            sender, number, whole = self._assembler.add(message.piece(coded))
         except (CdrError, struct.error) as error:
             self._node.complain('malformed slice', f'slice not shown: {error}')
             return
         self._node.put_out(self._feedback, UInt64MultiArray(
             data=[self._identity, sender, number]))
-        if place == 0 and size <= LARGEST:
-            self._image = _Image(sender, size, bytearray())
-        image = self._image
-        # They come in order; of an image that begins before the subscription, or of which the
-        # sender gave up a slice, the rest is dropped.
-        if image is None or (sender, size, place) != (image.sender, image.size, len(image.data)):
-            self._image = None
-            return
-        image.data += data[_HEADER.size:]
-        if len(image.data) >= image.size:
-            self._image = None
-            if len(image.data) == image.size:
-                self._whole(bytes(image.data))
+        if whole is not None:
+            self._whole(whole)

@@ -4,7 +4,6 @@ Transport point clouds over thin links, by a codec without ROS and two nodes.
 
 ``cloud`` describes point clouds, ``numbers`` codes columns of numbers. ``ranges`` predicts
 organised scans as range images, ``codec`` codes clouds. ``message`` converts ROS messages,
-``parts`` splits a coded cloud into messages, ``control`` adapts the resolution to the links.
-``encoder`` and ``decoder`` are the nodes, which share their base and the pacing with
-``image_transport_h264``.
+``control`` adapts the resolution to the links. ``encoder`` and ``decoder`` are the nodes, which
+share their base and the slices with ``image_transport_h264``.
 """

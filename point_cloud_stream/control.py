@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Adapt clouds to the links of all receivers: parts in flight, resolution, rate.
+Adapt clouds to the links of all receivers: resolution, rate.
 
-Each receiver acknowledges each part. The number of parts in flight is that of ``Pace``, so that
-the link's queue stays short for video and for the next cloud. If a cloud is on its way for most of
-the time until the next one, the resolution becomes coarser, by as many bits as the link lacks.
+If a cloud is on its way for most of the time until the next one, the resolution becomes coarser,
+by as many bits as the link lacks.
 The rate falls by itself: of the clouds that come while one is sent, only the newest is kept.
 """
 
@@ -13,14 +12,8 @@ from __future__ import annotations
 from collections import deque
 from typing import Optional
 
-from image_transport_h264.pacing import Pace, Sent
-from image_transport_h264.rate import MOST_RECEIVERS
 from point_cloud_stream.codec import Coded
 
-#: Seconds without an acknowledgement after which parts are given up.
-GIVE_UP = 1.0
-#: Parts in flight at the least, so that the link is busy until an acknowledgement comes.
-LEAST_PARTS = 2
 #: Coarsest resolution in metres that a thin link leads to.
 COARSEST = 0.2
 #: Shares of the time between clouds: above BUSY the resolution becomes coarser, such that a cloud
@@ -37,7 +30,7 @@ MOST_BITS = 4.0
 
 class Control:
     """
-    Choose resolution and rate, and when a part leaves; times are seconds of one clock.
+    Choose resolution and rate; times are seconds of one clock.
 
     :param asked: the user's resolution in metres; 0 for lossless clouds, whose rate adapts alone.
     :param max_rate: maximum clouds per second, 0: no limit.
@@ -49,11 +42,6 @@ class Control:
         self._interval = 0.1
         self._arrived: Optional[float] = None
         self._next_due = -1e9
-        self._pace = Pace()
-        self._parts: deque[tuple[int, Sent]] = deque()
-        self._receivers: dict[int, int] = {}
-        #: last part, time of the first part, and the cloud
-        self._clouds: deque[tuple[int, float, Coded]] = deque(maxlen=2)
         self._recent: deque[float] = deque(maxlen=IN_A_ROW)
         self._calm_since = -1e9
         #: Seconds of the last cloud from the encoder to the slowest decoder.
@@ -70,48 +58,14 @@ class Control:
         self._next_due = max(self._next_due + self._shortest, now)
         return True
 
-    def sending(self, last: int, coded: Coded, now: float) -> None:
-        """Record that a cloud is sent from now on; ``last`` is the number of its last part."""
-        self._clouds.append((last, now, coded))
+    def crossed(self, coded: Coded, seconds: float, quickest: float, now: float) -> None:
+        """
+        Adapt the resolution to the seconds that a cloud took to the slowest receiver and back.
 
-    def may_send(self) -> bool:
-        """Return whether to send a part now; without acknowledgements, nothing is known."""
-        return not self._receivers or len(self._parts) < max(LEAST_PARTS, self._pace.window)
-
-    def sent(self, number: int, now: float) -> None:
-        """Record that a part was sent."""
-        if self._receivers:
-            self._parts.append((number, self._pace.sent(now)))
-
-    def acknowledged(self, receiver: int, number: int, now: float) -> None:
-        """Record that a receiver has a part, and all parts before it."""
-        if len(self._receivers) == MOST_RECEIVERS and receiver not in self._receivers:
-            return
-        self._receivers[receiver] = max(number, self._receivers.get(receiver, 0))
-        done = min(self._receivers.values())
-        while self._parts and self._parts[0][0] <= done:
-            self._pace.acknowledged(self._parts.popleft()[1], now)
-        while self._clouds and self._clouds[0][0] <= done:
-            _, when, coded = self._clouds.popleft()
-            self.latency = now - when - self._pace.quickest / 2
-            self._adapt(coded, max(now - when - self._pace.quickest, 1e-3), now)
-
-    def forget(self) -> None:
-        """Forget the receivers, one of which has gone; the others acknowledge again."""
-        self._receivers.clear()
-        self._clouds.clear()
-
-    def give_up(self, now: float) -> None:
-        """Record that no part was acknowledged for GIVE_UP."""
-        while self._parts:
-            self._parts.popleft()
-            self._pace.expired(now)
-        if self._clouds:
-            self._adapt(self._clouds[-1][2], GIVE_UP, now)
-        self.forget()
-
-    def _adapt(self, coded: Coded, took: float, now: float) -> None:
-        """Adapt the resolution to the seconds that a cloud took."""
+        :param quickest: seconds of the quickest recent slice.
+        """
+        self.latency = seconds - quickest / 2
+        took = max(seconds - quickest, 1e-3)
         if coded.resolution != self.resolution:
             return
         interval = max(self._interval, self._shortest)

@@ -16,7 +16,6 @@ from sensor_msgs.msg import CompressedImage, PointCloud2
 
 from fogros2_examples.city import City
 from fogros2_examples.lidar import message
-from point_cloud_stream.parts import split
 from rigs.bench import Bench, BEST_EFFORT, RELIABLE
 
 SCAN = City(16, 256).scan(3)
@@ -96,7 +95,7 @@ def test_several_streams_and_late_subscribers(bench: Bench) -> None:
 
 
 def test_large_clouds_cross_a_link_that_loses_messages(root: None, bench: Bench) -> None:
-    """Every fifth datagram is lost; the middleware repeats parts, and none is shown damaged."""
+    """Every fifth datagram is lost; the middleware repeats slices, and none is shown damaged."""
     with bench.lossy():
         pair(bench, '-p', 'lossless:=true')
         seen = bench.heard(PointCloud2, '/seen/points')
@@ -105,17 +104,16 @@ def test_large_clouds_cross_a_link_that_loses_messages(root: None, bench: Bench)
 
 
 def test_what_is_damaged_is_one_warning(bench: Bench) -> None:
-    """Parts for the decoder and clouds for the encoder; good clouds go on."""
+    """Coded clouds for the decoder and clouds for the encoder; good clouds go on."""
     decoder = start(bench, 'decoder', '-r', 'points:=/seen/points', '-p', 'stream:=/s')
     seen = bench.heard(PointCloud2, '/seen/points')
-    parts = bench.node.create_publisher(CompressedImage, '/s', RELIABLE)
-    bench.until(parts.get_subscription_count, 'the decoder')
-    for data in (b'', b'PCP1', bytes(100), *split(b'PCS1' + bytes(500), 1, 1, 1)):
-        parts.publish(CompressedImage(format='pointcloud', data=array.array('B', data)))
+    stream = bench.node.create_publisher(CompressedImage, '/s', RELIABLE)
+    bench.until(stream.get_subscription_count, 'the decoder')
     cut = b'\0\1\0\0\1'
-    parts.publish(cut)
-    bench.until(lambda: all(any(text in line for line in decoder)
-                            for text in ('cloud not shown', 'ends too soon')), 'two warnings')
+    for text, bad in (('no point cloud', CompressedImage(data=array.array('B', bytes(100)))),
+                      ('a layout that was cut', CompressedImage()), ('ends too soon', cut)):
+        bench.until(lambda text=text: any(text in line for line in decoder), 'a warning',
+                    meanwhile=lambda bad=bad: stream.publish(bad))
     encoder = start(bench, 'encoder', '-r', 'points:=/points', '-p', 'stream:=/s')
     clouds = bench.node.create_publisher(PointCloud2, '/points', RELIABLE)
     for text, bad in (('ends too soon', cut), ('not float32', PointCloud2(

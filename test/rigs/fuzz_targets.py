@@ -13,6 +13,7 @@ import os
 from pathlib import Path
 import random
 import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -36,14 +37,13 @@ from fogros2_monitor import request as gate
 from fogros2_monitor.dashboard import server as dashboard
 from fogros2_replicas.pairs import header_of
 from image_transport_h264 import message as images
-from image_transport_h264 import repair, stills
+from image_transport_h264 import repair, slices, stills
 from image_transport_h264.cdr import CdrError, Header
 from image_transport_h264.codec import Decoder, Encoder, Picture
 from image_transport_h264.picture import CodecError
 from point_cloud_stream import codec
 from point_cloud_stream import message as point_clouds
 from point_cloud_stream.cloud import CloudError, Field, Layout
-from point_cloud_stream.parts import Assembler, split
 from rigs import recorded_agent
 from rigs.stranger import NOBODY
 
@@ -105,7 +105,7 @@ def _stills() -> Iterator[Target]:
 
 @contextlib.contextmanager
 def _clouds() -> Iterator[Target]:
-    """Coded point clouds, without the checksum that a part has."""
+    """Coded point clouds."""
     scan = City(8, 64).scan(1)
     made = message(scan)
     fields = tuple(Field(each.name, each.offset, each.datatype) for each in made.fields)
@@ -116,11 +116,11 @@ def _clouds() -> Iterator[Target]:
 
 
 @contextlib.contextmanager
-def _parts() -> Iterator[Target]:
-    """Parts of coded clouds, one assembler for all."""
-    assembler = Assembler(1 << 20)
-    yield Target([part for size in (100, 30_000) for part in split(bytes(size), 1, 2, 3)],
-                 assembler.add, ())
+def _slices() -> Iterator[Target]:
+    """Slices of images and clouds, one assembler for all."""
+    assembler = slices.Assembler(1 << 20)
+    yield Target([slices.HEADER.pack(sender, number, 300, 100 * number) + bytes(100)
+                  for sender in (1, 2) for number in range(3)], assembler.add, (struct.error,))
 
 
 @contextlib.contextmanager
@@ -402,10 +402,10 @@ def _dds() -> Iterator[Target]:
 
 
 TARGETS: dict[str, Callable[[], contextlib.AbstractContextManager[Target]]] = {
-    'decoder': _decoder, 'stills': _stills, 'clouds': _clouds, 'parts': _parts,
+    'decoder': _decoder, 'stills': _stills, 'clouds': _clouds, 'slices': _slices,
     'messages': _messages, 'calls': _calls, 'agent messages': _agent_messages,
     'heartbeats': _heartbeats, 'agent': _agent, 'door': _door, 'gate': _gate,
     'dashboard': _dashboard, 'VPN helper': _vpn_helper, 'DDS configuration': _dds}
 #: Targets whose readers are Python code in the process that feeds them.
-PYTHON = {'parts', 'messages', 'agent messages', 'heartbeats', 'door', 'gate', 'dashboard',
+PYTHON = {'slices', 'messages', 'agent messages', 'heartbeats', 'door', 'gate', 'dashboard',
           'VPN helper', 'DDS configuration'}

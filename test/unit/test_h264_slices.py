@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Large images in slices, from a sender to receivers that this process connects."""
+"""Messages in slices, from a sender to receivers that this process connects."""
 
 from __future__ import annotations
 
@@ -14,9 +14,15 @@ from std_msgs.msg import UInt64MultiArray
 
 from fogros2.waiting import wait_until
 from image_transport_h264 import message, slices
-from image_transport_h264.slices import LEAST, SliceReceiver, SliceSender
-
-HEADER = slices._HEADER
+from image_transport_h264.slices import (
+    Assembler,
+    HEADER,
+    LARGEST,
+    LEAST,
+    OPEN,
+    SliceReceiver,
+    SliceSender,
+)
 
 
 class Wire:
@@ -24,12 +30,17 @@ class Wire:
 
     def __init__(self) -> None:
         self.heard: dict[str, list[Callable[[Any], None]]] = {}
+        self.changed: dict[str, Callable[[], None]] = {}
         self.sent: list[bytes] = []
         self.complaints: list[str] = []
         self.lose: Callable[[str, Any], bool] = lambda topic, data: False
 
-    def offer(self, kind: Any, topic: str, qos: Any, changed: Any) -> str:
+    def offer(self, kind: Any, topic: str, qos: Any, changed: Callable[[], None]) -> str:
+        self.changed[topic] = changed
         return topic
+
+    def all_acknowledged(self, topic: str) -> bool:
+        return True
 
     def create_publisher(self, kind: Any, topic: str, qos: Any) -> str:
         return topic
@@ -58,13 +69,15 @@ def wire() -> Wire:
     return Wire()
 
 
-def sender(wire: Wire) -> SliceSender:
-    return SliceSender(wire, '/camera/raw', lambda: None)  # type: ignore[arg-type]
+def sender(wire: Wire, largest: int = LARGEST) -> SliceSender:
+    return SliceSender(
+        wire, '/camera/raw', lambda: None, largest)  # type: ignore[arg-type]
 
 
-def receiver(wire: Wire) -> list[bytes]:
+def receiver(wire: Wire, largest: int = LARGEST) -> list[bytes]:
     whole: list[bytes] = []
-    SliceReceiver(wire, '/camera/raw', whole.append).tap.want(True)  # type: ignore[arg-type]
+    SliceReceiver(
+        wire, '/camera/raw', whole.append, largest).tap.want(True)  # type: ignore[arg-type]
     return whole
 
 
@@ -93,15 +106,20 @@ def test_slices_of_a_quick_link_grow_and_of_a_slow_one_shrink(wire: Wire) -> Non
     assert one._size == LEAST
 
 
-def test_next_slice_waits_for_the_slowest_receiver(wire: Wire) -> None:
-    images, slow = receiver(wire), receiver(wire)
+def test_slices_grow_no_further_than_their_user_says(wire: Wire) -> None:
+    receiver(wire)
+    one = sender(wire, LEAST)
+    for _ in range(3):
+        one.send(bytes(4 * LEAST))
+    assert sizes(wire) == [LEAST] * 12
+
+
+def second_held_back(wire: Wire) -> list[UInt64MultiArray]:
+    """Return the acknowledgements of the second receiver from its second one on."""
     late: list[UInt64MultiArray] = []
-    one = sender(wire)
-    (acknowledged,) = wire.heard['/camera/raw/acknowledged']
     receivers: list[int] = []
 
-    def delay(topic: str, data: Any) -> bool:
-        """Hold the second receiver's acknowledgements back."""
+    def hold(topic: str, data: Any) -> bool:
         if isinstance(data, bytes):
             return False
         if data.data[0] not in receivers:
@@ -111,7 +129,32 @@ def test_next_slice_waits_for_the_slowest_receiver(wire: Wire) -> None:
             return True
         return False
 
-    wire.lose = delay
+    wire.lose = hold
+    return late
+
+
+def test_receiver_that_goes_delays_nobody(
+    wire: Wire, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(slices, 'LONGEST', 600.0)
+    images, _ = receiver(wire), receiver(wire)
+    one, topic = sender(wire), '/camera/raw/slices'
+    wire.changed[topic]()
+    late = second_held_back(wire)
+    thread = threading.Thread(target=one.send, args=(bytes(3 * LEAST),))
+    thread.start()
+    wait_until(lambda: late, timeout=30, what='a slice that waits')
+    del wire.heard[topic][1]
+    wire.changed[topic]()
+    thread.join(30)
+    assert not thread.is_alive() and images == [bytes(3 * LEAST)]
+
+
+def test_next_slice_waits_for_the_slowest_receiver(wire: Wire) -> None:
+    images, slow = receiver(wire), receiver(wire)
+    one = sender(wire)
+    (acknowledged,) = wire.heard['/camera/raw/acknowledged']
+    late = second_held_back(wire)
     thread = threading.Thread(target=one.send, args=(bytes(3 * LEAST),))
     thread.start()
     wait_until(lambda: len(late) == 1, timeout=30, what='the second acknowledgement')
@@ -130,11 +173,19 @@ def test_cut_link_costs_the_image_and_no_more(
     images = receiver(wire)
     one = sender(wire)
     wire.lose = lambda topic, data: True
-    one.send(bytes(2 * LEAST))
-    assert len(wire.sent) == 1
+    times: list[float] = []
+
+    def send(count: int) -> None:
+        one.send(bytes(count * LEAST), arrived=lambda seconds, _: times.append(seconds))
+
+    send(2)
+    assert len(wire.sent) == 1 and times == []  # there may be no receiver yet
     wire.lose = lambda topic, data: False
-    one.send(bytes(3 * LEAST))
-    assert images == [bytes(3 * LEAST)]
+    send(3)
+    assert images == [bytes(3 * LEAST)] and len(times) == 1
+    wire.lose = lambda topic, data: True
+    send(2)
+    assert times[1:] == [0.05]
 
 
 def test_slices_that_a_link_does_not_carry_in_time_shrink(
@@ -166,12 +217,40 @@ def test_image_with_a_slice_missing_is_not_shown(wire: Wire, first: int) -> None
 
 @pytest.mark.parametrize('data', [
     b'', b'x', HEADER.pack(1, 1, 10, 0)[:-1],
-    HEADER.pack(1, 1, 2 ** 32 - 1, 0) + b'too large', HEADER.pack(1, 1, 3, 0) + b'too long'])
+    HEADER.pack(1, 1, 101, 0) + b'too large', HEADER.pack(1, 1, 3, 0) + b'too long'])
 def test_malformed_slices_give_no_image(wire: Wire, data: bytes) -> None:
-    images = receiver(wire)
+    images = receiver(wire, 100)
     wire.put_out('/camera/raw/slices', message.in_pieces(data))
     wire.put_out('/camera/raw/slices', data)
     assert images == [] and wire.complaints
+
+
+def part(sender: int, number: int, size: int, place: int, data: bytes) -> bytes:
+    return HEADER.pack(sender, number, size, place) + data
+
+
+def test_senders_are_put_together_side_by_side() -> None:
+    assembler = Assembler()
+    for place in range(3):
+        for one in range(OPEN):
+            added = assembler.add(part(one, place, 3, place, bytes([one])))
+            assert added == (one, place, bytes(3 * [one]) if place == 2 else None)
+
+
+def test_equal_message_does_not_fill_the_gap_of_another() -> None:
+    """Of two images of a size, the end of one and the beginning of the next were lost."""
+    assembler = Assembler()
+    assembler.add(part(1, 1, 3, 0, b'a'))
+    for place in (1, 2):
+        assert assembler.add(part(1, place + 4, 3, place, b'b')) == (1, place + 4, None)
+
+
+def test_endless_messages_take_bounded_memory() -> None:
+    assembler = Assembler(10_000)
+    for number in range(100):
+        for one in range(OPEN):
+            assembler.add(part(one, number, 9_999, 99 * number, bytes(99)))
+        assert sum(len(each.data) for each in assembler._messages.values()) <= 10_000
 
 
 def test_strangers_acknowledge_nothing(wire: Wire) -> None:
@@ -206,3 +285,7 @@ def test_whole_images_go_to_subscribers_without_slices(wire: Wire) -> None:
     assert one.replace('/camera/raw')  # type: ignore[arg-type]
     wire.heard['/camera/raw'] *= 2
     assert not one.replace('/camera/raw')  # type: ignore[arg-type]
+    sizes: list[float] = []
+    one.send_to_all('/camera/raw', bytes(3 * LEAST), sizes.append,  # type: ignore[arg-type]
+                    lambda seconds, _: sizes.append(seconds))
+    assert wire.sent == [bytes(3 * LEAST)] and sizes[0] == 3 * LEAST and sizes[1] < 1.0

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import random
 import struct
 from typing import Any
 
@@ -15,10 +14,9 @@ pytest.importorskip('zstandard', reason='the extra "point-clouds" is not install
 import zstandard
 
 from fogros2_examples.city import City
-from point_cloud_stream import codec, numbers, parts
+from point_cloud_stream import codec, numbers
 from point_cloud_stream.cloud import CloudError, Field, Layout, unpack
 from point_cloud_stream.codec import Coded, decode, encode
-from point_cloud_stream.parts import Assembler, LARGEST, split
 
 KINDS = {'i1': 1, 'u1': 2, 'i2': 3, 'u2': 4, 'i4': 5, 'u4': 6, 'f4': 7, 'f8': 8}
 SCAN = City(16, 256).scan(3)
@@ -230,60 +228,3 @@ def test_larger_clouds_than_allowed_are_refused() -> None:
 def test_layouts_are_read_as_they_were_written() -> None:
     what = layout(SCAN, is_dense=True)
     assert unpack(what.pack() + b'more') == (what, len(what.pack()))
-
-
-# --- parts
-
-def joined(assembler: Assembler, parts: list[bytes]) -> list[bytes]:
-    return [whole for part in parts if (whole := assembler.add(part)[1]) is not None]
-
-
-@pytest.mark.parametrize('size', [1, 8192, 8193, 100_000, 600_000])
-def test_parts_make_the_same_cloud_in_any_order(size: int) -> None:
-    data = random.Random(size).randbytes(size)
-    parts = split(data, 7, 1, 20)
-    assert max(map(len, parts)) - min(map(len, parts)) < len(parts) + 40
-    assert max(map(len, parts)) < LARGEST + 40
-    assembler = Assembler(1 << 20)
-    assert assembler.add(parts[0])[0] == (7, 20)
-    assert joined(assembler, parts[::-1]) == [data]
-
-
-def test_newer_cloud_replaces_an_incomplete_one() -> None:
-    old, new = split(bytes(30_000), 1, 1, 1), split(b'1' * 30_000, 1, 2, 5)
-    assert joined(Assembler(1 << 20), [*old[:-1], *new, old[-1]]) == [b'1' * 30_000]
-
-
-def test_streams_are_put_together_side_by_side() -> None:
-    one, two = split(b'1' * 20_000, 1, 1, 1), split(b'2' * 20_000, 2, 1, 1)
-    mixed = [part for pair in zip(one, two) for part in pair]
-    assert joined(Assembler(1 << 20), mixed) == [b'1' * 20_000, b'2' * 20_000]
-
-
-def test_invalid_parts_are_not_acknowledged() -> None:
-    assembler = Assembler(1 << 20)
-    part = split(bytes(10), 1, 1, 1)[0]
-    assert assembler.add(b'') == assembler.add(b'x' + part[1:]) == (None, None)
-    # a damaged cloud is complete, but not shown
-    assert assembler.add(part[:-1] + b'1') == ((1, 1), None)
-
-
-def part_of_many(index: int, size: int) -> bytes:
-    """Return a part of a cloud that claims to have the largest number of parts."""
-    return parts._HEAD.pack(parts._MAGIC, 1, index, 1, index, 65535, 0) + bytes(size)
-
-
-def test_endless_parts_take_bounded_memory() -> None:
-    assembler = Assembler(100_000)
-    for index in range(100):
-        assembler.add(part_of_many(index, 5000))
-    held = sum(len(part) for one in assembler._clouds.values() for part in one.parts.values())
-    assert 0 < held <= 100_000
-
-
-@pytest.mark.timeout(60)  # adding up all parts at each one takes minutes
-def test_tiny_parts_take_bounded_time() -> None:
-    assembler = Assembler(1 << 20)
-    for index in range(60_000):
-        assembler.add(part_of_many(index, 1))
-    assert len(assembler._clouds[1].parts) == 60_000

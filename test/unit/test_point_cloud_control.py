@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
-from collections import deque
 import math
 
 import pytest
 
+from image_transport_h264.slices import LEAST
+
 pytest.importorskip('zstandard', reason='the extra "point-clouds" is not installed')
 from point_cloud_stream.codec import Coded
 from point_cloud_stream.control import COARSEST, Control
-from point_cloud_stream.parts import split
 
 #: Points of a cloud, and bytes of their other fields.
 POINTS, OTHER = 65_536, 42_000
@@ -25,53 +25,30 @@ def coded(resolution: float) -> Coded:
 
 
 class Link:
-    """A link with a queue, and a publisher of 10 clouds a second."""
+    """A link, and a publisher of 10 clouds a second, each of which waits for the one before."""
 
     def __init__(self, control: Control, rate: float, delay: float = 0.002) -> None:
         self.control, self.rate, self.delay = control, rate, delay
-        self.now = 0.0
-        self._free = 0.0
-        self._part = 0
-        self._arriving: deque[tuple[float, int]] = deque()
+        self.now = self._free = 0.0
         #: (time of publishing, time of arrival, resolution)
         self.arrived: list[tuple[float, float, float]] = []
 
-    def _until(self, now: float) -> None:
-        while self._arriving and self._arriving[0][0] <= now:
-            self.now, number = self._arriving.popleft()
-            self.control.acknowledged(1, number, self.now)
-        self.now = max(self.now, now)
-
     def run(self, seconds: float) -> None:
         end = self.now + seconds
-        tick = self.now
-        while tick < end:
+        while self.now < end:
             # of the clouds that came meanwhile, the newest
-            while tick + 0.1 <= self.now:
-                tick += 0.1
-                self.control.arrived(tick)
-            self._until(tick)
-            if self.control.arrived(tick):
-                self._send(tick)
-            tick += 0.1
-
-    def _send(self, published: float) -> None:
-        cloud = coded(self.control.resolution)
-        parts = split(cloud.data, 1, 1, self._part + 1)
-        self.control.sending(self._part + len(parts), cloud, self.now)
-        for part in parts:
-            begin = self.now
-            while not self.control.may_send():
-                if not self._arriving or self._arriving[0][0] > begin + 1.0:
-                    self.now = begin + 1.0
-                    self.control.give_up(self.now)
-                    return
-                self._until(self._arriving[0][0])
-            self._part += 1
-            self.control.sent(self._part, self.now)
-            self._free = max(self._free, self.now) + 8 * len(part) / self.rate
-            self._arriving.append((self._free + 2 * self.delay, self._part))
-        self.arrived.append((published, self._free + self.delay, cloud.resolution))
+            while self.now + 0.1 <= self._free:
+                self.now += 0.1
+                self.control.arrived(self.now)
+            if self.control.arrived(self.now):
+                cloud = coded(self.control.resolution)
+                begin = max(self.now, self._free)
+                self._free = begin + 8 * len(cloud.data) / self.rate
+                quickest = 2 * self.delay + 8 * LEAST / self.rate
+                back = self._free + 2 * self.delay
+                self.control.crossed(cloud, back - begin, quickest, back)
+                self.arrived.append((self.now, self._free + self.delay, cloud.resolution))
+            self.now += 0.1
 
 
 def test_a_wide_link_keeps_the_resolution() -> None:
@@ -119,38 +96,7 @@ def test_max_rate_is_kept_with_jitter() -> None:
     assert 49 <= sum(due) <= 52
 
 
-def test_a_receiver_that_has_gone_delays_nobody() -> None:
-    control = Control(0.01)
-    control.acknowledged(1, 1, 0.0)
-    control.acknowledged(2, 1, 0.0)
-    for number in (2, 3):
-        control.sent(number, 0.1)
-        control.acknowledged(1, number, 0.2)
-    assert not control.may_send()
-    control.forget()
-    assert control.may_send()
-    # the other one acknowledges what was in flight
-    control.sent(4, 0.3)
-    control.acknowledged(1, 4, 0.4)
-    assert control.may_send()
-
-
-def test_nothing_is_known_without_acknowledgements() -> None:
-    control = Control(0.01)
-    control.sending(50, coded(0.01), 0.0)
-    for number in range(50):
-        assert control.may_send()
-        control.sent(number, 0.0)
-    control.forget()
-    assert control.resolution == 0.01
-
-
 def test_a_link_that_takes_nothing_coarsens_at_once() -> None:
     control = Control(0.01)
-    control.acknowledged(1, 0, 0.0)
-    control.sending(12, coded(0.01), 0.0)
-    for number in (1, 2):
-        control.sent(number, 0.0)
-    assert not control.may_send()
-    control.give_up(1.0)
-    assert control.resolution > 0.02 and control.may_send()
+    control.crossed(coded(0.01), 2.0, 0.0, 2.0)
+    assert control.resolution > 0.02
