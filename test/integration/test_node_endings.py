@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes that a signal ends at any moment of their life."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import signal
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed')
+from rigs.bench import Bench
+
+#: A node without timers, whose executor has nothing to do. It says when it begins.
+IDLE = """
+import os
+import signal
+signal.signal(signal.SIGINT, lambda *_: os._exit(0))
+signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
+from rclpy.node import Node
+from image_transport_h264 import ending
+print('begins', flush=True)
+ending.run(lambda: Node('idle'))
+"""
+STARTS = 8
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_idle_node_ends_at_any_moment(bench: Bench, number: signal.Signals) -> None:
+    for _ in range(STARTS):
+        moment = random.uniform(0.0, 0.3)
+        with subprocess.Popen([sys.executable, '-c', IDLE], env=bench.environment, text=True,
+                              stdout=subprocess.PIPE, stderr=subprocess.PIPE) as node:
+            try:
+                assert node.stdout is not None and node.stdout.readline() == 'begins\n'
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    node.wait(moment)
+                node.send_signal(number)
+                _, errors = node.communicate(timeout=60)
+            finally:
+                node.kill()
+        assert (node.returncode, errors) == (0, ''), f'signal after {moment:.4f} s'
