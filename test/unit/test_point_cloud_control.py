@@ -30,6 +30,7 @@ class Link:
     def __init__(self, control: Control, rate: float, delay: float = 0.002) -> None:
         self.control, self.rate, self.delay = control, rate, delay
         self.now = self._free = 0.0
+        self._quickest = math.inf
         #: (time of publishing, time of arrival, resolution)
         self.arrived: list[tuple[float, float, float]] = []
 
@@ -44,9 +45,10 @@ class Link:
                 cloud = coded(self.control.resolution)
                 begin = max(self.now, self._free)
                 self._free = begin + 8 * len(cloud.data) / self.rate
-                quickest = 2 * self.delay + 8 * LEAST / self.rate
+                self._quickest = min(
+                    self._quickest, 2 * self.delay + 8 * LEAST / self.rate)
                 back = self._free + 2 * self.delay
-                self.control.crossed(cloud, back - begin, quickest, back)
+                self.control.crossed(cloud, back - begin, self._quickest, back)
                 self.arrived.append((self.now, self._free + self.delay, cloud.resolution))
             self.now += 0.1
 
