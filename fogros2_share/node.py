@@ -181,6 +181,11 @@ class Relay(Node):
 
     def destroy_node(self) -> None:
         """End the threads, then destroy the node."""
+        self.close()
+        super().destroy_node()
+
+    def close(self) -> None:
+        """End the threads."""
         with self._lock:
             for link in (self._server, *self._links):
                 with contextlib.suppress(OSError):  # it may not be connected
@@ -191,7 +196,6 @@ class Relay(Node):
             threads = [thread for thread in self._robots.values() if thread.is_alive()]
         for thread in threads:
             thread.join(2 * CHANGE)
-        super().destroy_node()
 
     def _complain(self, text: str) -> None:
         """Log a warning once."""
