@@ -38,6 +38,8 @@ LARGEST, OPEN = 1 << 28, 4
 QUICK, SLOW = 0.004, 0.1
 #: Slices in the link's queue above which fewer are sent; while one waits, the link has no pause.
 QUEUED = 1.25
+#: Fine slices: at least so many of a message, but of half of LEAST bytes or more, and in flight.
+MANY, AT_LEAST = 8, 2
 #: Factor from one size of slices to the next.
 STEP = 4
 #: Sender's identity, number of the slice, size of the message, place of the slice in it.
@@ -57,12 +59,12 @@ class SliceSender:
 
     :param stream: the topic whose messages are sent.
     :param changed: callback for a change of the subscribers.
-    :param largest: bytes of the largest slice.
+    :param fine: keep slices small, so that packets of other streams wait little behind them.
     """
 
     def __init__(self, node: LazyNode, stream: str, changed: Callable[[], None],
-                 largest: int = LARGEST) -> None:
-        self._node, self._changed, self._largest = node, changed, largest
+                 fine: bool = False) -> None:
+        self._node, self._changed, self._fine = node, changed, fine
         self._known = 0
         self._publisher = node.offer(
             UInt8MultiArray, f'{stream}/{SLICES}', SLICES_QOS, self._matched)
@@ -108,6 +110,8 @@ class SliceSender:
         begin = time.monotonic()
         # all of a size, as the pace compares their times
         count = -(-len(data) // self._size)
+        if self._fine:
+            count = max(count, min(MANY, len(data) // (LEAST // 2)))
         size = -(-len(data) // count)
         with self._news:
             self._pacemaker = min
@@ -121,12 +125,12 @@ class SliceSender:
             self._node.put_out(self._publisher, message.in_pieces(
                 HEADER.pack(self._identity, self._number, len(data), place) + part))
             with self._news:
-                if self._news.wait_for(self._pace.may_send, LONGEST):
+                if self._news.wait_for(self._may_send, LONGEST):
                     continue
                 # a receiver that hangs keeps the rest of the message from no other one
                 self._pacemaker = max
                 self._settle(time.monotonic())
-                if not self._pace.may_send():
+                if not self._may_send():
                     # the link is cut or slower than before, or nobody listens any more
                     self._under_way.clear()
                     if self._heard_of and self._messages:
@@ -139,10 +143,14 @@ class SliceSender:
         if count > 1 or seconds > SLOW:  # larger than the message would change nothing
             self._adapt(seconds)
 
+    def _may_send(self) -> bool:
+        """Return whether another slice may leave; fine ones keep the link busy until an answer."""
+        return self._pace.may_send() or self._fine and len(self._under_way) < AT_LEAST
+
     def _adapt(self, seconds: float) -> None:
         """Choose the size of the next message's slices by the time that one took."""
         size = self._size * STEP if seconds < QUICK else self._size // STEP
-        if QUICK <= seconds <= SLOW or not LEAST <= size <= self._largest:
+        if QUICK <= seconds <= SLOW or not LEAST <= size <= LARGEST or self._fine:
             return
         with self._news:
             # times of slices of another size say nothing about these

@@ -19,7 +19,7 @@ from image_transport_h264.budget import Budget
 from image_transport_h264.cdr import CdrError
 from image_transport_h264.lazy import IMAGE_QOS, LazyNode, run, STREAM_QOS, Tap
 from image_transport_h264.message import compressed
-from image_transport_h264.slices import LEAST, SliceSender
+from image_transport_h264.slices import SliceSender
 from point_cloud_stream import message
 from point_cloud_stream.cloud import CloudError
 from point_cloud_stream.codec import Coded, encode, FORMAT
@@ -46,8 +46,7 @@ class EncoderNode(LazyNode):
         self._worker = self.start_worker('encode', self._send)
         self._clouds = Tap(self, PointCloud2, topic, IMAGE_QOS, self._take)
         self._publisher = self.offer(CompressedImage, stream, STREAM_QOS, self._matched)
-        # small ones, as a packet of a video may wait behind each
-        self._slices = SliceSender(self, stream, self._matched, largest=LEAST)
+        self._slices = SliceSender(self, stream, self._matched, fine=True)
         self._budget = Budget(self, stream, lambda: self.subscribers(self._publisher))
         self._matched()
         self.get_logger().info(f'{topic} goes out as {stream}')

@@ -69,9 +69,9 @@ def wire() -> Wire:
     return Wire()
 
 
-def sender(wire: Wire, largest: int = LARGEST) -> SliceSender:
+def sender(wire: Wire, *, fine: bool = False) -> SliceSender:
     return SliceSender(
-        wire, '/camera/raw', lambda: None, largest)  # type: ignore[arg-type]
+        wire, '/camera/raw', lambda: None, fine)  # type: ignore[arg-type]
 
 
 def receiver(wire: Wire, largest: int = LARGEST) -> list[bytes]:
@@ -106,12 +106,14 @@ def test_slices_of_a_quick_link_grow_and_of_a_slow_one_shrink(wire: Wire) -> Non
     assert one._size == LEAST
 
 
-def test_slices_grow_no_further_than_their_user_says(wire: Wire) -> None:
-    receiver(wire)
-    one = sender(wire, LEAST)
-    for _ in range(3):
-        one.send(bytes(4 * LEAST))
-    assert sizes(wire) == [LEAST] * 12
+def test_fine_slices_are_many_and_stay_small(wire: Wire) -> None:
+    images = receiver(wire)
+    one = sender(wire, fine=True)
+    for size, count in ((100, 1), (LEAST, 2), (2 * LEAST, 4), (6 * LEAST, 8), (20 * LEAST, 20)):
+        for _ in range(2):
+            wire.sent.clear()
+            one.send(bytes(size))
+            assert len(wire.sent) == count and images[-1] == bytes(size)
 
 
 def second_held_back(wire: Wire) -> list[UInt64MultiArray]:
