@@ -2,6 +2,7 @@
 """``ros2 topic|node|service|param`` beside a node that runs."""
 
 import importlib.util
+import json
 import os
 import signal
 import subprocess
@@ -48,32 +49,69 @@ def worker():
         process.terminate()
 
 
-def ros2(*command, status=0, timeout=120, until=None, by=signal.SIGINT):
-    """Run a command; once it has said ``until``, send it a signal."""
-    if command[1] in ('list', 'info', 'get', 'set', 'echo'):
-        command = (*command[:2], '--no-daemon', *command[2:])  # which would outlive the test
+#: Runs a command a line: rclpy is imported once. It answers with the status and the output.
+COMMANDS = '''
+import contextlib, io, json, sys
+from ros2cli.cli import main
+for line in sys.stdin:
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
+        try:
+            status = main(argv=json.loads(line))
+        except SystemExit as end:
+            status = end.code
+    if isinstance(status, str):  # as sys.exit() does
+        status, _ = 1, output.write(status)
+    print(json.dumps([status or 0, output.getvalue()]), flush=True)
+'''
+
+
+def no_daemon(command):
+    """Return a command that starts no daemon, which would outlive the test."""
+    daemons = ('list', 'info', 'get', 'set', 'echo')
+    return [*command[:2], *['--no-daemon'] * (command[1] in daemons), *command[2:]]
+
+
+@pytest.fixture(scope='module')
+def ros2():
+    """Return what runs a command of ros2 and returns its output."""
+    process = subprocess.Popen([sys.executable, '-c', COMMANDS], text=True,
+                               stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+
+    def run(*command, status=0):
+        for _ in range(3):  # a busy computer may discover nothing within the command's time
+            process.stdin.write(json.dumps(no_daemon(command)) + '\n')
+            process.stdin.flush()
+            code, output = json.loads(process.stdout.readline())
+            if code == status:
+                return output
+        raise AssertionError(output)
+
+    with process:
+        yield run
+        process.stdin.close()
+
+
+def stopped(*command, until, by=signal.SIGINT):
+    """Run a command as a process and send it a signal once it has said something."""
     process = subprocess.Popen(
-        ['ros2', *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, 'PYTHONUNBUFFERED': '1'},
+        ['ros2', *no_daemon(command)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        text=True, env={**os.environ, 'PYTHONUNBUFFERED': '1'},
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
-    said = ''
+    output = ''
     try:
-        while until is not None and until not in said:
+        while until not in output:
             line = process.stdout.readline()
-            assert line, said
-            said += line
-        if until is not None:
-            process.send_signal(by)
-        out, errors = process.communicate(timeout=timeout)
+            assert line, output
+            output += line
+        process.send_signal(by)
+        return output + process.communicate(timeout=60)[0]
     finally:
         process.kill()
         process.wait()
-    if status is not None:
-        assert process.returncode == status, errors
-    return said + out + errors
 
 
-def test_topic_list_and_info_show_topics(worker):
+def test_topic_list_and_info_show_topics(worker, ros2):
     listed = ros2('topic', 'list', '-t').splitlines()
     assert '/cell/chatter [std_msgs/msg/String]' in listed and '/rosout [' in str(listed)
     info = ros2('topic', 'info', '/cell/chatter')
@@ -84,7 +122,7 @@ def test_topic_list_and_info_show_topics(worker):
     assert "Unknown topic '/none'" in ros2('topic', 'info', '/none', status=1)
 
 
-def test_topic_echo_prints_messages(worker):
+def test_topic_echo_prints_messages(worker, ros2):
     assert ros2('topic', 'echo', '--once', '--field', 'data', '/cell/chatter') == 'hello\n---\n'
     assert ros2('topic', 'echo', '--once', '/cell/chatter', 'std_msgs/msg/String') == \
         'data: hello\n---\n'
@@ -95,7 +133,7 @@ def test_topic_echo_prints_messages(worker):
     assert 'message type is invalid' in ros2('topic', 'echo', '/x', 'no/such', status=1)
 
 
-def test_topic_pub_publishes_and_ends(worker):
+def test_topic_pub_publishes_and_ends(worker, ros2):
     done = ros2('topic', 'pub', '--once', '/cell/orders', 'std_msgs/msg/String', '{data: go}')
     assert "publishing #1: std_msgs.msg.String(data='go')" in done
     assert worker.stdout.readline() == 'go\n'
@@ -110,7 +148,7 @@ def test_topic_pub_publishes_and_ends(worker):
 
 
 @ours
-def test_first_message_reaches_the_awaited_subscription():
+def test_first_message_reaches_the_awaited_subscription(ros2):
     reader = subprocess.Popen(
         ['ros2', 'topic', 'echo', '--once', '/first', 'std_msgs/msg/String'],
         stdout=subprocess.PIPE, text=True)
@@ -140,18 +178,18 @@ def test_topic_pub_repeats_until_interrupted(worker):
     ('topic', 'pub', '--once', '/nobody', 'std_msgs/msg/String'),
     ('service', 'call', '/nobody', 'std_srvs/srv/SetBool')])
 def test_sigterm_ends_a_waiting_command(command):
-    said = ros2(*command, until='aiting for ', by=signal.SIGTERM, status=None, timeout=60)
+    said = stopped(*command, until='aiting for ', by=signal.SIGTERM)
     assert 'publishing' not in said and 'response' not in said
     if importlib.util.find_spec('embedded_default'):
         assert len(said.splitlines()) == 1
 
 
 def test_topic_hz_measures(worker):
-    rate = ros2('topic', 'hz', '/cell/chatter', until='window: ', status=None)
+    rate = stopped('topic', 'hz', '/cell/chatter', until='window: ')
     assert 15 < float(rate.split('average rate: ')[1].split()[0]) < 25
 
 
-def test_node_list_and_info_show_nodes(worker):
+def test_node_list_and_info_show_nodes(worker, ros2):
     assert '/cell/worker' in ros2('node', 'list').splitlines()
     info = ros2('node', 'info', '/cell/worker').splitlines()
     assert info[0] == '/cell/worker'
@@ -164,7 +202,7 @@ def test_node_list_and_info_show_nodes(worker):
     assert "Unable to find node '/none'" in ros2('node', 'info', '/none', status=1)
 
 
-def test_service_list_and_call_work(worker):
+def test_service_list_and_call_work(worker, ros2):
     assert '/cell/switch [std_srvs/srv/SetBool]' in \
         ros2('service', 'list', '-t').splitlines()
     called = ros2('service', 'call', '/cell/switch', 'std_srvs/srv/SetBool',
@@ -175,7 +213,7 @@ def test_service_list_and_call_work(worker):
     assert 'service type is invalid' in ros2('service', 'call', '/x', 'no/such', status=1)
 
 
-def test_param_verbs_list_get_and_set(worker):
+def test_param_verbs_list_get_and_set(worker, ros2):
     listed = ros2('param', 'list', '/cell/worker').splitlines()
     assert {'  arm.joints', '  speed', '  use_sim_time'} <= {*listed} and sorted(listed) == listed
     assert '/cell/worker:' in ros2('param', 'list').splitlines()
