@@ -14,6 +14,7 @@ The relay passes UDP on, as a NAT would, so that the machine can't dial the robo
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+import contextlib
 import dataclasses
 import functools
 import importlib.util
@@ -393,15 +394,21 @@ def middleware() -> str:
     return 'cyclonedds'
 
 
-@pytest.fixture
-def lab(tmp_path: Path, tun: None, middleware: str) -> Iterator[Lab]:
-    """Return hosts without a VPN, gone after the test."""
-    network = Lab(tmp_path, middleware)
+@contextlib.contextmanager
+def opened(network: Lab) -> Iterator[Lab]:
+    """Have the hosts in the block."""
     try:
         network.open()
         yield network
     finally:
         network.close()
+
+
+@pytest.fixture
+def lab(tmp_path: Path, tun: None, middleware: str) -> Iterator[Lab]:
+    """Return hosts without a VPN, gone after the test."""
+    with opened(Lab(tmp_path, middleware)) as network:
+        yield network
 
 
 @pytest.fixture

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import dataclasses
 import os
 from pathlib import Path
 import stat
 import subprocess
 import sys
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -17,12 +17,8 @@ from fogros2 import process
 from fogros2.errors import CommandError
 from fogros2.model import Command, Peer
 from fogros2.waiting import wait_until
-from rigs.vpn_lab import abandoned
+from rigs.vpn_lab import abandoned, Lab, MACHINE, opened, ROBOT
 
-if TYPE_CHECKING:
-    from rigs.vpn_lab import Lab
-
-ROBOT, MACHINE = '198.18.7.1', '198.18.7.2'
 #: Answers UDP at ports 7411 (DDS's) and 9000, and TCP at 22, of the addresses given.
 SERVER = '''
 import itertools, selectors, socket, sys
@@ -82,49 +78,48 @@ def traces(lab: Lab, host: str) -> list[str]:
     return found + ([f'process {lab.wireguard_go(host)}'] if lab.wireguard_go(host) else [])
 
 
-def test_up_carries_and_down_leaves_nothing(vpn: Lab) -> None:
+def test_up_carries_and_down_leaves_nothing_of_ours(vpn: Lab, tmp_path: Path) -> None:
+    """A wireguard-go ends itself when its socket goes: a stopped one shows that down ends it."""
     assert vpn.ping('robot', MACHINE) and vpn.ping('machine', ROBOT)
     assert vpn.alive('robot') and vpn.alive('machine')
-    assert traces(vpn, 'robot') and traces(vpn, 'machine')
-    for host, interface in vpn.interfaces.items():
-        for _ in range(2):
-            vpn.do(host, vpn.vpn.down(interface))
-        assert traces(vpn, host) == []
-
-
-@pytest.mark.parametrize('host', ['robot', 'machine'])
-def test_down_ends_a_wireguard_go_that_does_not_end_itself(vpn: Lab, host: str) -> None:
-    """It normally does when its socket goes, which hides whether ``down`` has found it."""
-    running = vpn.wireguard_go(host)
-    if not running:
-        pytest.skip('this kernel has WireGuard itself')
-    process.run(Command(('kill', '-STOP', str(running)), sudo=True), timeout=60.0)
-    try:
-        vpn.do(host, vpn.vpn.down(vpn.interfaces[host]))
-        wait_until(lambda: not vpn.wireguard_go(host), timeout=10.0,
-                   what='the end of the stopped wireguard-go')
-    finally:
-        process.run(Command(('kill', '-CONT', str(running)), sudo=True), timeout=60.0,
-                    check=False)
-    assert traces(vpn, host) == []
-
-
-def test_down_leaves_a_wireguard_go_of_another_network(vpn: Lab, tmp_path: Path) -> None:
-    interface = vpn.interfaces['robot']
     program = tmp_path / 'wireguard-go'
     program.write_text('#!/bin/sh\necho "{\\"ready\\": true}"\nread -r end\n')
     program.chmod(0o755)
-    others = {host: vpn.start(host, [str(program), interface.name]) for host in ('lan', 'robot')}
+    others = {host: vpn.start(host, [str(program), vpn.interfaces['robot'].name])
+              for host in ('lan', 'robot')}
     for other in others.values():
         other.wait('ready')
-    vpn.do('robot', vpn.vpn.down(interface))
-    # the one beside it is ended, or this test would prove nothing
+    for host, interface in vpn.interfaces.items():
+        assert traces(vpn, host)
+        running = vpn.wireguard_go(host)
+        if running:  # this kernel has no WireGuard itself
+            process.run(Command(('kill', '-STOP', str(running)), sudo=True), timeout=60.0)
+        try:
+            for _ in range(2):
+                vpn.do(host, vpn.vpn.down(interface))
+            wait_until(lambda host=host: not vpn.wireguard_go(host), timeout=10.0,
+                       what='the end of the stopped wireguard-go')
+        finally:
+            if running:
+                process.run(Command(('kill', '-CONT', str(running)), sudo=True), timeout=60.0,
+                            check=False)
+        assert traces(vpn, host) == []
+    # of two others, the one in the robot's own network is ended
     wait_until(lambda: others['robot'].process.poll() is not None, timeout=10.0,
                what='the end of the wireguard-go in the same network')
     assert others['lan'].process.poll() is None
 
 
-def test_up_again_changes_nothing_and_keeps_the_session(vpn: Lab) -> None:
+@pytest.fixture(scope='module')
+def shared(tun: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    """Have a VPN for tests that leave it as it is."""
+    with opened(Lab(tmp_path_factory.mktemp('vpn'))) as vpn:
+        vpn.connect()
+        yield vpn
+
+
+def test_up_again_changes_nothing_and_keeps_the_session(shared: Lab) -> None:
+    vpn = shared
     def handshakes() -> list[object]:
         status = vpn.run('robot', vpn.vpn.status(vpn.interfaces['robot'])).stdout
         return [peer['handshake'] for peer in vpn.vpn.parse_status(status).values()]
@@ -138,32 +133,34 @@ def test_up_again_changes_nothing_and_keeps_the_session(vpn: Lab) -> None:
         'chain ') == 5
 
 
-def test_up_takes_over_what_a_killed_launch_left(lab: Lab) -> None:
+def test_up_takes_over_what_failed_and_killed_launches_left(lab: Lab) -> None:
     interface = lab.interfaces['machine']
-    lab.run('machine', lab.vpn.keys(interface))
+    command = lab.vpn.keys(interface)
+    public = [lab.run('machine', command).stdout for _ in range(2)]
+    assert public[0] == public[1] and len(public[0].strip()) == 44
+    # a step fails
+    with pytest.raises(CommandError, match='set the VPN interface .* up failed'):
+        lab.do('machine', lab.vpn.up(dataclasses.replace(interface, address='198.18.7.999'), []))
+    lab.do('machine', lab.vpn.down(interface))
+    assert traces(lab, 'machine') == []
+    # a launch is killed after its first step
+    lab.run('machine', command)
     lab.shell('machine', f'ip tuntap add dev {interface.name} mode tun; '
                          f'mkdir -p /var/run/wireguard; touch /var/run/wireguard/'
                          f'{interface.name}.sock')
     lab.connect()
     assert lab.ping('robot', MACHINE)
-
-
-def test_keys_are_made_once_and_stay_where_they_are(lab: Lab) -> None:
-    interface = lab.interfaces['robot']
-    command = lab.vpn.keys(interface)
-    public = [lab.run('robot', command).stdout for _ in range(2)]
-    assert public[0] == public[1] and len(public[0].strip()) == 44
     path = Path(interface.key_file)
     if os.geteuid() == 0:
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         private = path.read_text().strip()
-        lab.connect()
-        said = lab.run('robot', lab.vpn.status(interface)).stdout
+        said = lab.run('machine', lab.vpn.status(interface)).stdout
         words = [' '.join(c.argv) for c in lab.vpn.up(interface, [])]
         assert all(private not in text for text in [said, *words])
 
 
-def test_another_peer_doesnt_disturb_the_first(vpn: Lab) -> None:
+def test_another_peer_doesnt_disturb_the_first(shared: Lab) -> None:
+    vpn = shared
     interface = vpn.interfaces['robot']
     before = vpn.vpn.parse_status(vpn.run('robot', vpn.vpn.status(interface)).stdout)
     second = Peer('second', f'{"A" * 43}=', '198.18.7.3', '198.51.100.1:9')
@@ -177,9 +174,11 @@ def test_another_peer_doesnt_disturb_the_first(vpn: Lab) -> None:
         assert after[key]['received'] > peer['received']
     vpn.do('robot', vpn.vpn.peers(interface, [second]))
     assert not vpn.ping('robot', MACHINE, timeout=1.0)
+    vpn.do('robot', vpn.vpn.peers(interface, vpn.peers()['robot']))
 
 
-def test_networks_that_lead_to_no_machine_may_come_and_go(vpn: Lab) -> None:
+def test_networks_that_lead_to_no_machine_may_come_and_go(shared: Lab) -> None:
+    vpn = shared
     space = vpn.spaces['robot']
     vpn.ip('-n', space, 'link', 'add', 'br7', 'type', 'bridge')
     vpn.ip('-n', space, 'address', 'add', '192.168.99.1/24', 'dev', 'br7')
@@ -194,6 +193,8 @@ def test_networks_that_lead_to_no_machine_may_come_and_go(vpn: Lab) -> None:
     assert not vpn.alive('robot')
     vpn.repair('robot')
     assert vpn.alive('robot') and vpn.ping('robot', MACHINE, timeout=4.0)
+    vpn.ip('-n', space, 'address', 'delete', '198.51.100.7/24', 'dev', 'e0')
+    vpn.repair('robot')
 
 
 def test_a_hijacked_machine_reaches_dds_and_ping_alone(vpn: Lab) -> None:
@@ -229,34 +230,14 @@ def test_a_hijacked_machine_reaches_dds_and_ping_alone(vpn: Lab) -> None:
     assert sorted(reached()) == sorted(targets)
 
 
-def test_failure_of_a_step_is_reported(lab: Lab) -> None:
-    interface = dataclasses.replace(lab.interfaces['machine'], address='198.18.7.999')
-    lab.run('machine', lab.vpn.keys(interface))
-    with pytest.raises(CommandError, match='set the VPN interface .* up failed'):
-        lab.do('machine', lab.vpn.up(interface, []))
-    lab.do('machine', lab.vpn.down(interface))
-    assert traces(lab, 'machine') == []
-
-
-def test_a_machine_whose_own_network_overlaps_has_both(lab: Lab) -> None:
-    # the machine's own network is the very one that the launch has chosen
-    lab.link('machine', 'own0', '198.18.7.200/24', 'lan', 'own0', '198.18.7.201/24')
-    lab.interfaces['machine'] = dataclasses.replace(lab.interfaces['machine'], host_routes=True)
-    lab.connect()
-    assert lab.ping('robot', MACHINE) and lab.ping('machine', ROBOT)
-    assert lab.ping('machine', '198.18.7.201')
-    assert lab.ping('lan', '198.18.7.200')
-    # and again, as a repair has it
-    lab.repair('machine')
-    assert lab.ping('machine', ROBOT) and lab.ping('machine', '198.18.7.201')
-
-
-@pytest.mark.parametrize('taken', [ROBOT, MACHINE])
-def test_machine_with_an_address_of_the_vpn_is_reported(lab: Lab, taken: str) -> None:
-    lab.link('machine', 'own0', f'{taken}/24', 'lan', 'own0', '198.18.7.201/24')
-    lab.interfaces['machine'] = dataclasses.replace(lab.interfaces['machine'], host_routes=True)
-    with pytest.raises(CommandError, match=f'in use already: local {taken} dev own0'):
-        lab.connect()
+def test_machine_with_an_address_of_the_vpn_is_reported(lab: Lab) -> None:
+    interface = dataclasses.replace(lab.interfaces['machine'], host_routes=True)
+    peers = lab.peers()['machine']
+    for taken in (ROBOT, MACHINE):
+        lab.link('machine', 'own0', f'{taken}/24', 'lan', 'own0', '198.18.7.201/24')
+        with pytest.raises(CommandError, match=f'in use already: local {taken} dev own0'):
+            lab.do('machine', lab.vpn.up(interface, peers))
+        lab.ip('-n', lab.spaces['machine'], 'link', 'delete', 'own0')
 
 
 def test_only_hosts_of_killed_test_runs_are_removed() -> None:
