@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A launch of a second robot runs nodes on the first robot's machine, by an invitation."""
+"""A second robot joins the machine of a launch by an invitation, with terminals and with nodes."""
 
 from __future__ import annotations
 
@@ -21,8 +21,6 @@ from rigs.second_robot import second, SecondRobot
 
 __all__ = ['second']
 
-#: The key of a third computer.
-OTHER = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
 FIRST = """
 from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 
@@ -31,6 +29,8 @@ def generate_launch_description():
     machine = ContainerInstance(
         name='{name}', network='{network}', ros_workspace='', on_exit='{on_exit}')
     return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='fogros2_examples', executable='talker',
+                  remappings=[('chatter', '/far')]),
         CloudNode(machine=machine, package='fogros2_examples', executable='listener',
                   output='screen', remappings=[('chatter', '/near')])])
 """
@@ -73,13 +73,19 @@ class First:
                           ).split()
 
     def talkers(self) -> int:
-        return self.there('cat /proc/[0-9]*/cmdline | tr "\\0" " "').count('/talker ')
+        """Return how many nodes of guests run on the machine."""
+        return sum('/talker ' in line and '/near' in line for line in self.there(
+            'for p in /proc/[0-9]*; do tr "\\0" " " <$p/cmdline; echo; done').splitlines())
+
+    def fog(self, verb: str, *words: str, status: int = 0) -> str:
+        """Run a verb for the machine; return its output, or its errors if it has to fail."""
+        done = ros2('fog', verb, self.name, *words)
+        assert done.returncode == status, done.stdout + done.stderr
+        return str(done.stderr if status else done.stdout).strip()
 
     def invited(self, second: SecondRobot, *options: str) -> str:
         key = second.run('ros2', 'fog', 'key').strip()
-        done = ros2('fog', 'invite', self.name, '--key', key, '--address', second.host, *options)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return str(done.stdout).strip()
+        return self.fog('invite', '--key', key, '--address', second.host, *options)
 
 
 @pytest.fixture
@@ -128,12 +134,17 @@ def workspace(tmp_path: Path) -> Path:
     return prefix
 
 
-def test_nodes_of_a_second_robot_end_with_its_heartbeat(
+def test_guest_runs_nodes_until_it_is_silent_or_revoked(
     first: Callable[[str], First], second: SecondRobot, join: Callable[..., Launched],
     workspace: Path,
 ) -> None:
     host = first('delete')
+    old = host.invited(second)
     text = host.invited(second)
+    replayed = join(old)
+    assert replayed.ended() == 1
+    assert "'theirs' refuses this invitation" in replayed.text, replayed.text
+    assert host.accounts() == []
     joined = join(text, str(workspace.parents[1]))
     joined.wait_for(f'/ws{workspace}/lib/own/where')
     assert any('/var/lib/fogros2-guests/fog' in line for line in joined.said), joined.text
@@ -155,17 +166,52 @@ def test_nodes_of_a_second_robot_end_with_its_heartbeat(
     again.child.send_signal(signal.SIGKILL)
     wait_until(lambda: host.talkers() == 0, timeout=60.0, what='the end of the nodes')
     assert host.accounts()
-    assert ros2('fog', 'revoke', host.name).returncode == 0
+    host.fog('revoke')
     assert host.accounts() == []
     again.kill()
     second.run('ros2', 'fog', 'gc')
     assert second.run('ip', '-brief', 'link').count('fog') == 0
+    revoked = join(text)
+    assert revoked.ended() == 1
+    assert "'theirs' does not answer" in revoked.text, revoked.text
+    assert host.accounts() == []
 
 
-def test_nodes_go_on_when_the_inviting_launch_keeps_its_machine(
+def terminals_hear_and_are_heard(host: First, second: SecondRobot) -> None:
+    """Join with the terminals of the second robot, and leave."""
+    old = host.invited(second, '--for', '1s')
+    wait_until(lambda: 'GUEST' not in host.fog('status'), timeout=60, what='the expiry')
+    assert 'has expired' in second.run('ros2', 'fog', 'join', old, status=1)
+    text = host.invited(second)
+    own = ('198.18.0.9/15', 'dev', 'lo')
+    second.ip('-n', second.spaces[1], 'address', 'add', *own)
+    said = second.run('ros2', 'fog', 'join', text, status=1)
+    assert 'this computer uses 198.18.0.0/15' in said and 'FOGROS2_VPN_POOL' in said
+    second.ip('-n', second.spaces[1], 'address', 'delete', *own)
+    second.run('sh', '-ec', f'eval "$(ros2 fog join {text})"; ros2 topic echo --once '
+               '/far std_msgs/msg/String')
+    speaker = second.start('sh', '-ec', f'eval "$(ros2 fog env {host.name})"; exec ros2 topic pub '
+                           "/near std_msgs/msg/String '{data: from the second}'")
+    try:
+        host.launched.wait_for('from the second')
+    finally:
+        speaker.terminate()
+        speaker.communicate()
+    assert 'GUEST' in host.fog('status')
+    assert 'round trip' in second.run('ros2', 'fog', 'status', host.name)
+    second.run('ros2', 'fog', 'join', text)  # once more changes nothing
+    assert second.run('ros2', 'fog', 'leave', host.name) == f'left {host.name}\n'
+    assert 'has not joined' in second.run('ros2', 'fog', 'leave', host.name, status=1)
+    assert 'no guest robot9' in host.fog('revoke', 'robot9', status=1)
+    assert host.fog('revoke').startswith('revoked ')
+    wait_until(lambda: 'GUEST' not in host.fog('status'), timeout=60, what='the guest to be gone')
+
+
+def test_terminals_and_nodes_of_a_guest_until_the_next_launch(
     first: Callable[[str], First], second: SecondRobot, join: Callable[..., Launched],
 ) -> None:
     host = first('keep')
+    terminals_hear_and_are_heard(host, second)
     joined = join(host.invited(second))
     joined.wait_for('I heard')
     host.launched.interrupt()
@@ -173,49 +219,10 @@ def test_nodes_go_on_when_the_inviting_launch_keeps_its_machine(
     heard = joined.text.count('I heard')
     joined.wait_for('I heard', times=heard + 5)
     assert host.talkers() == 1 and host.there('ls /sys/class/net').count('fog') == 1
-    joined.interrupt()
-    assert joined.ended() == 0, joined.text
-    assert ros2('fog', 'revoke', host.name).returncode == 0
-    wait_until(lambda: not host.there('ls /sys/class/net /run | grep ^fog.*m0'), timeout=60.0,
-               what='the door to take the VPN down')
-    assert host.accounts() == []
-    deleted = ros2('fog', 'delete', '--yes', host.name)
-    assert deleted.returncode == 0, deleted.stdout + deleted.stderr
-
-
-def test_next_launch_takes_its_machine_from_the_guests(
-    first: Callable[[str], First], second: SecondRobot, join: Callable[..., Launched],
-) -> None:
-    host = first('keep')
-    joined = join(host.invited(second))
-    joined.wait_for('I heard')
-    host.launched.interrupt()
-    assert host.launched.ended() == 0, host.launched.text
+    # the next launch takes its machine from the guests
     again = first('delete')
     assert again.accounts() == [] and again.talkers() == 0
     assert again.there('ls /sys/class/net').count('fog') == 1
-
-
-def test_invitation_that_is_not_valid_any_more_gets_no_answer(
-    first: Callable[[str], First], second: SecondRobot, join: Callable[..., Launched],
-) -> None:
-    host = first('delete')
-    old = host.invited(second)
-    new = host.invited(second)
-    replayed = join(old)
-    assert replayed.ended() == 1
-    assert "'theirs' refuses this invitation" in replayed.text, replayed.text
-    assert host.accounts() == []
-    assert ros2('fog', 'revoke', host.name).returncode == 0
-    revoked = join(new)
-    assert revoked.ended() == 1
-    assert "'theirs' does not answer" in revoked.text, revoked.text
-    foreign = ros2('fog', 'invite', host.name, '--key', OTHER, '--address',
-                   second.host).stdout.strip()
-    stranger = join(foreign)
-    assert stranger.ended() == 1
-    assert 'this invitation is for another computer' in stranger.text, stranger.text
-    assert 'theirs: machine' not in stranger.text and host.accounts() == []
 
 
 SSH = """
