@@ -41,6 +41,13 @@ class Bench:
         self.executor.add_node(self.node)
         self.processes: list[tuple[subprocess.Popen[str], list[str], threading.Thread]] = []
 
+    def renew(self) -> None:
+        """Replace the node, so that the next test has no publisher or subscription of this one."""
+        self.executor.remove_node(self.node)
+        self.node.destroy_node()
+        self.node = Node('bench', context=self.context)
+        self.executor.add_node(self.node)
+
     def start(
         self, role: str, *words: str, package: str = 'image_transport_h264',
     ) -> list[str]:

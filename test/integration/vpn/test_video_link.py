@@ -163,6 +163,7 @@ def test_jpeg_fills_link_and_never_queues(vpn: Any) -> None:
         lines = during(viewer, time.monotonic() + 2.0, 5.0)
         numbers = [line['image'] for line in lines]
         assert numbers == sorted(set(numbers))
+        assert all(line.get('psnr', 99.0) > 30 for line in lines)
         latencies = sorted(line['latency'] - delay for line in lines)
         # its own time on the wire, twice: before it leaves, it waits for the one before
         return len(lines) >= 0.6 * 5.0 / wire \
