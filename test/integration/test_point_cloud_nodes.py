@@ -16,6 +16,7 @@ from sensor_msgs.msg import CompressedImage, PointCloud2
 
 from fogros2_examples.city import City
 from fogros2_examples.lidar import message
+from point_cloud_stream.control import COARSEST
 from rigs.bench import Bench, BEST_EFFORT, RELIABLE
 
 SCAN = City(16, 256).scan(3)
@@ -50,27 +51,7 @@ def points(got: PointCloud2) -> Any:
     return numpy.frombuffer(got.data, SCAN.dtype).reshape(got.height, got.width)
 
 
-def test_clouds_come_out_as_they_went_in(bench: Bench) -> None:
-    pair(bench)
-    seen = bench.heard(PointCloud2, '/seen/points')
-    bench.until(lambda: len(seen) >= 5, 'a cloud', meanwhile=source(bench))
-    for got in seen:
-        sent = cloud(got.header.stamp.sec - 1000)
-        assert got.header == sent.header and got.fields == sent.fields
-        assert (got.height, got.width, got.point_step, got.row_step, got.is_bigendian,
-                got.is_dense) == (sent.height, sent.width, sent.point_step, sent.row_step,
-                                  sent.is_bigendian, sent.is_dense)
-        after = points(got)
-        for name in SCAN.dtype.names:
-            if name in 'xyz':
-                assert (numpy.isnan(after[name]) == numpy.isnan(SCAN[name])).all()
-                error = numpy.nanmax(abs(after[name].astype(float) - SCAN[name]))
-                assert error <= 0.0005, error
-            else:
-                assert (after[name] == SCAN[name]).all()
-
-
-def test_several_streams_and_late_subscribers(bench: Bench) -> None:
+def test_clouds_of_several_streams_come_out_as_they_went_in(bench: Bench) -> None:
     pair(bench)
     pair(bench, topic='/rear')
     publish = [source(bench), source(bench, '/rear')]
@@ -86,6 +67,22 @@ def test_several_streams_and_late_subscribers(bench: Bench) -> None:
                 meanwhile=lambda: [p() for p in publish])
     numbers = [got.header.stamp.sec for got in seen]
     assert numbers == sorted(numbers)
+    errors = []
+    for got in (*seen, *late):
+        sent = cloud(got.header.stamp.sec - 1000)
+        assert got.header == sent.header and got.fields == sent.fields
+        assert (got.height, got.width, got.point_step, got.row_step, got.is_bigendian,
+                got.is_dense) == (sent.height, sent.width, sent.point_step, sent.row_step,
+                                  sent.is_bigendian, sent.is_dense)
+        after = points(got)
+        for name in SCAN.dtype.names:
+            if name in 'xyz':
+                assert (numpy.isnan(after[name]) == numpy.isnan(SCAN[name])).all()
+                errors.append(numpy.nanmax(abs(after[name].astype(float) - SCAN[name])))
+            else:
+                assert (after[name] == SCAN[name]).all()
+    # a busy computer's encoder may have taken a coarser resolution
+    assert min(errors) <= 0.0005 and max(errors) <= COARSEST / 2
     # one that dies stops nobody
     process, _, _ = bench.processes.pop()
     process.kill()
