@@ -33,17 +33,25 @@ while True:
         said = key.fileobj.accept()[1][0] if key.data[0] == 't' else key.fileobj.recv(99).decode()
         print(json.dumps({'at': key.data, 'said': said}), flush=True)
 '''
+#: Tries to reach all its arguments at once.
 SENDER = '''
-import socket, sys
+import select, socket, sys, time
+waiting = []
 for word in sys.argv[1:]:
     kind, host, port = word.split(':')
     one = socket.socket(type=socket.SOCK_STREAM if kind == 'tcp' else socket.SOCK_DGRAM)
-    one.settimeout(1.5)
+    one.setblocking(False)
     try:
         one.connect((host, int(port)))
         one.send(host.encode())
+    except BlockingIOError:
+        waiting.append(one)
     except OSError:
         pass
+end = time.monotonic() + 1.5
+while waiting and time.monotonic() < end:
+    for one in select.select([], waiting, [], 0.1)[1]:
+        waiting.remove(one)
 '''
 #: The last one is for the heartbeats of another guest.
 PORTS = ['tcp:0.0.0.0:22', 'tcp:0.0.0.0:8765', 'udp:0.0.0.0:7399', 'udp:0.0.0.0:53',
@@ -125,7 +133,7 @@ def test_guest_reaches_dds_ping_and_its_door_alone(vpn: Lab, guest: Guest) -> No
                 for word in (*PORTS, *OWN, DDS)))
     send(vpn, f'udp:{MACHINE}:7410')
     machine.wait('said', count=4)
-    assert [line['at'] for line in machine.lines('said')] == [*OWN, DDS, DDS]
+    assert sorted(line['at'] for line in machine.lines('said')) == sorted([*OWN, DDS, DDS])
     assert robot.lines('said') == []
     assert not vpn.ping('guest', ROBOT, timeout=1.0) and vpn.ping('guest', MACHINE)
 

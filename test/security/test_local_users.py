@@ -137,10 +137,11 @@ finally:
 """
 #: The loopback interface for sockets of both address families.
 FAMILIES = pytest.mark.parametrize('address', ['127.0.0.1', '::ffff:127.0.0.1'])
-#: Opens many connections to a port of the loopback, and counts those that the server closes.
+#: Opens so many connections to a port of the loopback, and counts those that the server closes.
 MANY = """\
 import socket
-links = [socket.create_connection((sys.argv[2], int(sys.argv[1]))) for _ in range(150)]
+links = [socket.create_connection((sys.argv[2], int(sys.argv[1])))
+         for _ in range(int(sys.argv[3]))]
 closed = 0
 for link in links:
     link.settimeout(60)
@@ -279,8 +280,8 @@ def test_no_account_takes_up_the_dashboard_s_threads(root: None) -> None:
     dashboard = Dashboard(None)  # type: ignore[arg-type]
     threading.Thread(target=dashboard.serve, daemon=True).start()
     before = threading.active_count()
-    with stranger(MANY, str(dashboard.port), '127.0.0.1') as child:
-        assert child.stdout and child.stdout.readline() == b'150\n'
+    with stranger(MANY, str(dashboard.port), '127.0.0.1', '20') as child:
+        assert child.stdout and child.stdout.readline() == b'20\n'
         assert threading.active_count() == before
         with socket.create_connection(('127.0.0.1', dashboard.port)) as own:
             own.sendall(b'GET / HTTP/1.0\r\nHost: %b\r\n\r\n' % dashboard.hosts[0].encode())
@@ -292,8 +293,8 @@ def test_no_account_starts_programs_through_the_tunnel(root: None) -> None:
     shell = FakeShell(streams=[])
     made = Tunnel(shell, ('127.0.0.1', 9))
     threading.Thread(target=made.serve, daemon=True).start()
-    with stranger(MANY, str(made.port), '127.0.0.1') as child:
-        assert child.stdout and child.stdout.readline() == b'150\n'
+    with stranger(MANY, str(made.port), '127.0.0.1', '20') as child:
+        assert child.stdout and child.stdout.readline() == b'20\n'
     assert shell.opened == []
     made.close()
 
@@ -305,7 +306,7 @@ def test_no_account_takes_up_the_gate_s_connections(root: None, address: str) ->
         listener.setblocking(False)
         port = listener.getsockname()[1]
         serving = asyncio.ensure_future(Gate(('127.0.0.1', 9), 'token').serve(listener))
-        with stranger(MANY, str(port), address) as child:
+        with stranger(MANY, str(port), address, '150') as child:
             assert child.stdout
             closed = await asyncio.to_thread(child.stdout.readline)
             assert closed == b'150\n'
@@ -351,8 +352,8 @@ def test_no_account_takes_up_the_door_for_guests(
     door = Door(SimpleNamespace(state=tmp_path / 'guests'),  # type: ignore[arg-type]
                 {'address': '127.0.0.1', 'port': 0, 'agent': __file__})
     threading.Thread(target=door.serve_forever, daemon=True).start()
-    with stranger(MANY, str(door.server_address[1]), '127.0.0.1') as child:
-        assert child.stdout and child.stdout.readline() == b'150\n'
+    with stranger(MANY, str(door.server_address[1]), '127.0.0.1', '20') as child:
+        assert child.stdout and child.stdout.readline() == b'20\n'
     door.shutdown()
     door.server_close()
 
