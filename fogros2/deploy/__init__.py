@@ -12,6 +12,7 @@ Each step pushes its undo before it runs. The modules, each imports only those b
 ``choosing``      choices of the providers before anything is created, and prices
 ``checks``        checks before anything is created
 ``context``       what the steps of one machine use
+``life``          the phases of a machine, and how it ends in each
 ``machine_job``   what the steps of one machine learn and change, and how they are undone
 ``requests``      the end of a creation that got no answer
 ``steps``         a module for each step

@@ -100,7 +100,7 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
     for name, ending in features.items():
         ending.enter_context(feature.load(name).machine(
             running, feature.options(name, job.spec.features.get(name, {}))))
-    job.failed = False
+    running.begin()
     return running
 
 

@@ -13,6 +13,7 @@ from typing import Any, Optional
 from fogros2 import plan
 from fogros2.agent_client import AgentClient, Heartbeat
 from fogros2.deploy.context import Context
+from fogros2.deploy.life import Life, Phase
 from fogros2.deploy.undo import PORTS, Site, UndoStack, unmake
 from fogros2.errors import AgentAbsent, ConnectError, DeadlineExceeded, FogError
 from fogros2.model import Command, MachineSpec, VpnInterface
@@ -57,16 +58,13 @@ class MachineJob(Site):
         self.undo = UndoStack(context.report, spec.name, context.failures)
         self.undo.callback(self._report_left)
         self._left: list[str] = []
-        #: Whether an earlier launch created the machine, and the id of its last launch.
-        self.reused = False
+        self.life = Life()
+        #: The id of the last launch of a machine that an earlier launch created.
         self.former = ''
+        #: Seconds of silence after which it is lost, whatever its provider reports.
+        self.longest_silence: Optional[float] = None
         #: The agent's UDP port for heartbeats, and the address from which they come.
         self.heartbeats = (plan.HEARTBEAT_PORT, context.vpn.interface.address)
-        #: False as soon as the machine is up.
-        self.failed = True
-        #: ``gone``: the provider reports the machine as stopped.
-        #: ``deleted``: the provider no longer knows the machine.
-        self.gone = self.deleted = False
         #: Number of the first agent event that belongs to this launch; 0 before the agent answers.
         self.first_event = 0
         #: Functions that ask the machine for an answer; each gets the time-out in seconds.
@@ -119,7 +117,7 @@ class MachineJob(Site):
     def _unmake(self, made: Made) -> None:
         if made not in self.record.made:
             return
-        if self.remains if made.kind in PORTS else self.survives:
+        if self.survives(stopped=made.kind in PORTS):
             unmake(self, made)
         self.forget(made)
 
@@ -200,21 +198,14 @@ class MachineJob(Site):
         """The path of the middleware's configuration on the machine."""
         return f'{self.directory}/{self._context.dds.file_name}'
 
-    @property
-    def survives(self) -> bool:
-        """Whether the machine outlives the launch, so that the launch has to clean it up."""
-        if self.gone:
-            return False
-        owned = self._context.capabilities.owned
-        if self.failed and not self.reused:
-            return not owned
-        return self.spec.on_exit == 'keep' or not owned
+    def enter(self, phase: Phase, reason: str = '') -> None:
+        """Enter a phase, unless it comes too late."""
+        self.life = self.life.then(phase, reason)
 
-    @property
-    def remains(self) -> bool:
-        """Whether the machine survives, or is stopped and keeps its firewall."""
-        return self.survives or self.spec.on_exit == 'stop' and not (
-            self.gone or self.failed and not self.reused)
+    def survives(self, *, stopped: bool = False) -> bool:
+        """Return whether the launch has to clean it up; see :meth:`Life.survives`."""
+        return self.life.survives(
+            self.spec.on_exit, owned=self._context.capabilities.owned, stopped=stopped)
 
     def run(self, *commands: Command, timeout: Optional[float] = None) -> str:
         """Run commands on the machine on the way up; return the last one's output."""

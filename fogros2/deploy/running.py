@@ -13,6 +13,7 @@ from typing import Any, Optional
 from fogros2 import feature
 from fogros2.agent_client import EventCallback
 from fogros2.deploy.context import Context
+from fogros2.deploy.life import Phase
 from fogros2.deploy.machine_job import MachineJob, SILENCE_TIMEOUT, Step
 from fogros2.deploy.steps.installing import Modules
 from fogros2.deploy.steps.watching import POLL_INTERVAL, Watch
@@ -54,21 +55,23 @@ class RunningMachine(Step):
         self._lock = threading.Lock()
         self._shortening = threading.Lock()
         self._callback: Optional[EventCallback] = None
-        self._lost = ''
-        #: Why the machine was ended while its launch goes on: its events are ignored since.
-        self._ended = ''
         #: Whether undo steps have begun.
         self._ending = False
         self._published: dict[int, tuple[str, int]] = {}
         self._watches: dict[str, Callable[[str], None]] = {}
-        self._watch = Watch(context, job, gone=self._gone, found=found, lost=self._is_lost)
-        job.undo.callback(self._watch.close)
+        self._found = found
         job.undo.callback(self._undo_begins)
+
+    def begin(self) -> None:
+        """Watch the machine, which is up now, until its end."""
+        self._job.enter('up')
+        self._job.undo.callback(
+            Watch(self._context, self._job, over=self._is_over, found=self._found).close)
 
     @property
     def lost(self) -> str:
         """Why the machine is gone or must not be used any more, '' while it is there."""
-        return self._lost
+        return self._job.life.lost
 
     @property
     def directory(self) -> str:
@@ -161,7 +164,7 @@ class RunningMachine(Step):
         def tell(event: Event) -> None:
             # an agent that exits at the end of the launch is expected
             expected = event['event'] == 'connection' and self._context.ending.is_set()
-            if self._lost or self._ended or expected:
+            if self._job.life.over or expected:
                 return
             if event['event'] != 'watched':
                 callback(event)
@@ -169,39 +172,39 @@ class RunningMachine(Step):
                 then(event['reason'])
 
         with self._lock:
-            self._callback, lost = callback, self._lost or self._ended
-        if lost:
-            callback({'event': 'lost', 'reason': lost})
+            self._callback, life = callback, self._job.life
+        if life.over:
+            callback({'event': 'lost', 'reason': life.reason})
             return
         try:
             self.agent.subscribe(tell, since=self._job.first_event)
         except AgentError:
             # another thread may have reported the loss and closed the connection meanwhile
-            if not self._lost:
+            if not self.lost:
                 raise
 
-    def _gone(self, reason: str) -> None:
-        """Report, once, that the provider has ended the machine; close the connection."""
-        # before anything else, which may create the machine anew
-        self._context.choices.end(self.spec.name)
-        self._report_end(reason)
-        self.agent.close()
-
-    def _is_lost(self, reason: str) -> None:
-        """Report, once, that the machine is lost; stop its nodes there if it comes back."""
-        # without heartbeats, the machine ends its nodes by itself
-        self.heartbeat.close()
-        self._report_end(reason)
-        with contextlib.suppress(FogError):
-            # they may run on the robot by then
-            self.agent.request('stop', nodes=None, timeout=self.spec.robot_timeout)
-        self.agent.close()
-
-    def _report_end(self, reason: str) -> None:
-        with self._lock:
-            self._lost, callback = reason, self._callback
+    def _is_over(self, phase: Phase, reason: str) -> None:
+        """Report, once, that the machine is gone or lost; stop its nodes if it comes back."""
+        if phase == 'lost':
+            # without heartbeats, the machine ends its nodes by itself
+            self.heartbeat.close()
+        else:
+            # before anything else, which may create the machine anew
+            self._context.choices.end(self.spec.name)
+        callback = self._enter(phase, reason)
         if callback is not None:
             callback({'event': 'lost', 'reason': reason})
+        if phase == 'lost':
+            with contextlib.suppress(FogError):
+                # they may run on the robot by then
+                self.agent.request('stop', nodes=None, timeout=self.spec.robot_timeout)
+        self.agent.close()
+
+    def _enter(self, phase: Phase, reason: str = '') -> Optional[EventCallback]:
+        """Enter a phase; return the subscriber of its events."""
+        with self._lock:
+            self._job.enter(phase, reason)
+            return self._callback
 
     def reclaimed(self, timeout: float) -> bool:
         """
@@ -215,12 +218,12 @@ class RunningMachine(Step):
             return False
 
         try:
-            wait_until(lambda: self._lost or confirmed(), timeout=timeout, interval=2.0,
+            wait_until(lambda: self.lost or confirmed(), timeout=timeout, interval=2.0,
                        longest=POLL_INTERVAL, cancel=self._context.cancel,
                        what='the provider to confirm the notice')
         except DeadlineExceeded:
             return False
-        return not self._lost
+        return not self.lost
 
     def retire(self) -> None:
         """
@@ -228,11 +231,10 @@ class RunningMachine(Step):
 
         :raises FogError: the provider has not confirmed the deletion; nothing else is undone yet.
         """
-        with self._lock:
-            self._lost = self._lost or 'it is replaced'
+        self._enter('lost', 'it is replaced')
         self.heartbeat.close()
         self._context.provider.destroy(self._job.machine_id)
-        self._job.gone = self._job.deleted = True
+        self._enter('deleted')
         self.close()
 
     def give_up(self, reason: str) -> None:
@@ -256,26 +258,25 @@ class RunningMachine(Step):
                     dataclasses.replace(job.spec, lifetime=seconds), made=True).lifetime
             except FogError:
                 return  # its time is over
-            if self._lost or self._ended or self._ending or allowed > seconds - 1.0:
+            if self._job.life.over or self._ending or allowed > seconds - 1.0:
                 return
             try:
                 self.agent.request(
                     'configure', timeout=self._context.timeouts.agent,
                     launch=self._context.launch_id, again=True, lifetime=allowed)
             except FogError:
-                if self._lost or self._ended or self._ending:
+                if self._job.life.over or self._ending:
                     return
                 raise
             job.restart_lifetime(allowed)
 
     def lose_after(self, seconds: float) -> None:
         """Count a silent machine as lost after this time, even if its provider says it runs."""
-        self._watch.limit = seconds
+        self._job.longest_silence = seconds
 
     def end(self, reason: str) -> None:
         """End the machine as its ``on_exit`` says; its further events are ignored."""
-        with self._lock:
-            self._ended = reason
+        self._enter('ended', reason)
         self.close()
 
     def close(self) -> None:

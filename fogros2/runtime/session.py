@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import dataclasses
 import functools
 import logging
-from typing import Any, Optional, Protocol, TYPE_CHECKING
+from typing import Any, Literal, Optional, Protocol, TYPE_CHECKING
 
 import launch.logging
 
@@ -51,6 +51,11 @@ _NOTICES = {
 _UNREPORTED = -9
 #: Seconds, at least, before nodes with respawn start again because their agent died.
 _RESPAWN_DELAY = 1.0
+#: What happens to the machine. ``given_up``: the launch is to go on without it.
+_Event = Literal['up', 'gone', 'given_up']
+#: The next phase by phase and event; another event is too late.
+_NEXT: Mapping[tuple[str, _Event], str] = {
+    ('awaited', 'up'): 'up', ('up', 'gone'): 'gone', ('up', 'given_up'): 'over'}
 
 
 class Robot(Protocol):
@@ -111,8 +116,9 @@ class Session:
         self._preempted = preempted
         self._starting = starting
         self._robot = robot
-        #: Whether the machine is gone.
-        self.lost = False
+        #: ``awaited``, ``up``, ``gone`` or, if the launch goes on without the machine, ``over``;
+        #: subclasses have more.
+        self.phase = 'awaited'
         #: Whether only agent, provider or time confirms that a process has left it.
         self.fenced = False
         self._backlog = Backlog(loop, self._on_event, busy, self._dropped)
@@ -134,6 +140,11 @@ class Session:
     def interrupted(self) -> bool:
         """Whether no process may start on the machine any more."""
         return self.lost
+
+    @property
+    def lost(self) -> bool:
+        """Whether the machine is gone."""
+        return self.phase == 'gone'
 
     @property
     def ready(self) -> bool:
@@ -197,7 +208,7 @@ class Session:
 
     def submit(self, run: RemoteRun) -> None:
         """Start a process when the machine is up."""
-        if self._reason:
+        if self.phase == 'over':
             self._logger.error(
                 f'{self.spec.name}: {run.node.name} does not start: the machine has ended, '
                 f'because {self._reason} (launch again)')
@@ -250,6 +261,7 @@ class Session:
     def up(self, running: RunningMachine) -> None:
         """Start the waiting processes: the machine is up."""
         self.running = running
+        self._on('up')
         if not self.came_up.done():
             self.came_up.set_result(True)
         for instance in self.instances:
@@ -331,7 +343,7 @@ class Session:
             self.request(functools.partial(self._give_up, event['reason']))
             return
         if event['event'] == 'lost':
-            self._gone(event['reason'] or 'no reason')
+            self._on('gone', event['reason'] or 'no reason')
             return
         kind: str = event['event']
         if event['event'] == 'connection':
@@ -349,10 +361,14 @@ class Session:
         if event['event'] == 'started':
             self._changed()
 
-    def _gone(self, reason: str) -> None:
-        """Note that the machine is gone."""
-        if not (self.lost or self._reason):
-            self.lost = True
+    def _on(self, event: _Event, reason: str = '') -> None:
+        """
+        Change the phase, and do what follows.
+
+        :param reason: why the machine is gone, for the user.
+        """
+        before, self.phase = self.phase, _NEXT.get((self.phase, event), self.phase)
+        if before != self.phase == 'gone':
             self._preempted(self, reason)
 
     def _restarted(self) -> None:
@@ -386,7 +402,9 @@ class Session:
 
     async def _give_up(self, reason: str) -> None:
         """End the machine and its processes, while the launch goes on."""
-        if self.interrupted or self._reason or self.running is None:
+        before = self.phase
+        self._on('given_up')
+        if self.phase == before or self.running is None:
             return
         self._reason = reason
         self._logger.info(f"{self.spec.name}: {reason}; on_exit='{self.spec.on_exit}'")

@@ -104,7 +104,7 @@ class Interruptible(Session):
 
     def submit(self, run: RemoteRun) -> None:
         """Start a process when the machine is up; elsewhere, if the machine is interrupted."""
-        if self.replacer is None or self.state.phase == 'over':
+        if self.replacer is None or self.phase == 'over':
             super().submit(run)
             return
         if self.checkpoints is not None and (folder := folder_of(run.node)):
@@ -148,13 +148,8 @@ class Interruptible(Session):
 
     # -- events ---------------------------------------------------------------------------------
 
-    def up(self, running: RunningMachine) -> None:
-        """Start the waiting processes: the machine is up."""
-        self._on('up')
-        super().up(running)
-
     def _on_process_event(self, run: RemoteRun, event: Event) -> None:
-        if event['event'] == 'exited' and self.state.phase == 'ending' and not run.state.stopping:
+        if event['event'] == 'exited' and self.phase == 'ending' and not run.state.stopping:
             self._held.append((run, event))
         else:
             super()._on_process_event(run, event)
@@ -168,15 +163,12 @@ class Interruptible(Session):
         elif event['event'] in _LAST_EVENTS:
             self._on('last_words')
 
-    def _gone(self, reason: str) -> None:
-        self._on('gone', reason)
-
     def _restarted(self) -> None:
-        if self.state.phase != 'ending':
+        if self.phase != 'ending':
             super()._restarted()
 
     def _agent_gone(self) -> None:
-        if self.state.phase != 'ending' and not (self.interrupted and self.fenced):
+        if self.phase != 'ending' and not (self.interrupted and self.fenced):
             super()._agent_gone()
 
     def _on(self, event: machine_state.Event, reason: str = '') -> None:
@@ -186,7 +178,7 @@ class Interruptible(Session):
         :param reason: of an interruption, for the user.
         """
         self.state, commands = machine_state.decide(self.state, event)
-        self.lost = self.state.phase == 'gone'
+        self.phase = self.state.phase
         for command in commands:
             if command == 'hold':
                 self._loop.call_later(_HOLD, self._on, 'spared')
@@ -253,11 +245,6 @@ class Interruptible(Session):
         self._held.clear()
         for run in list(self._runs.values()):
             run.on('move_gone' if self.lost or run in ended else 'move')
-
-    async def _give_up(self, reason: str) -> None:
-        self._on('given_up')
-        if self.state.phase == 'over':
-            await super()._give_up(reason)
 
     # -- a new machine --------------------------------------------------------------------------
 

@@ -458,7 +458,7 @@ def test_a_machine_that_boots_slowly_has_the_time_of_its_boot(launch, provider, 
     assert 270 < connection._timeout() <= 280
     mine.record = dataclasses.replace(mine.record, host_key='its own')
     assert connection._timeout() == 60.0
-    mine.failed = False
+    mine.enter('up')
     assert connection._timeout() == connecting.LOGIN_TIMEOUT
 
 
@@ -664,14 +664,14 @@ def test_failing_watch_is_reported_and_becomes_a_fault(
             raise KeyError('Reservations')
         return Machine('fake-1', 'planner', 'fake', state)
 
-    def fail(told):
+    def fail(*words):
         raise KeyError('Reservations')
 
     monkeypatch.setattr(provider, 'describe', describe)
     monkeypatch.setattr(watching, 'Periodic',
                         lambda name, interval, work, **stop: Periodic(
                             name, 0.01, work, **stop))
-    watch = Watch(context, mine, gone=fail, found=fail)
+    watch = Watch(context, mine, over=fail, found=fail)
     failed = wait_until(
         lambda: [event for event in heard if isinstance(event, StepFailed)] or None,
         timeout=60, what='a word of it')
@@ -718,6 +718,7 @@ def cut(request, launch, provider, monkeypatch):
     mine.agent = mine.heartbeat = link = Cut()
     mine.record = dataclasses.replace(mine.record, machine_id='fake-1')
     running = RunningMachine(context, mine, None, None)
+    running.begin()
     running.subscribe(events.append)
     yield link, reported, events
     running.close()
@@ -784,15 +785,16 @@ def test_a_machine_is_replaced_after_longer_silence(launch, provider, own, limit
     mine.record = dataclasses.replace(mine.record, machine_id='fake-1')
     mine.agent, mine.heartbeat = SimpleNamespace(silent_for=60.0), SimpleNamespace(age=limit)
     lost = []
-    watch = Watch(context, mine, gone=lost.append, found=print, lost=lost.append)
-    running = SimpleNamespace(spec=SPEC, lose_after=lambda limit: setattr(watch, 'limit', limit))
+    watch = Watch(context, mine, over=lambda *words: lost.append(words), found=print)
+    running = SimpleNamespace(
+        spec=SPEC, lose_after=lambda limit: setattr(mine, 'longest_silence', limit))
     with Replacement().machine(running, Replacement.options(on_interrupt='replace', **own)):
         pass
     wait_until(lambda: provider.calls.count('describe') > 0, timeout=60, what='a question')
     assert lost == []
     mine.heartbeat.age = limit + 0.1
     wait_until(lambda: lost or None, timeout=60, what='the verdict')
-    assert lost == [f'it is lost: no answer for {limit:g} s']
+    assert lost == [('lost', f'it is lost: no answer for {limit:g} s')]
     watch.close()
 
 
@@ -805,12 +807,13 @@ def test_retired_machine_is_deleted_and_created_anew(launch, provider, monkeypat
         mine.machine = mine.shell = None
         mine.agent = SimpleNamespace(request=lambda *words, **named: None)
         mine.interface = SimpleNamespace(address='198.18.7.2')
-        mine.failed = False
         creation = Creation(context, mine)
         mine.undoing('end', creation._end)
         creation._claim('token')
         mine.save(machine_id=provider.create(spec, CreateRequest('t', '', {}, 1)))
-        return RunningMachine(context, mine, None, None)
+        running = RunningMachine(context, mine, None, None)
+        running.begin()
+        return running
 
     monkeypatch.setattr(deployed, 'bring_up', bring_up)
     spec = dataclasses.replace(SPEC, on_exit='keep')
@@ -848,7 +851,7 @@ def test_undo_of_another_version_is_reported_others_are_done(launch, provider):
 
 def test_what_could_not_be_undone_stays_in_the_record(launch, provider):
     context, mine = begun(launch, dataclasses.replace(SPEC, on_exit='keep'))
-    mine.failed = False
+    mine.enter('up')
     ended = [1, 0]
     mine.shell = FakeShell(handlers={'sh': lambda c: Result(ended.pop(0), '', 'no')})
     with mine.undo:
@@ -895,7 +898,7 @@ def test_what_stays_on_a_machine_out_of_reach_is_told_once(
         launch, provider, monkeypatch, on_exit, owned, hint):
     monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(owned=owned))
     context, mine = begun(launch, dataclasses.replace(SPEC, on_exit=on_exit))
-    mine.reused = True
+    mine.enter('kept')
 
     def silent(command):
         raise ConnectError("'planner' has not answered for 2 s")

@@ -234,7 +234,7 @@ def test_leftovers_of_a_creation_are_reported_with_its_error(
 
 def keep(launch, spec):
     mine = create(launch, dataclasses.replace(spec, on_exit='keep'))
-    mine.failed = False
+    mine.enter('up')
     mine.undo.close()
 
 
@@ -243,7 +243,7 @@ def test_launch_replaces_machine_whose_id_was_not_saved(launch, provider, tmp_pa
     killed.save(machine_id=None, pid=1, pid_start=1)
     again = create(Launch(store=Store(tmp_path), environment={}))
     assert [machine.id for machine in provider.find({})] == [again.machine_id]
-    assert again.machine_id is not None and not again.reused
+    assert again.machine_id is not None and again.life.phase == 'new'
 
 
 def test_kept_machine_fits_though_today_differs(
@@ -254,10 +254,10 @@ def test_kept_machine_fits_though_today_differs(
     again = Launch(store=Store(tmp_path), environment={})
     again.prepare([SPEC])
     mine = create(again)
-    assert mine.reused and 'resolve' not in provider.calls and 'create' not in provider.calls
+    assert mine.life.phase == 'kept' and 'resolve' not in provider.calls and 'create' not in provider.calls
     assert mine.spec.options == {'size': 'small'}
     assert [(one.spec.name, one.price) for one in again.costs()] == [('planner', Decimal('0.5'))]
-    mine.failed = False
+    mine.enter('up')
     mine.undo.close()
     assert list(provider.find({})) == []
 
@@ -287,7 +287,7 @@ def test_kept_machine_gets_its_owner_before_it_starts(
     assert told.on_exit == tags['fogros2-on-exit'] == 'stop'
     assert tags['fogros2-launch'] == again.id
     assert 0 < int(tags['fogros2-expires']) - time.time() <= 60
-    mine.failed = False
+    mine.enter('up')
     mine.undo.close()
 
 

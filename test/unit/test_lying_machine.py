@@ -158,7 +158,7 @@ def test_machine_lost_at_subscription_affects_no_other(
 
     class Closing(Told):
         def subscribe(self, callback, since):
-            machine._gone('it was deleted')
+            machine._is_over('deleted', 'it was deleted')
             raise AgentError('the connection to the agent was closed')
 
         def close(self):

@@ -77,7 +77,7 @@ class Connection(Step):
             if context.capabilities.firewall:
                 job.makes(SSH_PORT, endpoint.port)
                 job.undo.callback(self._leave)
-                if job.reused:
+                if job.life.phase == 'kept':
                     # the earlier launch closed the port, or the robot's address has changed
                     self._open_port()
             job.shell = self._shell = MovableShell(self._shell_to(endpoint))
@@ -122,7 +122,7 @@ class Connection(Step):
     def close_outside(self) -> None:
         """Move SSH of a machine that is up into the VPN again, if its SSH port is open."""
         job = self._job
-        if not job.failed and Made(SSH_PORT, self._outside.port) in job.record.made:
+        if job.life.begun and Made(SSH_PORT, self._outside.port) in job.record.made:
             self._enter()
 
     def _enter(self) -> None:
@@ -158,7 +158,7 @@ class Connection(Step):
     def _leave_vpn(self) -> None:
         """Reach a kept machine from outside again, before the VPN is taken down."""
         self._leave()
-        if self._inside and self._job.survives:
+        if self._inside and self._job.survives():
             self._note_and_open()
             self._shell.move(self._shell_to(self._outside))
 
@@ -219,7 +219,7 @@ class Connection(Step):
             self._job.record
         if self._context.other_vpn is not None:
             return min(timeouts.ssh, VPN_TIMEOUT)
-        if not provider.capabilities.owned or not self._job.failed:
+        if not provider.capabilities.owned or self._job.life.begun:
             # the login to a machine that is up delays the next choice of its VPN's path
             return min(timeouts.ssh, LOGIN_TIMEOUT)
         boots = provider.capabilities.one_time_host_key and not record.host_key

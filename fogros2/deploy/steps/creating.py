@@ -7,7 +7,7 @@ import contextlib
 import dataclasses
 import json
 import time
-from typing import Any, Optional
+from typing import Any, Literal, Optional
 import uuid
 
 from fogros2 import feature, model, plan, process
@@ -37,9 +37,9 @@ from fogros2.store import robot_id, this_process
 class Creation(Step):
     """Create or reuse the machine of a deployment, and end it by its ``on_exit``."""
 
-    #: Whether the provider was asked to create the machine, whether it refused at once, and
-    #: whether it did not answer.
-    _asked = _refused = _unanswered = False
+    #: The request to create the machine. ``none``: no machine can exist. ``refused``: before the
+    #: provider got it, perhaps. ``unanswered``: a machine may still appear.
+    _request: Literal['none', 'sent', 'refused', 'unanswered'] = 'none'
 
     def run(self) -> None:
         """
@@ -131,7 +131,7 @@ class Creation(Step):
     def _adopt(self, machine: Machine) -> Optional[Machine]:
         """Use a kept machine; return it unless it has to start first."""
         context, job = self._context, self._job
-        job.reused = True
+        job.enter('kept')
         job.undoing('end', self._end)
         job.machine = machine
         self._claim(job.record.token)
@@ -172,16 +172,14 @@ class Creation(Step):
             vpn_port=plan.machine_port(context.launch_id), agent_config=config)
         for each, own in feature.used(job.spec):
             request = each.request(request, own)
-        self._asked = True
+        self._request = 'sent'
         try:
             machine_id = context.provider.create(job.spec, request)
         except FogError as error:
-            # after a refusal, no machine has to be looked for
-            self._asked = not error.refused
-            # without an answer a machine may exist: only a search by tags shows it
-            self._unanswered = error.refused is False
-            self._refused = error.refused is None and isinstance(
-                error, (ConfigurationError, PrerequisiteError))
+            if error.refused is not None:
+                self._request = 'none' if error.refused else 'unanswered'
+            elif isinstance(error, (ConfigurationError, PrerequisiteError)):
+                self._request = 'refused'
             for failure in error.undo_failures:
                 job.undo.failed('undo', failure)
             raise
@@ -223,9 +221,7 @@ class Creation(Step):
     def _end(self) -> None:
         """End the machine by its ``on_exit``; delete the record only after the machine."""
         context, job = self._context, self._job
-        mode = job.spec.on_exit
-        if job.deleted or job.failed and not job.reused:
-            mode = 'delete'
+        mode = job.life.ending(job.spec.on_exit)
         try:
             with job.step(mode if context.capabilities.owned else 'let go'):
                 if mode == 'delete':
@@ -243,13 +239,14 @@ class Creation(Step):
         context, job = self._context, self._job
         if job.record.machine_id is not None:
             context.provider.destroy(job.record.machine_id)
-        elif self._asked:
+        elif self._request != 'none':
+            # only a search by tags shows a machine
             try:
                 settled = requests.end(context.provider, job.record, tidy=False)
             except FogError:
-                if not self._refused:
+                if self._request != 'refused':
                     raise
-                settled = True  # the creation was refused before the provider was asked
-            if self._unanswered and not settled:
+                settled = True
+            if self._request == 'unanswered' and not settled:
                 raise requests.set_aside(context.store, job.record)
         context.store.delete(job.name)

@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-import functools
+from collections.abc import Callable, Mapping
 import threading
 import time
 from typing import Optional
@@ -12,6 +11,7 @@ from typing import Optional
 from fogros2.agent_client import Heartbeat
 from fogros2.clock import ClockOffset, OffsetAlarm
 from fogros2.deploy.context import Context
+from fogros2.deploy.life import Phase
 from fogros2.deploy.machine_job import MachineJob, Step
 from fogros2.errors import FogError, MachineNotFound
 from fogros2.model import Machine, MachineState
@@ -28,9 +28,10 @@ LOSS = 37.0
 #: Seconds without a silence after which the next one is reported as the first.
 CALM = 600.0
 
-_ENDED = {
-    MachineState.DELETED: 'it was deleted', MachineState.STOPPING: 'it is being ended',
-    MachineState.STOPPED: 'it was stopped'}
+_ENDED: Mapping[MachineState, tuple[Phase, str]] = {
+    MachineState.DELETED: ('deleted', 'it was deleted'),
+    MachineState.STOPPING: ('stopped', 'it is being ended'),
+    MachineState.STOPPED: ('stopped', 'it was stopped')}
 
 
 class ClockComparison:
@@ -98,26 +99,22 @@ class Watch(Step):
 
     A machine that exists but is out of reach is not gone. It is lost if neither it nor its
     provider answers for ``LOSS`` seconds; a computer that FogROS2 does not own has no provider.
-    With a ``limit``, it is lost after so many seconds of silence, whatever its provider reports.
+    With the job's ``longest_silence``, it is lost then, whatever its provider reports.
     An unknown exception is a defect of FogROS2 or of a plugin: it ends the watch and is reported
     at once, and ``close`` raises it, so that the nodes continue until then.
 
-    :param gone: called with the reason, once, from the watch's thread.
+    :param over: called once, in the watch's thread, with the machine's phase and the reason.
     :param found: called with the provider's report of a machine that runs.
-    :param lost: called instead of ``gone`` for a lost machine, which may still run.
     """
 
     def __init__(
         self, context: Context, job: MachineJob, *,
-        gone: Callable[[str], None], found: Callable[[Machine], None],
-        lost: Callable[[str], None] = lambda reason: None,
+        over: Callable[[Phase, str], None], found: Callable[[Machine], None],
     ) -> None:
         super().__init__(context, job)
-        self._gone = gone
+        self._over = over
         self._found = found
-        self._lost = lost
         self._alarm = SilenceAlarm()
-        self.limit: Optional[float] = None
         self._closed = threading.Event()
         self._ending = threading.Lock()
         self._fault: Optional[BaseException] = None
@@ -157,41 +154,35 @@ class Watch(Step):
         due = self._alarm.due(age, time.monotonic())
         if due is not None:
             self._context.report(Silence(self._job.name, *due))
-        if self.limit is not None:
-            if age > self.limit:
-                self._end(self._lost, f'it is lost: no answer for {age:.0f} s')
+        if (limit := self._job.longest_silence) is not None:
+            if age > limit:
+                self._end('lost', f'it is lost: no answer for {age:.0f} s')
         elif min(age, time.monotonic() - self._word_at) > LOSS:
-            self._end(self._lost, f'it is lost: no answer for {age:.0f} s, and no word of its '
+            self._end('lost', f'it is lost: no answer for {age:.0f} s, and no word of its '
                       'provider')
 
     def _ask(self) -> Optional[float]:
         age = self._job.heartbeat.age
         if age is None or age <= SILENCE:
             return None
-        deleted = False
         try:
             machine = self._context.provider.describe(self._job.machine_id)
         except MachineNotFound as error:
-            reason, deleted = str(error.args[0]), True
+            self._end('deleted', str(error.args[0]))
         except FogError:
-            return POLL_INTERVAL  # perhaps the robot has no network: retried
+            pass  # perhaps the robot has no network: retried
         else:
             self._word_at = time.monotonic()
-            reason, deleted = _ENDED.get(machine.state, ''), machine.state is MachineState.DELETED
-            if machine.state is MachineState.RUNNING and not self._closed.is_set():
+            if machine.state in _ENDED:
+                self._end(*_ENDED[machine.state])
+            elif machine.state is MachineState.RUNNING and not self._closed.is_set():
                 self._found(machine)
-        if reason:
-            self._end(functools.partial(self._is_gone, deleted), reason)
         return POLL_INTERVAL
 
-    def _is_gone(self, deleted: bool, reason: str) -> None:
-        self._job.gone, self._job.deleted = True, deleted
-        self._gone(reason)
-
-    def _end(self, tell: Callable[[str], None], reason: str) -> None:
+    def _end(self, phase: Phase, reason: str) -> None:
         with self._ending:
             # while the agent sends, the machine exists, whatever the provider reports
             if self._closed.is_set() or self._job.agent.silent_for <= SILENCE:
                 return
             self._closed.set()
-        tell(reason)
+        self._over(phase, reason)

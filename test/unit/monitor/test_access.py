@@ -88,7 +88,7 @@ def test_port_is_closed_at_the_end_of_the_launch(
     context, job = deploying.job(
         tmp_path, MachineSpec('planner', 'fake', on_exit=on_exit), provider=provider)
     job.save(machine_id='fake-1')
-    job.failed = False
+    job.enter('up')
     job.machine = Machine(
         'fake-1', 'planner', 'fake', MachineState.RUNNING, vpn_host='198.51.100.9')
     job.shell, job.interface = FakeShell(), VPN
