@@ -9,7 +9,7 @@ import itertools
 import math
 import threading
 import time
-from typing import Any, cast, Optional
+from typing import Any, cast, Literal, Optional
 
 from fogros2 import events, untrusted
 from fogros2.errors import (
@@ -75,7 +75,8 @@ class AgentClient:
         self._pending: dict[int, _Pending] = {}
         self._stream: Optional[Stream] = None
         self._error: Optional[AgentError] = None
-        self._ever = self._lost = False
+        #: Whether an agent has answered, and whether the connection to it is lost.
+        self._agent: Literal['awaited', 'here', 'lost'] = 'awaited'
         self._absent: Optional[str] = None
         self._next: Optional[int] = None
         #: The id of the request whose reply says where the log begins; 0 is a ping's.
@@ -197,8 +198,8 @@ class AgentClient:
                     self._judge(time.monotonic() - quiet_since)
                 if self._error is not None:
                     break
-                if self._ever and not self._lost and not self._closed.is_set():
-                    self._lost = True
+                if self._agent == 'here' and not self._closed.is_set():
+                    self._agent = 'lost'
                     self._tell({'event': 'connection', 'state': 'lost'})
                 if self._closed.wait(pause):
                     break
@@ -219,9 +220,10 @@ class AgentClient:
 
     def _judge(self, seconds: float) -> None:
         """Give up an agent that was silent for so many seconds, if it will not come back."""
-        if self._absent is not None and (not self._ever or seconds > RESTART):
+        awaited = self._agent == 'awaited'
+        if self._absent is not None and (awaited or seconds > RESTART):
             self._error = AgentAbsent(self._absent, 'its machine may have ended')
-        elif not self._ever and seconds > RESTART:
+        elif awaited and seconds > RESTART:
             self._error = AgentError(
                 'the program that connects to the agent ended without an answer',
                 'is python3 on the machine, and agent.py with it?')
@@ -244,9 +246,9 @@ class AgentClient:
                 if message.get('kind') == 'absent' and 'ok' not in message:
                     self._absent = str(message.get('error'))
                 else:
-                    self._ever = spoke = True
-                    if self._lost:
-                        self._lost = False
+                    spoke = True
+                    before, self._agent = self._agent, 'here'
+                    if before == 'lost':
                         self._tell({'event': 'connection', 'state': 'back'})
                     if 'event' in message:
                         self._deliver(message)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""End a creation that got no answer: its machine may exist, or may still appear."""
+"""End the machine of a record, also of a creation that got no answer: it may still appear."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ from fogros2.store import Record, Store
 
 def end(provider: Provider, record: Record, age: float = 0.0, *, tidy: bool = True) -> bool:
     """
-    Delete the machine of a creation without an answer; return whether none can appear any more.
+    Delete the machine of a record; return whether none of its creation can appear any more.
 
-    :param record: without the id of a machine.
+    :param record: without an id, it may have a machine: only a search by tags shows it.
     :param age: seconds since the launch stopped waiting for the answer.
     :param tidy: delete what was created beside the machine; the creation does so itself.
     :raises FogError: the provider does not answer.
     """
+    if record.machine_id is not None:
+        provider.destroy(record.machine_id)
+        return True
     machines: list[Machine] = []
     with contextlib.suppress(Unsupported):
         machines += provider.find(

@@ -13,8 +13,7 @@ from fogros2 import plan, plugin_system, process, ros2_daemon
 from fogros2.errors import PrerequisiteError
 from fogros2.model import Command
 from fogros2.provider import Provider
-from fogros2.report import Reporter, silent, step
-from fogros2.store import delete_folder, Record, Store
+from fogros2.store import delete_folder
 from fogros2.vpn import helped, Vpn
 from fogros2.waiting import Timeouts
 
@@ -82,24 +81,9 @@ def check_sudo(*, ask: bool = False) -> None:
         raise PrerequisiteError(f'a VPN interface needs root, and {reason}', remedy)
 
 
-def cleanup(record: Record, store: Store, report: Reporter = silent) -> None:
-    """
-    Remove what a launch that died left on the robot for a machine that is gone.
-
-    Removes the VPN interface with its program and filter, the launch's folder, and the machine's
-    folder with its keys. Does not touch the interface of a launch that still runs; idempotent.
-
-    :raises FogError: something could not be removed; the record then stays.
-    """
-    if record.launch and not record.launch_alive:
-        with step(report, record.name, 'VPN interface'):
-            clear(store.root / 'launches' / record.launch)
-    store.delete(record.name)
-
-
 def clear(folder: Path) -> None:
     """
-    Delete the VPN interface, firewall rules, key and folder of a dead launch.
+    Delete the VPN interface, firewall rules, key and folder of a dead launch; idempotent.
 
     The ROS 2 daemon that it had is stopped before.
 

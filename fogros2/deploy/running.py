@@ -55,12 +55,12 @@ class RunningMachine(Step):
         self._lock = threading.Lock()
         self._shortening = threading.Lock()
         self._callback: Optional[EventCallback] = None
-        #: Whether undo steps have begun.
-        self._ending = False
+        #: Set when undo steps have begun.
+        self._ending = threading.Event()
         self._published: dict[int, tuple[str, int]] = {}
         self._watches: dict[str, Callable[[str], None]] = {}
         self._found = found
-        job.undo.callback(self._undo_begins)
+        job.undo.callback(self._ending.set)
 
     def begin(self) -> None:
         """Watch the machine, which is up now, until its end."""
@@ -85,7 +85,7 @@ class RunningMachine(Step):
         :raises ShellError: it failed, or the machine does not answer.
         :raises Cancelled: the launch is ending, and the machine still came up.
         """
-        if not self._ending:
+        if not self._ending.is_set():
             return self._job.run(command, timeout=timeout)
         return self.shell.run(command, timeout=self._job.timeout(timeout)).stdout
 
@@ -96,9 +96,6 @@ class RunningMachine(Step):
     def warn(self, text: str, remedy: str) -> None:
         """Warn the user, with what to do about it on a line of its own."""
         self._context.report(Warned(self.spec.name, f"'{self.spec.name}': {text}", remedy))
-
-    def _undo_begins(self) -> None:
-        self._ending = True
 
     def start(self, nodes: Sequence[NodeSpec]) -> None:
         """
@@ -258,14 +255,14 @@ class RunningMachine(Step):
                     dataclasses.replace(job.spec, lifetime=seconds), made=True).lifetime
             except FogError:
                 return  # its time is over
-            if self._job.life.over or self._ending or allowed > seconds - 1.0:
+            if self._job.life.over or self._ending.is_set() or allowed > seconds - 1.0:
                 return
             try:
                 self.agent.request(
                     'configure', timeout=self._context.timeouts.agent,
                     launch=self._context.launch_id, again=True, lifetime=allowed)
             except FogError:
-                if self._job.life.over or self._ending:
+                if self._job.life.over or self._ending.is_set():
                     return
                 raise
             job.restart_lifetime(allowed)

@@ -168,14 +168,16 @@ def close_ports(site: Site) -> tuple[Made, ...]:
 
     :raises FogError: one may still be open; the others are closed.
     """
-    failures = unmake_all(site, [made for made in site.record.made if made.kind in PORTS])
-    if failures:
-        raise failures[0]
+    unmake_all(site, [made for made in site.record.made if made.kind in PORTS])
     return tuple(made for made in site.record.made if made.kind not in PORTS)
 
 
-def unmake_all(site: Site, things: Sequence[Made]) -> list[FogError]:
-    """Undo several things, the last made first; return the errors of those that failed."""
+def unmake_all(site: Site, things: Sequence[Made]) -> None:
+    """
+    Undo several things, the last made first.
+
+    :raises FogError: of the first that failed; the others are undone, if the machine answers.
+    """
     failures = []
     for made in reversed(things):
         try:
@@ -184,4 +186,5 @@ def unmake_all(site: Site, things: Sequence[Made]) -> list[FogError]:
             failures.append(error)
             if isinstance(error, (ConnectError, DeadlineExceeded)):
                 break  # the others would wait for the same machine
-    return failures
+    if failures:
+        raise failures[0]

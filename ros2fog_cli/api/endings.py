@@ -14,7 +14,6 @@ import re
 import time
 from typing import Optional
 
-from fogros2 import deploy
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
 from fogros2.deploy import requests
@@ -32,7 +31,7 @@ from fogros2.errors import (
 )
 from fogros2.model import Command, Machine, MachineState
 from fogros2.provider import Provider
-from fogros2.report import Reporter
+from fogros2.report import Reporter, step
 from fogros2.shell import Shell
 from fogros2.store import launch_process, Made, Record, robot_id, Store
 from fogros2.vpn import owner
@@ -89,19 +88,20 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
         record = entry.record
         if record is None:
             return
-        # The machine deleted itself, or was never created; its resources may still exist.
-        if entry.machine is None and entry.asked and record.machine_id is not None:
-            machines.load(record.provider).destroy(record.machine_id)
-        elif entry.machine is None and entry.asked and record.token:
-            if not requests.end(machines.load(record.provider), record):
-                store.set_aside(record)
         if record.damage:
             store.delete(record.name)
             return
+        # The machine deleted itself, or was never created; its resources may still exist.
+        if entry.machine is None and entry.asked and not requests.end(
+                machines.load(record.provider), record):
+            store.set_aside(record)
         if force and record.launch_alive:
             # The launch will notice that the machine is gone, and will clean up itself.
             return
-        deploy.cleanup(record, store, report)
+        if record.launch:
+            with step(report, record.name, 'VPN interface'):
+                clear(store.root / 'launches' / record.launch)
+        store.delete(record.name)
 
 
 def delete_all(
@@ -250,10 +250,8 @@ def _leave(record: Record, machine: Machine, *, force: bool) -> None:
             always.append(Made(WATCHDOG))
         if record.vpn is not None:
             always.append(Made(VPN))
-        failures = unmake_all(_Left(record, machine, shell), [
+        unmake_all(_Left(record, machine, shell), [
             *always, *(made for made in record.made if made not in always)])
-        if failures:
-            raise failures[0]
     except (ShellError, DeadlineExceeded):
         if not force and not account:  # another robot may have taken the account away
             raise

@@ -807,9 +807,7 @@ def test_retired_machine_is_deleted_and_created_anew(launch, provider, monkeypat
         mine.machine = mine.shell = None
         mine.agent = SimpleNamespace(request=lambda *words, **named: None)
         mine.interface = SimpleNamespace(address='198.18.7.2')
-        creation = Creation(context, mine)
-        mine.undoing('end', creation._end)
-        creation._claim('token')
+        Creation(context, mine)._claim('token')
         mine.save(machine_id=provider.create(spec, CreateRequest('t', '', {}, 1)))
         running = RunningMachine(context, mine, None, None)
         running.begin()
@@ -845,8 +843,9 @@ def test_machine_that_is_ended_in_order_is_not_lost(launch, provider):
 def test_undo_of_another_version_is_reported_others_are_done(launch, provider):
     context, mine = begun(launch)
     mine.shell = FakeShell(handlers={'sh': lambda command: Result(0, '', '')})
-    failure, = undo.unmake_all(mine, [Made(undo.WATCHDOG), Made('balloon')])
-    assert "'balloon', which this version can't undo" in str(failure) and mine.shell.commands
+    with pytest.raises(StoreError, match="'balloon', which this version can't undo"):
+        undo.unmake_all(mine, [Made(undo.WATCHDOG), Made('balloon')])
+    assert mine.shell.commands
 
 
 def test_what_could_not_be_undone_stays_in_the_record(launch, provider):
@@ -906,9 +905,7 @@ def test_what_stays_on_a_machine_out_of_reach_is_told_once(
     mine.shell = FakeShell(handlers={'ip': silent})
     mine.probes = [silent]
     with mine.undo:
-        creation = Creation(context, mine)
-        creation._claim('token')
-        mine.undoing('end', creation._end)
+        Creation(context, mine)._claim('token')
         for name in ('agent', 'VPN', 'nodes'):
             mine.undoing(name, lambda: mine.clean_up([Command(('ip', 'link'))]))
     told, = launch.down()

@@ -93,16 +93,15 @@ class Creation(Step):
             raise NameTaken(
                 f"'{job.name}' is a machine of the provider '{before.provider}'",
                 f'give the machine another name=, or: ros2 fog delete {job.name}')
-        if before.machine_id is None:
-            # that launch was killed before it saved the id of its machine, if it has one
+        machine: Optional[Machine] = None
+        # a launch that was killed did not save the id of its machine, if it has one
+        if before.machine_id is not None:
+            with contextlib.suppress(MachineNotFound):
+                machine = context.provider.describe(before.machine_id)
+        if machine is None or machine.state is MachineState.DELETED:
+            # what was made for it may still be there
             if not requests.end(context.provider, before):
                 context.store.set_aside(before)
-            return None
-        machine: Optional[Machine] = None
-        with contextlib.suppress(MachineNotFound):
-            machine = context.provider.describe(before.machine_id)
-        if machine is None or machine.state is MachineState.DELETED:
-            context.provider.destroy(before.machine_id)  # what was made for it may still be there
             return None
         self._check_alike(before.asked, machine)
         # the earlier choices still hold; everything else comes from this launch
@@ -110,7 +109,7 @@ class Creation(Step):
         context.choices.expect(job.spec, context.choices.price(job.spec))
         job.limit(made=True)
         job.record = dataclasses.replace(before, spec=job.spec)
-        job.former = before.last or before.launch
+        job.former = before.last
         return machine
 
     def _check_alike(self, before: Any, machine: Machine) -> None:
@@ -132,7 +131,7 @@ class Creation(Step):
         """Use a kept machine; return it unless it has to start first."""
         context, job = self._context, self._job
         job.enter('kept')
-        job.undoing('end', self._end)
+        self._request = 'sent'
         job.machine = machine
         self._claim(job.record.token)
         context.provider.adopt(machine.id, job.spec, self._tags())
@@ -154,7 +153,6 @@ class Creation(Step):
         token = str(uuid.uuid4())
         context.store.delete(job.name)
         job.record = dataclasses.replace(job.record, spec=job.spec)
-        job.undoing('end', self._end)
         self._claim(token)
         config = {
             **plan.agent_config(job.spec, context.launch_id, job.directory, ()),
@@ -201,8 +199,9 @@ class Creation(Step):
         return bootstrap.dependencies(job.spec, under, context.packages)
 
     def _claim(self, token: str) -> None:
-        """Record that this launch has the machine, before the provider creates anything."""
+        """Record that this launch has the machine, and ends it."""
         context, job = self._context, self._job
+        job.undoing('end', self._end)
         job.save(
             token=token, created=job.record.created or time.time(), armed=time.time(),
             launch=context.launch_id, last=context.launch_id, robot=robot_id(), **this_process(),
@@ -235,12 +234,9 @@ class Creation(Step):
                 context.choices.end(job.name)
 
     def _delete(self) -> None:
-        """Delete the machine and its record; find that of a failed creation by its tags."""
+        """Delete the machine and its record."""
         context, job = self._context, self._job
-        if job.record.machine_id is not None:
-            context.provider.destroy(job.record.machine_id)
-        elif self._request != 'none':
-            # only a search by tags shows a machine
+        if self._request != 'none':
             try:
                 settled = requests.end(context.provider, job.record, tidy=False)
             except FogError:
