@@ -268,7 +268,7 @@ class Store:
         delete_folder(self.machine(name))
 
     def _request(self, record: Record) -> Path:
-        return self.root / 'requests' / f'{record.name}.{record.last or record.launch}.json'
+        return self.root / 'requests' / f'{record.name}.{record.last}.json'
 
     def set_aside(self, record: Record) -> None:
         """Remove a machine's folder, but keep the request for it, which got no answer."""

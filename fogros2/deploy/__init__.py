@@ -14,7 +14,6 @@ Each step pushes its undo before it runs. The modules, each imports only those b
 ``context``       what the steps of one machine use
 ``life``          the phases of a machine, and how it ends in each
 ``machine_job``   what the steps of one machine learn and change, and how they are undone
-``requests``      the end of a creation that got no answer
 ``steps``         a module for each step
 ``running``       a machine that is up
 ``deployment``    the order of the steps

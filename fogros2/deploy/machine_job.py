@@ -69,8 +69,8 @@ class MachineJob(Site):
         self.first_event = 0
         #: Functions that ask the machine for an answer; each gets the time-out in seconds.
         self.probes: list[Callable[[float], object]] = []
+        #: Whether the machine does not answer; None until an undo step needs it.
         self._out_of_reach: Optional[bool] = None
-        self._released = False
         #: Makes the agent wait again for heartbeats, until these come through the VPN.
         self.rearming: Optional[Periodic] = None
         #: What else may help if nothing comes back through the VPN.
@@ -228,32 +228,24 @@ class MachineJob(Site):
                         raise
                     self.shell.run(command, timeout=seconds)
             except (ConnectError, DeadlineExceeded):
-                self.out_of_reach()
+                self._out_of_reach = True
                 raise
 
     def release(self) -> None:
-        """Make the agent stop the nodes and release the machine; once."""
-        if self._released:
-            return
-        self._released = True
+        """Make the agent stop the nodes and release the machine."""
         if self.rearming is not None:
             self.rearming.close()
-        with contextlib.suppress(AgentAbsent):
-            try:
-                # answered when the nodes have ended; an agent out of reach ends them by itself
-                self.agent.request(
-                    'release', timeout=self.timeout(self._context.timeouts.command),
-                    silent=SILENCE_TIMEOUT, launch=self._context.launch_id,
-                    on_exit=self.spec.on_exit, exit=not self.capabilities.agent_program)
-            except FogError as error:
-                self._released = False
-                if isinstance(error, DeadlineExceeded):
-                    self.out_of_reach()
-                raise
-
-    def out_of_reach(self) -> None:
-        """Shorten the time-outs of the remaining undo steps: the machine does not answer."""
-        self._out_of_reach = True
+        try:
+            # answered when the nodes have ended; an agent out of reach ends them by itself
+            self.agent.request(
+                'release', timeout=self.timeout(self._context.timeouts.command),
+                silent=SILENCE_TIMEOUT, launch=self._context.launch_id,
+                on_exit=self.spec.on_exit, exit=not self.capabilities.agent_program)
+        except AgentAbsent:
+            pass
+        except DeadlineExceeded:
+            self._out_of_reach = True
+            raise
 
     def timeout(self, seconds: float) -> float:
         """

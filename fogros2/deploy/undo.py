@@ -15,9 +15,16 @@ import contextlib
 import time
 
 from fogros2 import feature, plugin_system
-from fogros2.errors import ConnectError, DeadlineExceeded, FogError, StoreError
+from fogros2.errors import (
+    ConnectError,
+    DeadlineExceeded,
+    FogError,
+    ProviderError,
+    StoreError,
+    Unsupported,
+)
 from fogros2.model import Command, Machine
-from fogros2.provider import Provider
+from fogros2.provider import Provider, TAG_LAUNCH, TAG_NAME
 from fogros2.report import Reporter, StepFailed
 from fogros2.store import Made, Record
 from fogros2.vpn import Vpn
@@ -85,6 +92,8 @@ class Site(abc.ABC):
 
     record: Record
     machine: Machine
+    #: Whether the agent has released the machine.
+    released = False
 
     @property
     @abc.abstractmethod
@@ -97,7 +106,7 @@ class Site(abc.ABC):
 
     @abc.abstractmethod
     def release(self) -> None:
-        """Make the agent stop the nodes and release the machine; once."""
+        """Make the agent stop the nodes and release the machine."""
 
 
 def first_config(record: Record) -> str:
@@ -119,9 +128,15 @@ def _remove_agent(site: Site, made: Made) -> None:
         sudo=True, what='remove the agent')])
 
 
+def _release(site: Site, made: Made) -> None:
+    if not site.released:
+        site.release()
+        site.released = True
+
+
 def _take_vpn_down(site: Site, made: Made) -> None:
     try:
-        site.release()  # the agent would repair the interface
+        _release(site, made)  # the agent would repair the interface
     finally:
         site.clean_up(vpn_down(site.record))
 
@@ -138,7 +153,7 @@ SSH_PORT, OPEN_PORT = 'firewall', 'open port'
 PORTS = (SSH_PORT, OPEN_PORT)
 _UNDO: Mapping[str, Callable[[Site, Made], object]] = {
     WATCHDOG: _remove_agent,
-    NODES: lambda site, made: site.release(),
+    NODES: _release,
     VPN: _take_vpn_down,
     SSH_PORT: _close_ssh,
     OPEN_PORT: lambda site, made: site.provider.open_port(site.machine, made.port, ()),
@@ -188,3 +203,36 @@ def unmake_all(site: Site, things: Sequence[Made]) -> None:
                 break  # the others would wait for the same machine
     if failures:
         raise failures[0]
+
+
+def end_machine(
+    provider: Provider, record: Record, age: float = 0.0, *, tidy: bool = True,
+) -> bool:
+    """
+    Delete the machine of a record; return whether none of its creation can appear any more.
+
+    :param record: without an id, it may have a machine: only a search by tags shows it.
+    :param age: seconds since the launch stopped waiting for the answer.
+    :param tidy: delete what was created beside the machine; the creation does so itself.
+    :raises FogError: the provider does not answer.
+    """
+    if record.machine_id is not None:
+        provider.destroy(record.machine_id)
+        return True
+    machines: list[Machine] = []
+    with contextlib.suppress(Unsupported):
+        machines += provider.find({TAG_NAME: record.name, TAG_LAUNCH: record.last})
+    for machine in machines:
+        provider.destroy(machine.id)
+    if not record.token:
+        return True
+    if tidy:
+        provider.tidy(dead=[record.token])
+    return bool(machines) or not provider.may_create(record.token, age)
+
+
+def late(record: Record) -> ProviderError:
+    """Return the error for a machine that may still appear."""
+    return ProviderError(
+        f"'{record.name}' may still appear: its provider '{record.provider}' has not answered the "
+        'request for it', '`ros2 fog gc` deletes it when it has appeared')

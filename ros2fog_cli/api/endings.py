@@ -16,9 +16,8 @@ from typing import Optional
 
 from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
-from fogros2.deploy import requests
+from fogros2.deploy import undo
 from fogros2.deploy.robot import clear
-from fogros2.deploy.undo import close_ports, PORTS, Site, unmake_all, VPN, WATCHDOG
 from fogros2.errors import (
     AgentError,
     ConfigurationError,
@@ -92,7 +91,7 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
             store.delete(record.name)
             return
         # The machine deleted itself, or was never created; its resources may still exist.
-        if entry.machine is None and entry.asked and not requests.end(
+        if entry.machine is None and entry.asked and not undo.end_machine(
                 machines.load(record.provider), record):
             store.set_aside(record)
         if force and record.launch_alive:
@@ -197,7 +196,7 @@ def _agent(record: Record, shell: Shell) -> Iterator[Optional[AgentClient]]:
         client.close()
 
 
-class _Left(Site):
+class _Left(undo.Site):
     """
     What a launch that died has left on a machine, which is let go for good.
 
@@ -209,7 +208,6 @@ class _Left(Site):
             record, spec=dataclasses.replace(record.spec, on_exit='delete'))
         self.machine = machine
         self._shell = shell
-        self._released = False
 
     @property
     def provider(self) -> Provider:
@@ -222,9 +220,6 @@ class _Left(Site):
 
     def release(self) -> None:
         assert self._shell is not None
-        if self._released:
-            return
-        self._released = True
         with _agent(self.record, self._shell) as client, contextlib.suppress(AgentError):
             if client is not None:  # else it has ended by itself
                 client.request('release', on_exit='delete', exit=True, timeout=30.0)
@@ -247,10 +242,10 @@ def _leave(record: Record, machine: Machine, *, force: bool) -> None:
         # the VPN may have stayed after the launch's own end, and is not in ``made`` then
         always = []
         if record.agent and not account:
-            always.append(Made(WATCHDOG))
+            always.append(Made(undo.WATCHDOG))
         if record.vpn is not None:
-            always.append(Made(VPN))
-        unmake_all(_Left(record, machine, shell), [
+            always.append(Made(undo.VPN))
+        undo.unmake_all(_Left(record, machine, shell), [
             *always, *(made for made in record.made if made not in always)])
     except (ShellError, DeadlineExceeded):
         if not force and not account:  # another robot may have taken the account away
@@ -297,7 +292,7 @@ def due(
             machine = entry.machine if entry.own else None
             if dead:
                 reason = 'its launch is gone'
-            elif machine is not None and any(made.kind in PORTS for made in record.made):
+            elif machine is not None and any(made.kind in undo.PORTS for made in record.made):
                 reason = 'its launch could not close a port'
             else:
                 continue
@@ -321,14 +316,14 @@ def end_request(record: Record, age: float, store: Store) -> None:
 
     :raises FogError: the machine may still appear, or the provider does not answer.
     """
-    if not requests.end(machines.load(record.provider), record, age):
-        raise requests.late(record)
+    if not undo.end_machine(machines.load(record.provider), record, age):
+        raise undo.late(record)
     store.answered(record)
 
 
 def awaited(store: Store, name: str) -> list[str]:
     """Return warnings of the machines with a name that may still appear."""
-    return [str(requests.late(record)) for record, _ in store.requests() if record.name == name]
+    return [str(undo.late(record)) for record, _ in store.requests() if record.name == name]
 
 
 def why_end(
@@ -399,7 +394,7 @@ def let_go(record: Record, machine: Optional[Machine], store: Store) -> None:
             record, launch='', pid=0, pid_start=0, robot_vpn=None))
         if machine is not None:
             store.save(dataclasses.replace(
-                record, notes={}, made=close_ports(_Left(record, machine))))
+                record, notes={}, made=undo.close_ports(_Left(record, machine))))
 
 
 def leftovers(store: Store, now: Optional[float] = None) -> list[Path]:

@@ -11,9 +11,8 @@ from typing import Any, Literal, Optional
 import uuid
 
 from fogros2 import feature, model, plan, process
-from fogros2.deploy import requests
 from fogros2.deploy.machine_job import Step
-from fogros2.deploy.undo import close_ports
+from fogros2.deploy.undo import close_ports, end_machine, late
 from fogros2.errors import (
     ConfigurationError,
     FogError,
@@ -100,7 +99,7 @@ class Creation(Step):
                 machine = context.provider.describe(before.machine_id)
         if machine is None or machine.state is MachineState.DELETED:
             # what was made for it may still be there
-            if not requests.end(context.provider, before):
+            if not end_machine(context.provider, before):
                 context.store.set_aside(before)
             return None
         self._check_alike(before.asked, machine)
@@ -238,11 +237,12 @@ class Creation(Step):
         context, job = self._context, self._job
         if self._request != 'none':
             try:
-                settled = requests.end(context.provider, job.record, tidy=False)
+                settled = end_machine(context.provider, job.record, tidy=False)
             except FogError:
                 if self._request != 'refused':
                     raise
                 settled = True
             if self._request == 'unanswered' and not settled:
-                raise requests.set_aside(context.store, job.record)
+                context.store.set_aside(job.record)
+                raise late(job.record)
         context.store.delete(job.name)
