@@ -295,7 +295,7 @@ def test_request_of_a_killed_launch_is_watched(
         return []
 
     monkeypatch.setattr(Cloud, 'tidy', tidy)
-    record('slam', machine_id=None, token='t1', launch='abc123')
+    record('slam', machine_id=None, token='t1', launch='abc123', last='abc123')
     run(*verb)
     assert ('tidy', 't1') in Cloud.asked
     assert not Store().machine('slam').exists(), 'another launch may use the name'
