@@ -11,19 +11,22 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-#: ``waiting``: requested, not started. ``respawning``: exited, and its machine starts it again.
-#: ``leaving``: its machine ends it, so that it can go on elsewhere. ``away``: it has left its
-#: machine, and runs nowhere yet. ``here``: it runs on the robot. ``ended``: launch knows the end.
-Phase = Literal['waiting', 'running', 'respawning', 'leaving', 'away', 'here', 'ended']
-#: ``stop``: launch wants its end. ``move`` (to the robot) and ``halt`` (for another machine): the
-#: machine can end it; ``move_gone`` and ``halt_gone``: the machine is gone. ``absent``: it does
-#: not run on its machine, or nothing will be heard of it. ``overdue``: its end has not been
-#: reported in time. ``started``, ``exited``, ``respawns`` (exited, and starts again), ``refused``:
-#: what the agent says. ``left``: its machine no longer runs it. ``free``: it may start elsewhere.
-#: ``back``: it waits for a new machine. ``over``: it ends, whatever becomes of its machine.
+#: ``waiting``: for its machine. ``sent``: to its machine, and not started. ``respawning``: exited,
+#: and its machine starts it again. ``leaving``: its machine ends it, so that it can go on
+#: elsewhere. ``away``: it has left its machine, and runs nowhere yet. ``here``: it runs on the
+#: robot. ``ended``: launch knows the end.
+Phase = Literal[
+    'waiting', 'sent', 'running', 'respawning', 'leaving', 'away', 'here', 'ended']
+#: ``sent``: to its machine. ``stop``: launch wants its end. ``move`` (to the robot) and ``halt``
+#: (for another machine): the machine can end it; ``move_gone`` and ``halt_gone``: the machine is
+#: gone. ``absent``: it does not run on its machine, or nothing will be heard of it. ``overdue``:
+#: its end has not been reported in time. ``started``, ``exited``, ``respawns`` (exited, and starts
+#: again), ``refused``: what the agent says. ``left``: its machine no longer runs it. ``free``: it
+#: may start elsewhere. ``back``: it waits for its machine, or a new one. ``over``: it ends,
+#: whatever becomes of its machine.
 Event = Literal[
-    'stop', 'move', 'move_gone', 'halt', 'halt_gone', 'absent', 'overdue', 'started', 'exited',
-    'respawns', 'refused', 'left', 'free', 'back', 'over']
+    'sent', 'stop', 'move', 'move_gone', 'halt', 'halt_gone', 'absent', 'overdue', 'started',
+    'exited', 'respawns', 'refused', 'left', 'free', 'back', 'over']
 #: ``ask``: let the machine end it. ``expect``: ``overdue`` follows if it does not. ``report``:
 #: pass on to launch what the event says. ``leave``: note that it has left its machine. ``come``:
 #: start it on the robot. ``end``: no more events follow.
@@ -69,19 +72,23 @@ def decide(state: RunState, event: Event) -> tuple[RunState, tuple[Command, ...]
     if event in ('started', 'exited', 'respawns', 'refused'):
         return _decide_report(state, event)
     change, leaving = dataclasses.replace, state.phase == 'leaving'
+    if event == 'sent' and state.phase == 'waiting':
+        return change(state, phase='sent'), ()
+    if state.phase in ('waiting', 'respawning') and event in ('stop', 'move', 'halt'):
+        # it does not run
+        ask: tuple[Command, ...] = ('ask',) if state.phase == 'respawning' else ()
+        if event == 'stop' or event == 'move' and not state.movable:
+            return change(state, phase='ended', stopping=True), (*ask, 'end')
+        return change(state, phase='away'), (*ask, 'leave')
     ended: tuple[RunState, tuple[Command, ...]] = change(state, phase='ended'), ('end',)
     left: tuple[RunState, tuple[Command, ...]] = change(state, phase='away'), ('leave',)
     if event == 'stop' or event == 'move' and not state.movable:
         if state.stopping:
             return state, ()
-        if state.phase == 'respawning':
-            return change(state, phase='ended', stopping=True), ('ask', 'end')
         return change(state, stopping=True), ('ask', 'expect')
     if event == 'move_gone' and not state.movable:
         return ended
     if event in ('move', 'halt') and not (state.stopping or leaving):
-        if state.phase == 'respawning':
-            return change(state, phase='away'), ('ask', 'leave')
         return change(state, phase='leaving'), ('ask', 'expect') if event == 'move' else ('ask',)
     if event == 'overdue':
         if state.stopping:

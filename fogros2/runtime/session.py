@@ -123,7 +123,6 @@ class Session:
         self.fenced = False
         self._backlog = Backlog(loop, self._on_event, busy, self._dropped)
         self._runs: dict[str, RemoteRun] = {}
-        self._waiting: list[RemoteRun] = []
         self._to_stop: list[RemoteRun] = []
         #: Paths of the robot that its nodes get, and of which the user knows.
         self._paths: set[str] = set()
@@ -150,6 +149,11 @@ class Session:
     def ready(self) -> bool:
         """Whether the machine is up and all of its processes have started or ended."""
         return self.running is not None and all(run.state.started for run in self._runs.values())
+
+    @property
+    def _waiting(self) -> list[RemoteRun]:
+        return [run for run in list(self._runs.values())
+                if run.state.phase == 'waiting' and not run.complete.done()]
 
     @property
     def programs(self) -> Sequence[tuple[str, str]]:
@@ -195,7 +199,7 @@ class Session:
     @property
     def sent(self) -> list[NodeSpec]:
         """The nodes that have started, or are about to."""
-        return [run.node for run in list(self._runs.values()) if run not in self._waiting]
+        return [run.node for run in list(self._runs.values()) if run.state.phase != 'waiting']
 
     def command_here(self, resolve: Callable[[], list[str]]) -> Optional[list[str]]:
         """
@@ -218,15 +222,12 @@ class Session:
         if self.interrupted:
             run.on('move_gone')
             return
-        self._waiting.append(run)
         if self.running is not None:
             self.request(self._start_waiting)
 
     def stop(self, run: RemoteRun) -> bool:
         """Stop a process; return False if it does not run there and never will."""
-        if run in self._waiting or self.running is None or self.lost:
-            if run in self._waiting:
-                self._waiting.remove(run)
+        if self.running is None or self.lost:
             return False
         self._to_stop.append(run)
         if len(self._to_stop) == 1:
@@ -289,9 +290,11 @@ class Session:
 
     async def _start_waiting(self) -> None:
         # one request for all, so that many nodes start at once
-        runs, self._waiting = self._waiting, []
+        runs = self._waiting
         if not runs or self.running is None:
             return
+        for run in runs:
+            run.on('sent')
         try:
             async with self._order:
                 await self._in_thread(
@@ -422,8 +425,8 @@ class Session:
 
     def _respawning(self) -> list[RemoteRun]:
         """Return the processes that start again when they end."""
-        return [run for run in self._runs.values() if run not in self._waiting
-                and run.state.started and not run.state.stopping and not self.interrupted
+        return [run for run in self._runs.values()
+                if run.state.started and not run.state.stopping and not self.interrupted
                 and run.node.respawn and run.node.respawn_max_retries != 0]
 
     def _start_again(self, runs: list[RemoteRun]) -> None:
@@ -434,14 +437,14 @@ class Session:
             run.node = dataclasses.replace(
                 node, id=f'{node.id}+', respawn_max_retries=max(-1, node.respawn_max_retries - 1))
             self._runs[run.node.id] = run
+            run.on('back')
         if runs:
-            self._waiting += runs
             delay = max(_RESPAWN_DELAY, *(run.node.respawn_delay for run in runs))
             self._loop.call_later(delay, self.request, self._start_waiting)
 
     def _end_unreported(self, respawning: list[RemoteRun]) -> None:
         for run in list(self._runs.values()):
-            if run in self._waiting:
+            if run.state.phase == 'waiting':
                 continue
             node = run.node
             if run in respawning and run.state.phase == 'respawning':

@@ -301,7 +301,6 @@ class Interruptible(Session):
         self._on('returned')
         for run in [run for run, alive in back.items() if alive]:
             self._runs[run.node.id] = run
-            self._waiting.append(run)
         self._logger.info(f'{self.spec.name}: a new machine runs the nodes')
         await self._subscribe()
         await self._start_waiting()

@@ -32,9 +32,10 @@ def after(*events: Event, movable: bool = True) -> tuple[RunState, list[Command]
     ('started stop respawns', 'ended', 'report ask expect report end'),
     ('started stop overdue', 'ended', 'report ask expect report end'),
     ('started overdue', 'running', 'report'),
-    ('stop absent', 'ended', 'ask expect end'),
+    ('stop', 'ended', 'end'),
+    ('sent stop absent', 'ended', 'ask expect end'),
     # its machine gets to know it after the request to end it
-    ('stop started', 'running', 'ask expect report ask'),
+    ('sent stop started', 'running', 'ask expect report ask'),
     ('started respawns stop', 'ended', 'report report ask end'),
     ('absent', 'ended', 'end'),
     # it moves to the robot
@@ -43,10 +44,14 @@ def after(*events: Event, movable: bool = True) -> tuple[RunState, list[Command]
     ('started move move', 'leaving', 'report ask expect'),
     ('started move_gone free', 'here', 'report leave come'),
     ('started move move_gone free', 'here', 'report ask expect leave come'),
-    ('move absent free', 'here', 'ask expect leave come'),
+    ('move free', 'here', 'leave come'),
+    ('sent move absent free', 'here', 'ask expect leave come'),
     ('started respawns move free', 'here', 'report report ask leave come'),
     ('started stop move', 'running', 'report ask expect'),
     ('started stop move_gone', 'ended', 'report ask expect end'),
+    # its agent has died, and starts it again
+    ('sent started respawns back sent started', 'running', 'report report report'),
+    ('started respawns back stop', 'ended', 'report report end'),
     # the launch ends while the process moves
     ('started move stop exited', 'ended', 'report ask expect ask expect report end'),
     ('started move exited stop', 'ended', 'report ask expect leave end'),
@@ -67,7 +72,8 @@ def test_process_goes_from_state_to_state(events: str, phase: str, commands: str
     ('started move_gone', 'ended', 'report end'),
     ('started halt exited free', 'away', 'report ask leave'),
     ('started halt exited free back started', 'running', 'report ask leave report'),
-    ('halt_gone stop', 'ended', 'leave end')])
+    ('halt_gone stop', 'ended', 'leave end'),
+    ('move', 'ended', 'end')])
 def test_process_that_cannot_run_on_the_robot(events: str, phase: str, commands: str) -> None:
     state, said = after(*events.split(), movable=False)  # type: ignore[arg-type]
     assert (state.phase, ' '.join(said)) == (phase, commands)
