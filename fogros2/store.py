@@ -30,8 +30,6 @@ from fogros2.model import Endpoint, MachineSpec, OtherVpn, Peer, VpnInterface
 
 #: Name of a file or folder that only one process uses, with that process.
 _UNFINISHED = re.compile(r'\..+\.([0-9]+)\.[a-z0-9_]{8}')
-#: File in a machine's folder: its VPN may have stayed when its launch ended; see ``Vpn.leave``.
-VPN_LEFT = 'vpn_left'
 #: File in the folder of another robot's VPN, which is like a launch's folder; see ``OtherVpn``.
 OTHER_VPN = 'other_vpn.json'
 _NAME = re.compile(r'[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?')

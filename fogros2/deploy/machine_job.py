@@ -117,9 +117,8 @@ class MachineJob(Site):
     def _unmake(self, made: Made) -> None:
         if made not in self.record.made:
             return
-        if self.survives(stopped=made.kind in PORTS):
-            unmake(self, made)
-        self.forget(made)
+        if not self.survives(stopped=made.kind in PORTS) or not unmake(self, made):
+            self.forget(made)
 
     def forget(self, made: Made) -> None:
         """Note, with the record's next change, that something is undone: an undo may run twice."""
@@ -215,21 +214,23 @@ class MachineJob(Site):
                                     cancel=self.cancel).stdout
         return output
 
-    def clean_up(self, commands: Iterable[Command]) -> None:
-        """Run commands on the machine on the way down; each of them may run twice."""
+    def clean_up(self, commands: Iterable[Command]) -> str:
+        """Run commands on the machine on the way down; see the base class."""
+        output = ''
         for command in commands:
             seconds = self.timeout(min(self._context.timeouts.vpn, SILENCE_TIMEOUT))
             try:
                 try:
-                    self.shell.run(command, timeout=seconds)
+                    output = self.shell.run(command, timeout=seconds).stdout
                 except ConnectError:
                     # the connection may break though the machine is there
                     if self._out_of_reach or not self._answers():
                         raise
-                    self.shell.run(command, timeout=seconds)
+                    output = self.shell.run(command, timeout=seconds).stdout
             except (ConnectError, DeadlineExceeded):
                 self._out_of_reach = True
                 raise
+        return output
 
     def release(self) -> None:
         """Make the agent stop the nodes and release the machine."""

@@ -27,7 +27,7 @@ from fogros2.model import Command, Machine
 from fogros2.provider import Provider, TAG_LAUNCH, TAG_NAME
 from fogros2.report import Reporter, StepFailed
 from fogros2.store import Made, Record
-from fogros2.vpn import Vpn
+from fogros2.vpn import STAYS, Vpn
 
 # Remove the agent. A released agent is about to exit; an agent that was never reached still runs.
 # Another robot's agent stays: its configuration names its launch.
@@ -101,8 +101,8 @@ class Site(abc.ABC):
         """The machine's provider."""
 
     @abc.abstractmethod
-    def clean_up(self, commands: Iterable[Command]) -> None:
-        """Run commands on the machine; each of them may run twice."""
+    def clean_up(self, commands: Iterable[Command]) -> str:
+        """Run commands on the machine, each perhaps twice; return the last one's output."""
 
     @abc.abstractmethod
     def release(self) -> None:
@@ -134,11 +134,12 @@ def _release(site: Site, made: Made) -> None:
         site.released = True
 
 
-def _take_vpn_down(site: Site, made: Made) -> None:
+def _take_vpn_down(site: Site, made: Made) -> str:
     try:
         _release(site, made)  # the agent would repair the interface
     finally:
-        site.clean_up(vpn_down(site.record))
+        output = site.clean_up(vpn_down(site.record))
+    return output.strip()
 
 
 def _close_ssh(site: Site, made: Made) -> None:
@@ -160,19 +161,19 @@ _UNDO: Mapping[str, Callable[[Site, Made], object]] = {
 }
 
 
-def unmake(site: Site, made: Made) -> None:
+def unmake(site: Site, made: Made) -> bool:
     """
-    Undo one thing that a launch has made; idempotent.
+    Undo one thing that a launch has made; return whether others keep it; idempotent.
 
     :raises FogError: it may still be there.
     """
     if made.kind in _UNDO:
-        _UNDO[made.kind](site, made)
-    elif made.kind in plugin_system.names(feature.GROUP):
-        site.clean_up(feature.load(made.kind).clean_up(site.record.last))
-    else:  # of another version's launch
+        return _UNDO[made.kind](site, made) == STAYS
+    if made.kind not in plugin_system.names(feature.GROUP):  # of another version's launch
         raise StoreError(f"the record of '{site.record.name}' has '{made.kind}', which this "
                          "version can't undo", 'undo it with the version that made it')
+    site.clean_up(feature.load(made.kind).clean_up(site.record.last))
+    return False
 
 
 def close_ports(site: Site) -> tuple[Made, ...]:

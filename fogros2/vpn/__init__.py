@@ -22,6 +22,9 @@ from collections.abc import Iterator, Sequence
 
 from fogros2.model import Command, Peer, VpnInterface
 
+#: What the commands of ``Vpn.leave`` print if the interface stays.
+STAYS = 'stays'
+
 
 class Vpn(abc.ABC):
     """
@@ -68,5 +71,5 @@ class Vpn(abc.ABC):
         """Yield the commands that undo ``up`` and delete the key file."""
 
     def leave(self, interface: VpnInterface) -> Iterator[Command]:
-        """Yield the commands of ``down`` for a machine that is kept; further peers may stay."""
+        """Yield the commands of ``down``, which print ``STAYS`` if further peers keep it."""
         return self.down(interface)

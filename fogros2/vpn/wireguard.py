@@ -21,7 +21,7 @@ import shlex
 
 from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
-from fogros2.vpn import addresses, Vpn
+from fogros2.vpn import addresses, STAYS, Vpn
 from fogros2.vpn.addresses import dds_ports, DISCOVERY_GROUP
 
 #: Programs that each host needs, and their Debian and Ubuntu packages. ``wireguard-go`` is only
@@ -194,7 +194,8 @@ class WireGuard(Vpn):
         """Yield the script of ``down``, unless further peers stay."""
         for command in self.down(interface):
             yield dataclasses.replace(command, argv=(*command.argv[:-1], (
-                f'[ ! -e {more(interface)} ] || ! {_more(interface, "stay")} || exit 0\n'
+                f'[ ! -e {more(interface)} ] || ! {_more(interface, "stay")} '
+                f'|| {{ echo {STAYS}; exit 0; }}\n'
                 f'{command.argv[-1]}')))
 
     def _script(

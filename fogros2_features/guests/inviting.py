@@ -13,7 +13,7 @@ from fogros2 import plugin_system
 from fogros2.errors import CommandError, ConfigurationError, VpnError
 from fogros2.model import host_port
 from fogros2.shell import multiplexer
-from fogros2.store import Record, Store, VPN_LEFT
+from fogros2.store import Record, Store
 from fogros2.vpn import addresses, Vpn
 from fogros2.vpn.addresses import dds_ports
 from fogros2_features.guests import invitation, listing, membership, network
@@ -48,7 +48,6 @@ def invite(
     server, port = machines.load(entry.provider).dialled_at(entry.machine, record.vpn.port, host)
     server = server or addresses.own_address()
     secret = secrets.token_hex(32)
-    (store.machine(name) / VPN_LEFT).touch()
     dds = plugin_system.load('fogros2.dds', rmw)(domain=domain)
     with reach.session(entry) as shell:
         shell.run(listing.install(record.vpn), timeout=15.0)

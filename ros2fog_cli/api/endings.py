@@ -32,7 +32,7 @@ from fogros2.model import Command, Machine, MachineState
 from fogros2.provider import Provider
 from fogros2.report import Reporter, step
 from fogros2.shell import Shell
-from fogros2.store import launch_process, Made, Record, robot_id, Store
+from fogros2.store import launch_process, Record, robot_id, Store
 from fogros2.vpn import owner
 from fogros2.waiting import Timeouts, wait_until
 from ros2fog_cli.api import machines, reach
@@ -213,10 +213,12 @@ class _Left(undo.Site):
     def provider(self) -> Provider:
         return machines.load(self.record.provider)
 
-    def clean_up(self, commands: Iterable[Command]) -> None:
+    def clean_up(self, commands: Iterable[Command]) -> str:
         assert self._shell is not None
+        output = ''
         for command in commands:
-            self._shell.run(command, timeout=Timeouts().command)
+            output = self._shell.run(command, timeout=Timeouts().command).stdout
+        return output
 
     def release(self) -> None:
         assert self._shell is not None
@@ -239,14 +241,7 @@ def _leave(record: Record, machine: Machine, *, force: bool) -> None:
                     return  # our agent is gone, and another robot uses the computer now
                 if not force and not _sure(record) and _hears_launch(client):
                     raise _used(record)
-        # the VPN may have stayed after the launch's own end, and is not in ``made`` then
-        always = []
-        if record.agent and not account:
-            always.append(Made(undo.WATCHDOG))
-        if record.vpn is not None:
-            always.append(Made(undo.VPN))
-        undo.unmake_all(_Left(record, machine, shell), [
-            *always, *(made for made in record.made if made not in always)])
+        undo.unmake_all(_Left(record, machine, shell), record.made)
     except (ShellError, DeadlineExceeded):
         if not force and not account:  # another robot may have taken the account away
             raise

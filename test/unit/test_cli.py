@@ -470,7 +470,7 @@ def test_delete_does_not_wait_for_an_agent_that_ended(monkeypatch: pytest.Monkey
         return lambda c: ran.append(' '.join(c.argv)) or Result(status, '', '')
 
     shell = FakeShell(handlers={'test': program(1), 'sh': program(0)})
-    lab(monkeypatch, shell, made=(Made(undo.NODES),))
+    lab(monkeypatch, shell, made=(Made(undo.WATCHDOG), Made(undo.NODES)))
     assert run('delete', 'lab', '--yes') == 0
     assert ran.count('test -e /run/fogros2/lab/agent.py') == 2 and len(ran) == 3
     assert shell.opened == [] and shell.closed == 1
@@ -538,7 +538,8 @@ def test_delete_ends_what_guests_have_kept_on_a_host(monkeypatch: pytest.MonkeyP
     """The launch has left it to them at its own end."""
     shell = FakeShell(handlers={
         'test': lambda c: Result(1, '', ''), 'sh': lambda c: Result(0, '', '')})
-    lab(monkeypatch, shell, agent='', vpn=LAB_VPN, on_exit='keep', launch='')
+    lab(monkeypatch, shell, agent='', vpn=LAB_VPN, on_exit='keep', launch='',
+        made=(Made(undo.VPN),))
     assert run('delete', 'lab', '--yes') == 0
     assert next(WireGuard().down(LAB_VPN)) in shell.commands
 

@@ -58,7 +58,7 @@ from fogros2.model import (
 from fogros2.report import StepDone, StepFailed
 from fogros2.shell import host_key
 from fogros2.store import Made, Store
-from fogros2.vpn import addresses
+from fogros2.vpn import addresses, STAYS
 from fogros2.waiting import Periodic, Timeouts, wait_until
 from fogros2_features.guests import invitation
 from fogros2_features.replacement import Replacement
@@ -635,6 +635,7 @@ def test_connection_that_breaks_at_the_end_is_opened_again(launch, provider, the
         ran.append(command.argv[0])
         if len(ran) == 1 or not there:
             raise ConnectError('the connection was lost')
+        return Result(0, '', '')
 
     _, mine = begun(launch)
     mine.shell = SimpleNamespace(run=run)
@@ -859,6 +860,21 @@ def test_what_could_not_be_undone_stays_in_the_record(launch, provider):
     with mine.undo:
         mine.makes(undo.WATCHDOG)
     assert mine.record.made == ()
+
+
+def test_vpn_that_guests_keep_stays_in_the_record(launch, provider):
+    context, mine = begun(launch, dataclasses.replace(SPEC, on_exit='keep'))
+    joining = Joining(context, mine)
+    joining.choose_interface()
+    mine.enter('up')
+    mine.released = True
+    mine.shell = FakeShell(handlers={'true': lambda c: Result(0, f'{STAYS}\n', '')})
+    with mine.undo:
+        mine.makes(undo.VPN)
+    assert joining._former is None and mine.record.made == (Made(undo.VPN),)
+    # the next launch needs its port
+    joining.choose_interface()
+    assert joining._former == mine.interface
 
 
 def test_machine_that_its_provider_knows_is_not_lost(cut, provider, monkeypatch):

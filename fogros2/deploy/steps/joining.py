@@ -17,7 +17,7 @@ from fogros2.deploy.undo import VPN, vpn_down
 from fogros2.errors import CommandError, FogError, VpnError
 from fogros2.model import Command, host_port, Machine, Peer, VpnInterface
 from fogros2.report import step
-from fogros2.store import VPN_LEFT
+from fogros2.store import Made
 from fogros2.vpn import addresses
 
 #: Sends a packet to an address and port, from which the peer learns this end's endpoint.
@@ -33,13 +33,14 @@ class Joining(Step):
     def __init__(self, context: Context, job: MachineJob) -> None:
         super().__init__(context, job)
         self._member: Optional[VpnMember] = None
-        #: The interface of an earlier launch.
+        #: The interface of an earlier launch, if it has stayed.
         self._former: Optional[VpnInterface] = None
 
     def choose_interface(self) -> None:
         """Choose the machine's interface; record it before it is created."""
         context, job = self._context, self._job
-        self._former = job.record.vpn
+        if Made(VPN) in job.record.made:
+            self._former = job.record.vpn
         port = job.record.vpn.port if job.record.vpn else plan.machine_port(context.launch_id)
         job.interface = plan.machine_interface(
             context.launch_id, context.vpn.interface.network, context.index, port,
@@ -70,11 +71,9 @@ class Joining(Step):
         with job.step('VPN') as detail:
             job.makes(VPN)
             job.undoing(VPN, lambda: robot.remove(job.name))
-            noted = self._context.store.machine(job.name) / VPN_LEFT
-            if self._former is not None and noted.exists():
-                # others still use that of an earlier launch, and its port is needed
+            if self._former is not None:
+                # others still use it, and its port is needed
                 job.run(*robot.vpn.down(self._former))
-            noted.unlink(missing_ok=True)
             public_key = job.run(robot.vpn.keys(interface)).strip()
             route = plan.route(
                 job.machine, Peer(job.name, public_key, interface.address), interface.port,
