@@ -26,10 +26,10 @@ if [ "${1:-}" = kubernetes ]; then
     [ $# != 0 ] || again=yes
     paths=test/integration/kubernetes
 elif [ $# = 0 ]; then
-    # Three at a time: much of what tests with machines take is waiting. Tests named by hand run in
+    # Four at a time: much of what tests with machines take is waiting. Tests named by hand run in
     # turn, so that their output is seen as it comes.
     again=yes
-    set -- --ignore=test/integration/kubernetes -n 3 --dist loadgroup --no-loadscope-reorder
+    set -- --ignore=test/integration/kubernetes -n 4 --dist loadgroup --no-loadscope-reorder
 else
     # pytest collects it nevertheless if it is named
     set -- --ignore=test/integration/kubernetes "$@"
