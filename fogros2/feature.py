@@ -57,26 +57,50 @@ class Cost:
         return (self.price or Decimal(0)) * Decimal(self.seconds) / 3600
 
 
-class RunningMachine(Protocol):
+class ReachedMachine(Protocol):
+    """A machine on which commands can run, as features see it."""
+
+    spec: MachineSpec
+
+    @property
+    def provider(self) -> Provider:
+        """The machine's provider."""
+
+    @property
+    def launch(self) -> str:
+        """The launch's id."""
+
+    @property
+    def rmw(self) -> str:
+        """The launch's middleware."""
+
+    def run(self, command: Command, /, *, timeout: float) -> str:
+        """
+        Run a command there; return its output. Ctrl-C ends it on the way up.
+
+        :param timeout: seconds; on the way down a machine that does not answer gets few.
+        :raises FogError: the command failed, the machine does not answer, or the launch ends.
+        """
+
+    def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
+        """Report a step around a block, which may append details to the list that it gets."""
+
+
+class RunningMachine(ReachedMachine, Protocol):
     """
     A machine that is up, as features see it.
 
     :ivar machine: as the provider reported it.
-    :ivar provider: the machine's.
     :ivar shell: copies files; for commands there is ``run``.
     :ivar interface: its end of the launch's VPN, and ``vpn_address`` the address there.
-    :ivar launch: the launch's id.
     :ivar environment: the variables of its nodes.
     :ivar dds_file: path of the middleware's configuration there, which ``environment`` names.
     """
 
-    spec: MachineSpec
     machine: Machine
-    provider: Provider
     shell: Shell
     interface: VpnInterface
     vpn_address: str
-    launch: str
     environment: Mapping[str, str]
     dds_file: str
 
@@ -87,17 +111,6 @@ class RunningMachine(Protocol):
     @property
     def lost(self) -> str:
         """Why the machine is gone or must not be used any more, '' while it is there."""
-
-    def run(self, command: Command, *, timeout: float) -> str:
-        """
-        Run a command there; return its output. Ctrl-C ends it on the way up.
-
-        :param timeout: seconds; on the way down a machine that does not answer gets few.
-        :raises FogError: the command failed, the machine does not answer, or the launch ends.
-        """
-
-    def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
-        """Report a step around a block, which may append details to the list that it gets."""
 
     def warn(self, text: str, remedy: str) -> None:
         """Warn the user, with what to do about it on a line of its own."""
@@ -398,6 +411,14 @@ class Feature:
         another robot's VPN.
         """
         return contextlib.nullcontext()
+
+    def installing(self, reached: ReachedMachine, nodes: Sequence[NodeSpec], own: Any) -> None:
+        """
+        Do what takes long, while workspace and modules are installed, in a thread of its own.
+
+        :param nodes: those of the machine that are known by now.
+        :raises FogError: the machine can't be used, and ends.
+        """
 
     def machine(self, running: RunningMachine, own: Any) -> contextlib.AbstractContextManager[Any]:
         """

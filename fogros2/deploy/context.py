@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
 import shutil
 import threading
@@ -14,8 +14,9 @@ from fogros2.dds import DdsVendor
 from fogros2.deploy.choosing import Choices
 from fogros2.deploy.robot_vpn import RobotVpn
 from fogros2.errors import FogError, PrerequisiteError
+from fogros2.feature import contained
 from fogros2.host import workspace
-from fogros2.model import OtherVpn
+from fogros2.model import NodeSpec, OtherVpn
 from fogros2.provider import Capabilities, Provider
 from fogros2.report import Reporter
 from fogros2.store import Store
@@ -25,7 +26,7 @@ from fogros2.waiting import Timeouts
 @dataclasses.dataclass(frozen=True)
 class Context:
     """
-    What the steps of one machine use; only the machine's number and programs are its own.
+    What the steps of one machine use; only the machine's number and nodes are its own.
 
     :param launch_id: of the launch.
     :param environment: the user's environment variables.
@@ -35,7 +36,7 @@ class Context:
     :param vpn: the robot's VPN interface; it need not be up.
     :param index: the machine's number in the VPN.
     :param others: returns the VPN addresses of the other machines that are known now.
-    :param programs: the (package, executable) pairs that are known to run on the machine.
+    :param nodes: that are known to run on the machine.
     :param other_vpn: the VPN of another robot in which the machine is; None: the launch's.
     :param shorten_others: shortens the lifetimes of the launch's other machines where features
         allow less since this machine costs, too.
@@ -55,7 +56,7 @@ class Context:
     dds: DdsVendor
     index: int = 0
     others: Callable[[], Sequence[str]] = tuple
-    programs: Sequence[tuple[str, str]] = ()
+    nodes: Sequence[NodeSpec] = ()
     other_vpn: Optional[OtherVpn] = None
     shorten_others: Callable[[], None] = lambda: None
 
@@ -67,7 +68,7 @@ class Context:
     @property
     def packages(self) -> list[str]:
         """The packages of the known programs."""
-        return sorted({package for package, _ in self.programs})
+        return sorted({package for package, _ in programs_of(self.nodes)})
 
     def underlay(self, workspaces: Sequence[str]) -> plan.Underlay:
         """
@@ -80,3 +81,9 @@ class Context:
             raise PrerequisiteError('ros2 is not on PATH', "source ROS 2's setup.bash")
         return plan.underlay(
             workspace.sourced(next(iter(workspaces), None), self.environment), workspaces, ros2)
+
+
+def programs_of(nodes: Iterable[NodeSpec]) -> list[tuple[str, str]]:
+    """Return the (package, executable) pairs of nodes, without those in containers."""
+    return sorted({(node.package, node.executable) for node in nodes
+                   if node.package and not contained(node.features)})

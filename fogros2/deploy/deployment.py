@@ -14,7 +14,7 @@ import contextlib
 from typing import Any
 
 from fogros2 import feature, plan
-from fogros2.deploy.context import Context
+from fogros2.deploy.context import Context, programs_of
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.running import RunningMachine
 from fogros2.deploy.steps import dds, installing
@@ -70,12 +70,17 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
 
         def install_modules() -> None:
             ros_step.result()
-            modules.ensure(context.programs)
+            modules.ensure(programs_of(context.nodes))
+
+        def use_features() -> None:
+            ros_step.result()
+            for each, own in feature.used(job.spec):
+                each.installing(job, context.nodes, own)
 
         _wait_for_all(
             job, ros_step, vpn_step, dds_step,
             pool.submit(installing.send_workspaces, context, job, ros, ros_step.result),
-            pool.submit(install_modules))
+            pool.submit(install_modules), pool.submit(use_features))
     for name in feature.names(job.spec):
         for link in joining.links(connection):
             carrying = contextlib.ExitStack()

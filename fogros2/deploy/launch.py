@@ -18,7 +18,7 @@ from fogros2.dds import addresses_of, DdsVendor
 from fogros2.deploy import robot_router
 from fogros2.deploy.checks import check, check_architecture, check_here, check_names
 from fogros2.deploy.choosing import Choices
-from fogros2.deploy.context import Context
+from fogros2.deploy.context import Context, programs_of
 from fogros2.deploy.deployment import bring_up
 from fogros2.deploy.robot import check_robot, clear, provider, run
 from fogros2.deploy.robot_vpn import choose_interface, RobotVpn
@@ -27,7 +27,7 @@ from fogros2.deploy.undo import UndoStack
 from fogros2.errors import Cancelled, ConfigurationError, DdsError, FogError, StoreError
 from fogros2.feature import Cost
 from fogros2.journal import Journal
-from fogros2.model import DdsInterface, MachineSpec, OtherVpn
+from fogros2.model import DdsInterface, MachineSpec, NodeSpec, OtherVpn
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent, step, StepFailed, Warned
 from fogros2.store import delete_folder, Record, Store, this_process, write_private
@@ -66,7 +66,7 @@ class Launch:
         self._indices: dict[str, int] = {}
         self._ups: dict[str, Future[RunningMachine]] = {}
         self._providers: dict[str, Provider] = {}
-        self._programs: dict[str, Sequence[tuple[str, str]]] = {}
+        self._nodes: dict[str, Sequence[NodeSpec]] = {}
         self._choices = Choices(self.provider, self.report)
         self._vpn: Optional[RobotVpn] = None
         self._rmw = ''
@@ -102,22 +102,22 @@ class Launch:
 
     def prepare(
         self, specs: Sequence[MachineSpec],
-        programs: Mapping[str, Sequence[tuple[str, str]]] = {},
+        nodes: Mapping[str, Sequence[NodeSpec]] = {},
     ) -> None:
         """
         Check everything that can be checked at no cost, and make the open choices.
 
-        :param programs: machine name to the (package, executable) pairs that will run there.
+        :param nodes: machine name to the nodes that will run there.
         :raises FogError: the first problem that was found, with its remedy.
         """
         rmw = self.dds().rmw
         check_robot()
-        self._programs.update(programs)
+        self._nodes.update(nodes)
         check_names(specs)
         plan.check_rmw(rmw, plan.ament_prefixes(self.user_environment), specs)
         for spec in specs:
             check(spec, self.provider(spec.provider), environment=self.user_environment,
-                  programs=programs.get(spec.name, ()), report=self.report)
+                  programs=programs_of(nodes.get(spec.name, ())), report=self.report)
         with ThreadPoolExecutor(max(1, len(specs)), 'fog-choose') as pool:
             choices = [pool.submit(self._choose, spec) for spec in specs]
             chosen = [choice.result() for choice in choices]
@@ -359,7 +359,7 @@ class Launch:
             cancel=self.cancel, ending=self._ending, provider=self.provider(spec.provider),
             choices=self._choices, vpn=self.robot_vpn(), dds=self.dds(),
             index=self._indices[spec.name], others=others, other_vpn=self.join(spec),
-            programs=self._programs.get(spec.name, ()),
+            nodes=self._nodes.get(spec.name, ()),
             shorten_others=functools.partial(self._shorten, spec.name))
 
     def up(self, spec: MachineSpec) -> RunningMachine:

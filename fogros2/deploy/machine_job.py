@@ -176,6 +176,16 @@ class MachineJob(Site):
         return self._context.provider
 
     @property
+    def launch(self) -> str:
+        """The launch's id."""
+        return self._context.launch_id
+
+    @property
+    def rmw(self) -> str:
+        """The launch's middleware."""
+        return self._context.dds.rmw
+
+    @property
     def machine_id(self) -> str:
         """The provider's id of the machine; set as soon as the provider has created it."""
         assert self.record.machine_id is not None

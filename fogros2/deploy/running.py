@@ -50,6 +50,7 @@ class RunningMachine(Step):
         self.vpn_address = job.interface.address
         self.launch = context.launch_id
         self.dds_file = job.dds_file
+        self.rmw = job.rmw
         self.environment = environment
         self._modules = modules
         self._lock = threading.Lock()

@@ -461,7 +461,7 @@ class Coordinator:
             with defaults.named(self._context.environment):
                 await self._in_thread(
                     self.launch.prepare, [session.spec for session in sessions],
-                    {session.spec.name: session.programs for session in sessions})
+                    {session.spec.name: session.planned for session in sessions})
         except FogError as error:
             self._fail(error)
             return

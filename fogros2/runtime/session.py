@@ -21,7 +21,6 @@ from fogros2.errors import (
     ProviderError,
 )
 from fogros2.events import Event
-from fogros2.feature import contained
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2.ros_names import remapped
 from fogros2.runtime.backlog import Backlog
@@ -156,11 +155,9 @@ class Session:
                 if run.state.phase == 'waiting' and not run.complete.done()]
 
     @property
-    def programs(self) -> Sequence[tuple[str, str]]:
-        """The (package, executable) pairs of the processes that wait for the machine."""
-        return sorted({
-            (run.node.package, run.node.executable) for run in self._waiting
-            if run.node.package and not contained(run.node.features)})
+    def planned(self) -> Sequence[NodeSpec]:
+        """The processes that wait for the machine."""
+        return [run.node for run in self._waiting]
 
     def add(self, instance: CloudInstance) -> None:
         """Add a launch file's object for this machine."""

@@ -15,7 +15,14 @@ import inspect
 from typing import Any, ClassVar, Optional, TYPE_CHECKING
 
 from fogros2.errors import ConfigurationError
-from fogros2.feature import Feature, LaunchPart, Program, RunningLaunch, RunningMachine
+from fogros2.feature import (
+    Feature,
+    LaunchPart,
+    Program,
+    ReachedMachine,
+    RunningLaunch,
+    RunningMachine,
+)
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2_features.containers import commands
 from fogros2_features.containers.commands import Container
@@ -24,8 +31,8 @@ from fogros2_features.containers.engine import Engine
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
 
-#: The engines of the machines that are up.
-_ENGINES: dict[RunningMachine, Engine] = {}
+#: The engines of machines, by the launch's id and the machine's name.
+_ENGINES: dict[tuple[str, str], Engine] = {}
 
 
 class Containers(Feature):
@@ -118,21 +125,30 @@ class Containers(Feature):
         """Return the processes that follow the containers."""
         return [commands.follow(each, number) for number, each in enumerate(own)]
 
+    def installing(
+        self, reached: ReachedMachine, nodes: Sequence[NodeSpec], own: Sequence[Container],
+    ) -> None:
+        """Download the images."""
+        engine = _ENGINES[reached.launch, reached.spec.name] = Engine()
+        engine.fetch(reached, own, nodes)
+
     @contextlib.contextmanager
     def machine(self, running: RunningMachine, own: Sequence[Container]) -> Iterator[None]:
         """Start the containers."""
-        engine = _ENGINES[running] = Engine(running)
+        key = running.launch, running.spec.name
+        engine = _ENGINES[key]
         try:
-            engine.start(own)
+            engine.start(running, own)
             yield
         finally:
-            del _ENGINES[running]
+            if _ENGINES[key] is engine:  # not that of a machine in its place
+                del _ENGINES[key]
 
     def starting(
         self, running: RunningMachine, nodes: Sequence[NodeSpec], own: Sequence[Container],
     ) -> Sequence[NodeSpec]:
-        """Download the images of nodes; return the nodes with the commands of their containers."""
-        return _ENGINES[running].inside(nodes)
+        """Return nodes with the commands of their containers; download missing images."""
+        return _ENGINES[running.launch, running.spec.name].inside(running, nodes)
 
     def clean_up(self, launch: str) -> Sequence[Command]:
         """Return the command that removes all containers of a launch."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fogros2.errors import CommandError, PrerequisiteError
-from fogros2.feature import RunningMachine
+from fogros2.feature import ReachedMachine, RunningMachine
 from fogros2.host.installer import apt_install
 from fogros2.model import NodeSpec
 from fogros2.waiting import Timeouts
@@ -19,96 +19,107 @@ _TIMEOUTS = Timeouts()
 class Engine:
     """The container engine, the containers and the images of one machine."""
 
-    def __init__(self, running: RunningMachine) -> None:
-        self._running = running
-        self._works = False
+    def __init__(self) -> None:
+        self._works = self._recorded = False
         #: Name in the engine by (name in the launch file, middleware).
         self._images: dict[tuple[str, str], str] = {}
 
-    @property
-    def _rmw(self) -> str:
-        """The launch's middleware."""
-        return self._running.environment['RMW_IMPLEMENTATION']
-
-    def start(self, containers: Sequence[Container]) -> None:
+    def fetch(
+        self, reached: ReachedMachine, containers: Sequence[Container], nodes: Sequence[NodeSpec],
+    ) -> None:
         """
-        Start containers; install a container engine if the machine has none.
+        Download images; install a container engine if the machine has none.
+
+        :raises PrerequisiteError: the machine cannot install an engine, or download an image.
+        :raises Unsupported: no engine can run on the machine.
+        """
+        wanted = [(each.image, _lacking(each, reached.rmw)) for each in containers] + [
+            (image, reached.rmw) for node in nodes
+            if (image := commands.image_of(node).get('image'))]
+        for image, rmw in wanted:
+            if (image, rmw) not in self._images:
+                reached.provider.check_containers(reached.spec)
+                with reached.step(f'image {image}'):
+                    self._images[image, rmw] = self._image(reached, image, rmw)
+
+    def start(self, running: RunningMachine, containers: Sequence[Container]) -> None:
+        """
+        Start containers, whose images are there.
 
         :raises CommandError: a container does not start.
-        :raises PrerequisiteError: the machine cannot install an engine, or download an image.
         """
         if not containers:
             return
-        running = self._running
+        self._record(running)
         variables = f'{running.directory}/container-variables'
         with running.step('containers') as detail:
-            images = [self._image(each.image, self._lacking(each)) for each in containers]
             for text, path in (
                     (commands.follower(running.launch),
                      f'{running.directory}/{commands.FOLLOWER}'),
                     (commands.dds_variables(running.environment), variables)):
                 running.shell.put(text.encode(), path, mode=0o600, timeout=_TIMEOUTS.command)
-            for number, (container, image) in enumerate(zip(containers, images)):
+            for number, container in enumerate(containers):
+                image = self._images[container.image, _lacking(container, running.rmw)]
                 running.run(
                     commands.run(container, number, running.launch, image, running.dds_file,
                                  variables), timeout=_TIMEOUTS.install)
             detail.append(f'{len(containers)}')
 
-    def _lacking(self, container: Container) -> str:
-        """Return the middleware that a container's image must have, '' for any."""
-        if not commands.on_machine_network(container) \
-                or commands.sets(container, 'RMW_IMPLEMENTATION'):
-            return ''
-        return self._rmw
-
-    def inside(self, nodes: Sequence[NodeSpec]) -> list[NodeSpec]:
+    def inside(self, running: RunningMachine, nodes: Sequence[NodeSpec]) -> list[NodeSpec]:
         """
-        Download the images of nodes; return the nodes with the commands of their containers.
+        Return nodes with the commands of their containers; download missing images.
 
         :raises PrerequisiteError: the machine cannot install an engine, or download an image.
         :raises Unsupported: no engine can run on the machine.
         """
-        return [self._inside(node, image) if (image := commands.image_of(node).get('image'))
-                else node for node in nodes]
+        self.fetch(running, (), nodes)
+        result = []
+        for node in nodes:
+            image = commands.image_of(node).get('image')
+            if image:
+                self._record(running)
+                node = commands.inside(
+                    node, self._images[image, running.rmw], running.launch,
+                    running.spec.workspace or '', running.dds_file, running.spec.environment)
+            result.append(node)
+        return result
 
-    def _inside(self, node: NodeSpec, image: str) -> NodeSpec:
-        running = self._running
-        if (image, self._rmw) not in self._images:
-            running.provider.check_containers(running.spec)
-            with running.step(f'image {image}'):
-                self._image(image, self._rmw)
-        return commands.inside(
-            node, self._images[image, self._rmw], running.launch, running.spec.workspace or '',
-            running.dds_file, running.spec.environment)
+    def _record(self, running: RunningMachine) -> None:
+        if not self._recorded:
+            running.makes(commands.NAME)
+            self._recorded = True
 
-    def _image(self, image: str, rmw: str) -> str:
+    def _image(self, reached: ReachedMachine, image: str, rmw: str) -> str:
         """Return the engine's name of an image; download the image if it is missing."""
-        if (image, rmw) not in self._images:
-            self._ensure_engine()
-            try:
-                printed = self._running.run(
-                    commands.fetch(image, rmw), timeout=_TIMEOUTS.install)
-            except CommandError as error:
-                raise PrerequisiteError(
-                    f"'{self._running.spec.name}' can't get the image '{image}': "
-                    f'{commands.reason(error.result.stderr)}',
-                    "build it for the machine's processors too, or choose another machine"
-                    if 'processors, and the machine has' in error.result.stderr else
-                    'is its name right, and may anybody download it?') from error
-            self._images[image, rmw] = (printed.split() or [image])[-1]
-        return self._images[image, rmw]
+        self._ensure_engine(reached)
+        try:
+            printed = reached.run(commands.fetch(image, rmw), timeout=_TIMEOUTS.install)
+        except CommandError as error:
+            raise PrerequisiteError(
+                f"'{reached.spec.name}' can't get the image '{image}': "
+                f'{commands.reason(error.result.stderr)}',
+                "build it for the machine's processors too, or choose another machine"
+                if 'processors, and the machine has' in error.result.stderr else
+                'is its name right, and may anybody download it?') from error
+        return (printed.split() or [image])[-1]
 
-    def _ensure_engine(self) -> None:
+    def _ensure_engine(self, reached: ReachedMachine) -> None:
         if self._works:
             return
-        running = self._running
-        running.makes(commands.NAME)
-        if not running.run(commands.FIND, timeout=_TIMEOUTS.command).strip():
+        if not reached.run(commands.FIND, timeout=_TIMEOUTS.command).strip():
             try:
                 # the configuration of podman may name crun, and its package may bring another
-                running.run(apt_install(['podman', 'crun']), timeout=_TIMEOUTS.install)
+                reached.run(apt_install(['podman', 'crun']), timeout=_TIMEOUTS.install)
             except CommandError as error:
                 raise PrerequisiteError(
-                    f"'{running.spec.name}' has neither podman nor docker, and podman can't be "
+                    f"'{reached.spec.name}' has neither podman nor docker, and podman can't be "
                     f'installed: {error}', 'take an image with one of them') from error
         self._works = True
+
+
+def _lacking(container: Container, rmw: str) -> str:
+    """Return the middleware that a container's image must have, '' for any."""
+    if not commands.on_machine_network(container) \
+            or commands.sets(container, 'RMW_IMPLEMENTATION'):
+        return ''
+    return rmw

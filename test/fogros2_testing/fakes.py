@@ -375,6 +375,7 @@ class FakeRunning:
     environment: Mapping[str, str] = {
         'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp', 'ROS_DOMAIN_ID': '7'}
     dds_file = f'{directory}/dds.xml'
+    rmw = 'rmw_fastrtps_cpp'
 
     def __init__(
         self, shell: Any = None, *, spec: Optional[MachineSpec] = None, launch: str = '0a0b0c',

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from fogros2 import ContainerInstance, events
+from fogros2.deploy.context import programs_of
 from fogros2.errors import Cancelled
 from fogros2.provider import Capabilities
 from fogros2.report import step
@@ -145,8 +146,9 @@ class FakeLaunch:
         self.note('robot environment')
         return {'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp', 'CYCLONEDDS_URI': '<CycloneDDS/>'}
 
-    def prepare(self, specs, programs):
-        self.note('prepare', [spec.name for spec in specs], programs)
+    def prepare(self, specs, nodes):
+        self.note('prepare', [spec.name for spec in specs],
+                  {name: programs_of(some) for name, some in nodes.items()})
         if self.prepare_error is not None:
             raise self.prepare_error
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import contextlib
 import dataclasses
 import os
@@ -401,7 +402,7 @@ def test_container_gets_variables_of_the_middleware(vendor, variables):
 def test_containers_start_with_the_middleware_of_the_machine(engine, monkeypatch):
     monkeypatch.setenv('THERE', 'ros:jazzy web')
     shell = FakeShell(handlers={'sh': here})
-    beside(shell).start([parse('docker run ros:jazzy'), parse('docker run -p 80:80 web')])
+    started(shell, [parse('docker run ros:jazzy'), parse('docker run -p 80:80 web')])
     assert shell.files['/var/lib/agent/container-variables'] == (
         b'RMW_IMPLEMENTATION=rmw_fastrtps_cpp\nROS_DOMAIN_ID=7\n', 0o600)
     first, second = (line for line in notes() if ' run ' in line)
@@ -545,15 +546,17 @@ def here(command: Command) -> Result:
     return Result(said.returncode, said.stdout, said.stderr)
 
 
-def beside(shell: FakeShell) -> Engine:
-    return Engine(FakeRunning(shell, launch='abc'))
+def started(shell: FakeShell, own: Sequence[containers.Container]) -> None:
+    running, engine = FakeRunning(shell, launch='abc'), Engine()
+    engine.fetch(running, own, ())
+    engine.start(running, own)
 
 
 def test_a_wrong_image_is_one_clear_line(engine, monkeypatch):
     monkeypatch.setenv('WRONG', 'docker.io/library/no-such:1')
     node = NodeSpec('1', 'n', 'p', 'e', features=in_image('no-such:1'))
     with pytest.raises(PrerequisiteError) as error:
-        beside(FakeShell(handlers={'sh': here})).inside([node])
+        Engine().inside(FakeRunning(FakeShell(handlers={'sh': here})), [node])
     assert str(error.value) == (
         "'a' can't get the image 'no-such:1': Error: docker.io/library/no-such:1: manifest "
         'unknown (is its name right, and may anybody download it?)')
@@ -562,12 +565,13 @@ def test_a_wrong_image_is_one_clear_line(engine, monkeypatch):
 def test_image_of_several_nodes_is_fetched_once(engine, monkeypatch):
     monkeypatch.setenv('THERE', 'localhost/a:1')
     shell = FakeShell(handlers={'sh': here})
-    there = beside(shell)
+    there, running = Engine(), FakeRunning(shell)
     nodes = [NodeSpec('1', 'n', 'p', 'e', features=in_image('localhost/a:1')),
              NodeSpec('2', 'plain', 'p', 'e')]
-    first, plain = there.inside(nodes)
+    there.fetch(running, (), nodes)
     asked = len(shell.commands)
-    (second,) = there.inside(nodes[:1])
+    first, plain = there.inside(running, nodes)
+    (second,) = there.inside(running, nodes[:1])
     assert 'localhost/a:1' in first.arguments and second == first and plain == nodes[1]
     assert len(shell.commands) == asked > 0
 
@@ -577,7 +581,7 @@ def test_a_node_that_comes_late_has_to_fit_its_machine_too():
     running = FakeRunning(shell, spec=MachineSpec('m', 'container'))
     running.provider = ContainerProvider()
     with pytest.raises(Unsupported, match='containers=True'):
-        Engine(running).inside([NodeSpec('1', 'n', 'p', 'e', features=in_image('a'))])
+        Engine().inside(running, [NodeSpec('1', 'n', 'p', 'e', features=in_image('a'))])
     assert shell.commands == []
 
 
@@ -585,12 +589,13 @@ def test_machine_without_engine_and_apt_is_reported():
     shell = FakeShell(handlers={'sh': lambda command: Result(
         127 if 'apt-get' in command.argv[-1] else 0, '\n', 'sh: 2: apt-get: not found')})
     with pytest.raises(PrerequisiteError, match="'a' has neither podman nor docker.*apt-get"):
-        beside(shell).start([parse('docker run image')])
+        started(shell, [parse('docker run image')])
 
 
 def test_containers_are_recorded_before_they_are_made():
     running = FakeRunning(FakeShell(handlers={'sh': lambda command: Result(0, 'podman\n', '')}))
     feature = Containers()
+    feature.installing(running, (), ())
     with feature.machine(running, ()):
         assert running.calls == []
         feature.starting(running, [NodeSpec('1', 'n', 'p', 'e', features=in_image('a'))], ())

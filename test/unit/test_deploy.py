@@ -44,6 +44,7 @@ from fogros2.errors import (
     VpnError,
     WorkspaceError,
 )
+from fogros2.feature import Feature
 from fogros2.host.bootstrap import RosInstall
 from fogros2.model import (
     Command,
@@ -321,12 +322,17 @@ def skip_early_steps(monkeypatch):
     monkeypatch.setattr(dds, 'configure', lambda *_: {})
 
 
-def test_a_step_that_fails_ends_those_beside_it(launch, provider, monkeypatch):
+@pytest.mark.parametrize('step', ['join', 'feature'])
+def test_a_step_that_fails_ends_those_beside_it(launch, provider, monkeypatch, step):
     syncing = threading.Event()
 
-    def join(self, *arguments):
+    def fail(*_):
         assert syncing.wait(60)
         raise VpnError('no way there')
+
+    class Busy(Feature):
+        always = True
+        installing = fail
 
     def send(context, job, *_):
         syncing.set()
@@ -334,7 +340,8 @@ def test_a_step_that_fails_ends_those_beside_it(launch, provider, monkeypatch):
 
     skip_early_steps(monkeypatch)
     monkeypatch.setattr(installing, 'install_ros', lambda *_: RosInstall('ros'))
-    monkeypatch.setattr(Joining, 'join', join)
+    monkeypatch.setattr(Joining, 'join', fail if step == 'join' else lambda self: None)
+    instead(monkeypatch, 'fogros2.feature', {'busy': Busy} if step == 'feature' else {})
     monkeypatch.setattr(installing, 'send_workspaces', send)
     begin = time.monotonic()
     with pytest.raises(VpnError, match='no way there'):
