@@ -12,8 +12,6 @@ from __future__ import annotations
 import importlib.util
 from typing import Any, TYPE_CHECKING
 
-from fogros2 import plugin_system
-
 if TYPE_CHECKING:
     from fogros2.actions.cloud_group import CloudGroup
     from fogros2.actions.fog_machine import FogMachine
@@ -70,13 +68,18 @@ def __getattr__(name: str) -> Any:
     elif name in _MODULES:
         value = getattr(importlib.import_module(_MODULES[name]), name)
     elif name == '__all__':
-        value = [*_MODULES, _FORMERLY_UTILS, *plugin_system.names(_GROUP)]
-    elif not importlib.util.find_spec(f'fogros2.{name}') and name in plugin_system.names(_GROUP):
-        value = plugin_system.load(_GROUP, name)
+        value = [*_MODULES, _FORMERLY_UTILS, *_plugins().names(_GROUP)]
+    elif not importlib.util.find_spec(f'fogros2.{name}') and name in _plugins().names(_GROUP):
+        value = _plugins().load(_GROUP, name)
     else:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
     globals()[name] = value
     return value
+
+
+def _plugins() -> Any:
+    """Return the module, which small copies of the package do without."""
+    return importlib.import_module('fogros2.plugin_system')
 
 
 def __dir__() -> list[str]:

@@ -266,7 +266,7 @@ def test_anybody_can_import_it_and_has_its_plugins(installed: System) -> None:
     version = installed.run('dpkg-query', '--show', '--showformat=${Version}', NAME).stdout
     assert said == [
         f'{SITE}/fogros2/__init__.py {version}',
-        'provider aws azure container gcp hosted joined kubernetes ssh',
+        'provider aws azure cheapest container gcp hosted joined kubernetes ssh',
         'shell guest kubernetes local ssh', 'vpn wireguard',
         'dds rmw_cyclonedds_cpp rmw_fastrtps_cpp rmw_zenoh_cpp',
         'image_transport compressed draco ffmpeg h264 pointcloud raw republished_compressed '
