@@ -425,7 +425,7 @@ def _digits(folder: Path, *, new: bool) -> str:
 
 
 def mac_addresses(folder: Path = Path('/sys/class/net')) -> list[str]:
-    """Return the MAC addresses of this computer, those that belong to hardware first."""
+    """Return this computer's MAC addresses, hardware's first, bridges and their ports last."""
     candidates = []
     for path in folder.iterdir() if folder.is_dir() else []:
         with contextlib.suppress(OSError):
@@ -433,7 +433,10 @@ def mac_addresses(folder: Path = Path('/sys/class/net')) -> list[str]:
             # 0: the address is the device's own, not a random one
             own = (path / 'addr_assign_type').read_text().strip() == '0'
             if len(address) == 17 and address.strip('0:'):
-                candidates.append((not (path / 'device').exists(), not own, path.name, address))
+                # a container engine makes bridges, and takes them away
+                passing = (path / 'bridge').exists() or (path / 'brport').exists()
+                candidates.append(
+                    (not (path / 'device').exists(), passing, not own, path.name, address))
     return [address for *_, address in sorted(candidates)]
 
 

@@ -25,6 +25,8 @@ from image_transport_h264 import memory
 
 Made = TypeVar('Made', bound=Node)
 _SIGNALS = signal.SIGINT, signal.SIGTERM
+#: Seconds that a signal waits for a node that is being made.
+LONGEST = 5.0
 
 
 def run(
@@ -38,12 +40,13 @@ def run(
     :return: the node, None if the signal came first.
     """
     memory.keep()
-    _init()
+    made = _init()
     node: Optional[Made] = None
     try:
         node = make()
         executor = node.executor or SingleThreadedExecutor()
         executor.add_node(node)
+        made.set()
         while rclpy.ok():
             try:
                 executor.spin()
@@ -52,7 +55,7 @@ def run(
                     raise
                 refuse(node, str(error))
     except Exception:
-        # a signal before the node is complete, or while it publishes, is an error of rclpy
+        # a signal while the node publishes is an error of rclpy
         if rclpy.ok():
             raise
     finally:
@@ -61,14 +64,17 @@ def run(
     return node
 
 
-def _init() -> None:
+def _init() -> threading.Event:
+    """Initialize rclpy; return what to set when the node is complete."""
+    made = threading.Event()
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer)
     for number in _SIGNALS:
         signal.signal(number, _ignore_further)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    threading.Thread(target=_shut_down, args=(reader,), name='ending', daemon=True).start()
+    threading.Thread(target=_shut_down, args=(reader, made), name='ending', daemon=True).start()
+    return made
 
 
 def _ignore_further(*_: object) -> None:
@@ -78,6 +84,7 @@ def _ignore_further(*_: object) -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def _shut_down(reader: int) -> None:
+def _shut_down(reader: int, made: threading.Event) -> None:
     os.read(reader, 1)
+    made.wait(LONGEST)  # an executor that is half made prints an error
     rclpy.try_shutdown()

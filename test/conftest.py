@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import contextlib
 import datetime
 from decimal import Decimal
 import gc
@@ -60,11 +61,26 @@ def pytest_collection() -> Iterator[None]:
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Write down what failed, for ``tools/test.sh``; the names without xdist's groups."""
+    if not hasattr(session.config, 'workerinput'):
+        remove_shared_memory()
     reporter = session.config.pluginmanager.get_plugin('terminalreporter')
     if reporter is not None and CACHE.is_dir():
         (CACHE / 'failed-tests.txt').write_text(''.join(dict.fromkeys(
             re.sub(r'@[^]@]*$', '', report.nodeid) + '\n'
             for kind in ('failed', 'error') for report in reporter.stats.get(kind, ()))))
+
+
+def remove_shared_memory(folder: Path = Path('/dev/shm')) -> None:
+    """Remove what is left of Fast DDS's shared memory of this user's nodes that were killed."""
+    used: set[str] = set()
+    for maps in Path('/proc').glob('[0-9]*/maps'):
+        with contextlib.suppress(OSError):
+            used.update(re.findall(r'/(fastrtps_\w+)$', maps.read_text(), re.MULTILINE))
+    for path in folder.glob('*fastrtps_*'):
+        name = re.sub(r'^sem\.|_mutex$|_el$', '', path.name)
+        with contextlib.suppress(OSError):
+            if name not in used and path.stat().st_uid == os.getuid():
+                path.unlink()
 
 
 @pytest.hookimpl(tryfirst=True)  # xdist reads the marks in its own hook of this name
@@ -160,7 +176,7 @@ def root_at_login() -> None:
     """Skip where who logs in by SSH has no root: sudo's ticket belongs to the terminal."""
     if os.geteuid() != 0 and (shutil.which('sudo') is None or subprocess.run(
             ['sudo', '-n', 'true'], capture_output=True, start_new_session=True).returncode):
-        pytest.skip('the user of an SSH machine needs sudo without a password')
+        pytest.skip('a login or terminal of its own needs sudo without a password')
 
 
 @pytest.fixture(scope='session')

@@ -169,8 +169,10 @@ def end_at(launch, step, deafen):
 
 # test_runtime_console.py has all kinds of screens
 @pytest.mark.parametrize(('step', 'output'), [('ending', 'terminal'), ('running', 'unread pipe')])
-def test_closed_output_takes_everything_back(launched, step, output):
+def test_closed_output_takes_everything_back(launched, request, step, output):
     """A closed terminal also sends SIGHUP; `| less` does not read until it is asked to."""
+    if output == 'terminal':
+        request.getfixturevalue('root_at_login')
     launch = launched(terminal=output == 'terminal')
     end_at(launch, step, lambda: launch.deafen(close=output != 'unread pipe'))
 

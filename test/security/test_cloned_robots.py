@@ -128,13 +128,14 @@ def test_id_stays_without_a_state_folder(
 
 def test_mac_address_of_hardware_comes_first(tmp_path: Path) -> None:
     for name, address, kind in (
-            ('br0', '02:00:00:00:00:0b', '3'), ('lo', '00:00:00:00:00:00', '0'),
-            ('eth1', '02:00:00:00:00:0a', '0'), ('fog1', '', '0'),
+            ('br0', '02:00:00:00:00:0b', '3'), ('tap0', '02:00:00:00:00:0c', '3'),
+            ('lo', '00:00:00:00:00:00', '0'), ('eth1', '02:00:00:00:00:0a', '0'),
+            ('fog1', '', '0'),
             ('wlan0', '02:00:00:00:00:09', '3')):
         (tmp_path / name).mkdir()
         (tmp_path / name / 'address').write_text(f'{address}\n')
         (tmp_path / name / 'addr_assign_type').write_text(kind)
-    for name in ('eth1', 'wlan0'):
-        (tmp_path / name / 'device').mkdir()
+    for name in ('eth1/device', 'wlan0/device', 'br0/bridge'):
+        (tmp_path / name).mkdir()
     assert store.mac_addresses(tmp_path) == [
-        '02:00:00:00:00:0a', '02:00:00:00:00:09', '02:00:00:00:00:0b']
+        f'02:00:00:00:00:{end}' for end in ('0a', '09', '0c', '0b')]

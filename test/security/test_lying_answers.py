@@ -13,7 +13,7 @@ import pytest
 from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.errors import FogError
 from fogros2.host import inspection, installer, modules, wheels
-from fogros2.model import Result, SyncReport
+from fogros2.model import NodeSpec, Result, SyncReport
 from fogros2.shell import host_key, sync
 from fogros2.untrusted import InvalidMessage
 from fogros2.vpn import addresses
@@ -55,8 +55,8 @@ def checkpoints(answer: str, folder: Path) -> None:
 
 
 def images(answer: str, _: Path) -> None:
-    engine = Engine(FakeRunning(Machine(answer)))
-    engine._image('image', '')
+    Engine().inside(FakeRunning(Machine(answer)), [
+        NodeSpec('1', 'n', 'p', 'e', features={'containers': {'image': 'image'}})])
 
 
 def installed(answer: str, _: Path) -> None:
