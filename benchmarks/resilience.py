@@ -310,10 +310,10 @@ def robot() -> list[Row]:
     kept = [one for one in times + after if one < float('inf')]
     return [
         Row(f'{what}: lost', CUT - len(kept), 'calls', 0),
-        Row('the same: answers of the robot before the stop', before, 'calls', 0),
-        Row('the same: the slowest call', 1e3 * max(kept), 'ms',
+        Row('robot as last replica: its answers before the stop', before, 'calls', 0),
+        Row('robot as last replica: the slowest call', 1e3 * max(kept), 'ms',
             1e3 * (DEADLINE + max(own)) + 10),
-        Row("the same: median after the stop, over the robot's copy asked directly",
+        Row('robot as last replica: median after the stop, over its copy asked directly',
             statistics.median(after) / statistics.median(own), 'times')]
 
 
