@@ -38,7 +38,8 @@ class Warned(ContainerInstance):
 
 def generate_launch_description():
     machine = Warned(
-        name={name!r}, network={network!r}, on_interrupt={on_interrupt!r})
+        name={name!r}, network={network!r}, on_interrupt={on_interrupt!r},
+        vpn_path={vpn_path!r})
 
     def say(context):
         event = context.locals.event
@@ -74,10 +75,11 @@ class WarningProvider(ContainerProvider):
 def launched(cloud_network, tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     with launching() as launch:
-        def start(name, on_interrupt, provider='container'):
+        def start(name, on_interrupt, provider='container', vpn_path='auto'):
             path = tmp_path / 'interrupted.launch.py'
             path.write_text(LAUNCH.format(
-                name=name, network=cloud_network, on_interrupt=on_interrupt, provider=provider))
+                name=name, network=cloud_network, on_interrupt=on_interrupt, provider=provider,
+                vpn_path=vpn_path))
             return launch(str(path))
         yield start
 
@@ -109,10 +111,11 @@ def test_preemption_notice_moves_the_nodes_in_time(
     assert run.ended() == 0, run.text
 
 
-def test_new_machine_replaces_a_killed_one(launched, engine):
+@pytest.mark.parametrize('vpn_path', ['auto', 'stream'])
+def test_new_machine_replaces_a_killed_one(launched, engine, vpn_path):
     """On the robot meanwhile; the machine has the same name, and launch sees no exit."""
-    name = f'gone-{RUN}-replaced'
-    run = launched(name, 'replace')
+    name = f'gone-{RUN}-{vpn_path}'
+    run = launched(name, 'replace', vpn_path=vpn_path)
     run.wait_for(f'I heard: [Hello World from {name} ')
     begin = time.monotonic()
     # as somebody would who knows nothing of the launch
