@@ -74,7 +74,7 @@ class Capabilities:
     :param preemption_notice: command that the agent runs as root every few seconds. Exit status 0
         means that the provider is about to reclaim the machine; the output has reason and time.
     :param keeps_volumes: it has disks or folders that outlive machines, ``with_volumes`` of a
-        request, and the methods by which the feature ``volumes`` attaches them.
+        request, and methods that attach and list them.
     """
 
     shell_kind: str = 'ssh'

@@ -141,7 +141,7 @@ class Containers(Feature):
             engine.start(running, own)
             yield
         finally:
-            if _ENGINES[key] is engine:  # not that of a machine in its place
+            if _ENGINES.get(key) is engine:  # not that of a machine in its place
                 del _ENGINES[key]
 
     def starting(

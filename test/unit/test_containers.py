@@ -603,6 +603,15 @@ def test_containers_are_recorded_before_they_are_made():
     assert feature.clean_up('abc') == [containers.remove('abc')]
 
 
+def test_machine_that_was_replaced_may_end_after_its_successor():
+    feature, first, second = Containers(), FakeRunning(FakeShell()), FakeRunning(FakeShell())
+    feature.installing(first, (), ())
+    with feature.machine(first, ()):
+        feature.installing(second, (), ())
+        with feature.machine(second, ()):
+            assert feature.starting(second, [], ()) == []
+
+
 @pytest.mark.parametrize(('survives', 'used'), [(True, True), (True, False), (False, True)])
 def test_a_computer_that_stays_keeps_no_container(monkeypatch, survives, used):
     monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(owned=not survives))
