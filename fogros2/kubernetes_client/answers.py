@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import json
-from typing import Any, Optional
+from typing import Any
 
 from fogros2.errors import ProviderError
 
@@ -16,17 +16,14 @@ class ApiError(ProviderError):
 
     :param status: HTTP status: 403, 404, 409, 422, ...
     :param reason: the API's reason: Forbidden, NotFound, AlreadyExists, Invalid, ...
-    :param details: ``details`` of the response, such as causes.
     """
 
     def __init__(
         self, message: str, hint: str = '', *, status: int = 0, reason: str = '',
-        details: Optional[Mapping[str, Any]] = None,
     ) -> None:
         super().__init__(message, hint)
         self.status = status
         self.reason = reason
-        self.details = details or {}
 
 
 class Unreachable(ProviderError):
@@ -55,7 +52,7 @@ def refusal(status: int, answer: Mapping[str, Any], data: bytes) -> ApiError:
     hint = 'the kubeconfig holds credentials that the cluster does not take: log in again' \
         if status == 401 else ''
     return ApiError(' '.join(message.split()), hint, status=status,
-                    reason=str(answer.get('reason') or ''), details=answer.get('details'))
+                    reason=str(answer.get('reason') or ''))
 
 
 def selector(labels: Mapping[str, str]) -> str:

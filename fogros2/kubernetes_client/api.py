@@ -3,8 +3,8 @@
 Send requests to a cluster's API server, watch objects, and open the WebSocket of exec.
 
 The official client reads the kubeconfig, gets and renews credentials, and sets TLS up. This module
-sends requests by path and parses the JSON responses itself, because the client's classes for all
-kinds of objects take most of a second to load.
+sends requests by path and parses the JSON responses itself: the client's WebSocket has no
+time-outs, and its watch cannot be cancelled.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import socket
 import threading
 import time
 from typing import Any, Optional, TYPE_CHECKING, TypeVar
-from urllib.parse import urlencode
+from urllib.parse import urlencode, urlsplit
 
 from fogros2.errors import DeadlineExceeded, ProviderError
 from fogros2.kubernetes_client import configuration as kubeconfig
@@ -74,11 +74,9 @@ class Api:
 
     def headers(self) -> dict[str, str]:
         """Return the headers that authenticate a request; renew expired credentials."""
-        headers: dict[str, str] = {}
-        for each in self._client.configuration.auth_settings().values():
-            if each['in'] == 'header' and each['value']:
-                headers[each['key']] = each['value']
-        return headers
+        return {each['key']: each['value']
+                for each in self._client.configuration.auth_settings().values()
+                if each['in'] == 'header' and each['value']}
 
     # -- requests -------------------------------------------------------------------------------
 
@@ -255,7 +253,6 @@ class Api:
         options: dict[str, Any] = {}
         configuration = self._client.configuration
         if proxy := configuration.proxy:
-            from urllib.parse import urlsplit
             parts = urlsplit(proxy)
             options.update(http_proxy_host=parts.hostname, http_proxy_port=parts.port,
                            proxy_type='http')

@@ -82,7 +82,6 @@ class KubernetesProvider(Provider):
         self._lifetimes: dict[str, float] = {}
         #: Jobs that this process created, which saves requests.
         self._made: dict[str, dict[str, Any]] = {}
-        self._services: dict[str, Optional[dict[str, Any]]] = {}
         #: Uid of the first pod; a later pod of the same Job is not the machine.
         self._pods: dict[str, str] = {}
 
@@ -167,14 +166,13 @@ class KubernetesProvider(Provider):
         job = existing or self._make_job(api, namespace, spec, request, options)
         machine_id = str(MachineId.of(job, api.context))
         try:
-            service = ways.make(api, namespace, spec, request, options, job, self.cancel)
+            ways.make(api, spec, request, options, job, self.cancel)
         except BaseException as error:
             self.destroy(machine_id)
             if isinstance(error, FogError):
                 error.refused = True
             raise
         self._made[machine_id] = job
-        self._services[machine_id] = service
         return machine_id
 
     def _make_job(
@@ -225,7 +223,7 @@ class KubernetesProvider(Provider):
         exposure = ways.known(job)
         if exposure is None:
             exposure = ways.find(
-                api, where, job, pod, service=self._services.get(machine_id), cancel=cancel,
+                api, where, job, pod, cancel=cancel,
                 timeout=max(1.0, timeout - (time.monotonic() - begin)))
             change['metadata'] = {'annotations': {names.EXPOSURE: str(exposure)}}
         if change and names.tags_of(job).get(TAG_ON_EXIT) == 'keep':
@@ -295,8 +293,8 @@ class KubernetesProvider(Provider):
         """Delete the Job; return when Job, pod and Service are deleted."""
         where = MachineId.parse(machine_id)
         api = kubernetes_client.connect(where.context)
-        for cache in (self._made, self._services, self._pods):
-            cache.pop(machine_id, None)
+        self._made.pop(machine_id, None)
+        self._pods.pop(machine_id, None)
         with explained(f"deleting '{where.job}'", where.namespace):
             ending.end(api, where)
 

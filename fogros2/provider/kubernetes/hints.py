@@ -26,6 +26,34 @@ _FORBIDDEN = re.compile(
     r'User "(?P<user>[^"]*)" cannot (?P<verb>\w+) resource "(?P<resource>[^"]*)"'
     r' in API group "(?P<group>[^"]*)"(?: in the namespace "(?P<namespace>[^"]*)")?')
 
+#: Remedies for refusals, by patterns of their messages.
+_REMEDIES = {
+    'violates PodSecurity':
+        'a VPN takes NET_ADMIN, which the namespace forbids: kubectl label namespace '
+        '{namespace} pod-security.kubernetes.io/enforce=privileged --overwrite',
+    '(?i)pod ?security ?policy':
+        'a VPN takes NET_ADMIN: let the service account use a PodSecurityPolicy whose '
+        'allowedCapabilities has it',
+    'admission webhook':
+        'a policy of the cluster refuses the pod, which asks for NET_ADMIN and user 0, '
+        "and is not privileged: have it allowed in namespace '{namespace}'",
+    'security context constraint':
+        'a VPN takes NET_ADMIN: grant the service account a security context constraint '
+        'that allows it',
+    'exceeded quota':
+        "ask for less (mcpu=, mb=, gpus=), end other machines of namespace '{namespace}',"
+        ' or have its quota raised',
+    'failed quota|must specify':
+        "the quota of namespace '{namespace}' wants mcpu= and mb= to be given",
+    r'LimitRange|(minimum|maximum) \S+ usage per':
+        "the limits of namespace '{namespace}' allow other mcpu= and mb= alone",
+    'namespaces? "[^"]*" not found': 'kubectl create namespace {namespace}',
+    'serviceaccount.*not found': 'check service_account=',
+    'RuntimeClass.*not found':
+        'check runtime_class=; `kubectl get runtimeclass` lists what there is',
+    'is being terminated': "namespace '{namespace}' is being deleted: take another one",
+}
+
 
 def of_refusal(message: str, namespace: str) -> str:
     """
@@ -39,34 +67,8 @@ def of_refusal(message: str, namespace: str) -> str:
         where = f"namespace '{match['namespace']}'" if match['namespace'] else 'whole cluster'
         return (f"let '{match['user']}' {match['verb']} {resource} in the {where}: "
                 'packaging/kubernetes/role.yaml has all that a robot needs')
-    if 'violates PodSecurity' in message:
-        return ('a VPN takes NET_ADMIN, which the namespace forbids: kubectl label namespace '
-                f'{namespace} pod-security.kubernetes.io/enforce=privileged --overwrite')
-    if re.search('pod ?security ?policy', message, re.I):
-        return ('a VPN takes NET_ADMIN: let the service account use a PodSecurityPolicy whose '
-                'allowedCapabilities has it')
-    if 'admission webhook' in message:
-        return ('a policy of the cluster refuses the pod, which asks for NET_ADMIN and user 0, '
-                f"and is not privileged: have it allowed in namespace '{namespace}'")
-    if 'security context constraint' in message:
-        return ('a VPN takes NET_ADMIN: grant the service account a security context constraint '
-                'that allows it')
-    if 'exceeded quota' in message:
-        return (f"ask for less (mcpu=, mb=, gpus=), end other machines of namespace '{namespace}',"
-                ' or have its quota raised')
-    if 'failed quota' in message or 'must specify' in message:
-        return f"the quota of namespace '{namespace}' wants mcpu= and mb= to be given"
-    if 'LimitRange' in message or re.search(r'(minimum|maximum) \S+ usage per', message):
-        return f"the limits of namespace '{namespace}' allow other mcpu= and mb= alone"
-    if re.search(r'namespaces? "[^"]*" not found', message):
-        return f'kubectl create namespace {namespace}'
-    if 'serviceaccount' in message and 'not found' in message:
-        return 'check service_account='
-    if 'RuntimeClass' in message and 'not found' in message:
-        return 'check runtime_class=; `kubectl get runtimeclass` lists what there is'
-    if 'is being terminated' in message:
-        return f"namespace '{namespace}' is being deleted: take another one"
-    return ''
+    return next((remedy.format(namespace=namespace) for pattern, remedy in _REMEDIES.items()
+                 if re.search(pattern, message, re.DOTALL)), '')
 
 
 def refused(error: ApiError, what: str, namespace: str) -> ProviderError:

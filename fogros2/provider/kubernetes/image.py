@@ -25,7 +25,6 @@ from fogros2.provider.kubernetes.options import IMAGE
 #: Programs that build and push images, in order of preference, with their Debian packages.
 ENGINES = {'podman': 'podman', 'docker': 'docker.io', 'buildah': 'buildah'}
 NAME = 'fogros2'
-CONTAINERFILE = 'Containerfile'
 #: Seconds for the build, and for the push.
 STEP_TIMEOUT = 3600.0
 
@@ -89,16 +88,6 @@ def engine(wanted: str = 'auto') -> str:
                             f'sudo apt-get install {package}')
 
 
-def commands(what: Recipe, folder: Path, program: str, *, push: bool = True) -> list[Command]:
-    """Return the commands that build an image and, with ``push``, send it to its registry."""
-    file = str(folder / CONTAINERFILE)
-    build = Command((program, 'build', '-t', what.reference, '-f', file, str(folder)),
-                    what=f'building {what.reference}')
-    if not push:
-        return [build]
-    return [build, Command((program, 'push', what.reference), what=f'pushing {what.reference}')]
-
-
 def build(
     what: Recipe, folder: Path, *, program: str, push: bool = True,
     on_output: Optional[Callable[[str], None]] = None,
@@ -112,28 +101,29 @@ def build(
     :raises PrerequisiteError: the folder cannot be written.
     :raises ProviderError: the build failed, or the registry refused the image.
     """
+    file = folder / 'Containerfile'
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / CONTAINERFILE).write_text(what.containerfile)
+        file.write_text(what.containerfile)
     except OSError as error:
         raise PrerequisiteError(f'{folder} can not be written: {error.strerror}',
                                 '--folder names another') from error
-    for command in commands(what, folder, program, push=push):
+    # with the paths of the user's logins to registries
+    login = {name: os.environ[name] for name in ('REGISTRY_AUTH_FILE', 'DOCKER_CONFIG')
+             if os.environ.get(name)}
+    steps: list[tuple[str, str, tuple[str, ...]]] = [(
+        what.base, 'building', ('build', '-t', what.reference, '-f', str(file), str(folder)))]
+    if push:
+        steps.append((what.reference, 'pushing', ('push', what.reference)))
+    for image, verb, words in steps:
+        command = Command((program, *words), environment=login, what=f'{verb} {what.reference}')
         try:
-            process.run(dataclasses.replace(command, environment=_login()), timeout=STEP_TIMEOUT,
-                        on_output=on_output)
+            process.run(command, timeout=STEP_TIMEOUT, on_output=on_output)
         except CommandError as error:
             output = error.result.stderr
-            image = what.reference if command.argv[1] == 'push' else what.base
             raise ProviderError(f'{command.what} failed: {_reason(output)}',
-                                _hint(output, image, program, command.argv[1])) from error
+                                _hint(output, image, program, words[0])) from error
     return what.reference
-
-
-def _login() -> dict[str, str]:
-    """Return the variables with the paths of the user's logins to registries."""
-    return {name: os.environ[name] for name in ('REGISTRY_AUTH_FILE', 'DOCKER_CONFIG')
-            if os.environ.get(name)}
 
 
 def _reason(output: str) -> str:

@@ -152,21 +152,6 @@ def _preferring(zone: str) -> dict[str, Any]:
             'key': 'topology.kubernetes.io/zone', 'operator': 'In', 'values': [zone]}]}}]}}
 
 
-def service(
-    kind: str, spec: MachineSpec, request: CreateRequest, options: Options, uid: str,
-) -> dict[str, Any]:
-    """
-    Return the Service of the machine's VPN, for UDP.
-
-    :param kind: 'LoadBalancer' or 'NodePort'.
-    :param uid: uid of the Job, which owns the Service.
-    """
-    name = names.job_name(spec.name)
-    return owned_service(
-        name, kind, name, uid, 'UDP', request.vpn_port,
-        labels=names.labels(spec.name, request.tags), annotations=options.annotations)
-
-
 def port_service(
     kind: str, where: names.MachineId, port: int, sources: Sequence[str],
 ) -> dict[str, Any]:
@@ -178,8 +163,8 @@ def port_service(
 
     :param kind: 'LoadBalancer' or 'NodePort'.
     """
-    manifest = owned_service(
-        names.port_service(where, port), kind, where.job, where.uid, 'TCP', port,
+    manifest = service(
+        kind, names.port_service(where, port), where, 'TCP', port,
         labels={**names.MANAGED, names.MACHINE: where.job}, annotations={})
     manifest['spec']['externalTrafficPolicy'] = 'Local'
     if kind == 'LoadBalancer':
@@ -187,20 +172,24 @@ def port_service(
     return manifest
 
 
-def owned_service(
-    name: str, kind: str, job: str, uid: str, protocol: str, port: int, *,
+def service(
+    kind: str, name: str, where: names.MachineId, protocol: str, port: int, *,
     labels: Mapping[str, str], annotations: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Return a Service for one port of a machine, which the machine's Job owns."""
+    """
+    Return a Service for one port of a machine, which the machine's Job owns.
+
+    :param kind: 'LoadBalancer' or 'NodePort'.
+    """
     return {
         'apiVersion': 'v1', 'kind': 'Service',
         'metadata': {
             'name': name, 'labels': dict(labels), 'annotations': dict(annotations),
             'ownerReferences': [{
-                'apiVersion': 'batch/v1', 'kind': 'Job', 'name': job, 'uid': uid,
+                'apiVersion': 'batch/v1', 'kind': 'Job', 'name': where.job, 'uid': where.uid,
                 'controller': True, 'blockOwnerDeletion': True}]},
         'spec': {
-            'type': kind, 'selector': {names.MACHINE: job},
+            'type': kind, 'selector': {names.MACHINE: where.job},
             'ports': [{'name': protocol.lower(), 'protocol': protocol, 'port': port,
                        'targetPort': port}]}}
 

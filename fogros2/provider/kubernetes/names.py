@@ -83,14 +83,13 @@ def port_service(where: MachineId, port: int) -> str:
 
 def labels(machine: str, tags: Mapping[str, str]) -> dict[str, str]:
     """Return the labels of a machine's objects: our own, and the tags that can be labels."""
-    fit = {key: value for key, value in tags.items() if _LABEL_VALUE.fullmatch(value)}
-    return {**fit, **MANAGED, MACHINE: job_name(machine)}
+    return {**wanted(tags), MACHINE: job_name(machine)}
 
 
 def wanted(tags: Mapping[str, str]) -> dict[str, str]:
     """Return the labels to search for; tags that cannot be labels are compared afterwards."""
-    return {**MANAGED,
-            **{key: value for key, value in tags.items() if _LABEL_VALUE.fullmatch(value)}}
+    fit = {key: value for key, value in tags.items() if _LABEL_VALUE.fullmatch(value)}
+    return {**fit, **MANAGED}
 
 
 def tags_of(job: Mapping[str, Any]) -> dict[str, str]:

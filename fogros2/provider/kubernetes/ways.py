@@ -23,22 +23,24 @@ TAKEN = 20.0
 
 
 def make(
-    api: Api, namespace: str, spec: MachineSpec, request: CreateRequest, options: Options,
+    api: Api, spec: MachineSpec, request: CreateRequest, options: Options,
     job: Mapping[str, Any], cancel: Optional[threading.Event] = None,
-) -> Optional[dict[str, Any]]:
+) -> None:
     """
-    Create and return the Service for ``options.expose``, which the Job owns.
+    Create the Service for ``options.expose``, which the Job owns.
 
-    With 'auto', return None if the cluster allows no Service.
+    With 'auto', the cluster may refuse it.
 
     :raises ProviderError: the cluster refused.
     """
     kind = _service_kind(api, options.expose, cancel)
     if not kind:
-        return None
-    uid = str(job['metadata']['uid'])
-    body = manifests.service(kind, spec, request, options, uid)
-    target = path('services', namespace)
+        return
+    where = MachineId.of(job, api.context)
+    body = manifests.service(
+        kind, where.job, where, 'UDP', request.vpn_port,
+        labels=names.labels(spec.name, request.tags), annotations=options.annotations)
+    target = path('services', where.namespace)
 
     def attempt() -> Optional[dict[str, Any]]:
         try:
@@ -46,25 +48,23 @@ def make(
         except ApiError as error:
             if error.reason != 'AlreadyExists':
                 raise
-        service = existing(api, f"{target}/{body['metadata']['name']}", cancel)
+        service = existing(api, f'{target}/{where.job}', cancel)
         # It belongs to an earlier attempt, or to an earlier Job with the name, with which the
         # cluster will delete it soon.
-        return service if service is not None and owned(service, uid) else None
+        return service if service is not None and owned(service, where.uid) else None
 
     try:
-        return wait_until(attempt, timeout=TAKEN, cancel=cancel, interval=0.2,
-                          what=f"the Service of an earlier '{spec.name}' to be gone")
+        wait_until(attempt, timeout=TAKEN, cancel=cancel, interval=0.2,
+                   what=f"the Service of an earlier '{spec.name}' to be gone")
     except ApiError as error:
-        if options.expose == 'auto':
-            return None
-        raise hints.refused(error, f"the Service of '{spec.name}'", namespace) from error
+        if options.expose != 'auto':
+            raise hints.refused(error, f"the Service of '{spec.name}'", where.namespace) from error
     except DeadlineExceeded as error:
-        if options.expose == 'auto':
-            return None
-        raise NameTaken(
-            f"namespace '{namespace}' has a Service '{body['metadata']['name']}' that is not "
-            f"the machine's", 'give the machine another name=, or: kubectl delete service '
-            f"-n {namespace} {body['metadata']['name']}") from error
+        if options.expose != 'auto':
+            raise NameTaken(
+                f"namespace '{where.namespace}' has a Service '{where.job}' that is not the "
+                "machine's", 'give the machine another name=, or: kubectl delete service '
+                f'-n {where.namespace} {where.job}') from error
 
 
 def owned(thing: Mapping[str, Any], uid: str) -> bool:
@@ -135,12 +135,11 @@ def robot_host(api: Api, job: Mapping[str, Any]) -> str:
 
 def find(
     api: Api, where: MachineId, job: Mapping[str, Any], pod: Mapping[str, Any], *,
-    service: Optional[Mapping[str, Any]], timeout: float, cancel: threading.Event,
+    timeout: float, cancel: threading.Event,
 ) -> Exposure:
     """
     Return how UDP reaches a running pod.
 
-    :param service: result of ``make``, None if it is unknown.
     :raises ProviderError: the requested exposure does not work.
     """
     expose = names.annotation(job, names.EXPOSE)
@@ -150,7 +149,7 @@ def find(
         return Exposure('pod_dials_robot', '', 0, 'as asked')
     search = _Search(api, where, job, pod, cancel)
     with hints.explained(f"reading the Service of '{where.job}'", where.namespace):
-        return search.run(expose, service or search.service(), timeout)
+        return search.run(expose, timeout)
 
 
 class _Search:
@@ -166,14 +165,12 @@ class _Search:
         self._cancel = cancel
         self._port = int(names.annotation(job, names.VPN_PORT) or 0)
         self._word = manifests.word(names.annotation(job, names.ATTEMPT))
-        self._path = path('services', where.namespace, where.job)
         self._failed: list[str] = []
 
-    def run(
-        self, expose: str, service: Optional[Mapping[str, Any]], timeout: float,
-    ) -> Exposure:
+    def run(self, expose: str, timeout: float) -> Exposure:
         """Return the first exposure that works."""
         deadline = time.monotonic() + timeout
+        service = self._service()
         if service is not None and service['spec']['type'] == 'LoadBalancer':
             limit = min(exposure.timeout(maker(self._api, self._cancel)), timeout * 0.8)
             if (result := self._load_balancer(limit)) is not None:
@@ -189,9 +186,10 @@ class _Search:
             f"no UDP gets to the pod of '{self._where.job}' by expose='{expose}': {reason}",
             "let UDP through on the way there, or take expose='pod_dials_robot'")
 
-    def service(self) -> Optional[dict[str, Any]]:
+    def _service(self) -> Optional[dict[str, Any]]:
         """Return the Service, None if there is none."""
-        service = existing(self._api, self._path, self._cancel)
+        service = existing(
+            self._api, path('services', self._where.namespace, self._where.job), self._cancel)
         if service is None:
             self._failed.append('the cluster allows no Service')
         elif not owned(service, self._where.uid):

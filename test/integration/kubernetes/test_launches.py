@@ -112,8 +112,9 @@ def killed(kubernetes, namespaces_of_module, tmp_path_factory):
         patch.setenv('ROS_LOG_DIR', str(folder / 'log'))
         path = folder / 'killed.launch.py'
         path.write_text(
-            HEADER.replace('{image}', READY)
-            + "        talker(pod('killed', robot_timeout=3)), listener()])\n")
+            IMAGE + HEADER.replace('{image}', READY)
+            + "        talker(pod('killed', robot_timeout=3, launch_foxglove=True)),\n"
+            + '        listener()])\n')
         with launching() as start:
             run = start(str(path))
             run.wait_for('I heard', timeout=TIMEOUT)
@@ -131,13 +132,14 @@ def killed(kubernetes, namespaces_of_module, tmp_path_factory):
 
 
 def test_a_killed_robot_s_pod_ends_itself(killed):
+    """The container of the web application, too."""
     space, _ = killed
     assert space.all('services')
 
     def ended():
-        return [pod['status']['phase'] for pod in space.all('pods')] in ([], ['Succeeded'])
+        return {pod['status']['phase'] for pod in space.all('pods')} <= {'Succeeded', 'Failed'}
 
-    wait_until(ended, timeout=30.0, what='the pod to end')
+    wait_until(ended, timeout=90.0, what='both containers to end')
 
 
 @pytest.mark.usefixtures('nothing_left')
@@ -203,20 +205,52 @@ def test_a_pod_needs_no_udp(launch, namespace, kubernetes):
 
 
 @pytest.mark.usefixtures('nothing_left')
-def test_pod_serves_the_web_application(launch, namespace):
-    run = launch("talker(pod('watched', launch_foxglove=True))", 'listener()',
-                 before=IMAGE)
-    run.wait_for('I heard', timeout=TIMEOUT)
+def test_two_pods_talk_and_verbs_and_web_application_work(
+        launch, namespace, kubernetes, monkeypatch, tmp_path):
+    run = launch(
+        "talker(pod('known', launch_foxglove=True))",
+        "CloudNode(machine=pod('hearer'), package='fogros2_examples', executable='listener', "
+        "output='screen')", "listener(name='robot_listener')", before=IMAGE)
+    run.wait_for('[listener]: I heard: [Hello World from known ', times=2, timeout=TIMEOUT)
+    run.wait_for('[robot_listener]: I heard: [Hello World from known ', timeout=TIMEOUT)
+    with ThreadPoolExecutor() as pool:
+        listed, status, logs, connected, swept = pool.map(lambda words: ros2('fog', *words), (
+            ['list'], ['status', 'known'], ['logs', 'known'],
+            ['connect', 'known', '--', 'sh', '-c', 'hostname; id -un'], ['gc']))
+    # the robot's role lets it see its own namespace
+    assert 'known' in listed.stdout and namespace.name in listed.stdout, listed
+    assert status.returncode == 0 and 'talker' in status.stdout, status
+    assert 'Publishing: "Hello World from known ' in logs.stderr, logs  # where ROS 2 logs
+    assert connected.stdout.split() == ['known', 'fog'], connected
+    assert swept.returncode == 0, swept
+    # one who may sees all of them, with nothing of this robot's at hand
+    with monkeypatch.context() as patch:
+        patch.setenv('KUBECONFIG', str(kubernetes.kubeconfig))
+        patch.setenv('FOGROS2_STATE_HOME', str(tmp_path / 'another'))
+        everywhere = ros2('fog', 'list')
+    assert 'known' in everywhere.stdout and namespace.name in everywhere.stdout, everywhere
+    before = run.text.count('I heard')
+    run.wait_for('I heard', times=before + 1, timeout=TIMEOUT)  # gc has let it be
+    check_application('known')
+    assert {name: [each['name'] for each in pod['spec']['containers']]
+            for pod in namespace.all('pods') for name in [pod['spec']['hostname']]} == {
+        'known': ['machine', 'application'], 'hearer': ['machine']}
+    run.interrupt()
+    assert run.ended() == 0, run.text
+    assert clean(run), run.text
+    assert namespace.left() == []
+
+
+def check_application(machine):
+    """Check that a machine's web application is served by ``ros2 fog monitor``."""
     opener = urllib.request.build_opener(
         urllib.request.ProxyHandler({}), urllib.request.HTTPCookieProcessor())
-    pages = []
 
     def shown():
         with contextlib.suppress(OSError), opener.open(f'http://{address}', timeout=5) as answer:
-            pages.append(answer.read().decode().strip())
-        return pages[-1:] == ['the application']
+            return answer.read().decode().strip() == 'the application'
 
-    tunnel = subprocess.Popen(['ros2', 'fog', 'monitor', 'watched', '--no-browser'], text=True,
+    tunnel = subprocess.Popen(['ros2', 'fog', 'monitor', machine, '--no-browser'], text=True,
                               stdout=subprocess.PIPE)
     try:
         line = tunnel.stdout.readline()
@@ -226,43 +260,6 @@ def test_pod_serves_the_web_application(launch, namespace):
         tunnel.send_signal(signal.SIGINT)
         tunnel.wait(20)
         tunnel.stdout.close()
-    (found,) = namespace.all('pods')
-    assert [each['name'] for each in found['spec']['containers']] == ['machine', 'application']
-    run.interrupt()
-    assert run.ended() == 0, run.text
-    assert clean(run), run.text
-    assert namespace.left() == []
-
-
-@pytest.mark.usefixtures('nothing_left')
-def test_application_ends_with_a_machine_that_ends_itself(launch, namespace):
-    run = launch("talker(pod('watched', launch_foxglove=True, robot_timeout=3))", 'listener()',
-                 before=IMAGE)
-    run.wait_for('I heard', timeout=TIMEOUT)
-    run.kill()
-
-    def ended():
-        return [pod['status']['phase'] for pod in namespace.all('pods')
-                if pod['status']['phase'] not in ('Succeeded', 'Failed')] == []
-
-    wait_until(ended, timeout=90.0, what='both containers to end')
-    assert ros2('fog', 'gc').returncode == 0
-    deleted = ros2('fog', 'delete', 'watched', '--yes')
-    assert deleted.returncode == 0 or namespace.left() == [], deleted
-
-
-@pytest.mark.usefixtures('nothing_left')
-def test_two_pods_talk_to_each_other(launch, namespace):
-    run = launch(
-        "talker(pod('speaker'))",
-        "CloudNode(machine=pod('hearer'), package='fogros2_examples', executable='listener', "
-        "output='screen')", "listener(name='robot_listener')")
-    run.wait_for('[listener]: I heard: [Hello World from speaker ', times=2, timeout=TIMEOUT)
-    run.wait_for('[robot_listener]: I heard: [Hello World from speaker ', timeout=TIMEOUT)
-    run.interrupt()
-    assert run.ended() == 0, run.text
-    assert clean(run), run.text
-    assert namespace.left() == []
 
 
 @pytest.mark.usefixtures('nothing_left')
@@ -334,33 +331,6 @@ def test_second_launch_reuses_a_kept_pod(launch, namespace):
     assert status.stderr == '', status
     deleted = ros2('fog', 'delete', 'warm', '--yes')
     assert deleted.returncode == 0, deleted
-    assert namespace.left() == []
-
-
-@pytest.mark.usefixtures('nothing_left')
-def test_fog_verbs_work_with_pods(launch, namespace, kubernetes, monkeypatch, tmp_path):
-    run = launch("talker(pod('known'))", 'listener()')
-    run.wait_for('I heard', timeout=TIMEOUT)
-    with ThreadPoolExecutor() as pool:
-        listed, status, logs, connected, swept = pool.map(lambda words: ros2('fog', *words), (
-            ['list'], ['status', 'known'], ['logs', 'known'],
-            ['connect', 'known', '--', 'sh', '-c', 'hostname; id -un'], ['gc']))
-    # the robot's role lets it see its own namespace
-    assert 'known' in listed.stdout and namespace.name in listed.stdout, listed
-    assert status.returncode == 0 and 'talker' in status.stdout, status
-    assert 'Publishing: "Hello World from known ' in logs.stderr, logs  # where ROS 2 logs
-    assert connected.stdout.split() == ['known', 'fog'], connected
-    assert swept.returncode == 0, swept
-    # one who may sees all of them, with nothing of this robot's at hand
-    with monkeypatch.context() as patch:
-        patch.setenv('KUBECONFIG', str(kubernetes.kubeconfig))
-        patch.setenv('FOGROS2_STATE_HOME', str(tmp_path / 'another'))
-        everywhere = ros2('fog', 'list')
-    assert 'known' in everywhere.stdout and namespace.name in everywhere.stdout, everywhere
-    before = run.text.count('I heard')
-    run.wait_for('I heard', times=before + 1, timeout=TIMEOUT)  # gc has let it be
-    run.interrupt()
-    assert run.ended() == 0, run.text
     assert namespace.left() == []
 
 

@@ -14,7 +14,6 @@ from fogros2.deploy import Launch
 from fogros2.errors import FogError
 from fogros2.model import MachineSpec
 from rigs.cluster import BARE
-from rigs.cluster.pod_security import NO_CAPABILITIES
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
@@ -81,18 +80,3 @@ def test_the_role_is_a_verb_short(namespaces, monkeypatch):
     assert 'create pods/exec' in said, said
     assert 'role.yaml' in said, said
     assert space.left() == []
-
-
-def test_net_admin_is_refused_by_the_api_server_s_own_plugin(namespaces, monkeypatch):
-    space = namespaces(policy=NO_CAPABILITIES)
-    monkeypatch.setenv('KUBECONFIG', str(space.kubeconfig))
-    (said,) = refused(15.0, {})
-    assert 'PodSecurityPolicy' in said and 'NET_ADMIN' in said, said
-    assert 'whose allowedCapabilities has it' in said, said
-    assert space.left() == []
-
-
-def test_the_namespace_does_not_exist(namespace):
-    (said,) = refused(15.0, {'namespace': 'it-nowhere'})
-    assert 'it-nowhere' in said, said
-    assert namespace.left() == []

@@ -12,14 +12,13 @@ import json
 import os
 from pathlib import Path
 import secrets
+import tempfile
 from typing import Any, Optional
 
 from fogros2 import process
 from fogros2.model import Command, Result
-from rigs.cluster import certificates, images, node, services
-from rigs.cluster.client import Client
+from rigs.cluster import images, node, services
 from rigs.cluster.node_process import ask, ClusterError, run_node
-from rigs.cluster.pod_security import make_policies
 
 #: Users besides the administrator; none has a right until somebody gives it one.
 USERS = ('robot',)
@@ -103,16 +102,14 @@ def cluster(
     network = free_network()
     host, there = network.hosts()
     layout = services.Layout(str(there), str(host), network.prefixlen)
-    authority = certificates.Authority("FogROS2's tests")
-    api = authority.issue('kube-apiserver', [layout.node, '127.0.0.1', 'localhost'])
-    kubelet = authority.issue(services.NODE, [layout.node, services.NODE])
+    key, certificate = key_pair(f'IP:{layout.node},IP:127.0.0.1,DNS:{services.NODE}')
     users = {
         'admin': (secrets.token_hex(16), ('system:masters',)),
         'cluster': (secrets.token_hex(16), ('system:masters',)),
         f'system:node:{services.NODE}': (secrets.token_hex(16), ('system:nodes',)),
         **{name: (secrets.token_hex(16), ()) for name in USERS},
     }
-    trusted = base64.b64encode(authority.certificate).decode()
+    trusted = base64.b64encode(certificate.encode()).decode()
 
     def access(user: str) -> str:
         return services.kubeconfig(layout.server, trusted, user, users[user][0])
@@ -121,10 +118,7 @@ def cluster(
     run_folder_mark = secrets.token_hex(3)
     files = {
         **services.files(layout, images.SANDBOX, node.MARK + run_folder_mark),
-        'ca.crt': authority.certificate.decode(),
-        'api.crt': api.certificate.decode(), 'api.key': api.key.decode(),
-        'kubelet.crt': kubelet.certificate.decode(), 'kubelet.key': kubelet.key.decode(),
-        'accounts.key': certificates.rsa_key().decode(),
+        'tls.crt': certificate, 'tls.key': key,
         'tokens.csv': services.tokens(users),
         'admin.conf': access('admin'), 'cluster.conf': access('cluster'),
         'node.conf': access(f'system:node:{services.NODE}'),
@@ -134,7 +128,7 @@ def cluster(
     started = run_node(runs, {
         'commands': services.commands(layout), 'binaries': str(binaries / 'bin'),
         'images': str(store), 'server': layout.server, 'pods': layout.pods,
-        'authority': authority.certificate.decode(), 'token': users['cluster'][0],
+        'authority': certificate, 'token': users['cluster'][0],
         'cable': {'name': f'fogt{run_folder_mark}',
                   'host': f'{layout.host}/{layout.prefix}',
                   'node': f'{layout.node}/{layout.prefix}'},
@@ -142,9 +136,7 @@ def cluster(
     try:
         if started.await_line(120.0) is None:
             raise ClusterError('the node ended before it had begun')
-        running = Cluster(started.folder, layout, store)
-        make_policies(Client(running.kubeconfig))
-        yield running
+        yield Cluster(started.folder, layout, store)
     finally:
         started.stop()
 
@@ -153,6 +145,22 @@ def running_cluster(folder: Path) -> Cluster:
     """Return the cluster that another process runs, see ``python -m rigs.cluster``."""
     own = json.loads((folder / _OWN).read_text())
     return Cluster(folder, services.Layout(**own['layout']), Path(own['images']))
+
+
+def key_pair(names: str) -> tuple[str, str]:
+    """
+    Return a new key and its certificate, PEM, valid for a day: for all services of a cluster.
+
+    :param names: what the services are reached by, as in ``subjectAltName``.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        key, certificate = Path(folder, 'key'), Path(folder, 'certificate')
+        process.run(Command((
+            'openssl', 'req', '-x509', '-newkey', 'rsa:2048', '-nodes', '-days', '1',
+            '-subj', "/CN=FogROS2's tests", '-addext', f'subjectAltName={names}',
+            '-addext', 'extendedKeyUsage=serverAuth,clientAuth',
+            '-keyout', str(key), '-out', str(certificate))), timeout=60.0)
+        return key.read_text(), certificate.read_text()
 
 
 def free_network() -> ipaddress.IPv4Network:

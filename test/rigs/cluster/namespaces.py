@@ -15,7 +15,6 @@ import yaml
 from fogros2.waiting import wait_until
 from rigs.cluster.client import Client
 from rigs.cluster.cluster import Cluster
-from rigs.cluster.pod_security import ALL
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,15 +67,12 @@ def making_namespaces(
     """
     Yield what makes a namespace in which a user has a role, or a changed one; gone at the end.
 
-    Pods there are judged by the PodSecurityPolicy that it is given; see ``pod_security``.
-
     :param role_file: YAML with one Role, whichever namespace it is for.
     """
     made: list[str] = []
 
     def make(
-        change: Callable[[dict[str, Any]], None] = lambda role: None, *, user: str = 'robot',
-        policy: str = ALL,
+        change: Callable[[dict[str, Any]], None] = lambda role: None,
     ) -> Namespace:
         name = f'it-{secrets.token_hex(3)}'
         client.create('/api/v1/namespaces', 'v1 Namespace', name)
@@ -87,19 +83,13 @@ def making_namespaces(
         client.ask('POST', f'{base}/roles', rights)
         client.create(
             f'{base}/rolebindings', 'rbac.authorization.k8s.io/v1 RoleBinding', 'robot',
-            subjects=[{'kind': 'User', 'name': user, 'apiGroup': 'rbac.authorization.k8s.io'}],
+            subjects=[{'kind': 'User', 'name': 'robot', 'apiGroup': 'rbac.authorization.k8s.io'}],
             roleRef={'kind': 'Role', 'name': rights['metadata']['name'],
-                     'apiGroup': 'rbac.authorization.k8s.io'})
-        client.create(
-            f'{base}/rolebindings', 'rbac.authorization.k8s.io/v1 RoleBinding', 'policy',
-            subjects=[{'kind': 'Group', 'name': f'system:serviceaccounts:{name}',
-                       'apiGroup': 'rbac.authorization.k8s.io'}],
-            roleRef={'kind': 'ClusterRole', 'name': policy,
                      'apiGroup': 'rbac.authorization.k8s.io'})
         wait_until(lambda: client.ask(
             'GET', f'/api/v1/namespaces/{name}/serviceaccounts')['items'] or None,
             timeout=30.0, what="the namespace's service account")
-        return Namespace(name, client, cluster.kubeconfig_of(user, name))
+        return Namespace(name, client, cluster.kubeconfig_of('robot', name))
 
     try:
         yield make
