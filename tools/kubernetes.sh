@@ -9,7 +9,7 @@
 # The source is Debian's own package (1.20.2, with everything it needs), the compiler Debian's.
 # That takes six minutes on two idle cores and 8 GB of free disk for that time, once; later runs find
 # the programs in the user's cache folder, under a checksum of how they were built. What the cluster runs beside them
-# (etcd, containerd, runc, CNI plugins, a registry) comes as packages, installed here if they are missing.
+# (etcd, containerd, runc, CNI plugins) comes as packages, installed here if they are missing.
 set -eu
 cd "$(dirname "$0")/.."
 . tools/common.sh
@@ -34,7 +34,6 @@ runc runc
 debootstrap debootstrap
 iptables iptables
 conntrack conntrack
-docker-registry docker-registry
 ip iproute2
 unshare util-linux
 LIST
@@ -153,7 +152,7 @@ install_packages() {
     # they are wanted as programs alone: no service of theirs may start
     services=
     if [ -d /run/systemd/system ]; then
-        for service in etcd containerd docker-registry; do
+        for service in etcd containerd; do
             case " $packages " in *" $service"*) services="$services $service.service" ;; esac
         done
         [ -z "$services" ] || as_root systemctl mask --runtime --quiet $services

@@ -169,7 +169,6 @@ class FastDds(DdsVendor):
             _child(_child(rtps, 'propertiesPolicy'), 'properties'), 'property')
         _text(size, name='fastdds.max_message_size', value=str(DATAGRAM))
         _times(profiles)
-        _sort(rtps)
         ElementTree.indent(root)
         return ('<?xml version="1.0" encoding="UTF-8"?>\n'
                 + ElementTree.tostring(root, encoding='unicode') + '\n')
@@ -286,9 +285,3 @@ def _text(parent: Element, **values: str) -> None:
 def _child(parent: Element, name: str) -> Element:
     child = parent.find(name)
     return ElementTree.SubElement(parent, name) if child is None else child
-
-
-def _sort(rtps: Element) -> None:
-    """Put transports first, as in the schema's examples."""
-    order = ('userTransports', 'useBuiltinTransports')
-    rtps[:] = sorted(rtps, key=lambda child: child.tag not in order)

@@ -87,11 +87,7 @@ class Zenoh(DdsVendor):
                 'multicast': {'enabled': False},
                 'gossip': {'enabled': True, 'multihop': False,
                            'autoconnect': {'router': [], 'peer': ['router', 'peer']}}},
-            # needed to keep the order of latched topics
-            'timestamping': {'enabled': {'router': True, 'peer': True, 'client': True}},
-            'queries_default_timeout': QUERY_TIMEOUT,
-            'transport': _TRANSPORT,
-        })
+            **_COMMON})
 
     def router(
         self, address: str, others: Sequence[str], user: Optional[Mapping[str, str]],
@@ -112,10 +108,7 @@ class Zenoh(DdsVendor):
             'connect': {'endpoints': dialled, **_PATIENT},
             # no multicast scouting, neither on the VPN nor on a LAN
             'scouting': {'multicast': {'enabled': False}, 'gossip': {'enabled': True}},
-            'timestamping': {'enabled': {'router': True, 'peer': True, 'client': True}},
-            'queries_default_timeout': QUERY_TIMEOUT,
-            'transport': _TRANSPORT,
-        }), beside=USERS_ROUTER if wide and host not in named else None)
+            **_COMMON}), beside=USERS_ROUTER if wide and host not in named else None)
 
     def environment(self, path: str, user: Mapping[str, str]) -> Mapping[str, str]:
         """
@@ -131,11 +124,16 @@ class Zenoh(DdsVendor):
 _PATIENT: Mapping[str, Any] = {
     'timeout_ms': -1, 'exit_on_failure': False,
     'retry': {'period_init_ms': RETRY, 'period_max_ms': RETRY_MAX, 'period_increase_factor': 2}}
-_TRANSPORT: Mapping[str, Any] = {
-    'unicast': {'open_timeout': 60_000, 'accept_timeout': 60_000, 'max_sessions': 10_000},
-    'link': {'tx': {'lease': LEASE, 'keep_alive': 4}},
-    # hosts share no memory, and a machine's limits are small
-    'shared_memory': {'enabled': False}}
+#: Settings of sessions and of routers.
+_COMMON: Mapping[str, Any] = {
+    # needed to keep the order of latched topics
+    'timestamping': {'enabled': {'router': True, 'peer': True, 'client': True}},
+    'queries_default_timeout': QUERY_TIMEOUT,
+    'transport': {
+        'unicast': {'open_timeout': 60_000, 'accept_timeout': 60_000, 'max_sessions': 10_000},
+        'link': {'tx': {'lease': LEASE, 'keep_alive': 4}},
+        # hosts share no memory, and a machine's limits are small
+        'shared_memory': {'enabled': False}}}
 
 
 def _endpoint(address: str) -> str:

@@ -261,15 +261,6 @@ class Lab:
         self.children.append(child)
         return child
 
-    def relayed(self, **settings: float) -> Child:
-        """Start the relay that stands before the machine's VPN port."""
-        options = [word for key, value in settings.items() for word in (f'--{key}', str(value))]
-        self.relay = self.start('net', [
-            sys.executable, str(RELAY), f'198.51.100.1:{PORT}', f'203.0.113.2:{PORT}',
-            '--seed', '1', *options])
-        self.relay.wait('listen')
-        return self.relay
-
     def bad(self, **settings: object) -> None:
         """Change what the relay does to packets."""
         assert self.relay is not None
@@ -305,8 +296,11 @@ class Lab:
         peers = self.peers()
         if endpoint:
             peers['robot'] = [dataclasses.replace(peers['robot'][0], endpoint=endpoint)]
-        elif self.relay is None:
-            self.relayed()
+        else:
+            self.relay = self.start('net', [
+                sys.executable, str(RELAY), f'198.51.100.1:{PORT}', f'203.0.113.2:{PORT}',
+                '--seed', '1'])
+            self.relay.wait('listen')
         self.do('robot', self.vpn.up(self.interfaces['robot'], []))
         self.do('machine', self.vpn.up(self.interfaces['machine'], peers['machine']))
         self.do('robot', self.vpn.peers(self.interfaces['robot'], peers['robot']))

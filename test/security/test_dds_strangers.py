@@ -3,14 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+import dataclasses
 from pathlib import Path
 import sys
-from typing import TYPE_CHECKING
+import time
 
 import pytest
 
-if TYPE_CHECKING:
-    from rigs.vpn_lab import Child, Lab
+from rigs.vpn_lab import Child, Lab, opened
 
 RTPS = str(Path(__file__).parents[1] / 'rigs/rtps.py')
 ROBOT, MACHINE = '198.18.7.1', '198.18.7.2'
@@ -48,7 +49,35 @@ for word in sys.argv[2:]:
 '''
 
 
-by_middleware = pytest.mark.parametrize('middleware', ['cyclonedds 0.10', 'fastdds'])
+@dataclasses.dataclass
+class Launch:
+    """A robot with a LAN and a machine, with a node on each."""
+
+    vpn: Lab
+    robot: Child
+    machine: Child
+
+
+@pytest.fixture(scope='module', params=['cyclonedds 0.10', 'fastdds'])
+def running(
+    request: pytest.FixtureRequest, tun: None, tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Launch]:
+    with opened(Lab(tmp_path_factory.mktemp('launch'), request.param)) as vpn:
+        vpn.lan()
+        vpn.connect()
+        route(vpn, 'net', MACHINE, 'via', OUTSIDE)
+        route(vpn, 'net', '239.0.0.0/8', 'dev', 'e1')
+        yield Launch(vpn, vpn.node('robot', 'to:/ok'),
+                     vpn.node('machine', 'from:/ok', 'from:/cmd_vel', 'to:/up'))
+
+
+@pytest.fixture
+def launch(running: Launch) -> Iterator[Launch]:
+    """Return a launch; the strangers of a test end with it."""
+    own = len(running.vpn.children)
+    yield running
+    for child in running.vpn.children[own:]:
+        child.stop()
 
 
 def listener(vpn: Lab, host: str, *at: str, group: str = '') -> Child:
@@ -82,18 +111,6 @@ def test_machine_hears_dds_from_its_launch_only(vpn: Lab) -> None:
     assert [line['said'] for line in machine.lines('said')] == ['itself', 'robot']
 
 
-@by_middleware
-def test_stranger_cannot_publish_on_a_machine(vpn: Lab) -> None:
-    """Cyclone 0.10 (ROS 2 Jazzy) would take these messages, 11 would not."""
-    machine = vpn.node('machine', 'from:/cmd_vel', 'from:/ok')
-    vpn.node('robot', 'to:/ok')
-    stranger = vpn.start('net', [
-        sys.executable, RTPS, 'inject', f'{OUTSIDE}:7410,{OUTSIDE}:7411', '/cmd_vel', '1 0 bad'])
-    stranger.wait('round', 5)
-    machine.wait('topic', '/ok', count=5)
-    assert machine.lines('topic', '/cmd_vel') == []
-
-
 def test_host_of_others_filters_the_launch_only(lab: Lab) -> None:
     lab.launch('machine')
     lab.connect()
@@ -106,10 +123,17 @@ def test_host_of_others_filters_the_launch_only(lab: Lab) -> None:
     assert [line['said'] for line in ours.lines('said')] == ['robot']
 
 
-@by_middleware
-def test_robot_sends_no_dds_where_a_machine_points(vpn: Lab) -> None:
-    vpn.lan()
-    robot = vpn.node('robot', 'to:/up')
+def test_stranger_cannot_publish_on_a_machine(launch: Launch) -> None:
+    """Cyclone 0.10 (ROS 2 Jazzy) would take these messages, 11 would not."""
+    stranger = launch.vpn.start('net', [
+        sys.executable, RTPS, 'inject', f'{OUTSIDE}:7410,{OUTSIDE}:7411', '/cmd_vel', '1 0 bad'])
+    stranger.wait('round', 5)
+    launch.machine.wait('topic', '/ok', count=5, after=time.monotonic())
+    assert launch.machine.lines('topic', '/cmd_vel') == []
+
+
+def test_robot_sends_no_dds_where_a_machine_points(launch: Launch) -> None:
+    vpn = launch.vpn
     traps = ['192.168.77.2:7410', '192.168.77.2:5000', '127.0.0.1:14550', '192.168.77.1:9000']
     lan = listener(vpn, 'lan', *traps[:2])
     local = listener(vpn, 'robot', *traps[2:])
@@ -118,16 +142,13 @@ def test_robot_sends_no_dds_where_a_machine_points(vpn: Lab) -> None:
     # the robot answers all participants alike, and may answer in the VPN
     machine.wait('said', count=20, timeout=60.0)
     assert lan.lines('said') == [] and local.lines('said') == []
-    assert robot.process.poll() is None
+    assert launch.robot.process.poll() is None
 
 
-@by_middleware
-def test_machine_answers_no_participant_outside_the_vpn(vpn: Lab) -> None:
+def test_machine_answers_no_participant_outside_the_vpn(launch: Launch) -> None:
     """Participants claim addresses in the VPN, to which a node that takes them sends."""
-    vpn.node('machine', 'to:/ok')
+    vpn = launch.vpn
     listener(vpn, 'machine', f'{OUTSIDE}:9000')
-    route(vpn, 'net', MACHINE, 'via', OUTSIDE)
-    route(vpn, 'net', '239.0.0.0/8', 'dev', 'e1')
     robot = listener(vpn, 'robot', f'{ROBOT}:7498', f'{ROBOT}:7499')
     announce(vpn, 'net', [f'{OUTSIDE}:7410', f'{MACHINE}:7410', '239.255.0.1:7400',
                           '239.18.7.2:7402'], f'{ROBOT}:7498')

@@ -9,7 +9,6 @@ from pathlib import Path
 import random
 import socket
 import sys
-import time
 from types import ModuleType
 
 import pytest
@@ -26,13 +25,6 @@ def relay() -> ModuleType:
     sys.modules['relay'] = module
     spec.loader.exec_module(module)
     return module
-
-
-def test_delay_and_jitter(relay: ModuleType) -> None:
-    link = relay.Link(delay=0.1, jitter=0.05)
-    chance = random.Random(1)
-    times = [link.schedule(100, 1.0, chance) for _ in range(1000)]
-    assert 1.05 <= min(times) < 1.06 and 1.14 < max(times) <= 1.15
 
 
 def test_loss_and_cut(relay: ModuleType) -> None:
@@ -84,25 +76,3 @@ def test_packets_pass_both_ways_and_a_rebind_moves_the_client(relay: ModuleType)
     got, ports, counters = loops.run(run())
     assert got == [b're0', b're1'] and len(ports) == 2
     assert counters['passed'] == 4 and counters['lost'] == 0
-
-
-def test_relay_adds_less_than_a_millisecond(
-    relay: ModuleType,
-) -> None:
-    async def run() -> list[float]:
-        pending, late = relay.Pending(), []
-        try:
-            for _ in range(300):
-                came = asyncio.Event()
-                begin = time.monotonic()
-                pending.add(begin + 2e-4, came.set)
-                await came.wait()
-                late.append(time.monotonic() - begin)
-            assert len(pending) == 0
-        finally:
-            pending.close()
-        return late
-
-    late = loops.run(run())
-    # a busy computer makes some late; what rounds to milliseconds makes all of them late
-    assert 2e-4 <= min(late) < 8e-4

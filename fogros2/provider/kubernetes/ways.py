@@ -221,15 +221,9 @@ class _Search:
         if not port:
             self._failed.append('the Service has no port on the nodes')
             return None
-        hosts = [str(self._pod['status'].get('hostIP') or '')]
+        hosts = node_hosts(self._api, self._pod, self._cancel)
         answer = exposure.first_to_answer(
-            [(hosts[0], port)], self._word, timeout=min(1.0, timeout), cancel=self._cancel)
-        if answer is None:
-            # The pod reports the private IP of its node.
-            hosts = node_hosts(self._api, self._pod, self._cancel)
-            answer = exposure.first_to_answer(
-                [(host, port) for host in hosts], self._word, timeout=timeout,
-                cancel=self._cancel)
+            [(host, port) for host in hosts], self._word, timeout=timeout, cancel=self._cancel)
         if answer is None:
             self._failed.append(f"port {port} of the node ({', '.join(hosts)}) answers nothing in "
                                 f'{timeout:.0f} s')

@@ -7,10 +7,10 @@ It reads ZENOH_SESSION_CONFIG_URI as rmw_zenoh's nodes do. With ``router`` for a
 what ``rmw_zenohd`` is, and reads ZENOH_ROUTER_CONFIG_URI.
 """
 
-import argparse
 import json
 import os
 import signal
+import sys
 import threading
 import time
 
@@ -28,29 +28,26 @@ def configuration(variable: str) -> zenoh.Config:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument('topics', nargs='+')
-    parser.add_argument('--period', type=float, default=0.1)
-    arguments, _ = parser.parse_known_args()
+    topics = sys.argv[1:]
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
-    if arguments.topics == ['router']:
+    if topics == ['router']:
         with zenoh.open(configuration('ZENOH_ROUTER_CONFIG_URI')):
             print(json.dumps({'ready': True}), flush=True)
             ended.wait()
         return
     with zenoh.open(configuration('ZENOH_SESSION_CONFIG_URI')) as session:
         kept = []
-        for topic in arguments.topics:
+        for topic in topics:
             if topic.startswith('from:'):
                 kept.append(session.declare_subscriber(
                     topic[6:], lambda sample, topic=topic[5:]: heard(topic, sample)))
-        publishers = [session.declare_publisher(topic[4:]) for topic in arguments.topics
+        publishers = [session.declare_publisher(topic[4:]) for topic in topics
                       if topic.startswith('to:')]
         print(json.dumps({'ready': True}), flush=True)
         number = 0
-        while not ended.wait(arguments.period):
+        while not ended.wait(0.1):
             for publisher in publishers:
                 publisher.put(f'{number} {time.monotonic()!r}')
             number += 1

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import contextlib
 import dataclasses
 import ipaddress
@@ -20,8 +20,6 @@ from fogros2.model import Command, Result
 from rigs.cluster import images, node, services
 from rigs.cluster.node_process import ask, ClusterError, run_node
 
-#: Users besides the administrator; none has a right until somebody gives it one.
-USERS = ('robot',)
 #: Networks for the cable between computer and node. Of TEST-NET-2, the last ones: the tests'
 #: container networks take the first.
 CABLES = [f'198.51.100.{last}/30' for last in (252, 248, 244, 240)]
@@ -34,7 +32,7 @@ class Cluster:
     """
     A running cluster.
 
-    :param folder: holds kubeconfig files, ``admin.conf`` and one for each user, and ``log/``.
+    :param folder: holds kubeconfig files, ``admin.conf`` and ``robot.conf``, and ``log/``.
     :param images: containerd's folder that it began with; another cluster may as well.
     """
 
@@ -52,10 +50,10 @@ class Cluster:
         """Return why ``READY`` has nothing that a launch of this robot needs, '' if it has."""
         return images.why_not_ready(self.images)
 
-    def kubeconfig_of(self, user: str, namespace: str = 'default') -> Path:
-        """Return a kubeconfig file of a user (see ``USERS``) for a namespace."""
-        path = self.folder / f'{user}-{namespace}.conf'
-        config = json.loads((self.folder / f'{user}.conf').read_text())
+    def kubeconfig_of_robot(self, namespace: str) -> Path:
+        """Return a kubeconfig file for a namespace, of a user without a right of its own."""
+        path = self.folder / f'robot-{namespace}.conf'
+        config = json.loads((self.folder / 'robot.conf').read_text())
         config['contexts'][0]['context']['namespace'] = namespace
         with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), 'w') as file:
             file.write(json.dumps(config))
@@ -85,7 +83,6 @@ class Cluster:
 @contextlib.contextmanager
 def cluster(
     cache: Path, binaries: Path, *, store: Optional[Path] = None,
-    say: Callable[[str], None] = print,
 ) -> Iterator[Cluster]:
     """
     Run a cluster for the time of the block.
@@ -95,10 +92,9 @@ def cluster(
     :param cache: a folder for images, and for all nodes that run.
     :param binaries: folder with Kubernetes's programs, see ``tools/kubernetes.sh``.
     :param store: another cluster's ``images``; those of today's sources unless given.
-    :param say: gets a line before something slow begins.
     :raises ClusterError: it didn't come up.
     """
-    store = store or images.store(cache, binaries, say)
+    store = store or images.store(cache, binaries)
     network = free_network()
     host, there = network.hosts()
     layout = services.Layout(str(there), str(host), network.prefixlen)
@@ -107,7 +103,7 @@ def cluster(
         'admin': (secrets.token_hex(16), ('system:masters',)),
         'cluster': (secrets.token_hex(16), ('system:masters',)),
         f'system:node:{services.NODE}': (secrets.token_hex(16), ('system:nodes',)),
-        **{name: (secrets.token_hex(16), ()) for name in USERS},
+        'robot': (secrets.token_hex(16), ()),
     }
     trusted = base64.b64encode(certificate.encode()).decode()
 
@@ -122,7 +118,7 @@ def cluster(
         'tokens.csv': services.tokens(users),
         'admin.conf': access('admin'), 'cluster.conf': access('cluster'),
         'node.conf': access(f'system:node:{services.NODE}'),
-        **{f'{name}.conf': access(name) for name in USERS},
+        'robot.conf': access('robot'),
         _OWN: json.dumps({'layout': dataclasses.asdict(layout), 'images': str(store)}),
     }
     started = run_node(runs, {

@@ -137,7 +137,7 @@ class RootShell:
             cancel=cancel)
 
 
-def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
+def store(cache: Path, binaries: Path) -> Path:
     """
     Return containerd's folder with all images in it, made unless it is there.
 
@@ -148,7 +148,7 @@ def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
     packed = wheels.collect()
     its = None if packed.ros else ros.prefix()
     with alone(cache):
-        root = base(cache, say)
+        root = base(cache, print)
         system = cache / f'system-{system_key(root, static_busybox())}'
         has = f'{packed.key} {its} {ros.key(its)}' if its else packed.key
         target = cache / f'images-{_checksum(f"4 {system.name} {has}")}'
@@ -157,7 +157,7 @@ def store(cache: Path, binaries: Path, say: Callable[[str], None]) -> Path:
             with contextlib.suppress(FileNotFoundError, PermissionError):
                 os.utime(path)
         if not target.is_dir():
-            say('packing the machine images')
+            print('packing the machine images')
             with tempfile.TemporaryDirectory(dir=cache, prefix='new-images-') as aside:
                 _make(Path(aside), root, system, target, its, binaries)
             _forget_old(cache, 'images-', keep=target)

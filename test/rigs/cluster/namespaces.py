@@ -89,7 +89,7 @@ def making_namespaces(
         wait_until(lambda: client.ask(
             'GET', f'/api/v1/namespaces/{name}/serviceaccounts')['items'] or None,
             timeout=30.0, what="the namespace's service account")
-        return Namespace(name, client, cluster.kubeconfig_of('robot', name))
+        return Namespace(name, client, cluster.kubeconfig_of_robot(name))
 
     try:
         yield make

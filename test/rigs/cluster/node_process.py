@@ -59,10 +59,6 @@ class NodeProcess:
                 f"the tests' cluster: its node ended with exit status {status}", *lines)))
         return said
 
-    def ask(self, question: Mapping[str, Any], timeout: float = 70.0) -> dict[str, Any]:
-        """Have the node carry out a command, see ``node.Node.answer``."""
-        return ask(self.folder, question, timeout)
-
     def wait(self, timeout: float = 300.0) -> None:
         """
         Wait for a node that ends by itself.

@@ -17,8 +17,6 @@ from typing import Any
 HERE = '/run/fog'
 CONTAINERD_SOCKET = '/run/containerd/containerd.sock'
 NODE = 'fog-node'
-#: Folder below the node's with how containerd speaks with registries (its hosts.toml files).
-REGISTRIES = 'registries'
 API_PORT = 6443
 #: Feature gate that 1.20 still needs for ttlSecondsAfterFinished.
 _GATES = '--feature-gates=TTLAfterFinished=true'
@@ -145,8 +143,6 @@ disabled_plugins = [
   # lowering it takes CAP_SYS_RESOURCE
   restrict_oom_score_adj = true
   stream_server_address = "127.0.0.1"
-  [plugins."io.containerd.grpc.v1.cri".registry]
-    config_path = "{HERE}/{REGISTRIES}"
   [plugins."io.containerd.grpc.v1.cri".containerd]
     snapshotter = "overlayfs"
   [plugins."io.containerd.grpc.v1.cri".cni]
