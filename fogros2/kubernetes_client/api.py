@@ -15,7 +15,6 @@ import json
 import math
 import os
 import queue
-import socket
 import threading
 import time
 from typing import Any, Optional, TYPE_CHECKING, TypeVar
@@ -39,6 +38,8 @@ if TYPE_CHECKING:
 T = TypeVar('T')
 #: Query parameters; a list repeats the name.
 Query = Mapping[str, Any]
+#: ADDED, MODIFIED or DELETED, and the object; or CLOSED or ERROR.
+Event = tuple[str, dict[str, Any]]
 
 #: Time-out of a connection to the API server, in seconds.
 CONNECT = 5.0
@@ -46,8 +47,9 @@ CONNECT = 5.0
 ANSWER = 30.0
 #: Seconds to wait for an API server that restarts.
 TIMEOUT = 30.0
-#: Seconds of silence after which a watch is restarted, because its connection may be dead.
-SILENCE = 240.0
+#: Seconds after which the API server ends a watch, and another one follows. After twice as long
+#: without an event, its connection is dead.
+WATCH = 30
 #: Seconds after a restart in which an API server may not have loaded its permissions yet.
 DOUBT = 15.0
 
@@ -214,29 +216,60 @@ class Api:
         :raises DeadlineExceeded: after ``timeout`` seconds.
         :raises Cancelled: ``cancel`` was set.
         """
-        with contextlib.ExitStack() as undo:
-            watch: Optional[Watch] = None
-            lost = False
+        events: Optional[queue.SimpleQueue[Event | ApiError]] = None
+        lost = False
 
-            def probe() -> Optional[tuple[T]]:
-                nonlocal watch, lost, query
-                if watch is None:
-                    if lost and again is not None and (result := again()) is not None:
-                        return (result,)
-                    watch = undo.enter_context(Watch(self, path, {'watch': 'true', **query}))
-                event = watch.get(0.1)
-                if event is not None and event[0] in ('CLOSED', 'ERROR'):
-                    watch.__exit__()
-                    watch, lost = None, True
-                    query = {k: v for k, v in query.items() if k != 'resourceVersion'}
-                elif event is not None and event[0] != 'BOOKMARK':
+        def probe() -> Optional[tuple[T]]:
+            nonlocal events, lost, query
+            if events is None:
+                if lost and again is not None and (result := again()) is not None:
+                    return (result,)
+                events = queue.SimpleQueue()
+                # An API server that accepts the connection and sends nothing blocks this thread,
+                # which ends some time after the watch.
+                threading.Thread(target=self._watch, args=(path, query, events),
+                                 name='fog-watch', daemon=True).start()
+            with contextlib.suppress(queue.Empty):
+                event = events.get(timeout=0.1)
+                if isinstance(event, ApiError):
+                    raise event
+                if event[0] not in ('CLOSED', 'ERROR'):
                     result = look(*event)
                     return None if result is None else (result,)
-                result = tick() if tick is not None else None
-                return None if result is None else (result,)
+                events, lost = None, True
+                query = {k: v for k, v in query.items() if k != 'resourceVersion'}
+            result = tick() if tick is not None else None
+            return None if result is None else (result,)
 
-            return wait_until(probe, timeout=timeout, what=what, cancel=cancel,
-                              interval=0.0)[0]
+        return wait_until(probe, timeout=timeout, what=what, cancel=cancel, interval=0.0)[0]
+
+    def _watch(
+        self, path: str, query: Query, events: queue.SimpleQueue[Event | ApiError],
+    ) -> None:
+        """Send a watch's request, and put its events into a queue; CLOSED is the last one."""
+        try:
+            response = self.send(
+                'GET', path, None, {'watch': 'true', 'timeoutSeconds': WATCH, **query}, 2 * WATCH)
+            if response.status >= 400:
+                data = response.read(decode_content=True)
+                error = refusal(response.status, parsed(data), data)
+                if error.status != 410 and not self.passing(error):
+                    events.put(error)
+                raise error
+            rest = b''
+            for data in response.stream(1 << 16):
+                *lines, rest = (rest + data).split(b'\n')
+                for line in lines:
+                    event = parsed(line)
+                    if 'type' in event:
+                        events.put((event['type'], event.get('object') or {}))
+            response.release_conn()
+        except (ApiError, Unreachable):
+            # Limits the retries during a restart of the API server to ten per second.
+            threading.Event().wait(0.1)
+        except http_errors():
+            self.lost()
+        events.put(('CLOSED', {}))
 
     # -- exec -----------------------------------------------------------------------------------
 
@@ -271,106 +304,6 @@ class Api:
             raise self._unreachable(error) from error
 
 
-class Watch:
-    """
-    One watch; its thread sends the request and reads the lines, so that callers can be cancelled.
-
-    An API server that accepts the connection and sends nothing blocks only that thread.
-    """
-
-    def __init__(self, api: Api, path: str, query: Mapping[str, Any]) -> None:
-        self._events: queue.SimpleQueue[tuple[str, dict[str, Any]]] = queue.SimpleQueue()
-        self._refusal: Optional[ApiError] = None
-        self._lock = threading.Lock()
-        self._ended = False
-        self._response: Any = None
-        self._thread = threading.Thread(
-            target=self._run, args=(api, path, query), name='fog-watch', daemon=True)
-        self._thread.start()
-
-    def _run(self, api: Api, path: str, query: Mapping[str, Any]) -> None:
-        response = self._open(api, path, query)
-        with self._lock:
-            self._response = response
-            ended = self._ended
-        if response is not None and ended:
-            response.close()
-        elif response is not None:
-            self._read(api, response)
-        else:
-            # Limits the retries during a restart of the API server to ten per second.
-            threading.Event().wait(0.1)
-        self._events.put(('CLOSED', {}))
-
-    def _open(self, api: Api, path: str, query: Mapping[str, Any]) -> Any:
-        try:
-            response = api.send('GET', path, None, query, SILENCE)
-            if response.status < 400:
-                return response
-            data = response.read(decode_content=True)
-            response.release_conn()
-        except Unreachable:
-            return None
-        except http_errors():
-            return None
-        error = refusal(response.status, parsed(data), data)
-        if error.status != 410 and not api.passing(error):
-            self._refusal = error
-        return None
-
-    def _read(self, api: Api, response: Any) -> None:
-        rest = b''
-        with contextlib.suppress(OSError, ValueError, AttributeError, *http_errors()):
-            for data in response.stream(1 << 16):
-                *lines, rest = (rest + data).split(b'\n')
-                for line in lines:
-                    event = parsed(line)
-                    if 'type' in event:
-                        self._events.put((event['type'], event.get('object') or {}))
-        if not self._ended:
-            api.lost()  # or the API server closed the watch regularly; this call is then harmless
-
-    def get(self, timeout: float) -> Optional[tuple[str, dict[str, Any]]]:
-        """
-        Return the next event, None after ``timeout`` seconds.
-
-        :raises ApiError: the API server refused the watch.
-        """
-        try:
-            event = self._events.get(timeout=timeout)
-        except queue.Empty:
-            return None
-        if event[0] == 'CLOSED' and self._refusal is not None:
-            raise self._refusal
-        return event
-
-    def __enter__(self) -> Watch:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        with self._lock:
-            self._ended = True
-            response, self._response = self._response, None
-        if response is None:
-            return  # the watch has ended, or its thread will close the response
-        with contextlib.suppress(OSError, RuntimeError, ValueError, AttributeError):
-            _wake(response)
-        self._thread.join(2.0)
-        response.close()
-
-
-def _wake(response: Any) -> None:
-    """Wake the thread that reads a response; close() would wait for that thread."""
-    if hasattr(response, 'shutdown'):
-        response.shutdown()
-        return
-    # urllib3 before 2.3, as in Debian 12 and Ubuntu 24.04
-    held = getattr(response.connection, 'sock', None)
-    if held is None:
-        held = response._fp.fp.raw._sock
-    held.shutdown(socket.SHUT_RDWR)
-
-
 def existing(
     api: Api, path: str, cancel: Optional[threading.Event] = None,
 ) -> Optional[dict[str, Any]]:
@@ -401,13 +334,10 @@ def connect(context: str = '') -> Api:
     """
     kubeconfig = os.environ.get('KUBECONFIG', '')
     with _apis_lock:
-        api = _apis.get((context, kubeconfig))
-        if api is None:
-            api = Api(context)
-            # Also store the current context by its name, so that both share one object.
-            api = _apis.setdefault((api.context, kubeconfig), api)
-            _apis[context, kubeconfig] = api
-        return api
+        api = _apis.get((context, kubeconfig)) or Api(context)
+        # Also store the current context by its name, so that both share one object.
+        return _apis.setdefault(
+            (context, kubeconfig), _apis.setdefault((api.context, kubeconfig), api))
 
 
 def _tls(configuration: Any) -> dict[str, Any]:

@@ -237,7 +237,8 @@ def test_a_watch_tells_what_is_there_and_what_comes(api, server):
                              'hold'])]
     assert follow(api, names_of(seen)) == 'last'
     assert seen == ['ADDED a', 'MODIFIED a', 'ADDED last']
-    assert server.asked[0][2] == {'watch': ['true'], 'labelSelector': ['a=b']}
+    assert server.asked[0][2] == {
+        'watch': ['true'], 'timeoutSeconds': ['30'], 'labelSelector': ['a=b']}
 
 
 def test_a_watch_that_ends_is_begun_anew_from_what_is_there_then(api, server):
@@ -267,7 +268,8 @@ def test_forbidden_watch_is_reported(api, server):
     assert 'cannot watch' in str(error)
 
 
-def test_a_watch_ends_with_the_launch_and_by_its_deadline(api, server):
+def test_a_watch_ends_with_the_launch_and_by_its_deadline(api, server, monkeypatch):
+    monkeypatch.setattr(kubernetes_client.api, 'WATCH', 1)
     server.answers = [(200, ['hold']), (200, ['hold'])]
     before, cancel = {*threading.enumerate()}, threading.Event()
     timer = threading.Timer(0.2, cancel.set)

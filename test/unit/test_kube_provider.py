@@ -44,7 +44,7 @@ from fogros2_testing.shell_contract import raised
 
 ROOT = Path(__file__).resolve().parents[2]
 #: What the manifests have to hold in, beside the real cluster of the tests (1.20).
-VERSIONS = ('1.25', '1.30', '1.33', '')
+VERSIONS = ('1.25', '')
 REQUEST = CreateRequest(
     token='4f5b2a9c-0001-4000-8000-000000000001', authorized_key='ssh-ed25519 AAAA',
     tags={TAG_NAME: 'Talker', TAG_LAUNCH: 'a1b2c3', TAG_ROBOT: "Anna's robot"}, vpn_port=51830)

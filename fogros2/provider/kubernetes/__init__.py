@@ -57,8 +57,6 @@ _REVIEW = '/apis/authorization.k8s.io/v1/selfsubjectrulesreviews'
 _FIRST = 5.0
 #: Label of every node.
 _ARCHITECTURE = 'kubernetes.io/arch'
-#: Seconds for which rights and admissions are not checked again.
-_SURE = 30.0
 
 
 class KubernetesProvider(Provider):
@@ -75,8 +73,8 @@ class KubernetesProvider(Provider):
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._asking = threading.Lock()
-        #: When the cluster last agreed: that this user has all rights, or to a pod.
-        self._agreed: dict[object, float] = {}
+        #: To what the cluster has agreed: that this user has all rights, or to a pod.
+        self._agreed: set[object] = set()
         #: Contexts and namespaces in launch files.
         self._places: set[tuple[str, str]] = set()
         self._lifetimes: dict[str, float] = {}
@@ -110,9 +108,9 @@ class KubernetesProvider(Provider):
     def _once(self, what: object, ask: Callable[[], object]) -> None:
         """Ask the cluster, once for all machines of a launch; ``ask`` raises if it refuses."""
         with self._asking:
-            if time.monotonic() - self._agreed.get(what, -_SURE) >= _SURE:
+            if what not in self._agreed:
                 ask()
-                self._agreed[what] = time.monotonic()
+                self._agreed.add(what)
 
     def _check_rights(self, api: Api, namespace: str) -> None:
         review = api.request('POST', _REVIEW, {'spec': {'namespace': namespace}}, timeout=_FIRST)
@@ -144,7 +142,6 @@ class KubernetesProvider(Provider):
         """Check the pod's admission by a dry run, then create the Job and its Service."""
         options = Options.parse(spec.options)
         api, namespace = self._place(options)
-        self._lifetimes[names.job_name(spec.name)] = spec.lifetime
         claims.make(api, namespace, names.job_name(spec.name), request.with_volumes, self.cancel)
         existing = None
         try:
