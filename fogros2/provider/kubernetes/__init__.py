@@ -57,6 +57,8 @@ _REVIEW = '/apis/authorization.k8s.io/v1/selfsubjectrulesreviews'
 _FIRST = 5.0
 #: Label of every node.
 _ARCHITECTURE = 'kubernetes.io/arch'
+#: Seconds for which rights and admissions are not checked again.
+_SURE = 30.0
 
 
 class KubernetesProvider(Provider):
@@ -73,8 +75,8 @@ class KubernetesProvider(Provider):
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._asking = threading.Lock()
-        #: To what the cluster has agreed: that this user has all rights, or to a pod.
-        self._agreed: set[object] = set()
+        #: When the cluster last agreed: that this user has all rights, or to a pod.
+        self._agreed: dict[object, float] = {}
         #: Contexts and namespaces in launch files.
         self._places: set[tuple[str, str]] = set()
         self._lifetimes: dict[str, float] = {}
@@ -108,9 +110,9 @@ class KubernetesProvider(Provider):
     def _once(self, what: object, ask: Callable[[], object]) -> None:
         """Ask the cluster, once for all machines of a launch; ``ask`` raises if it refuses."""
         with self._asking:
-            if what not in self._agreed:
+            if time.monotonic() - self._agreed.get(what, -_SURE) >= _SURE:
                 ask()
-                self._agreed.add(what)
+                self._agreed[what] = time.monotonic()
 
     def _check_rights(self, api: Api, namespace: str) -> None:
         review = api.request('POST', _REVIEW, {'spec': {'namespace': namespace}}, timeout=_FIRST)
