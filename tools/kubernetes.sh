@@ -37,7 +37,6 @@ conntrack conntrack
 ip iproute2
 unshare util-linux
 LIST
-    have_static busybox || echo busybox-static
     [ -d "$(folder)" ] || while read -r program package; do
         have "$program" || echo "$package"
     done <<LIST

@@ -147,15 +147,16 @@ def choose_port(environment: Mapping[str, str] = {}) -> int:
     return port
 
 
-def own_address() -> str:
+def own_address(to: tuple[str, int] = ('192.0.2.1', 9)) -> str:
     """
-    Return this computer's address in the network of its default route.
+    Return this computer's address on the way to another one.
 
-    :raises VpnError: there is none.
+    :param to: host and port; by default an address that only the default route leads to.
+    :raises VpnError: there is no route.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(('192.0.2.1', 9))  # sends nothing
+            probe.connect(to)  # sends nothing
         except OSError as error:
             raise VpnError('this computer has no default route, so its address is not known',
                            'name the address: --address') from error

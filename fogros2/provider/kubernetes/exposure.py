@@ -177,12 +177,3 @@ def _resolved(places: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
             address = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
             endpoints.append((str(address[0]), port))
     return endpoints
-
-
-def own_address(server: str) -> str:
-    """Return this computer's address on the way to an API server, '' if there is no route."""
-    parts = urlsplit(server)
-    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
-        link.connect((parts.hostname or '', parts.port or 443))
-        return str(link.getsockname()[0])
-    return ''

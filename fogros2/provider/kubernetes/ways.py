@@ -8,14 +8,16 @@ import contextlib
 import threading
 import time
 from typing import Any, Optional
+from urllib.parse import urlsplit
 
-from fogros2.errors import DeadlineExceeded, NameTaken, ProviderError
+from fogros2.errors import DeadlineExceeded, NameTaken, ProviderError, VpnError
 from fogros2.kubernetes_client import Api, ApiError, existing, path, Unreachable
 from fogros2.model import CreateRequest, Machine, MachineSpec
 from fogros2.provider.kubernetes import exposure, hints, manifests, names
 from fogros2.provider.kubernetes.exposure import Exposure
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.provider.kubernetes.options import Options
+from fogros2.vpn import addresses
 from fogros2.waiting import wait_until
 
 #: Time-out of the deletion of an earlier Job's Service, in seconds.
@@ -129,8 +131,12 @@ def known(job: Mapping[str, Any]) -> Optional[Exposure]:
 
 
 def robot_host(api: Api, job: Mapping[str, Any]) -> str:
-    """Return the address at which a pod reaches this robot."""
-    return names.annotation(job, names.ROBOT_HOST) or exposure.own_address(api.server)
+    """Return the address at which a pod reaches this robot, '' if there is no route."""
+    server = urlsplit(api.server)
+    with contextlib.suppress(VpnError):
+        return names.annotation(job, names.ROBOT_HOST) or addresses.own_address(
+            (server.hostname or '', server.port or 443))
+    return ''
 
 
 def find(

@@ -40,13 +40,8 @@ READY = 'fogros2.test/machine:ready'
 #: ``READY`` under the name that ``KubeInstance()`` asks for if nothing else is said.
 DEFAULT = IMAGE
 SANDBOX = 'fogros2.test/sandbox:1'
-_SANDBOX_CONFIG = {'Env': ['PATH=/'], 'Entrypoint': ['/busybox', 'sleep', '2147483647']}
 #: Stands for Lichtblick: serves one page at port 8080.
 APPLICATION = 'fogros2.test/application:1'
-_APPLICATION_CONFIG = {'Env': ['PATH=/'], 'Cmd': [
-    '/busybox', 'sh', '-c', '/busybox echo "the application" >/index.html; '
-    # as Lichtblick's server does; the first process of a container has no default handler
-    'trap "exit 0" TERM; /busybox httpd -f -p 8080 -h / & wait']}
 #: What a machine needs before a launch can begin with it, and what tests look at it with.
 PACKAGES = ('ca-certificates', 'iproute2', 'iputils-ping', 'nftables', 'procps', 'python3',
             'rsync', 'wireguard-go', 'wireguard-tools')
@@ -55,6 +50,11 @@ USER, UID = 'fog', 1000
 _ARCHITECTURES = {'x86_64': 'amd64', 'aarch64': 'arm64'}
 _CONFIG = {'Env': ['PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin'],
            'Cmd': ['/bin/sh']}
+_SANDBOX_CONFIG = {**_CONFIG, 'Cmd': ['sleep', 'infinity']}
+_APPLICATION_CONFIG = {**_CONFIG, 'Cmd': [
+    'sh', '-c', 'echo "the application" >/srv/index.html; '
+    # as Lichtblick's server does; the first process of a container has no default handler
+    'trap "exit 0" TERM; python3 -m http.server -d /srv 8080 & wait']}
 #: In an image folder: why ``READY`` is no more than ``BARE``, if it isn't.
 _WHY_NOT = 'why-not-ready'
 
@@ -149,7 +149,7 @@ def store(cache: Path, binaries: Path) -> Path:
     its = None if packed.ros else ros.prefix()
     with alone(cache):
         root = base(cache, print)
-        system = cache / f'system-{system_key(root, static_busybox())}'
+        system = cache / f'system-{system_key(root)}'
         has = f'{packed.key} {its} {ros.key(its)}' if its else packed.key
         target = cache / f'images-{_checksum(f"4 {system.name} {has}")}'
         for path in (system, target):
@@ -179,18 +179,17 @@ def alone(cache: Path) -> Iterator[None]:
 def _make(
     aside: Path, root: Path, system: Path, target: Path, its: Optional[Path], binaries: Path,
 ) -> None:
-    layers = [aside / name for name in ('system.tar', 'wheels.tar', 'sandbox.tar')]
+    layers = [aside / name for name in ('system.tar', 'wheels.tar')]
     upper, archive = aside / 'upper', aside / 'images.tar'
     with contextlib.ExitStack() as undo:
         undo.callback(debian_root.remove, upper)
         upper.mkdir()
         pack(layers[0], root)
         if not system.is_dir():
-            sandbox_layer(layers[2], static_busybox())
             write_archive(archive, [
-                Image(BARE, (layers[0],), _CONFIG),
-                Image(APPLICATION, (layers[2],), _APPLICATION_CONFIG),
-                Image(SANDBOX, (layers[2],), _SANDBOX_CONFIG)])
+                Image(name, tuple(layers[:1]), config) for name, config in (
+                    (BARE, _CONFIG), (APPLICATION, _APPLICATION_CONFIG),
+                    (SANDBOX, _SANDBOX_CONFIG))])
             _unpack(archive, system, binaries)
         shell = RootShell(root, upper)
         shell.run(Command(('useradd', '-m', '-s', '/bin/bash', '-u', str(UID), USER), sudo=True,
@@ -199,7 +198,7 @@ def _make(
         pack(layers[1], upper / 'files')
         # the lower layer is there already
         write_archive(archive, [
-            Image(name, tuple(layers[:2]), _CONFIG) for name in (READY, DEFAULT)],
+            Image(name, tuple(layers), _CONFIG) for name in (READY, DEFAULT)],
             leave_out=layers[:1])
         _unpack(archive, target, binaries, system, {_WHY_NOT: why_not})
 
@@ -275,28 +274,14 @@ def static_busybox() -> Path:
     return Path(found)
 
 
-def system_key(root: Path, busybox: Path) -> str:
+def system_key(root: Path) -> str:
     """
     Return a checksum of what the images of a system without ROS are made of.
 
     :param root: the system, with dpkg's list of packages and versions.
     """
     packages = _digest(root / 'var/lib/dpkg/status')
-    return _checksum(f'2 {root.name} {packages} {_digest(busybox)} {_CONFIG} {_SANDBOX_CONFIG} '
-                     f'{_APPLICATION_CONFIG}')
-
-
-def sandbox_layer(target: Path, busybox: Path) -> None:
-    """Write the layer of the image that keeps a pod's namespaces."""
-    with tarfile.open(target, 'w') as layer:
-        layer.add(busybox, 'busybox', filter=_root_owned)
-
-
-def _root_owned(info: tarfile.TarInfo) -> tarfile.TarInfo:
-    info.uid = info.gid = 0
-    info.uname = info.gname = ''
-    info.mode = 0o755
-    return info
+    return _checksum(f'3 {root.name} {packages} {_SANDBOX_CONFIG} {_APPLICATION_CONFIG}')
 
 
 def write_archive(
