@@ -39,14 +39,9 @@ def start(vpn: Any, host: str, *words: str) -> Any:
 
 
 def stream(
-    vpn: Any, *parameters: str, codec: str = 'h264', images: int = 30, topic: str = '/camera',
-    links: str = '',
+    vpn: Any, *parameters: str, codec: str = 'h264', topic: str = '/camera', links: str = '',
 ) -> Any:
-    """
-    Start camera and encoder on the robot, decoder and viewer on the machine; return the viewer.
-
-    :param images: so many have come when it returns.
-    """
+    """Start camera and encoder on the robot, decoder and viewer on the machine; return that."""
     common = ['-p', f'codec:={codec}', '-p', f'stream:={topic}/{codec}']
     scripts = ROOT / 'image_transport_h264/scripts'
     start(vpn, 'robot', str(scripts / 'encoder'), '--ros-args', '-r', f'image:={topic}', *common,
@@ -55,7 +50,7 @@ def stream(
           *(('-p', f'links:="{links}"') if links else ()), *common)
     viewer = start(vpn, 'machine', str(HERE / 'video_node.py'), 'viewer', f'/seen{topic}')
     start(vpn, 'robot', str(HERE / 'video_node.py'), 'camera', topic).wait('ready', timeout=60.0)
-    viewer.wait('image', count=images, timeout=90.0)
+    viewer.wait('image', count=30, timeout=90.0)
     return viewer
 
 
@@ -67,55 +62,36 @@ def during(viewer: Any, begin: float, seconds: float) -> list[dict[str, Any]]:
             if begin <= line['arrival'] < begin + seconds]
 
 
-def median(lines: list[dict[str, Any]]) -> float:
-    latencies = sorted(line['latency'] for line in lines)
-    return latencies[len(latencies) // 2] if latencies else math.inf
-
-
-def test_stream_survives_a_slower_link_and_losses(vpn: Any) -> None:
-    """A second later it fits, nothing waits in a queue, and it recovers."""
-    vpn.bad(rate=10e6, delay=0.02, queue=1.0)
+def test_the_link_drops_from_10_to_1_megabit_and_returns(vpn: Any) -> None:
+    """A second later the stream fits, nothing waits in a queue, and it recovers."""
+    vpn.bad(rate=10e6, queue=1.0)
     # a quality that takes about 3 Mbit/s
     viewer = stream(vpn, '-p', 'quality:=14.0')
 
-    def stretch(loss: float = 0.0) -> list[dict[str, Any]]:
-        vpn.bad(loss=loss)
-        return during(viewer, time.monotonic() + (1.0 if loss else 0.0), 3.0)
+    def stretch() -> tuple[int, float]:
+        latencies = sorted(line['latency'] for line in during(viewer, time.monotonic(), 2.0))
+        return len(latencies), latencies[len(latencies) // 2] if latencies else math.inf
 
-    # 90 on an idle computer, within 0.07 s
-    before = stretch()
+    # 60 on an idle computer, within 0.05 s
+    images, latency = stretch()
     vpn.bad(rate=1e6)
     begin = time.monotonic()
 
     def squeezed() -> bool:
         lines = during(viewer, max(begin + 2.0, time.monotonic()), 4.0)
+        latencies = sorted(line['latency'] for line in lines)
         # about 40 images on an idle computer, half of them within 0.3 to 0.4; the queue takes 1.0
-        return len(lines) > 10 and median(lines) < 0.6 \
-            and max(line['latency'] for line in lines) < 1.2
+        return len(lines) > 10 and latencies[len(lines) // 2] < 0.6 and latencies[-1] < 1.2
+
+    def recovered() -> bool:
+        again, late = stretch()
+        return again > 0.75 * images and late < latency + 0.1
 
     # in the first stretch on an idle computer; a busy one's encoder adapts late
     wait_until(squeezed, timeout=60.0, what='a stream that fits')
     vpn.bad(rate=10e6)
-
-    def recovered() -> bool:
-        again = stretch()
-        return len(again) > 0.75 * len(before) and median(again) < median(before) + 0.1
-
     # after about 5 s on an idle computer
     wait_until(recovered, timeout=60.0, what='the stream of before')
-    pictures: list[float] = []
-
-    def compared() -> bool:
-        whole, lossy = stretch(), stretch(loss=0.02)
-        pictures.extend(line['psnr'] for line in lossy if 'psnr' in line)
-        return len(whole) > 20 and len(lossy) > 0.9 * len(whole) \
-            and median(lossy) < median(whole) + 0.05
-
-    # a busy computer encodes fewer images, and not always as many
-    wait_until(compared, timeout=90.0, what='two stretches with as many images')
-    # smears would show at once: they cost tens of decibels
-    assert len(pictures) > 2
-    assert min(pictures) > 30
 
 
 def test_late_subscriber_of_a_budget_spoils_no_stream(vpn: Any) -> None:
@@ -213,3 +189,30 @@ def test_raw_best_effort_images_arrive_whole(receive_buffers: None, lab: Any) ->
         return len(lines) >= 0.8 * expected and expected > 25
 
     wait_until(whole, timeout=60.0, what='images without a loss')
+
+
+def test_losses_cost_neither_pictures_nor_pixels(vpn: Any) -> None:
+    """2 % of the packets lost and 20 ms each way, against the same link without a loss."""
+    vpn.bad(rate=10e6, delay=0.02)
+    viewer = stream(vpn)
+
+    pictures: list[float] = []
+
+    def stretch(loss: float) -> list[dict[str, Any]]:
+        vpn.bad(loss=loss)
+        return during(viewer, time.monotonic() + 1.0, 4.0)
+
+    def median(lines: list[dict[str, Any]]) -> float:
+        return sorted(line['latency'] for line in lines)[len(lines) // 2]
+
+    def compared() -> Any:
+        whole, lossy = stretch(0.0), stretch(0.02)
+        pictures.extend(line['psnr'] for line in lossy if 'psnr' in line)
+        return len(whole) > 20 and len(lossy) > 0.9 * len(whole) \
+            and median(lossy) < median(whole) + 0.05
+
+    # 120 images on an idle computer; a busy one encodes fewer, and not always as many
+    wait_until(compared, timeout=90.0, what='two stretches with as many images')
+    # smears would show at once: they cost tens of decibels
+    assert len(pictures) > 2
+    assert min(pictures) > 30
