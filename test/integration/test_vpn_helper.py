@@ -275,8 +275,11 @@ def test_so_many_interfaces_and_no_more(copy: Copy) -> None:
     assert copy.run('root', 'ls', '-A', '/run/fogros2-vpn').stdout == ''
 
 
-def without_product(copy: Copy, user: str) -> bool:
-    return copy.run(user, sys.executable, '-c', 'import fogros2').returncode != 0
+@pytest.fixture
+def product(copy: Copy) -> None:
+    """Skip where users of the copy cannot import FogROS2."""
+    if copy.run('fogada', sys.executable, '-c', 'import fogros2').returncode != 0:
+        pytest.skip("this Python's folder is on a disk of its own, and no layer over / has it")
 
 
 PRODUCT = """\
@@ -293,9 +296,7 @@ sys.stdin.readline()
 """
 
 
-def test_what_a_killed_launch_has_made_goes_by_gc(copy: Copy) -> None:
-    if without_product(copy, 'fogada'):
-        pytest.skip("this Python's folder is on a disk of its own, and no layer over / has it")
+def test_what_a_killed_launch_has_made_goes_by_gc(copy: Copy, product: None) -> None:
     words = process.argv(Command(tuple(copy.argv(
         'fogada', sys.executable, '-c', PRODUCT, '/home/fogada/state')), sudo=True))
     child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -352,10 +353,8 @@ ip netns exec machine /usr/sbin/sshd -h /run/sshd/key -o PidFile=none
 """
 
 
-def test_a_whole_launch_of_a_user_without_rights(copy: Copy) -> None:
+def test_a_whole_launch_of_a_user_without_rights(copy: Copy, product: None) -> None:
     """A talker on a machine and a listener here; ``ros2 launch`` runs as one of the group."""
-    if without_product(copy, 'fogada'):
-        pytest.skip("this Python's folder is on a disk of its own, and no layer over / has it")
     copy.run('root', 'sh', '-ec', MACHINE, check=True)
     copy.run('fogada', 'sh', '-c', 'cat >~/first.launch.py', data=LAUNCH.encode(), check=True)
     script = ('cd; export ROS_DOMAIN_ID=31; sudo -n true && exit 99; '
@@ -387,10 +386,8 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
 """
 
 
-def test_without_it_the_question_comes_first(copy: Copy) -> None:
+def test_without_it_the_question_comes_first(copy: Copy, product: None) -> None:
     """A user who may use sudo with a password, at a terminal, is asked before anything is made."""
-    if without_product(copy, 'fogeve'):
-        pytest.skip("this Python's folder is on a disk of its own, and no layer over / has it")
     copy.run('root', 'sh', '-c', 'echo fogeve:words | chpasswd; '
              'echo "fogeve ALL=(ALL) ALL" >/etc/sudoers.d/eve', check=True)
     twice = 'from fogros2.deploy import check_robot; check_robot(); check_robot(); print("ready")'

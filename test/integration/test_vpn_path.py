@@ -11,9 +11,7 @@ import pytest
 from fogros2.deploy import Launch
 from fogros2.errors import VpnError
 from fogros2.model import MachineSpec
-from fogros2.provider.container import root as container_root
 from fogros2.waiting import Timeouts
-from rigs.bare_computer import bare_computer
 from rigs.launched import launching
 from rigs.networks import without_udp
 
@@ -65,18 +63,3 @@ def test_nodes_of_a_machine_are_heard(cloud_network, tmp_path, monkeypatch):
         run.interrupt()
         assert run.ended() == 0, run.text
     assert 'VPN path' in run.text and run.clean, run.text
-
-
-def test_host_of_a_user_is_reached(cloud_network, tmp_path):
-    with bare_computer(
-            f'fogt-path-{RUN}', tmp_path / 'computer', cloud_network,
-            mounts=container_root.environment_mounts(None)) as computer, \
-            without_udp(cloud_network):
-        launch = Launch()
-        try:
-            machine = launch.up(MachineSpec(f'path-{RUN}', 'ssh', {
-                'host': computer.address, 'user': computer.user, 'key': str(computer.key),
-                'host_key': computer.host_key}, bootstrap='none'))
-            assert launch.store.load(machine.spec.name).carried == 'stream'
-        finally:
-            assert launch.down() == []
