@@ -66,10 +66,11 @@ def running(
         early.wait('topic', '/early')
         begin = time.monotonic()
         lab.connect()
+        connecting = begin, time.monotonic()
         yield Talk(lab, machine=lab.node('machine', 'from:/up', 'to:/down'),
                    robot=lab.node('robot', 'to:/up', 'from:/down', 'to:/local'),
                    beside=lab.node('robot', 'from:/local'),
-                   early=early, connecting=(begin, time.monotonic()))
+                   early=early, connecting=connecting)
 
 
 @pytest.fixture
@@ -206,8 +207,9 @@ def test_an_interface_that_is_taken_away_harms_no_node(talk: Talk) -> None:
 
 
 def test_unread_topics_send_only_announcements_across(talk: Talk) -> None:
-    # of the other nodes, too
-    vpn, idle = talk.vpn, 40_000.0
+    vpn = talk.vpn
+    # bytes a second, with the messages of the nodes that talk
+    idle = 40_000.0
     camera = vpn.node('robot', 'to:/camera', '--size', '50000')
     beside = vpn.node('robot', 'from:/camera')
     beside.wait('topic', '/camera', count=3)
