@@ -93,23 +93,20 @@ def _tolerations(value: Any) -> tuple[Mapping[str, Any], ...]:
 
 
 def _check_values(options: Options) -> None:
-    if options.expose not in ('auto', *EXPOSURES):
-        raise ConfigurationError(f"expose= can't be '{options.expose}'",
-                                 f"it takes auto, {', '.join(EXPOSURES)}")
-    if not options.container_image or any(c.isspace() for c in options.container_image) \
-            or options.container_image.startswith('-'):
-        raise ConfigurationError(f"container_image= can't be '{options.container_image}'",
-                                 f"it takes an image's name, such as {IMAGE}")
-    if options.namespace and not _LABEL.fullmatch(options.namespace):
-        raise ConfigurationError(f"'{options.namespace}' can't be a namespace",
-                                 'lower-case letters, digits and - make one, 63 at most')
-    if not untrusted.NAME.fullmatch(options.user):
-        raise ConfigurationError(f"'{options.user}' can't be a user name",
-                                 'lower-case letters, digits, _ and - make one, 32 at most')
-    if any(c.isspace() or c in '/@' for c in options.robot_host):
-        raise ConfigurationError(f"robot_host= can't be '{options.robot_host}'",
-                                 'it takes an address or a name')
-    for name in options.env:
-        if not re.fullmatch(r'[A-Za-z_][A-Za-z0-9_]*', name):
-            raise ConfigurationError(f"env= can't carry the variable {name!r}",
+    image, robot_host = options.container_image, options.robot_host
+    for name, fits, hint in (
+            ('expose', options.expose in ('auto', *EXPOSURES),
+             f"it takes auto, {', '.join(EXPOSURES)}"),
+            ('container_image', image and not re.search(r'\s|^-', image),
+             f"it takes an image's name, such as {IMAGE}"),
+            ('namespace', not options.namespace or _LABEL.fullmatch(options.namespace),
+             'lower-case letters, digits and - make one, 63 at most'),
+            ('user', untrusted.NAME.fullmatch(options.user),
+             'lower-case letters, digits, _ and - make one, 32 at most'),
+            ('robot_host', not re.search(r'[\s/@]', robot_host), 'it takes an address or a name')):
+        if not fits:
+            raise ConfigurationError(f"{name}= can't be '{getattr(options, name)}'", hint)
+    for variable in options.env:
+        if not re.fullmatch(r'[A-Za-z_][A-Za-z0-9_]*', variable):
+            raise ConfigurationError(f"env= can't carry the variable {variable!r}",
                                      'a name has letters, digits and _')
