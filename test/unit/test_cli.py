@@ -337,25 +337,19 @@ def test_delete_works_with_a_damaged_record() -> None:
     assert not Memory.machines and not folder.exists()
 
 
-def test_delete_all_leaves_other_robots_alone(capsys: pytest.CaptureFixture[str]) -> None:
-    machine('a')
-    machine('b')
-    machine('c', robot='somebody-7')
-    assert run('delete', 'all', '--yes') == 0
+@pytest.mark.parametrize(('name', 'own', 'others'), [
+    ('all', ['a', 'b'], ['--any-robot']),
+    ('c', ['c'], [])])  # from any computer, where none of that name is its own
+def test_delete_prefers_own_machines(
+    capsys: pytest.CaptureFixture[str], name: str, own: list[str], others: list[str],
+) -> None:
+    for each in own:
+        machine(each)
+    machine('c', 'theirs', robot='somebody-7')
+    assert run('delete', name, '--yes') == 0
     assert '1 of other robots left out' in capsys.readouterr().err
-    assert list(Memory.machines) == ['id-c']
-    assert run('delete', 'all', '--yes', '--any-robot') == 0
-    assert not Memory.machines
-
-
-def test_delete_by_name_prefers_own_machine(capsys: pytest.CaptureFixture[str]) -> None:
-    machine('a', 'ours')
-    machine('a', 'theirs', robot='somebody-7')
-    assert run('delete', 'a', '--yes') == 0
     assert list(Memory.machines) == ['theirs']
-    assert '1 of other robots left out' in capsys.readouterr().err
-    # from any computer, where none of that name is its own
-    assert run('delete', 'a', '--yes') == 0
+    assert run('delete', name, '--yes', *others) == 0
     assert not Memory.machines
     assert 'of the robot somebody-7' in capsys.readouterr().out
 
@@ -715,14 +709,6 @@ def test_sizes_and_costs_have_units() -> None:
     assert [report.size(n) for n in (0, 999, 1000, 1.5e9, 3e13)] == [
         '0 B', '999 B', '1.0 kB', '1.5 GB', '30.0 TB']
     assert table.cost(None) == '-' and table.cost(Decimal('1.5')) == '$1.5000'
-
-
-def test_no_verb_prints_the_help(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run() == 0
-    said = capsys.readouterr().out
-    for verb in ('connect', 'dashboard', 'delete', 'doctor', 'env', 'gc', 'image', 'list', 'logs',
-                 'price', 'regions', 'shell', 'status'):
-        assert verb in said
 
 
 def test_help_imports_no_core(tmp_path: Path) -> None:
