@@ -4,6 +4,7 @@
 from collections.abc import Callable, Iterator
 import contextlib
 import json
+import os
 from pathlib import Path
 import subprocess
 import sys
@@ -42,6 +43,22 @@ def own_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     launch.logging.reset()
     yield
     launch.logging.reset()
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Install a package 'pkg' with an executable 'exe' that prints its arguments."""
+    root = tmp_path / 'prefix'
+    index = root / 'share/ament_index/resource_index/packages'
+    for folder in (index, root / 'share/pkg', root / 'lib/pkg'):
+        folder.mkdir(parents=True)
+    (index / 'pkg').touch()
+    executable = root / 'lib/pkg/exe'
+    executable.write_text('#!/bin/sh\nfor word; do echo "word $word"; done\n')
+    executable.chmod(0o755)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', os.pathsep.join(
+        [str(root), os.environ.get('AMENT_PREFIX_PATH', '')]).rstrip(os.pathsep))
+    return root
 
 
 #: Runs a command a line: rclpy is imported once. It answers with the status and the output.

@@ -53,14 +53,11 @@ except KeyboardInterrupt:
 
 
 @pytest.fixture
-def package(tmp_path, monkeypatch):
-    """Install a package 'pkg' with executables and launch files; return its prefix."""
-    root = tmp_path / 'prefix'
-    share, lib = root / 'share' / 'pkg', root / 'lib' / 'pkg'
-    index = root / 'share' / 'ament_index' / 'resource_index' / 'packages'
-    for directory in (share / 'launch', share / 'other', lib, index):
-        directory.mkdir(parents=True)
-    (index / 'pkg').write_text('')
+def package(package, tmp_path, monkeypatch):
+    """Add executables and launch files to the package 'pkg'; return its prefix."""
+    share, lib = package / 'share/pkg', package / 'lib/pkg'
+    for folder in ('launch', 'other'):
+        (share / folder).mkdir()
     for path in ('launch/a.launch.py', 'launch/twice.launch.py', 'other/twice.launch.py'):
         (share / path).write_text(LAUNCH_FILE)
     (share / 'launch' / 'say.launch.xml').write_text(
@@ -72,9 +69,7 @@ def package(tmp_path, monkeypatch):
     (lib / 'data').write_text('')
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     monkeypatch.setenv('TMPDIR', str(tmp_path))
-    monkeypatch.setenv('AMENT_PREFIX_PATH', os.pathsep.join(
-        [str(root), os.environ.get('AMENT_PREFIX_PATH', '')]).rstrip(os.pathsep))
-    return root
+    return package
 
 
 @pytest.fixture
@@ -104,9 +99,9 @@ def test_pkg_verbs_find_packages_and_executables(package, ros2):
     assert ros2('pkg', 'prefix', '--share', 'pkg')[:2] == (0, f'{package}/share/pkg\n')
     assert ros2('pkg', 'prefix', 'no-such-package') == (1, '', 'Package not found\n')
     assert ros2('pkg', 'executables', 'pkg')[:2] == (
-        0, 'pkg killed\npkg sleeper\npkg status\n')
+        0, 'pkg exe\npkg killed\npkg sleeper\npkg status\n')
     assert ros2('pkg', 'executables', '--full-path', 'pkg')[1].splitlines()[0] == (
-        f'{package}/lib/pkg/killed')
+        f'{package}/lib/pkg/exe')
     assert ros2('pkg', 'executables', 'nope') == (1, '', "Package 'nope' not found\n")
 
 
