@@ -51,8 +51,6 @@ from launch.substitutions import (
     ThisLaunchFile,
     ThisLaunchFileDir,
 )
-import launch.utilities
-from launch.utilities import perform_substitutions
 import pytest
 
 pytestmark = pytest.mark.usefixtures('own_log')
@@ -236,17 +234,6 @@ def test_timer_action_runs_and_is_cancelled():
         TimerAction(period=1.0, actions=None)
 
 
-def test_launch_waits_for_completion_futures():
-    notes = []
-
-    def start(context):
-        future = context.asyncio_loop.run_in_executor(None, lambda: notes.append('done'))
-        context.add_completion_future(future)
-
-    assert run(OpaqueFunction(function=start)) == 0
-    assert notes == ['done']
-
-
 def test_service_runs_twice_and_takes_events_of_threads():
     service = LaunchService(noninteractive=True)
     notes = []
@@ -426,21 +413,6 @@ def test_launch_description_is_printed_as_a_tree():
         "EmitEvent(event='test.Asked')"]
     assert lines[4].startswith("RegisterEventHandler('<launch.event_handlers.")
     assert lines[5].startswith('OnProcessExit(') and lines[6:] == ["LogInfo('bye')"]
-
-
-def test_launch_utilities_normalize_and_check():
-    context = LaunchContext()
-    subs = launch.utilities.normalize_to_list_of_substitutions(['a', TextSubstitution(text='b')])
-    assert perform_substitutions(context, subs) == 'ab'
-    with pytest.raises(TypeError, match='Failed to normalize given item of type'):
-        launch.utilities.normalize_to_list_of_substitutions(['a', 1])
-    assert launch.utilities.is_a_subclass(Asked, launch.Event)
-    assert launch.utilities.is_a_subclass(Asked(), launch.Event)
-    assert not launch.utilities.is_a_subclass(launch.Event, Asked)
-    log = LogInfo(msg='')
-    assert launch.utilities.normalize_to_list_of_entities([log, [log, log]]) == [log] * 3
-    with pytest.raises(TypeError, match="'me' expected 'x' to be one of .* but got '1'"):
-        launch.utilities.ensure_argument_type(1, [str, float], 'x', 'me')
 
 
 def test_module_paths_of_ros2_can_be_imported():

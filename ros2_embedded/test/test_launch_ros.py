@@ -217,16 +217,6 @@ def test_invalid_parameters_are_refused():
         normalize_remap_rule(('a',))
 
 
-def test_parameter_value_has_the_requested_type():
-    context = LaunchContext()
-    value = ParameterValue(LaunchConfiguration('x', default='1'), value_type=float)
-    assert value.evaluate(context) == 1.0 and value.value == 1.0
-    with pytest.raises(ValueError):
-        ParameterValue(LaunchConfiguration('x', default='a'), value_type=int).evaluate(context)
-    with pytest.raises(TypeError):
-        ParameterValue('a', value_type=int)
-
-
 @pytest.mark.parametrize('base, name, expected', [
     (None, None, None), (None, 'a', 'a'), ('/', 'a', '/a'), ('/a', 'b/', '/a/b'),
     ('/a', '/b', '/b'), ('a', None, 'a'), ('', 'a', 'a')])
@@ -327,25 +317,21 @@ def test_xml_and_yaml_describe_a_node(tmp_path, capsys, name, content):
     assert {key for content in contents for key in content} == {'/a/b/n', '/**'}
 
 
-def test_composable_nodes_are_described(tmp_path):
+def test_composable_nodes_are_described():
     node = ComposableNode(
         package='image_tools', plugin='image_tools::Cam2Image', name=['c', 'am'], namespace='/ns',
         parameters=[{'a': 1}], remappings=[('a', 'b')],
         extra_arguments=[{'use_intra_process_comms': True}])
     context = LaunchContext()
-    for part, text in ((node.package, 'image_tools'), (node.node_name, 'cam'),
-                       (node.node_plugin, 'image_tools::Cam2Image'),
-                       (node.node_namespace, '/ns')):
-        assert perform_substitutions(context, part) == text
-    assert evaluate_parameters(context, node.parameters) == ({'a': 1},)
-    assert evaluate_parameters(context, node.extra_arguments) == (
-        {'use_intra_process_comms': True},)
-    assert node.condition() is None
+    assert [perform_substitutions(context, part) for part in (
+        node.package, node.node_name, node.node_plugin, node.node_namespace)] == [
+            'image_tools', 'cam', 'image_tools::Cam2Image', '/ns']
+    assert evaluate_parameters(context, [*node.parameters, *node.extra_arguments]) == (
+        {'a': 1}, {'use_intra_process_comms': True})
     container = ComposableNodeContainer(
         name='c', namespace='/', package='pkg', executable='exe',
         composable_node_descriptions=[node])
     LoadComposableNodes(target_container=container, composable_node_descriptions=[node])
-    LoadComposableNodes(target_container='/c', composable_node_descriptions=[node])
     visit(context, container)
     assert container.node_name == '/c'
     with pytest.raises(TypeError):
