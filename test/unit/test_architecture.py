@@ -7,6 +7,7 @@ import ast
 from collections.abc import Iterator
 import functools
 from graphlib import TopologicalSorter
+from importlib import util
 from pathlib import Path
 import re
 import subprocess
@@ -19,6 +20,7 @@ from fogros2.describe.machines import ContainerInstance
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE = ROOT / 'fogros2'
+EMBEDDED = ROOT / 'ros2_embedded'
 PACKAGES = ('fogros2_features', 'fogros2_replicas', 'fogros2_share', 'image_transport_h264',
             'point_cloud_stream', 'fogros2', 'fogros2_monitor', 'ros2fog_cli')
 
@@ -92,34 +94,39 @@ def text(path: Path) -> str:
 @functools.cache
 def imports(path: Path) -> list[tuple[str, bool]]:
     """Return what a file imports, and whether that is when it is itself imported."""
-    return list(_imports(ast.parse(text(path), str(path))))
+    root = EMBEDDED if EMBEDDED in path.parents else ROOT
+    return list(_imports(ast.parse(text(path), str(path)),
+                         '.'.join(path.relative_to(root).parts[:-1])))
 
 
-def _imports(block: ast.AST, early: bool = True) -> Iterator[tuple[str, bool]]:
+def _imports(
+    block: ast.AST, package: str, early: bool = True,
+) -> Iterator[tuple[str, bool]]:
     early = early and not isinstance(block, (ast.FunctionDef, ast.AsyncFunctionDef)) and not (
         isinstance(block, ast.If) and 'TYPE_CHECKING' in ast.unparse(block.test))
     for node in ast.iter_child_nodes(block):
         if isinstance(node, ast.Import):
             for name in node.names:
                 yield name.name, early
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+        elif isinstance(node, ast.ImportFrom):
+            base = util.resolve_name('.' * node.level + (node.module or ''), package)
             for name in node.names:
-                yield f'{node.module}.{name.name}', early
+                yield f'{base}.{name.name}', early
         elif not isinstance(node, ast.expr):
-            yield from _imports(node, early)
+            yield from _imports(node, package, early)
 
 
 @functools.cache
-def modules() -> dict[str, Path]:
+def modules(root: Path = ROOT, packages: tuple[str, ...] = PACKAGES) -> dict[str, Path]:
     """Return the file of each module of the packages."""
-    return {'.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix('.__init__'): path
-            for package in PACKAGES for path in python_files(ROOT / package)}
+    return {'.'.join(path.relative_to(root).with_suffix('').parts).removesuffix('.__init__'): path
+            for package in packages for path in python_files(root / package)}
 
 
 @functools.cache
-def graph() -> dict[str, set[str]]:
+def graph(root: Path = ROOT, packages: tuple[str, ...] = PACKAGES) -> dict[str, set[str]]:
     """Return the modules of ours that each module imports."""
-    known = modules()
+    known = modules(root, packages)
     found: dict[str, set[str]] = {}
     for name, path in known.items():
         named = {other for other, _ in imports(path)}
@@ -178,6 +185,13 @@ def test_no_circle_of_imports(package: str) -> None:
             between.setdefault(own, set()).update(
                 below for other in others if (below := child(package, other)) not in ('', own))
     TopologicalSorter(between).prepare()
+
+
+def test_no_circle_of_imports_in_the_embedded_default() -> None:
+    """Between modules, whatever an import is for."""
+    embedded = graph(EMBEDDED, ('launch', 'launch_ros', 'launch_xml', 'launch_yaml', 'ros2cli'))
+    assert 'launch._base' in embedded['launch.actions._simple']
+    TopologicalSorter(embedded).prepare()
 
 
 @pytest.mark.parametrize(('folder', 'above'), [

@@ -21,7 +21,7 @@ import pytest
 from ros2cli.cli import main
 
 from fogros2 import process, report
-from fogros2.deploy import robot, undo
+from fogros2.deploy import undo
 from fogros2.errors import (
     ConnectError,
     MachineNotFound,
@@ -131,10 +131,6 @@ def lab(monkeypatch: pytest.MonkeyPatch, shell: FakeShell, **changes: Any) -> No
 
 def run(*words: str) -> Any:
     return main(argv=['fog', *words])
-
-
-def entries() -> dict[str, Entry]:
-    return {entry.name: entry for entry in machines.survey(lambda text: None)}
 
 
 def test_list_without_machines(capsys: pytest.CaptureFixture[str]) -> None:
@@ -251,7 +247,8 @@ def test_gc_deletes_machine_whose_id_was_not_saved(capsys: pytest.CaptureFixture
     record('a', machine_id=None, **dead())
     machine('b', 'id-of-a-neighbour')
     record('b', machine_id=None, **{**dead(), 'launch': 'fedcba'})
-    assert entries()['a'].state == 'running (launch gone)'
+    states = {entry.name: entry.state for entry in machines.survey(lambda text: None)}
+    assert states['a'] == 'running (launch gone)'
     assert run('gc') == 0
     assert 'cleared machine a: its launch is gone' in capsys.readouterr().out
     assert [*Memory.machines] == ['id-of-a-neighbour']
@@ -567,21 +564,6 @@ def test_container_without_an_engine_on_path_is_not_gone(
     said = capsys.readouterr()
     assert ' unknown ' in said.out and 'neither podman nor docker found' in said.err
     assert run('gc') == 1 and Store().exists('a')
-
-
-def test_gc_stops_the_daemon_of_a_kept_machines_launch(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    done: list[str] = []
-    monkeypatch.setattr(robot.ros2_daemon, 'stop', lambda folder: done.append(folder.name))
-    monkeypatch.setattr(robot, 'run', lambda commands, **more: done.extend(
-        ' '.join(command.argv) for command in commands))
-    interface = VpnInterface('fogabc123', '198.18.0.1', '198.18.0.0/24', 51820, '/none')
-    kept = record('a', on_exit='keep', robot_vpn=interface, **dead())
-    endings.let_go(kept, machine('a'), Store())
-    # the daemon is a node with the interface
-    assert done[0] == 'abc123' and 'fogabc123' in done[-1]
-    assert Store().load('a').launch == ''
 
 
 def test_leftover_launch_folders_are_found_by_their_process() -> None:
