@@ -29,7 +29,7 @@ _NAMES: dict[str, Any] = {
     'ByRegion': Union[str, Mapping[str, str]],
 }
 #: Parameters that launch files cannot set.
-_NOT_MEANT = ('self', 'return', 'options', 'unknown', 'common', 'args', 'kwargs', 'lists')
+_NOT_MEANT = ('self', 'return', 'options', 'unknown', 'common')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,7 +140,8 @@ def _fits(kind: Kind, value: Any) -> bool:
 def names_of(cls: type[Any]) -> set[str]:
     """Return the names of all parameters of a class's constructors."""
     return {name for each in cls.__mro__ if '__init__' in vars(each)
-            for name in inspect.signature(vars(each)['__init__']).parameters} - {*_NOT_MEANT}
+            for name in inspect.signature(vars(each)['__init__']).parameters} - {
+                *_NOT_MEANT, 'args', 'kwargs', 'lists'}
 
 
 def unknown(what: str, name: str, names: Iterable[str]) -> ConfigurationError:

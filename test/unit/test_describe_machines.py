@@ -186,18 +186,6 @@ def test_numbers_are_texts_where_a_text_is_needed(context):
     assert (spec.name, spec.environment) == ('5', {'N': '1', 'S': '/x'})
 
 
-def test_a_provider_of_somebody_elses(context):
-    class Mine(CloudInstance):
-        provider = 'mine'
-
-        def __init__(self, zone, **common):
-            super().__init__(options={'zone': zone}, **common)
-
-    assert Mine('b', name='m', ros_workspace='').spec(context).options == {'zone': 'b'}
-    with pytest.raises(ConfigurationError, match="did you mean 'zone'"):
-        Mine('b', zon=1)
-
-
 @pytest.mark.parametrize('isolated', [False, True])
 @pytest.mark.parametrize('variable', ['COLCON_PREFIX_PATH', 'AMENT_PREFIX_PATH'])
 def test_the_workspace_is_found(tmp_path, variable, isolated):
