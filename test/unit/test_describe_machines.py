@@ -126,6 +126,7 @@ def test_substitutions_are_resolved_when_executed(context):
     (lambda: ContainerInstance(pip=[None]), 'pip=[None] has the wrong type'),
     (lambda: ContainerInstance(name={}), 'name={} has the wrong type (it takes a text)'),
     (lambda: ContainerInstance(cpus=[1.5]), 'it takes a number'),
+    (lambda: ContainerInstance(cpus='many'), "cpus: 'many' is no number"),
     (lambda: ContainerInstance(lifetime=timedelta(hours=8)), 'lifetime=datetime.timedelta'),
     (lambda: ContainerInstance(environment={1: 'A'}), 'it takes a mapping'),
     (lambda: ContainerInstance(isolated=b'no'), 'it takes a bool'),
