@@ -45,12 +45,16 @@ def verbs() -> list[str]:
     return plugin_system.names('fogros2.verb')
 
 
-def main() -> int:
-    """Write what is generated, and build."""
+def main(*options: str) -> int:
+    """
+    Write what is generated, and build.
+
+    :param options: of sphinx-build.
+    """
     (ROOT / 'doc/reference/command_line.md').write_text(command_line(verbs()))
     target = ROOT / '.cache/docs'
     status = subprocess.run(
-        [sys.executable, '-m', 'sphinx', '-q', '-W', '--keep-going', '-b', 'html', '-d',
+        [sys.executable, '-m', 'sphinx', '-q', '-W', '--keep-going', *options, '-b', 'html', '-d',
          str(ROOT / '.cache/doctrees'), str(ROOT / 'doc'), str(target)]).returncode
     if status == 0:
         print(target / 'index.html')
@@ -58,4 +62,4 @@ def main() -> int:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(main(*sys.argv[1:]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 import functools
-import inspect
 from typing import Any, get_args, Optional, Union
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
@@ -25,10 +24,11 @@ from launch.actions import (
 
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.fog_machine import FogMachine
-from fogros2.describe import features, keywords
+from fogros2.describe import features
+from fogros2.describe.kinds import names_of, unknown
 from fogros2.errors import ConfigurationError
 from fogros2.launch_internals import private
-from fogros2.launch_internals.wrapping import below, wrap
+from fogros2.launch_internals.wrapping import below, everything, wrap
 from fogros2.model import RobotNodes
 from fogros2.runtime import node_spec
 from fogros2.runtime.coordinator import Coordinator, Planned
@@ -40,7 +40,6 @@ _SETTINGS = (
     SetEnvironmentVariable, SetLaunchConfiguration, UnsetEnvironmentVariable,
     UnsetLaunchConfiguration,
 )
-
 
 #: Those that change what the values of a machine may depend on.
 _SETTERS = tuple(one for one in _SETTINGS if one not in (FogMachine, LogInfo))
@@ -64,9 +63,8 @@ class FogROSLaunchDescription(LaunchDescription):
     ) -> None:
         self.lists = features.take_lists(lists)
         for name in lists:
-            parameters = set(inspect.signature(FogROSLaunchDescription).parameters) - {'lists'}
-            raise keywords.unknown('a FogROSLaunchDescription', name,
-                                   parameters | features.node_lists().keys())
+            raise unknown('a FogROSLaunchDescription', name,
+                          names_of(FogROSLaunchDescription) | features.node_lists().keys())
         super().__init__(initial_entities, deprecated_reason=deprecated_reason)
         if robot_nodes not in get_args(RobotNodes):
             raise ConfigurationError(
@@ -144,9 +142,7 @@ def _processes(
 
 def _sets(entity: LaunchDescriptionEntity) -> bool:
     """Return whether an entity, or one below it, sets what a machine's values may depend on."""
-    return isinstance(entity, _SETTERS) or (
-        not isinstance(entity, IncludeLaunchDescription)
-        and any(_sets(one) for some in below(entity) for one in some))
+    return any(isinstance(one, _SETTERS) for one in everything([entity]))
 
 
 def cloud_entities(

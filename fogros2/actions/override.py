@@ -11,7 +11,7 @@ from launch.actions import IncludeLaunchDescription, OpaqueFunction
 
 from fogros2.actions.launch_description import cloud_entities, holder
 from fogros2.describe.overrides import Overrides
-from fogros2.launch_internals.wrapping import below, wrap
+from fogros2.launch_internals.wrapping import everything, wrap
 from fogros2.runtime.coordinator import Coordinator
 
 if TYPE_CHECKING:
@@ -65,12 +65,10 @@ def _look_through(
     :return: True if these are all; False if a function or an unread file may add machines.
     """
     whole = True
-    for entity in entities:
+    for entity in everything(entities, included=True):
         member = holder(entity)
         if member is not None and member.machine is not None:
             machines.append(member.machine)
-        for some in below(entity):
-            whole = _look_through(some, machines) and whole
         if isinstance(entity, OpaqueFunction) or (
                 isinstance(entity, IncludeLaunchDescription)
                 and not entity.describe_sub_entities()):

@@ -7,14 +7,12 @@ from collections.abc import Collection, Iterator, Mapping
 import contextlib
 import dataclasses
 import importlib
-import inspect
 import os
 from pathlib import Path
 import re
 from typing import Any, Optional, TYPE_CHECKING
 
-from fogros2.describe import features, keywords, values
-from fogros2.describe.kinds import Kind
+from fogros2.describe import features, keywords, kinds, values
 from fogros2.describe.machines import check_setting, CloudInstance, SETTINGS
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.host.workspace import find_workspaces
@@ -28,10 +26,6 @@ if TYPE_CHECKING:
 
 #: The file's name, in the user's folder of configurations and in a workspace.
 FILE = 'fogros2.toml'
-_TYPES: Mapping[Kind, tuple[type, ...]] = {
-    'text': (str, int, float), 'number': (int, float, str), 'bool': (bool,), 'list': (list,),
-    'table': (list,), 'mapping': (dict,), 'scalar': (str, int, float),
-    'text or mapping': (str, dict)}
 
 
 def files(environment: Mapping[str, str]) -> list[Path]:
@@ -59,16 +53,13 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
         else:
             tables[''][name] = value
     for provider, table in tables.items():
-        kinds_of = {name: kind for each in ([provider] if provider else keywords.providers())
-                    for name, kind in _allowed(keywords.machine_class(each)).items()}
+        allowed = {name: keyword for each in ([provider] if provider else keywords.providers())
+                   for name, keyword in _allowed(keywords.machine_class(each)).items()}
         for name, value in table.items():
-            if name not in kinds_of:
-                raise keywords.unknown(f"{path}: [{provider or 'machines'}]", name, kinds_of)
-            if not isinstance(value, _TYPES[kinds_of[name]]) or (
-                    isinstance(value, bool) and kinds_of[name] not in ('bool', 'scalar')):
-                raise ConfigurationError(f'{path}: {name} = {value!r} has the wrong type',
-                                         f'it takes a {kinds_of[name]}')
+            if name not in allowed:
+                raise kinds.unknown(f"{path}: [{provider or 'machines'}]", name, allowed)
             with values.named(str(path)):
+                kinds.check({name: allowed[name]}, {name: value})
                 if name in SETTINGS:
                     check_setting(name, value)
                 features.own({name: value})
@@ -113,15 +104,11 @@ def _parsed(path: Path) -> dict[str, Any]:
     raise PrerequisiteError(f"Python 3.10 can't read {path}", 'pip install tomli')
 
 
-def _allowed(cls: type[CloudInstance]) -> dict[str, Kind]:
-    """Return the keywords that a file may set, with their kinds: no machine has them by itself."""
-    optional = {name for base in cls.__mro__ if '__init__' in vars(base)
-                for name, parameter in inspect.signature(vars(base)['__init__']).parameters.items()
-                if parameter.default is None}
-    common = keywords.keywords(CloudInstance)
-    return {name: keyword.kind for name, keyword in keywords.keywords(cls).items()
-            if name in features.keywords()
-            or name in optional and (name in SETTINGS if name in common else True)}
+def _allowed(cls: type[CloudInstance]) -> dict[str, kinds.Keyword]:
+    """Return the keywords that a file may set: no machine has them by itself."""
+    fixed = keywords.keywords(CloudInstance).keys() - features.keywords().keys() - {*SETTINGS}
+    return {name: keyword for name, keyword in keywords.keywords(cls).items()
+            if name in features.keywords() or keyword.default is None and name not in fixed}
 
 
 def apply(
@@ -136,9 +123,9 @@ def apply(
     wanted: dict[str, Any] = {}
     for path in files(environment):
         tables = read(path)
-        kinds_of = _allowed(keywords.machine_class(spec.provider)) if tables else {}
+        allowed = _allowed(keywords.machine_class(spec.provider)) if tables else {}
         wanted.update({name: value for part in ('', spec.provider)
-                       for name, value in tables.get(part, {}).items() if name in kinds_of})
+                       for name, value in tables.get(part, {}).items() if name in allowed})
     settings = {name: check_setting(name, value) for name, value in wanted.items()
                 if name in SETTINGS and name not in given}
     # an empty text is what an argument of a launch file has without a value
@@ -147,7 +134,7 @@ def apply(
                if name not in SETTINGS and spec.options.get(name, '') == ''}
     return dataclasses.replace(
         spec, options={**spec.options, **options},
-        features=features.merged(features.by_feature(features.known(features.own(more))),
+        features=features.merged(features.by_feature(values.known(features.own(more))),
                                  spec.features), **settings)
 
 

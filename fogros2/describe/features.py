@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import Any
 
 from fogros2 import plugin_system
 from fogros2.describe import values
@@ -68,29 +68,9 @@ def own(given: Mapping[str, Any], of: str = 'options') -> dict[str, Any]:
     """
     mine = {name: keyword for name, keyword in keywords(of).items() if name in given}
     result = marked(mine, given)
-    by_feature(known({name: value for name, value in result.items() if _is_plain(value)}), of)
+    by_feature(values.known({name: value for name, value in result.items()
+                             if values.is_known(value)}), of)
     return result
-
-
-def known(given: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Return marked values, which have no substitutions, in their types.
-
-    :raises ConfigurationError: one can't be converted.
-    """
-    result = {}
-    for name, value in given.items():
-        with values.named(name):
-            result[name] = values.resolve(cast(Any, None), value)
-    return result
-
-
-def _is_plain(value: Any) -> bool:
-    if isinstance(value, values.Items):
-        return all(isinstance(one, str) for one in value)
-    if isinstance(value, values.Converted):
-        return _is_plain(value.value)
-    return isinstance(value, (str, int, float))
 
 
 def by_feature(given: Mapping[str, Any], of: str = 'options') -> dict[str, dict[str, Any]]:

@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 import contextlib
-import inspect
 import re
 from typing import Any
 
 from fogros2 import plugin_system
 from fogros2.describe import features, values
-from fogros2.describe.kinds import Keyword, parameters_of
+from fogros2.describe.kinds import Keyword, names_of, parameters_of, unknown
 from fogros2.describe.machines import CloudInstance
 from fogros2.errors import ConfigurationError, did_you_mean
 
@@ -146,13 +145,5 @@ def refused(cls: type[Any], more: Iterable[str] = ()) -> Iterator[None]:
         match = re.search(r"got an unexpected keyword argument '(\w+)'", str(error))
         if match is None:
             raise
-        names = {*more, *features.node_lists(), *(
-            name for each in cls.__mro__ if '__init__' in vars(each)
-            for name in inspect.signature(vars(each)['__init__']).parameters)}
-        raise unknown(f'a {cls.__name__}', match[1],
-                      names - {'self', 'args', 'kwargs', 'lists'}) from None
-
-
-def unknown(what: str, name: str, names: Iterable[str]) -> ConfigurationError:
-    """Return the error for an unknown name, with the nearest known one in its hint."""
-    return ConfigurationError(f"{what} has no '{name}'", did_you_mean(name, sorted(names)))
+        raise unknown(f'a {cls.__name__}', match[1], {
+            *more, *features.node_lists(), *names_of(cls)}) from None

@@ -17,7 +17,7 @@ import types
 from typing import Any, get_args, get_origin, get_type_hints, Literal, Union
 
 from fogros2.describe import values
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, did_you_mean
 
 Kind = Literal[
     'text', 'number', 'bool', 'scalar', 'list', 'mapping', 'text or mapping', 'table']
@@ -38,13 +38,18 @@ class Keyword:
     One keyword of a constructor.
 
     :param columns: for a table, the kind of each column by name.
-    :param needed: whether the constructor requires the keyword.
+    :param default: as of :class:`inspect.Parameter`.
     """
 
     name: str
     kind: Kind
     columns: Mapping[str, Kind] = dataclasses.field(default_factory=dict)
-    needed: bool = False
+    default: Any = None
+
+    @property
+    def needed(self) -> bool:
+        """Whether the constructor requires the keyword."""
+        return self.default is inspect.Parameter.empty
 
 
 @functools.cache
@@ -62,8 +67,7 @@ def parameters_of(function: Callable[..., Any]) -> dict[str, Keyword]:
             'import the types of its annotations, not only for type checkers') from error
     parameters = inspect.signature(function).parameters
     return {
-        name: Keyword(name, *_kind(hint),
-                      needed=parameters[name].default is inspect.Parameter.empty)
+        name: Keyword(name, *_kind(hint), parameters[name].default)
         for name, hint in hints.items() if name not in _NOT_MEANT}
 
 
@@ -114,6 +118,8 @@ def check(keywords: Mapping[str, Keyword], arguments: Mapping[str, Any]) -> None
 def _fits(kind: Kind, value: Any) -> bool:
     if value is None or isinstance(value, values.Converted):
         return True
+    if isinstance(value, bool):
+        return kind in ('bool', 'scalar')
     if isinstance(value, Mapping):
         return kind in ('mapping', 'text or mapping') and all(
             isinstance(one, str) for one in value)
@@ -129,6 +135,18 @@ def _fits(kind: Kind, value: Any) -> bool:
         return all(isinstance(one, (str, os.PathLike)) or hasattr(one, 'perform')
                    for one in value)
     return isinstance(value, (str, int, float, Decimal, os.PathLike))
+
+
+def names_of(cls: type[Any]) -> set[str]:
+    """Return the names of all parameters of a class's constructors."""
+    return {name for each in cls.__mro__ if '__init__' in vars(each)
+            for name in inspect.signature(vars(each)['__init__']).parameters} - {
+                *_NOT_MEANT, 'args', 'kwargs', 'lists'}
+
+
+def unknown(what: str, name: str, names: Iterable[str]) -> ConfigurationError:
+    """Return the error for an unknown name, with the nearest known one in its hint."""
+    return ConfigurationError(f"{what} has no '{name}'", did_you_mean(name, sorted(names)))
 
 
 def options_of(constructor: Callable[..., Any], arguments: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,13 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 import functools
-import inspect
 import os
 import shlex
 from typing import Any, NoReturn, Optional, TYPE_CHECKING, Union
 
 from fogros2.describe import features, names, values, variables
-from fogros2.describe.kinds import check, options_of, parameters_of
+from fogros2.describe.kinds import check, names_of, options_of, parameters_of
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.feature import contained
 from fogros2.host import dependencies
@@ -83,7 +82,9 @@ class CloudInstance:
         self._features = features.own(unknown) if unknown else {}
         for keyword in unknown:
             if keyword not in self._features:
-                raise self._unknown(keyword)
+                raise ConfigurationError(
+                    f"{type(self).__name__} has no attribute '{keyword}'", did_you_mean(
+                        keyword, sorted({*names_of(type(self)), *features.keywords()})))
         if not self.provider:
             raise ConfigurationError(
                 f'{type(self).__name__} is no machine yet',
@@ -96,14 +97,12 @@ class CloudInstance:
         self._values = {name: parameters[name] for name in _CHECKS if parameters[name] is not None}
         self._environment = dict(environment or {})
         self._options = {k: v for k, v in (options or {}).items() if v is not None}
-        self._lists = {name: _listed(name, parameters) for name, parameters in (
-            ('apt', apt), ('pip', pip))}
+        self._lists = {'apt': _listed('apt', apt), 'pip': _listed('pip', pip)}
         self._spec: Optional[MachineSpec] = None
         self._running: Optional[RunningMachine] = None
         # values that are known already are checked where they are written
-        for key, value in [*self._options.items(), *self._features.items()]:
-            with values.named(key):
-                values.check_plain(value)
+        values.known({key: value for key, value in self._options.items()
+                      if values.is_known(value)})
         if isinstance(self._name, str):
             check_name(self._name)
         for key, value in self._values.items():
@@ -128,14 +127,6 @@ class CloudInstance:
             raise ConfigurationError(
                 f"a machine with on_exit='{on_exit}' needs a name",
                 'give it a name=, so that the next launch finds it')
-
-    def _unknown(self, name: str) -> ConfigurationError:
-        parameters = sorted({
-            parameter for cls in type(self).__mro__[:-1]
-            for parameter in inspect.signature(cls).parameters
-        } - {'self', 'options', 'unknown', 'common'} | {*features.keywords()})
-        return ConfigurationError(
-            f"{type(self).__name__} has no attribute '{name}'", did_you_mean(name, parameters))
 
     @property
     def name(self) -> str:
@@ -238,7 +229,7 @@ class CloudInstance:
             elif workspace:
                 workspace = os.path.abspath(os.path.expanduser(str(workspace)))
             of_features = features.by_feature({
-                key: self._converted(context, key, value)
+                key: self._resolved(context, key, value)
                 for key, value in self._features.items()})
             if contained(of_features):
                 self.takes_containers()
@@ -262,10 +253,6 @@ class CloudInstance:
         wanted = [value for some in self._lists[program]
                   for value in values.resolve(context, some)]
         return tuple(dict.fromkeys(_LIST_CHECKS[program](str(value)) for value in wanted))
-
-    def _converted(self, context: LaunchContext, keyword: str, value: Any) -> Any:
-        with values.named(keyword):
-            return values.resolve(context, value)
 
     def _resolved(self, context: LaunchContext, keyword: str, value: Any) -> Any:
         with values.named(keyword):
@@ -374,8 +361,6 @@ def checked(machine: SomeMachine) -> SomeMachine:
     return machine
 
 
-
-
 _LIST_CHECKS = {'apt': dependencies.check_apt, 'pip': dependencies.check_pip}
 
 
@@ -385,7 +370,10 @@ def _listed(program: str, content: Any) -> list[Union[values.Items, values.List]
 
     :raises ConfigurationError: not a list, or a wrong item.
     """
-    items = values.checked_items(content, _LIST_CHECKS[program])
+    items = values.items(content)
+    for value in items if isinstance(items, values.Items) else ():
+        if isinstance(value, str):
+            _LIST_CHECKS[program](value)
     return [] if items is None else [items]
 
 

@@ -9,6 +9,7 @@ import fnmatch
 from typing import Any, Optional, TYPE_CHECKING
 
 from fogros2.describe import features, keywords, values
+from fogros2.describe.kinds import unknown
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.feature import contained
 
@@ -131,7 +132,7 @@ def parse(text: str) -> Override:
             raise ConfigurationError(f"--machine '{text}': '{setting}' is no keyword=value",
                                      'such as region=eu-west-1')
         if name not in parameters or name == 'name':
-            raise keywords.unknown(f"a machine of the provider '{provider}'", name, parameters)
+            raise unknown(f"a machine of the provider '{provider}'", name, parameters)
         options[name] = keywords.read(parameters[name], value)
     override = Override(pattern.strip(), provider, options)
     # report wrong values before the launch begins; the name does not matter

@@ -9,7 +9,7 @@ import contextlib
 from decimal import Decimal
 import os
 import re
-from typing import Any, get_args, TYPE_CHECKING, Union
+from typing import Any, cast, get_args, TYPE_CHECKING, Union
 
 from fogros2.errors import ConfigurationError, did_you_mean
 
@@ -58,19 +58,6 @@ def items(
         return values
     # recognised by its method: describing a machine does not import launch
     return List(values) if hasattr(values, 'perform') else Items(values)
-
-
-def checked_items(sequence: Any, check: Callable[[str], object]) -> Any:
-    """
-    Return the values of a list as separate items, None for none; check those that are known.
-
-    :raises ConfigurationError: an invalid value.
-    """
-    parts = items(sequence)
-    for value in parts if isinstance(parts, Items) else ():
-        if isinstance(value, str):
-            check(value)
-    return parts
 
 
 @contextlib.contextmanager
@@ -165,15 +152,26 @@ def is_text(value: Any) -> bool:
     return all(isinstance(part, (str, Substitution)) for part in parts)
 
 
-def check_plain(value: Any) -> None:
-    """
-    Check a Number or a Bool whose value is known already.
+def is_known(value: Any) -> bool:
+    """Return whether a marked value is known before the launch: it has no substitution."""
+    if isinstance(value, Items):
+        return all(isinstance(item, str) for item in value)
+    if isinstance(value, Converted):
+        return is_known(value.value)
+    return isinstance(value, (str, int, float, Decimal))
 
-    :raises ConfigurationError: the value is something else.
+
+def known(given: Mapping[str, Any]) -> dict[str, Any]:
     """
-    if isinstance(value, Converted) and isinstance(
-            value.value, (str, bool, int, float, Decimal)):
-        value.convert(value.value)
+    Return marked values, which have no substitutions, in their types.
+
+    :raises ConfigurationError: one can't be converted.
+    """
+    result = {}
+    for name, value in given.items():
+        with named(name):
+            result[name] = resolve(cast(Any, None), value)
+    return result
 
 
 def read_number(value: Any) -> Union[int, float]:

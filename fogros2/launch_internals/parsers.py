@@ -19,7 +19,7 @@ from launch.actions import IncludeLaunchDescription
 from launch.frontend import Entity, Parser
 
 from fogros2.launch_internals import private
-from fogros2.launch_internals.wrapping import below
+from fogros2.launch_internals.wrapping import everything
 
 #: Creates the action of an element; None leaves the element to its usual parser.
 Read = Callable[[Entity, Parser], Optional[Action]]
@@ -47,13 +47,10 @@ def scoped(parser: Parser, read: Read) -> Parser:
 
 def _reach(entities: Iterable[LaunchDescriptionEntity], read: Read) -> None:
     """Make the includes among entities, at any depth, read their files with a scoped parser."""
-    for entity in entities:
+    for entity in everything(entities):
         if isinstance(entity, IncludeLaunchDescription):
             private.replace_reader(
                 entity.launch_description_source, functools.partial(_read_file, read))
-            continue
-        for some in below(entity):
-            _reach(some, read)
 
 
 def _read_file(

@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable, Iterable, Iterator
 import contextlib
 from typing import Any, Optional
 
-from launch import Event, LaunchContext, LaunchDescription, LaunchDescriptionEntity
-from launch.actions import TimerAction
+from launch import actions, Event, LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.events import IncludeLaunchDescription
 
 #: Methods of the context by which a visit adds entities for later.
@@ -30,42 +28,42 @@ class Wrapped(LaunchDescriptionEntity):
     def __init__(self, entity: LaunchDescriptionEntity, apply: Apply) -> None:
         self._entity = entity
         self._apply = apply
+        # launch asks the wrapper for these, and they are the entity's own
+        for name in ('get_asyncio_future', 'describe', 'describe_sub_entities',
+                     'describe_conditional_sub_entities'):
+            setattr(self, name, getattr(entity, name))
 
     def visit(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Apply the function to the entity, visit it, and wrap the results."""
         entity = self._entity
         self._apply(entity, context)
-        if isinstance(entity, TimerAction):
+        if isinstance(entity, actions.TimerAction):
             # its handler serves all timers of the launch, also timers outside this content
             _wrap_result(entity, self._apply)
             return wrap(entity.visit(context), self._apply)
         with _intercepted(context, self._apply):
             return wrap(entity.visit(context), self._apply)
 
-    def get_asyncio_future(self) -> Optional[asyncio.Future[Any]]:
-        """Return the entity's own future."""
-        future: Optional[asyncio.Future[Any]] = self._entity.get_asyncio_future()
-        return future
-
-    def describe(self) -> str:
-        """Return the entity's own description."""
-        return str(self._entity.describe())
-
-    def describe_sub_entities(self) -> list[LaunchDescriptionEntity]:
-        """Return the entity's own sub-entities."""
-        return list(self._entity.describe_sub_entities())
-
-    def describe_conditional_sub_entities(
-        self,
-    ) -> list[tuple[str, Iterable[LaunchDescriptionEntity]]]:
-        """Return the entity's own conditional sub-entities."""
-        return list(self._entity.describe_conditional_sub_entities())
-
 
 def below(entity: LaunchDescriptionEntity) -> list[Iterable[LaunchDescriptionEntity]]:
     """Return the entity's sub-entities, and those of each of its conditions."""
     return [entity.describe_sub_entities(), *(
         some for _, some in entity.describe_conditional_sub_entities())]
+
+
+def everything(
+    entities: Iterable[LaunchDescriptionEntity], *, included: bool = False,
+) -> Iterator[LaunchDescriptionEntity]:
+    """
+    Yield entities, and those below them at any depth.
+
+    :param included: also of included files, which launch then reads.
+    """
+    for entity in entities:
+        yield entity
+        if included or not isinstance(entity, actions.IncludeLaunchDescription):
+            for some in below(entity):
+                yield from everything(some, included=included)
 
 
 def wrap(entities: Any, apply: Apply) -> Optional[list[LaunchDescriptionEntity]]:

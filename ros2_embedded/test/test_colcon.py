@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Workspaces of ``ament_python`` packages built by colcon: set-up, run, launch, overlay."""
+"""A workspace with an ``ament_python`` package built by colcon: set-up, run, launch."""
 
 import os
 import shutil
@@ -40,7 +40,7 @@ import rclpy
 def main():
     rclpy.init()
     node = rclpy.create_node('sayer')
-    print('{text} from', node.get_fully_qualified_name(), flush=True)
+    print('hello from', node.get_fully_qualified_name(), flush=True)
     node.destroy_node()
     rclpy.shutdown()
 '''
@@ -64,9 +64,9 @@ def run(script, cwd):
     return done.stdout
 
 
-def workspace(root, name, text, setup=''):
-    """Lay out a workspace with a package, and build it on top of what a script has set up."""
-    package = root / 'src' / name
+def test_package_of_a_workspace_is_found_run_and_launched(tmp_path):
+    name = 'fog_colcon_test'
+    package = tmp_path / 'src' / name
     for folder in (package / name, package / 'resource'):
         folder.mkdir(parents=True)
     for path, content in (
@@ -75,20 +75,10 @@ def workspace(root, name, text, setup=''):
                           f'[install]\ninstall_scripts=$base/lib/{name}\n'),
             (f'{name}/__init__.py', ''), (f'{name}/node.py', NODE),
             ('say.launch.py', LAUNCH_FILE)):
-        (package / path).write_text(textwrap.dedent(content.format(name=name, text=text)))
-    run(f'{setup}\n{COLCON} build --base-paths src', root)
-    return f'. {root}/install/setup.bash'
-
-
-def test_packages_of_workspaces_are_found_run_and_launched(tmp_path):
-    """That of an overlay hides the one below it, which stays as it was by itself."""
-    root = tmp_path / 'below'
-    setup = workspace(root, 'fog_colcon_test', 'underlay')
-    over = workspace(tmp_path, 'fog_colcon_test', 'overlay', setup)
-    found = run(f'{over}; ros2 pkg prefix fog_colcon_test; ros2 pkg executables fog_colcon_test\n'
-                'ros2 run fog_colcon_test say', tmp_path)
-    assert found.splitlines() == [f'{tmp_path}/install/fog_colcon_test', 'fog_colcon_test say',
-                                  'overlay from /sayer']
-    assert run(f'{setup}; ros2 run fog_colcon_test say', root) == 'underlay from /sayer\n'
-    assert '] overlay from /renamed' in run(
-        f'{over}; ros2 launch fog_colcon_test say.launch.py', tmp_path)
+        (package / path).write_text(textwrap.dedent(content.format(name=name)))
+    said = run(f'{COLCON} build --base-paths src >&2; . install/setup.bash; '
+               f'ros2 pkg prefix {name}; ros2 pkg executables {name}; ros2 run {name} say; '
+               f'ros2 launch {name} say.launch.py', tmp_path)
+    assert said.splitlines()[:3] == [f'{tmp_path}/install/{name}', f'{name} say',
+                                     'hello from /sayer']
+    assert '] hello from /renamed' in said

@@ -4,13 +4,11 @@
 import importlib.util
 import os
 from pathlib import Path
-import stat
 import subprocess
 import sys
 
 from launch import LaunchContext, LaunchDescription, LaunchService
 from launch.actions import GroupAction, IncludeLaunchDescription, OpaqueFunction
-import launch.logging
 from launch.substitutions import (
     LaunchConfiguration,
     PathJoinSubstitution,
@@ -45,28 +43,7 @@ from launch_ros.utilities import (
 import pytest
 import yaml
 
-
-@pytest.fixture(autouse=True)
-def prefix(tmp_path, monkeypatch):
-    """Install a package 'pkg' with an executable 'exe' that prints its arguments."""
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-    monkeypatch.setenv('TMPDIR', str(tmp_path))
-    monkeypatch.setattr('tempfile.tempdir', None)
-    root = tmp_path / 'prefix'
-    index = root / 'share' / 'ament_index' / 'resource_index' / 'packages'
-    index.mkdir(parents=True)
-    (index / 'pkg').write_text('')
-    (root / 'share' / 'pkg').mkdir()
-    executable = root / 'lib' / 'pkg' / 'exe'
-    executable.parent.mkdir(parents=True)
-    executable.write_text('#!/bin/sh\nfor word; do echo "word $word"; done\n')
-    executable.chmod(executable.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setenv(
-        'AMENT_PREFIX_PATH', os.pathsep.join([str(root), os.environ.get(
-            'AMENT_PREFIX_PATH', '')]).rstrip(os.pathsep))
-    launch.logging.reset()
-    yield root
-    launch.logging.reset()
+pytestmark = pytest.mark.usefixtures('own_log', 'package')
 
 
 def visit(context, *entities):
@@ -240,16 +217,6 @@ def test_invalid_parameters_are_refused():
         normalize_remap_rule(('a',))
 
 
-def test_parameter_value_has_the_requested_type():
-    context = LaunchContext()
-    value = ParameterValue(LaunchConfiguration('x', default='1'), value_type=float)
-    assert value.evaluate(context) == 1.0 and value.value == 1.0
-    with pytest.raises(ValueError):
-        ParameterValue(LaunchConfiguration('x', default='a'), value_type=int).evaluate(context)
-    with pytest.raises(TypeError):
-        ParameterValue('a', value_type=int)
-
-
 @pytest.mark.parametrize('base, name, expected', [
     (None, None, None), (None, 'a', 'a'), ('/', 'a', '/a'), ('/a', 'b/', '/a/b'),
     ('/a', '/b', '/b'), ('a', None, 'a'), ('', 'a', 'a')])
@@ -258,12 +225,12 @@ def test_namespaces_are_joined(base, name, expected):
     assert make_namespace_absolute('a') == '/a' and make_namespace_absolute(None) is None
 
 
-def test_substitutions_find_packages_and_executables(prefix):
+def test_substitutions_find_packages_and_executables(package):
     context = LaunchContext()
-    assert FindPackagePrefix('pkg').perform(context) == str(prefix)
-    assert FindPackageShare(['p', 'kg']).perform(context) == str(prefix / 'share' / 'pkg')
+    assert FindPackagePrefix('pkg').perform(context) == str(package)
+    assert FindPackageShare(['p', 'kg']).perform(context) == str(package / 'share' / 'pkg')
     executable = ExecutableInPackage(package='pkg', executable='exe')
-    assert executable.perform(context) == str(prefix / 'lib' / 'pkg' / 'exe')
+    assert executable.perform(context) == str(package / 'lib' / 'pkg' / 'exe')
     assert executable.describe() == "ExecInPkg(pkg='pkg', exec='exe')"
     with pytest.raises(SubstitutionFailure, match="executable 'no' not found on the libexec"):
         ExecutableInPackage(package='pkg', executable='no').perform(context)
@@ -295,9 +262,6 @@ XML = '''<launch>
   <set_remap from="x" to="y"/>
   <node pkg="pkg" exec="exe" name="n" namespace="b" args="one 'two words'"
         ros_args="--log-level $(var level)" output="screen">
-    <param name="int" value="1"/>
-    <param name="str" value="1" type="str"/>
-    <param name="list" value="1,2" value-sep=","/>
     <param name="nested"><param name="deep" value="$(var level)"/></param>
     <param from="$(dirname)/p.yaml" allow_substs="true"/>
     <remap from="p" to="q"/>
@@ -319,9 +283,6 @@ launch:
     ros_args: --log-level $(var level)
     output: screen
     param:
-    - {name: int, value: 1}
-    - {name: str, value: '1', type: str}
-    - {name: list, value: [1, 2]}
     - {name: nested, param: [{name: deep, value: $(var level)}]}
     - {from: $(dirname)/p.yaml, allow_substs: true}
     remap: [{from: p, to: q}]
@@ -352,30 +313,25 @@ def test_xml_and_yaml_describe_a_node(tmp_path, capsys, name, content):
     assert got[10:12] == ['-p', 'g:=1'] and got[-4:] == ['-r', 'x:=y', '-r', 'p:=q']
     merged = {key: value for content in contents for node in content.values()
               for key, value in node['ros__parameters'].items()}
-    assert merged == {'int': 1, 'str': '1', 'list': [1, 2], 'nested.deep': 'warn',
-                      'level': 'warn'}
+    assert merged == {'nested.deep': 'warn', 'level': 'warn'}
     assert {key for content in contents for key in content} == {'/a/b/n', '/**'}
 
 
-def test_composable_nodes_are_described(tmp_path):
+def test_composable_nodes_are_described():
     node = ComposableNode(
         package='image_tools', plugin='image_tools::Cam2Image', name=['c', 'am'], namespace='/ns',
         parameters=[{'a': 1}], remappings=[('a', 'b')],
         extra_arguments=[{'use_intra_process_comms': True}])
     context = LaunchContext()
-    for part, text in ((node.package, 'image_tools'), (node.node_name, 'cam'),
-                       (node.node_plugin, 'image_tools::Cam2Image'),
-                       (node.node_namespace, '/ns')):
-        assert perform_substitutions(context, part) == text
-    assert evaluate_parameters(context, node.parameters) == ({'a': 1},)
-    assert evaluate_parameters(context, node.extra_arguments) == (
-        {'use_intra_process_comms': True},)
-    assert node.condition() is None
+    assert [perform_substitutions(context, part) for part in (
+        node.package, node.node_name, node.node_plugin, node.node_namespace)] == [
+            'image_tools', 'cam', 'image_tools::Cam2Image', '/ns']
+    assert evaluate_parameters(context, [*node.parameters, *node.extra_arguments]) == (
+        {'a': 1}, {'use_intra_process_comms': True})
     container = ComposableNodeContainer(
         name='c', namespace='/', package='pkg', executable='exe',
         composable_node_descriptions=[node])
     LoadComposableNodes(target_container=container, composable_node_descriptions=[node])
-    LoadComposableNodes(target_container='/c', composable_node_descriptions=[node])
     visit(context, container)
     assert container.node_name == '/c'
     with pytest.raises(TypeError):
@@ -408,6 +364,6 @@ node._perform_substitutions(LaunchContext())
 print(len(glob.glob(sys.argv[1] + '/launch_params_*')))
 '''
     done = subprocess.run([sys.executable, '-c', code, str(tmp_path)], capture_output=True,
-                          text=True, timeout=60)
+                          text=True, env={**os.environ, 'TMPDIR': str(tmp_path)})
     assert done.stdout.split()[-1:] == ['1'], done.stderr
     assert not list(tmp_path.glob('launch_params_*'))

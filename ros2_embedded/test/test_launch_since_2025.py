@@ -6,7 +6,6 @@ An installation of ROS 2 that is older skips these tests.
 """
 
 import importlib.util
-import os
 from pathlib import Path
 import re
 
@@ -72,22 +71,6 @@ A = LaunchConfiguration('a')
 
 
 pytestmark = pytest.mark.usefixtures('own_log')
-
-
-@pytest.fixture
-def package(tmp_path, monkeypatch):
-    """Install a package 'pkg' with an executable 'exe'; return its prefix."""
-    index = tmp_path / 'prefix/share/ament_index/resource_index/packages'
-    index.mkdir(parents=True)
-    (index / 'pkg').write_text('')
-    (tmp_path / 'prefix/share/pkg').mkdir()
-    executable = tmp_path / 'prefix/lib/pkg/exe'
-    executable.parent.mkdir(parents=True)
-    executable.write_text('#!/bin/sh\n')
-    executable.chmod(0o755)
-    monkeypatch.setenv('AMENT_PREFIX_PATH', os.pathsep.join([
-        str(tmp_path / 'prefix'), os.environ.get('AMENT_PREFIX_PATH', '')]).rstrip(os.pathsep))
-    return tmp_path / 'prefix'
 
 
 def run(*entities):

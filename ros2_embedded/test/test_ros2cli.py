@@ -4,13 +4,16 @@
 import contextlib
 import importlib.util
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import textwrap
 
+import launch.logging
 import pytest
+from ros2cli.cli import main
 from ros2cli.plugin_system import PluginException, satisfies_version
 
 ROS2 = shutil.which('ros2', path=os.pathsep.join([os.path.dirname(sys.executable), os.environ[
@@ -50,14 +53,11 @@ except KeyboardInterrupt:
 
 
 @pytest.fixture
-def package(tmp_path, monkeypatch):
-    """Install a package 'pkg' with executables and launch files; return its prefix."""
-    root = tmp_path / 'prefix'
-    share, lib = root / 'share' / 'pkg', root / 'lib' / 'pkg'
-    index = root / 'share' / 'ament_index' / 'resource_index' / 'packages'
-    for directory in (share / 'launch', share / 'other', lib, index):
-        directory.mkdir(parents=True)
-    (index / 'pkg').write_text('')
+def package(package, tmp_path, monkeypatch):
+    """Add executables and launch files to the package 'pkg'; return its prefix."""
+    share, lib = package / 'share/pkg', package / 'lib/pkg'
+    for folder in ('launch', 'other'):
+        (share / folder).mkdir()
     for path in ('launch/a.launch.py', 'launch/twice.launch.py', 'other/twice.launch.py'):
         (share / path).write_text(LAUNCH_FILE)
     (share / 'launch' / 'say.launch.xml').write_text(
@@ -69,43 +69,54 @@ def package(tmp_path, monkeypatch):
     (lib / 'data').write_text('')
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     monkeypatch.setenv('TMPDIR', str(tmp_path))
-    monkeypatch.setenv('AMENT_PREFIX_PATH', os.pathsep.join(
-        [str(root), os.environ.get('AMENT_PREFIX_PATH', '')]).rstrip(os.pathsep))
-    return root
+    return package
 
 
-def ros2(*arguments, **kwargs):
-    done = subprocess.run(
-        [ROS2, *arguments], capture_output=True, text=True, timeout=180,
-        stdin=subprocess.DEVNULL, **kwargs)
-    return done.returncode, done.stdout, done.stderr
+@pytest.fixture
+def ros2(capfd, monkeypatch):
+    """Return what runs a command of ros2 here, and returns its status, output and errors."""
+    monkeypatch.setenv('PATH', os.environ['PATH'])
+
+    def run(*words):
+        launch.logging.reset()
+        monkeypatch.setattr(sys, 'argv', ['ros2', *words])
+        try:
+            status = main()
+        except SystemExit as end:
+            status = end.code
+        if isinstance(status, str):  # as sys.exit() does
+            status, _ = 1, sys.stderr.write(f'{status}\n')
+        return (status or 0, *capfd.readouterr())
+
+    yield run
+    launch.logging.reset()
 
 
-def test_pkg_verbs_find_packages_and_executables(package):
+def test_pkg_verbs_find_packages_and_executables(package, ros2):
     status, out, err = ros2('pkg', 'list')
     assert status == 0 and 'pkg' in out.split() and out.split() == sorted(out.split())
     assert ros2('pkg', 'prefix', 'pkg') == (0, f'{package}\n', '')
     assert ros2('pkg', 'prefix', '--share', 'pkg')[:2] == (0, f'{package}/share/pkg\n')
     assert ros2('pkg', 'prefix', 'no-such-package') == (1, '', 'Package not found\n')
     assert ros2('pkg', 'executables', 'pkg')[:2] == (
-        0, 'pkg killed\npkg sleeper\npkg status\n')
+        0, 'pkg exe\npkg killed\npkg sleeper\npkg status\n')
     assert ros2('pkg', 'executables', '--full-path', 'pkg')[1].splitlines()[0] == (
-        f'{package}/lib/pkg/killed')
+        f'{package}/lib/pkg/exe')
     assert ros2('pkg', 'executables', 'nope') == (1, '', "Package 'nope' not found\n")
 
 
-def test_run_passes_arguments_and_exit_status(package):
+def test_run_passes_arguments_and_exit_status(package, ros2):
     assert ros2('run', 'pkg', 'status', 'a', '--b') == (
         7, 'a --b\n[ros2run]: Process exited with failure 7\n', '')
     status, out, _ = ros2('run', 'pkg', 'killed')
-    assert status == 256 - signal.SIGUSR1 and out.startswith('[ros2run]: User defined signal 1')
+    assert status == -signal.SIGUSR1 and out.startswith('[ros2run]: User defined signal 1')
     assert ros2('run', '--prefix', 'echo before', 'pkg', 'status', 'x')[:2] == (
         0, f'before {package}/lib/pkg/status x\n')
     assert ros2('run', 'pkg', 'data') == (1, '', 'No executable found\n')
     assert ros2('run', 'nope', 'x') == (1, '', "Package 'nope' not found\n")
 
 
-def test_help_lists_the_commands(package):
+def test_help_lists_the_commands(package, ros2):
     status, out, _ = ros2('--help')
     assert status == 0 and out.startswith('usage: ros2 [-h]')
     for line in ('launch', 'run', 'pkg'):
@@ -120,7 +131,7 @@ def test_help_lists_the_commands(package):
 @embedded_alone
 @pytest.mark.parametrize('words', [
     ('bag', 'record', '-a'), ('topic', 'delay', '/x')])
-def test_missing_command_names_ros2(words):
+def test_missing_command_names_ros2(words, ros2):
     status, out, err = ros2(*words)
     name = 'bag' if words[0] == 'bag' else 'topic delay'
     assert (status, out) == (1, '') and err.startswith(
@@ -128,7 +139,7 @@ def test_missing_command_names_ros2(words):
     assert '\n  bag ' not in ros2('-h')[1]
 
 
-def test_launch_arguments_are_shown(package):
+def test_launch_arguments_are_shown(package, ros2):
     status, out, _ = ros2('launch', '-s', 'pkg', 'a.launch.py')
     assert status == 0
     assert out == textwrap.dedent('''\
@@ -152,20 +163,20 @@ def test_launch_arguments_are_shown(package):
     ('-s', 'a.launch.xml', '<launch><nod/></launch>', 'Unrecognized entity of the type: nod'),
     ('-p', 'a.launch.py', 'def generate_launch_description():\n    pass\n',
      "generate_launch_description() of '{}' returned NoneType, no LaunchDescription")])
-def test_file_that_is_no_launch_file_is_one_line(package, option, name, text, why):
+def test_file_that_is_no_launch_file_is_one_line(package, ros2, option, name, text, why):
     path = package / name
     path.write_text(text)
     status, out, err = ros2('launch', option, str(path))
     assert (status, out, err.count('\n')) == (1, '', 1) and why.format(path) in err
 
 
-def test_launch_description_is_printed(package):
+def test_launch_description_is_printed(package, ros2):
     status, out, _ = ros2('launch', '-p', 'pkg', 'a.launch.py')
     assert status == 0 and "── LogInfo('says ' + LaunchConfig('word'))" in out
     assert "ExecuteProcess(cmd=[ExecInPkg(pkg='pkg', exec='sleeper'), '--ros-args', '-r', " in out
 
 
-def test_launch_file_runs_with_arguments(package):
+def test_launch_file_runs_with_arguments(package, ros2):
     status, out, err = ros2('launch', 'pkg', 'say.launch.xml', 'word:=one', 'word:=two')
     assert (status, err) == (0, '') and '[INFO] [launch.user]: says two' in out.splitlines()
     path = package / 'share' / 'pkg' / 'launch' / 'say.launch.xml'
@@ -182,13 +193,13 @@ def test_launch_file_runs_with_arguments(package):
     (['pkg', 'a.launch.py', 'a=b'], "malformed launch argument 'a=b', expected format "
                                     "'<name>:=<value>'"),
 ])
-def test_launch_error_is_one_line_and_status_1(package, arguments, error):
+def test_launch_error_is_one_line_and_status_1(package, ros2, arguments, error):
     status, out, err = ros2('launch', *arguments)
     assert (status, len(err.splitlines())) == (1, 1) and err.startswith(error)
 
 
 @embedded_alone
-def test_absent_launch_file_is_one_error():
+def test_absent_launch_file_is_one_error(ros2):
     status, out, err = ros2('launch', './nope.launch.py')
     assert (status, len(err.splitlines())) == (1, 1)
     assert err.startswith("there is no launch file './nope.launch.py' (")
@@ -220,13 +231,13 @@ def test_interrupt_ends_both_nodes_of_a_launch(package):
 
 
 def test_launch_prefix_precedes_each_executable(package):
-    status, out, _ = ros2(
-        'launch', '--launch-prefix', 'echo prefixed', '-a', 'pkg', 'a.launch.py', 'word:=0')
-    assert status == 0
+    out = subprocess.run(
+        [ROS2, 'launch', '--launch-prefix', 'echo prefixed', '-a', 'pkg', 'a.launch.py',
+         'word:=0'], capture_output=True, text=True, check=True).stdout
     assert f'prefixed {package}/lib/pkg/sleeper --ros-args -r __node:=one' in out
 
 
-def test_commands_come_from_entry_points(package, tmp_path):
+def test_commands_come_from_entry_points(tmp_path, commands, monkeypatch):
     site = tmp_path / 'site'
     metadata = site / 'fogtest-1.0.dist-info'
     metadata.mkdir(parents=True)
@@ -273,22 +284,16 @@ def test_commands_come_from_entry_points(package, tmp_path):
             def main(self, *, args):
                 raise RuntimeError('one line')
         '''))
-    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(
-        filter(None, [str(site), os.environ.get('PYTHONPATH')]))}
-
-    def run(*arguments):
-        return ros2(*arguments, env=environment)
-
-    assert run('fogtest', 'say', 'hello')[:2] == (0, 'hello say\n')
-    assert run('fogtest', 'fail') == (1, '', 'one line\n')
-    assert 'fogtest ' in run('-h')[1] and 'Test something' in run('-h')[1]
-    status, out, _ = run('fogtest')
-    assert status == 0 and 'say ' in out and 'Say something' in out
-    status, out, _ = run('fogtest', 'say', '-h')
-    assert status == 0 and 'usage: ros2 fogtest say [-h] word' in out
-    assert 'ros2 fogtest say' in out
-    status, _, err = run('broken')
-    assert status == 1 and "No module named 'fogtest_that_is_not_there'" in err
+    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
+        filter(None, [str(site), os.environ.get('PYTHONPATH')])))
+    with commands() as run:
+        assert run('fogtest', 'say', 'hello') == [0, 'hello say\n']
+        assert run('fogtest', 'fail') == [1, 'one line']
+        assert re.search('fogtest +Test something', run('-h')[1])
+        assert re.search('say +Say something', run('fogtest')[1])
+        assert 'usage: ros2 fogtest say [-h] word' in run('fogtest', 'say', '-h')[1]
+        status, out = run('broken')
+        assert status == 1 and "No module named 'fogtest_that_is_not_there'" in out
 
 
 def test_incompatible_extension_point_is_refused():

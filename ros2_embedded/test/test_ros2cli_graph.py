@@ -2,7 +2,6 @@
 """``ros2 topic|node|service|param`` beside a node that runs."""
 
 import importlib.util
-import json
 import os
 import signal
 import subprocess
@@ -49,23 +48,6 @@ def worker():
         process.terminate()
 
 
-#: Runs a command a line: rclpy is imported once. It answers with the status and the output.
-COMMANDS = '''
-import contextlib, io, json, sys
-from ros2cli.cli import main
-for line in sys.stdin:
-    output = io.StringIO()
-    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
-        try:
-            status = main(argv=json.loads(line))
-        except SystemExit as end:
-            status = end.code
-    if isinstance(status, str):  # as sys.exit() does
-        status, _ = 1, output.write(status)
-    print(json.dumps([status or 0, output.getvalue()]), flush=True)
-'''
-
-
 def no_daemon(command):
     """Return a command that starts no daemon, which would outlive the test."""
     daemons = ('list', 'info', 'get', 'set', 'echo')
@@ -73,23 +55,17 @@ def no_daemon(command):
 
 
 @pytest.fixture(scope='module')
-def ros2():
+def ros2(commands):
     """Return what runs a command of ros2 and returns its output."""
-    process = subprocess.Popen([sys.executable, '-c', COMMANDS], text=True,
-                               stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    with commands() as answer:
+        def run(*command, status=0):
+            for _ in range(3):  # a busy computer may discover nothing within the command's time
+                code, output = answer(*no_daemon(command))
+                if code == status:
+                    return output
+            raise AssertionError(output)
 
-    def run(*command, status=0):
-        for _ in range(3):  # a busy computer may discover nothing within the command's time
-            process.stdin.write(json.dumps(no_daemon(command)) + '\n')
-            process.stdin.flush()
-            code, output = json.loads(process.stdout.readline())
-            if code == status:
-                return output
-        raise AssertionError(output)
-
-    with process:
         yield run
-        process.stdin.close()
 
 
 def stopped(*command, until, by=signal.SIGINT):

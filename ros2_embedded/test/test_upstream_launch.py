@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The launch files of ROS 2's demonstrations and of launch_ros's examples, unmodified.
+The launch files of ROS 2's demonstrations and of ros2launch's examples, unmodified.
 
 ROS2_SOURCES names a folder that holds the repositories ``demos`` and ``launch_ros`` of
 github.com/ros2, branch jazzy. Nothing of theirs is here. What they launch is mostly C++: programs
@@ -36,12 +36,6 @@ echo "I am $0 $*"
 n=0
 while [ $((n += 1)) -lt 300 ]; do sleep 0.1; done
 '''
-NODE = '''#!{python}
-import sys
-sys.path.insert(0, {folder!r})
-from {module} import main
-sys.exit(main())
-'''
 
 pytestmark = pytest.mark.skipif(
     not FILES, reason="the sources of ROS 2's demos and of launch_ros are not here (ROS2_SOURCES)")
@@ -62,23 +56,21 @@ def prefix(tmp_path_factory):
         lib = root / 'lib' / package
         lib.mkdir(parents=True)
         for name in named(EXECUTABLE, *FILES):
-            write(lib / name, CONTAINER if name == 'component_container' else STAND_IN)
+            (lib / name).write_text(CONTAINER if name == 'component_container' else STAND_IN)
+            (lib / name).chmod(0o755)
     share = root / 'share' / 'dummy_robot_bringup'
     share.mkdir()
     (share / 'launch').symlink_to(SOURCES / 'demos/dummy_robot/dummy_robot_bringup/launch')
     return root
 
 
-def write(path, text):
-    path.write_text(text)
-    path.chmod(0o755)
-
-
-def launched(prefix, tmp_path, *command, until=None):
+def launched(prefix, tmp_path, file, until):
     """Run a launch, interrupted once it has said something; return status and output."""
+    ros2 = shutil.which('ros2', path=os.pathsep.join(
+        [os.path.dirname(sys.executable), os.environ['PATH']]))
     process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        text=True, start_new_session=True, env={
+        [ros2, 'launch', str(SOURCES / file)], stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True, env={
             **os.environ, 'ROS_LOG_DIR': str(tmp_path), 'USER': 'me', 'PYTHONUNBUFFERED': '1',
             'AMENT_PREFIX_PATH': f"{prefix}:{os.environ.get('AMENT_PREFIX_PATH', '')}"})
     watchdog = threading.Timer(300, os.killpg, [process.pid, signal.SIGKILL])
@@ -96,16 +88,10 @@ def launched(prefix, tmp_path, *command, until=None):
         process.stdout.close()
 
 
-def ros2():
-    return shutil.which('ros2', path=os.pathsep.join(
-        [os.path.dirname(sys.executable), os.environ['PATH']]))
-
-
 @pytest.mark.parametrize('file', FILES)
 def test_launch_file_of_ros2_starts_its_programs(prefix, tmp_path, file):
     container = 'component_container' in named(EXECUTABLE, file)
-    status, out = launched(prefix, tmp_path, ros2(), 'launch', str(SOURCES / file),
-                           until='I am ' if container else None)
+    status, out = launched(prefix, tmp_path, file, until='I am ' if container else None)
     if container and importlib.util.find_spec('embedded_default'):
         assert status == 1 and out.count('ERROR') == 1, out
         assert 'composition_interfaces is not part of the embedded default; ROS 2 Jazzy' in out
@@ -116,32 +102,3 @@ def test_launch_file_of_ros2_starts_its_programs(prefix, tmp_path, file):
     started = set(re.findall(r'\[(\w+)-\d+\]: process started', out))
     assert started == (named(EXECUTABLE, file) or {'talker', 'listener'}), out
     assert stumbled or ('Abandoning wait' in out) == container
-
-
-def example(tmp_path, name):
-    """Copy an example away from launch_ros itself, which it puts on its path."""
-    path = tmp_path / 'examples' / name
-    path.parent.mkdir()
-    shutil.copy(SOURCES / 'launch_ros/launch_ros/examples' / name, path)
-    return str(path)
-
-
-def test_example_starts_talker_and_listener(prefix, tmp_path):
-    status, out = launched(
-        prefix, tmp_path, sys.executable, example(tmp_path, 'pub_sub_launch.py'))
-    assert status == 0 and 'Starting introspection of launch description' in out
-    for name in ('talker', 'listener'):
-        assert f'/{name} --ros-args -r chatter:=my_chatter' in out
-
-
-def test_example_activates_the_lifecycle_talker(prefix, tmp_path):
-    write(prefix / 'lib/lifecycle/lifecycle_talker', NODE.format(
-        python=sys.executable, folder=str(SOURCES / 'demos/lifecycle_py'),
-        module='lifecycle_py.talker'))
-    status, out = launched(
-        prefix, tmp_path, sys.executable, example(tmp_path, 'lifecycle_pub_sub_launch.py'),
-        until='lifecycle_listener --ros-args')
-    assert status == 0, out
-    for text in ("node 'talker' reached the 'inactive' state, 'activating'.",
-                 "node 'talker' reached the 'active' state, launching 'listener'."):
-        assert f'[launch.user]: {text}' in out

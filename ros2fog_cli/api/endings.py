@@ -104,7 +104,7 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
 
 
 def delete_all(
-    entries: Sequence[Entry], store: Store, report: Reporter, *, force: bool = False,
+    entries: Sequence[Entry], store: Store, report: Reporter, *, force: bool,
 ) -> Iterator[tuple[Entry, Optional[FogError]]]:
     """Delete machines in parallel; yield each one when it is done, with its error or None."""
     with ThreadPoolExecutor(min(16, max(1, len(entries))), 'fog-delete') as pool:

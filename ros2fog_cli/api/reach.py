@@ -99,15 +99,13 @@ def session(
         yield shell
 
 
-def through_vpn(
-    entry: Entry, to: Endpoint, timeout: float = 1.5,
-) -> Optional[Endpoint]:
-    """Return an endpoint in the VPN, None if it does not answer within ``timeout`` seconds."""
+def through_vpn(entry: Entry, to: Endpoint) -> Optional[Endpoint]:
+    """Return an endpoint in the VPN, None if it does not answer at once."""
     record = entry.record
     if record is None or record.vpn is None or not record.launch_alive:
         return None
     try:
-        socket.create_connection((record.vpn.address, to.port), timeout=timeout).close()
+        socket.create_connection((record.vpn.address, to.port), timeout=1.5).close()
     except OSError:
         return None
     return dataclasses.replace(to, host=record.vpn.address)

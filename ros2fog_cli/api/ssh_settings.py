@@ -95,10 +95,11 @@ def include(store: Store) -> str:
     return f"Include {_path(f'{root}/machines/*/{FILE}')}"
 
 
-def included(line: str, path: Path = Path('~/.ssh/config')) -> bool:
+def included(line: str) -> bool:
     """Return whether the user's configuration has the line."""
     try:
-        return line in map(str.strip, path.expanduser().read_text().splitlines())
+        config = Path('~/.ssh/config').expanduser()
+        return line in map(str.strip, config.read_text().splitlines())
     except (OSError, ValueError):
         return False
 

@@ -43,9 +43,9 @@ def complete(argument: argparse.Action, names: Callable[[], Iterable[str]]) -> N
         lambda prefix, **_: [name for name in names() if name.startswith(prefix)])
 
 
-def add_name(parser: argparse.ArgumentParser, text: str = "the machine's name") -> None:
+def add_name(parser: argparse.ArgumentParser) -> None:
     """Add the argument ``name``, with completion from the machines that this robot knows."""
-    complete(parser.add_argument('name', help=text), machine_names)
+    complete(parser.add_argument('name', help="the machine's name"), machine_names)
 
 
 def machine_names() -> list[str]:

@@ -66,20 +66,9 @@ def logs(tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
 
 
-def test_launch_file_of_fogros2_is_read(tmp_path):
+def test_launch_file_of_fogros2_is_read_without_a_request(tmp_path):
     path = tmp_path / 'own.launch.py'
-    path.write_text(f'{HEAD}{MACHINES}{TAIL}')
-    check(ros2('launch', str(path), '-s'), '')
-
-
-def test_streams_of_fogros2_may_be_positional():
-    node = fogros2.CloudNode('planner', [('/image', 'h264')], package='p', executable='e')
-    assert node.lists == {'stream_topics': [('/image', 'h264')]}
-
-
-def test_choice_of_region_and_type_makes_no_request(tmp_path):
-    path = tmp_path / 'auto.launch.py'
-    path.write_text(f"""{HEAD}
+    path.write_text(f"""{HEAD}{MACHINES}
     from fogros2 import ec2_instance_type_selection as types, region_ami_selection as places
     region, image = places.find_nearest_region_and_ami({{'us-west-1': {{'ami_image': 'ami-1'}}}})
     kind = types.find_cheapest_ec2_instance_type(region)
@@ -92,6 +81,11 @@ def test_choice_of_region_and_type_makes_no_request(tmp_path):
         'http://127.0.0.1:9'})
     check(shown, '')
     assert 'chosen <the nearest AWS region>' in shown.stdout
+
+
+def test_streams_of_fogros2_may_be_positional():
+    node = fogros2.CloudNode('planner', [('/image', 'h264')], package='p', executable='e')
+    assert node.lists == {'stream_topics': [('/image', 'h264')]}
 
 
 def check(shown: subprocess.CompletedProcess[str], error: str) -> None:

@@ -52,7 +52,8 @@ def test_output_of_nodes_is_in_no_report(log: Path) -> None:
     'PrivateKey = hunter2', 'AccountKey=hunter2;', 'https://x?key=hunter2',
     "{'token': b'hunter2'}", 'Set-Cookie: session=hunter2', 'npm_hunter2hunter2hunter2',
     'SG.hunter2hunter2.hunter2hunter2',
-    'glpat-hunter2HunterHunterHunter', 'AIzaSyhunter2HunterHunterHunterHunter'])
+    'glpat-hunter2HunterHunterHunter', 'AIzaSyhunter2HunterHunterHunterHunter',
+    'eyJhbGciOiJIUzI1NiJ9.hunter2eyJzdWIi.hunter2', 'ASIA0000000HUNTER2AK hunter'])
 def test_secrets_that_programs_write_are_hidden(text: str) -> None:
     environment = {'ROS_EXTRA': text}
     said = bugreport.report([], Store(), environment, Path('/nonexistent'))

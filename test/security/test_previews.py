@@ -12,35 +12,31 @@ from ros2cli.cli import main
 
 from ros2fog_cli.api.preview import Preview
 
-elements = pytest.mark.parametrize('element', [
+
+@pytest.fixture(params=[
     '<include file="{}"/>', '<include file="a$(var x {})"/>', '<arg name="a" default="{}"/>',
     '<let name="a" value="{}"/>', '<set_env name="a" value="{}"/>', '<executable cmd="{}"/>',
     '<node pkg="{}" exec="a"/>', '<node pkg="a" exec="a" if="{}"/>',
     '<node pkg="a" exec="a" if="$(not {})"/>',
     '<group unless="{}"><node pkg="a" exec="b"/></group>',
     '<fog_machine name="m" provider="container" image="{}"/>'])
-
-
-@pytest.fixture
-def made(tmp_path: Path, element: str) -> Path:
+def made(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
     """Return the file that a command of a launch file beside it would make."""
     path = tmp_path / 'made'
-    content = element.format(f"$(command 'touch {path}')")
+    content = request.param.format(f"$(command 'touch {path}')")
     (tmp_path / 'x.launch.xml').write_text(f'<launch>{content}</launch>')
     return path
 
 
-@elements
 def test_plan_runs_no_command_of_a_launch_file(made: Path) -> None:
     file = str(made.with_name('x.launch.xml'))
     list(Preview(get_launch_description_from_any_launch_file(file), {}).lines())
     assert not made.exists()
 
 
-@elements
-@pytest.mark.parametrize('option', ['-s', '-p'])
 @pytest.mark.skipif(find_spec('ros2launch') is not None,
                     reason="ROS 2's own ros2launch evaluates the names of included files")
-def test_launch_shows_a_file_and_runs_no_command_of_it(made: Path, option: str) -> None:
-    assert not main(argv=['launch', str(made.with_name('x.launch.xml')), option])
+def test_launch_shows_a_file_and_runs_no_command_of_it(made: Path) -> None:
+    for option in ('-s', '-p'):
+        assert not main(argv=['launch', str(made.with_name('x.launch.xml')), option])
     assert not made.exists()

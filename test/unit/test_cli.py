@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 import dataclasses
 from decimal import Decimal
+import functools
 import importlib.util
 import json
 import os
@@ -21,7 +22,7 @@ import pytest
 from ros2cli.cli import main
 
 from fogros2 import process, report
-from fogros2.deploy import robot, undo
+from fogros2.deploy import undo
 from fogros2.errors import (
     ConnectError,
     MachineNotFound,
@@ -113,8 +114,9 @@ def alive() -> dict[str, int]:
     return {'pid': os.getpid(), 'pid_start': process_start(os.getpid()) or 0}
 
 
+@functools.cache
 def dead() -> dict[str, int]:
-    child = subprocess.Popen([sys.executable, '-c', ''])
+    child = subprocess.Popen(['true'])
     start = process_start(child.pid) or 1
     child.wait()
     return {'pid': child.pid, 'pid_start': start}
@@ -131,10 +133,6 @@ def lab(monkeypatch: pytest.MonkeyPatch, shell: FakeShell, **changes: Any) -> No
 
 def run(*words: str) -> Any:
     return main(argv=['fog', *words])
-
-
-def entries() -> dict[str, Entry]:
-    return {entry.name: entry for entry in machines.survey(lambda text: None)}
 
 
 def test_list_without_machines(capsys: pytest.CaptureFixture[str]) -> None:
@@ -251,7 +249,8 @@ def test_gc_deletes_machine_whose_id_was_not_saved(capsys: pytest.CaptureFixture
     record('a', machine_id=None, **dead())
     machine('b', 'id-of-a-neighbour')
     record('b', machine_id=None, **{**dead(), 'launch': 'fedcba'})
-    assert entries()['a'].state == 'running (launch gone)'
+    states = {entry.name: entry.state for entry in machines.survey(lambda text: None)}
+    assert states['a'] == 'running (launch gone)'
     assert run('gc') == 0
     assert 'cleared machine a: its launch is gone' in capsys.readouterr().out
     assert [*Memory.machines] == ['id-of-a-neighbour']
@@ -337,25 +336,19 @@ def test_delete_works_with_a_damaged_record() -> None:
     assert not Memory.machines and not folder.exists()
 
 
-def test_delete_all_leaves_other_robots_alone(capsys: pytest.CaptureFixture[str]) -> None:
-    machine('a')
-    machine('b')
-    machine('c', robot='somebody-7')
-    assert run('delete', 'all', '--yes') == 0
+@pytest.mark.parametrize(('name', 'own', 'others'), [
+    ('all', ['a', 'b'], ['--any-robot']),
+    ('c', ['c'], [])])  # from any computer, where none of that name is its own
+def test_delete_prefers_own_machines(
+    capsys: pytest.CaptureFixture[str], name: str, own: list[str], others: list[str],
+) -> None:
+    for each in own:
+        machine(each)
+    machine('c', 'theirs', robot='somebody-7')
+    assert run('delete', name, '--yes') == 0
     assert '1 of other robots left out' in capsys.readouterr().err
-    assert list(Memory.machines) == ['id-c']
-    assert run('delete', 'all', '--yes', '--any-robot') == 0
-    assert not Memory.machines
-
-
-def test_delete_by_name_prefers_own_machine(capsys: pytest.CaptureFixture[str]) -> None:
-    machine('a', 'ours')
-    machine('a', 'theirs', robot='somebody-7')
-    assert run('delete', 'a', '--yes') == 0
     assert list(Memory.machines) == ['theirs']
-    assert '1 of other robots left out' in capsys.readouterr().err
-    # from any computer, where none of that name is its own
-    assert run('delete', 'a', '--yes') == 0
+    assert run('delete', name, '--yes', *others) == 0
     assert not Memory.machines
     assert 'of the robot somebody-7' in capsys.readouterr().out
 
@@ -575,21 +568,6 @@ def test_container_without_an_engine_on_path_is_not_gone(
     assert run('gc') == 1 and Store().exists('a')
 
 
-def test_gc_stops_the_daemon_of_a_kept_machines_launch(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    done: list[str] = []
-    monkeypatch.setattr(robot.ros2_daemon, 'stop', lambda folder: done.append(folder.name))
-    monkeypatch.setattr(robot, 'run', lambda commands, **more: done.extend(
-        ' '.join(command.argv) for command in commands))
-    interface = VpnInterface('fogabc123', '198.18.0.1', '198.18.0.0/24', 51820, '/none')
-    kept = record('a', on_exit='keep', robot_vpn=interface, **dead())
-    endings.let_go(kept, machine('a'), Store())
-    # the daemon is a node with the interface
-    assert done[0] == 'abc123' and 'fogabc123' in done[-1]
-    assert Store().load('a').launch == ''
-
-
 def test_leftover_launch_folders_are_found_by_their_process() -> None:
     store = Store()
     rebooted = {**alive(), 'boot': 'another'}
@@ -715,14 +693,6 @@ def test_sizes_and_costs_have_units() -> None:
     assert [report.size(n) for n in (0, 999, 1000, 1.5e9, 3e13)] == [
         '0 B', '999 B', '1.0 kB', '1.5 GB', '30.0 TB']
     assert table.cost(None) == '-' and table.cost(Decimal('1.5')) == '$1.5000'
-
-
-def test_no_verb_prints_the_help(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run() == 0
-    said = capsys.readouterr().out
-    for verb in ('connect', 'dashboard', 'delete', 'doctor', 'env', 'gc', 'image', 'list', 'logs',
-                 'price', 'regions', 'shell', 'status'):
-        assert verb in said
 
 
 def test_help_imports_no_core(tmp_path: Path) -> None:

@@ -69,9 +69,6 @@ def complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Complete:
     ('ros2 fog doctor --provider ', [
         'aws', 'azure', 'cheapest', 'container', 'gcp', 'hosted', 'joined', 'kubernetes', 'ssh']),
     ('ros2 launch --machine ma', ['mapper=']),
-    ('ros2 launch --machine mapper=', [
-        'mapper=aws', 'mapper=azure', 'mapper=cheapest', 'mapper=container', 'mapper=gcp',
-        'mapper=joined', 'mapper=kubernetes', 'mapper=robot', 'mapper=ssh']),
 ])
 def test_command_line_is_completed(complete: Complete, line: str, offered: list[str]) -> None:
     assert sorted(word for word in complete(line) if not word.startswith('-')) == offered

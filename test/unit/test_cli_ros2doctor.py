@@ -56,7 +56,7 @@ def module(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     del sys.modules['ros2fog_cli.ros2doctor']
 
 
-def test_ros2_doctor_counts_failures_and_warnings(module: Any) -> None:
+def test_ros2_doctor_counts_and_reports_every_check(module: Any) -> None:
     check = module.FogCheck()
     with pytest.warns(UserWarning) as said:
         result = check.check()
@@ -64,9 +64,6 @@ def test_ros2_doctor_counts_failures_and_warnings(module: Any) -> None:
     assert [str(one.message) for one in said] == [
         'FogROS2, two: is old (get a newer one)', 'ERROR: FogROS2, three: is away (get one)']
     assert check.category() == module.FogReport().category() == 'fogros2'
-
-
-def test_ros2_doctor_reports_every_check(module: Any) -> None:
     report = module.FogReport().report()
     assert report.name == 'FOGROS2'
     assert report.items == [

@@ -107,7 +107,7 @@ def test_workspace_wins_over_user_and_overlay_over_underlay(own, tmp_path, monke
     ("[aws]\nregoin = 'x'", r"\[aws\] has no 'regoin'", "did you mean 'region'?"),
     ("on_exit = 'keep'", "has no 'on_exit'", ''), ("name = 'a'", "has no 'name'", ''),
     ("[ssh]\nhost = 'a'", "has no 'host'", ''),
-    ('lifetime = [1]', 'wrong type', ''), ("ssh_from = 'a'", 'wrong type', 'list'),
+    ('lifetime = [1]', 'wrong type', ''), ("ssh_from = 'a'", 'is no list', "ssh_from=['a']"),
     ('[aws]\ndisk_size = true', 'wrong type', 'number'),
     ('lifetime = ', "can't be read", 'TOML'), (f"x = {'[' * 5000}", "can't be read", ''),
     ("lifetime = 'soon'", 'lifetime', ''), ("on_loss_after = 'soon'", 'on_loss_after', '')])

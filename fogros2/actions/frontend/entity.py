@@ -6,20 +6,19 @@ from __future__ import annotations
 import ast
 from collections.abc import Callable, Iterable, Mapping
 import re
-from typing import Any, List, Optional, TYPE_CHECKING, Union
+from typing import Any, List, Optional, Union
+
+from launch import Substitution
+from launch.frontend import Entity, Parser
+from launch.substitutions import TextSubstitution
 
 from fogros2.describe import keywords, kinds, values
 from fogros2.errors import ConfigurationError
 
-if TYPE_CHECKING:
-    from launch import Substitution
-    from launch.frontend import Entity, Parser
-
-    #: A text, or substitutions to resolve later.
-    ParsedText = Union[str, list[Substitution]]
-    #: The class of an action, and its constructor's keywords.
-    Parsed = tuple[type[Any], dict[str, Any]]
-
+#: A text, or substitutions to resolve later.
+ParsedText = Union[str, list[Substitution]]
+#: The class of an action, and its constructor's keywords.
+Parsed = tuple[type[Any], dict[str, Any]]
 #: The parsers' error about attributes that were not read: ``... found in `node`: {'a', 'b'}``.
 _UNREAD = re.compile(r'found in `.*?`: (\{.*\})', re.DOTALL)
 #: Attributes of every action.
@@ -31,7 +30,6 @@ _EXPECTED = {
 
 def text(parser: Parser, raw: str) -> ParsedText:
     """Parse a text as launch does: a plain string, or substitutions to resolve later."""
-    from launch.substitutions import TextSubstitution
     parts: list[Substitution] = parser.parse_substitution(raw)
     plain = [part.text for part in parts if isinstance(part, TextSubstitution)]
     return ''.join(plain) if len(plain) == len(parts) else parts
@@ -122,17 +120,12 @@ def children(entity: Entity, name: str) -> list[Entity]:
     """
     try:
         elements: Optional[list[Entity]] = entity.get_attr(
-            name, data_type=_list_of_entities(), optional=True)
+            name, data_type=List[Entity], optional=True)
     except TypeError as error:
         raise ConfigurationError(
             f"{entity.type_name}: '{name}' is no list of elements",
             'write - {name: ..., value: ...} for each') from error
     return elements or []
-
-
-def _list_of_entities() -> Any:
-    from launch.frontend import Entity
-    return List[Entity]
 
 
 def _mapping(entity: Entity, parser: Parser, keyword: kinds.Keyword) -> Any:
@@ -173,4 +166,4 @@ def complete(entity: Entity, known: Iterable[str], what: str = '') -> None:
         names = sorted(ast.literal_eval(match[1])) if match is not None else []
         if not names:
             raise ConfigurationError(str(error), 'take it out') from error
-        raise keywords.unknown(what or entity.type_name, names[0], known) from error
+        raise kinds.unknown(what or entity.type_name, names[0], known) from error

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Optional, TYPE_CHECKING
+from collections.abc import Iterable, Mapping
+from typing import Any, Optional
 
 from launch import Action
 from launch.actions import GroupAction
+from launch.frontend import Entity, Parser
 
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.fog_machine import FogMachine
@@ -16,18 +18,14 @@ from fogros2.actions.frontend.entity import (
     children,
     complete,
     CONDITIONS,
-    text,
+    Parsed,
     value,
 )
 from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, LifecycleNode, Node
 from fogros2.describe import features, keywords
+from fogros2.describe.kinds import Keyword
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.launch_internals.parsers import scoped
-
-if TYPE_CHECKING:
-    from launch.frontend import Entity, Parser
-
-    from fogros2.actions.frontend.entity import Parsed
 
 #: Attributes and elements of nodes that launch_ros reads.
 _NODE = (
@@ -51,17 +49,28 @@ def fog_machine(entity: Entity, parser: Parser) -> Parsed:
         # the provider is resolved when the action is executed: accept the keywords of all
         parameters = {name: keyword for each in keywords.providers() if _loads(each)
                       for name, keyword in keywords.keywords(keywords.machine_class(each)).items()}
-    contents = {name: value(entity, parser, keyword) for name, keyword in parameters.items()}
+    given = _given(entity, parser, parameters)
     items = features.machine_lists()
-    _, lists = separate(
-        parser.parse_action(child) for item in items for child in children(entity, item))
+    given.update(_items(entity, parser, items))
     what = f"a fog_machine of the provider '{provider}'" if isinstance(provider, str) else ''
     complete(entity, (*parameters, 'provider', *items, *CONDITIONS), what)
-    if contents['name'] is None:
+    if 'name' not in given:
         raise ConfigurationError('a fog_machine needs a name', 'its nodes say machine="that name"')
-    kwargs.update(provider=provider, given={**{
-        name: content for name, content in contents.items() if content is not None}, **lists})
-    return FogMachine, kwargs
+    return FogMachine, {**kwargs, 'provider': provider, 'given': given}
+
+
+def _given(
+    entity: Entity, parser: Parser, parameters: Mapping[str, Keyword],
+) -> dict[str, Any]:
+    """Return the values of the keywords that an element has."""
+    contents = {name: value(entity, parser, keyword) for name, keyword in parameters.items()}
+    return {name: content for name, content in contents.items() if content is not None}
+
+
+def _items(entity: Entity, parser: Parser, names: Iterable[str]) -> dict[str, list[Any]]:
+    """Return the items of features' lists by keyword, from child elements with these names."""
+    return separate(
+        parser.parse_action(child) for name in names for child in children(entity, name))[1]
 
 
 def _loads(provider: str) -> bool:
@@ -83,12 +92,9 @@ def node(entity: Entity, parser: Parser, cls: type[Node]) -> Parsed:
     _, kwargs = cls.parse(entity, parser)
     kwargs['machine'] = _machine(entity, parser)
     parameters = features.keywords('node_options')
-    contents = {name: value(entity, parser, keyword) for name, keyword in parameters.items()}
-    kwargs.update({name: content for name, content in contents.items() if content is not None})
+    kwargs.update(_given(entity, parser, parameters))
     items = features.node_lists().values()
-    _, lists = separate(
-        parser.parse_action(child) for item in items for child in children(entity, item))
-    kwargs.update(lists)
+    kwargs.update(_items(entity, parser, items))
     complete(entity, ('machine', *items, *parameters, *_NODE, *CONDITIONS))
     return cls, kwargs
 
@@ -127,10 +133,8 @@ def _machine(entity: Entity, parser: Parser) -> Any:
 def fogros_launch(entity: Entity, parser: Parser) -> Parsed:
     """Read ``<fogros_launch robot_nodes="after_cloud" dds="fastdds">`` with its content."""
     _, kwargs = Action.parse(entity, parser)
-    for name in ('robot_nodes', 'dds'):
-        value = entity.get_attr(name, optional=True)
-        if value is not None:
-            kwargs[name] = text(parser, value)
+    kwargs.update(_given(entity, parser, {
+        name: Keyword(name, 'text') for name in ('robot_nodes', 'dds')}))
     below = scoped(parser, _node_with_machine)
     kwargs['actions'], lists = separate(map(below.parse_action, entity.children))
     kwargs.update(lists)
