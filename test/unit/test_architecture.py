@@ -73,6 +73,16 @@ SDKS = {'boto3': 'provider', 'botocore': 'provider', 'kubernetes': 'kubernetes_c
 #: Found by their entry points, or started by the user: the core imports none of them.
 ABOVE = ('fogros2_features', 'fogros2_monitor', 'fogros2_replicas', 'fogros2_share',
          'fogros2_testing', 'ros2fog_cli', 'rigs')
+#: Names of features that the core had, and clouds may have. Only ever add some.
+MOVED = (
+    'StreamTopic', 'image_transport', 'republish(ers)?', r'[Cc]heckpoint\w*', r'[Rr]eplacer\w*',
+    r'Replacement\w*', 'drained', r'\w*[Gg]uest\w*', '[Ii]nvit(e|ed|ations?)', 'JoinedMachine',
+    r'[Ff]oxglove\w*', r'\w*[Mm]onitor(ed|_\w+)?', '[Dd]ashboard',
+    r'[Rr]eplic\w*', 'first_answer', 'HostedProvider', 'served', 'shared topics',
+    r'\w*docker_(containers?|lines)', 'container_scripts', 'has_image',
+    r'Cheapest\w*', r'find_cheapest\w*', 'Market', 'Wants', 'Offers?', 'bake', 'delete_image',
+    r'(Image|Volume)Keeper')
+CLOUDS = {'aws', 'azure', 'gcp', 'kubernetes'}
 #: All of the core but the import of types.
 BUT_TYPES = r'fogros2(?! import ros_types$)'
 
@@ -221,6 +231,12 @@ def test_core_names_no_keyword_of_a_feature() -> None:
         assert not re.search(rf'\b({pattern})', text(path)), path
 
 
+def test_core_names_nothing_that_has_moved_to_a_feature() -> None:
+    for path in python_files(CORE):
+        if not CLOUDS & {*path.parts}:
+            assert not re.search(rf"\b({'|'.join(MOVED)})\b", text(path)), path
+
+
 def plugin(module: str) -> str:
     """Return the plugin that a module belongs to, '' for none."""
     unit = '.'.join(module.split('.')[:3])
@@ -243,6 +259,19 @@ def test_ros_and_sdks_are_imported_by_their_parts() -> None:
             assert words[0] not in ROS or own in ROS_ALLOWED, f'{path} imports {name}'
             if words[0] in SDKS:
                 assert own == SDKS[words[0]], f'{path} imports {name}'
+
+
+def test_verb_imports_nothing_slow_before_it_runs() -> None:
+    """``ros2 fog -h`` loads all verbs; one of them must not bring an SDK or the core with it."""
+    for path in (*python_files(ROOT / 'ros2fog_cli' / 'verb'),
+                 *(ROOT / 'fogros2_features').glob('*/verbs.py'),
+                 ROOT / 'fogros2_monitor' / 'verbs.py'):
+        for name, early in imports(path):
+            if early:
+                assert name.split('.')[0] in (
+                    'ros2fog_cli', 'ros2cli', '__future__', 'abc', 'argparse', 'dataclasses',
+                    'json', 'shlex', 'sys', 'time', 'typing'), f'{path.name} imports {name}'
+                assert 'ros2fog_cli.api' not in name, f'{path.name} imports {name}'
 
 
 def test_agent_imports_the_standard_library_only() -> None:

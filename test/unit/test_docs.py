@@ -17,7 +17,9 @@ import pytest
 import fogros2
 from fogros2.describe import overrides
 from fogros2.provider import Capabilities, Provider
+from fogros2.provider.kubernetes import manifests
 from fogros2.provider.vm.cloud import VmCloud
+from fogros2.waiting import Timeouts
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'doc').rglob('*.md'))]
@@ -154,6 +156,17 @@ def test_manual_has_at_most_25000_words():
 
 def test_change_log_has_at_most_600_words():
     assert len((ROOT / 'CHANGELOG.rst').read_text().split()) <= 600
+
+
+@pytest.mark.parametrize('page', [
+    'README.md', 'doc/machines.md', 'doc/safety.md', 'doc/developers/security.md',
+    'doc/developers/machine_life.md',
+    'doc/troubleshooting.md', 'fogros2/describe/machines.py'])
+def test_end_of_a_machine_that_was_never_reached_is_stated(page):
+    text = ' '.join(re.sub(r'\]\(.*?\)', '', (ROOT / page).read_text()).split())
+    allowance = Timeouts()
+    assert f'{(allowance.boot + allowance.ssh) / 60:g} minutes after' in text
+    assert f'a pod: {manifests.BOOT / 60:g}' in text
 
 
 def test_all_benchmark_results_are_listed():
