@@ -23,8 +23,6 @@ from rigs.computers.network import ROBOT
 from rigs.launched import launching
 
 HERE = Path(__file__).parent
-BOX = 'test_ec2_box.py'
-
 
 #: What is tried on ROS 2 as well as on the embedded default: what its launch and nodes have a part
 #: in. All else is the cloud's and the box's, the same on either, and takes minutes.
@@ -38,11 +36,11 @@ ON_BOTH = (
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave to the embedded default what is the same there, unless it is asked for by name."""
     embedded = any(found.name == 'ros2-embedded' for found in metadata.distributions())
-    named = any('clouds' in word or 'ec2' in word for word in config.args)
+    named = any('clouds' in word for word in config.args)
     if embedded or named or config.option.keyword:
         return
-    left = [item for item in items if item.path.parent == HERE or item.path.name == BOX
-            if getattr(item, 'originalname', item.name) not in ON_BOTH]
+    left = [item for item in items if item.path.parent == HERE
+            and getattr(item, 'originalname', item.name) not in ON_BOTH]
     items[:] = [item for item in items if item not in left]
     config.hook.pytest_deselected(items=left)
 
@@ -78,7 +76,7 @@ def box(cloud: Cloud, engine: str) -> Iterator[Any]:
 @pytest.fixture
 def robot(cloud: Cloud, box: Any, tmp_path: Path) -> Iterator[Robot]:
     """Yield a robot; when the test ends, nothing that somebody would pay for is left."""
-    box.heal()
+    box.slow()
     box.forget_calls()
     box.set_boot_delay(0.0)
     cloud.reset(box)

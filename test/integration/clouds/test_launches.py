@@ -336,7 +336,7 @@ def test_machine_that_appears_after_its_launch_is_cleared(cloud, robot, box, nam
     early = robot.ros2('fog', 'gc')
     assert f"could not clear machine {name}-killed: '{name}-killed' may still appear" \
         in early.stdout and early.returncode == 1
-    box.heal()
+    box.slow()
     wait_until(lambda: box.held() == 0, timeout=60, what='the requests to be carried out')
     assert len(box.alive()) == (2 if cloud.name == 'gcp' else 0)
     late = robot.ros2('fog', 'gc')

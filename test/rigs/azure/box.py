@@ -25,18 +25,6 @@ class AzureBox(Box):
         """Return the variables by which programs on the robot take the box for Azure."""
         return service.environment(self.inside)
 
-    def fail(self, code: str, **words: Any) -> None:
-        """
-        Answer the next fitting requests with an error, or let their operation fail.
-
-        :param words: the other fields of :class:`rigs.azure.service.Fault`.
-        """
-        self._ask({'do': 'fault', 'fault': {'code': code, **words}})
-
-    def interrupt(self, instance: str, *, notice: float = 30.0) -> None:
-        """Take a spot machine away, with an event ``notice`` seconds before."""
-        self._ask({'do': 'interrupt', 'instance': instance, 'notice': notice})
-
     def set_rights(self, *, owner: bool, propagation: float = 0.0) -> None:
         """Let the user be an owner or a contributor; a role works after ``propagation`` s."""
         self._ask({'do': 'rights', 'owner': owner, 'propagation': propagation})

@@ -10,6 +10,7 @@ import hashlib
 import json
 import sys
 import threading
+import time
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -136,7 +137,9 @@ class Cloud(cloud.Cloud, service.Computers):
             if path == 'scheduledevents':
                 events = [{'EventId': '1', 'EventType': 'Preempt', 'ResourceType':
                            'VirtualMachine', 'Resources': [vm['name']], 'EventStatus':
-                           'Scheduled', 'NotBefore': machine.notice}] if machine.notice else []
+                           'Scheduled', 'NotBefore': time.strftime(
+                               '%a, %d %b %Y %H:%M:%S GMT', time.gmtime(machine.notice))},
+                          ] if machine.notice else []
                 return 200, {'DocumentIncarnation': len(events), 'Events': events}
             return 404, {'error': 'Not found'}
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-import time
 from typing import Any
 
 from fogros2.waiting import Periodic
@@ -44,18 +43,10 @@ class Box(server.Box):
                 'zone': '', 'public': machine.public, 'private': machine.private,
                 'reason': machine.reason, 'tags': dict(vm.get('tags', {}))}
 
-    def fault(self, **words: Any) -> Any:
-        """Return an error to order."""
-        return service.Fault(**words)
-
     def do(self, order: Mapping[str, Any]) -> Any:
-        """Announce an eviction, change the user's rights, or show all resources."""
+        """Change the user's rights, delete all groups, or show all resources."""
         what = order['do']
-        if what == 'interrupt':
-            when = time.strftime('%a, %d %b %Y %H:%M:%S GMT',
-                                 time.gmtime(time.time() + order['notice']))
-            self.cloud.interrupt(order['instance'], notice=order['notice'], when=when)
-        elif what == 'rights':
+        if what == 'rights':
             self.api.rights = service.OPERATOR if order['owner'] else service.CONTRIBUTOR
             self.api.propagation = order['propagation']
         elif what == 'things':

@@ -73,28 +73,24 @@ class Box:
     It takes root (or sudo without a password), podman and ``werkzeug``. All of it goes when
     the block ends, or the process of the test, however that happens.
 
-    :param boot_delay: seconds from the request until an instance's first process starts.
     :param mounts: folders of this computer that every instance sees, read-only; None for this
         Python environment and ROS 2, as an image made for it would have them.
-    :param regions: whose API hosts the robot can connect to, for who measures which is near.
     :param volumes: an instance may mount disks, which are loop devices of this computer.
     """
 
     #: Module of the process.
     SERVER: ClassVar[str]
-    #: Regions whose API hosts the robot can connect to unless said otherwise.
+    #: Regions whose API hosts the robot can connect to.
     REGIONS: ClassVar[Sequence[str]]
 
     def __init__(
-        self, *, boot_delay: float = 0.0, mounts: Optional[Sequence[str]] = None,
-        regions: Sequence[str] = (), volumes: bool = False,
+        self, *, mounts: Optional[Sequence[str]] = None, volumes: bool = False,
     ) -> None:
         self.mark = secrets.token_hex(2)
         self.endpoint = ''
         self.robot = ''
         self._settings = {
-            'mark': self.mark, 'boot_delay': boot_delay,
-            'regions': list(regions or self.REGIONS), 'volumes': volumes,
+            'mark': self.mark, 'regions': list(self.REGIONS), 'volumes': volumes,
             'mounts': container_root.environment_mounts(None) if mounts is None
             else list(mounts)}
         self._child: Optional[subprocess.Popen[str]] = None
@@ -242,13 +238,12 @@ class Box:
 
     # -- what goes wrong ------------------------------------------------------------------
 
-    def heal(self) -> None:
-        """Order no more errors, and no slow answers."""
-        self._ask({'do': 'clear_faults'})
-        self.slow('', 0.0)
+    def interrupt(self, instance: str, *, notice: float) -> None:
+        """Take a spot instance away, told to it ``notice`` seconds before."""
+        self._ask({'do': 'interrupt', 'instance': instance, 'notice': notice})
 
-    def slow(self, pattern: str, seconds: float) -> None:
-        """Carry out requests so late whose method, path and body fit the pattern."""
+    def slow(self, pattern: str = '', seconds: float = 0.0) -> None:
+        """Carry out requests so late whose method, path and body fit the pattern; '' for none."""
         self._ask({'do': 'slow', 'pattern': pattern, 'seconds': seconds})
 
     def held(self) -> int:

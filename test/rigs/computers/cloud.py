@@ -44,7 +44,7 @@ class Machine:
     :param instance: the API's own object.
     :param disk_of: image that its disk is a copy of.
     :param wanted: run, stop or terminate; ``news`` is set when it changes.
-    :param notice: what the metadata service says of an interruption.
+    :param notice: when it is interrupted (seconds since the epoch); 0 while nobody knows.
     :param asked: when it was told to start (seconds since the epoch); ``ready`` when its SSH
         server answered.
     """
@@ -61,7 +61,7 @@ class Machine:
     private: str = ''
     space: str = ''
     host: Optional[network.Host] = None
-    notice: str = ''
+    notice: float = 0.0
     runs: bool = False
     again: bool = False
     asked: float = 0.0
@@ -76,18 +76,17 @@ class Cloud(abc.ABC):
     The computers of a box.
 
     :param mark: the box; on everything that it makes.
-    :param boot_delay: seconds from the request until an instance's first process starts.
     :param mounts: folders of this computer that every instance sees, read-only.
     :param volumes: instances may mount disks.
     """
 
     def __init__(
-        self, mark: str, net: network.Network, *, boot_delay: float, mounts: tuple[str, ...],
-        volumes: bool = False,
+        self, mark: str, net: network.Network, *, mounts: tuple[str, ...], volumes: bool = False,
     ) -> None:
         self.mark = mark
         self.net = net
-        self.boot_delay = boot_delay
+        #: Seconds from the request until an instance's first process starts.
+        self.boot_delay = 0.0
         self.disks = computer.DISKS / mark
         self.addresses = network.Addresses()
         self.machines: dict[str, Machine] = {}
@@ -191,9 +190,9 @@ class Cloud(abc.ABC):
         machine.cutting.daemon = True
         machine.cutting.start()
 
-    def interrupt(self, number: str, *, notice: float, when: str) -> None:
+    def interrupt(self, number: str, notice: float) -> None:
         """Announce that a spot instance is taken away, and take it ``notice`` seconds later."""
-        self.machines[number].notice = when
+        self.machines[number].notice = time.time() + notice
         timer = threading.Timer(notice, self.end, (number, 'terminate', BY_SPOT))
         timer.daemon = True
         timer.start()

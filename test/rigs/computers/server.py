@@ -63,7 +63,7 @@ class Box(abc.ABC):
     """
     One box.
 
-    :param settings: ``mark``, ``boot_delay``, ``mounts`` and ``regions``.
+    :param settings: ``mark``, ``mounts``, ``regions`` and ``volumes``.
     """
 
     #: Host of a region's API, with ``{}`` for the region.
@@ -76,20 +76,16 @@ class Box(abc.ABC):
 
     def computers(self, kind: type[Computers]) -> Computers:
         """Return the computers, of a cloud's class."""
-        return kind(self.mark, self.net, boot_delay=float(self.settings['boot_delay']),
-                    mounts=tuple(self.settings['mounts']), volumes=self.settings['volumes'])
+        return kind(self.mark, self.net, mounts=tuple(self.settings['mounts']),
+                    volumes=self.settings['volumes'])
 
     @abc.abstractmethod
     def open(self) -> tuple[Cloud, Any]:
-        """Return the computers, and the API: a WSGI application with ``faults`` and ``calls``."""
+        """Return the computers, and the API: a WSGI application with ``calls``."""
 
     @abc.abstractmethod
     def shown(self, machine: Any) -> dict[str, Any]:
         """Return what the parent gets of an instance."""
-
-    @abc.abstractmethod
-    def fault(self, **words: Any) -> Any:
-        """Return an error to order."""
 
     def do(self, order: Mapping[str, Any]) -> Any:
         """Carry out an order that only this cloud knows."""
@@ -146,11 +142,7 @@ class Box(abc.ABC):
 
     def _do(self, order: Mapping[str, Any]) -> Any:
         what = order['do']
-        if what == 'fault':
-            self.api.faults.append(self.fault(**order['fault']))
-        elif what == 'clear_faults':
-            self.api.faults.clear()
-        elif what == 'calls':
+        if what == 'calls':
             return [dataclasses.asdict(call) for call in list(self.api.calls)]
         elif what == 'clear_calls':
             self.api.calls.clear()
@@ -163,6 +155,8 @@ class Box(abc.ABC):
                 order['script'], check=order['check'])
         elif what == 'user data':
             return self.cloud.user_data(self.cloud.machines[order['instance']]).hex()
+        elif what == 'interrupt':
+            self.cloud.interrupt(order['instance'], order['notice'])
         elif what == 'move_robot':
             self.net.move_robot(order['address'])
         elif what == 'slow':

@@ -46,38 +46,15 @@ class Ec2Box(Box):
         }
 
     def publish(
-        self, image: str, *, region: str, name: str = 'published', architecture: str = 'x86_64',
-        files: Optional[Mapping[str, str]] = None,
+        self, image: str, *, region: str, files: Optional[Mapping[str, str]] = None,
     ) -> None:
         """
         Let a region have a public AMI of this id, a fresh disk as Ubuntu's is.
 
         :param files: programs that it has besides, or in the place of others: path and text.
         """
-        self._ask({'do': 'publish', 'image': image, 'region': region, 'name': name,
-                   'architecture': architecture, 'files': dict(files or {})})
-
-    def fail(
-        self, code: str, *, action: str = '', region: str = '', message: str = '',
-        times: int = 1, after: bool = False, **params: str,
-    ) -> None:
-        """
-        Answer the next fitting requests with an error.
-
-        :param code: AWS's, such as InsufficientInstanceCapacity, VcpuLimitExceeded,
-            RequestLimitExceeded, UnauthorizedOperation, ExpiredToken.
-        :param action: such as RunInstances; '' for every request.
-        :param times: 0 for always, until ``heal``.
-        :param after: carry the request out, and lose the answer.
-        :param params: the request's parameters that have to be so, ``InstanceType='t3.medium'``.
-        """
-        self._ask({'do': 'fault', 'fault': {
-            'code': code, 'action': action, 'region': region, 'message': message,
-            'times': times, 'after': after, 'params': params}})
-
-    def interrupt(self, instance: str, *, notice: float = 120.0) -> None:
-        """Take a spot instance away, told to it ``notice`` seconds before."""
-        self._ask({'do': 'interrupt', 'instance': instance, 'notice': notice})
+        self._ask({'do': 'publish', 'image': image, 'region': region,
+                   'files': dict(files or {})})
 
 
 __all__ = ['Call', 'Ec2Box', 'Instance']

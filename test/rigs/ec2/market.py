@@ -15,7 +15,7 @@ from decimal import Decimal
 import hashlib
 import json
 import re
-from typing import Any, Optional
+from typing import Optional
 
 #: Regions that every account has; the others have to be enabled first, which nobody has done.
 ENABLED = (
@@ -73,41 +73,17 @@ def spot_price(region: str, kind: str, zone: str) -> Optional[Decimal]:
     return (whole * _SPOT_SHARES[ord(zone[-1]) % 3]).quantize(Decimal('0.000001'))
 
 
-def products(
-    wanted: Mapping[str, str], types: Mapping[str, Mapping[str, Any]],
-    regions: Iterable[str],
-) -> Iterator[str]:
-    """
-    Yield GetProducts' entries, JSON each, whose attributes are the ``wanted`` ones.
-
-    :param types: what DescribeInstanceTypes knows of each.
-    """
-    for region in regions:
-        for kind in PRICES:
-            facts = types.get(kind, {})
-            for system in ('Linux', 'Windows'):
-                attributes = _attributes(region, kind, system, facts)
-                if all(attributes.get(field) == value for field, value in wanted.items()):
-                    yield _product(region, kind, system, attributes)
-
-
-def _attributes(
-    region: str, kind: str, system: str, facts: Mapping[str, Any],
-) -> dict[str, str]:
-    memory = facts.get('MemoryInfo', {}).get('SizeInMiB', 0) / 1024
-    gpus = facts.get('GpuInfo', {}).get('Gpus', [])
-    found = {
-        'servicecode': 'AmazonEC2', 'regionCode': region, 'location': region,
-        'locationType': 'AWS Region', 'instanceType': kind, 'operatingSystem': system,
-        'tenancy': 'Shared', 'preInstalledSw': 'NA', 'capacitystatus': 'Used',
-        'marketoption': 'OnDemand', 'currentGeneration': 'Yes',
-        'licenseModel': 'No License required', 'operation': 'RunInstances',
-        'vcpu': str(facts.get('VCpuInfo', {}).get('DefaultVCpus', 0)),
-        'memory': f'{memory:g} GiB',
-    }
-    if gpus:
-        found['gpu'] = str(sum(int(gpu.get('Count', 1)) for gpu in gpus))
-    return found
+def products(wanted: Mapping[str, str]) -> Iterator[str]:
+    """Yield GetProducts' entries, JSON each, whose attributes are the ``wanted`` ones."""
+    region = wanted['regionCode']
+    for kind in PRICES:
+        for system in ('Linux', 'Windows'):
+            attributes = {
+                'regionCode': region, 'instanceType': kind, 'operatingSystem': system,
+                'tenancy': 'Shared', 'preInstalledSw': 'NA', 'capacitystatus': 'Used',
+                'marketoption': 'OnDemand'}
+            if all(attributes.get(field) == value for field, value in wanted.items()):
+                yield _product(region, kind, system, attributes)
 
 
 def _product(region: str, kind: str, system: str, attributes: Mapping[str, str]) -> str:
@@ -120,13 +96,8 @@ def _product(region: str, kind: str, system: str, attributes: Mapping[str, str])
         'serviceCode': 'AmazonEC2',
         'terms': {'OnDemand': {term: {
             'priceDimensions': {rate: {
-                'unit': 'Hrs', 'rateCode': rate, 'appliesTo': [], 'beginRange': '0',
-                'endRange': 'Inf', 'pricePerUnit': {'USD': f'{cost:.10f}'},
-                'description': f'${cost} per On Demand {system} {kind} Instance Hour'}},
-            'sku': sku, 'offerTermCode': 'JRTCKXETXF', 'termAttributes': {},
-            'effectiveDate': '2026-01-01T00:00:00Z'}}},
-        'version': '1', 'publicationDate': '2026-01-01T00:00:00Z',
-    })
+                'unit': 'Hrs', 'rateCode': rate, 'pricePerUnit': {'USD': f'{cost:.10f}'}}},
+            'sku': sku, 'offerTermCode': 'JRTCKXETXF'}}}})
 
 
 def spot_history(

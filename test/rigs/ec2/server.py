@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import os
-import time
 from typing import Any
 
 from rigs.computers import computer, server
@@ -41,21 +40,13 @@ class Box(server.Box):
             'private': instance.private_ip or '', 'reason': instance.state_reason.code or '',
             'tags': {tag['key']: tag['value'] for tag in instance.get_tags()}}
 
-    def fault(self, **words: Any) -> Any:
-        """Return an error to order."""
-        from rigs.ec2.api import Fault
-        return Fault(**words)
-
     def do(self, order: Mapping[str, Any]) -> Any:
-        """Interrupt a spot instance, or publish an image."""
+        """Publish an image."""
         from rigs.ec2 import hooks
         from rigs.ec2.market import PublicImage
-        if order['do'] == 'interrupt':
-            when = time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime(time.time() + order['notice']))
-            self.cloud.interrupt(order['instance'], notice=order['notice'], when=when)
-        elif order['do'] == 'publish':
+        if order['do'] == 'publish':
             hooks.publish(order['region'], PublicImage(
-                order['image'], order['name'], order['architecture'], '099720109477'))
+                order['image'], 'published', 'x86_64', '099720109477'))
             if order['files']:
                 computer.new_disk(self.cloud.disks / order['image'])
                 computer.put_files(self.cloud.disks / order['image'], order['files'])

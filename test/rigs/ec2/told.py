@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping, Sequence
 import json
+import time
 from typing import Any
 
 from rigs.computers import cloud_config, network
@@ -18,17 +19,18 @@ def plan(instance: Any) -> dict[str, Any]:
             'keys': _public_keys(instance)}
 
 
-def values(instance: Any, notice: str) -> dict[str, str]:
+def values(instance: Any, notice: float) -> dict[str, str]:
     """
     Return what the metadata service knows, by path below ``/latest/``.
 
-    :param notice: when a spot instance will be taken away, '' while nobody has said so.
+    :param notice: when a spot instance will be taken away (seconds since the epoch), else 0.
     """
     return {
         'meta-data/instance-id': instance.id,
         'meta-data/placement/region': instance.region_name,
         **({'meta-data/spot/instance-action': json.dumps(
-            {'action': 'terminate', 'time': notice})} if notice else {})}
+            {'action': 'terminate', 'time': time.strftime(
+                '%Y-%m-%dT%H:%M:%SZ', time.gmtime(notice))})} if notice else {})}
 
 
 def allowed(

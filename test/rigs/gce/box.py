@@ -60,20 +60,3 @@ class GceBox(Box):
         """Return a firewall rule."""
         found: dict[str, Any] = self._ask({'do': 'firewall', 'name': name})
         return found
-
-    def fail(
-        self, code: str, *, action: str = '', message: str = '', times: int = 1,
-        after: bool = False, **params: str,
-    ) -> None:
-        """
-        Answer the next fitting requests with an error; see :class:`rigs.gce.api.Fault`.
-
-        :param times: 0 for always, until ``heal``.
-        """
-        self._ask({'do': 'fault', 'fault': {
-            'code': code, 'action': action, 'message': message, 'times': times, 'after': after,
-            'params': params}})
-
-    def interrupt(self, instance: str, *, notice: float = 30.0) -> None:
-        """Preempt a spot instance, told to it ``notice`` seconds before."""
-        self._ask({'do': 'interrupt', 'instance': instance, 'notice': notice})

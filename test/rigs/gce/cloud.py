@@ -111,7 +111,7 @@ class Hollow(Cloud):
     """Instances without computers, for tests of the API alone."""
 
     def __init__(self) -> None:
-        super().__init__('hollow', None, boot_delay=0.0, mounts=())  # type: ignore[arg-type]
+        super().__init__('hollow', None, mounts=())  # type: ignore[arg-type]
 
     def _live(self, machine: Machine) -> None:
         if not machine.news.wait(self.boot_delay):

@@ -377,14 +377,6 @@ class Project:
         self.cloud.end(instance['id'], 'terminate' if instance['scheduling'].get(
             'instanceTerminationAction') == 'DELETE' else 'stop')
 
-    def preempt(self, number: str, notice: float) -> None:
-        """Take a spot instance away after a notice."""
-        machine = self.cloud.machines[number]
-        machine.notice = 'TRUE'
-        timer = threading.Timer(notice, self._over, (machine.instance,))
-        timer.daemon = True
-        timer.start()
-
     def _state(self, instance: Mapping[str, Any]) -> str:
         return self.cloud.machines[instance['id']].state
 

@@ -34,16 +34,9 @@ class Box(server.Box):
             'public': machine.public, 'private': machine.private, 'reason': machine.reason,
             'tags': instance['labels']}
 
-    def fault(self, **words: Any) -> Any:
-        """Return an error to order."""
-        from rigs.gce.api import Fault
-        return Fault(**words)
-
     def do(self, order: Mapping[str, Any]) -> Any:
-        """Preempt a spot instance, delete all resources, or return their names."""
-        if order['do'] == 'interrupt':
-            self.api.project.preempt(order['instance'], order['notice'])
-        elif order['do'] == 'clear':
+        """Delete all resources, return their names, or a firewall rule."""
+        if order['do'] == 'clear':
             self.api.project.clear()
         elif order['do'] == 'things':
             project = self.api.project
