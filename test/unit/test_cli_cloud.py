@@ -44,12 +44,11 @@ from fogros2.provider import (
     TAG_NAME,
     TAG_ROBOT,
 )
-from fogros2.provider.machine_types import MachineType, Region
+from fogros2.provider.machine_types import Region
 from fogros2.provider.vm.images import Image
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.waiting import wait_until
 from fogros2_features.images import baking, pods
-from fogros2_features.prices.offers import Offer, Offers, ranked, Wants
 from fogros2_monitor import access
 from fogros2_testing.fakes import FakeProvider, FakeShell
 from fogros2_testing.plugins import instead
@@ -558,41 +557,6 @@ def test_pod_image_has_what_a_launch_installs(
 
 
 # -- prices and regions -------------------------------------------------------------------
-
-
-KINDS = [MachineType('g6.2xlarge', 8, 4, 32.0, 'x86_64', 'AMD', 1, 'NVIDIA L4', 22.4, True),
-         MachineType('m6i.2xlarge', 8, 4, 32.0, 'x86_64', 'Intel', spot=True)]
-DOLLARS = {'g6.2xlarge': Decimal('9.4'), 'm6i.2xlarge': Decimal('10.46')}
-
-
-def offer(
-    self: Cloud, wanted: Wants, names: Sequence[str] = (), *, refresh: bool = False,
-) -> Offers:
-    """Offer two types in two regions."""
-    names = ['eu-west-1', 'me-south-1', 'us-west-1'] if 'all' in names else names or ['eu-west-1']
-    found = [Offer(name, kind, DOLLARS[kind.name] + Decimal('0.5' if name == 'eu-west-1' else 0),
-                   Decimal('0.1') if kind.name == 'm6i.2xlarge' else None, (f'{name}a',))
-             for name in names if name != 'me-south-1' for kind in KINDS]
-    return Offers(wanted, tuple(ranked(found, wanted.spot)), tuple(names), tuple(
-        (name, 'not enabled') for name in names if name == 'me-south-1'))
-
-
-@pytest.fixture
-def market(monkeypatch: pytest.MonkeyPatch) -> None:
-    seller = type('Seller', (Cloud,), {'offers': offer, 'taking': offer})
-    instead(monkeypatch, 'fogros2.provider', {'cloud': seller, 'plain': Plain})
-
-
-def test_prices_of_all_regions_are_compared(
-    market: None, capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert run('price', '--region', 'all', '--arch', 'any', '--limit', '1') == 0
-    said = capsys.readouterr()
-    assert said.err == 'cloud me-south-1: not enabled\n'
-    lines = said.out.splitlines()
-    assert lines[0] == '2 CPUs, 4 GB, in eu-west-1, me-south-1, us-west-1'
-    assert lines[2].split()[:3] == ['g6.2xlarge', 'cloud', 'us-west-1']
-    assert lines[3] == '3 more cost as much or more (--limit 0)'
 
 
 @pytest.mark.parametrize('measured', [True, False])

@@ -74,7 +74,6 @@ class Fault:
     status: int = 409
     method: str = ''
     kind: str = ''
-    region: str = ''
     size: str = ''
     times: int = 1
     late: bool = False
@@ -151,9 +150,6 @@ class Service:
         #: The actions that requests have needed.
         self.actions: set[str] = set()
         self.restricted: set[str] = set()
-        self.cores = 100
-        self.registered = {'microsoft.compute', 'microsoft.network', 'microsoft.authorization',
-                           'microsoft.devtestlab', 'microsoft.resources'}
         self.lock = threading.RLock()
 
     # -- requests -------------------------------------------------------------------------------
@@ -241,10 +237,6 @@ class Service:
             raise Refusal(404, 'InvalidResourceType')
         if words[2] != SUBSCRIPTION:
             raise Refusal(404, 'SubscriptionNotFound')
-        if (name := re.search('/providers/(Microsoft[.][A-Za-z]+)', path)) \
-                and name[1].lower() not in self.registered:
-            raise Refusal(409, 'MissingSubscriptionRegistration',
-                          f"The subscription is not registered to use namespace '{name[1]}'.")
         return '' if token == TOKEN else token.removeprefix('token-of-')
 
     def _fault(self, method: str, kind: str, path: str, body: Any) -> Optional[Fault]:
@@ -252,7 +244,7 @@ class Service:
         size = str(body.get('properties', {}).get('hardwareProfile', {}).get('vmSize', ''))
         return faults.due(self.faults, lambda one: (
             one.method in ('', method) and one.kind.lower() in ('', kind)
-            and one.region in ('', body.get('location')) and one.size in ('', size)
+            and one.size in ('', size)
             and '/operations/' not in path))
 
     def _route(
@@ -623,12 +615,6 @@ class Service:
         if size in self.restricted:
             raise Refusal(409, 'SkuNotAvailable', f"The requested size '{size}' is currently not "
                           f"available in location '{region}'.")
-        used = sum(catalogue.SIZES[other['properties']['hardwareProfile']['vmSize']][0]
-                   for other in self.resources.values()
-                   if kind_of(other['id']) == 'virtualmachines' and other['location'] == region)
-        if used + catalogue.SIZES[size][0] > self.cores:
-            raise Refusal(409, 'OperationNotAllowed', 'Operation could not be completed as it '
-                          'results in exceeding approved Total Regional Cores quota.')
         self._check_image(what, size)
         system = what['osProfile']
         if system['adminUsername'].lower() in _USERS or len(system['computerName']) > 64:
@@ -706,8 +692,7 @@ class Service:
     ) -> tuple[int, dict[str, str], Any]:
         entry = self._there(path)
         before, after = {'deallocate': ('deallocating', 'deallocated'),
-                         'start': ('starting', 'running'),
-                         'poweroff': ('stopping', 'stopped')}[action]
+                         'start': ('starting', 'running')}[action]
         if entry['properties']['provisioningState'] not in ('Succeeded', 'Failed'):
             raise Refusal(409, 'OperationNotAllowed', 'another operation is in progress')
         entry['_power'], entry['properties']['provisioningState'] = before, 'Updating'
@@ -804,7 +789,7 @@ def kind_of(path: str) -> str:
     if not last:
         return ''
     kinds = last[::2]
-    return kinds[-1] if kinds[-1] not in ('deallocate', 'start', 'poweroff') else kinds[-2]
+    return kinds[-1] if kinds[-1] not in ('deallocate', 'start') else kinds[-2]
 
 
 def _matches(action: str, patterns: Sequence[str]) -> bool:

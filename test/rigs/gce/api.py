@@ -32,16 +32,13 @@ class Fault:
     An error to order.
 
     :param code: Google's reason, or in capitals the code of an operation that fails late.
-    :param action: such as 'instances.insert'; '' for every request.
-    :param params: words of the path that have to be so.
+    :param action: such as 'instances.insert'.
     :param times: how often; 0 for always.
     :param after: carry the request out first, as if its answer was lost.
     """
 
     code: str
-    action: str = ''
-    message: str = ''
-    params: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    action: str
     times: int = 1
     after: bool = False
 
@@ -131,12 +128,11 @@ class Api:
         return status, answer
 
     def _carry_out(self, found: discovery.Route, query: Mapping[str, str], body: Any) -> Any:
-        body = _without_null(body)
         discovery.check_parameters(found, query)
         discovery.check_body(found, body)
-        fault = self._fault(found)
+        fault = faults.due(self.faults, lambda one: one.action == found.name)
         if fault and not fault.after and not fault.code.isupper():
-            raise Refusal(fault.code, fault.message)
+            raise Refusal(fault.code)
         if found.words['project'] != self.project.name and not found.name.startswith('images.'):
             raise Refusal('notFound', f"The resource 'projects/{found.words['project']}' was not "
                           'found')
@@ -153,7 +149,7 @@ class Api:
             print(f'the answer to {found.name}: {error}', file=sys.stderr, flush=True)
             raise Refusal('internalError', f'the box is wrong: {error}') from error
         if fault and fault.after:
-            raise Refusal(fault.code, fault.message)
+            raise Refusal(fault.code)
         return answer
 
     def _locked(self, handler: Callable[..., Any], found: discovery.Route,
@@ -179,22 +175,7 @@ class Api:
               query: Mapping[str, str], body: Any, fault: Fault) -> Any:
         """Let an operation fail after Google has accepted it."""
         if found.name == 'instances.insert':
-            project, zone = self.project, found.words['zone']
-            project._check_instance(zone, body)
-            image = project._check_disk(zone, body)
-            return project.boot(project._made(zone, body, image), image,
-                                late(fault.code, fault.message))
+            return self.project.instances_insert(found.words, query, body, late(fault.code))
         operation = handler(found.words, query, body)
-        self.project.operations[operation['name']].error = late(fault.code, fault.message)
+        self.project.operations[operation['name']].error = late(fault.code)
         return operation
-
-    def _fault(self, found: discovery.Route) -> Optional[Fault]:
-        return faults.due(self.faults, lambda one: one.action in ('', found.name) and all(
-            found.words.get(key) == value for key, value in one.params.items()))
-
-
-def _without_null(value: Any) -> Any:
-    """Return a JSON value without fields that are null, which Google takes as absent."""
-    if isinstance(value, dict):
-        return {key: _without_null(item) for key, item in value.items() if item is not None}
-    return [_without_null(item) for item in value] if isinstance(value, list) else value

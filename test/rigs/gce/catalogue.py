@@ -30,10 +30,6 @@ IMAGES = (
     ('ubuntu-os-cloud', 'ubuntu-2204-jammy-v20220712a', 'ubuntu-2204-lts', 'X86_64', 10),
     ('ubuntu-os-accelerator-images', 'ubuntu-accelerator-2404-amd64-with-nvidia-580-v20260101',
      'ubuntu-accelerator-2404-amd64-with-nvidia-580', 'X86_64', 20))
-#: Limits of the project.
-QUOTAS = {'CPUS': 24, 'FIREWALLS': 30}
-
-
 def zones() -> list[str]:
     """Return the names of all zones."""
     return [f'{region}-{letter}' for region, letters in ZONES.items() for letter in letters]

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple, Optional
 
 ROOT = '/compute/v1/'
 #: Parameters that every request may have.
-#: Google's command line sends the last one, which not every edition of the document has.
-_COMMON = ('alt', 'prettyPrint', 'key', 'fields', 'quotaUser', 'returnPartialSuccess')
+_COMMON = ('alt', 'prettyPrint', 'key', 'fields', 'quotaUser')
 
 
 class Route(NamedTuple):

@@ -7,26 +7,13 @@ from typing import Any
 
 #: HTTP status of reasons; others have 400.
 STATUS = {
-    'notFound': 404, 'alreadyExists': 409, 'forbidden': 403, 'quotaExceeded': 403,
-    'rateLimitExceeded': 403, 'accessNotConfigured': 403, 'conditionNotMet': 412,
-    'authError': 401, 'backendError': 503, 'internalError': 500, 'duplicate': 409}
-_MESSAGES = {
-    'forbidden': "Required 'compute.instances.create' permission for 'projects/robots'",
-    'rateLimitExceeded': 'Rate Limit Exceeded',
-    'authError': 'Request had invalid authentication credentials.',
-    'backendError': 'Backend Error',
-    'accessNotConfigured': 'Compute Engine API has not been used in project robots before',
-    'ZONE_RESOURCE_POOL_EXHAUSTED':
-        'The zone does not have enough resources available to fulfill the request.',
-    'QUOTA_EXCEEDED': "Quota 'CPUS' exceeded. Limit: 24.0 in region us-central1.",
-}
-
-
+    'notFound': 404, 'alreadyExists': 409, 'forbidden': 403, 'rateLimitExceeded': 403,
+    'conditionNotMet': 412, 'authError': 401, 'backendError': 503, 'internalError': 500}
 class Refusal(Exception):
     """An error that Google answers at once; ``reason`` is Google's."""
 
     def __init__(self, reason: str, message: str = '') -> None:
-        super().__init__(message or _MESSAGES.get(reason, reason))
+        super().__init__(message or reason)
         self.reason = reason
         self.status = STATUS.get(reason, 400)
 
@@ -36,6 +23,6 @@ class Refusal(Exception):
             {'domain': 'global', 'reason': self.reason, 'message': str(self)}]}}
 
 
-def late(code: str, message: str = '') -> dict[str, Any]:
+def late(code: str) -> dict[str, Any]:
     """Return the error of an operation."""
-    return {'errors': [{'code': code, 'message': message or _MESSAGES.get(code, code)}]}
+    return {'errors': [{'code': code, 'message': code}]}

@@ -13,8 +13,8 @@ from typing import Any
 
 from rigs.gce.errors import Refusal
 
-_TERM = re.compile(r'([A-Za-z][\w.-]*)\s*(=|!=|:)\s*("[^"]*"|\*|[^\s()]+)')
-_REGEX = re.compile(r'([A-Za-z]\w*) (eq|ne) (\S+)')
+_TERM = re.compile(r'([A-Za-z][\w.-]*)\s*[=:]\s*("[^"]*"|\*|[^\s()]+)')
+_REGEX = re.compile(r'([A-Za-z]\w*) eq (\S+)')
 Test = Callable[[Mapping[str, Any]], bool]
 
 
@@ -28,10 +28,8 @@ def parse(text: str) -> Test:
         return lambda entry: True
     found = _REGEX.fullmatch(text)
     if found:
-        name, verb, pattern = found.groups()
-        pattern = pattern.strip('\'"')
-        return lambda entry: bool(
-            re.fullmatch(pattern, str(_value(entry, name)))) == (verb == 'eq')
+        name, pattern = found.groups()
+        return lambda entry: bool(re.fullmatch(pattern, str(_value(entry, name))))
     test, rest = _either(text)
     if rest:
         raise Refusal('invalid', f"Invalid value for field 'filter': '{text}'")
@@ -39,27 +37,21 @@ def parse(text: str) -> Test:
 
 
 def _either(text: str) -> tuple[Test, str]:
-    test, rest = _both(text)
+    one, rest = _both(text)
+    tests = [one]
     while rest.startswith('OR '):
-        one, (other, rest) = test, _both(rest[3:].lstrip())
-        test = _any(one, other)
-    return test, rest
+        one, rest = _both(rest[3:].lstrip())
+        tests.append(one)
+    return lambda entry: any(test(entry) for test in tests), rest
 
 
 def _both(text: str) -> tuple[Test, str]:
-    test, rest = _term(text)
+    one, rest = _term(text)
+    tests = [one]
     while rest and not rest.startswith((')', 'OR ')):
-        one, (other, rest) = test, _term(rest[4:].lstrip() if rest.startswith('AND ') else rest)
-        test = _all(one, other)
-    return test, rest
-
-
-def _any(one: Test, other: Test) -> Test:
-    return lambda entry: one(entry) or other(entry)
-
-
-def _all(one: Test, other: Test) -> Test:
-    return lambda entry: one(entry) and other(entry)
+        one, rest = _term(rest.removeprefix('AND ').lstrip())
+        tests.append(one)
+    return lambda entry: all(test(entry) for test in tests), rest
 
 
 def _term(text: str) -> tuple[Test, str]:
@@ -71,14 +63,11 @@ def _term(text: str) -> tuple[Test, str]:
     found = _TERM.match(text)
     if found is None:
         raise Refusal('invalid', f"Invalid value for field 'filter': '{text}'")
-    name, verb, value = found.groups()
-    wanted = value.strip('"')
+    name, value = found.groups()
 
     def fits(entry: Mapping[str, Any]) -> bool:
         known = _value(entry, name)
-        if value == '*':
-            return known is not None
-        return (str(known) == wanted) == (verb != '!=')
+        return known is not None if value == '*' else str(known) == value.strip('"')
 
     return fits, text[found.end():].lstrip()
 

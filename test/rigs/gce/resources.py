@@ -26,7 +26,7 @@ import uuid
 from fogros2.errors import FogError
 from rigs.gce import catalogue, filters
 from rigs.gce.cloud import Cloud
-from rigs.gce.errors import late, Refusal
+from rigs.gce.errors import Refusal
 
 BASE = 'https://www.googleapis.com/compute/v1/projects/'
 SERVICE_ACCOUNT = 'robot@robots.iam.gserviceaccount.com'
@@ -232,15 +232,6 @@ class Project:
         """Return the project."""
         return {**self._new('project', self.name, self.name), 'quotas': []}
 
-    def zones_get(self, words: Words, query: Words, body: Any) -> Any:
-        """Return a zone."""
-        self._known_zone(words['zone'])
-        return self._zone(words['zone'])
-
-    def _zone(self, zone: str) -> dict[str, Any]:
-        return {**self._new('zone', zone, f'{self.name}/zones/{zone}'), 'status': 'UP',
-                'region': f'{BASE}{self.name}/regions/{zone[:-2]}'}
-
     def machine_types_aggregated_list(self, words: Words, query: Words, body: Any) -> Any:
         """Return the machine types of all zones."""
         return self.aggregated('machineType', [
@@ -277,8 +268,6 @@ class Project:
         _check_firewall(body)
         if body['name'] in self.firewalls:
             raise Refusal('alreadyExists', f"The resource '{body['name']}' already exists")
-        if len(self.firewalls) >= catalogue.QUOTAS['FIREWALLS']:
-            raise Refusal('quotaExceeded', "Quota 'FIREWALLS' exceeded.")
         self.networks_get({'network': _last(body.get('network', 'default'))}, {}, None)
         return self.start('insert', self._add_firewall(body), last=self.cloud.protect)
 
@@ -332,28 +321,19 @@ class Project:
             raise Refusal('notFound', f"The resource 'projects/{path}' was not found")
         return self.instances[BASE + path]
 
-    def instances_insert(self, words: Words, query: Words, body: Any) -> Any:
-        """Create an instance."""
+    def instances_insert(
+        self, words: Words, query: Words, body: Any, error: Optional[dict[str, Any]] = None,
+    ) -> Any:
+        """Start a new instance, or let its operation fail late."""
         self._prune()
         zone = words['zone']
         self._known_zone(zone)
         link = f'{BASE}{self.name}/zones/{zone}/instances/{body["name"]}'
         if link in self.instances:
             raise Refusal('alreadyExists', f"The resource '{body['name']}' already exists")
-        kind = self._check_instance(zone, body)
+        self._check_instance(zone, body)
         image = self._check_disk(zone, body)
-        cpus = sum(catalogue.TYPES[_last(i['machineType'])][0] for i in self.instances.values()
-                   if i['zone'].rpartition('/')[2][:-2] == zone[:-2]
-                   and i['status'] != 'TERMINATED') + kind['guestCpus']
-        instance = self._made(zone, body, image)
-        error = late('QUOTA_EXCEEDED') if cpus > catalogue.QUOTAS['CPUS'] else None
-        return self.boot(instance, image, error)
-
-    def boot(self, instance: dict[str, Any], image: Mapping[str, Any],
-             error: Optional[dict[str, Any]]) -> dict[str, Any]:
-        """Start a new instance, or let its operation fail late."""
-        link = instance['selfLink']
-        self.instances[link] = instance
+        instance = self.instances[link] = self._made(zone, body, image)
         if error:
             def drop() -> None:
                 del self.instances[link]
@@ -408,8 +388,8 @@ class Project:
                 'diskSizeGb': str(disk.get('diskSizeGb') or image['diskSizeGb']),
                 'source': f'{BASE}{self.name}/zones/{zone}/disks/{disk.get("diskName") or name}'}]}
 
-    def _check_instance(self, zone: str, body: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the machine type of a request, after a look at everything but the disk."""
+    def _check_instance(self, zone: str, body: Mapping[str, Any]) -> None:
+        """Look at everything of a request but the disk."""
         kind = catalogue.machine_types(zone).get(_last(body['machineType']))
         if kind is None or f'zones/{zone}/' not in body['machineType']:
             raise Refusal('invalid', f"Machine type with name '{body['machineType']}' does not "
@@ -432,7 +412,6 @@ class Project:
         for account in body.get('serviceAccounts', ()):
             if account['email'] not in (SERVICE_ACCOUNT, 'default'):
                 raise Refusal('invalid', f"The service account '{account['email']}' was not found")
-        return kind
 
     def _check_disk(self, zone: str, body: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the image of a request's boot disk."""
@@ -586,7 +565,7 @@ class Project:
 
     def _image(self, path: str) -> dict[str, Any]:
         found = re.search(r'(?:projects/([^/]+)/)?'
-                          r'(?:global/images|zones/-)/(family/|imageFamilyViews/)?([^/]+)$', path)
+                          r'global/images/(family/)?([^/]+)$', path)
         if found:
             owner, family, name = found[1] or self.name, found[2], found[3]
             for (project, known), image in reversed(self.images.items()):
