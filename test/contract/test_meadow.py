@@ -8,7 +8,6 @@ from collections.abc import Callable
 import dataclasses
 import gzip
 import json
-import threading
 from typing import Any, NamedTuple
 import uuid
 
@@ -22,28 +21,24 @@ from fogros2.provider.vm.user_data import END_COMMAND
 from fogros2_features.prices.market import Market, seller
 from fogros2_features.prices.offers import wants
 from fogros2_testing import request_for, VmContract
+from rigs import serving
 from rigs.meadow import provider as adapter
 from rigs.meadow.provider import Meadow, MeadowError, MeadowProvider
 from rigs.meadow.server import Meadow as Service
-from rigs.meadow.server import serve, TOKEN
+from rigs.meadow.server import TOKEN
 
 
 @pytest.fixture
 def meadow(hasty, monkeypatch, tmp_path):
     """Serve an empty Meadow on the loopback."""
     state = Service()
-    server = serve(state)
-    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
-    thread.start()
-    for name, value in {
-            'MEADOW_URL': f'http://127.0.0.1:{server.server_port}', 'MEADOW_TOKEN': TOKEN,
-            'MEADOW_REGION': 'north', 'FOGROS2_ROBOT_ADDRESS': '198.51.100.7',
-            'FOGROS2_STATE_HOME': str(tmp_path)}.items():
-        monkeypatch.setenv(name, value)
-    yield state
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with serving.serve(state) as url:
+        for name, value in {
+                'MEADOW_URL': url, 'MEADOW_TOKEN': TOKEN, 'MEADOW_REGION': 'north',
+                'FOGROS2_ROBOT_ADDRESS': '198.51.100.7',
+                'FOGROS2_STATE_HOME': str(tmp_path)}.items():
+            monkeypatch.setenv(name, value)
+        yield state
 
 
 class TestMeadow(VmContract):

@@ -23,9 +23,9 @@ def server(app: Any, host: str = '127.0.0.1', port: int = 0, **words: Any) -> An
 
 
 @contextlib.contextmanager
-def serve(app: Any, port: int = 0, **words: Any) -> Iterator[str]:
+def serve(app: Any) -> Iterator[str]:
     """Serve an application on the loopback in the block; yields its address."""
-    one = server(app, port=port, **words)
+    one = server(app)
     thread = threading.Thread(target=one.serve_forever, args=(0.02,), daemon=True)
     thread.start()
     try:

@@ -9,7 +9,6 @@ import dataclasses
 import datetime
 from decimal import Decimal
 import gzip
-import http.server
 import ipaddress
 import json
 import os
@@ -19,7 +18,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 
 import pytest
@@ -38,6 +36,7 @@ from fogros2.provider.vm import user_data as boot
 from fogros2.provider.vm.cloud import Order, Place
 from fogros2.provider.vm.host_key import one_time
 from fogros2.waiting import wait_until
+from rigs import serving
 from rigs.ec2 import iam
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -289,28 +288,15 @@ def echo(monkeypatch):
     """Answer HTTP on the loopback with the words of a list, one after the other."""
     said = []
 
-    class Handler(http.server.BaseHTTPRequestHandler):
-        def do_GET(self):
-            status, words = said.pop(0)
-            self.send_response(status)
-            self.end_headers()
-            self.wfile.write(words.encode())
+    def answer(environ, start_response):
+        status, words = said.pop(0)
+        start_response(f'{status} {status}', [('Content-Length', str(len(words)))])
+        return [words.encode()]
 
-        do_PUT = do_GET
-
-        def log_message(self, *args):
-            """Say nothing."""
-
-    server = http.server.ThreadingHTTPServer(('127.0.0.1', 0), Handler)
-    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
-    thread.start()
-    url = f'http://127.0.0.1:{server.server_port}/'
-    monkeypatch.setenv(address.CHECKIP_VARIABLE, url)
-    monkeypatch.delenv(address.ADDRESS_VARIABLE, raising=False)
-    yield url, said
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with serving.serve(answer) as url:
+        monkeypatch.setenv(address.CHECKIP_VARIABLE, url)
+        monkeypatch.delenv(address.ADDRESS_VARIABLE, raising=False)
+        yield url, said
 
 
 def test_robot_address_is_asked_once_for_all_machines(echo):

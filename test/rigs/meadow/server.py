@@ -4,7 +4,7 @@ The service: machines in memory, over HTTP on the loopback, without any real mac
 
 It refuses what a real service refuses: a wrong token, a label with other characters than
 ``a-z0-9_-`` or with more than 63, a type or a zone that it does not have. A new machine is
-pending for one report; a deleted one stays for ``DELETION`` seconds; a full zone refuses.
+pending for one report; a deleted one stays for ``DELETION`` seconds.
 ``fault`` disturbs the next requests for a machine.
 """
 
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 import contextlib
-import http.server
 import itertools
 import json
 import math
@@ -20,7 +19,7 @@ import re
 import threading
 import time
 from typing import Any
-from urllib.parse import parse_qsl, urlsplit
+from urllib.parse import parse_qsl
 
 TOKEN = 'meadow-token'
 TYPES = [
@@ -42,27 +41,22 @@ class Refusal(Exception):
         self.status, self.code, self.headers = status, code, headers
 
 
-class Lost(Exception):
-    """A request that gets no answer."""
-
-
-#: Answers to a request for a machine that has no effect, by the fault.
-REFUSALS: Mapping[str, tuple[int, str, Mapping[str, str]]] = {
-    'throttled': (429, 'too_fast', {'Retry-After': '1'}), 'unavailable': (503, 'closed', {}),
-    'full': (409, 'exhausted', {})}
+#: Answers to a request for a machine, by the fault; one that is 'lost' has its effect.
+FAULTS = {
+    'throttled': Refusal(429, 'too_fast', **{'Retry-After': '1'}),
+    'unavailable': Refusal(503, 'closed'), 'full': Refusal(409, 'exhausted'),
+    'lost': Refusal(500, 'no_answer')}
 
 
 class Meadow:
     """
-    The state of the service.
+    The service, a WSGI application.
 
-    :ivar full: zones without capacity.
     :ivar orders: when each request for a machine came, by the monotonic clock.
     """
 
     def __init__(self) -> None:
         self.machines: dict[str, dict[str, Any]] = {}
-        self.full: set[str] = set()
         self.orders: list[float] = []
         self._faults: list[str] = []
         self._met = threading.Event()
@@ -86,11 +80,25 @@ class Meadow:
             self._faults = []
             self._answering.set()
 
-    def wait(self) -> None:
-        """Wait while the service is silent."""
+    def __call__(self, environ: Mapping[str, Any], start_response: Any) -> list[bytes]:
+        """Answer a request, not while the service is silent."""
+        text = environ['wsgi.input'].read(int(environ.get('CONTENT_LENGTH') or 0))
         if not self._answering.is_set():
             self._met.set()
             self._answering.wait(30.0)
+        headers: Mapping[str, str] = {}
+        try:
+            if environ.get('HTTP_AUTHORIZATION') != f'Bearer {TOKEN}':
+                raise Refusal(401, 'bad_token')
+            status, answer = 200, self.answer(
+                environ['REQUEST_METHOD'], environ['PATH_INFO'],
+                dict(parse_qsl(environ['QUERY_STRING'])), json.loads(text) if text else None)
+        except Refusal as error:
+            status, answer, headers = error.status, {'code': error.code}, error.headers
+        data = json.dumps(answer).encode()
+        start_response(f'{status} {status}', [
+            *headers.items(), ('Content-Length', str(len(data)))])
+        return [data]
 
     def left(self) -> list[str]:
         """Return the machines that exist, those that are being deleted too."""
@@ -126,13 +134,10 @@ class Meadow:
         fault = self._faults.pop() if self._faults else ''
         if fault:
             self._met.set()
-        if fault in REFUSALS:
-            status, code, headers = REFUSALS[fault]
-            raise Refusal(status, code, **headers)
-        machine = self._create(region, body)
-        if fault == 'lost':
-            raise Lost
-        return machine
+            if fault == 'lost':
+                self._create(region, body)
+            raise FAULTS[fault]
+        return self._create(region, body)
 
     def _create(self, region: str, body: dict[str, Any]) -> dict[str, Any]:
         for machine in self.machines.values():
@@ -142,8 +147,6 @@ class Meadow:
                 or body['zone'] not in ZONES[region]:
             raise Refusal(400, 'bad_request')
         self._check_labels(body['labels'])
-        if body['zone'] in self.full:
-            raise Refusal(409, 'exhausted')
         number = next(self._numbers)
         machine = self.machines[f'm-{number:x}'] = {
             **body, 'id': f'm-{number:x}', 'region': region, 'state': 'pending', 'reports': 1,
@@ -181,37 +184,3 @@ class Meadow:
         if not all(re.fullmatch('[A-Za-z0-9_-]{1,63}', key)
                    and re.fullmatch('[a-z0-9_-]{0,63}', value) for key, value in labels.items()):
             raise Refusal(400, 'bad_label')
-
-
-def serve(meadow: Meadow) -> http.server.ThreadingHTTPServer:
-    """Return a server for the state, which the caller runs and closes."""
-    class Handler(http.server.BaseHTTPRequestHandler):
-        def _answer(self) -> None:
-            parts = urlsplit(self.path)
-            length = int(self.headers.get('Content-Length') or 0)
-            body = json.loads(self.rfile.read(length)) if length else None
-            headers: Mapping[str, str] = {}
-            meadow.wait()
-            try:
-                if self.headers.get('Authorization') != f'Bearer {TOKEN}':
-                    raise Refusal(401, 'bad_token')
-                status, answer = 200, meadow.answer(
-                    self.command, parts.path, dict(parse_qsl(parts.query)), body)
-            except Refusal as error:
-                status, answer, headers = error.status, {'code': error.code}, error.headers
-            except Lost:
-                self.close_connection = True
-                return
-            data = json.dumps(answer).encode()
-            self.send_response(status)
-            for name, value in {**headers, 'Content-Length': str(len(data))}.items():
-                self.send_header(name, value)
-            self.end_headers()
-            self.wfile.write(data)
-
-        do_GET = do_POST = do_PUT = do_PATCH = do_DELETE = _answer
-
-        def log_message(self, *args: object) -> None:
-            """Write no log."""
-
-    return http.server.ThreadingHTTPServer(('127.0.0.1', 0), Handler)
