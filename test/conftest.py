@@ -268,6 +268,7 @@ def moto_aws(
     from moto.core import DEFAULT_ACCOUNT_ID  # type: ignore[attr-defined]
     from moto.ec2.models import ec2_backends, instance_types
     from moto.ec2.models.amis import AmiBackend
+    from moto.ec2.models.availability_zones_and_regions import RegionsAndZonesBackend
     from moto.ec2.models.elastic_block_store import EBSBackend
     from moto.ssm.models import Parameter, ssm_backends
 
@@ -296,6 +297,8 @@ def moto_aws(
         monkeypatch.setitem(offered, region, [
             one for one in offered[region] if one['InstanceType'] in kinds])
     monkeypatch.setattr(EBSBackend, '_create_default_encryption_key', lambda self: 'arn:aws:kms')
+    monkeypatch.setattr(RegionsAndZonesBackend, 'regions', [
+        region for region in RegionsAndZonesBackend.regions if region.name in MOTO_REGIONS])
     create_image = AmiBackend.create_image
 
     def create_with_snapshots(

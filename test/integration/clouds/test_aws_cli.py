@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 fog`` on the robot, with instances beside it: what it shows, and how it gets in."""
+"""``ros2 fog`` on the robot, with instances beside it: what it shows, and how a robot gets in."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import json
 import time
 
 import pytest
+
+from fogros2.waiting import wait_until
 
 boto3 = pytest.importorskip('boto3', reason='needs boto3')
 CLOUDS = ('aws',)
@@ -87,6 +89,18 @@ def test_a_kept_machine_is_entered_through_its_firewall(robot, box, name):
     # the robot that made it has nothing to delete but its memory
     deleted = fog(robot, 'delete', name, '--yes')
     assert 'gone' in deleted and f'deleted {name}' in deleted
+
+
+def test_a_robot_that_moves_during_the_boot_is_let_in(robot, box, name):
+    box.set_boot_delay(5.0)
+    run = robot.launch('fogros2_examples', 'talker.aws.launch.py', f'name:={name}', 'count:=1')
+    wait_until(box.alive, timeout=60, what='an instance')
+    box.move_robot()
+    try:
+        assert run.ended() == 0, run.text
+        assert run.clean, run.text
+    finally:
+        box.move_robot(back=True)
 
 
 def groups(box):

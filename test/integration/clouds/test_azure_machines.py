@@ -16,18 +16,6 @@ CLOUDS = ('azure',)
 pytestmark = pytest.mark.soak
 
 
-def test_killed_robot_s_machine_deletes_its_group(robot, box, name):
-    run = robot.own(name)
-    run.wait_for('I heard: ')
-    run.kill()
-    wait_until(lambda: not robot.things(), timeout=60, what='the group to be deleted')
-    assert not box.alive()
-    # nobody else was asked to
-    assert [call.action for call in box.calls()].count('DELETE') == 2  # the SSH rule, the group
-    forgotten = robot.ros2('fog', 'delete', '--yes', 'all')
-    assert forgotten.returncode == 0, forgotten.stdout + forgotten.stderr
-
-
 def test_machine_without_the_right_is_off_and_billed(robot, box, name):
     box.set_rights(owner=False)
     run = robot.own(name)

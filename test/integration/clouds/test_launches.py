@@ -282,6 +282,8 @@ def test_machine_ends_whose_robot_was_killed(cloud, robot, box, name):
     (instance,) = box.alive()
     run.kill()
     box.wait_for(instance.id, 'terminated', 'stopped', timeout=60)
+    if cloud.name == 'azure':
+        wait_until(lambda: not robot.things(), timeout=60, what='its group, which it deletes')
     # what the machine can't take along goes with the robot's record of it
     robot.fog('gc')
     robot.fog('delete', '--yes', 'all')

@@ -7,19 +7,18 @@ from collections import Counter
 from collections.abc import Iterator
 import functools
 import json
-from typing import Any, Optional
+from typing import Any, ClassVar, Optional
 
 import boto3
 from botocore.awsrequest import AWSResponse
-import botocore.session
 
 from fogros2.provider.aws import instances
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.aws.provider import AWSProvider
 
-#: Knows the services' models, which take longest to read, for all tests.
-LOADER = botocore.session.get_session().get_component('data_loader')
+#: The session and its clients, which take longest to make, for all tests of a process.
+_SHARED: dict[str, Any] = {}
 HOME = 'eu-central-1'
 NOTHING: dict[str, list[str]] = {
     'instances': [], 'groups': [], 'keys': [], 'volumes': [], 'addresses': []}
@@ -32,17 +31,22 @@ class Watched:
     :ivar calls: (service:Operation, parameters), each call once however often it is repeated.
     """
 
+    #: That of the test that runs.
+    newest: ClassVar[Watched]
+
     def __init__(self) -> None:
         #: Codes of the refusals that were sent, each repetition anew.
         self.sent: list[str] = []
         self.calls: list[tuple[str, dict[str, Any]]] = []
         self.refusals: dict[str, list[Optional[tuple[str, str]]]] = {}
-        core = botocore.session.get_session()
-        core.register_component('data_loader', LOADER)
-        session = boto3.session.Session(botocore_session=core)
-        session.events.register('provide-client-params', self._called)
-        session.events.register('before-send', self._sent)
-        self.account = Account(session)
+        if not _SHARED:
+            session = _SHARED['session'] = boto3.session.Session()
+            session.events.register(
+                'provide-client-params', lambda **words: Watched.newest._called(**words))
+            session.events.register('before-send', lambda **words: Watched.newest._sent(**words))
+        Watched.newest = self
+        self.account = Account()
+        self.account._known = _SHARED
         self.provider = AWSProvider(Ec2(self.account))
 
     def _called(self, params: Any, model: Any, **words: Any) -> None:
