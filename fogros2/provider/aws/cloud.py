@@ -16,7 +16,6 @@ from fogros2.provider.aws.disks import Ec2Disks
 from fogros2.provider.aws.network import Ec2Network
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import Ec2Prices
-from fogros2.provider.machine_types import MachineType
 from fogros2.provider.vm.cloud import Order, Place, PRICES_AGE, Vm, VmId
 from fogros2.provider.vm.failures import unless_gone
 from fogros2.provider.vm.regions import read_table, Regions
@@ -61,9 +60,6 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network, Ec2Disks):
             'asking for the regions of the account')
         return sorted(str(entry['RegionName']) for entry in answer['Regions'])
 
-    def named_types(self, region: str, names: Sequence[str]) -> list[MachineType]:
-        return images.kinds(self._account, region, list(names))
-
     # -- machines -------------------------------------------------------------------------------
 
     def find(self, region: str, tags: Mapping[str, str]) -> list[Vm]:
@@ -97,11 +93,11 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network, Ec2Disks):
         """Return the image of each type, looked up once for all types that use the same."""
         cache: dict[tuple[str, bool], Mapping[str, Any]] = {}
         chosen: dict[str, Any] = {}
-        for kind in images.kinds(self._account, region, list(types)):
+        for kind in self.named_types(region, types):
             key = (kind.arch, images.has_nvidia(kind))
             if key not in cache:
-                cache[key] = images.choose(self._account, region, kind, order.options,
-                                           order.request.dependencies)
+                cache[key] = self.image_for(region, kind, order.options,
+                                            order.request.dependencies)
             chosen[kind.name] = cache[key]
         return chosen
 

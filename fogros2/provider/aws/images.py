@@ -32,97 +32,92 @@ DEEP_LEARNING = {
 _STATES = {'invalid': 'failed', 'error': 'failed', 'transient': 'pending'}
 
 
-def kinds(account: Account, region: str, names: list[str]) -> list[MachineType]:
-    """
-    Return the instance types that a region has, in the order of ``names``.
-
-    :raises ConfigurationError: it has none of them.
-    """
-    types = {entry['InstanceType']: instance_type(entry) for entry in account.call(
-        'ec2', region, 'describe_instance_types',
-        f'looking for the instance type {" or ".join(names)}',
-        # a filter, because one unknown name among InstanceTypes is an error for all
-        Filters=[{'Name': 'instance-type', 'Values': names}])['InstanceTypes']}
-    if not types:
-        raise ConfigurationError(
-            f'looking for the instance type {" or ".join(names)} in {region} failed: the region '
-            'has no such instance type', 'ros2 fog price shows what it has')
-    fitting = [kind for name in names if (kind := types.get(name)) is not None]
-    if not fitting:
-        raise ConfigurationError(f'machines of the type {" or ".join(names)} run no Ubuntu',
-                                 'take one with an x86_64 or arm64 processor')
-    return fitting
-
-
 def has_nvidia(kind: MachineType) -> bool:
     """Return whether a type has a GPU that takes NVIDIA's driver."""
     return kind.gpu.upper().startswith('NVIDIA')
 
 
-def choose(
-    account: Account, region: str, kind: MachineType, options: Options, dependencies: str,
-) -> Mapping[str, Any]:
-    """
-    Return the image (an entry of DescribeImages) that a machine starts from.
-
-    :param dependencies: hash of the launch; an image that was baked with the same is preferred.
-    :raises ConfigurationError: the image does not exist, or is for another processor.
-    """
-    if options.ami_image:
-        return _named(account, region, kind, options.ami_image)
-    baked = _baked(account, region, kind, options, dependencies) if dependencies else None
-    if baked is not None:
-        return baked
-    nvidia = has_nvidia(kind)
-    parameter = (DEEP_LEARNING if nvidia else UBUNTU)[kind.arch]
-    identity = account.call('ssm', region, 'get_parameter', f'asking for the image {parameter}',
-                            Name=parameter)['Parameter']['Value']
-    if not nvidia:
-        # the other properties are known
-        return {'ImageId': str(identity), 'RootDeviceName': ROOT_DEVICE,
-                'Architecture': kind.arch}
-    return _named(account, region, kind, str(identity))
-
-
-def _named(account: Account, region: str, kind: MachineType, identity: str) -> Mapping[str, Any]:
-    images: Sequence[Mapping[str, Any]] = ()
-    with unless_gone():
-        images = account.call(
-            'ec2', region, 'describe_images', f'looking for the image {identity}',
-            ImageIds=[identity])['Images']
-    if not images:
-        raise ConfigurationError(f'there is no image {identity} in {region}',
-                                 'an AMI belongs to one region; leave ami_image= out')
-    image = images[0]
-    if image.get('State', 'available') != 'available':
-        raise ConfigurationError(f'the image {identity} in {region} is {image["State"]}',
-                                 'ros2 fog image list shows when it is available')
-    if image.get('Architecture', kind.arch) != kind.arch:
-        raise ConfigurationError(
-            f'the image {identity} is for {image["Architecture"]} processors, and {kind.name} '
-            f'has {kind.arch}', 'another ec2_instance_type=, or leave ami_image= out')
-    return image
-
-
-def _baked(
-    account: Account, region: str, kind: MachineType, options: Options, dependencies: str,
-) -> Optional[Mapping[str, Any]]:
-    """Return the newest image of FogROS2 with the same dependencies, or None."""
-    images = account.call(
-        'ec2', region, 'describe_images', 'looking for images baked before', Owners=['self'],
-        Filters=[{'Name': f'tag:{TAG_DEPENDENCIES}', 'Values': [dependencies]},
-                 {'Name': 'tag-key', 'Values': [TAG_BAKED]},
-                 {'Name': 'architecture', 'Values': [kind.arch]},
-                 {'Name': 'state', 'Values': ['available']}])['Images']
-    fitting = [image for image in images
-               if tags_of(image).get(TAG_USER, options.user) == options.user]
-    return max(fitting, key=lambda image: str(image.get('CreationDate', '')), default=None)
-
-
 class Ec2Images(VmCloud):
-    """The part of EC2 that makes images of machines."""
+    """The part of EC2 that chooses images of types, and makes images of machines."""
 
     _account: Account
+
+    def named_types(self, region: str, names: Sequence[str]) -> list[MachineType]:
+        """
+        Return the instance types that a region has, in the order of ``names``.
+
+        :raises ConfigurationError: it has none of them.
+        """
+        types = {entry['InstanceType']: instance_type(entry) for entry in self._account.call(
+            'ec2', region, 'describe_instance_types',
+            f'looking for the instance type {" or ".join(names)}',
+            # a filter, because one unknown name among InstanceTypes is an error for all
+            Filters=[{'Name': 'instance-type', 'Values': list(names)}])['InstanceTypes']}
+        if not types:
+            raise ConfigurationError(
+                f'looking for the instance type {" or ".join(names)} in {region} failed: the '
+                'region has no such instance type', 'ros2 fog price shows what it has')
+        fitting = [kind for name in names if (kind := types.get(name)) is not None]
+        if not fitting:
+            raise ConfigurationError(f'machines of the type {" or ".join(names)} run no Ubuntu',
+                                     'take one with an x86_64 or arm64 processor')
+        return fitting
+
+    def image_for(
+        self, region: str, kind: MachineType, options: Options, dependencies: str,
+    ) -> Mapping[str, Any]:
+        """
+        Return the image (an entry of DescribeImages) that a machine starts from.
+
+        :param dependencies: hash of the launch; an image baked with the same is preferred.
+        :raises ConfigurationError: the image does not exist, or is for another processor.
+        """
+        if options.ami_image:
+            return self._named(region, kind, options.ami_image)
+        baked = self._baked(region, kind, options, dependencies) if dependencies else None
+        if baked is not None:
+            return baked
+        nvidia = has_nvidia(kind)
+        parameter = (DEEP_LEARNING if nvidia else UBUNTU)[kind.arch]
+        identity = str(self._account.call(
+            'ssm', region, 'get_parameter', f'asking for the image {parameter}',
+            Name=parameter)['Parameter']['Value'])
+        # the other properties of Ubuntu's are known
+        return self._named(region, kind, identity) if nvidia else {
+            'ImageId': identity, 'RootDeviceName': ROOT_DEVICE, 'Architecture': kind.arch}
+
+    def _named(self, region: str, kind: MachineType, identity: str) -> Mapping[str, Any]:
+        images: Sequence[Mapping[str, Any]] = ()
+        with unless_gone():
+            images = self._account.call(
+                'ec2', region, 'describe_images', f'looking for the image {identity}',
+                ImageIds=[identity])['Images']
+        if not images:
+            raise ConfigurationError(f'there is no image {identity} in {region}',
+                                     'an AMI belongs to one region; leave ami_image= out')
+        image = images[0]
+        if image.get('State', 'available') != 'available':
+            raise ConfigurationError(f'the image {identity} in {region} is {image["State"]}',
+                                     'ros2 fog image list shows when it is available')
+        if image.get('Architecture', kind.arch) != kind.arch:
+            raise ConfigurationError(
+                f'the image {identity} is for {image["Architecture"]} processors, and {kind.name} '
+                f'has {kind.arch}', 'another ec2_instance_type=, or leave ami_image= out')
+        return image
+
+    def _baked(
+        self, region: str, kind: MachineType, options: Options, dependencies: str,
+    ) -> Optional[Mapping[str, Any]]:
+        """Return the newest image of FogROS2 with the same dependencies, or None."""
+        images = self._account.call(
+            'ec2', region, 'describe_images', 'looking for images baked before', Owners=['self'],
+            Filters=[{'Name': f'tag:{TAG_DEPENDENCIES}', 'Values': [dependencies]},
+                     {'Name': 'tag-key', 'Values': [TAG_BAKED]},
+                     {'Name': 'architecture', 'Values': [kind.arch]},
+                     {'Name': 'state', 'Values': ['available']}])['Images']
+        fitting = [image for image in images
+                   if tags_of(image).get(TAG_USER, options.user) == options.user]
+        return max(fitting, key=lambda image: str(image.get('CreationDate', '')), default=None)
 
     def bake(self, machine: VmId, name: str, dependencies: str) -> str:
         # without a reboot, files of the last half minute may be missing, unless ``sync`` ran

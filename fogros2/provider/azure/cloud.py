@@ -20,10 +20,11 @@ from typing import Any, Optional
 from fogros2.errors import ConfigurationError, FogError, MachineNotFound, ProviderError
 from fogros2.model import MachineSpec, MachineState
 from fogros2.provider import TAG_EXPIRES
-from fogros2.provider.azure import ending, images, login, machines, prices
+from fogros2.provider.azure import ending, login, machines, prices
 from fogros2.provider.azure.account import Account, endpoint, subscription
 from fogros2.provider.azure.disks import AzureDisks
 from fogros2.provider.azure.failures import refusal
+from fogros2.provider.azure.images import AzureImages
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
 from fogros2.provider.vm.cloud import (
@@ -53,7 +54,7 @@ ALLOCATION = 300.0
 _USUAL = Account()
 
 
-class Azure(prices.AzurePrices, images.AzureImages, AzureDisks):
+class Azure(AzureImages, AzureDisks):
     """
     Virtual machines of Azure.
 
@@ -125,11 +126,6 @@ class Azure(prices.AzurePrices, images.AzureImages, AzureDisks):
             raise MachineNotFound(f'{vm} in {region} is being deleted')
         return machine
 
-    def _entry(self, vm: str) -> Mapping[str, Any]:
-        entry: Mapping[str, Any] = self._account.call(
-            'GET', self._account.vm(vm), f'looking for {vm}', query={'$expand': 'instanceView'})
-        return entry
-
     def prepare(self, region: str, order: Order, types: Sequence[str]) -> dict[str, Prepared]:
         """Return image, disk and network of each size that the region has."""
         options: Options = order.options
@@ -137,8 +133,7 @@ class Azure(prices.AzurePrices, images.AzureImages, AzureDisks):
             listing = pool.submit(self.sizes, region)
             guarded = pool.submit(ending.may_assign, self._account)
             subnet = pool.submit(self._subnet, options.resource_group, region)
-            baked = pool.submit(images.baked, self._account, region, options,
-                                order.request.dependencies)
+            baked = pool.submit(self.baked, region, options, order.request.dependencies)
             sizes = {name: listing.result()[name] for name in types if name in listing.result()}
             if not sizes:
                 raise ConfigurationError(
@@ -378,11 +373,3 @@ class Azure(prices.AzurePrices, images.AzureImages, AzureDisks):
 
     def end_command(self, machine: VmId, tags: Mapping[str, str]) -> tuple[str, ...]:
         return (*ending.END, endpoint())
-
-    # -- images ---------------------------------------------------------------------------------
-
-    def bake(self, machine: VmId, name: str, dependencies: str) -> str:
-        entry = self._entry(machine.vm)
-        size = self.sizes(machine.region)[entry['properties']['hardwareProfile']['vmSize']]
-        return images.bake(self._account, machine, entry, prices.machine_type(size),
-                           prices.generation(size), name, dependencies)

@@ -14,11 +14,10 @@ from typing import Any
 
 from fogros2.errors import FogError
 from fogros2.provider import TAG_DEPENDENCIES
-from fogros2.provider.azure.account import Account
 from fogros2.provider.azure.machines import region_of
 from fogros2.provider.azure.options import Options
-from fogros2.provider.machine_types import MachineType
-from fogros2.provider.vm.cloud import made_at, TAG_BAKED, TAG_MADE, TAG_USER, VmCloud, VmId
+from fogros2.provider.azure.prices import AzurePrices, generation, is_in, machine_type
+from fogros2.provider.vm.cloud import made_at, TAG_BAKED, TAG_MADE, TAG_USER, VmId
 from fogros2.provider.vm.failures import unless_gone
 from fogros2.provider.vm.images import check_baked, Image, image_parts, image_tags
 
@@ -28,93 +27,89 @@ _STATES = {'Succeeded': 'available', 'Failed': 'failed'}
 _COMPUTE = 'providers/Microsoft.Compute'
 
 
-def _version(account: Account, group: str) -> str:
-    # a gallery's name has no hyphen
-    return account.path(group, f'{_COMPUTE}/galleries/{group.replace("-", "_")}/images/machine/'
-                               'versions/1.0.0')
-
-
-def bake(
-    account: Account, machine: VmId, entry: Mapping[str, Any], kind: MachineType,
-    generation: str, name: str, dependencies: str,
-) -> str:
-    """
-    Make an image of a running machine, and return its id; the last step takes minutes.
-
-    :param entry: the machine as Azure describes it.
-    """
-    region, group = machine.region, f'fogros2-image-{secrets.token_hex(6)}'
-    tags = {**image_tags(name, entry['tags'], dependencies), TAG_MADE: str(int(time.time())),
-            TAG_KIND: f'{kind.arch} {generation}'}
-    version = _version(account, group)
-    definition, gallery = version.rsplit('/', 2)[0], version.rsplit('/', 4)[0]
-    snapshot = account.path(group, f'{_COMPUTE}/snapshots/machine')
-    disk = entry['properties']['storageProfile']['osDisk']['managedDisk']['id']
-    steps: list[tuple[str, dict[str, Any]]] = [
-        (account.path(group), {}),
-        (snapshot, {'incremental': True, 'creationData': {
-            'createOption': 'Copy', 'sourceResourceId': disk}}),
-        (gallery, {}),
-        (definition, {
-            'osType': 'Linux', 'osState': 'Generalized', 'hyperVGeneration': generation,
-            'architecture': 'Arm64' if kind.arch == 'arm64' else 'x64',
-            'identifier': {'publisher': 'fogros2', 'offer': 'machine', 'sku': group}}),
-        (version, {'publishingProfile': {'targetRegions': [{'name': region}]},
-                   'storageProfile': {'osDiskImage': {'source': {'id': snapshot}}}})]
-    try:
-        for path, properties in steps:
-            account.call('PUT', path, f"making the image '{name}'",
-                         {'location': region, 'tags': tags, 'properties': properties},
-                         wait=path is not version)
-    except FogError:
-        account.delete(account.path(group), f"deleting the rest of the image '{name}'")
-        raise
-    return f'azure:{region}/{group}'
-
-
-def _groups(account: Account, region: str, query: str) -> list[Mapping[str, Any]]:
-    return [group for group in account.pages(
-                account.path(rest='resourceGroups'), 'looking for images', **{'$filter': query})
-            if TAG_BAKED in (group.get('tags') or {}) and region in ('', region_of(group))
-            and group['properties']['provisioningState'] != 'Deleting']
-
-
-def _state(account: Account, group: str) -> str:
-    with unless_gone():
-        version = account.call('GET', _version(account, group), f'looking for the image {group}')
-        return _STATES.get(version['properties']['provisioningState'], 'pending')
-    return 'failed'
-
-
-def baked(
-    account: Account, region: str, options: Options, dependencies: str,
-) -> dict[tuple[str, str], str]:
-    """Return the newest images with the same dependencies, by architecture and generation."""
-    versions: dict[tuple[str, str], str] = {}
-    if options.image or not dependencies:
-        return versions
-    groups = _groups(account, region,
-                     f"tagName eq '{TAG_DEPENDENCIES}' and tagValue eq '{dependencies}'")
-    for group in sorted(groups, key=lambda one: str(one['tags'].get(TAG_MADE, ''))):
-        arch, _, generation = group['tags'].get(TAG_KIND, '').partition(' ')
-        if group['tags'].get(TAG_DEPENDENCIES) == dependencies \
-                and group['tags'].get(TAG_USER, options.user) == options.user \
-                and _state(account, str(group['name'])) == 'available':
-            versions[arch, generation] = _version(account, str(group['name']))
-    return versions
-
-
-class AzureImages(VmCloud):
+class AzureImages(AzurePrices):
     """The part of Azure that makes images of machines."""
 
-    _account: Account
+    def _entry(self, vm: str) -> Mapping[str, Any]:
+        entry: Mapping[str, Any] = self._account.call(
+            'GET', self._account.vm(vm), f'looking for {vm}', query={'$expand': 'instanceView'})
+        return entry
+
+    def _version(self, group: str) -> str:
+        # a gallery's name has no hyphen
+        return self._account.path(
+            group, f'{_COMPUTE}/galleries/{group.replace("-", "_")}/images/machine/versions/1.0.0')
+
+    def bake(self, machine: VmId, name: str, dependencies: str) -> str:
+        """Make an image of a running machine, and return its id; the last step takes minutes."""
+        entry, region = self._entry(machine.vm), machine.region
+        size = self.sizes(region)[entry['properties']['hardwareProfile']['vmSize']]
+        kind, made_for = machine_type(size), generation(size)
+        group = f'fogros2-image-{secrets.token_hex(6)}'
+        tags = {**image_tags(name, entry['tags'], dependencies), TAG_MADE: str(int(time.time())),
+                TAG_KIND: f'{kind.arch} {made_for}'}
+        path, version = self._account.path, self._version(group)
+        definition, gallery = version.rsplit('/', 2)[0], version.rsplit('/', 4)[0]
+        snapshot = path(group, f'{_COMPUTE}/snapshots/machine')
+        disk = entry['properties']['storageProfile']['osDisk']['managedDisk']['id']
+        steps: list[tuple[str, dict[str, Any]]] = [
+            (path(group), {}),
+            (snapshot, {'incremental': True, 'creationData': {
+                'createOption': 'Copy', 'sourceResourceId': disk}}),
+            (gallery, {}),
+            (definition, {
+                'osType': 'Linux', 'osState': 'Generalized', 'hyperVGeneration': made_for,
+                'architecture': 'Arm64' if kind.arch == 'arm64' else 'x64',
+                'identifier': {'publisher': 'fogros2', 'offer': 'machine', 'sku': group}}),
+            (version, {'publishingProfile': {'targetRegions': [{'name': region}]},
+                       'storageProfile': {'osDiskImage': {'source': {'id': snapshot}}}})]
+        try:
+            for step, properties in steps:
+                self._account.call('PUT', step, f"making the image '{name}'",
+                                   {'location': region, 'tags': tags, 'properties': properties},
+                                   wait=step is not version)
+        except FogError:
+            self._account.delete(path(group), f"deleting the rest of the image '{name}'")
+            raise
+        return f'azure:{region}/{group}'
+
+    def _image_groups(self, region: str, query: str) -> list[Mapping[str, Any]]:
+        return [group for group in self._account.pages(
+                    self._account.path(rest='resourceGroups'), 'looking for images',
+                    **{'$filter': query})
+                if TAG_BAKED in (group.get('tags') or {}) and is_in(group, region)
+                and group['properties']['provisioningState'] != 'Deleting']
+
+    def _state(self, group: str) -> str:
+        with unless_gone():
+            version = self._account.call(
+                'GET', self._version(group), f'looking for the image {group}')
+            return _STATES.get(version['properties']['provisioningState'], 'pending')
+        return 'failed'
+
+    def baked(
+        self, region: str, options: Options, dependencies: str,
+    ) -> dict[tuple[str, str], str]:
+        """Return the newest images with the same dependencies, by architecture and generation."""
+        versions: dict[tuple[str, str], str] = {}
+        if options.image or not dependencies:
+            return versions
+        groups = self._image_groups(
+            region, f"tagName eq '{TAG_DEPENDENCIES}' and tagValue eq '{dependencies}'")
+        for group in sorted(groups, key=lambda one: str(one['tags'].get(TAG_MADE, ''))):
+            arch, _, made_for = group['tags'].get(TAG_KIND, '').partition(' ')
+            if group['tags'].get(TAG_DEPENDENCIES) == dependencies \
+                    and group['tags'].get(TAG_USER, options.user) == options.user \
+                    and self._state(str(group['name'])) == 'available':
+                versions[arch, made_for] = self._version(str(group['name']))
+        return versions
 
     def images(self, region: str) -> Iterator[Image]:
-        for group in _groups(self._account, region, f"tagName eq '{TAG_BAKED}'"):
+        for group in self._image_groups(region, f"tagName eq '{TAG_BAKED}'"):
             tags, name = group['tags'], str(group['name'])
             yield Image(
                 f'azure:{region_of(group)}/{name}', tags[TAG_BAKED], 'azure', region_of(group),
-                created=made_at(tags) or None, state=_state(self._account, name),
+                created=made_at(tags) or None, state=self._state(name),
                 dependencies=tags.get(TAG_DEPENDENCIES, ''), tags=tags)
 
     def delete_image(self, image_id: str) -> None:

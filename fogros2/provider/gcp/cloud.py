@@ -180,8 +180,7 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall, GoogleDisks):
         for entry in chosen.values():
             key = entry['arch'], entry['gpus']
             if key not in chosen_images:
-                chosen_images[key] = images.choose(
-                    self._account, options, *key, order.request.dependencies)
+                chosen_images[key] = self.image_for(options, *key, order.request.dependencies)
             entry['path'], entry['size'] = chosen_images[key]
         return {kind: chosen[kind] for kind in types if kind in chosen}
 

@@ -26,51 +26,51 @@ _STATES = {'READY': 'available', 'DELETING': 'deleted'}
 _ARCHES = {'x86_64': 'amd64', 'arm64': 'arm64'}
 
 
-def choose(
-    account: Account, options: Options, arch: str, gpus: bool, dependencies: str,
-) -> tuple[str, int]:
-    """
-    Return the path of the image that a machine starts from, and the size of its disk in GB.
-
-    :raises ConfigurationError: the image does not exist, or is for another processor.
-    """
-    if options.ami_image:
-        return _named(account, options.ami_image, arch)
-    fitting = [image for image in account.pages(
-        f'{account.project}/global/images', 'looking for images baked before',
-        filter=f'(labels.{TAG_BAKED}:*) (labels.{TAG_DEPENDENCIES} = "{dependencies}")')
-        if image['status'] == 'READY' and image.get('architecture', 'X86_64').lower() == arch
-        and image['labels'].get(TAG_USER) == RULES.encode({'': options.user})['']
-    ] if dependencies else []
-    if fitting:
-        newest = max(fitting, key=lambda image: when(image['creationTimestamp']) or 0.0)
-        return (f'projects/{account.project}/global/images/{newest["name"]}',
-                int(newest['diskSizeGb']))
-    return (ACCELERATED.format(_ARCHES[arch]) if gpus else f'{UBUNTU}{_ARCHES[arch]}'), 10
-
-
-def _named(account: Account, name: str, arch: str) -> tuple[str, int]:
-    short = name.removeprefix('global/images/')
-    path = name if name.startswith('projects/') \
-        else f'projects/{account.project}/global/images/{short}'
-    image: Mapping[str, Any] = {}
-    with unless_gone():
-        image = account.call('GET', path.removeprefix('projects/'),
-                             f'looking for the image {name}')
-    if not image:
-        raise ConfigurationError(f"there is no image '{name}'",
-                                 'leave ami_image= out for Ubuntu 24.04')
-    if image.get('architecture', arch).lower() != arch:
-        raise ConfigurationError(
-            f"the image '{name}' is for {image['architecture']} processors, and the machine has "
-            f'{arch}', 'another machine_type=, or leave ami_image= out')
-    return path, int(image.get('diskSizeGb', 10))
-
-
 class GoogleImages(VmCloud):
-    """The part of Compute Engine that makes images of machines."""
+    """The part of Compute Engine that chooses images of types, and makes images of machines."""
 
     _account: Account
+
+    def image_for(
+        self, options: Options, arch: str, gpus: bool, dependencies: str,
+    ) -> tuple[str, int]:
+        """
+        Return the path of the image that a machine starts from, and the size of its disk in GB.
+
+        :raises ConfigurationError: the image does not exist, or is for another processor.
+        """
+        if options.ami_image:
+            return self._named(options.ami_image, arch)
+        project = self._account.project
+        fitting = [image for image in self._account.pages(
+            f'{project}/global/images', 'looking for images baked before',
+            filter=f'(labels.{TAG_BAKED}:*) (labels.{TAG_DEPENDENCIES} = "{dependencies}")')
+            if image['status'] == 'READY'
+            and image.get('architecture', 'X86_64').lower() == arch
+            and image['labels'].get(TAG_USER) == RULES.encode({'': options.user})['']
+        ] if dependencies else []
+        if fitting:
+            newest = max(fitting, key=lambda image: when(image['creationTimestamp']) or 0.0)
+            return (f'projects/{project}/global/images/{newest["name"]}',
+                    int(newest['diskSizeGb']))
+        return (ACCELERATED.format(_ARCHES[arch]) if gpus else f'{UBUNTU}{_ARCHES[arch]}'), 10
+
+    def _named(self, name: str, arch: str) -> tuple[str, int]:
+        short = name.removeprefix('global/images/')
+        path = name if name.startswith('projects/') \
+            else f'projects/{self._account.project}/global/images/{short}'
+        image: Mapping[str, Any] = {}
+        with unless_gone():
+            image = self._account.call('GET', path.removeprefix('projects/'),
+                                       f'looking for the image {name}')
+        if not image:
+            raise ConfigurationError(f"there is no image '{name}'",
+                                     'leave ami_image= out for Ubuntu 24.04')
+        if image.get('architecture', arch).lower() != arch:
+            raise ConfigurationError(
+                f"the image '{name}' is for {image['architecture']} processors, and the machine "
+                f'has {arch}', 'another machine_type=, or leave ami_image= out')
+        return path, int(image.get('diskSizeGb', 10))
 
     def bake(self, machine: VmId, name: str, dependencies: str) -> str:
         vm = self.get(machine.region, machine.vm)
