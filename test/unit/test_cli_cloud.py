@@ -367,27 +367,23 @@ def test_port_that_stays_open_is_reported(
     assert 'slam: its TCP port 22 is still open' in capsys.readouterr().err
 
 
-def test_session_works_without_a_record(shells: list[Endpoint]) -> None:
-    machine('slam')
-    assert run('connect', 'slam') == 0
-    assert shells[0].host_key == 'ssh-ed25519 AAAA' and shells[0].key_file is None
-
-
-def test_session_does_not_change_another_robots_firewall(shells: list[Endpoint]) -> None:
-    found = machine('slam')
-    machine('slam', tags={**found.tags, TAG_ROBOT: 'another'})
-    assert run('connect', 'slam') == 0
-    assert [call for call in Cloud.asked if call[0] == 'allow'] == []
-    assert shells[0].host == '198.51.100.7'
-
-
-def test_session_leaves_the_port_open_for_a_launch(
-    shells: list[Endpoint], monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(('robot', 'of_launch', 'firewall', 'calls'), [
+    ('', False, True, ['allow', 'connect', 'allow']), ('another', False, True, ['connect']),
+    ('', True, True, ['allow', 'connect']),  # the launch closes the port
+    ('', False, False, ['connect'])])
+def test_session_changes_the_firewall_of_its_robot(
+    shells: list[Endpoint], monkeypatch: pytest.MonkeyPatch, robot: str, of_launch: bool,
+    firewall: bool, calls: list[str],
 ) -> None:
-    machine('slam')
-    record('slam', alive=True)
+    monkeypatch.setattr(Cloud, 'capabilities', Capabilities(firewall=firewall, regions=True))
+    own = machine('slam')
+    machine('slam', tags={**own.tags, TAG_ROBOT: robot or robot_name()})
+    if of_launch:
+        record('slam', alive=True)
     assert run('connect', 'slam') == 0
-    assert [call[0] for call in Cloud.asked] == ['allow', 'connect']
+    assert [call[0] for call in Cloud.asked if call[0] != 'find'] == calls
+    if not of_launch:
+        assert shells[0].host_key == 'ssh-ed25519 AAAA' and shells[0].key_file is None
 
 
 def test_session_prefers_the_vpn(shells: list[Endpoint]) -> None:
@@ -402,15 +398,6 @@ def test_session_prefers_the_vpn(shells: list[Endpoint]) -> None:
     # it answers no more: the way round, through the firewall
     assert run('connect', 'slam') == 0
     assert shells[1].host == '198.51.100.7'
-
-
-def test_session_without_firewall_makes_no_rule(
-    shells: list[Endpoint], monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(Cloud, 'capabilities', Capabilities(regions=True))
-    machine('slam')
-    assert run('connect', 'slam') == 0
-    assert [call[0] for call in Cloud.asked if call[0] != 'find'] == ['connect']
 
 
 # -- images -------------------------------------------------------------------------------
