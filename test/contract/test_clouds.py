@@ -141,8 +141,8 @@ def test_fault_at_each_step_leaves_nothing(request, monkeypatch, name, step, how
 
 
 def test_full_quota_leads_to_the_next_type(memory):
-    memory.fill(1)
-    machine, _ = create(memory, **memory.more)
+    with memory.fault('quota', 1):
+        machine, _ = create(memory, **memory.more)
     (further,) = memory.more.values()
     assert memory.provider().describe(machine).kind == further[0]
     memory.provider().destroy(machine)

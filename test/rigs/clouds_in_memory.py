@@ -47,7 +47,7 @@ class Memory(abc.ABC):
 
     @contextlib.contextmanager
     def fault(self, how: str, times: int) -> Iterator[threading.Event]:
-        """Disturb requests for a machine in the block; see ``fogros2_testing.VmContract``."""
+        """Disturb requests in the block, as ``VmContract`` describes; 'quota' is of a region."""
         met, over = threading.Event(), threading.Event()
         with self.patch.context() as patch:
             if how == 'silent':
@@ -112,10 +112,6 @@ class Memory(abc.ABC):
         :param how: 'refused', 'late' (its operation fails), or 'lost' (it has its effect, and
             its answer is an error).
         """
-
-    @abc.abstractmethod
-    def fill(self, times: int) -> None:
-        """Let the next ``times`` machines find no room in their region; 0 for all."""
 
     @abc.abstractmethod
     def vanish(self) -> None:
@@ -190,7 +186,7 @@ class Aws(Memory):
             return
         patch.setattr(self._watched, 'sent', Sent())
         code = {'throttled': 'RequestLimitExceeded', 'unavailable': 'ServiceUnavailable',
-                'full': 'InsufficientInstanceCapacity'}[how]
+                'full': 'InsufficientInstanceCapacity', 'quota': 'VcpuLimitExceeded'}[how]
         self._watched.refuse('RunInstances', *[code] * times,
                              status=503 if how == 'unavailable' else 400)
 
@@ -241,10 +237,6 @@ class Aws(Memory):
 
         patch.setattr(Account, 'call', lost)
 
-    def fill(self, times: int) -> None:
-        """Report a quota, which holds for the region."""
-        self._watched.refuse('RunInstances', *['VcpuLimitExceeded'] * (times or 20))
-
     def vanish(self) -> None:
         """Terminate the instances."""
         self._rig.ec2().terminate_instances(InstanceIds=self._rig.left()['instances'])
@@ -271,7 +263,8 @@ class Azure(Memory):
         from rigs.azure.service import Fault
         code, status = {
             'throttled': ('TooManyRequests', 429), 'unavailable': ('ServiceUnavailable', 503),
-            'lost': ('InternalServerError', 500), 'full': ('AllocationFailed', 409)}[how]
+            'lost': ('InternalServerError', 500), 'full': ('AllocationFailed', 409),
+            'quota': ('QuotaExceeded', 409)}[how]
         self.served.faults.append(_counted(Fault(
             code, status, 'PUT', 'virtualMachines', times=times, after=how == 'lost'), met))
 
@@ -311,12 +304,6 @@ class Azure(Memory):
             'SomethingIsWrong', 500 if how == 'lost' else 400, 'PUT', step, times=0,
             late=how == 'late', after=how == 'lost'))
 
-    def fill(self, times: int) -> None:
-        """Report a quota."""
-        from rigs.azure.service import Fault
-        self.served.faults.append(Fault('QuotaExceeded', 409, 'PUT', 'virtualMachines',
-                                        times=times))
-
     def vanish(self) -> None:
         """Evict the machines."""
         for vm in self.served.vms():
@@ -346,7 +333,8 @@ class Gcp(Memory):
         """Order errors of an insert; a code in capitals is that of its operation."""
         from rigs.gce.api import Fault
         code = {'throttled': 'rateLimitExceeded', 'unavailable': 'backendError',
-                'lost': 'internalError', 'full': 'ZONE_RESOURCE_POOL_EXHAUSTED'}[how]
+                'lost': 'internalError', 'full': 'ZONE_RESOURCE_POOL_EXHAUSTED',
+                'quota': 'QUOTA_EXCEEDED'}[how]
         self.served.api.faults.append(_counted(Fault(
             code, 'instances.insert', times=times, after=how == 'lost'), met))
 
@@ -374,19 +362,12 @@ class Gcp(Memory):
         """Return the number of requests."""
         return len(self.served.api.calls)
 
-    def _order(self, code: str, action: str, times: int, *, after: bool = False) -> None:
-        from rigs.gce.api import Fault
-        self.served.api.faults.append(Fault(code, action, times=times, after=after))
-
     def fail(self, step: str, how: str) -> None:
         """Order an error; a code in capitals is that of an operation."""
         self.patch.setattr('fogros2.provider.vm.account.ATTEMPTS', 1)
+        from rigs.gce.api import Fault
         code = {'refused': 'forbidden', 'late': 'INTERNAL_ERROR', 'lost': 'internalError'}[how]
-        self._order(code, step, 0, after=how == 'lost')
-
-    def fill(self, times: int) -> None:
-        """Report a quota."""
-        self._order('QUOTA_EXCEEDED', 'instances.insert', times)
+        self.served.api.faults.append(Fault(code, step, times=0, after=how == 'lost'))
 
     def vanish(self) -> None:
         """End the instances."""

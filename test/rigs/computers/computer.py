@@ -20,7 +20,7 @@ import threading
 from typing import Any, Optional
 
 from fogros2 import process
-from fogros2.errors import CommandError, FogError
+from fogros2.errors import CommandError
 from fogros2.model import Command
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import root as container_root
@@ -34,8 +34,8 @@ LABEL = 'fogros2-ec2'
 USER = 'ubuntu'
 _GUEST = 'opt/ec2/guest.py'
 _ENTRY = ('/usr/bin/python3', '-IS', f'/{_GUEST}')
-#: Programs of an Ubuntu image that end the computer, or stand for systemd and cloud-init.
-_PROGRAMS = ('shutdown', 'poweroff', 'halt', 'reboot', 'systemctl', 'cloud-init')
+#: Programs of an Ubuntu image that end the computer, or stand for systemd.
+_PROGRAMS = ('shutdown', 'poweroff', 'reboot', 'systemctl')
 _SSHD = """\
 Include /etc/ssh/sshd_config.d/*.conf
 PasswordAuthentication no
@@ -363,7 +363,3 @@ def started(pid: int) -> str:
     except OSError:
         return ''
     return '' if words[0] in 'ZX' else words[19]
-
-
-__all__ = ['Boot', 'Computer', 'DISKS', 'FogError', 'USER', 'copy_disk', 'left_over', 'new_disk',
-           'put_files', 'remove_disk', 'started', 'sweep']

@@ -7,7 +7,7 @@ Standard library alone; it is copied into the instance. The order is that of an 
 commands of runcmd. What belongs to the first boot alone is done
 again when the instance's id is another, as after an image was made of it.
 
-With an argument it is a program of the instance: ``status`` as of cloud-init, ``reload``.
+With an argument it is a program of the instance, such as ``shutdown``.
 """
 
 from __future__ import annotations
@@ -106,7 +106,6 @@ def last_stage() -> None:
         for words in plan['runcmd']:
             run(words)
         write(f'{STATE}/data/instance-id', plan['instance'].encode())
-    write(f'{STATE}/instance/boot-finished', b'done\n')
     say('cloud-init: finished')
 
 
@@ -142,8 +141,6 @@ def first_process() -> None:
 
     os.environ.clear()
     os.environ.update(PATH=PATH, LANG='C.UTF-8', HOME='/root')
-    with contextlib.suppress(FileNotFoundError):
-        os.unlink(f'{STATE}/instance/boot-finished')
     with open(PLAN) as file:
         plan = json.load(file)
     write('/etc/hosts', f'127.0.0.1 localhost\n127.0.1.1 {os.uname().nodename}\n'.encode())
@@ -174,19 +171,11 @@ def first_process() -> None:
     sys.exit(code[0])
 
 
-def status(words: Sequence[str]) -> None:
-    """Answer as ``cloud-init status`` does."""
-    while '--wait' in words and not os.path.exists(f'{STATE}/instance/boot-finished'):
-        time.sleep(0.05)
-    print('status: ' + ('done' if os.path.exists(f'{STATE}/instance/boot-finished')
-                        else 'running'))
-
-
 def systemctl(words: Sequence[str]) -> None:
     """Answer the few orders to systemd that make sense here; others fail as they do without it."""
     order = [word for word in words if not word.startswith('-')]
     ssh = {'ssh', 'sshd', 'ssh.service', 'sshd.service'}
-    if order[:1] in (['poweroff'], ['halt'], ['reboot']):
+    if order[:1] in (['poweroff'], ['reboot']):
         os.kill(1, signal.SIGINT if order == ['reboot'] else signal.SIGTERM)
     elif order[:1] and set(order[1:]) & ssh and order[0] in (
             'reload', 'restart', 'try-restart', 'reload-or-restart'):
@@ -200,7 +189,7 @@ def systemctl(words: Sequence[str]) -> None:
 
 
 def shutdown(program: str, words: Sequence[str]) -> None:
-    """End the instance, as ``shutdown``, ``poweroff``, ``halt`` and ``reboot`` do."""
+    """End the instance, as ``shutdown``, ``poweroff`` and ``reboot`` do."""
     when = 0.0 if program != 'shutdown' else 60.0
     again = program == 'reboot'
     for word in words:
@@ -221,8 +210,6 @@ def main() -> None:
     program = sys.argv[1] if len(sys.argv) > 1 else ''
     if program == 'final':
         last_stage()
-    elif program == 'cloud-init':
-        status(sys.argv[2:])
     elif program == 'systemctl':
         systemctl(sys.argv[2:])
     elif program:

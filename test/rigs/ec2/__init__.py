@@ -3,7 +3,7 @@
 EC2 in a box, for tests of what uses EC2: see :class:`Ec2Box`.
 
 ``box`` is what a test holds; ``server`` the process behind it, which has Moto (``api``, ``rules``,
-``market``, ``hooks``) in front of ``rigs.computers`` (``cloud``, ``told``, ``metadata``). ``iam``
+``market``, ``hooks``) in front of ``rigs.computers`` (``cloud``, ``metadata``). ``iam``
 has the policy that ``doc/aws.md`` gives to robots.
 """
 

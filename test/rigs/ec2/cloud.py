@@ -3,18 +3,21 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable, Mapping, Sequence
 from email.message import Message
+import json
 import secrets
 import sys
 import threading
+import time
 from typing import Any
 
 from fogros2.errors import FogError
-from rigs.computers import cloud, network
+from rigs.computers import cloud, cloud_config, network
 from rigs.computers.cloud import BY_ITSELF, BY_SPOT, BY_TROUBLE, BY_USER, Machine
+from rigs.computers.computer import USER
 from rigs.computers.metadata import MetadataService
-from rigs.ec2 import told
 
 _STATES = {'pending': 0, 'running': 16, 'shutting-down': 32, 'terminated': 48, 'stopping': 64,
            'stopped': 80}
@@ -34,11 +37,15 @@ class Cloud(cloud.Cloud):
 
     def user_data(self, machine: Machine) -> bytes:
         """Return the attribute of that name."""
-        return told.user_data(machine.instance)
+        data = machine.instance.user_data
+        return base64.b64decode(data.as_bytes()) if data else b''
 
     def plan(self, machine: Machine) -> dict[str, Any]:
         """Return what the user data and the key pair say."""
-        return told.plan(machine.instance)
+        pair = machine.instance.ec2_backend.key_pairs.get(machine.instance.key_name)
+        key = pair.material_public if pair else b''
+        return {**cloud_config.parse(self.user_data(machine)), 'instance': machine.id,
+                'user': USER, 'keys': [key.decode() if isinstance(key, bytes) else str(key)]}
 
     def network_of(self, machine: Machine) -> str:
         """Return the VPC."""
@@ -51,8 +58,18 @@ class Cloud(cloud.Cloud):
     def allowed(
         self, machine: Machine, members: Mapping[str, Sequence[str]],
     ) -> tuple[network.Allowed, ...]:
-        """Return what the security groups let in."""
-        return told.allowed(machine.instance, members)
+        """Return what the security groups let in; a source may be another group."""
+        allowed = []
+        for group in machine.instance.nics[0].group_set:
+            for rule in group.ingress_rules:
+                sources = [rule.ip_range['CidrIp']] if rule.ip_range.get('CidrIp') else []
+                if rule.source_group:
+                    sources += members.get(rule.source_group.get('GroupId', ''), ())
+                ports = None if rule.from_port in (None, -1) else (
+                    int(rule.from_port), int(rule.to_port))
+                if sources:
+                    allowed.append(network.Allowed(rule.ip_protocol, ports, tuple(sources)))
+        return tuple(allowed)
 
     def serve_metadata(self, machine: Machine) -> MetadataService:
         """Serve IMDS, of version 2 where the instance asks for it: with a token."""
@@ -66,7 +83,13 @@ class Cloud(cloud.Cloud):
             if instance.metadata_options.http_tokens == 'required' \
                     and headers.get('X-aws-ec2-metadata-token') != token:
                 return 401, ''
-            text = told.values(instance, machine.notice).get(path.removeprefix('/latest/'))
+            text = {
+                'meta-data/instance-id': instance.id,
+                'meta-data/placement/region': instance.region_name,
+                **({'meta-data/spot/instance-action': json.dumps({
+                    'action': 'terminate', 'time': time.strftime(
+                        '%Y-%m-%dT%H:%M:%SZ', time.gmtime(machine.notice))})}
+                   if machine.notice else {})}.get(path.removeprefix('/latest/'))
             return (404, '') if text is None else (200, text)
 
         return MetadataService(machine.space, answers)
