@@ -42,10 +42,9 @@ class Refusal(Exception):
 
 
 #: Answers to a request for a machine, by the fault; one that is 'lost' has its effect.
-FAULTS = {
-    'throttled': Refusal(429, 'too_fast', **{'Retry-After': '1'}),
-    'unavailable': Refusal(503, 'closed'), 'full': Refusal(409, 'exhausted'),
-    'lost': Refusal(500, 'no_answer')}
+FAULTS: Mapping[str, tuple[int, str, Mapping[str, str]]] = {
+    'throttled': (429, 'too_fast', {'Retry-After': '1'}), 'unavailable': (503, 'closed', {}),
+    'full': (409, 'exhausted', {}), 'lost': (500, 'no_answer', {})}
 
 
 class Meadow:
@@ -136,7 +135,8 @@ class Meadow:
             self._met.set()
             if fault == 'lost':
                 self._create(region, body)
-            raise FAULTS[fault]
+            status, code, headers = FAULTS[fault]
+            raise Refusal(status, code, **headers)
         return self._create(region, body)
 
     def _create(self, region: str, body: dict[str, Any]) -> dict[str, Any]:
