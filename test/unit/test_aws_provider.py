@@ -18,7 +18,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 
 import pytest
 import yaml
@@ -613,22 +612,13 @@ def test_policy_names_each_action_once_as_documented():
     assert written == document
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(('127.0.0.1', 0))
-        port: int = probe.getsockname()[1]
-    return port
-
-
-def test_unreachable_aws_is_one_line(monkeypatch):
+def test_unreachable_aws_is_one_line(hasty, monkeypatch):
     for name, value in {'AWS_ACCESS_KEY_ID': 'x', 'AWS_SECRET_ACCESS_KEY': 'x',
                         'FOGROS2_AWS_REGIONS': 'eu-central-1',
-                        'AWS_ENDPOINT_URL': f'http://127.0.0.1:{free_port()}'}.items():
+                        'AWS_ENDPOINT_URL': 'http://127.0.0.1:9'}.items():
         monkeypatch.setenv(name, value)
     provider = AWSProvider(Ec2(clients.Account()))
-    begin = time.monotonic()
     for ask in (provider.answers, lambda: list(provider.find({}))):
         with pytest.raises(PrerequisiteError, match='AWS does not answer') as caught:
             ask()
         assert 'AWS_ENDPOINT_URL' in caught.value.hint
-    assert time.monotonic() - begin < 30.0

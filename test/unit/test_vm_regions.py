@@ -8,6 +8,7 @@ import math
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -162,27 +163,20 @@ def test_distances() -> None:
     assert regions.distance_km((52.52, 13.41), (40.71, -74.01)) == pytest.approx(6385, abs=10)
 
 
-class Answer:
-    def __init__(self, body: object) -> None:
-        self.body = body
-
-    def raise_for_status(self) -> None:
-        pass
-
-    def json(self) -> object:
-        return self.body
-
-
 def test_geolocation_reads_what_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     import requests
-    monkeypatch.setattr(requests, 'get', lambda url, timeout: Answer({'loc': '48.2085,16.3721'}))
+
+    def answer(body: object) -> object:
+        return SimpleNamespace(raise_for_status=lambda: None, json=lambda: body)
+
+    monkeypatch.setattr(requests, 'get', lambda url, timeout: answer({'loc': '48.2085,16.3721'}))
     assert regions.geolocate() == (48.2085, 16.3721)
     for body in ({'loc': 'moon'}, {}, [], {'loc': '1,2,3'}):
-        monkeypatch.setattr(requests, 'get', lambda url, timeout, body=body: Answer(body))
+        monkeypatch.setattr(requests, 'get', lambda url, timeout, body=body: answer(body))
         with pytest.raises(ProviderError, match='location of this computer'):
             regions.geolocate()
 
-    def refuse(url: str, timeout: float) -> Answer:
+    def refuse(url: str, timeout: float) -> None:
         raise requests.ConnectionError('no route')
 
     monkeypatch.setattr(requests, 'get', refuse)

@@ -49,7 +49,7 @@ from fogros2.provider.vm.cloud import (
     VmId,
 )
 from fogros2.provider.vm.creation import Creation
-from fogros2.provider.vm.options import CHEAPEST, ipv4, NEAREST, VmOptions
+from fogros2.provider.vm.options import ipv4, NEAREST, VmOptions
 from fogros2.provider.vm.user_data import AGENT_DIRECTORY, AGENT_PROGRAM
 from fogros2.waiting import cancellable, wait_until
 
@@ -186,9 +186,8 @@ class VmProvider(Provider):
         if region == NEAREST:
             return None
         options = options.in_region(region)
-        if options.named_type == CHEAPEST or options.chooses_type:
-            return None
-        return self._price(region, options.types[0], options, self.cancel)
+        return None if options.chooses_type else self._price(
+            region, options.types[0], options, self.cancel)
 
     def _price(
         self, region: str, kind: str, options: VmOptions, cancel: Optional[threading.Event],
