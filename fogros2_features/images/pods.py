@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 import os
 from pathlib import Path
 import shutil
@@ -48,3 +48,15 @@ def recipe(
         script=installer.image_script(
             (*bootstrap.apt_packages(under.rmw), PACKAGE),
             workspace.dependencies(*spec.workspaces)), **more)
+
+
+def build(
+    what: image.Recipe, folder: Path, *, engine: str, push: bool, say: Callable[[str], None],
+) -> str:
+    """
+    Write the recipe to ``folder``, build the image and push it; return its reference.
+
+    :raises FogError: a step failed; the error has the last output of the engine.
+    """
+    return image.build(
+        what, folder, program=image.engine(engine), push=push, on_output=say)

@@ -92,14 +92,13 @@ def _create(args: argparse.Namespace) -> int:
     words = parser.parse_args(args.rest)
     from pathlib import Path
 
-    from fogros2.provider.kubernetes import image
     from fogros2_features.images import pods
     recipe = pods.recipe(words.registry, base=words.base, folder=words.workspace)
     if words.dry_run or args.dry_run:
         print(recipe.containerfile, end='')
         return 0
-    made = image.build(recipe, Path(words.folder), program=image.engine(words.engine),
-                       push=not words.no_push, on_output=warn)
+    made = pods.build(recipe, Path(words.folder), engine=words.engine,
+                           push=not words.no_push, say=warn)
     print(f"{'built' if words.no_push else 'pushed'} {made}")
     registry = made.rpartition(':')[0]
     print(f"launch files take it by container_image='{registry}:{{dependencies}}'")
