@@ -356,6 +356,17 @@ def test_ssh_rule_changes_and_ends(robot):
     robot.provider.destroy(machine_id)
 
 
+def test_a_changed_rule_is_waited_for(robot):
+    """Azure answers a change of a resource with 200, and needs time for it all the same."""
+    machine_id = robot.create()
+    robot.provider.allow(machine_id, 8765, ['198.51.100.0/24'])
+    robot.azure.delay = 0.5
+    robot.provider.allow(machine_id, 8765, ['203.0.113.0/24'])
+    (rule,) = [entry for key, entry in robot.azure.resources.items() if key.endswith('tcp-8765')]
+    assert rule['properties']['provisioningState'] == 'Succeeded'
+    robot.provider.destroy(machine_id)
+
+
 def test_no_room_at_a_start_is_named(robot):
     machine_id = robot.create()
     robot.reach(machine_id)
