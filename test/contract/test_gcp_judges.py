@@ -63,3 +63,18 @@ def test_googles_client_creates_lists_and_deletes(gce, google):
     assert listed == ['planner']
     done(instances.delete(**place, instance='planner'))
     assert gce.instances == []
+
+
+def test_googles_client_reads_our_firewall_rules(gce, google):
+    from fogros2.model import MachineSpec
+    from fogros2.provider.gcp.provider import GCPProvider
+    from fogros2_testing import request_for
+    _, client = google
+    provider, spec = GCPProvider(), MachineSpec('planner', 'gcp', {})
+    machine = provider.create(spec, request_for(spec))
+    rules = {rule.name.rpartition('-')[2]: rule for rule in client('FirewallsClient').list(
+        project='robots') if rule.name.startswith('fogros2-')}
+    assert rules['deny'].denied[0].I_p_protocol == 'all'
+    assert rules['22'].source_ranges == ['198.51.100.7/32']
+    assert max(rules['22'].priority, rules['vpn'].priority) < rules['deny'].priority < 65534
+    provider.destroy(machine)
