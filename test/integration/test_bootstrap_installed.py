@@ -25,7 +25,7 @@ from fogros2.shell.local import LocalShell
 
 TOOLS = frozenset({'ip', 'nft', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'})
 ROS = HostFacts(
-    system='ubuntu', release='24.04', architecture='x86_64', uid=1000,
+    system='ubuntu', release='24.04', architecture='x86_64',
     user='ubuntu', home='/home/ubuntu', libc='glibc 2.39', root=True,
     pythons=(Python('/usr/bin/python3', (3, 12), True),), programs=TOOLS | {'colcon', 'rosdep'},
     free_bytes=50 << 30, ros={'jazzy': '/opt/ros/jazzy'},

@@ -19,7 +19,7 @@ from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError
 from fogros2.host import bootstrap, dependencies, installer, workspace
 from fogros2.host.inspection import HostFacts
 from fogros2.host.installer import fill, find_pip, Needs
-from fogros2.model import Command, MachineSpec, Result
+from fogros2.model import Command, Result
 from rigs.rosdep import rosdep_source
 
 FACTS = HostFacts(user='fog', home='/home/fog')
@@ -78,13 +78,6 @@ def test_folder_follows_the_requirements_and_the_interpreters() -> None:
 
     assert path('x', 'y') == path('y', 'x') and path('x').startswith('/home/a/.local/share/')
     assert len({path('x'), path('y'), path('x', python='python 3 11 1 /usr/bin/python3')}) == 3
-
-
-def test_packages_count_for_the_image() -> None:
-    under = plan.underlay({}, (), '/usr/bin/ros2')
-    found = {bootstrap.dependencies(MachineSpec('a', 'fake', **more), under) for more in (
-        {}, {'apt': ('x',)}, {'pip': ('x',)}, {'apt': ('x', 'y')}, {'apt': ('y', 'x')})}
-    assert len(found) == 4
 
 
 def completed(command: Command) -> subprocess.CompletedProcess[str]:
