@@ -95,9 +95,10 @@ class Engine:
         try:
             printed = reached.run(commands.fetch(image, rmw), timeout=_TIMEOUTS.install)
         except CommandError as error:
+            from fogros2.provider.container.engine import last_line  # slow to import
             raise PrerequisiteError(
                 f"'{reached.spec.name}' can't get the image '{image}': "
-                f'{commands.reason(error.result.stderr)}',
+                f'{last_line(error.result.stderr)}',
                 "build it for the machine's processors too, or choose another machine"
                 if 'processors, and the machine has' in error.result.stderr else
                 'is its name right, and may anybody download it?') from error

@@ -192,6 +192,7 @@ def engine() -> Check:
 def overlay() -> Check:
     """Check whether the root file system of this computer can serve as an image."""
     try:
+        container.check_programs()
         container.check_root()
     except FogError as error:
         return Check("container on this computer's root", 'warning', str(error.args[0]),

@@ -142,7 +142,8 @@ def test_image_for_another_processor_is_named(foreign: str, image: str) -> None:
             'unshare', '--mount', 'sh', '-ec',
             'mount -t tmpfs none /proc/sys/fs/binfmt_misc; : >/proc/sys/fs/binfmt_misc/status; '
             'exec "$@"', 'sh', *fetch.argv)))
-    assert 'processors, and the machine has' in containers.reason(caught.value.result.stderr)
+    assert 'processors, and the machine has' in container_engine.last_line(
+        caught.value.result.stderr)
 
 
 def test_container_of_a_killed_follower_is_removed(image, launch, tmp_path):

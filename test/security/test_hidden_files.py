@@ -147,4 +147,4 @@ def test_machine_gets_a_search_of_its_own_folders(tmp_path: Path) -> None:
             f'{shown / name}/secret\0'.encode() for name in names)
         assert set(hidden_files.read(str(cache))) == {str(shown / name) for name in names}
         if names != 'a':
-            cache.write_text('what another version wrote')
+            cache.write_bytes(cache.read_bytes()[:-9])

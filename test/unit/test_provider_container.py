@@ -368,11 +368,9 @@ def test_times_of_both_engines_are_read():
 
 
 def entry_files(**changes) -> bytes:
-    archive = container_root.Archive()
-    container_entry.add(archive, **{
+    return container_entry.archive(**{
         'user': 'fog', 'number': 2013265999, 'authorized_key': 'ssh-ed25519 AAAA me',
-        'agent_config': {'machine': 'm', 'end_command': []}, **changes})
-    return archive.data()
+        'agent_config': {'machine': 'm', 'end_command': []}, **changes}).data()
 
 
 def test_first_process_gets_key_and_agent():

@@ -188,7 +188,7 @@ class ContainerProvider(Provider):
         if options.image:
             container_engine.check_architecture(engine, options.image)
         else:
-            check_root(isolated=options.isolated)
+            check_root()
             for path in () if options.isolated else container_root.environment_mounts(
                     *spec.workspaces):
                 if options.user != 'root' and not os.stat(path).st_mode & 0o004:
@@ -278,7 +278,7 @@ class ContainerProvider(Provider):
         shown = () if base else system if options.user == 'root' else (
             *system, *filter(os.path.isdir, environment))
         number = login_ids.login_id(request.token)
-        archive = _entry(spec, request, options, number)
+        archive = _entry(request, options, number)
         container_root.accounts(archive, options.user, number, Path(f'{base}/etc'))
         if base:
             archive.file('etc/apt/sources.list', ''.join(
@@ -317,7 +317,7 @@ class ContainerProvider(Provider):
             # podman keeps what it has copied in its folder for temporary files
             with tempfile.TemporaryDirectory() as aside:
                 engine.call('cp', '-', f'{identity}:/', what=what, variables=(f'TMPDIR={aside}',),
-                            data=_entry(spec, request, options,
+                            data=_entry(request, options,
                                         login_ids.login_id(request.token)).data())
             _start(engine, identity, request.token, kept=spec.on_exit == 'stop', what=what)
         except BaseException:
@@ -592,16 +592,10 @@ def _start(engine: Engine, identity: str, token: str, *, kept: bool, what: str) 
         raise container_engine.translate(error) from error
 
 
-def _entry(
-    spec: MachineSpec, request: CreateRequest, options: Options, number: int,
-) -> Archive:
-    """Return an archive with the first process of a machine, and the files that it needs."""
-    archive = Archive()
-    container_entry.add(
-        archive, user=options.user, number=number, authorized_key=request.authorized_key,
-        agent_config=request.agent_config,
-        nested=options.containers)
-    return archive
+def _entry(request: CreateRequest, options: Options, number: int) -> Archive:
+    return container_entry.archive(
+        user=options.user, number=number, authorized_key=request.authorized_key,
+        agent_config=request.agent_config, nested=options.containers)
 
 
 def _after(log: str, mark: str) -> str:
@@ -660,16 +654,12 @@ def check_programs(*, isolated: bool = False) -> None:
             package_of={'sshd': 'openssh-server', 'ssh-keygen': 'openssh-client'})
 
 
-def check_root(*, isolated: bool = False) -> None:
+def check_root() -> None:
     """
-    Check that this computer's own root can replace an image.
+    Check that a root of this computer can be overlaid, and so replace an image.
 
-    :param isolated: check the root of a new system instead.
-    :raises PrerequisiteError: it cannot be overlaid, or lacks what a machine needs.
+    :raises PrerequisiteError: it cannot be overlaid.
     """
-    check_programs(isolated=isolated)
-    if isolated:
-        debian_root.check()
     kinds = Path('/proc/filesystems').read_text().split()
     if 'overlay' not in kinds and not os.path.isdir('/sys/module/overlay'):
         process.run(Command(('modprobe', 'overlay'), sudo=True), timeout=10.0, check=False)

@@ -95,7 +95,7 @@ def gone(text: str) -> bool:
 def last_line(text: str) -> str:
     """Return the last error among an engine's messages."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    errors = [line for line in lines if line.lower().startswith('error')]
+    errors = [line for line in lines if line.lower().startswith(('error', 'e: '))]
     return (errors or lines or ['no reason given'])[-1]
 
 
