@@ -317,7 +317,8 @@ def test_other_flags_are_tried_where_control_groups_mislead(monkeypatch):
     assert list(container_engine.candidates(Engine('docker'))) == [Engine('docker')]
     assert container_engine.is_runtime_trouble(ProviderError(
         'crun: invalid file system type on `/sys/fs/cgroup`: OCI runtime error'))
-    assert not container_engine.is_runtime_trouble(ProviderError('the name is already in use'))
+    for reason in ('the name is already in use', 'OCI runtime error: error running hook #0'):
+        assert not container_engine.is_runtime_trouble(ProviderError(reason))
 
 
 def test_limits_never_ask_for_more_than_there_is():

@@ -208,7 +208,9 @@ def remember(engine: Engine) -> None:
 def is_runtime_trouble(error: ProviderError) -> bool:
     """Return whether other flags may help: the runtime does not fit the control groups."""
     text = str(error).lower()
-    return any(word in text for word in ('cgroup', 'oci runtime', 'sd-bus', 'dbus', 'systemd'))
+    # a hook of ours fails with any runtime
+    return 'hook' not in text and any(
+        word in text for word in ('cgroup', 'oci runtime', 'sd-bus', 'dbus', 'systemd'))
 
 
 def answers(engine: Engine) -> None:
