@@ -10,7 +10,6 @@ from pathlib import Path
 import shutil
 import subprocess
 import sys
-import zipfile
 
 import pytest
 
@@ -20,6 +19,7 @@ from fogros2.host import bootstrap, dependencies, installer, workspace
 from fogros2.host.inspection import HostFacts
 from fogros2.host.installer import fill, find_pip, Needs
 from fogros2.model import Command, Result
+from rigs.pip_site import package, wheel
 from rigs.rosdep import rosdep_source
 
 FACTS = HostFacts(user='fog', home='/home/fog')
@@ -91,20 +91,6 @@ def test_variables_of_a_launch_file_are_on_no_command_line() -> None:
     assert 'secret' not in ' '.join(command.argv)
     shown = installer.among_nodes({'API_KEY': "it's secret"}, (), 'cat; echo "$API_KEY"', 'show')
     assert completed(shown).stdout == "it's secret\n"
-
-
-def wheel(folder: Path, name: str, version: str = '1', needs: str = '', **modules: str) -> None:
-    """Write a wheel of some modules."""
-    with zipfile.ZipFile(folder / f'{name}-{version}-py3-none-any.whl', 'w') as archive:
-        for module, text in modules.items():
-            archive.writestr(f'{module}.py', text)
-        info = f'{name}-{version}.dist-info'
-        archive.writestr(f'{info}/METADATA', (
-            f'Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n'
-            f'{needs and f"Requires-Dist: {needs}"}\n'))
-        archive.writestr(f'{info}/WHEEL', 'Wheel-Version: 1.0\nRoot-Is-Purelib: true\n'
-                                          'Tag: py3-none-any\n')
-        archive.writestr(f'{info}/RECORD', '')
 
 
 def installed(
@@ -195,25 +181,14 @@ def test_package_that_brings_a_module_of_ours_is_not_kept(tmp_path: Path) -> Non
     assert not Path(folder, 'site').exists() and not Path(folder, 'complete').exists()
 
 
-def manifest(root: Path, name: str, *lines: str) -> None:
-    """Write an installed package of a workspace."""
-    for folder, text in (
-            (f'share/ament_index/resource_index/packages/{name}', ''),
-            (f'share/{name}/package.xml',
-             f'<package><name>{name}</name>{"".join(lines)}</package>')):
-        path = root / 'install' / name / folder
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-
-
 def test_keys_are_what_packages_and_nodes_run_with(tmp_path: Path) -> None:
-    manifest(tmp_path, 'mine', '<exec_depend>python3-scipy</exec_depend>',
+    package(tmp_path, 'mine', '', '<exec_depend>python3-scipy</exec_depend>',
              '<depend>tf2_ros</depend>', '<build_depend>eigen</build_depend>',
              '<exec_depend>other</exec_depend>', '<test_depend>gtest</test_depend>',
              '<exec_depend condition="$ROS_VERSION == 1">rospy</exec_depend>')
-    manifest(tmp_path, 'other')
+    package(tmp_path, 'other')
     # it is in the workspaces of its users, and rosdep has no such key
-    manifest(tmp_path, 'fogros2', '<exec_depend>fogros2-av-pip</exec_depend>')
+    package(tmp_path, 'fogros2', '', '<exec_depend>fogros2-av-pip</exec_depend>')
     found = workspace.inspect(tmp_path)
     assert workspace.dependencies(tmp_path) == [
         'eigen', 'gtest', 'python3-scipy', 'tf2_ros']

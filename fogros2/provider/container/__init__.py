@@ -227,24 +227,16 @@ class ContainerProvider(Provider):
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Create and start the container; return when the engine has started it."""
         options = Options.parse(spec.options)
-        ways = container_engine.candidates(
-            container_engine.select(options.engine, options.image or None))
-        engine = next(ways)
+        engine = container_engine.select(options.engine, options.image or None)
         create = self._create_from_image if options.image else self._create_from_root
         for name in request.with_volumes:
             _check_free(engine, name, container_machine.container_name(spec.name, request.tags))
         with _sharing(request):
-            while True:
-                try:
-                    identity = create(engine, spec, request, options)
-                    container_engine.remember(engine)
-                    break
-                except ProviderError as error:
-                    another = next(ways, None)
-                    if another is None or not container_engine.is_runtime_trouble(error):
-                        identity = self._existing(engine, spec.name, request, error)
-                        break
-                    engine = another
+            try:
+                identity = container_engine.tried(
+                    engine, lambda way: create(way, spec, request, options))
+            except ProviderError as error:
+                identity = self._existing(engine, spec.name, request, error)
         return container_machine.machine_id(engine, identity, request.token)
 
     def _existing(

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import dataclasses
 import json
 import math
@@ -12,12 +12,13 @@ from pathlib import Path
 import re
 import resource
 import threading
-from typing import Any, Optional
+from typing import Any, Optional, TypeVar
 
 from fogros2 import process
 from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError, ProviderError
 from fogros2.model import Command, Result
 
+T = TypeVar('T')
 ENGINES = ('podman', 'docker')
 DOCKER_SOCKET = Path('/var/run/docker.sock')
 #: How an engine had to be called in this process, by its name.
@@ -186,6 +187,26 @@ def docker() -> Engine:
         os.environ.get('DOCKER_HOST') or os.access(DOCKER_SOCKET, os.W_OK)))
 
 
+def tried(engine: Engine, create: Callable[[Engine], T]) -> T:
+    """
+    Create a container by the first way to call an engine that works; remember it for this process.
+
+    :raises ProviderError: of the last way, or no other way would help.
+    """
+    ways = candidates(engine)
+    way = next(ways)
+    while True:
+        try:
+            result = create(way)
+            _WORKED[engine.name] = way
+            return result
+        except ProviderError as error:
+            another = next(ways, None)
+            if another is None or not is_runtime_trouble(error):
+                raise
+            way = another
+
+
 def candidates(engine: Engine) -> Iterator[Engine]:
     """
     Yield ways to call an engine: the one that worked before, the one for the control groups, and
@@ -198,11 +219,6 @@ def candidates(engine: Engine) -> Iterator[Engine]:
                 engines += [dataclasses.replace(engine, flags=(*runtime, *manager))
                             for manager in ((), ('--cgroup-manager', 'cgroupfs'))]
     return iter(dict.fromkeys(engines))
-
-
-def remember(engine: Engine) -> None:
-    """Remember for this process how an engine had to be called."""
-    _WORKED[engine.name] = engine
 
 
 def is_runtime_trouble(error: ProviderError) -> bool:
