@@ -178,7 +178,7 @@ def test_a_machine_like_the_robot_needs_nothing() -> None:
 
 def test_auto_takes_ros_where_it_is() -> None:
     todo = plan(ROS)
-    assert todo.mode == 'none' and todo.wheels_target
+    assert todo == plan(ROS, 'none') and todo.mode == 'none' and todo.wheels_target
     assert todo.install.kind == 'ros'
     assert todo.install.setup == ('/opt/ros/jazzy/setup.sh',)
     assert todo.install.environment['PYTHONPATH'] == '/home/ubuntu/.local/share/fogros2/k1/site'
@@ -324,47 +324,40 @@ def test_apt_installs_ros_on_noble_alone() -> None:
                     'python3-colcon-common-extensions', 'python3-rosdep'):
         assert package in install.argv[-1]
     assert plan(ROS, 'apt').commands[0].what == 'unpack fogros2'
-    for changes, words in (
-            ({'system': 'debian'}, 'Ubuntu 24.04 alone'), ({'root': False}, 'needs root'),
-            ({'free_bytes': 1 << 20}, 'are free'),
-            ({'architecture': 'armv7l'}, 'for x86_64 and aarch64 .* not for armv7l')):
-        with pytest.raises(PrerequisiteError, match=words):
-            plan(dataclasses.replace(NOBLE, **changes), 'apt')
-    with pytest.raises(PrerequisiteError, match='1 MB are free in .*, 400 are needed .make room'):
-        plan(dataclasses.replace(NOBLE, free_bytes=1 << 20), 'pip')
     # and where the robot has no wheels
     assert plan(NOBLE, wheel=dataclasses.replace(WHEELS, ros=False)).mode == 'apt'
     with pytest.raises(PrerequisiteError, match='no wheels of ROS 2 to send.*Ubuntu 24.04'):
         plan(DEBIAN, wheel=dataclasses.replace(WHEELS, ros=False))
 
 
-def test_none_installs_nothing() -> None:
-    with pytest.raises(PrerequisiteError, match="bootstrap='auto'"):
-        plan(NOBLE, 'none')
-    assert plan(ROS, 'none').install.kind == 'ros'
-    with pytest.raises(PrerequisiteError, match='lacks rsync'):
-        plan(dataclasses.replace(ROS, programs=TOOLS - {'rsync'}), 'none')
+@pytest.mark.parametrize(('changes', 'mode', 'words'), [
+    ({'system': 'debian'}, 'apt', 'Ubuntu 24.04 alone'), ({'root': False}, 'apt', 'needs root'),
+    ({'free_bytes': 1 << 20}, 'apt', '1 MB are free, 3072 are needed'),
+    ({'architecture': 'armv7l'}, 'apt', 'for x86_64 and aarch64 .* not for armv7l'),
+    ({'free_bytes': 1 << 20}, 'pip', '1 MB are free in .*, 400 are needed .make room'),
+    ({}, 'none', "no ROS 2 jazzy .*bootstrap='auto'"),
+    ({'programs': TOOLS - {'rsync'}}, 'none', 'lacks rsync'),
+    ({'programs': {'apt-get', 'ip'}, 'root': False}, 'auto',
+     r'lacks nftables, rsync, wireguard-tools \('),
+    ({'pythons': ()}, 'auto', 'Python 3.10'),
+    ({'pythons': (Python('/usr/bin/python3', (3, 8), True),)}, 'auto', 'Python 3.10')])
+def test_machine_that_cannot_be_prepared_is_named(
+    changes: dict[str, Any], mode: Bootstrap, words: str,
+) -> None:
+    with pytest.raises(PrerequisiteError, match=words):
+        plan(dataclasses.replace(NOBLE, **changes), mode)
 
 
-def test_missing_programs_are_installed_first_or_named() -> None:
+def test_missing_programs_are_installed_first() -> None:
     bare = dataclasses.replace(NOBLE, programs=frozenset({'apt-get', 'ip'}))
     tools = plan(bare).tools
     assert len(tools) == 1 and tools[0].sudo
     for package in ('rsync', 'wireguard-tools', 'wireguard-go'):
         assert package in tools[0].argv[-1]
     assert 'iproute2' not in tools[0].argv[-1]
-    with pytest.raises(PrerequisiteError, match=r'lacks nftables, rsync, wireguard-tools \('):
-        plan(dataclasses.replace(bare, root=False))
     kernel = dataclasses.replace(
         NOBLE, kernel_wireguard=True, programs=TOOLS - {'wireguard-go'})
     assert plan(kernel).tools == ()
-
-
-def test_a_machine_without_a_python_is_refused() -> None:
-    old = (Python('/usr/bin/python3', (3, 8), True),)
-    for pythons in ((), old):
-        with pytest.raises(PrerequisiteError, match='Python 3.10'):
-            plan(dataclasses.replace(NOBLE, pythons=pythons))
 
 
 def test_the_workspace_s_folders_come_before_the_install_s_own(tmp_path: Path) -> None:
