@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from fogros2 import process
 from fogros2.errors import CommandError, PrerequisiteError
 from fogros2.feature import ReachedMachine, RunningMachine
 from fogros2.host.installer import apt_install
@@ -95,10 +96,9 @@ class Engine:
         try:
             printed = reached.run(commands.fetch(image, rmw), timeout=_TIMEOUTS.install)
         except CommandError as error:
-            from fogros2.provider.container.engine import last_line  # slow to import
             raise PrerequisiteError(
                 f"'{reached.spec.name}' can't get the image '{image}': "
-                f'{last_line(error.result.stderr)}',
+                f'{process.last_error(error.result.stderr)}',
                 "build it for the machine's processors too, or choose another machine"
                 if 'processors, and the machine has' in error.result.stderr else
                 'is its name right, and may anybody download it?') from error

@@ -21,7 +21,7 @@ import pytest
 from fogros2 import plan
 from fogros2.errors import CommandError, ConfigurationError, DdsError
 from fogros2.model import Command, CreateRequest, MachineSpec, NodeSpec
-from fogros2.process import run, which
+from fogros2.process import last_error, run, which
 from fogros2.provider.container import ContainerProvider
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import root as container_root
@@ -142,7 +142,7 @@ def test_image_for_another_processor_is_named(foreign: str, image: str) -> None:
             'unshare', '--mount', 'sh', '-ec',
             'mount -t tmpfs none /proc/sys/fs/binfmt_misc; : >/proc/sys/fs/binfmt_misc/status; '
             'exec "$@"', 'sh', *fetch.argv)))
-    assert 'processors, and the machine has' in container_engine.last_line(
+    assert 'processors, and the machine has' in last_error(
         caught.value.result.stderr)
 
 

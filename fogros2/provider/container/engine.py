@@ -83,7 +83,7 @@ class Engine:
         result = self.call('container', 'inspect', *names, what='look at containers', check=False)
         reports = json.loads(result.stdout) if result.stdout.strip() else []
         if result.returncode != 0 and not gone(result.stderr):
-            raise ProviderError(f'{self.name} failed: {last_line(result.stderr)}',
+            raise ProviderError(f'{self.name} failed: {process.last_error(result.stderr)}',
                                 sudo_hint(result.stderr))
         return [dict(entry) for entry in reports or ()]
 
@@ -91,13 +91,6 @@ class Engine:
 def gone(text: str) -> bool:
     """Return whether an engine's message says that there is no such container."""
     return 'no such container' in text.lower() or 'no such object' in text.lower()
-
-
-def last_line(text: str) -> str:
-    """Return the last error among an engine's messages."""
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    errors = [line for line in lines if line.lower().startswith(('error', 'e: '))]
-    return (errors or lines or ['no reason given'])[-1]
 
 
 def sudo_hint(text: str) -> str:
@@ -140,7 +133,7 @@ def translate(error: CommandError) -> ProviderError:
     text = error.result.stderr
     hint = next((hint for pattern, hint in _HINTS.items()
                  if re.search(pattern, text.lower(), re.DOTALL)), sudo_hint(text))
-    return ProviderError(f'{error.command.what} failed: {last_line(text)}', hint)
+    return ProviderError(f'{error.command.what} failed: {process.last_error(text)}', hint)
 
 
 def select(wanted: str, image: Optional[str]) -> Engine:
@@ -239,7 +232,7 @@ def answers(engine: Engine) -> None:
         result = engine.call('version', what='asking docker', check=False)
         if result.returncode != 0:
             raise PrerequisiteError(
-                f'docker does not answer: {last_line(result.stderr)}',
+                f'docker does not answer: {process.last_error(result.stderr)}',
                 sudo_hint(result.stderr) or 'sudo systemctl start docker')
 
 
