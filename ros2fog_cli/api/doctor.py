@@ -179,7 +179,7 @@ def engine() -> Check:
     """Check for a container engine that works."""
     name = 'container engine'
     try:
-        chosen = container_engine.select('auto', None)
+        chosen = container_engine.select('auto')
         # The flags may name a runtime or a cgroup manager that does not work: call with flags.
         result = chosen.call('ps', '--format', '{{.ID}}', what='asking the container engine',
                              timeout=20.0)

@@ -168,7 +168,7 @@ class ContainerProvider(Provider):
     def check_here(self, spec: MachineSpec) -> None:
         """Check that the engine, TUN and the programs for a machine without an image exist."""
         options = Options.parse(spec.options)
-        container_engine.select(options.engine, options.image or None)
+        container_engine.select(options.engine, options.image)
         if not os.path.exists('/dev/net/tun'):
             raise PrerequisiteError('there is no /dev/net/tun on this computer',
                                     'sudo modprobe tun')
@@ -179,7 +179,7 @@ class ContainerProvider(Provider):
         """Check the engine, the rights, TUN, and what a machine without an image needs."""
         self.check_here(spec)
         options = Options.parse(spec.options)
-        engine = container_engine.select(options.engine, options.image or None)
+        engine = container_engine.select(options.engine, options.image)
         trouble = process.sudo_trouble() if engine.sudo else None
         if trouble is not None:
             raise PrerequisiteError(
@@ -227,7 +227,7 @@ class ContainerProvider(Provider):
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Create and start the container; return when the engine has started it."""
         options = Options.parse(spec.options)
-        engine = container_engine.select(options.engine, options.image or None)
+        engine = container_engine.select(options.engine, options.image)
         create = self._create_from_image if options.image else self._create_from_root
         for name in request.with_volumes:
             _check_free(engine, name, container_machine.container_name(spec.name, request.tags))

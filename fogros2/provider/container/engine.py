@@ -136,7 +136,7 @@ def translate(error: CommandError) -> ProviderError:
     return ProviderError(f'{error.command.what} failed: {process.last_error(text)}', hint)
 
 
-def select(wanted: str, image: Optional[str]) -> Engine:
+def select(wanted: str, image: str = '') -> Engine:
     """
     Return the engine to create a machine with: the requested one, or the first that is installed.
 
