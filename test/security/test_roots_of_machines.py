@@ -156,7 +156,7 @@ def attacked(
             clouds.provider.destroy(machine_id)
             assert machine_id.split(':')[2].encode() not in log.read_bytes()
     finally:
-        sudo('rm -rf "$1"', own)
+        sudo('rm -rf "$@"', own, str(underlay))
 
 
 def test_no_account_looks_into_a_machine_s_root(attacked: Attacked) -> None:
