@@ -208,6 +208,13 @@ def run(
     return result
 
 
+def last_error(text: str) -> str:
+    """Return the last error among the messages of a container engine or of apt."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    errors = [line for line in lines if line.lower().startswith(('error', 'e: '))]
+    return (errors or lines or ['no reason given'])[-1]
+
+
 class Tail:
     """
     The last bytes of a stream.

@@ -96,8 +96,6 @@ class Preparation:
     :param mode: how ROS gets to the machine; 'none' if the machine has it.
     :param tools: commands that install rsync and the VPN's programs, which later steps need.
     :param wheels_target: folder on the machine to send the wheels to; '' sends none.
-    :param fetched: distributions that ``commands`` take from the machine's package index, for
-        ``python``; where it reaches none, the robot fetches and sends them.
     """
 
     mode: Literal['none', 'apt', 'pip']
@@ -105,8 +103,6 @@ class Preparation:
     tools: tuple[Command, ...] = ()
     wheels_target: str = ''
     commands: tuple[Command, ...] = ()
-    fetched: tuple[str, ...] = ()
-    python: tuple[int, int] = MIN_PYTHON
 
     @property
     def note(self) -> str:
@@ -224,13 +220,15 @@ def ensure(
         try:
             run(command)
         except CommandError:
-            if not todo.fetched:
+            names = _asked(facts, wheels) if todo.mode == 'pip' else []
+            if not names:
                 raise
             # its package index cannot be reached
-            fetched = wheel_cache.fetch(todo.fetched, todo.python, timeout=timeout)
-            shell.sync(Path(fetched.folder), f'{todo.wheels_target}-fetched', excludes=(),
-                       timeout=timeout, cancel=cancel)
-            run(_install_wheels(facts, wheels, fetched.hashes))
+            fetched = wheel_cache.fetch(
+                names, _pip_python(facts, wheels).version, timeout=timeout)
+            shell.sync(fetched, f'{todo.wheels_target}-fetched', excludes=(), timeout=timeout,
+                       cancel=cancel)
+            run(_install_wheels(facts, wheels, wheel_cache.hashes(fetched)))
     notes = [todo.note]
     if needed.apt or needed.pip or needed.keys:
         notes += installer.install(needed, run, warn, always=install.kind == 'pip')
@@ -305,9 +303,7 @@ def plan(
                                 'install python3 there')
     tools = _tools(facts, mode, spec.name)
     python_only = all(space.python_only for space in chain)
-    no_pip = _why_not_pip(facts, wheels, python_only)
-    if under.rmw != DEFAULT_RMW:
-        no_pip = f'the wheels of ROS 2 have {DEFAULT_RMW} alone, and not {under.rmw}'
+    no_pip = _why_not_pip(facts, wheels, python_only, under.rmw)
     no_apt = _why_not_apt(facts)
     if facts.has_rmw(under.rmw) and (
             mode in ('auto', 'none')
@@ -436,8 +432,10 @@ def _tools(facts: HostFacts, mode: Bootstrap, machine: str) -> tuple[Command, ..
 
 
 def _why_not_pip(
-    facts: HostFacts, wheels: wheel_cache.Wheels, python_only: bool,
+    facts: HostFacts, wheels: wheel_cache.Wheels, python_only: bool, rmw: str,
 ) -> str:
+    if rmw != DEFAULT_RMW:
+        return f'the wheels of ROS 2 have {DEFAULT_RMW} alone, and not {rmw}'
     if not wheels.ros:
         return 'this robot has no wheels of ROS 2 to send'
     if not python_only:
@@ -513,8 +511,7 @@ def _pip(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
     """Return the plan that installs the sent wheels into a virtual environment."""
     return Preparation(
         'pip', _pip_install(facts, wheels), wheels_target=f'{_folder(facts, wheels)}/wheels',
-        commands=(_install_wheels(facts, wheels),), fetched=tuple(_asked(facts, wheels)),
-        python=_pip_python(facts, wheels).version)
+        commands=(_install_wheels(facts, wheels),))
 
 
 def _install_wheels(

@@ -20,12 +20,11 @@ ID=unknown VERSION_ID=
 [ ! -r /etc/os-release ] || . /etc/os-release
 echo "os $ID $VERSION_ID"
 echo "arch $(uname -m)"
-u=$(id -u)
-echo "user $u $(id -un)"
+echo "user $(id -un)"
 echo "home $HOME"
 echo "libc $(getconf GNU_LIBC_VERSION 2>/dev/null || echo other 0)"
 # in a pod the shell runs as root what asks for it, without sudo
-if [ "$u" = 0 ] || [ -n "$FOGROS2_ROOT" ] || sudo -n true 2>/dev/null; then echo root; fi
+if [ "$(id -u)" = 0 ] || [ -n "$FOGROS2_ROOT" ] || sudo -n true 2>/dev/null; then echo root; fi
 seen=
 for x in /usr/bin/python3 "$(command -v python3)" /usr/bin/python3.1[0-9] \
         /usr/local/bin/python3.1[0-9]; do
@@ -126,7 +125,6 @@ class HostFacts:
     system: str = 'unknown'
     release: str = ''
     architecture: str = ''
-    uid: int = 0
     user: str = 'root'
     home: str = '/root'
     libc: str = ''
@@ -191,12 +189,11 @@ def parse_facts(output: str) -> HostFacts:
     for distro, name in split('rmw', 2):
         rmw[distro] = (*rmw.get(distro, ()), name)
     system, release = (one('os', 'unknown').split() + [''])[:2]
-    uid, _, user = one('user', '0 root').partition(' ')
     disk = one('disk')
     return HostFacts(
-        system=system, release=release, architecture=one('arch'), uid=number(uid), user=user,
-        home=matched(PATH, one('home', '/root')),
-        libc=one('libc'), root='root' in values, pythons=tuple(pythons.values()),
+        system=system, release=release, architecture=one('arch'), user=one('user', 'root'),
+        home=matched(PATH, one('home', '/root')), libc=one('libc'), root='root' in values,
+        pythons=tuple(pythons.values()),
         programs=frozenset(values.get('program', ())), ros=dict(split('ros', 2)), rmw=rmw,
         kernel_wireguard='kernel-wireguard' in values,
         free_bytes=number(disk) * 1024 if disk.isdecimal() else None,

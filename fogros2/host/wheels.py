@@ -108,9 +108,9 @@ def _collect(folder: Path) -> Wheels:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix='.new-') as aside:
             packed = {name: _wheel(d, Path(aside)) for name, d in zip(names, distributions)}
+            digests = hashes(Path(aside))
             Path(aside, 'wheels.json').write_text(json.dumps({
-                name: [file, hashlib.sha256(Path(aside, file).read_bytes()).hexdigest()]
-                for name, file in packed.items()}))
+                name: [file, digests[file]] for name, file in packed.items()}))
             try:
                 os.rename(aside, target)
             except OSError:
@@ -128,24 +128,18 @@ def _collect(folder: Path) -> Wheels:
         dict(listed.values()))
 
 
-@dataclasses.dataclass(frozen=True)
-class Fetched:
-    """
-    Wheels from this computer's package index for the Python of a machine.
-
-    :param hashes: SHA-256 of each wheel in hexadecimal digits, by file name.
-    """
-
-    folder: str
-    hashes: Mapping[str, str]
+def hashes(folder: Path) -> dict[str, str]:
+    """Return the SHA-256 of each wheel in a folder in hexadecimal digits, by file name."""
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in folder.glob('*.whl')}
 
 
 def fetch(
     names: Iterable[str], python: tuple[int, int], *, timeout: float,
     folder: Optional[Path] = None,
-) -> Fetched:
+) -> Path:
     """
-    Return pinned wheels for another Python, from FOGROS2_WHEELS or this computer's package index.
+    Fetch pinned wheels for another Python from FOGROS2_WHEELS or the index; return their folder.
 
     pip compares the hashes, also of the files that an earlier call has left in the cache.
 
@@ -177,9 +171,7 @@ def fetch(
                 f'{error.result.stderr.strip()[-300:]}',
                 'FOGROS2_WHEELS names a folder with them; or use an image that has ROS 2'
             ) from error
-    return Fetched(str(target), {
-        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in target.glob('*.whl')})
+    return target
 
 
 #: Platforms of wheels that a machine can use, see ``bootstrap.WHEELS_LIBC``.

@@ -303,13 +303,6 @@ def qualified(image: str) -> str:
     return f'docker.io/{image}' if slash else f'docker.io/library/{image}'
 
 
-def reason(text: str) -> str:
-    """Return the last error in an engine's messages about an image."""
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    errors = [line for line in lines if line.lower().startswith(('error', 'e: '))]
-    return (errors or lines or ['no reason given'])[-1]
-
-
 def fetch(image: str, rmw: str = '') -> Command:
     """
     Return the command that downloads an image if necessary, and prints the engine's name of it.

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from fogros2 import process
 from fogros2.errors import CommandError, PrerequisiteError
 from fogros2.feature import ReachedMachine, RunningMachine
 from fogros2.host.installer import apt_install
@@ -97,7 +98,7 @@ class Engine:
         except CommandError as error:
             raise PrerequisiteError(
                 f"'{reached.spec.name}' can't get the image '{image}': "
-                f'{commands.reason(error.result.stderr)}',
+                f'{process.last_error(error.result.stderr)}',
                 "build it for the machine's processors too, or choose another machine"
                 if 'processors, and the machine has' in error.result.stderr else
                 'is its name right, and may anybody download it?') from error

@@ -179,7 +179,7 @@ def engine() -> Check:
     """Check for a container engine that works."""
     name = 'container engine'
     try:
-        chosen = container_engine.select('auto', None)
+        chosen = container_engine.select('auto')
         # The flags may name a runtime or a cgroup manager that does not work: call with flags.
         result = chosen.call('ps', '--format', '{{.ID}}', what='asking the container engine',
                              timeout=20.0)
@@ -192,6 +192,7 @@ def engine() -> Check:
 def overlay() -> Check:
     """Check whether the root file system of this computer can serve as an image."""
     try:
+        container.check_programs()
         container.check_root()
     except FogError as error:
         return Check("container on this computer's root", 'warning', str(error.args[0]),

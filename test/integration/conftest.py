@@ -100,12 +100,12 @@ def nothing_left(
 
 
 @pytest.fixture(scope='session')
-def isolated_root() -> None:
+def isolated_root(root: None) -> None:
     """Skip where isolated machines get no root, or one that can't have the robot's ROS."""
     if not embedded():
         pytest.skip('an isolated root gets ROS 2 by pip alone')
     try:
-        debian_root.check()
+        debian_root.check_programs()
     except PrerequisiteError as error:
         pytest.skip(f'needs an isolated root: {error}')
     python = Path(debian_root.root(), 'usr/bin/python3').resolve().name

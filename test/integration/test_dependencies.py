@@ -18,7 +18,6 @@ from pathlib import Path
 import shutil
 import time
 import uuid
-import zipfile
 
 import pytest
 
@@ -32,6 +31,7 @@ from fogros2.report import StepDone
 from fogros2.waiting import wait_until
 from rigs.cluster.images import RootShell
 from rigs.colcon_workspace import colcon_workspace
+from rigs.pip_site import wheel
 from rigs.rosdep import rosdep_source
 
 pytestmark = [
@@ -101,13 +101,7 @@ def packages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     (folder / 'sources.list').write_text('deb [trusted=yes] file:/fogt ./\n')
     (folder / 'apt.conf').write_text(APT)
     for name in ('fogt_one', 'fogt_two'):
-        with zipfile.ZipFile(folder / f'{name}-1-py3-none-any.whl', 'w') as archive:
-            archive.writestr(f'{name}.py', f"name = '{name}'")
-            archive.writestr(f'{name}-1.dist-info/METADATA',
-                             f'Metadata-Version: 2.1\nName: {name}\nVersion: 1\n')
-            archive.writestr(f'{name}-1.dist-info/WHEEL', 'Wheel-Version: 1.0\n'
-                             'Root-Is-Purelib: true\nTag: py3-none-any\n')
-            archive.writestr(f'{name}-1.dist-info/RECORD', '')
+        wheel(folder, name, **{name: f"name = '{name}'"})
     yield folder
 
 

@@ -24,14 +24,13 @@ import pytest
 
 from fogros2 import plan, process
 from fogros2.errors import PrerequisiteError
-from fogros2.host import bootstrap, wheels, workspace
+from fogros2.host import bootstrap, workspace
 from fogros2.model import Command, MachineSpec
 from fogros2.provider.container import debian_root
 from fogros2.shell.ssh import SSHShell
 from fogros2.waiting import Timeouts
 from rigs.bare_computer import bare_computer, BareComputer
 from rigs.colcon_workspace import colcon_workspace
-from rigs.launched import launching
 
 ARCHITECTURE, DEBIAN_NAME, ELF_MACHINE = 'aarch64', 'arm64', b'\xb7\x00'
 EMULATOR = '/usr/bin/qemu-aarch64-static'
@@ -215,30 +214,3 @@ def test_compiled_programs_are_built_there(
     assert bytes.fromhex(read.stdout) == ELF_MACHINE
     said = shell.run(Command((str(program),)), timeout=30.0).stdout
     assert said == 'compiled there\n'
-
-
-def test_package_that_cannot_be_installed_is_named_first(
-    computer: BareComputer, tmp_path: Path,
-) -> None:
-    if not wheels.collect(tmp_path / 'wheels').ros:
-        pytest.skip('this robot has an installation of ROS 2 and no wheels to send')
-    path = tmp_path / 'arm.launch.py'
-    path.write_text(f"""
-from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
-
-
-def generate_launch_description():
-    machine = SSHInstance('{computer.address}', '{computer.user}', key='{computer.key}',
-                          host_key='{computer.host_key}', name='{computer.name}')
-    return FogROSLaunchDescription([
-        CloudNode(package='fogros2_examples', executable='talker', machine=machine)])
-""")
-    with launching() as start:
-        ended = start(str(path))
-        assert ended.ended() == 1, ended.text
-    assert f"(debian 12 {ARCHITECTURE}) can't be made ready for ROS 2" in ended.text
-    assert f'ROS 2 has no wheels for {ARCHITECTURE} processors' in ended.text
-    assert 'Ubuntu 24.04' in ended.text
-    # nothing was sent but the agent, which has gone
-    assert computer.run('ls /home/fog/.local/share/fogros2 /run/fogros2 2>&1 || :').stdout \
-        .count('No such file') == 2

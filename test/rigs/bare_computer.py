@@ -88,9 +88,8 @@ def bare_computer(
     key, root = folder / 'id', folder / 'root'
     process.run(Command(('ssh-keygen', '-q', '-t', 'ed25519', '-N', '', '-C', 'test',
                          '-f', str(key))), timeout=30.0)
-    archive = container_root.Archive()
-    container_entry.add(
-        archive, user=USER, number=1000, authorized_key=key.with_suffix('.pub').read_text(),
+    archive = container_entry.archive(
+        user=USER, number=1000, authorized_key=key.with_suffix('.pub').read_text(),
         agent_config={})
     container_root.accounts(archive, USER, 1000)
     engine = container_engine.named('podman')

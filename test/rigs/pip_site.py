@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packages of a workspace as colcon installs them, and distributions as pip does."""
+"""Packages of a workspace as colcon installs them, distributions as pip does, and wheels."""
 
 from __future__ import annotations
 
 from pathlib import Path
+import zipfile
 
 
 def package(root: Path, name: str, code: str = '', *lines: str) -> None:
@@ -31,3 +32,22 @@ def distribution(site: Path, name: str, *files: str, installer: str = 'pip') -> 
     for file in files:
         (site / file).parent.mkdir(parents=True, exist_ok=True)
         (site / file).touch()
+
+
+def wheel(
+    folder: Path, name: str, version: str = '1', needs: str = '', **files: str,
+) -> Path:
+    """Write a wheel of some modules, by name without suffix, or of other files."""
+    path = folder / f'{name}-{version}-py3-none-any.whl'
+    info = f'{name}-{version}.dist-info'
+    texts = {
+        **{file if '.' in file else f'{file}.py': text for file, text in files.items()},
+        f'{info}/METADATA': f'Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n'
+                            f'{needs and f"Requires-Dist: {needs}"}\n',
+        f'{info}/WHEEL': 'Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n'}
+    with zipfile.ZipFile(path, 'w') as archive:
+        for file, text in texts.items():
+            archive.writestr(file, text)
+        archive.writestr(f'{info}/RECORD', ''.join(
+            f'{file},,\n' for file in (*texts, f'{info}/RECORD')))
+    return path

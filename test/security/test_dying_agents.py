@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from fogros2.agent_client import agent_program
-from fogros2.provider.container import entry, root
+from fogros2.provider.container import entry
 from fogros2.waiting import wait_until
 
 
@@ -120,9 +120,8 @@ def test_supervisor_leaves_the_folder_to_another_agent(agent: Detached) -> None:
 
 @pytest.mark.parametrize('status', [0, 1, 'signal'])
 def test_agent_of_a_container_always_starts_again(tmp_path: Path, status: object) -> None:
-    archive = root.Archive()
-    entry.add(archive, user='fog', number=1000, authorized_key='',
-              agent_config={'machine': 'planner'})
+    archive = entry.archive(user='fog', number=1000, authorized_key='',
+                            agent_config={'machine': 'planner'})
     with tarfile.open(fileobj=io.BytesIO(archive.data())) as tar:
         member = tar.extractfile('opt/fogros2/entry.sh')
         assert member is not None

@@ -367,16 +367,6 @@ def test_mount_of_fogros2_s_file_is_the_launch_s(written, became):
     assert containers.dds_options(container, '/run/dds.xml')[-2:] == became
 
 
-def test_line_of_fogros2_examples_reads_launch_s_file():
-    made = containers.run(parse(GQCNN), 0, 'abc', 'gqcnn', '/run/dds.xml', '/run/v').argv
-    assert made[made.index('--label'):] == (
-        '--label', 'fogros2-launch=abc', '--env-file', '/run/v', '--ipc', 'host', *FILE,
-        '--net', 'host', '--env', 'RMW_IMPLEMENTATION=rmw_cyclonedds_cpp',
-        '--env', 'CYCLONEDDS_URI=file:///tmp/cyclonedds.xml',
-        '-v', '/run/dds.xml:/tmp/cyclonedds.xml', 'gqcnn', 'ros2', 'launch', 'gqcnn_ros',
-        'planner.launch.py')
-
-
 def test_fogros2_s_file_needs_cyclone_dds():
     containers.check(parse(GQCNN), 'rmw_cyclonedds_cpp')
     containers.check(parse('docker run image'), 'rmw_zenoh_cpp')

@@ -10,7 +10,6 @@ from pathlib import Path
 import shutil
 import subprocess
 import sys
-import zipfile
 
 import pytest
 
@@ -19,7 +18,8 @@ from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError
 from fogros2.host import bootstrap, dependencies, installer, workspace
 from fogros2.host.inspection import HostFacts
 from fogros2.host.installer import fill, find_pip, Needs
-from fogros2.model import Command, MachineSpec, Result
+from fogros2.model import Command, Result
+from rigs.pip_site import package, wheel
 from rigs.rosdep import rosdep_source
 
 FACTS = HostFacts(user='fog', home='/home/fog')
@@ -80,13 +80,6 @@ def test_folder_follows_the_requirements_and_the_interpreters() -> None:
     assert len({path('x'), path('y'), path('x', python='python 3 11 1 /usr/bin/python3')}) == 3
 
 
-def test_packages_count_for_the_image() -> None:
-    under = plan.underlay({}, (), '/usr/bin/ros2')
-    found = {bootstrap.dependencies(MachineSpec('a', 'fake', **more), under) for more in (
-        {}, {'apt': ('x',)}, {'pip': ('x',)}, {'apt': ('x', 'y')}, {'apt': ('y', 'x')})}
-    assert len(found) == 4
-
-
 def completed(command: Command) -> subprocess.CompletedProcess[str]:
     """Run a command as a machine does."""
     return subprocess.run(
@@ -98,20 +91,6 @@ def test_variables_of_a_launch_file_are_on_no_command_line() -> None:
     assert 'secret' not in ' '.join(command.argv)
     shown = installer.among_nodes({'API_KEY': "it's secret"}, (), 'cat; echo "$API_KEY"', 'show')
     assert completed(shown).stdout == "it's secret\n"
-
-
-def wheel(folder: Path, name: str, version: str = '1', needs: str = '', **modules: str) -> None:
-    """Write a wheel of some modules."""
-    with zipfile.ZipFile(folder / f'{name}-{version}-py3-none-any.whl', 'w') as archive:
-        for module, text in modules.items():
-            archive.writestr(f'{module}.py', text)
-        info = f'{name}-{version}.dist-info'
-        archive.writestr(f'{info}/METADATA', (
-            f'Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n'
-            f'{needs and f"Requires-Dist: {needs}"}\n'))
-        archive.writestr(f'{info}/WHEEL', 'Wheel-Version: 1.0\nRoot-Is-Purelib: true\n'
-                                          'Tag: py3-none-any\n')
-        archive.writestr(f'{info}/RECORD', '')
 
 
 def installed(
@@ -165,23 +144,19 @@ def test_package_that_cannot_be_imported_is_reported(
     accepted: tuple[Path, str], tmp_path: Path,
 ) -> None:
     wheel(tmp_path, 'fogt_bad', fogt_bad='import numpy_that_is_newer', test='')
-    folder, done = installed(tmp_path, 'fogt-bad>=1')
-    assert done.stderr.splitlines()[-1] == (
-        "'fogt_bad' of fogt-bad>=1 can't be imported there: ModuleNotFoundError: "
-        "No module named 'numpy_that_is_newer'")
+    # a part of a namespace
+    wheel(tmp_path, 'fogt_part', **{'fogt_space/part/__init__': 'import absent_library',
+                                    'fogt_space/part/deep/__init__': ''})
+    folder, done = installed(tmp_path, 'fogt-bad>=1', 'fogt-part')
+    assert done.stderr.splitlines()[-2:] == [
+        f"'{module}' of {name} can't be imported there: ModuleNotFoundError: "
+        f"No module named '{lacking}'" for module, name, lacking in (
+            ('fogt_bad', 'fogt-bad>=1', 'numpy_that_is_newer'),
+            ('fogt_space.part', 'fogt-part', 'absent_library'))]
     assert done.returncode == 1 and not Path(folder, 'site').exists()
     assert not Path(folder, 'complete').exists()
     # one that fails by itself lacks nothing
     assert Path(accepted[1], 'site/fogt_half.py').exists()
-
-
-@RUNS_PIP
-def test_part_of_a_namespace_is_imported(accepted: tuple[Path, str], tmp_path: Path) -> None:
-    wheel(tmp_path, 'fogt_part', **{'fogt_space/part/__init__': 'import absent_library',
-                                    'fogt_space/part/deep/__init__': ''})
-    _, done = installed(tmp_path, 'fogt-part')
-    assert done.returncode == 1 and done.stderr.splitlines()[-1].startswith(
-        "'fogt_space.part' of fogt-part can't be imported there: ModuleNotFoundError: ")
     assert Path(accepted[1], 'site/fogt_space/other').exists()
 
 
@@ -200,37 +175,20 @@ def test_installed_packages_are_found_after_the_systems(
 
 @RUNS_PIP
 def test_package_that_brings_a_module_of_ours_is_not_kept(tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / 'harmless-1-py3-none-any.whl', 'w') as archive:
-        archive.writestr('fogros2/__init__.py', '')
-        archive.writestr('harmless-1.dist-info/METADATA',
-                         'Metadata-Version: 2.1\nName: harmless\nVersion: 1\n')
-        archive.writestr('harmless-1.dist-info/WHEEL', 'Wheel-Version: 1.0\n'
-                         'Root-Is-Purelib: true\nTag: py3-none-any\n')
-        archive.writestr('harmless-1.dist-info/RECORD', '')
+    wheel(tmp_path, 'harmless', **{'fogros2/__init__': ''})
     folder, done = installed(tmp_path, 'harmless')
     assert done.returncode == 1 and "brings 'fogros2'" in done.stderr
     assert not Path(folder, 'site').exists() and not Path(folder, 'complete').exists()
 
 
-def manifest(root: Path, name: str, *lines: str) -> None:
-    """Write an installed package of a workspace."""
-    for folder, text in (
-            (f'share/ament_index/resource_index/packages/{name}', ''),
-            (f'share/{name}/package.xml',
-             f'<package><name>{name}</name>{"".join(lines)}</package>')):
-        path = root / 'install' / name / folder
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-
-
 def test_keys_are_what_packages_and_nodes_run_with(tmp_path: Path) -> None:
-    manifest(tmp_path, 'mine', '<exec_depend>python3-scipy</exec_depend>',
+    package(tmp_path, 'mine', '', '<exec_depend>python3-scipy</exec_depend>',
              '<depend>tf2_ros</depend>', '<build_depend>eigen</build_depend>',
              '<exec_depend>other</exec_depend>', '<test_depend>gtest</test_depend>',
              '<exec_depend condition="$ROS_VERSION == 1">rospy</exec_depend>')
-    manifest(tmp_path, 'other')
+    package(tmp_path, 'other')
     # it is in the workspaces of its users, and rosdep has no such key
-    manifest(tmp_path, 'fogros2', '<exec_depend>fogros2-av-pip</exec_depend>')
+    package(tmp_path, 'fogros2', '', '<exec_depend>fogros2-av-pip</exec_depend>')
     found = workspace.inspect(tmp_path)
     assert workspace.dependencies(tmp_path) == [
         'eigen', 'gtest', 'python3-scipy', 'tf2_ros']
@@ -256,22 +214,6 @@ def test_packages_of_an_equal_underlay_are_not_asked_for(tmp_path: Path) -> None
     assert (nothing.returncode, nothing.stdout) == (0, '')
 
 
-def test_rosdep_resolves_keys_from_a_file(tmp_path: Path) -> None:
-    if shutil.which('rosdep', path=str(Path(sys.executable).parent)) is None:
-        pytest.skip('needs rosdep in this environment')
-    environment = {
-        **rosdep_source(tmp_path, {'fogt_key': '[fogt-hello]',
-                                   'fogt_pip': '{pip: {packages: [fogt-one]}}'}),
-        'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}'}
-    done = completed(installer.resolve(
-        Needs('a', FACTS, True, environment=environment),
-        ['fogt_key', 'fogt_none', 'fogt_pip', 'slam_toolbox']))
-    assert done.returncode == 0, done.stderr
-    assert installer.resolved(done.stdout) == (
-        ('fogt-hello', 'ros-jazzy-slam-toolbox'), ('fogt-one',))
-    assert "no rosdep rule for 'fogt_none'" in done.stderr
-
-
 def test_image_gets_the_debian_packages_of_keys(tmp_path: Path) -> None:
     if shutil.which('rosdep', path=str(Path(sys.executable).parent)) is None:
         pytest.skip('needs rosdep in this environment')
@@ -282,12 +224,14 @@ def test_image_gets_the_debian_packages_of_keys(tmp_path: Path) -> None:
         **rosdep_source(tmp_path, {'fogt_key': '[fogt-hello]',
                                    'fogt_pip': '{pip: {packages: [fogt-one]}}'}),
         'PATH': f'{tmp_path}:{Path(sys.executable).parent}:{os.environ["PATH"]}'}
-    script = installer.image_script(['rsync'], ['fogt_key', 'fogt_none', 'fogt_pip'])
+    script = installer.image_script(
+        ['rsync'], ['fogt_key', 'fogt_none', 'fogt_pip', 'slam_toolbox'])
     done = subprocess.run(['sh', '-ec', script], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     installed = [line.partition(' --no-install-recommends ')[2] for line in
                  (tmp_path / 'apt-get.called').read_text().splitlines() if ' install ' in line]
-    assert installed == ['rsync', 'fogt-hello']
+    assert installed == ['rsync', 'fogt-hello ros-jazzy-slam-toolbox']
+    assert "no rosdep rule for 'fogt_none'" in done.stderr
 
 
 def test_machine_without_rosdep_says_so() -> None:

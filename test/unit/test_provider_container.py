@@ -311,13 +311,30 @@ def test_other_flags_are_tried_where_control_groups_mislead(monkeypatch):
         ('--cgroup-manager', 'cgroupfs'), (), ('--runtime', 'runc'),
         ('--runtime', 'runc', '--cgroup-manager', 'cgroupfs')]
     worked = Engine('podman', ('--runtime', 'runc'))
-    container_engine.remember(worked)
+
+    def create(engine: Engine) -> str:
+        if engine != worked:
+            raise ProviderError('crun: invalid file system type on `/sys/fs/cgroup`')
+        return 'created'
+
+    assert container_engine.tried(guess, create) == 'created'
     assert next(container_engine.candidates(guess)) == worked
     assert container_engine.named('podman') == worked
     assert list(container_engine.candidates(Engine('docker'))) == [Engine('docker')]
-    assert container_engine.is_runtime_trouble(ProviderError(
-        'crun: invalid file system type on `/sys/fs/cgroup`: OCI runtime error'))
-    assert not container_engine.is_runtime_trouble(ProviderError('the name is already in use'))
+
+
+@pytest.mark.parametrize('reason', [
+    'the name is already in use', 'OCI runtime error: error running hook #0'])
+def test_failure_of_any_runtime_is_final(reason):
+    ways = []
+
+    def create(engine):
+        ways.append(engine)
+        raise ProviderError(reason)
+
+    with pytest.raises(ProviderError, match=reason):
+        container_engine.tried(Engine('podman'), create)
+    assert len(ways) == 1
 
 
 def test_limits_never_ask_for_more_than_there_is():
@@ -368,11 +385,9 @@ def test_times_of_both_engines_are_read():
 
 
 def entry_files(**changes) -> bytes:
-    archive = container_root.Archive()
-    container_entry.add(archive, **{
+    return container_entry.archive(**{
         'user': 'fog', 'number': 2013265999, 'authorized_key': 'ssh-ed25519 AAAA me',
-        'agent_config': {'machine': 'm', 'end_command': []}, **changes})
-    return archive.data()
+        'agent_config': {'machine': 'm', 'end_command': []}, **changes}).data()
 
 
 def test_first_process_gets_key_and_agent():

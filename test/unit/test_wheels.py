@@ -115,7 +115,7 @@ def test_workspace_with_fogros2_needs_no_wheel(tmp_path):
     install(root)
     workspace = inspect(root)
     robot = HostFacts(
-        'ubuntu', '24.04', 'x86_64', 1000, 'u', '/home/u', 'glibc 2.39', True,
+        'ubuntu', '24.04', 'x86_64', 'u', '/home/u', 'glibc 2.39', True,
         (Python('/usr/bin/python3', (3, 12), True),),
         frozenset({'ip', 'nft', 'rsync', 'wg', 'wireguard-go', 'colcon', 'rosdep'}),
         {'jazzy': '/opt/ros/jazzy'}, {'jazzy': ('rmw_fastrtps_cpp',)},

@@ -247,6 +247,8 @@ def test_sources_alone_are_built_there(root: Path) -> None:
     space = workspace.inspect(root)
     assert not space.python_only  # beta is ament_cmake
     assert plan(space).reason == 'it is not built'
+    with pytest.raises(WorkspaceError, match='not built.*has no colcon .run colcon build here'):
+        plan(space, can_build=False)
 
 
 def test_an_install_space_that_fits_nowhere_and_has_no_sources(root: Path) -> None:

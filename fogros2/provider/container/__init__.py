@@ -168,7 +168,7 @@ class ContainerProvider(Provider):
     def check_here(self, spec: MachineSpec) -> None:
         """Check that the engine, TUN and the programs for a machine without an image exist."""
         options = Options.parse(spec.options)
-        container_engine.select(options.engine, options.image or None)
+        container_engine.select(options.engine, options.image)
         if not os.path.exists('/dev/net/tun'):
             raise PrerequisiteError('there is no /dev/net/tun on this computer',
                                     'sudo modprobe tun')
@@ -179,7 +179,7 @@ class ContainerProvider(Provider):
         """Check the engine, the rights, TUN, and what a machine without an image needs."""
         self.check_here(spec)
         options = Options.parse(spec.options)
-        engine = container_engine.select(options.engine, options.image or None)
+        engine = container_engine.select(options.engine, options.image)
         trouble = process.sudo_trouble() if engine.sudo else None
         if trouble is not None:
             raise PrerequisiteError(
@@ -188,7 +188,7 @@ class ContainerProvider(Provider):
         if options.image:
             container_engine.check_architecture(engine, options.image)
         else:
-            check_root(isolated=options.isolated)
+            check_root()
             for path in () if options.isolated else container_root.environment_mounts(
                     *spec.workspaces):
                 if options.user != 'root' and not os.stat(path).st_mode & 0o004:
@@ -227,24 +227,16 @@ class ContainerProvider(Provider):
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Create and start the container; return when the engine has started it."""
         options = Options.parse(spec.options)
-        ways = container_engine.candidates(
-            container_engine.select(options.engine, options.image or None))
-        engine = next(ways)
+        engine = container_engine.select(options.engine, options.image)
         create = self._create_from_image if options.image else self._create_from_root
         for name in request.with_volumes:
             _check_free(engine, name, container_machine.container_name(spec.name, request.tags))
         with _sharing(request):
-            while True:
-                try:
-                    identity = create(engine, spec, request, options)
-                    container_engine.remember(engine)
-                    break
-                except ProviderError as error:
-                    another = next(ways, None)
-                    if another is None or not container_engine.is_runtime_trouble(error):
-                        identity = self._existing(engine, spec.name, request, error)
-                        break
-                    engine = another
+            try:
+                identity = container_engine.tried(
+                    engine, lambda way: create(way, spec, request, options))
+            except ProviderError as error:
+                identity = self._existing(engine, spec.name, request, error)
         return container_machine.machine_id(engine, identity, request.token)
 
     def _existing(
@@ -278,7 +270,7 @@ class ContainerProvider(Provider):
         shown = () if base else system if options.user == 'root' else (
             *system, *filter(os.path.isdir, environment))
         number = login_ids.login_id(request.token)
-        archive = _entry(spec, request, options, number)
+        archive = _entry(request, options, number)
         container_root.accounts(archive, options.user, number, Path(f'{base}/etc'))
         if base:
             archive.file('etc/apt/sources.list', ''.join(
@@ -317,7 +309,7 @@ class ContainerProvider(Provider):
             # podman keeps what it has copied in its folder for temporary files
             with tempfile.TemporaryDirectory() as aside:
                 engine.call('cp', '-', f'{identity}:/', what=what, variables=(f'TMPDIR={aside}',),
-                            data=_entry(spec, request, options,
+                            data=_entry(request, options,
                                         login_ids.login_id(request.token)).data())
             _start(engine, identity, request.token, kept=spec.on_exit == 'stop', what=what)
         except BaseException:
@@ -360,7 +352,7 @@ class ContainerProvider(Provider):
             if result.returncode != 0 and 'docker daemon' not in result.stderr.lower():
                 raise ProviderError(
                     f'{engine.name} lists no containers: '
-                    f'{container_engine.last_line(result.stderr)}',
+                    f'{process.last_error(result.stderr)}',
                     container_engine.sudo_hint(result.stderr))
             # Without docker's service, its socket may still exist; it has no containers.
             listed = result.stdout.split()
@@ -409,7 +401,7 @@ class ContainerProvider(Provider):
         # The engine may be removing it already.
         wait_until(lambda: not engine.inspect([identity]), timeout=20.0,
                    what=f'container {identity} to be removed',
-                   hint=container_engine.last_line(result.stderr))
+                   hint=process.last_error(result.stderr))
 
     def stop(self, machine_id: str) -> None:
         """Stop a container that was created with ``on_exit='stop'``; its disk stays."""
@@ -509,7 +501,7 @@ class ContainerProvider(Provider):
         log = engine.call('logs', '--tail', '100', identity, what='reading its log', check=False,
                           kept=_LOG_BYTES)
         reason = _after(log.stdout, container_entry.ERROR_MARK) \
-            or container_engine.last_line(f'{log.stderr}\n{log.stdout}')
+            or process.last_error(f'{log.stderr}\n{log.stdout}')
         raise ProviderError(f'container {identity} could not start: {reason}',
                             'it needs sshd, sudo, rsync and python3, or apt-get and a network')
 
@@ -592,16 +584,10 @@ def _start(engine: Engine, identity: str, token: str, *, kept: bool, what: str) 
         raise container_engine.translate(error) from error
 
 
-def _entry(
-    spec: MachineSpec, request: CreateRequest, options: Options, number: int,
-) -> Archive:
-    """Return an archive with the first process of a machine, and the files that it needs."""
-    archive = Archive()
-    container_entry.add(
-        archive, user=options.user, number=number, authorized_key=request.authorized_key,
-        agent_config=request.agent_config,
-        nested=options.containers)
-    return archive
+def _entry(request: CreateRequest, options: Options, number: int) -> Archive:
+    return container_entry.archive(
+        user=options.user, number=number, authorized_key=request.authorized_key,
+        agent_config=request.agent_config, nested=options.containers)
 
 
 def _after(log: str, mark: str) -> str:
@@ -660,16 +646,12 @@ def check_programs(*, isolated: bool = False) -> None:
             package_of={'sshd': 'openssh-server', 'ssh-keygen': 'openssh-client'})
 
 
-def check_root(*, isolated: bool = False) -> None:
+def check_root() -> None:
     """
-    Check that this computer's own root can replace an image.
+    Check that a root of this computer can be overlaid, and so replace an image.
 
-    :param isolated: check the root of a new system instead.
-    :raises PrerequisiteError: it cannot be overlaid, or lacks what a machine needs.
+    :raises PrerequisiteError: it cannot be overlaid.
     """
-    check_programs(isolated=isolated)
-    if isolated:
-        debian_root.check()
     kinds = Path('/proc/filesystems').read_text().split()
     if 'overlay' not in kinds and not os.path.isdir('/sys/module/overlay'):
         process.run(Command(('modprobe', 'overlay'), sudo=True), timeout=10.0, check=False)

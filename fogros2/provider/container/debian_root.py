@@ -126,28 +126,14 @@ def path(folder: Path, own: Release, packages: Sequence[str] = PACKAGES) -> Path
     return folder / f'{own.codename}-{digits}'
 
 
-def check_programs(folder: Optional[Path] = None) -> None:
+def check_programs() -> None:
     """
     Check that the root exists, or that the programs to make it do.
 
     :raises PrerequisiteError: a program is missing.
     """
-    if not path(folder or cache_folder(), release()).is_dir():
+    if not path(cache_folder(), release()).is_dir():
         process.require(('debootstrap', 'unshare'), package_of={'unshare': 'util-linux'})
-
-
-def check(folder: Optional[Path] = None) -> None:
-    """
-    Check that the root exists, or can be made.
-
-    :raises PrerequisiteError: a program or root is missing.
-    """
-    check_programs(folder)
-    if not path(folder or cache_folder(), release()).is_dir():
-        trouble = process.sudo_trouble()
-        if trouble is not None:
-            raise PrerequisiteError(
-                f'debootstrap needs root on this computer, and {trouble[0]}', trouble[1])
 
 
 def root(

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import dataclasses
 import json
 import math
@@ -12,12 +12,13 @@ from pathlib import Path
 import re
 import resource
 import threading
-from typing import Any, Optional
+from typing import Any, Optional, TypeVar
 
 from fogros2 import process
 from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError, ProviderError
 from fogros2.model import Command, Result
 
+T = TypeVar('T')
 ENGINES = ('podman', 'docker')
 DOCKER_SOCKET = Path('/var/run/docker.sock')
 #: How an engine had to be called in this process, by its name.
@@ -82,7 +83,7 @@ class Engine:
         result = self.call('container', 'inspect', *names, what='look at containers', check=False)
         reports = json.loads(result.stdout) if result.stdout.strip() else []
         if result.returncode != 0 and not gone(result.stderr):
-            raise ProviderError(f'{self.name} failed: {last_line(result.stderr)}',
+            raise ProviderError(f'{self.name} failed: {process.last_error(result.stderr)}',
                                 sudo_hint(result.stderr))
         return [dict(entry) for entry in reports or ()]
 
@@ -90,13 +91,6 @@ class Engine:
 def gone(text: str) -> bool:
     """Return whether an engine's message says that there is no such container."""
     return 'no such container' in text.lower() or 'no such object' in text.lower()
-
-
-def last_line(text: str) -> str:
-    """Return the last error among an engine's messages."""
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    errors = [line for line in lines if line.lower().startswith('error')]
-    return (errors or lines or ['no reason given'])[-1]
 
 
 def sudo_hint(text: str) -> str:
@@ -139,10 +133,10 @@ def translate(error: CommandError) -> ProviderError:
     text = error.result.stderr
     hint = next((hint for pattern, hint in _HINTS.items()
                  if re.search(pattern, text.lower(), re.DOTALL)), sudo_hint(text))
-    return ProviderError(f'{error.command.what} failed: {last_line(text)}', hint)
+    return ProviderError(f'{error.command.what} failed: {process.last_error(text)}', hint)
 
 
-def select(wanted: str, image: Optional[str]) -> Engine:
+def select(wanted: str, image: str = '') -> Engine:
     """
     Return the engine to create a machine with: the requested one, or the first that is installed.
 
@@ -186,6 +180,26 @@ def docker() -> Engine:
         os.environ.get('DOCKER_HOST') or os.access(DOCKER_SOCKET, os.W_OK)))
 
 
+def tried(engine: Engine, create: Callable[[Engine], T]) -> T:
+    """
+    Create a container by the first way to call an engine that works; remember it for this process.
+
+    :raises ProviderError: of the last way, or no other way would help.
+    """
+    ways = candidates(engine)
+    way = next(ways)
+    while True:
+        try:
+            result = create(way)
+            _WORKED[engine.name] = way
+            return result
+        except ProviderError as error:
+            another = next(ways, None)
+            if another is None or not is_runtime_trouble(error):
+                raise
+            way = another
+
+
 def candidates(engine: Engine) -> Iterator[Engine]:
     """
     Yield ways to call an engine: the one that worked before, the one for the control groups, and
@@ -200,15 +214,12 @@ def candidates(engine: Engine) -> Iterator[Engine]:
     return iter(dict.fromkeys(engines))
 
 
-def remember(engine: Engine) -> None:
-    """Remember for this process how an engine had to be called."""
-    _WORKED[engine.name] = engine
-
-
 def is_runtime_trouble(error: ProviderError) -> bool:
     """Return whether other flags may help: the runtime does not fit the control groups."""
     text = str(error).lower()
-    return any(word in text for word in ('cgroup', 'oci runtime', 'sd-bus', 'dbus', 'systemd'))
+    # a hook of ours fails with any runtime
+    return 'hook' not in text and any(
+        word in text for word in ('cgroup', 'oci runtime', 'sd-bus', 'dbus', 'systemd'))
 
 
 def answers(engine: Engine) -> None:
@@ -221,7 +232,7 @@ def answers(engine: Engine) -> None:
         result = engine.call('version', what='asking docker', check=False)
         if result.returncode != 0:
             raise PrerequisiteError(
-                f'docker does not answer: {last_line(result.stderr)}',
+                f'docker does not answer: {process.last_error(result.stderr)}',
                 sudo_hint(result.stderr) or 'sudo systemctl start docker')
 
 

@@ -145,12 +145,12 @@ SetEnv LANG=C.UTF-8 PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin
 """
 
 
-def add(
-    archive: Archive, *, user: str, number: int, authorized_key: str,
-    agent_config: Mapping[str, Any], nested: bool = False,
-) -> None:
+def archive(
+    *, user: str, number: int, authorized_key: str, agent_config: Mapping[str, Any],
+    nested: bool = False,
+) -> Archive:
     """
-    Add the script of the first process, and the files that it needs, to a machine's root.
+    Return the script of the first process, and the files that it needs in a machine's root.
 
     :param number: id of the login user, if the user is not root.
     :param nested: whether the machine runs containers.
@@ -162,16 +162,18 @@ def add(
         'root': 'prohibit-password' if user == 'root' else 'no',
     }
     start_agent = _AGENT.format(**names) if agent_config else _IDLE
+    files = Archive()
     if nested:
-        archive.file(_NESTED_CONFIG, _NESTED_SETTINGS.format(
+        files.file(_NESTED_CONFIG, _NESTED_SETTINGS.format(
             limits=', '.join(f'"{word}"' for word in container_engine.limits()[1::2])).encode())
-    archive.folder(FOLDER)
-    archive.file(f'{FOLDER}/entry.sh', _ENTRY.format(
+    files.folder(FOLDER)
+    files.file(f'{FOLDER}/entry.sh', _ENTRY.format(
         agent=start_agent, nested=_NESTED if nested else '', **names).encode(), 0o755)
-    archive.file(f'{FOLDER}/sshd_config', _SSHD.format(**names).encode())
-    archive.file(f'{FOLDER}/authorized_keys', f'{authorized_key.strip()}\n'.encode())
+    files.file(f'{FOLDER}/sshd_config', _SSHD.format(**names).encode())
+    files.file(f'{FOLDER}/authorized_keys', f'{authorized_key.strip()}\n'.encode())
     if agent_config:
         config = {'user': user, **agent_config}
         config['end_command'] = config.get('end_command') or list(END_COMMAND)
-        archive.file(f'{FOLDER}/agent.py', agent_program().encode())
-        archive.file(f'{FOLDER}/agent.json', json.dumps(config).encode(), 0o600)
+        files.file(f'{FOLDER}/agent.py', agent_program().encode())
+        files.file(f'{FOLDER}/agent.json', json.dumps(config).encode(), 0o600)
+    return files

@@ -16,13 +16,13 @@ zero byte. Imports nothing of fogros2, and no module that takes long.
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import time
 
-#: The last results, in a folder of root's: of each folder, the paths to hide, and the paths that
-#: the result depends on with their times. A letter begins each part, a zero byte ends it.
-CACHE = '/var/cache/fogros2/hidden'
+#: The last results of ``search`` by folder, in a folder of root's.
+CACHE = '/var/cache/fogros2/hidden.json'
 #: Where administrators put files of their own.
 LOCAL = '/usr/local'
 #: Nanoseconds in which a second change of a path may leave its time as it is.
@@ -103,25 +103,12 @@ def unchanged(changed: dict[str, int]) -> bool:
 
 
 def read(path: str) -> dict[str, tuple[list[str], dict[str, int]]]:
-    """Return the last results by folder; none if there is no file, or one of another version."""
-    results: dict[str, tuple[list[str], dict[str, int]]] = {}
+    """Return the last results by folder; none if there is no file, or a damaged one."""
     try:
         with open(path, 'rb') as file:
-            parts = os.fsdecode(file.read()).split('\0')
-        if parts.pop() != 'end':
-            return {}
-        for part in parts:
-            kind, rest = part[0], part[1:]
-            if kind == 'f':
-                paths, changed = results[rest] = [], {}
-            elif kind == 'h':
-                paths.append(rest)
-            else:
-                at, _, name = rest.partition(' ')
-                changed[name] = int(at)
-    except (OSError, ValueError, IndexError, UnboundLocalError):
+            return dict(json.load(file))
+    except (OSError, ValueError):
         return {}
-    return results
 
 
 def write(path: str, data: bytes) -> None:
@@ -144,15 +131,11 @@ def main(top: str, cache: str = CACHE) -> None:
     write(f'{top}/hidden', b''.join(
         os.fsencode(path) + b'\0' for folder in folders for path in results[folder][0]))
     if fresh:
-        parts = []
-        for folder in folders:
-            paths, changed = results[folder]
-            # a change that was a moment ago may hide another one
-            if max(changed.values()) < begin - TICK:
-                parts += [f'f{folder}', *(f'h{path}' for path in paths),
-                          *(f'c{at} {path}' for path, at in changed.items())]
         os.makedirs(os.path.dirname(cache), 0o700, exist_ok=True)
-        write(cache, os.fsencode('\0'.join([*parts, 'end'])))
+        # a change that was a moment ago may hide another one
+        write(cache, json.dumps({
+            folder: results[folder] for folder in folders
+            if max(results[folder][1].values()) < begin - TICK}).encode())
 
 
 if __name__ == '__main__':

@@ -228,21 +228,15 @@ def accounts(archive: Archive, user: str, number: int, etc: Path = Path('/etc'))
 
     :param number: id of the login user and its group, if the user is not root.
     """
-    people, groups = [], []
-    for line in (etc / 'passwd').read_text().splitlines():
-        words = line.split(':')
-        if len(words) == 7 and _system(words[2]) and words[0] != user:
-            people.append(words)
-    for line in (etc / 'group').read_text().splitlines():
-        words = line.split(':')
-        if len(words) == 4 and _system(words[2]) and words[0] != user:
-            groups.append([*words[:3], ''])
-    if user != 'root':
-        people.append([user, 'x', str(number), str(number), '', f'/home/{user}', '/bin/bash'])
-        groups.append([user, 'x', str(number), ''])
-    else:
-        people.append(['root', 'x', '0', '0', 'root', '/root', '/bin/bash'])
-        groups.append(['root', 'x', '0', ''])
+    home, own = ('/root', '0') if user == 'root' else (f'/home/{user}', str(number))
+
+    def system(name: str, columns: int) -> list[list[str]]:
+        rows = (line.split(':') for line in (etc / name).read_text().splitlines())
+        return [row for row in rows
+                if len(row) == columns and _system(row[2]) and row[0] != user]
+
+    people = [*system('passwd', 7), [user, 'x', own, own, '', home, '/bin/bash']]
+    groups = [*([*row[:3], ''] for row in system('group', 4)), [user, 'x', own, '']]
 
     def text(rows: Iterable[Sequence[str]]) -> bytes:
         return ''.join(':'.join(row) + '\n' for row in rows).encode()

@@ -20,7 +20,6 @@ import threading
 from typing import Any, Optional
 
 from fogros2 import process
-from fogros2.errors import CommandError
 from fogros2.model import Command
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import root as container_root
@@ -215,32 +214,14 @@ class Computer:
         for path in container_root.outermost(self._mounts):
             words += ['-v', f'{path}:{path}:ro']
         self._name = boot.name
-        self._run(words)
+        container_engine.tried(self._engine, lambda engine: engine.call(
+            'run', '-d', '--replace', *words, '--rootfs', str(self.disk / 'root'), *_ENTRY,
+            what='start an instance'))
         (entry,) = self._engine.inspect([boot.name])
         pid = int(entry['State']['Pid'])
         if pid:
             with self._lock:
                 self._handle = os.pidfd_open(pid)
-
-    def _run(self, words: Sequence[str]) -> None:
-        ways = container_engine.candidates(self._engine)
-        engine = next(ways)
-        while True:
-            command = Command(
-                engine.argv('run', '-d', *words, '--rootfs', str(self.disk / 'root'), *_ENTRY),
-                sudo=engine.sudo, what='start an instance')
-            try:
-                process.run(command, timeout=60.0)
-            except CommandError as error:
-                trouble = container_engine.translate(error)
-                another = next(ways, None)
-                if another is None or not container_engine.is_runtime_trouble(trouble):
-                    raise trouble from error
-                engine = another
-                engine.call('rm', '-f', self._name, what='remove an instance', check=False)
-                continue
-            container_engine.remember(engine)
-            return
 
     def wait(self) -> None:
         """Wait until its first process has ended."""
