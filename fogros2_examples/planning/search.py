@@ -13,7 +13,8 @@ import ompl.base
 import ompl.geometric
 import ompl.util
 
-from fogros2_examples.meshes import Floats, joined, Mesh, rotation
+from fogros2_examples.collisions import solid
+from fogros2_examples.meshes import Floats, joined, rotation
 from fogros2_examples.planning.scene import Scene
 
 #: OMPL's planners between two poses.
@@ -52,9 +53,8 @@ class Space:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self.checks = 0
-        self._body = fcl.CollisionObject(_model(scene.body), fcl.Transform())
-        self._walls = fcl.CollisionObject(_model(joined([scene.walls, scene.shell])),
-                                          fcl.Transform())
+        self._body = solid(scene.body)
+        self._walls = solid(joined([scene.walls, scene.shell]))
         self._request = fcl.CollisionRequest()
         ompl.util.setLogLevel(ompl.util.LOG_ERROR)
         self.states = ompl.base.SE3StateSpace()
@@ -147,11 +147,3 @@ class Space:
 def _pose(state: Any) -> list[float]:
     turn = state.rotation()
     return [state.getX(), state.getY(), state.getZ(), turn.x, turn.y, turn.z, turn.w]
-
-
-def _model(mesh: Mesh) -> Any:
-    model = fcl.BVHModel()
-    model.beginModel(len(mesh.triangles), len(mesh.vertices))
-    model.addSubModel(mesh.vertices, mesh.triangles)
-    model.endModel()
-    return model

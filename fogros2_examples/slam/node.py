@@ -20,13 +20,13 @@ from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Path as PathMessage
 import numpy
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, TimeReference
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
+from fogros2_examples.nodes import LATCHED, run
 from fogros2_examples.slam import messages, stored
 from fogros2_examples.slam.tracking import Slam, State, Tracked
 
@@ -37,8 +37,6 @@ except ImportError:  # it is not part of the smallest ROS 2
 
 #: Only the newest images, so that a slow node is late by one image instead of many.
 NEWEST = QoSProfile(depth=2)
-#: Keeps the last message for late subscribers.
-KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 #: Images to keep until a frame's other image arrives, and images without one until a warning.
 WAITING, ALONE = 8, 30
 
@@ -74,9 +72,9 @@ class SlamNode(Node):
         self.poses = self.create_publisher(PoseStamped, 'pose', 10)
         self.transforms = TFMessage and self.create_publisher(TFMessage, '/tf', 10)
         self.times = self.create_publisher(TimeReference, 'computing', 10)
-        self.states = self.create_publisher(String, 'slam_state', KEPT)
-        self.paths = self.create_publisher(PathMessage, 'path', KEPT)
-        self.clouds = self.create_publisher(PointCloud2, 'map_points', KEPT)
+        self.states = self.create_publisher(String, 'slam_state', LATCHED)
+        self.paths = self.create_publisher(PathMessage, 'path', LATCHED)
+        self.clouds = self.create_publisher(PointCloud2, 'map_points', LATCHED)
         for half, topic in (('image', 'image'), ('depth', 'depth'), ('right', 'right/image')):
             self.create_subscription(Image, f'camera/{topic}', self._taker(half), newest)
         for half, topic in (('image', 'camera_info'), ('right', 'right/camera_info')):
@@ -209,13 +207,14 @@ class SlamNode(Node):
             self.clouds.publish(messages.cloud(path.header, numpy.asarray(points)))
 
 
-def main() -> None:
-    """Run until interrupted."""
-    rclpy.init()
-    node = SlamNode()
+def serve(node: SlamNode) -> None:
+    """Run until a signal, then save the map."""
     try:
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
     finally:
         node.save()
+
+
+def main() -> None:
+    """Run until interrupted."""
+    run('slam', SlamNode, serve)

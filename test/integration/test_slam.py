@@ -29,9 +29,10 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
 from std_msgs.msg import Header, String  # noqa: E402
 
 from fogros2.waiting import wait_until  # noqa: E402
+from fogros2_examples.nodes import LATCHED  # noqa: E402
 from fogros2_examples.slam import messages, room  # noqa: E402
 from fogros2_examples.slam.camera import SlamCamera  # noqa: E402
-from fogros2_examples.slam.node import KEPT, TFMessage  # noqa: E402
+from fogros2_examples.slam.node import TFMessage  # noqa: E402
 from rigs.launched import launching  # noqa: E402
 
 pytestmark = [
@@ -119,8 +120,8 @@ class Side:
                 ('image', Image), ('depth', Image), ('camera_info', CameraInfo))}
         self.heard = {}
         for topic, kind, qos in (
-                ('pose', PoseStamped, 10), ('slam_state', String, KEPT), *TRANSFORMS,
-                ('path', PathMessage, KEPT), ('map_points', PointCloud2, KEPT)):
+                ('pose', PoseStamped, 10), ('slam_state', String, LATCHED), *TRANSFORMS,
+                ('path', PathMessage, LATCHED), ('map_points', PointCloud2, LATCHED)):
             self.heard[topic] = []
             self.node.create_subscription(kind, topic, self.heard[topic].append, qos)
         self.stamp = 0

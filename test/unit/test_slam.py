@@ -14,6 +14,7 @@ cv2 = pytest.importorskip('cv2', reason='OpenCV (the extra "applications") is no
 pytest.importorskip('gtsam', reason='GTSAM (the extra "applications") is not installed')
 pytest.importorskip('evo', reason='evo (the extra "applications") is not installed')
 
+from fogros2_examples.files import BadInput  # noqa: E402
 from fogros2_examples.slam import (  # noqa: E402
     geometry,
     mapping,
@@ -204,7 +205,7 @@ def test_bad_dataset_is_reported_with_its_line(
         (folder / name).unlink()
     else:
         (folder / name).write_text(text)
-    with pytest.raises(tum.DatasetError) as caught:
+    with pytest.raises(BadInput) as caught:
         list(sources.dataset(folder).shots)
     assert said in str(caught.value)
 
