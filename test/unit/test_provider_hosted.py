@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import dataclasses
 import io
 import json
 from pathlib import Path
@@ -27,19 +28,21 @@ from fogros2.errors import (
 )
 from fogros2.model import (
     Command,
+    CreateRequest,
     Endpoint,
     MachineSpec,
     MachineState,
     Result,
     to_json,
 )
+from fogros2.provider.container import ContainerProvider
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import machine as container_machine
 from fogros2.shell.local import LocalShell
 from fogros2.store import Record, Store
-from fogros2_features.hosts import hosted
+from fogros2_features.hosts import hosted, served
 from fogros2_features.hosts.hosted import HostedProvider, program, result_of
-from fogros2_testing import FakeShell, request_for
+from fogros2_testing import FakeProvider, FakeShell, ProviderContract, request_for
 
 ID = 'podman:0123456789ab:0123-token'
 REPORT = {
@@ -62,6 +65,47 @@ def shell(monkeypatch: pytest.MonkeyPatch) -> FakeShell:
     fake.said = ''  # type: ignore[attr-defined]
     monkeypatch.setattr(hosted, 'connect', lambda endpoint, name: fake)
     return fake
+
+
+class Engine(FakeProvider):
+    """A host's container provider, whose containers are entries of a dictionary."""
+
+    def check(self, spec: MachineSpec) -> None:
+        assert spec.provider == ContainerProvider.name
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        made = super().create(spec, request)
+        if made.startswith('fake-'):  # it is new
+            identity = f'podman:{made[5:]:0>12}:{request.token}'
+            self.machines[identity] = dataclasses.replace(self.machines.pop(made), id=identity)
+            self._tokens[request.token], self._waits[identity] = identity, 0
+        return self._tokens[request.token]
+
+
+class TestHostedProvider(ProviderContract):
+    """Against a host in memory; the contract of real containers is ``ContainerProvider``'s."""
+
+    @pytest.fixture(autouse=True)
+    def place(self, on: dict[str, Any], shell: FakeShell) -> None:
+        self.options = {'on': on}
+        engine = Engine(shell=Endpoint('ssh', '198.51.100.2', 40001, 'fog', 'ssh-ed25519 AA'))
+
+        def serve(command: Command) -> Result:
+            ask = json.loads(command.input or b'')
+            reply: dict[str, Any]
+            try:
+                reply = {'result': served.answer(engine, ask['call'], ask['given'])}
+            except FogError as error:
+                reply = {'error': type(error).__name__, 'message': error.args[0],
+                         'hint': error.hint}
+            return Result(0, to_json(reply), '')
+
+        shell._handlers['sh'] = serve
+
+    def make(self) -> tuple[HostedProvider, dict[str, Any]]:
+        provider = HostedProvider()
+        provider.check(MachineSpec('any', 'hosted', self.options))
+        return provider, self.options
 
 
 def spec_on(on: dict[str, Any], **options: Any) -> MachineSpec:
