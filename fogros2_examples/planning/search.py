@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import dataclasses
 import time
-from typing import Any, Literal, Optional, Union
+from typing import Any, Literal, Union
 
 import fcl
 import numpy
@@ -33,7 +34,7 @@ class Outcome:
 
     :param end: 'found'; 'start' or 'goal': that pose collides or is out of bounds; 'time': the
         time-out was over.
-    :param path: poses (n, 7) as in Scene, from start to goal; empty unless found. Between two
+    :param path: n poses of 7 numbers as in Scene, start to goal; empty unless found. Between two
         poses, the body moves straight and turns the shorter way, both at a constant rate.
     :param length: length of the path, m.
     :param checks: number of collision checks.
@@ -41,7 +42,7 @@ class Outcome:
     """
 
     end: End
-    path: Floats
+    path: list[list[float]]
     length: float
     checks: int
     seconds: float
@@ -95,10 +96,10 @@ class Space:
         """
         begin, self.checks = time.monotonic(), 0
 
-        def ended(end: End, path: Optional[Floats] = None) -> Outcome:
-            poses = numpy.empty((0, 7)) if path is None else path
-            steps = numpy.linalg.norm(numpy.diff(poses[:, :3], axis=0), axis=1)
-            return Outcome(end, poses, float(steps.sum()), self.checks, time.monotonic() - begin)
+        def ended(end: End, path: Sequence[list[float]] = ()) -> Outcome:
+            places = numpy.array(path).reshape(-1, 7)[:, :3]
+            length = float(numpy.linalg.norm(numpy.diff(places, axis=0), axis=1).sum())
+            return Outcome(end, [*path], length, self.checks, time.monotonic() - begin)
 
         if not self.free(start):
             return ended('start')
@@ -127,7 +128,7 @@ class Space:
         simplifier.collapseCloseVertices(path)
         simplifier.partialShortcutPath(path)
         simplifier.reduceVertices(path)
-        return ended('found', numpy.array([_pose(state) for state in path.getStates()]))
+        return ended('found', [_pose(state) for state in path.getStates()])
 
     def _valid(self, state: Any) -> bool:
         # Plain numbers, because arrays of three would take as long as FCL.

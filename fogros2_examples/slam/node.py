@@ -11,6 +11,7 @@ The world's frame is ``map``; the camera's frame is the image's.
 
 from __future__ import annotations
 
+from functools import partial
 import os
 from pathlib import Path
 import time
@@ -76,37 +77,35 @@ class SlamNode(Node):
         self.paths = self.create_publisher(PathMessage, 'path', LATCHED)
         self.clouds = self.create_publisher(PointCloud2, 'map_points', LATCHED)
         for half, topic in (('image', 'image'), ('depth', 'depth'), ('right', 'right/image')):
-            self.create_subscription(Image, f'camera/{topic}', self._taker(half), newest)
+            self.create_subscription(
+                Image, f'camera/{topic}', partial(self._take, half), newest)
         for half, topic in (('image', 'camera_info'), ('right', 'right/camera_info')):
             self.create_subscription(
-                CameraInfo, f'camera/{topic}', self._learner(half), newest)
+                CameraInfo, f'camera/{topic}', partial(self._learn, half), newest)
         self.create_timer(1.0, self._show_map)
         self._say(State.STARTING, 'no image yet')
 
-    def _learner(self, half: str) -> Any:
-        def learn(info: CameraInfo) -> None:
-            self.infos[half] = info
-        return learn
+    def _learn(self, half: str, info: CameraInfo) -> None:
+        self.infos[half] = info
 
-    def _taker(self, half: str) -> Any:
-        def take(image: Image) -> None:
-            key = messages.nanoseconds(image.header.stamp)
-            self.halves[half][key] = image
-            other = 'right' if key in self.halves['right'] else 'depth'
-            if key in self.halves['image'] and key in self.halves[other]:
-                self._process(self.halves['image'][key], other, self.halves[other][key])
-                self.alone = 0
-                for waiting in self.halves.values():
-                    for old in [one for one in waiting if one <= key]:
-                        del waiting[old]
-            elif half == 'image':
-                self.alone += 1
-                if self.alone == ALONE:
-                    self._say(State.STARTING if self.slam is None else self.slam.state,
-                              'neither a depth image nor a right one has the stamps of the images')
-            while len(self.halves[half]) > WAITING:
-                del self.halves[half][min(self.halves[half])]
-        return take
+    def _take(self, half: str, image: Image) -> None:
+        """Keep an image until the other one with its stamp is there; then process both."""
+        key = messages.nanoseconds(image.header.stamp)
+        self.halves[half][key] = image
+        other = 'right' if key in self.halves['right'] else 'depth'
+        if key in self.halves['image'] and key in self.halves[other]:
+            self._process(self.halves['image'][key], other, self.halves[other][key])
+            self.alone = 0
+            for waiting in self.halves.values():
+                for old in [one for one in waiting if one <= key]:
+                    del waiting[old]
+        elif half == 'image':
+            self.alone += 1
+            if self.alone == ALONE:
+                self._say(State.STARTING if self.slam is None else self.slam.state,
+                          'neither a depth image nor a right one has the stamps of the images')
+        while len(self.halves[half]) > WAITING:
+            del self.halves[half][min(self.halves[half])]
 
     def _process(self, image: Image, other: str, second: Image) -> None:
         """Track a frame and publish its pose, then add the frame to the map."""

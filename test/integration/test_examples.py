@@ -60,7 +60,7 @@ def test_three_hosts_exchange_messages(launch, cloud_network):
 
 
 @pytest.mark.parametrize('words', [
-    ('talker.local.launch.py',), ('talker.container.launch.py', 'machine:=local'),
+    ('talker.container.launch.py', 'machine:=local'),
     ('two_clouds.launch.yaml', '--machine', 'speaker=robot', '--machine', 'hear*=robot'),
 ])
 def test_nodes_run_on_the_robot_without_a_machine(launch, words):
