@@ -27,12 +27,6 @@ ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH')
 
 
-@pytest.fixture(autouse=True)
-def surroundings(tmp_path, monkeypatch):
-    """Keep what launch logs out of the user's home."""
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-
-
 @pytest.fixture
 def launch(nothing_left):
     with launching() as start:

@@ -26,12 +26,6 @@ pytestmark = [
 RUN = uuid.uuid4().hex[:6]
 
 
-@pytest.fixture(autouse=True)
-def logs(tmp_path, monkeypatch):
-    """Keep what launch logs out of the user's home."""
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-
-
 @pytest.fixture
 def launch():
     with launching() as start:

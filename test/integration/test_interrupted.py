@@ -72,8 +72,7 @@ class WarningProvider(ContainerProvider):
 
 
 @pytest.fixture
-def launched(cloud_network, tmp_path, monkeypatch):
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+def launched(cloud_network, tmp_path):
     with launching() as launch:
         def start(machines, on_interrupt, provider='container'):
             path = tmp_path / 'interrupted.launch.py'

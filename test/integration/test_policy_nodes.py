@@ -41,12 +41,6 @@ IMAGES = {f'observation.images.{name}': (1, 3, training.HEIGHT, training.WIDTH)
           for name in ('top', 'side')}
 
 
-@pytest.fixture(autouse=True)
-def surroundings(tmp_path, monkeypatch):
-    """Keep what launch logs out of the user's home."""
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-
-
 @pytest.fixture
 def policy(tmp_path):
     """Return a policy that is blind, and goes to the demo's third target from the start."""

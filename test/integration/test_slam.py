@@ -43,12 +43,6 @@ TRANSFORMS = [('/tf', TFMessage, 10)] if TFMessage else []
 SMALL = ('width:=320', 'height:=240', 'frames:=25', 'rate:=20.0')
 
 
-@pytest.fixture(autouse=True)
-def surroundings(tmp_path, monkeypatch):
-    """Keep what launch logs out of the user's home."""
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-
-
 @pytest.fixture
 def launch():
     with launching() as start:

@@ -60,7 +60,7 @@ DDS = 'udp:0.0.0.0:7410'
 #: What a guest reaches besides DDS: the door, and the port for its heartbeats.
 OWN = [f'tcp:0.0.0.0:{network.PORT}', f'udp:0.0.0.0:{network.heartbeats(GUEST)}']
 #: Gives a guest an account, whose program leaves files; ends it, and gives another one. Prints
-#: the ids of both, and what System V keeps of the first.
+#: the ids of both, and how much System V keeps of the first, and the packet filter.
 ACCOUNTS = """
 import os, pathlib, pwd, socket, subprocess, sys, types
 guests = types.ModuleType('guests')
@@ -88,8 +88,9 @@ for _ in range(2):
             subprocess.run(words, user=found.pw_uid, group=found.pw_gid, extra_groups=(),
                            stdout=subprocess.DEVNULL, check=True)
     guests.evict('fogabc123m0g224')
+tables = subprocess.run(['nft', 'list', 'tables'], capture_output=True, text=True, check=True)
 print(*ids, sum(path.read_text().count(str(ids[0])) for path in
-                pathlib.Path('/proc/sysvipc').iterdir()))
+                pathlib.Path('/proc/sysvipc').iterdir()), tables.stdout.count('fogabc123m0g224'))
 """
 #: Seconds in which WireGuard makes a second attempt at a handshake.
 ATTEMPTS = 6.0
@@ -194,6 +195,6 @@ def test_next_guest_owns_no_file_of_a_former_one(cloud: Cloud) -> None:
         look = Command(('find', '/', '/dev/shm', '-xdev', '-name', '*of a guest*'), sudo=True)
         wait_until(lambda: not shell.run(look, timeout=60.0, check=False).stdout, timeout=60.0,
                    what='all files of the guest to be gone')
-    first, second, kept = map(int, said.split())
-    assert kept == 0
+    first, second, kept, filters = map(int, said.split())
+    assert kept == filters == 0
     assert first != second and first in guests.IDS and second in guests.IDS

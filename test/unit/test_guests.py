@@ -19,8 +19,8 @@ KEY, OTHER = 'first=', 'second='
 
 
 def asked(key: str = KEY, **changes: object) -> Guest:
-    return {'key': key, 'label': 'robot2', 'seconds': 60.0, 'patience': 180.0,
-            'addresses': ['198.18.7.224', '198.18.7.225'], **changes}
+    return {'key': key, 'label': 'robot2', 'seconds': 60.0, 'patience': 180.0, 'left': 3600.0,
+            'secret': '5a' * 32, 'addresses': ['198.18.7.224', '198.18.7.225'], **changes}
 
 
 def test_guests_get_the_free_addresses_in_turn() -> None:
