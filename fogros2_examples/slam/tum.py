@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Read and write folders in the TUM RGB-D format (Sturm et al., IROS 2012).
+Read folders in the TUM RGB-D format (Sturm et al., IROS 2012).
 
 ``rgb.txt`` and ``depth.txt`` list images by time. ``groundtruth.txt`` lists poses as time,
 position and quaternion. Depth is PNG with 16 bits, 5000 per metre. The format does not contain the
@@ -11,7 +11,7 @@ freiburg1 to 3, else a Kinect's. Distorted images are rectified when they are re
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from fogros2_examples.files import BadInput
 from fogros2_examples.letterbox import Pixels
-from fogros2_examples.slam.geometry import Array, Camera, from_quaternion, quaternion
+from fogros2_examples.slam.geometry import Array, Camera, from_quaternion
 
 #: Units of depth per metre.
 SCALE = 5000
@@ -115,26 +115,6 @@ def read(folder: Path) -> Dataset:
     first = _image(folder, pairs[0][0], cv2.IMREAD_COLOR)
     own = _camera(folder)
     return Dataset(folder, Camera(first.shape[1], first.shape[0], *own[:4]), own[4:], pairs, truth)
-
-
-def write(folder: Path, camera: Camera,
-          frames: Iterable[tuple[float, Pixels, NDArray[numpy.uint16]]],
-          truth: Iterable[tuple[float, Array]]) -> None:
-    """Write a folder; ``frames`` are as in ``Dataset.frames``."""
-    for name in ('rgb', 'depth'):
-        (folder / name).mkdir(parents=True, exist_ok=True)
-    times = []
-    for time, image, depth in frames:
-        cv2.imwrite(str(folder / f'rgb/{time:.6f}.png'), image)
-        cv2.imwrite(str(folder / f'depth/{time:.6f}.png'),
-                    (depth.astype(int) * (SCALE // 1000)).clip(0, 65535).astype(numpy.uint16))
-        times.append(f'{time:.6f}')
-    for name in ('rgb', 'depth'):
-        (folder / f'{name}.txt').write_text(''.join(f'{t} {name}/{t}.png\n' for t in times))
-    (folder / 'groundtruth.txt').write_text('# time tx ty tz qx qy qz qw\n' + ''.join(
-        ' '.join([f'{time:.6f}', *(f'{v:.9f}' for v in (*pose[:3, 3], *quaternion(pose)))]) + '\n'
-        for time, pose in truth))
-    (folder / 'camera.txt').write_text(f'{camera.fx} {camera.fy} {camera.cx} {camera.cy}\n')
 
 
 def _lines(path: Path, words: int) -> list[Line]:
