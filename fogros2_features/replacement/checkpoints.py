@@ -9,22 +9,37 @@ import logging
 from pathlib import Path
 import threading
 import time
-from typing import Any, Optional, TYPE_CHECKING
+from typing import Any, Optional, Protocol
 import zlib
 
 from launch import LaunchContext
 
 from fogros2.errors import FogError
-from fogros2.model import Endpoint, NodeSpec
+from fogros2.model import Endpoint, MachineSpec, NodeSpec
 from fogros2.runtime.node_spec import full_name
 from fogros2.shell import connect, Shell
+from fogros2_features.replacement.options import Options
 from fogros2_features.replacement.snapshots import Checkpoint
-
-if TYPE_CHECKING:
-    from fogros2_features.replacement.session import Interruptible
 
 #: Seconds that the nodes have to answer ``~/checkpoint``.
 ANSWER = 5.0
+
+
+class Nodes(Protocol):
+    """The nodes of one machine, as a session has them."""
+
+    spec: MachineSpec
+    own: Options
+
+    @property
+    def shell(self) -> Optional[Shell]:
+        """The shell of the machine, None while the machine does not run the nodes."""
+
+    def nodes(self) -> list[NodeSpec]:
+        """Return the nodes that have started."""
+
+    def request(self, function: Callable[[], Any]) -> None:
+        """Run a coroutine function; the launch waits for it on its way down."""
 
 
 class Checkpoints:
@@ -37,7 +52,7 @@ class Checkpoints:
     """
 
     def __init__(
-        self, session: Interruptible, context: LaunchContext, store: Path, suffix: str,
+        self, session: Nodes, context: LaunchContext, store: Path, suffix: str,
         cancel: Optional[threading.Event], *, in_thread: Callable[..., asyncio.Future[Any]],
         logger: logging.Logger,
     ) -> None:

@@ -7,15 +7,15 @@ import asyncio
 from collections.abc import Callable
 import dataclasses
 import logging
-from typing import Any, TYPE_CHECKING
+from typing import Any, Optional, Protocol, TYPE_CHECKING
 
 from fogros2.errors import Cancelled, FogError, ProviderError
 from fogros2.model import NodeSpec
+from fogros2_features.replacement.checkpoints import Checkpoints, Nodes
 from fogros2_features.replacement.steps import decide, Event, Replacement
 
 if TYPE_CHECKING:
-    from fogros2.deploy import Launch
-    from fogros2_features.replacement.session import Interruptible
+    from fogros2.deploy import Launch, RunningMachine
 
 #: Seconds that an agent has, beyond a node's own time-outs, to end it and to report that.
 GRACE = 10.0
@@ -23,6 +23,27 @@ GRACE = 10.0
 CHECKPOINT = 20.0
 #: Seconds until the provider is asked again.
 RETRY = 10.0
+
+
+class Moving(Nodes, Protocol):
+    """The nodes of one machine, which move to the robot and to a new machine."""
+
+    checkpoints: Optional[Checkpoints]
+
+    async def halt_all(self) -> None:
+        """Let the machine end all of its processes; ``drained`` follows."""
+
+    async def move_halted(self) -> None:
+        """Let processes start on the robot: the machine no longer runs them."""
+
+    def homeless(self) -> list[str]:
+        """Return the names of processes that cannot run on the robot."""
+
+    def replace(self, running: RunningMachine) -> None:
+        """Use another machine from now on."""
+
+    async def come_back(self) -> None:
+        """Move all processes to the new machine."""
 
 
 class Replacer:
@@ -35,7 +56,7 @@ class Replacer:
     """
 
     def __init__(
-        self, session: Interruptible, launch: Launch, loop: asyncio.AbstractEventLoop, *,
+        self, session: Moving, launch: Launch, loop: asyncio.AbstractEventLoop, *,
         in_thread: Callable[..., asyncio.Future[Any]], fail: Callable[[BaseException], None],
         is_over: Callable[[], bool], logger: logging.Logger,
     ) -> None:
