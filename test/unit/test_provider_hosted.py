@@ -8,7 +8,6 @@ import dataclasses
 import io
 import json
 from pathlib import Path
-import re
 import socket
 import tarfile
 from typing import Any
@@ -143,19 +142,6 @@ def test_host_may_go_on_with_a_lost_request(on: dict[str, Any], shell: FakeShell
     Store().set_aside(record)
     shell._handlers['sh'] = lambda command: Result(0, json.dumps({'result': [REPORT]}), '')
     assert [found.name for found in HostedProvider().find({})] == ['planner']
-
-
-def test_robots_have_containers_of_different_names(
-    on: dict[str, Any], shell: FakeShell, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    shell.said = json.dumps({'result': ID})  # type: ignore[attr-defined]
-    names = set()
-    for robot in ('one', 'two'):
-        monkeypatch.setattr(hosted, 'robot_id', lambda: robot)  # noqa: B023
-        HostedProvider().create(spec_on(on), request_for(spec_on(on)))
-        names.add(container_machine.container_name(
-            'planner', asked(shell)['given']['request']['tags']))
-    assert len(names) == 2 and all(re.fullmatch('fogros2-planner-[0-9a-f]{8}', n) for n in names)
 
 
 def test_machine_has_the_ports_of_its_host(on: dict[str, Any], shell: FakeShell) -> None:
