@@ -347,13 +347,6 @@ def _bytes(link: Any) -> int:
     return sum(int((folder / f'{way}_bytes').read_text()) for way in ('tx', 'rx'))
 
 
-def prepare(machine: Any) -> None:
-    """Put onto the machine what its nodes are made of."""
-    for package in ('image_transport_h264', 'fogros2_examples'):
-        for path in sorted((ROOT / package).rglob('*.py')):
-            machine.shell.put(path.read_bytes(), f'{FOLDER}/{path.relative_to(ROOT)}', mode=0o644)
-
-
 @functools.cache
 def coded_alone(codec: str) -> tuple[float, float]:
     """Return the seconds to encode and decode a depth image, and its bytes: medians of some."""
@@ -563,7 +556,7 @@ def main() -> None:
     scenarios = SCENARIOS + (app_scenarios(arguments.ompl_app) if arguments.ompl_app else [])
     from figures import machine as computer
     from figures import today
-    from streaming import launched
+    from streaming import launched, prepare
 
     if os.geteuid():
         raise SystemExit('holding a node to a share of a core takes root')

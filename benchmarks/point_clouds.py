@@ -25,7 +25,7 @@ import tempfile
 import time
 from typing import Any
 
-from streaming import answer_of, end, FOLDER, launched, Link, Output
+from streaming import answer_of, end, FOLDER, launched, Link, Output, put
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
@@ -364,11 +364,8 @@ def table(codecs: list[tuple[str, int, float, float, str]], outcomes: list[Outco
 
 def prepare(machine: Any) -> None:
     """Put onto the machine what its nodes need."""
-    for package in ('image_transport_h264', 'point_cloud_stream', 'fogros2_examples'):
-        for path in sorted((ROOT / package).glob('*.py')):
-            machine.shell.put(path.read_bytes(), f'{FOLDER}/{package}/{path.name}', mode=0o644)
-    for name in ('streaming.py', 'point_clouds.py'):
-        machine.shell.put((HERE / name).read_bytes(), f'{FOLDER}/{name}', mode=0o644)
+    put(machine, 'image_transport_h264', 'point_cloud_stream', 'fogros2_examples',
+        'streaming.py', 'point_clouds.py')
 
 
 def main() -> None:

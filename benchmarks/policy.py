@@ -27,7 +27,7 @@ import sys
 import time
 from typing import Any, Optional
 
-from applications import prepare, words
+from applications import words
 from streaming import (
     answer_of,
     codec_alone,
@@ -38,6 +38,7 @@ from streaming import (
     launched,
     Link,
     Output,
+    put,
     shown,
 )
 
@@ -343,10 +344,8 @@ def table(outcomes: list[Outcome], note: str) -> str:
 
 def prepare_policy(machine: Any) -> None:
     """Put onto the machine what its nodes need."""
-    prepare(machine)
-    for path in (HERE / 'policy.py', HERE / 'applications.py', HERE / 'streaming.py',
-                 *sorted((HERE / 'figures').glob('*.py'))):
-        machine.shell.put(path.read_bytes(), f'{FOLDER}/{path.relative_to(HERE)}', mode=0o644)
+    put(machine, 'image_transport_h264', 'fogros2_examples', 'policy.py', 'applications.py',
+        'streaming.py', 'figures')
     machine.shell.put(model(), MODEL, mode=0o644)
 
 

@@ -11,7 +11,6 @@ sample role and no other right.
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -24,14 +23,14 @@ import time
 import uuid
 
 from figures import paper, Row, write
+from figures.places import place, Pod
 
 from fogros2.waiting import wait_until
-from rigs.cluster import Client, Cluster, cluster, READY, running_cluster
-from rigs.cluster.namespaces import making_namespaces, Namespace
+from rigs.cluster import Cluster, READY
+from rigs.cluster.namespaces import Namespace
 from rigs.launched import launching, ros2
 
-ROOT = Path(__file__).resolve().parents[1]
-SCRIPT = ROOT / 'tools' / 'kubernetes.sh'
+SCRIPT = Path(__file__).resolve().parents[1] / 'tools' / 'kubernetes.sh'
 MANY = 20
 
 LAUNCH = """\
@@ -186,16 +185,9 @@ def rows(here: Robot, runs: int) -> Iterator[Row]:
 @contextlib.contextmanager
 def robot() -> Iterator[Robot]:
     """Yield a robot with a cluster: the one that FOGROS2_CLUSTER names, or one for this time."""
-    with contextlib.ExitStack() as stack:
-        if folder := os.environ.get('FOGROS2_CLUSTER'):
-            there = running_cluster(Path(folder))
-        else:
-            binaries = Path(subprocess.check_output([SCRIPT], text=True).strip())
-            there = stack.enter_context(cluster(binaries.parent, binaries))
-        make = stack.enter_context(making_namespaces(
-            there, Client(there.kubeconfig), ROOT / 'packaging' / 'kubernetes' / 'role.yaml'))
-        home = stack.enter_context(tempfile.TemporaryDirectory())
-        yield Robot(there, make(), Path(home))
+    with place('kubernetes') as here, tempfile.TemporaryDirectory() as home:
+        assert isinstance(here, Pod)
+        yield Robot(here.nodes, here.space, Path(home))
 
 
 def measure(runs: int) -> None:
@@ -207,14 +199,3 @@ def measure(runs: int) -> None:
     with robot() as here:
         write('startup_kubernetes', 'From ros2 launch to the first message, a local cluster',
               [*rows(here, runs)])
-
-
-def main() -> None:
-    """Take the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--runs', type=int, default=3)
-    measure(parser.parse_args().runs)
-
-
-if __name__ == '__main__':
-    main()

@@ -653,15 +653,19 @@ def rows(outcomes: list[Outcome], limits: dict[str, float], video: bool) -> Iter
             yield Row(f'{o.case.name}: p99 over median', o.p99 / o.median, '', 2.0)
 
 
-def prepare(machine: Any, video: str) -> None:
+def put(machine: Any, *names: str) -> None:
+    """Put packages onto the machine, and programs of this folder."""
+    for name in names:
+        top = HERE if (HERE / name).exists() else ROOT
+        for path in [top / name] if name.endswith('.py') else sorted((top / name).rglob('*.py')):
+            machine.shell.put(path.read_bytes(), f'{FOLDER}/{path.relative_to(top)}', mode=0o644)
+
+
+def prepare(machine: Any, video: str = '') -> None:
     """Put onto the machine what its nodes need."""
     if video:
         machine.shell.put(Path(video).read_bytes(), VIDEO, mode=0o644)
-    for package in ('image_transport_h264', 'fogros2_examples'):
-        for path in sorted((ROOT / package).glob('*.py')):
-            machine.shell.put(path.read_bytes(), f'{FOLDER}/{package}/{path.name}', mode=0o644)
-    for name in ('streaming.py', 'theora.py'):
-        machine.shell.put((HERE / name).read_bytes(), f'{FOLDER}/{name}', mode=0o644)
+    put(machine, 'image_transport_h264', 'fogros2_examples', 'streaming.py', 'theora.py')
 
 
 def main() -> None:

@@ -12,7 +12,6 @@ import argparse
 import asyncio
 import contextlib
 import fcntl
-import functools
 import json
 import os
 from pathlib import Path
@@ -26,7 +25,9 @@ from typing import Any
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE.parent), str(HERE.parent / 'test')]
 
-from relay import Link, Pending  # noqa: E402
+from streaming import Case, launched, Link, prepare, run  # noqa: E402
+
+import relay  # noqa: E402
 
 DEVICE = 'fogtpath'
 #: The name of a path's figures.
@@ -58,8 +59,8 @@ async def carry(robot: str, machine: str, process: str) -> None:
     here = tun(machine, robot)
     netns._enter(f'/proc/{process}/ns/net')
     there = tun(robot, machine)
-    pending, chance = Pending(), random.Random(1)
-    links = {here: Link(), there: Link()}
+    pending, chance = relay.Pending(), random.Random(1)
+    links = {here: relay.Link(), there: relay.Link()}
     counters = {'passed': 0, 'lost': 0}
 
     def deliver(end: int, data: bytes) -> None:
@@ -84,53 +85,34 @@ async def carry(robot: str, machine: str, process: str) -> None:
         print(json.dumps(counters), flush=True)
 
 
-class Path10:
+class Path10(Link):
     """The link between the robot and a container machine, as ``streaming.run`` needs it."""
 
     def __init__(self, launch: Any, machine: Any) -> None:
-        self._interface = f'fog{launch.id}'
+        self.interface = f'fog{launch.id}'
         name = f'fogros2-{machine.spec.name}'
         host = machine.machine.shell.host
-        pid = self._read('podman', 'inspect', '--format', '{{.State.Pid}}', name)
-        robot = self._read('ip', '-o', 'route', 'get', host).split(' src ')[1].split()[0]
-        self._process = subprocess.Popen(
+        pid = _printed('podman', 'inspect', '--format', '{{.State.Pid}}', name)
+        robot = _printed('ip', '-o', 'route', 'get', host).split(' src ')[1].split()[0]
+        self.process = subprocess.Popen(
             [sys.executable, __file__, '--carry', robot, host, pid],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        assert self._process.stdout is not None
-        if self._process.stdout.readline() != 'ready\n':
+        assert self.process.stdout is not None
+        if self.process.stdout.readline() != 'ready\n':
             raise RuntimeError('the link has no device')
 
-    def _read(self, *words: str) -> str:
-        return subprocess.run(words, check=True, capture_output=True, text=True).stdout.strip()
 
-    def change(self, **settings: float) -> dict[str, Any]:
-        """Set rate (bit/s), delay (s), loss, both ways; return the counters."""
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.write(json.dumps(settings) + '\n')
-        self._process.stdin.flush()
-        counters: dict[str, Any] = json.loads(self._process.stdout.readline())
-        return counters
-
-    def sent(self) -> int:
-        """Return the bytes that the robot has sent into the VPN."""
-        return int(Path(f'/sys/class/net/{self._interface}/statistics/tx_bytes').read_text())
-
-    def close(self) -> None:
-        """End."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait(30)
+def _printed(*words: str) -> str:
+    return subprocess.run(words, check=True, capture_output=True, text=True).stdout.strip()
 
 
 # --- the measurement ----------------------------------------------------------------------------
 
 def measure(path: str, count: int) -> dict[str, Any]:
     """Return the outcomes of a path's cases by their names."""
-    from streaming import Case, launched, prepare, run
-
     outcomes = {}
     with launched(
-            f'bench-path-{path}', functools.partial(prepare, video=''), Path10,
+            f'bench-path-{path}', prepare, Path10,
             {'vpn_path': {'vpn_path': path}}) as (launch, machine, link, output):
         for name, (delay, loss) in LINKS.items():
             case = Case(f'H.264, {NAMES[path]}{name}', 'h264', delay=delay, loss=loss)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import array
 from collections.abc import Iterator
 import itertools
 from pathlib import Path
@@ -12,10 +11,13 @@ import cv2
 import numpy
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
 
-from fogros2_examples.letterbox import letterbox
-from fogros2_examples.parameters import run
-from fogros2_examples.scene import Pixels, Scene
+from fogros2_examples.letterbox import letterbox, Pixels
+from fogros2_examples.nodes import run
+from fogros2_examples.scene import Scene
+from fogros2_examples.slam.geometry import Camera as Lens
+from fogros2_examples.slam.messages import camera_info, image
 
 
 def synthetic(width: int, height: int, rate: float) -> Iterator[Pixels]:
@@ -70,10 +72,7 @@ class Camera(Node):
         self.frame_id = str(self.declare_parameter('frame_id', 'camera').value)
         self.frames = (synthetic(width, height, rate) if source == 'synthetic'
                        else captured(source, width, height))
-        self.info = CameraInfo(width=width, height=height, distortion_model='plumb_bob')
-        focal = float(width)
-        self.info.k = [focal, 0.0, width / 2, 0.0, focal, height / 2, 0.0, 0.0, 1.0]
-        self.info.p = [focal, 0.0, width / 2, 0.0, 0.0, focal, height / 2, 0.0, 0.0, 0.0, 1.0, 0.0]
+        self.lens = Lens(width, height, float(width), float(width), width / 2, height / 2)
         self.images = self.create_publisher(Image, 'camera', 2)
         self.infos = self.create_publisher(CameraInfo, 'camera_info', 2)
         self.next = next(self.frames)
@@ -81,16 +80,9 @@ class Camera(Node):
 
     def shoot(self) -> None:
         """Publish a frame, then render the next one."""
-        stamp = self.get_clock().now().to_msg()
-        image = Image(height=self.next.shape[0], width=self.next.shape[1], encoding='bgr8',
-                      step=3 * self.next.shape[1])
-        image.header.stamp, image.header.frame_id = stamp, self.frame_id
-        # rclpy takes an array over as it is, and checks anything else byte by byte.
-        image.data = array.array('B')
-        image.data.frombytes(self.next.data.cast('B'))
-        self.info.header = image.header
-        self.images.publish(image)
-        self.infos.publish(self.info)
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.frame_id)
+        self.images.publish(image(header, self.next, 'bgr8'))
+        self.infos.publish(camera_info(header, self.lens, False))
         if self.counted:
             self.remaining -= 1
             if not self.remaining:

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 PICTURES = ('.png', '.jpg', '.jpeg')
 
 
+class BadInput(ValueError):
+    """A parameter or a file cannot be used; the text has the reason."""
+
+
 def check_writable(text: str, endings: Sequence[str] = ()) -> None:
     """
     Check that a file can be written.

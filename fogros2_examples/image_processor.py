@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
 
-from fogros2_examples.parameters import run
+from fogros2_examples.nodes import run
 
 
 class ImageProcessor(Node):

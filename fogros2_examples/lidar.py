@@ -12,7 +12,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2, PointField
 
 from fogros2_examples.city import City, TURN
-from fogros2_examples.parameters import run
+from fogros2_examples.nodes import run
 
 #: Scans that are computed at the start, and published forwards and backwards in turn.
 SCANS = 5

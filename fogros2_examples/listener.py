@@ -6,7 +6,7 @@ from __future__ import annotations
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from fogros2_examples.parameters import run
+from fogros2_examples.nodes import run
 
 
 class Listener(Node):

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import PointCloud2
 
-from fogros2_examples.parameters import run
+from fogros2_examples.nodes import run
 
 #: Metres above the ground and from the lidar between which a point is an obstacle.
 LOW, HIGH, FAR = 0.3, 2.5, 20.0

@@ -1,22 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Declare and validate parameters of nodes, and run a node that does."""
+"""Declare and validate parameters of nodes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 import math
-from typing import Any, TypeVar
+from typing import TypeVar
 
-import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
-from fogros2_examples.files import check_writable
+from fogros2_examples.files import BadInput, check_writable
 
 Number = TypeVar('Number', int, float)
 
 
-class BadParameter(ValueError):
+class BadParameter(BadInput):
     """A parameter is invalid; the text has its name and the reason."""
 
 
@@ -49,24 +47,3 @@ def writable(node: Node, name: str, endings: Sequence[str] = ()) -> str:
     except ValueError as error:
         raise BadParameter(f"'{name}' is {text}: {error}") from error
     return text
-
-
-def run(name: str, make: Callable[[], Any], turn: Callable[[Any], object] = rclpy.spin) -> None:
-    """
-    Create a node and run it until a signal; exit at once on an invalid parameter or file.
-
-    :param turn: runs the node; may raise SystemExit.
-    """
-    rclpy.init()
-    try:
-        turn(make())
-    except (BadParameter, OSError) as error:
-        raise SystemExit(f'{name}: {error}') from error
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
-    except RuntimeError:  # RCLError: the signal came before a message was published
-        if rclpy.ok():
-            raise
-    except SystemExit:
-        rclpy.try_shutdown()
-        raise

@@ -17,7 +17,7 @@ import cv2
 import numpy
 from numpy.typing import NDArray
 
-Pixels = NDArray[numpy.uint8]
+from fogros2_examples.letterbox import Pixels
 
 #: The scene is larger than the view by this factor, so that the camera can pan.
 FIELD = 1.6

@@ -8,7 +8,7 @@ import socket
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from fogros2_examples.parameters import run
+from fogros2_examples.nodes import run
 
 
 def own_address() -> str:

@@ -25,6 +25,8 @@ import pytest
 
 # ONNX Runtime tells Microsoft of its use, from its import on
 os.environ['ORT_DISABLE_TELEMETRY'] = '1'
+# threads that multiply small matrices mostly wait for each other, each on a processor
+os.environ['OPENBLAS_NUM_THREADS'] = '1'
 
 #: What ``colcon test`` runs by default: what makes no machine.
 QUICK = ['test/unit', 'test/contract', 'test/launch']
@@ -118,10 +120,12 @@ def state_home(
     request: pytest.FixtureRequest, own_folders: Iterator[Path], monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Path]:
     """Give each test a state folder of its own, so that none sees the user's machines."""
-    if 'integration' not in request.path.parts:
+    folder = next(own_folders)
+    if 'integration' in request.path.parts:
+        monkeypatch.setenv('ROS_LOG_DIR', str(folder / 'log'))
+    else:
         # gc deletes the interfaces of dead launches
         monkeypatch.setattr('fogros2.vpn.owner.INTERFACES', Path('/nonexistent'))
-    folder = next(own_folders)
     path, config = folder / 'state', folder / 'config'
     for made in (folder, path, config):
         made.mkdir(0o700)

@@ -219,7 +219,7 @@ class Host(Place):
 
     def things(self, name: str) -> dict[str, bool]:
         """Return the processes that name the machine."""
-        return {f'process {line}': True for line in self.computer.processes() if name in line}
+        return {f'process {line}': True for line in self.computer.leftovers() if name in line}
 
 
 @contextlib.contextmanager

@@ -20,8 +20,9 @@ import fcl
 import numpy
 from numpy.typing import NDArray
 
+from fogros2_examples.collisions import solid
 from fogros2_examples.grasp.surface import CELL, NothingThere, Surface
-from fogros2_examples.meshes import Floats, turned
+from fogros2_examples.meshes import Floats, Mesh, turned
 
 
 @dataclasses.dataclass(frozen=True)
@@ -233,11 +234,7 @@ class Obstacle:
         triangles = numpy.concatenate([
             numpy.column_stack([corner, corner + 1, corner + columns]),
             numpy.column_stack([corner + 1, corner + columns + 1, corner + columns])])
-        model = fcl.BVHModel()
-        model.beginModel(len(triangles), len(vertices))
-        model.addSubModel(vertices, triangles)
-        model.endModel()
-        self._surface = fcl.CollisionObject(model, fcl.Transform())
+        self._surface = solid(Mesh(vertices, triangles.astype(numpy.int32)))
 
     def hit(self, grasp: Grasp, gripper: Gripper) -> bool:
         """Return whether the open gripper touches the surface at a grasp."""

@@ -11,6 +11,7 @@ import fcl
 import numpy
 from numpy.typing import NDArray
 
+from fogros2_examples.collisions import solid
 from fogros2_examples.meshes import box, cylinder, Floats, joined, lathe, Mesh, sphere, turned
 from fogros2_examples.rendering import Camera, drawn
 
@@ -77,7 +78,7 @@ def thrown(seed: int, count: int = 9) -> Bin:
     random = numpy.random.default_rng(seed)
     floor = box((-SIZE[0] / 2, -SIZE[1] / 2, -0.01), (SIZE[0] / 2, SIZE[1] / 2, 0))
     objects: list[Mesh] = []
-    lying = [_solid(floor)]
+    lying = [solid(floor)]
     for _ in range(count):
         mesh = KINDS[int(random.integers(len(KINDS)))](float(random.uniform(0.85, 1.2)))
         # Objects rest on a face more often than on an edge.
@@ -89,21 +90,13 @@ def thrown(seed: int, count: int = 9) -> Bin:
         height = _resting(mesh, lying)
         mesh = mesh.moved(numpy.eye(3), (0, 0, height))
         objects.append(mesh)
-        lying.append(_solid(mesh))
+        lying.append(solid(mesh))
     return Bin(tuple(objects), floor)
-
-
-def _solid(mesh: Mesh) -> fcl.CollisionObject:
-    model = fcl.BVHModel()
-    model.beginModel(len(mesh.triangles), len(mesh.vertices))
-    model.addSubModel(mesh.vertices, mesh.triangles)
-    model.endModel()
-    return fcl.CollisionObject(model, fcl.Transform())
 
 
 def _resting(mesh: Mesh, lying: list[fcl.CollisionObject]) -> float:
     """Return the height above the floor at which a falling mesh stops."""
-    falling = _solid(mesh)
+    falling = solid(mesh)
 
     def touches(height: float) -> bool:
         falling.setTransform(fcl.Transform(numpy.array([0.0, 0.0, height])))

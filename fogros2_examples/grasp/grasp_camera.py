@@ -7,8 +7,6 @@ The node publishes ``depth`` and ``camera_info``. It shows the grasps on ``pictu
 
 from __future__ import annotations
 
-import array
-from collections.abc import Callable
 import itertools
 import json
 import time
@@ -19,28 +17,21 @@ import cv2
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy
 from numpy.typing import NDArray
-import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from fogros2_examples.files import PICTURES
 from fogros2_examples.grasp.bins import camera, depth_image, thrown
-from fogros2_examples.grasp.messages import (
-    depth_message,
-    ENCODINGS,
-    grasps_of,
-    info_message,
-)
+from fogros2_examples.grasp.messages import depth_message, grasps_of, info_message
 from fogros2_examples.grasp.picture import beside, picture
+from fogros2_examples.nodes import LATCHED, run, until
 from fogros2_examples.parameters import BadParameter, within, writable
+from fogros2_examples.slam.messages import DEPTHS, image
 
 #: Seconds for the answer to the first image; each further one gets twice as long.
 FIRST_PAUSE = 5.0
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class GraspCamera(Node):
@@ -57,9 +48,9 @@ class GraspCamera(Node):
         self.trials = within(self, 'trials', 10, 0)
         self.seed = within(self, 'seed', 0, 0)
         self.encoding = str(self.declare_parameter('encoding', '16UC1').value)
-        if self.encoding not in ENCODINGS:
+        if self.encoding not in DEPTHS:
             raise BadParameter(
-                f"'encoding' is '{self.encoding}': it has to be {', '.join(ENCODINGS)}")
+                f"'encoding' is '{self.encoding}': it has to be {', '.join(DEPTHS)}")
         self.picture = writable(self, 'picture', PICTURES)
         self.figures = writable(self, 'figures')
         self.wait = within(self, 'wait', 60.0, 0.1)
@@ -88,7 +79,7 @@ class GraspCamera(Node):
 
     def run(self) -> int:
         """Show all bins, and return the exit status: 0 if each bin had a grasp."""
-        if not self._until(lambda: self.ready, self.wait):
+        if not until(self, lambda: self.ready, self.wait):
             self.get_logger().fatal(f'no grasp planner is there after {self.wait:g} s')
             return 2
         if not self._warm_up(self._bin(self.seed)):
@@ -115,7 +106,8 @@ class GraspCamera(Node):
                 with open(self.figures, 'a') as file:
                     file.write(json.dumps(figures) + '\n')
             drawn = picture(depth, grasps, self.eye.focal, f'bin {number}: {best}')
-            self._show(drawn)
+            header = Header(stamp=self.get_clock().now().to_msg(), frame_id='camera')
+            self.pictures.publish(image(header, drawn, 'bgr8'))
             if self.trials:
                 pictures.append(drawn)
         if self.picture and pictures:
@@ -132,7 +124,7 @@ class GraspCamera(Node):
     def _asked(self, depth: NDArray[numpy.float32], wait: float) -> Optional[tuple[int, int]]:
         """Publish an image; return its stamp after its grasps arrived, None after ``wait`` s."""
         key = self._published(depth)
-        return key if self._until(lambda: self._answered(key), wait) else None
+        return key if until(self, lambda: self._answered(key), wait) else None
 
     def _warm_up(self, depth: NDArray[numpy.float32]) -> bool:
         """
@@ -148,11 +140,11 @@ class GraspCamera(Node):
             if left <= 0:
                 return False
             keys.append(self._published(depth))
-            self._until(lambda: any(map(self._answered, keys)), min(pause, left))
+            until(self, lambda: any(map(self._answered, keys)), min(pause, left))
             pause *= 2
         # the first bin's time must not include the planner's time for these images
         others = (len(keys) - 1) * (max(self.seconds.values()) + 1.0)
-        self._until(lambda: all(map(self._answered, keys)), others)
+        until(self, lambda: all(map(self._answered, keys)), others)
         return True
 
     def _answered(self, key: tuple[int, int]) -> bool:
@@ -167,22 +159,6 @@ class GraspCamera(Node):
         self.images.publish(depth_message(depth, self.encoding, header))
         return key
 
-    def _show(self, image: NDArray[numpy.uint8]) -> None:
-        height, width = image.shape[:2]
-        self.pictures.publish(Image(
-            header=Header(stamp=self.get_clock().now().to_msg(), frame_id='camera'),
-            height=height, width=width, encoding='bgr8', step=3 * width,
-            data=array.array('B', image.tobytes())))
-
-    def _until(self, true: Callable[[], bool], wait: float) -> bool:
-        """Handle messages until ``true()`` is true; return False after ``wait`` seconds."""
-        deadline = time.monotonic() + wait
-        while not true():
-            if time.monotonic() > deadline:
-                return False
-            rclpy.spin_once(self, timeout_sec=0.1)
-        return True
-
 
 def _key(stamp: Time) -> tuple[int, int]:
     return stamp.sec, stamp.nanosec
@@ -190,13 +166,4 @@ def _key(stamp: Time) -> tuple[int, int]:
 
 def main() -> None:
     """Show all bins; exit at once on an invalid parameter."""
-    rclpy.init()
-    try:
-        raise SystemExit(GraspCamera().run())
-    except BadParameter as error:
-        raise SystemExit(f'grasp_camera: {error}') from error
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
-    except SystemExit:
-        rclpy.try_shutdown()
-        raise
+    run('grasp_camera', GraspCamera, GraspCamera.run)

@@ -14,17 +14,13 @@ from typing import Optional
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseArray
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from visualization_msgs.msg import MarkerArray
 
 from fogros2_examples.grasp.antipodal import Grasp, Gripper, plan
-from fogros2_examples.grasp.messages import BadImage, depth_of, grasp_messages
-from fogros2_examples.grasp.surface import NothingThere, surface
-from fogros2_examples.parameters import run
-
-#: Keeps the last message for late subscribers.
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+from fogros2_examples.grasp.messages import depth_of, grasp_messages
+from fogros2_examples.grasp.surface import surface
+from fogros2_examples.nodes import LATCHED, run
 
 
 class GraspPlanner(Node):
@@ -70,15 +66,15 @@ class GraspPlanner(Node):
             depth = depth_of(image)
             k = self.info.k
             if (self.info.height, self.info.width) != depth.shape or not (k[0] > 0 and k[4] > 0):
-                raise BadImage(f'camera_info is of {self.info.width}x{self.info.height} pixels, '
-                               f'the image has {image.width}x{image.height}'
-                               if k[0] > 0 and k[4] > 0 else 'camera_info has no focal length')
+                raise ValueError(f'camera_info is of {self.info.width}x{self.info.height} pixels, '
+                                 f'the image has {image.width}x{image.height}'
+                                 if k[0] > 0 and k[4] > 0 else 'camera_info has no focal length')
             seen = surface(depth, (k[0], k[4]), (k[2], k[5]))
             grasps = plan(seen, self.gripper, samples=self.samples, perturbed=self.perturbed,
                           count=self.count)
             text = f'{len(grasps)} grasps, the best of quality {grasps[0].quality:.2f}'
             level = DiagnosticStatus.OK
-        except (BadImage, NothingThere) as error:
+        except ValueError as error:
             text, level = f'no grasp: {error}', DiagnosticStatus.WARN
         seconds = time.monotonic() - begin
         poses, markers = grasp_messages(grasps, image.header)

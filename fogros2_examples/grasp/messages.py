@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import array
 import math
 
 from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion, Vector3
@@ -14,55 +13,31 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from fogros2_examples.grasp.antipodal import Grasp
-
-#: Encodings of depth: type of a pixel, and m per unit (REP 118).
-ENCODINGS = {'16UC1': ('u2', 0.001), 'mono16': ('u2', 0.001), '32FC1': ('f4', 1.0)}
-
-
-class BadImage(ValueError):
-    """An image is no depth image; the text has the reason."""
+from fogros2_examples.slam.geometry import Camera
+from fogros2_examples.slam.messages import camera_info, depth, DEPTHS, image
 
 
 def depth_of(image: Image) -> NDArray[numpy.float32]:
     """
     Return the depths of an image, m, array (height, width); 0 or NaN means unknown.
 
-    :raises BadImage: the encoding is none of depth, or the data do not fit the size.
+    :raises ValueError: the encoding is none of depth, or the data do not fit the size.
     """
-    if image.encoding not in ENCODINGS:
-        raise BadImage(f"'{image.encoding}' is no encoding of depth: it takes "
-                       f"{', '.join(ENCODINGS)}")
-    kind, unit = ENCODINGS[image.encoding]
-    pixel = numpy.dtype(kind).newbyteorder('>' if image.is_bigendian else '<')
-    if not image.width or not image.height or image.step < image.width * pixel.itemsize or (
-            len(image.data) < image.step * image.height):
-        raise BadImage(f'{len(image.data)} bytes are no image of {image.width}x{image.height} '
-                       f'pixels and {image.step} bytes a row')
-    rows = numpy.frombuffer(image.data, numpy.uint8)[:image.step * image.height].reshape(
-        image.height, image.step)[:, :image.width * pixel.itemsize]
-    values = numpy.ascontiguousarray(rows).view(pixel)
+    values = depth(image)
+    unit = 0.001 if values.dtype.kind == 'u' else 1.0  # REP 118
     return numpy.asarray(values * numpy.float32(unit), numpy.float32)
 
 
-def depth_message(depth: NDArray[numpy.float32], encoding: str, header: Header) -> Image:
+def depth_message(depths: NDArray[numpy.float32], encoding: str, header: Header) -> Image:
     """Return depths in m as an image message."""
-    kind, unit = ENCODINGS[encoding]
-    values = depth / unit
-    pixels = (numpy.rint(values) if kind == 'u2' else values).astype(f'<{kind}')
-    height, width = depth.shape
-    return Image(header=header, height=height, width=width, encoding=encoding,
-                 step=width * pixels.itemsize, data=array.array('B', pixels.tobytes()))
+    values = depths if encoding == '32FC1' else numpy.rint(1000 * depths)
+    return image(header, values.astype(f'<{DEPTHS[encoding]}'), encoding)
 
 
 def info_message(width: int, height: int, focal: float, header: Header) -> CameraInfo:
     """Return the CameraInfo of a pinhole camera with its axis in the middle of the image."""
-    x, y = (width - 1) / 2, (height - 1) / 2
-    info = CameraInfo(header=header, width=width, height=height, distortion_model='plumb_bob',
-                      d=[0.0] * 5)
-    info.k = [focal, 0.0, x, 0.0, focal, y, 0.0, 0.0, 1.0]
-    info.r = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
-    info.p = [focal, 0.0, x, 0.0, 0.0, focal, y, 0.0, 0.0, 0.0, 1.0, 0.0]
-    return info
+    return camera_info(header, Camera(
+        width, height, focal, focal, (width - 1) / 2, (height - 1) / 2), False)
 
 
 def grasp_messages(grasps: list[Grasp], header: Header) -> tuple[PoseArray, MarkerArray]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy
 
+from fogros2_examples.files import BadInput
 from fogros2_examples.meshes import Floats, joined, Mesh, quaternion, turned
 from fogros2_examples.planning.scene import Scene
 
@@ -18,15 +19,11 @@ _UPRIGHT = {'X_UP': numpy.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
             'Z_UP': numpy.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
 
 
-class BadFile(ValueError):
-    """A file is no problem of a rigid body in space; the text has the file and the reason."""
-
-
 def loaded(path: Path) -> Scene:
     """
     Read the problem of a file, in the file's unit of length.
 
-    :raises BadFile: the file or a mesh cannot be read, or a value is missing.
+    :raises BadInput: the file or a mesh cannot be read, or a value is missing.
     """
     # Some files have comments after values, and define a planner twice.
     parser = configparser.ConfigParser(
@@ -45,12 +42,12 @@ def loaded(path: Path) -> Scene:
             low, high = walls.vertices.min(axis=0), walls.vertices.max(axis=0)
     except (OSError, UnicodeDecodeError, configparser.Error) as error:
         why = getattr(error, 'strerror', None) or ' '.join(str(error).split())
-        raise BadFile(f"{path} can't be read: {why}") from error
+        raise BadInput(f"{path} can't be read: {why}") from error
     except KeyError as error:
-        raise BadFile(f'{path} has no {error}: is it a problem of a body in space (SE(3))?'
+        raise BadInput(f'{path} has no {error}: is it a problem of a body in space (SE(3))?'
                       ) from error
     except ValueError as error:
-        raise BadFile(f'{path}: {error}') from error
+        raise BadInput(f'{path}: {error}') from error
     return Scene(path.stem, body, walls, joined([]), low, high, poses[0], poses[1])
 
 
@@ -92,7 +89,7 @@ def _triangles(path: Path) -> tuple[Floats, Floats]:
 
         mesh: Any = trimesh.load(path, force='mesh', process=False)
     except ImportError as error:
-        raise BadFile(f"{path} can't be read: {error}; pip install trimesh pycollada") from error
+        raise BadInput(f"{path} can't be read: {error}; pip install trimesh pycollada") from error
     vertices = numpy.array(mesh.vertices, float)
     return vertices[numpy.array(mesh.faces, int)].reshape(-1, 3, 3), vertices
 
@@ -100,16 +97,16 @@ def _triangles(path: Path) -> tuple[Floats, Floats]:
 def _mesh(path: Path, *, centred: bool) -> Mesh:
     """Read a mesh; ``centred`` moves the mean of its vertices to the origin."""
     if not path.is_file():
-        raise BadFile(f'there is no {path}')
+        raise BadInput(f'there is no {path}')
     try:
         triangles, counted = _triangles(path)
-    except BadFile:
+    except BadInput:
         raise
     except (ValueError, LookupError, AttributeError, TypeError, OSError, SyntaxError,
             NotImplementedError) as error:
-        raise BadFile(f"{path} can't be read as a mesh: {error}") from error
+        raise BadInput(f"{path} can't be read as a mesh: {error}") from error
     if not len(triangles):
-        raise BadFile(f'{path} has no triangles')
+        raise BadInput(f'{path} has no triangles')
     if centred:
         triangles = triangles - counted.mean(axis=0)
     vertices, indices = numpy.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)

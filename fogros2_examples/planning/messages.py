@@ -18,10 +18,6 @@ COLOURS = {'body': (0.85, 0.45, 0.15, 1.0), 'walls': (0.75, 0.77, 0.8, 0.9),
            'start': (0.2, 0.6, 0.3, 1.0), 'goal': (0.2, 0.4, 0.9, 1.0)}
 
 
-class BadScene(ValueError):
-    """Markers describe no scene; the text has the reason."""
-
-
 def pose_message(pose: Floats) -> Pose:
     """Return a pose x, y, z, qx, qy, qz, qw as a message."""
     x, y, z, qx, qy, qz, qw = map(float, pose)
@@ -92,20 +88,17 @@ def scene_of(message: MarkerArray) -> Scene:
     """
     Return the scene of markers.
 
-    :raises BadScene: a part is missing, or its triangles, bounds or pose are invalid.
+    :raises ValueError: a part is missing, or its triangles, bounds or pose are invalid.
     """
     parts: dict[str, Marker] = {marker.ns: marker for marker in message.markers}
     for name in COLOURS:
         if name not in parts:
-            raise BadScene(f"no marker '{name}'")
+            raise ValueError(f"no marker '{name}'")
     box = parts['bounds']
     middle, size = (numpy.array([v.x, v.y, v.z]) for v in (box.pose.position, box.scale))
     if not (numpy.isfinite(middle).all() and numpy.isfinite(size).all() and (size > 0).all()):
-        raise BadScene(f"the marker 'bounds' has no size: {size.tolist()}")
-    try:
-        start, goal = pose_of(parts['start'].pose), pose_of(parts['goal'].pose)
-    except ValueError as error:
-        raise BadScene(str(error)) from error
+        raise ValueError(f"the marker 'bounds' has no size: {size.tolist()}")
+    start, goal = pose_of(parts['start'].pose), pose_of(parts['goal'].pose)
     return Scene(box.header.frame_id, _mesh(parts['body']), _mesh(parts['walls']),
                  _mesh(parts['shell'], empty=True), middle - size / 2, middle + size / 2,
                  start, goal)
@@ -114,7 +107,7 @@ def scene_of(message: MarkerArray) -> Scene:
 def _mesh(marker: Marker, *, empty: bool = False) -> Mesh:
     points = numpy.array([(p.x, p.y, p.z) for p in marker.points]).reshape(-1, 3)
     if len(points) % 3 or not (len(points) or empty) or not numpy.isfinite(points).all():
-        raise BadScene(f"the marker '{marker.ns}' has {len(points)} points, which are no "
-                       'finite triangles')
+        raise ValueError(f"the marker '{marker.ns}' has {len(points)} points, which are no "
+                         'finite triangles')
     vertices, indices = numpy.unique(points, axis=0, return_inverse=True)
     return Mesh(vertices, indices.reshape(-1, 3).astype(numpy.int32))

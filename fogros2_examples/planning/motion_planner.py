@@ -13,17 +13,14 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from nav_msgs.srv import GetPlan
 import numpy
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from visualization_msgs.msg import MarkerArray
 
-from fogros2_examples.parameters import BadParameter, within
-from fogros2_examples.planning.messages import BadScene, path_message, pose_of, scene_of
+from fogros2_examples.nodes import LATCHED, run
+from fogros2_examples.parameters import within
+from fogros2_examples.planning.messages import path_message, pose_of, scene_of
 from fogros2_examples.planning.racing import Racer
 
-#: Keeps the last message for late subscribers.
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 WHY = {'start': 'the start touches something, or is out of bounds',
        'goal': 'the goal touches something, or is out of bounds'}
 
@@ -52,12 +49,8 @@ class MotionPlanner(Node):
         """Use a new scene; keep the last scene if the new one is invalid."""
         try:
             scene = scene_of(markers)
-        except BadScene as error:
-            self.tell(DiagnosticStatus.ERROR, 'environment', f'no environment: {error}')
-            return
-        try:
             self.racer.enter(scene)
-        except RuntimeError as error:
+        except (RuntimeError, ValueError) as error:
             self.tell(DiagnosticStatus.ERROR, 'environment', f'no environment: {error}')
             return
         self.scene = scene.name
@@ -75,16 +68,12 @@ class MotionPlanner(Node):
             return response
         try:
             start, goal = pose_of(request.start.pose), pose_of(request.goal.pose)
-        except ValueError as error:
-            self.tell(DiagnosticStatus.ERROR, 'plan', f'no plan: {error}')
-            return response
-        try:
             outcome = self.racer.plan(start, goal, seconds=self.seconds, seed=self.seed)
-            # A repeated request should search with other random numbers.
-            self.seed += self.racer.workers
-        except RuntimeError as error:
+        except (RuntimeError, ValueError) as error:
             self.tell(DiagnosticStatus.ERROR, 'plan', f'no plan: {error}')
             return response
+        # A repeated request should search with other random numbers.
+        self.seed += self.racer.workers
         figures = {name: outcome[name] for name in ('end', 'seconds', 'checks', 'length')}
         took = f"{outcome['seconds']:.2f} s, {outcome['checks']} checks"
         if outcome['end'] == 'found':
@@ -111,18 +100,16 @@ class MotionPlanner(Node):
                     for key, value in (figures or {}).items()]))
 
 
-def main() -> None:
-    """Run until a signal; exit at once on an invalid parameter."""
-    rclpy.init()
-    try:
-        node = MotionPlanner()
-    except BadParameter as error:
-        raise SystemExit(f'motion_planner: {error}') from error
+def serve(node: MotionPlanner) -> None:
+    """Answer requests until a signal, then stop the searches."""
     try:
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
     finally:
         # A second Ctrl-C must not interrupt the end of the searches.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         node.racer.close()
+
+
+def main() -> None:
+    """Run until a signal; exit at once on an invalid parameter."""
+    run('motion_planner', MotionPlanner, serve)

@@ -8,8 +8,6 @@ picture on ``picture`` and in a file.
 
 from __future__ import annotations
 
-import array
-from collections.abc import Callable
 import itertools
 import json
 from pathlib import Path as File
@@ -22,17 +20,16 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
 from nav_msgs.srv import GetPlan
 import numpy
-import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
+from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from fogros2_examples.files import PICTURES
 from fogros2_examples.meshes import Floats
-from fogros2_examples.parameters import BadParameter, within, writable
-from fogros2_examples.planning.app_files import BadFile, loaded
+from fogros2_examples.nodes import LATCHED, run, until
+from fogros2_examples.parameters import within, writable
+from fogros2_examples.planning.app_files import loaded
 from fogros2_examples.planning.messages import (
     COLOURS,
     mesh_marker,
@@ -42,8 +39,7 @@ from fogros2_examples.planning.messages import (
 )
 from fogros2_examples.planning.picture import picture, spaced
 from fogros2_examples.planning.scene import MADE, Scene
-
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+from fogros2_examples.slam.messages import image
 
 
 class PlanningClient(Node):
@@ -78,14 +74,11 @@ class PlanningClient(Node):
 
     def run(self) -> int:
         """Request all plans, and return the exit status: 0 if all paths were found."""
-        try:
-            scene = MADE[self.environment]() if self.environment in MADE else (
-                loaded(File(self.environment)))
-        except BadFile as error:
-            self.get_logger().fatal(str(error))
-            return 2
+        scene = MADE[self.environment]() if self.environment in MADE else (
+            loaded(File(self.environment)))
         self.scenes.publish(scene_message(scene))
-        if not self._until(lambda: self.told is not None and self.told.hardware_id == scene.name):
+        if not until(self, lambda: self.told is not None and self.told.hardware_id == scene.name,
+                     self.wait):
             self.get_logger().fatal(f'no planner took the environment in {self.wait:g} s')
             return 2
         solved, path = 0, numpy.empty((0, 7))
@@ -108,9 +101,9 @@ class PlanningClient(Node):
         self.told = None
         begin = time.monotonic()
         future = self.planner.call_async(request)
-        self._until(future.done, self.seconds + self.wait)
+        until(self, future.done, self.seconds + self.wait)
         total = time.monotonic() - begin
-        self._until(lambda: self.told is not None, 5.0)
+        until(self, lambda: self.told is not None, 5.0)
         response = future.result() if future.done() else None
         path = numpy.array([pose_of(stamped.pose) for stamped in response.plan.poses]
                            if response else []).reshape(-1, 7)
@@ -137,9 +130,7 @@ class PlanningClient(Node):
                         COLOURS['body']) for number, pose in enumerate(spaced(path, apart))]))
         length = float(numpy.linalg.norm(numpy.diff(path[:, :3], axis=0), axis=1).sum())
         drawn = picture(scene, path, f'{scene.name}: a path of {length:.1f}')
-        height, width = drawn.shape[:2]
-        self.pictures.publish(Image(height=height, width=width, encoding='bgr8', step=3 * width,
-                                    data=array.array('B', drawn.tobytes())))
+        self.pictures.publish(image(Header(), drawn, 'bgr8'))
         if self.picture and not cv2.imwrite(self.picture, drawn):
             self.get_logger().error(f'{self.picture} can not be written')
             return False
@@ -147,25 +138,7 @@ class PlanningClient(Node):
             self.get_logger().info(f'wrote {self.picture}')
         return True
 
-    def _until(self, true: Callable[[], bool], wait: float = 0.0) -> bool:
-        """Handle messages until ``true()`` is true; return False after ``wait`` seconds."""
-        deadline = time.monotonic() + (wait or self.wait)
-        while not true():
-            if time.monotonic() > deadline:
-                return False
-            rclpy.spin_once(self, timeout_sec=0.1)
-        return True
-
 
 def main() -> None:
     """Request all plans; exit at once on an invalid parameter."""
-    rclpy.init()
-    try:
-        raise SystemExit(PlanningClient().run())
-    except BadParameter as error:
-        raise SystemExit(f'planning_client: {error}') from error
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
-    except SystemExit:
-        rclpy.try_shutdown()
-        raise
+    run('planning_client', PlanningClient, PlanningClient.run)

@@ -53,7 +53,7 @@ class Racer:
     def plan(self, start: Floats, goal: Floats, *, seconds: float,
              seed: int = 1) -> dict[str, Any]:
         """
-        Return the fields of ``search.Outcome``, the path as lists; the first motion found wins.
+        Return the fields of ``search.Outcome``; the first motion found wins.
 
         :param seconds: time-out.
         :param seed: seed of the first search, increased by one for each further search.

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import dataclasses
 import time
-from typing import Any, Literal, Optional, Union
+from typing import Any, Literal, Union
 
 import fcl
 import numpy
@@ -13,7 +14,8 @@ import ompl.base
 import ompl.geometric
 import ompl.util
 
-from fogros2_examples.meshes import Floats, joined, Mesh, rotation
+from fogros2_examples.collisions import solid
+from fogros2_examples.meshes import Floats, joined, rotation
 from fogros2_examples.planning.scene import Scene
 
 #: OMPL's planners between two poses.
@@ -32,7 +34,7 @@ class Outcome:
 
     :param end: 'found'; 'start' or 'goal': that pose collides or is out of bounds; 'time': the
         time-out was over.
-    :param path: poses (n, 7) as in Scene, from start to goal; empty unless found. Between two
+    :param path: n poses of 7 numbers as in Scene, start to goal; empty unless found. Between two
         poses, the body moves straight and turns the shorter way, both at a constant rate.
     :param length: length of the path, m.
     :param checks: number of collision checks.
@@ -40,7 +42,7 @@ class Outcome:
     """
 
     end: End
-    path: Floats
+    path: list[list[float]]
     length: float
     checks: int
     seconds: float
@@ -52,9 +54,8 @@ class Space:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self.checks = 0
-        self._body = fcl.CollisionObject(_model(scene.body), fcl.Transform())
-        self._walls = fcl.CollisionObject(_model(joined([scene.walls, scene.shell])),
-                                          fcl.Transform())
+        self._body = solid(scene.body)
+        self._walls = solid(joined([scene.walls, scene.shell]))
         self._request = fcl.CollisionRequest()
         ompl.util.setLogLevel(ompl.util.LOG_ERROR)
         self.states = ompl.base.SE3StateSpace()
@@ -95,10 +96,10 @@ class Space:
         """
         begin, self.checks = time.monotonic(), 0
 
-        def ended(end: End, path: Optional[Floats] = None) -> Outcome:
-            poses = numpy.empty((0, 7)) if path is None else path
-            steps = numpy.linalg.norm(numpy.diff(poses[:, :3], axis=0), axis=1)
-            return Outcome(end, poses, float(steps.sum()), self.checks, time.monotonic() - begin)
+        def ended(end: End, path: Sequence[list[float]] = ()) -> Outcome:
+            places = numpy.array(path).reshape(-1, 7)[:, :3]
+            length = float(numpy.linalg.norm(numpy.diff(places, axis=0), axis=1).sum())
+            return Outcome(end, [*path], length, self.checks, time.monotonic() - begin)
 
         if not self.free(start):
             return ended('start')
@@ -127,7 +128,7 @@ class Space:
         simplifier.collapseCloseVertices(path)
         simplifier.partialShortcutPath(path)
         simplifier.reduceVertices(path)
-        return ended('found', numpy.array([_pose(state) for state in path.getStates()]))
+        return ended('found', [_pose(state) for state in path.getStates()])
 
     def _valid(self, state: Any) -> bool:
         # Plain numbers, because arrays of three would take as long as FCL.
@@ -147,11 +148,3 @@ class Space:
 def _pose(state: Any) -> list[float]:
     turn = state.rotation()
     return [state.getX(), state.getY(), state.getZ(), turn.x, turn.y, turn.z, turn.w]
-
-
-def _model(mesh: Mesh) -> Any:
-    model = fcl.BVHModel()
-    model.beginModel(len(mesh.triangles), len(mesh.vertices))
-    model.addSubModel(mesh.vertices, mesh.triangles)
-    model.endModel()
-    return model

@@ -57,7 +57,7 @@ def race(space: Space, request: Mapping[str, Any]) -> Outcome:
     Run a search per seed; return the first motion found, or a reason if none was found.
 
     :raises SystemExit: the caller is gone; all searches were killed.
-    :param asked: ``start``, ``goal``, ``seconds``, ``seeds`` and ``planners``; the searches use
+    :param request: ``start``, ``goal``, ``seconds``, ``seeds`` and ``planners``; the searches use
         the planners in turn.
     """
     from fogros2_examples.planning.search import Outcome
@@ -89,8 +89,7 @@ def race(space: Space, request: Mapping[str, Any]) -> Outcome:
                 _, status = os.waitpid(pipes.pop(read), 0)
                 if not texts[read]:
                     raise RuntimeError(f'a search ended with status {status} and no answer')
-                fields = json.loads(texts[read])
-                outcome = Outcome(**{**fields, 'path': numpy.array(fields['path']).reshape(-1, 7)})
+                outcome = Outcome(**json.loads(texts[read]))
                 if best is None or outcome.end != 'time':
                     best = outcome
     finally:
@@ -108,7 +107,7 @@ def _search(space: Space, write: int, start: Any, goal: Any, seconds: float, see
     """Search in a child process, and exit it."""
     outcome = space.search(start, goal, seconds=seconds, seed=seed, planner=planner)
     with os.fdopen(write, 'w') as out:
-        json.dump({**dataclasses.asdict(outcome), 'path': outcome.path.tolist()}, out)
+        json.dump(dataclasses.asdict(outcome), out)
     # The bindings would print a page about objects that they did not free.
     os._exit(0)
 
@@ -129,9 +128,7 @@ def main() -> None:
                 continue
             if space is None:
                 raise RuntimeError('asked for a motion before there was a scene')
-            outcome = race(space, request)
-            print(json.dumps({**dataclasses.asdict(outcome), 'path': outcome.path.tolist()}),
-                  flush=True)
+            print(json.dumps(dataclasses.asdict(race(space, request))), flush=True)
     os._exit(0)
 
 

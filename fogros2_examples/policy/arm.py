@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import cv2
 import numpy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fogros2_examples.letterbox import Pixels
 from fogros2_examples.meshes import Floats
 from fogros2_examples.rendering import Camera, looking
 
-Pixels = NDArray[numpy.uint8]
 JOINTS = ('shoulder', 'elbow')
 #: Lengths of the two links, half of their width, and the radius of the target, m.
 LINKS, HALF, RADIUS = (0.5, 0.4), 0.03, 0.06

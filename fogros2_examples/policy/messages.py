@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from builtin_interfaces.msg import Duration
 import numpy
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -17,8 +17,6 @@ from fogros2_examples.meshes import Floats
 from fogros2_examples.policy.chunks import Chunk, SECOND
 from fogros2_examples.slam.messages import nanoseconds, time
 
-#: Keeps the last message for late subscribers.
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 #: Repeats no lost message, so that nothing waits; a busy reader misses none.
 SENSED = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 

@@ -20,7 +20,8 @@ from sensor_msgs.msg import Image, JointState, TimeReference
 from std_msgs.msg import Float64MultiArray, Header
 
 from fogros2_examples.files import PICTURES
-from fogros2_examples.parameters import run, within, writable
+from fogros2_examples.nodes import run
+from fogros2_examples.parameters import within, writable
 from fogros2_examples.policy import arm
 from fogros2_examples.policy.messages import SENSED
 from fogros2_examples.policy.picture import draw, summary

@@ -20,10 +20,11 @@ from std_msgs.msg import Float64MultiArray, Header, String, UInt8MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from fogros2_examples.meshes import Floats
-from fogros2_examples.parameters import run, within
+from fogros2_examples.nodes import LATCHED, run
+from fogros2_examples.parameters import within
 from fogros2_examples.policy.arm import JOINTS
 from fogros2_examples.policy.chunks import Queue, SECOND
-from fogros2_examples.policy.messages import angles_of, chunk_of, LATCHED, SENSED
+from fogros2_examples.policy.messages import angles_of, chunk_of, SENSED
 from fogros2_examples.slam.messages import nanoseconds, time
 
 

@@ -19,10 +19,11 @@ from std_msgs.msg import String, UInt8MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from fogros2_examples.letterbox import Pixels
-from fogros2_examples.parameters import BadParameter, run, within
+from fogros2_examples.nodes import LATCHED, run
+from fogros2_examples.parameters import BadParameter, within
 from fogros2_examples.policy.chunks import SECOND
 from fogros2_examples.policy.matching import Matcher
-from fogros2_examples.policy.messages import angles_of, chunk_message, LATCHED, SENSED
+from fogros2_examples.policy.messages import angles_of, chunk_message, SENSED
 from fogros2_examples.policy.policies import BadPolicy, Onnx, OPENPI, Openpi, Policy, PROMPT
 from fogros2_examples.slam.messages import nanoseconds, rgb
 

@@ -26,19 +26,18 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path as PathMessage
 import numpy
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image, TimeReference
 from std_msgs.msg import Header
 
 from fogros2_examples.files import PICTURES
-from fogros2_examples.parameters import BadParameter, within, writable
+from fogros2_examples.letterbox import Pixels
+from fogros2_examples.nodes import LATCHED, run
+from fogros2_examples.parameters import within, writable
 from fogros2_examples.slam import messages, sources
 from fogros2_examples.slam.evaluation import Accuracy, accuracy
 from fogros2_examples.slam.geometry import Array
-from fogros2_examples.slam.sources import Pixels, Shot
-from fogros2_examples.slam.tum import DatasetError
+from fogros2_examples.slam.sources import Shot
 
 #: Time-out of the last poses and of the path, in seconds.
 TIMEOUT = 5.0
@@ -92,8 +91,7 @@ class SlamCamera(Node):
         self.infos = self.create_publisher(CameraInfo, 'camera/camera_info', 2)
         self.right_infos = self.create_publisher(CameraInfo, 'camera/right/camera_info', 2)
         self.create_subscription(PoseStamped, 'pose', self._take_pose, 10)
-        self.create_subscription(PathMessage, 'path', self._take_path, QoSProfile(
-            depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        self.create_subscription(PathMessage, 'path', self._take_path, LATCHED)
         self.create_subscription(TimeReference, 'computing', self._take_time, 10)
         self.create_timer(1 / rate, self._shoot)
         self.get_logger().info(f'{self.source.count} frames of {self.source.camera.width}x'
@@ -214,20 +212,16 @@ class SlamCamera(Node):
         return accuracy([self.truth[s] for s in both], [estimate[s] for s in both])
 
 
-def main() -> None:
-    """Run until all frames are answered or a signal arrives; exit at once on an invalid input."""
-    rclpy.init()
-    try:
-        node = SlamCamera()
-    except (BadParameter, DatasetError) as error:
-        raise SystemExit(f'slam_camera: {error}') from error
+def measure(node: SlamCamera) -> int:
+    """Run until all frames are answered; return the exit status."""
     try:
         while not node.ended:
             rclpy.spin_once(node, timeout_sec=0.1)
-        raise SystemExit(node.report())
-    except (DatasetError, OSError) as error:
-        raise SystemExit(f'slam_camera: {error}') from error
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
+        return node.report()
     finally:
         node.close()
+
+
+def main() -> None:
+    """Run until all frames are answered or a signal arrives; exit at once on an invalid input."""
+    run('slam_camera', SlamCamera, measure)

@@ -17,9 +17,9 @@ import cv2
 import numpy
 from numpy.typing import NDArray
 
+from fogros2_examples.letterbox import Pixels
 from fogros2_examples.slam.geometry import Array, Camera
 
-Pixels = NDArray[numpy.uint8]
 #: FAST thresholds: the usual one, and one for images with too few corners.
 FAINT, FAINTEST = 20, 7
 SCALE, LEVELS = 1.2, 8

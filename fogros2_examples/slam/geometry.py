@@ -15,6 +15,8 @@ import cv2
 import numpy
 from numpy.typing import ArrayLike, NDArray
 
+from fogros2_examples import meshes
+
 Array = NDArray[numpy.float64]
 
 
@@ -80,19 +82,8 @@ def angle(pose: Array) -> float:
 
 
 def quaternion(pose: Array) -> Array:
-    """Return a pose's rotation as (x, y, z, w), w >= 0 (Shepperd, 1978)."""
-    r = pose[:3, :3]
-    squares = numpy.array([1 + r[0, 0] - r[1, 1] - r[2, 2], 1 - r[0, 0] + r[1, 1] - r[2, 2],
-                           1 - r[0, 0] - r[1, 1] + r[2, 2], 1 + numpy.trace(r)])
-    largest = int(numpy.argmax(squares))
-    q = numpy.empty(4)
-    q[largest] = squares[largest]
-    if largest == 3:
-        q[:3] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
-    else:
-        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
-        q[j], q[k], q[3] = r[i, j] + r[j, i], r[i, k] + r[k, i], r[k, j] - r[j, k]
-    q /= numpy.linalg.norm(q)
+    """Return a pose's rotation as (x, y, z, w), w >= 0."""
+    q = meshes.quaternion(pose[:3, :3])
     return -q if q[3] < 0 else q
 
 
@@ -105,11 +96,7 @@ def from_quaternion(translation: Array, q: Array) -> Array:
     length = float(numpy.linalg.norm(q))
     if not 0.5 < length < 2.0:
         raise ValueError(f'a quaternion of length {length:.3g}')
-    x, y, z, w = numpy.asarray(q, float) / length
     pose = numpy.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]
+    pose[:3, :3] = meshes.rotation(q)
     pose[:3, 3] = translation
     return pose

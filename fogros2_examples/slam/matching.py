@@ -7,9 +7,9 @@ import cv2
 import numpy
 from numpy.typing import NDArray
 
+from fogros2_examples.letterbox import Pixels
 from fogros2_examples.slam.geometry import Array
 
-Pixels = NDArray[numpy.uint8]
 Indices = NDArray[numpy.int64]
 #: Maximum number of different bits (of 256) in the descriptors of a match.
 ALIKE = 64

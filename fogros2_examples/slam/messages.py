@@ -23,7 +23,8 @@ _COLOURS = {'bgr8': (3, cv2.COLOR_BGR2GRAY, cv2.COLOR_BGR2RGB),
             'bgra8': (4, cv2.COLOR_BGRA2GRAY, cv2.COLOR_BGRA2RGB),
             'rgba8': (4, cv2.COLOR_RGBA2GRAY, cv2.COLOR_RGBA2RGB),
             'mono8': (1, None, cv2.COLOR_GRAY2RGB), '8UC1': (1, None, cv2.COLOR_GRAY2RGB)}
-_DEPTHS = {'16UC1': 'u2', 'mono16': 'u2', '32FC1': 'f4'}
+#: Encodings of depth images, and types of their pixels.
+DEPTHS = {'16UC1': 'u2', 'mono16': 'u2', '32FC1': 'f4'}
 
 
 def grey(image: Image) -> Pixels:
@@ -70,9 +71,9 @@ def depth(image: Image) -> NDArray[numpy.generic]:
 
     :raises ValueError: the encoding is none of depth, or the fields contradict each other.
     """
-    if image.encoding not in _DEPTHS:
-        raise ValueError(f"depth as '{image.encoding}': {', '.join(_DEPTHS)} are for me")
-    kind = numpy.dtype(_DEPTHS[image.encoding]).newbyteorder('>' if image.is_bigendian else '<')
+    if image.encoding not in DEPTHS:
+        raise ValueError(f"depth as '{image.encoding}': {', '.join(DEPTHS)} are for me")
+    kind = numpy.dtype(DEPTHS[image.encoding]).newbyteorder('>' if image.is_bigendian else '<')
     return numpy.ascontiguousarray(_rows(image, kind.itemsize)).view(kind)
 
 

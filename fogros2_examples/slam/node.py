@@ -11,6 +11,7 @@ The world's frame is ``map``; the camera's frame is the image's.
 
 from __future__ import annotations
 
+from functools import partial
 import os
 from pathlib import Path
 import time
@@ -20,13 +21,13 @@ from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Path as PathMessage
 import numpy
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, TimeReference
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
+from fogros2_examples.nodes import LATCHED, run
 from fogros2_examples.slam import messages, stored
 from fogros2_examples.slam.tracking import Slam, State, Tracked
 
@@ -37,8 +38,6 @@ except ImportError:  # it is not part of the smallest ROS 2
 
 #: Only the newest images, so that a slow node is late by one image instead of many.
 NEWEST = QoSProfile(depth=2)
-#: Keeps the last message for late subscribers.
-KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 #: Images to keep until a frame's other image arrives, and images without one until a warning.
 WAITING, ALONE = 8, 30
 
@@ -74,41 +73,39 @@ class SlamNode(Node):
         self.poses = self.create_publisher(PoseStamped, 'pose', 10)
         self.transforms = TFMessage and self.create_publisher(TFMessage, '/tf', 10)
         self.times = self.create_publisher(TimeReference, 'computing', 10)
-        self.states = self.create_publisher(String, 'slam_state', KEPT)
-        self.paths = self.create_publisher(PathMessage, 'path', KEPT)
-        self.clouds = self.create_publisher(PointCloud2, 'map_points', KEPT)
+        self.states = self.create_publisher(String, 'slam_state', LATCHED)
+        self.paths = self.create_publisher(PathMessage, 'path', LATCHED)
+        self.clouds = self.create_publisher(PointCloud2, 'map_points', LATCHED)
         for half, topic in (('image', 'image'), ('depth', 'depth'), ('right', 'right/image')):
-            self.create_subscription(Image, f'camera/{topic}', self._taker(half), newest)
+            self.create_subscription(
+                Image, f'camera/{topic}', partial(self._take, half), newest)
         for half, topic in (('image', 'camera_info'), ('right', 'right/camera_info')):
             self.create_subscription(
-                CameraInfo, f'camera/{topic}', self._learner(half), newest)
+                CameraInfo, f'camera/{topic}', partial(self._learn, half), newest)
         self.create_timer(1.0, self._show_map)
         self._say(State.STARTING, 'no image yet')
 
-    def _learner(self, half: str) -> Any:
-        def learn(info: CameraInfo) -> None:
-            self.infos[half] = info
-        return learn
+    def _learn(self, half: str, info: CameraInfo) -> None:
+        self.infos[half] = info
 
-    def _taker(self, half: str) -> Any:
-        def take(image: Image) -> None:
-            key = messages.nanoseconds(image.header.stamp)
-            self.halves[half][key] = image
-            other = 'right' if key in self.halves['right'] else 'depth'
-            if key in self.halves['image'] and key in self.halves[other]:
-                self._process(self.halves['image'][key], other, self.halves[other][key])
-                self.alone = 0
-                for waiting in self.halves.values():
-                    for old in [one for one in waiting if one <= key]:
-                        del waiting[old]
-            elif half == 'image':
-                self.alone += 1
-                if self.alone == ALONE:
-                    self._say(State.STARTING if self.slam is None else self.slam.state,
-                              'neither a depth image nor a right one has the stamps of the images')
-            while len(self.halves[half]) > WAITING:
-                del self.halves[half][min(self.halves[half])]
-        return take
+    def _take(self, half: str, image: Image) -> None:
+        """Keep an image until the other one with its stamp is there; then process both."""
+        key = messages.nanoseconds(image.header.stamp)
+        self.halves[half][key] = image
+        other = 'right' if key in self.halves['right'] else 'depth'
+        if key in self.halves['image'] and key in self.halves[other]:
+            self._process(self.halves['image'][key], other, self.halves[other][key])
+            self.alone = 0
+            for waiting in self.halves.values():
+                for old in [one for one in waiting if one <= key]:
+                    del waiting[old]
+        elif half == 'image':
+            self.alone += 1
+            if self.alone == ALONE:
+                self._say(State.STARTING if self.slam is None else self.slam.state,
+                          'neither a depth image nor a right one has the stamps of the images')
+        while len(self.halves[half]) > WAITING:
+            del self.halves[half][min(self.halves[half])]
 
     def _process(self, image: Image, other: str, second: Image) -> None:
         """Track a frame and publish its pose, then add the frame to the map."""
@@ -209,13 +206,14 @@ class SlamNode(Node):
             self.clouds.publish(messages.cloud(path.header, numpy.asarray(points)))
 
 
-def main() -> None:
-    """Run until interrupted."""
-    rclpy.init()
-    node = SlamNode()
+def serve(node: SlamNode) -> None:
+    """Run until a signal, then save the map."""
     try:
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # rclpy's signal handler shuts rclpy down in its own thread; do not do it twice
     finally:
         node.save()
+
+
+def main() -> None:
+    """Run until interrupted."""
+    run('slam', SlamNode, serve)

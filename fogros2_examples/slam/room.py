@@ -17,10 +17,10 @@ import cv2
 import numpy
 from numpy.typing import NDArray
 
+from fogros2_examples.letterbox import Pixels
 from fogros2_examples.slam import textures
 from fogros2_examples.slam.geometry import Array, Camera
 
-Pixels = NDArray[numpy.uint8]
 Floats = NDArray[numpy.float32]
 SIZE = (6.0, 5.0, 2.7)
 #: Furniture: lower and upper corner, metres, and the look of its sides.

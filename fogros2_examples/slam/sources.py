@@ -11,10 +11,9 @@ from typing import Optional
 import numpy
 from numpy.typing import NDArray
 
+from fogros2_examples.letterbox import Pixels
 from fogros2_examples.slam import room, tum
 from fogros2_examples.slam.geometry import Array, Camera
-
-Pixels = NDArray[numpy.uint8]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +66,7 @@ def dataset(folder: Path, count: int = 0) -> Source:
     Return the frames of a TUM RGB-D folder; images are read on demand.
 
     :param count: maximum number of images, 0: all.
-    :raises DatasetError: the folder is invalid; ``shots`` raises it for a missing image.
+    :raises BadInput: the folder is invalid; ``shots`` raises it for a missing image.
     """
     sequence = tum.read(folder)
     pairs = sequence.pairs[:count or None]

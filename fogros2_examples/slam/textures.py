@@ -9,7 +9,8 @@ import cv2
 import numpy
 from numpy.typing import NDArray
 
-Pixels = NDArray[numpy.uint8]
+from fogros2_examples.letterbox import Pixels
+
 Random = numpy.random.Generator
 WORDS = ('FOG', 'ROS 2', 'SLAM', 'EXIT', 'Lab 4', 'Jazzy', '42', 'north', 'B-17', 'open')
 

@@ -15,6 +15,7 @@ from typing import Optional
 import numpy
 from numpy.typing import NDArray
 
+from fogros2_examples.letterbox import Pixels
 from fogros2_examples.slam import features as front
 from fogros2_examples.slam import matching
 from fogros2_examples.slam.features import Features
@@ -22,7 +23,6 @@ from fogros2_examples.slam.geometry import Array, Camera, inverse, moved
 from fogros2_examples.slam.mapping import apart, Keyframe, Map
 from fogros2_examples.slam.pose import solve
 
-Pixels = NDArray[numpy.uint8]
 #: Minimum number of points that agree on a pose.
 LEAST = 20
 #: Minimum number of features with a depth in a keyframe.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Read and write folders in the TUM RGB-D format (Sturm et al., IROS 2012).
+Read folders in the TUM RGB-D format (Sturm et al., IROS 2012).
 
 ``rgb.txt`` and ``depth.txt`` list images by time. ``groundtruth.txt`` lists poses as time,
 position and quaternion. Depth is PNG with 16 bits, 5000 per metre. The format does not contain the
@@ -11,7 +11,7 @@ freiburg1 to 3, else a Kinect's. Distorted images are rectified when they are re
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,10 @@ import cv2
 import numpy
 from numpy.typing import NDArray
 
-from fogros2_examples.slam.geometry import Array, Camera, from_quaternion, quaternion
+from fogros2_examples.files import BadInput
+from fogros2_examples.letterbox import Pixels
+from fogros2_examples.slam.geometry import Array, Camera, from_quaternion
 
-Pixels = NDArray[numpy.uint8]
 #: Units of depth per metre.
 SCALE = 5000
 #: Maximum difference in seconds between an image and its depth or pose.
@@ -33,10 +34,6 @@ _CAMERAS: dict[str, tuple[float, ...]] = {
     'freiburg2': (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
     'freiburg3': (535.4, 539.2, 320.1, 247.6)}
 _KINECT = (525.0, 525.0, 319.5, 239.5)
-
-
-class DatasetError(ValueError):
-    """A folder is invalid; the text has the file and line."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +71,7 @@ class Dataset:
 
         Both are rectified; pixels outside of the original image are black or of unknown depth.
 
-        :raises DatasetError: a file is missing, or an image has another size.
+        :raises BadInput: a file is missing, or an image has another size.
         """
         maps = cv2.initUndistortRectifyMap(
             self.camera.matrix, numpy.array(self.distortion), None, self.camera.matrix,
@@ -83,11 +80,11 @@ class Dataset:
             colours = _image(self.folder, image, cv2.IMREAD_COLOR)
             depth = _image(self.folder, deep, cv2.IMREAD_UNCHANGED)
             if depth.dtype != numpy.uint16 or depth.shape != colours.shape[:2]:
-                raise DatasetError(f'{deep.where}: {deep.rest[0]} is no depth of 16 bits of the '
+                raise BadInput(f'{deep.where}: {deep.rest[0]} is no depth of 16 bits of the '
                                    f'size of {image.rest[0]}')
             size = (self.camera.height, self.camera.width)
             if depth.shape != size:
-                raise DatasetError(f'{image.where}: {image.rest[0]} is not of the size of the '
+                raise BadInput(f'{image.where}: {image.rest[0]} is not of the size of the '
                                    'first image')
             if maps:
                 colours = cv2.remap(colours, *maps, cv2.INTER_LINEAR)
@@ -100,12 +97,12 @@ def read(folder: Path) -> Dataset:
     """
     Read the lists of a folder; images are read later.
 
-    :raises DatasetError: the folder does not have this format.
+    :raises BadInput: the folder does not have this format.
     """
     images, depths = (_lines(folder / name, 1) for name in ('rgb.txt', 'depth.txt'))
     pairs = _associated(images, depths)
     if not pairs:
-        raise DatasetError(f'{folder}: no image of rgb.txt has a depth image within '
+        raise BadInput(f'{folder}: no image of rgb.txt has a depth image within '
                            f'{APART} seconds in depth.txt')
     truth = []
     if (folder / 'groundtruth.txt').exists():
@@ -114,30 +111,10 @@ def read(folder: Path) -> Dataset:
             try:
                 truth.append((line.time, from_quaternion(values[:3], values[3:])))
             except ValueError as error:
-                raise DatasetError(f'{line.where}: {error}') from error
+                raise BadInput(f'{line.where}: {error}') from error
     first = _image(folder, pairs[0][0], cv2.IMREAD_COLOR)
     own = _camera(folder)
     return Dataset(folder, Camera(first.shape[1], first.shape[0], *own[:4]), own[4:], pairs, truth)
-
-
-def write(folder: Path, camera: Camera,
-          frames: Iterable[tuple[float, Pixels, NDArray[numpy.uint16]]],
-          truth: Iterable[tuple[float, Array]]) -> None:
-    """Write a folder; ``frames`` are as in ``Dataset.frames``."""
-    for name in ('rgb', 'depth'):
-        (folder / name).mkdir(parents=True, exist_ok=True)
-    times = []
-    for time, image, depth in frames:
-        cv2.imwrite(str(folder / f'rgb/{time:.6f}.png'), image)
-        cv2.imwrite(str(folder / f'depth/{time:.6f}.png'),
-                    (depth.astype(int) * (SCALE // 1000)).clip(0, 65535).astype(numpy.uint16))
-        times.append(f'{time:.6f}')
-    for name in ('rgb', 'depth'):
-        (folder / f'{name}.txt').write_text(''.join(f'{t} {name}/{t}.png\n' for t in times))
-    (folder / 'groundtruth.txt').write_text('# time tx ty tz qx qy qz qw\n' + ''.join(
-        ' '.join([f'{time:.6f}', *(f'{v:.9f}' for v in (*pose[:3, 3], *quaternion(pose)))]) + '\n'
-        for time, pose in truth))
-    (folder / 'camera.txt').write_text(f'{camera.fx} {camera.fy} {camera.cx} {camera.cy}\n')
 
 
 def _lines(path: Path, words: int) -> list[Line]:
@@ -145,7 +122,7 @@ def _lines(path: Path, words: int) -> list[Line]:
     try:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f'{path}: {getattr(error, "strerror", None) or error}') from error
+        raise BadInput(f'{path}: {getattr(error, "strerror", None) or error}') from error
     lines = []
     for number, line in enumerate(text.splitlines(), 1):
         parts = line.replace(',', ' ').split()
@@ -153,10 +130,10 @@ def _lines(path: Path, words: int) -> list[Line]:
             continue
         where = f'{path}:{number}'
         if len(parts) < 1 + words:
-            raise DatasetError(f'{where}: {len(parts)} words where {1 + words} belong')
+            raise BadInput(f'{where}: {len(parts)} words where {1 + words} belong')
         lines.append(Line(_number(parts[0], where), tuple(parts[1:]), where))
     if not lines:
-        raise DatasetError(f'{path}: nothing in it')
+        raise BadInput(f'{path}: nothing in it')
     return sorted(lines, key=lambda line: line.time)
 
 
@@ -164,9 +141,9 @@ def _number(word: str, where: str) -> float:
     try:
         value = float(word)
     except ValueError:
-        raise DatasetError(f"{where}: '{word}' is no number") from None
+        raise BadInput(f"{where}: '{word}' is no number") from None
     if not numpy.isfinite(value):
-        raise DatasetError(f"{where}: '{word}' is no number")
+        raise BadInput(f"{where}: '{word}' is no number")
     return value
 
 
@@ -186,7 +163,7 @@ def _associated(images: list[Line], depths: list[Line]) -> list[tuple[Line, Line
 def _image(folder: Path, line: Line, how: int) -> NDArray[Any]:
     image = cv2.imread(str(folder / line.rest[0]), how)
     if image is None:
-        raise DatasetError(f'{line.where}: {line.rest[0]} is missing, or no image')
+        raise BadInput(f'{line.where}: {line.rest[0]} is missing, or no image')
     return numpy.asarray(image)
 
 
@@ -197,7 +174,7 @@ def _camera(folder: Path) -> tuple[float, ...]:
     if path.exists():
         words = path.read_text().split()
         if len(words) not in (4, 9):
-            raise DatasetError(f'{path}:1: {len(words)} words where fx, fy, cx and cy belong, or '
+            raise BadInput(f'{path}:1: {len(words)} words where fx, fy, cx and cy belong, or '
                                'these with k1, k2, p1, p2 and k3')
         values = tuple(_number(word, f'{path}:1') for word in words)
     return values

@@ -132,8 +132,8 @@ def admitted(guests: list[Guest], request: dict[str, Any], now: float) -> list[G
     return [*others, {
         **(matches[0] if matches else {'address': free[0], 'handshake': 0, 'heard': None}),
         'key': request['key'], 'label': request['label'], 'until': now + request['seconds'],
-        'patience': request['patience'], 'secret': request.get('secret', ''),
-        'end': now + request['left'] if 'left' in request else None}]
+        'patience': request['patience'], 'secret': request['secret'],
+        'end': now + request['left']}]
 
 
 def due(guest: Guest) -> float:
@@ -141,7 +141,7 @@ def due(guest: Guest) -> float:
     until: float = guest['until']
     if guest['heard'] is not None:
         until = max(until, guest['heard'] + guest['patience'])
-    return until if guest.get('end') is None else min(until, guest['end'])
+    return min(until, float(guest['end']))
 
 
 def rendered(guests: list[Guest]) -> str:
@@ -381,7 +381,7 @@ class Door(socketserver.ThreadingTCPServer):
         return any(proof is None or hmac.compare_digest(
             hmac.digest(bytes.fromhex(guest['secret']), challenge, 'sha256'), proof)
             for guest in json.loads(self.guests.state.read_text())
-            if guest['address'] == address and guest.get('secret'))
+            if guest['address'] == address and guest['secret'])
 
     def begin(self, link: socket.socket, user: str) -> subprocess.Popen[bytes]:
         """

@@ -27,12 +27,6 @@ ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH')
 
 
-@pytest.fixture(autouse=True)
-def surroundings(tmp_path, monkeypatch):
-    """Keep what launch logs out of the user's home."""
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-
-
 @pytest.fixture
 def launch(nothing_left):
     with launching() as start:
@@ -167,7 +161,7 @@ def test_grasp_planner_survives_bad_images(launch):
         planner.send_signal(signal.SIGINT)
         said = planner.communicate(timeout=60)[0]
     assert planner.returncode == 0, said
-    for words in ("'bgr8' is no encoding of depth", '0 of 76800 pixels have a depth',
+    for words in ("depth as 'bgr8'", '0 of 76800 pixels have a depth',
                   'camera_info is of 320x240 pixels'):
         assert words in said, said
 
@@ -183,8 +177,8 @@ def test_motion_planner_survives_bad_requests(launch):
 
     from fogros2.waiting import wait_until
     from fogros2_examples.meshes import box, joined
+    from fogros2_examples.nodes import LATCHED
     from fogros2_examples.planning.messages import pose_message, scene_message
-    from fogros2_examples.planning.motion_planner import LATCHED
     from fogros2_examples.planning.scene import pose, Scene
 
     planner = started('motion_planner', '-p', 'time:=1.0')
@@ -336,7 +330,7 @@ def test_camera_limits_its_frames_in_flight(tmp_path):
     from sensor_msgs.msg import Image
 
     from fogros2.waiting import wait_until
-    from fogros2_examples.grasp.grasp_camera import LATCHED
+    from fogros2_examples.nodes import LATCHED
     from fogros2_examples.slam.camera import TIMEOUT
 
     cv2.imwrite(str(tmp_path / 'grey.png'), numpy.full((48, 64, 3), 99, numpy.uint8))

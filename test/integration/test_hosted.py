@@ -11,21 +11,17 @@ import json
 from pathlib import Path
 import subprocess
 import threading
-from typing import Any
 import uuid
 
 import pytest
 
 from fogros2 import process
-from fogros2.errors import Cancelled, FogError, NameTaken, PrerequisiteError, ShellError
-from fogros2.model import Command, MachineSpec, MachineState, Result, to_json
+from fogros2.errors import Cancelled, NameTaken, PrerequisiteError, ShellError
+from fogros2.model import Command, CreateRequest, MachineSpec, MachineState
 from fogros2.provider import Attached
-from fogros2.provider.container import ContainerProvider
 from fogros2.shell.ssh import SSHShell
 from fogros2.waiting import wait_until
-from fogros2_features.hosts import hosted, served
-from fogros2_features.hosts.hosted import HostedProvider
-from fogros2_testing import FakeShell, ProviderContract, request_for
+from fogros2_testing import request_for
 from rigs.container_machines import key
 from rigs.fleet import Fleet, fleet, heard, LAUNCH
 from rigs.launched import Launched, launching, ROS2
@@ -45,82 +41,45 @@ def host(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
         wait_until(lambda: not running.traces(), timeout=60.0, what='all traces to be gone')
 
 
-def serve(command: Command) -> Result:
-    """Answer a call as the host's program does, in this process."""
-    ask = json.loads(command.input or b'')
-    reply: dict[str, Any]
-    try:
-        reply = {'result': served.answer(ContainerProvider(), ask['call'], ask['given'])}
-    except FogError as error:
-        reply = {'error': type(error).__name__, 'message': error.args[0], 'hint': error.hint}
-    return Result(0, to_json(reply), '')
-
-
-class TestHostedProvider(ProviderContract):
-    """The contract takes a hundred calls; how they reach a host, the other tests show."""
-
-    @pytest.fixture(autouse=True)
-    def place(self, host: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.host = host
-        monkeypatch.setattr(hosted, 'connect', lambda *_, **__: FakeShell(handlers={'sh': serve}))
-
-    def make(self) -> tuple[HostedProvider, dict[str, Any]]:
-        return self.host.provider(), self.host.options
-
-
-def request(key: Path, spec: MachineSpec, **config: Any) -> Any:
-    made = dataclasses.replace(
+def request(key: Path, spec: MachineSpec) -> CreateRequest:
+    return dataclasses.replace(
         request_for(spec), authorized_key=key.with_suffix('.pub').read_text())
-    if config:
-        directory = HostedProvider.capabilities.agent_directory
-        made = dataclasses.replace(made, agent_config={
-            'machine': 'm', 'launch': 'abc', 'directory': directory, 'on_exit': 'delete',
-            'lifetime': 600, 'end_command': [], **config})
-    return made
-
-
-def test_robot_logs_in_through_the_port_of_the_host(host: Fleet, key: Path) -> None:
-    provider, spec = host.provider(), MachineSpec('planner', 'hosted', {
-        **host.options, 'memory': '300m', 'cpus': 0.5})
-    machine_id = provider.create(spec, request(key, spec))
-    try:
-        machine = provider.reachable(machine_id, name='planner', timeout=60.0)
-        assert machine.shell is not None and machine.shell.host == '127.0.0.1'
-        assert len({22, host.on['port'], machine.shell.port, machine.vpn_port}) == 4
-        shell = SSHShell(dataclasses.replace(machine.shell, key_file=str(key)), name='planner')
-
-        def answers() -> bool:
-            with contextlib.suppress(ShellError):
-                return shell.run(Command(('true',)), timeout=60.0).returncode == 0
-            return False
-
-        wait_until(answers, timeout=60.0, what='the SSH server')
-        # the key is of the machine alone, and the host's own files are not there
-        assert shell.run(Command(('hostname',)), timeout=60.0).stdout == 'planner\n'
-        assert shell.run(Command(('ls', '/srv', '/home')), timeout=60.0).stdout.split() == [
-            '/home:', 'fog', '/srv:']
-        shell.close()
-        container, = host.containers().values()
-        assert container['HostConfig']['Memory'] == 300 << 20
-        assert container['HostConfig']['NanoCpus'] == 500_000_000
-    finally:
-        provider.destroy(machine_id)
 
 
 def test_robots_have_machines_of_the_same_name(
     host: Fleet, key: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
 ) -> None:
-    providers = []
+    """Each logs in to its own, through a port of the host, within the limits it asked for."""
+    spec = MachineSpec('planner', 'hosted', {**host.options, 'memory': '300m', 'cpus': 0.5})
+    machines = []
     for robot in ('one', 'two'):
         monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path / robot))
         provider = host.provider()
-        spec = MachineSpec('planner', 'hosted', host.options)
-        providers.append((provider, provider.create(spec, request(key, spec))))
+        machines.append((provider, provider.create(spec, request(key, spec))))
         with pytest.raises(NameTaken, match="'planner' already") as error:
             provider.create(spec, request(key, spec))
         assert error.value.hint == 'ros2 fog delete planner'
-    (one, first), (two, second) = providers
+    (one, first), (two, second) = machines
     assert first != second and len(host.containers()) == 2
+    for container in host.containers().values():
+        assert container['HostConfig']['Memory'] == 300 << 20
+        assert container['HostConfig']['NanoCpus'] == 500_000_000
+    machine = one.reachable(first, name='planner', timeout=60.0)
+    assert machine.shell is not None and machine.shell.host == '127.0.0.1'
+    assert len({22, host.on['port'], machine.shell.port, machine.vpn_port}) == 4
+    shell = SSHShell(dataclasses.replace(machine.shell, key_file=str(key)), name='planner')
+
+    def answers() -> bool:
+        with contextlib.suppress(ShellError):
+            return shell.run(Command(('true',)), timeout=60.0).returncode == 0
+        return False
+
+    wait_until(answers, timeout=60.0, what='the SSH server')
+    # the key is of the machine alone, and the host's own files are not there
+    assert shell.run(Command(('hostname',)), timeout=60.0).stdout == 'planner\n'
+    assert shell.run(Command(('ls', '/srv', '/home')), timeout=60.0).stdout.split() == [
+        '/home:', 'fog', '/srv:']
+    shell.close()
     one.destroy(first)
     assert two.describe(second).state is not MachineState.DELETED
     two.destroy(second)
@@ -164,11 +123,10 @@ def test_volume_stays_on_the_host_and_has_one_machine(
     assert name not in [one.name for one in provider.volumes(['127.0.0.1'])]
 
 
-@pytest.mark.parametrize('delay', [0.05, 0.6])
-def test_cancelled_creation_leaves_nothing(host: Fleet, key: Path, delay: float) -> None:
+def test_cancelled_creation_leaves_nothing(host: Fleet, key: Path) -> None:
     provider, spec = host.provider(), MachineSpec('planner', 'hosted', host.options)
     provider.cancel = threading.Event()
-    timer = threading.Timer(delay, provider.cancel.set)
+    timer = threading.Timer(0.6, provider.cancel.set)
     timer.start()
     with contextlib.suppress(Cancelled):
         provider.create(spec, request(key, spec))

@@ -37,18 +37,18 @@ class Warned(ContainerInstance):
 
 
 def generate_launch_description():
-    machine = Warned(
-        name={name!r}, network={network!r}, on_interrupt={on_interrupt!r},
-        vpn_path={vpn_path!r})
+    machines = [Warned(name=name, network={network!r}, on_interrupt={on_interrupt!r},
+                       vpn_path=path) for name, path in {machines!r}.items()]
 
     def say(context):
         event = context.locals.event
         return [LogInfo(msg=f'noticed: {{event.machine}} lost {{event.lost}}')]
 
     return FogROSLaunchDescription([
-        CloudNode(machine=machine, package='fogros2_examples', executable='talker',
-                  name='speaker', namespace='arm', remappings=[('chatter', '/chatter')],
-                  parameters=[{{'period': 0.2}}], output='screen'),
+        *[CloudNode(machine=machine, package='fogros2_examples', executable='talker',
+                    name='speaker', namespace=f'arm{{number}}',
+                    remappings=[('chatter', '/chatter')], parameters=[{{'period': 0.2}}],
+                    output='screen') for number, machine in enumerate(machines)],
         Node(package='fogros2_examples', executable='listener', output='screen'),
         RegisterEventHandler(EventHandler(
             matcher=lambda event: isinstance(event, MachineInterrupted),
@@ -72,14 +72,12 @@ class WarningProvider(ContainerProvider):
 
 
 @pytest.fixture
-def launched(cloud_network, tmp_path, monkeypatch):
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+def launched(cloud_network, tmp_path):
     with launching() as launch:
-        def start(name, on_interrupt, provider='container', vpn_path='auto'):
+        def start(machines, on_interrupt, provider='container'):
             path = tmp_path / 'interrupted.launch.py'
-            path.write_text(LAUNCH.format(
-                name=name, network=cloud_network, on_interrupt=on_interrupt, provider=provider,
-                vpn_path=vpn_path))
+            path.write_text(LAUNCH.format(machines=machines, network=cloud_network,
+                                          on_interrupt=on_interrupt, provider=provider))
             return launch(str(path))
         yield start
 
@@ -90,7 +88,7 @@ def test_preemption_notice_moves_the_nodes_in_time(
     monkeypatch.setenv('PYTHONPATH', install(
         tmp_path / 'plugin', 'fogros2.provider', 'warning', PROVIDER, 'WarningProvider'))
     name = f'warned-{RUN}'
-    run = launched(name, 'robot', 'warning')
+    run = launched({name: 'auto'}, 'robot', 'warning')
     run.wait_for(f'I heard: [Hello World from {name} ')
     words = argv(Command((engine, 'exec', f'fogros2-{name}', 'sh', '-c',
                           'echo "terminate at 12:00" >/run/notice'), sudo=True))
@@ -111,32 +109,38 @@ def test_preemption_notice_moves_the_nodes_in_time(
     assert run.ended() == 0, run.text
 
 
-@pytest.mark.parametrize('vpn_path', ['auto', 'stream'])
-def test_new_machine_replaces_a_killed_one(launched, engine, vpn_path):
-    """On the robot meanwhile; the machine has the same name, and launch sees no exit."""
-    name = f'gone-{RUN}-{vpn_path}'
-    run = launched(name, 'replace', vpn_path=vpn_path)
-    run.wait_for(f'I heard: [Hello World from {name} ')
+def test_new_machines_replace_killed_ones(launched, engine):
+    """On the robot meanwhile; each machine has the same name, and launch sees no exit."""
+    machines = {f'gone-{RUN}-{path}': path for path in ('auto', 'stream')}
+    run = launched(machines, 'replace')
+    for name in machines:
+        run.wait_for(f'I heard: [Hello World from {name} ')
     begin = time.monotonic()
     # as somebody would who knows nothing of the launch
-    words = argv(Command((engine, 'rm', '-f', '-t', '0', f'fogros2-{name}'), sudo=True))
+    words = argv(Command((engine, 'rm', '-f', '-t', '0', *(
+        f'fogros2-{name}' for name in machines)), sudo=True))
     subprocess.run(words, check=True, capture_output=True, timeout=60)
-    run.wait_for(f'noticed: {name} lost True')
-    run.wait_for(f"the machine '{name}' is gone")
+    for name in machines:
+        run.wait_for(f'noticed: {name} lost True')
+        run.wait_for(f"the machine '{name}' is gone")
     here = subprocess.run(['hostname'], capture_output=True, text=True).stdout.strip()
-    # the new machine may be there before the listener finds this node
+    # the new machines may be there before the listener finds these nodes
     run.wait_for(f'Publishing: "Hello World from {here} ')
-    run.wait_for(f'{name}: a new machine runs the nodes')
+    for name in machines:
+        run.wait_for(f'{name}: a new machine runs the nodes')
     replaced = time.monotonic()
-    wait_until(lambda: run.since(replaced, f'I heard: [Hello World from {name} ') or None,
-               timeout=60, what='a message of the new machine')
+    for name in machines:
+        wait_until(lambda n=name: run.since(replaced, f'I heard: [Hello World from {n} ') or None,
+                   timeout=60, what='a message of the new machine')
     last = run.times[-1]
-    wait_until(lambda: len(run.since(last, f'Hello World from {name} ')) > 5,
-               timeout=60, what='more messages')
-    # the last messages of the robot's may be read late
-    third, _ = run.since(last, f'Hello World from {name} ')[2]
-    assert run.since(third, f'Hello World from {here} ') == [], 'it runs once'
-    assert len(run.since(begin, 'process started')) == 2, run.text
-    assert f'[{name}.talker' in run.text and '[arm.speaker]' in run.text
+    for name in machines:
+        wait_until(lambda n=name: len(run.since(last, f'Hello World from {n} ')) > 5,
+                   timeout=60, what='more messages')
+        # the last messages of the robot's may be read late
+        third, _ = run.since(last, f'Hello World from {name} ')[2]
+        assert run.since(third, f'Hello World from {here} ') == [], 'it runs once'
+        assert f'[{name}.talker' in run.text
+    assert len(run.since(begin, 'process started')) == 4, run.text
+    assert '[arm0.speaker]' in run.text and '[arm1.speaker]' in run.text
     run.interrupt()
     assert run.ended() == 0, run.text

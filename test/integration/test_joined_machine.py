@@ -134,49 +134,6 @@ def workspace(tmp_path: Path) -> Path:
     return prefix
 
 
-def test_guest_runs_nodes_until_it_is_silent_or_revoked(
-    first: Callable[[str], First], second: SecondRobot, join: Callable[..., Launched],
-    workspace: Path,
-) -> None:
-    host = first('delete')
-    old = host.invited(second)
-    text = host.invited(second)
-    replayed = join(old)
-    assert replayed.ended() == 1
-    assert "'theirs' refuses this invitation" in replayed.text, replayed.text
-    assert host.accounts() == []
-    joined = join(text, str(workspace.parents[1]))
-    joined.wait_for(f'/ws{workspace}/lib/own/where')
-    assert any('/var/lib/fogros2-guests/fog' in line for line in joined.said), joined.text
-    joined.wait_for('I heard')
-    assert host.talkers() == 1
-    host.launched.wait_for('I heard')  # the first robot's node there hears the second's too
-    (account,) = {name for name in host.accounts() if ':' not in name}
-    for script in ('cat /{0}/config.json', 'sudo -n true', 'kill -0 1', 'ls /home/*',
-                   'cat /run/fog*.more.json', 'touch /var/lib/fogros2-guests/x'):
-        said = host.there(f"su -s /bin/sh -c '{script.format(AGENT_DIRECTORY)}' {account} "
-                          '2>/dev/null && echo may')
-        assert 'may' not in said, (script, said)
-    assert 'may' in host.there(f"su -s /bin/sh -c 'touch ~/x' {account} && echo may")
-    joined.interrupt()
-    assert joined.ended() == 0, joined.text
-    assert host.talkers() == 0
-    again = join(text)
-    again.wait_for('I heard')
-    again.child.send_signal(signal.SIGKILL)
-    wait_until(lambda: host.talkers() == 0, timeout=60.0, what='the end of the nodes')
-    assert host.accounts()
-    host.fog('revoke')
-    assert host.accounts() == []
-    again.kill()
-    second.run('ros2', 'fog', 'gc')
-    assert second.run('ip', '-brief', 'link').count('fog') == 0
-    revoked = join(text)
-    assert revoked.ended() == 1
-    assert "'theirs' does not answer" in revoked.text, revoked.text
-    assert host.accounts() == []
-
-
 def terminals_hear_and_are_heard(host: First, second: SecondRobot) -> None:
     """Join with the terminals of the second robot, and leave."""
     old = host.invited(second, '--for', '1s')
@@ -207,12 +164,45 @@ def terminals_hear_and_are_heard(host: First, second: SecondRobot) -> None:
     wait_until(lambda: 'GUEST' not in host.fog('status'), timeout=60, what='the guest to be gone')
 
 
-def test_terminals_and_nodes_of_a_guest_until_the_next_launch(
+def test_guest_uses_a_machine_until_it_is_gone_or_revoked(
     first: Callable[[str], First], second: SecondRobot, join: Callable[..., Launched],
+    workspace: Path,
 ) -> None:
     host = first('keep')
     terminals_hear_and_are_heard(host, second)
-    joined = join(host.invited(second))
+    text = host.invited(second)
+    joined = join(text, str(workspace.parents[1]))
+    joined.wait_for(f'/ws{workspace}/lib/own/where')
+    assert any('/var/lib/fogros2-guests/fog' in line for line in joined.said), joined.text
+    joined.wait_for('I heard')
+    assert host.talkers() == 1
+    host.launched.wait_for('I heard')  # the first robot's node there hears the second's too
+    (account,) = {name for name in host.accounts() if ':' not in name}
+    for script in ('cat /{0}/config.json', 'sudo -n true', 'kill -0 1', 'ls /home/*',
+                   'cat /run/fog*.more.json', 'touch /var/lib/fogros2-guests/x'):
+        said = host.there(f"su -s /bin/sh -c '{script.format(AGENT_DIRECTORY)}' {account} "
+                          '2>/dev/null && echo may')
+        assert 'may' not in said, (script, said)
+    assert 'may' in host.there(f"su -s /bin/sh -c 'touch ~/x' {account} && echo may")
+    joined.child.send_signal(signal.SIGKILL)
+    wait_until(lambda: host.talkers() == 0, timeout=60.0, what='the end of the nodes')
+    assert host.accounts()
+    host.fog('revoke')
+    assert host.accounts() == []
+    joined.kill()
+    second.run('ros2', 'fog', 'gc')
+    assert second.run('ip', '-brief', 'link').count('fog') == 0
+    revoked = join(text)
+    assert revoked.ended() == 1
+    assert "'theirs' does not answer" in revoked.text, revoked.text
+    assert host.accounts() == []
+    guest_stays_until_the_next_launch(host, first, join(host.invited(second)))
+
+
+def guest_stays_until_the_next_launch(
+    host: First, first: Callable[[str], First], joined: Launched,
+) -> None:
+    """End the first robot's launch, which keeps its machine; then launch there again."""
     joined.wait_for('I heard')
     host.launched.interrupt()
     assert host.launched.ended() == 0, host.launched.text
@@ -264,6 +254,7 @@ def test_guest_of_an_ssh_host_gets_what_its_nodes_need(
         joined.wait_for('I heard', times=joined.text.count('I heard') + 5)
         joined.interrupt()
         assert joined.ended() == 0, joined.text
+        assert 'talker' not in ' '.join(computer.leftovers())
         assert ros2('fog', 'revoke', name).returncode == 0
         wait_until(lambda: not computer.run(
             'ls -d /sys/class/net/fog* /run/fog* /var/lib/fogros2-guests || :').stdout,

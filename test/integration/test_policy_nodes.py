@@ -25,9 +25,10 @@ from std_msgs.msg import Float64MultiArray, Header, String, UInt8MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from fogros2.waiting import wait_until
+from fogros2_examples.nodes import LATCHED
 from fogros2_examples.policy import arm, training
 from fogros2_examples.policy.chunks import SECOND
-from fogros2_examples.policy.messages import chunk_message, LATCHED, SENSED
+from fogros2_examples.policy.messages import chunk_message, SENSED
 from fogros2_examples.policy.onnx_file import perceptron
 from fogros2_examples.slam.messages import image, nanoseconds, time
 from rigs.launched import launching
@@ -38,12 +39,6 @@ pytestmark = [
 ]
 IMAGES = {f'observation.images.{name}': (1, 3, training.HEIGHT, training.WIDTH)
           for name in ('top', 'side')}
-
-
-@pytest.fixture(autouse=True)
-def surroundings(tmp_path, monkeypatch):
-    """Keep what launch logs out of the user's home."""
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
 
 
 @pytest.fixture

@@ -29,9 +29,10 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
 from std_msgs.msg import Header, String  # noqa: E402
 
 from fogros2.waiting import wait_until  # noqa: E402
+from fogros2_examples.nodes import LATCHED  # noqa: E402
 from fogros2_examples.slam import messages, room  # noqa: E402
 from fogros2_examples.slam.camera import SlamCamera  # noqa: E402
-from fogros2_examples.slam.node import KEPT, TFMessage  # noqa: E402
+from fogros2_examples.slam.node import TFMessage  # noqa: E402
 from rigs.launched import launching  # noqa: E402
 
 pytestmark = [
@@ -40,12 +41,6 @@ pytestmark = [
 ]
 TRANSFORMS = [('/tf', TFMessage, 10)] if TFMessage else []
 SMALL = ('width:=320', 'height:=240', 'frames:=25', 'rate:=20.0')
-
-
-@pytest.fixture(autouse=True)
-def surroundings(tmp_path, monkeypatch):
-    """Keep what launch logs out of the user's home."""
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
 
 
 @pytest.fixture
@@ -119,8 +114,8 @@ class Side:
                 ('image', Image), ('depth', Image), ('camera_info', CameraInfo))}
         self.heard = {}
         for topic, kind, qos in (
-                ('pose', PoseStamped, 10), ('slam_state', String, KEPT), *TRANSFORMS,
-                ('path', PathMessage, KEPT), ('map_points', PointCloud2, KEPT)):
+                ('pose', PoseStamped, 10), ('slam_state', String, LATCHED), *TRANSFORMS,
+                ('path', PathMessage, LATCHED), ('map_points', PointCloud2, LATCHED)):
             self.heard[topic] = []
             self.node.create_subscription(kind, topic, self.heard[topic].append, qos)
         self.stamp = 0

@@ -133,7 +133,7 @@ def test_walk_with_depth_is_accurate_and_closes_loop(made: Any, walk: Any) -> No
 
 def test_walk_with_stereo_is_accurate(made: Any) -> None:
     slam = Slam(made.camera)
-    poses = room.trajectory(40, LAP)
+    poses = room.trajectory(20, LAP)
     for number, pose in enumerate(poses):
         left, right = (cv2.cvtColor(i, cv2.COLOR_BGR2GRAY) for i in made.pair(pose, number))
         tracked = slam.track(number, left, right=right)

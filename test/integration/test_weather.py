@@ -137,7 +137,6 @@ def weather(tmp_path, monkeypatch) -> Iterator[Path]:
     folder = tmp_path / 'talk'
     folder.mkdir()
     monkeypatch.setenv('FOGT_RELAY', str(folder))
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     yield folder
 
 

@@ -64,7 +64,8 @@ class Guest:
         interface, dds = self.lab.interfaces['machine'], self.lab.dds
         self.lab.run('machine', listing.install(interface))
         (own,) = self.ask('admit', key=self.key, label='second', seconds=seconds,
-                          patience=patience, addresses=[GUEST], rules=network.rules(
+                          patience=patience, left=3600.0, secret='5a' * 32, addresses=[GUEST],
+                          rules=network.rules(
                               interface, [dds_ports(dds.domain), *dds.ports]))
         assert own['address'] == GUEST and own['heard'] is None
 

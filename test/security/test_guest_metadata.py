@@ -6,8 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 import os
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -70,15 +68,3 @@ def test_guest_gets_no_answer_of_the_metadata_service(cloud: str) -> None:
         confine(cloud, 'fogabc123m0g224', NOBODY)
     assert answering(cloud, NOBODY) == {(host, '53') for host in SERVICES}, 'names are found'
     assert answering(cloud, NOBODY - 1) == every, 'the nodes of the launch are not concerned'
-
-
-def test_filter_of_a_guest_ends_with_its_account(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    ran: list[Any] = []
-    monkeypatch.setattr(guests, 'HOMES', tmp_path / 'homes')
-    monkeypatch.setattr(guests.pwd, 'getpwnam', lambda user: SimpleNamespace(pw_uid=1, pw_gid=1))
-    monkeypatch.setattr(guests.subprocess, 'run', lambda words, **options: ran.append(
-        words) or SimpleNamespace(returncode=0))
-    guests.evict('fogabc123m0g224')
-    assert ('nft', 'delete', 'table', 'inet', 'fogabc123m0g224') in ran

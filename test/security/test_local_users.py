@@ -39,14 +39,17 @@ from rigs import loops
 from rigs.stranger import stranger
 
 ROOT = Path(__file__).resolve().parents[2]
-#: Another account opens the helper's folder and locks it; then root makes a name a user's own.
-HELPER = """\
-import importlib.util, os, shutil, signal, sys, tempfile
+HELPER = ROOT / 'packaging/vpn_helper/vpn.py'
+#: Loads the VPN helper as ``vpn``.
+LOADED = f"""\
+import importlib.util, os, shutil, signal, subprocess, sys, tempfile, time
 from pathlib import Path
-import re
-spec = importlib.util.spec_from_file_location('vpn_helper', sys.argv[1])
+spec = importlib.util.spec_from_file_location('vpn_helper', {str(HELPER)!r})
 vpn = sys.modules['vpn_helper'] = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(vpn)
+"""
+#: Another account opens the helper's folder and locks it; then root makes a name a user's own.
+LOCKED = LOADED + """\
 top = Path(tempfile.mkdtemp(dir='/run'))
 top.chmod(0o755)
 def late(*_):
@@ -69,7 +72,7 @@ try:
         os._exit(0)
     print(os.read(read, 10).decode(), flush=True)
     signal.alarm(5)
-    if sys.argv[2] == 'stays':
+    if sys.argv[1] == 'stays':
         vpn.QUEUE = 0.2
         with vpn.locked(vpn.RECORDS):
             try:
@@ -88,12 +91,7 @@ finally:
 #: Root makes a name a user's own; the launch ends, and another process gets its id, at last while
 #: a request waits. Prints what the helper says to the requests that concern this process, and what
 #: it does for them.
-REUSED = """\
-import importlib.util, os, shutil, subprocess, sys, tempfile, time
-from pathlib import Path
-spec = importlib.util.spec_from_file_location('vpn_helper', sys.argv[1])
-vpn = sys.modules['vpn_helper'] = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(vpn)
+REUSED = LOADED + """\
 top = Path(tempfile.mkdtemp(dir='/run'))
 vpn.RECORDS = top / 'records'
 vpn.prepare()
@@ -222,9 +220,8 @@ class Said:
 
 def helper(lock: str) -> str:
     """Run the attack on the helper's folder as root, and return what it printed."""
-    return process.run(Command((
-        sys.executable, '-I', '-c', HELPER, str(ROOT / 'packaging/vpn_helper/vpn.py'), lock),
-        sudo=True), timeout=30.0, check=False).stdout
+    return process.run(Command((sys.executable, '-I', '-c', LOCKED, lock), sudo=True),
+                       timeout=30.0, check=False).stdout
 
 
 def test_no_account_locks_the_vpn_helper_s_folder(root: None) -> None:
@@ -239,8 +236,8 @@ def test_vpn_helper_knows_a_process_id_that_was_used_again(root: None) -> None:
     if not Path('/proc/sys/kernel/ns_last_pid').exists():
         pytest.skip('needs a kernel that lets root choose the next process id')
     said = process.run(Command((
-        'unshare', '--pid', '--fork', '--mount-proc', sys.executable, '-I', '-c', REUSED,
-        str(ROOT / 'packaging/vpn_helper/vpn.py')), sudo=True), timeout=60.0).stdout
+        'unshare', '--pid', '--fork', '--mount-proc', sys.executable, '-I', '-c', REUSED),
+        sudo=True), timeout=60.0).stdout
     first, *others = said.splitlines()
     assert first.startswith('root acts on') and len(others) == 4
     assert all(line.endswith('has ended') for line in others), said
@@ -248,16 +245,9 @@ def test_vpn_helper_knows_a_process_id_that_was_used_again(root: None) -> None:
 
 def test_a_stopped_terminal_does_not_stop_the_vpn_helper(root: None) -> None:
     """A user's terminal sends SIGTSTP to root's programs too."""
-    code = ('import importlib.util, os, signal, sys\n'
-            'spec = importlib.util.spec_from_file_location("vpn_helper", sys.argv[1])\n'
-            'vpn = sys.modules["vpn_helper"] = importlib.util.module_from_spec(spec)\n'
-            'spec.loader.exec_module(vpn)\n'
-            'vpn.settle()\n'
-            'os.kill(os.getpid(), signal.SIGTSTP)\n'
-            'print("goes on")')
-    done = subprocess.run(
-        [sys.executable, '-I', '-c', code, str(ROOT / 'packaging/vpn_helper/vpn.py')],
-        capture_output=True, text=True, timeout=60, preexec_fn=os.setpgrp)
+    code = f"{LOADED}vpn.settle()\nos.kill(os.getpid(), signal.SIGTSTP)\nprint('goes on')"
+    done = subprocess.run([sys.executable, '-I', '-c', code], capture_output=True, text=True,
+                          timeout=60, preexec_fn=os.setpgrp)
     assert done.stdout == 'goes on\n', done.stderr
 
 

@@ -30,7 +30,6 @@ from fogros2.model import (
     VpnInterface,
 )
 from fogros2.provider import Capabilities
-from fogros2.provider.container import packet_filter
 from fogros2.store import OTHER_VPN, process_start, Record, Store, write_private
 from fogros2_features.guests import invitation, listing, membership, program, provider
 from fogros2_testing.fakes import FakeProvider, FakeShell
@@ -243,29 +242,6 @@ def test_folder_of_a_joined_machine_stays_until_a_reboot(
             assert endings.leftovers(store) == []
         assert cleared == ends
         cleared.clear()  # the folder stays here, and its owner runs
-
-
-def test_range_of_the_joiners_own_is_one_clear_error(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
-) -> None:
-    store = Store(tmp_path / 'second')
-    text = invitation.seal(invitation.Invitation(
-        'planner', OTHER, '198.18.7.2', '203.0.113.9:30000', '198.18.7.224', '198.18.7.0/24',
-        'rmw_cyclonedds_cpp', 7, time.time() + 60), invitation.public_text(
-            invitation.own_key(store)))
-    monkeypatch.setattr(membership, 'check_robot', lambda: None)
-    monkeypatch.setattr(membership, 'run', lambda *a, **k: json.dumps(
-        [{'dst': '198.18.0.0/16', 'dev': 'eth1'}]))
-    with pytest.raises(VpnError, match='uses 198.18.0.0/16'):
-        membership.join(text, store, {})
-    assert store.other_vpns() == {}
-
-
-def test_published_port_is_part_of_the_machines_filter() -> None:
-    text = packet_filter.publish('fogros2-abc', 50000, '198.51.100.2')
-    assert 'fib daddr type local udp dport 50000 dnat ip to 198.51.100.2' in text
-    assert 'table inet fogros2-abc' in text
-    assert 'delete table %s fogros2-abc' in packet_filter.unset('fogros2-abc')
 
 
 def test_leave_names_the_nearest_machine() -> None:

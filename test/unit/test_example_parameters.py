@@ -17,7 +17,8 @@ import rclpy
 
 from fogros2_examples.ending import ended
 from fogros2_examples.files import checked, PICTURES
-from fogros2_examples.parameters import BadParameter, run, within, writable
+from fogros2_examples.nodes import run
+from fogros2_examples.parameters import BadParameter, within, writable
 from fogros2_examples.policy.onnx_file import perceptron
 
 

@@ -19,8 +19,8 @@ KEY, OTHER = 'first=', 'second='
 
 
 def asked(key: str = KEY, **changes: object) -> Guest:
-    return {'key': key, 'label': 'robot2', 'seconds': 60.0, 'patience': 180.0,
-            'addresses': ['198.18.7.224', '198.18.7.225'], **changes}
+    return {'key': key, 'label': 'robot2', 'seconds': 60.0, 'patience': 180.0, 'left': 3600.0,
+            'secret': '5a' * 32, 'addresses': ['198.18.7.224', '198.18.7.225'], **changes}
 
 
 def test_guests_get_the_free_addresses_in_turn() -> None:
@@ -31,10 +31,11 @@ def test_guests_get_the_free_addresses_in_turn() -> None:
         guests.admitted(found, asked('third='), 100.0)
 
 
-def test_second_invitation_keeps_the_address() -> None:
+def test_second_invitation_keeps_address_and_replaces_secret() -> None:
     found = guests.admitted(guests.admitted([], asked(), 100.0), asked(OTHER), 100.0)
     guests.heard(found, {KEY: 1700000000}, 110.0)
-    again = guests.admitted(found, asked(seconds=600.0), 120.0)
+    again = guests.admitted(found, asked(seconds=600.0, secret='b7' * 32), 120.0)
+    assert again[1]['secret'] == 'b7' * 32
     assert [(guest['key'], guest['address'], guest['until'], guest['heard'])
             for guest in again] == [
         (OTHER, '198.18.7.225', 160.0, None), (KEY, '198.18.7.224', 720.0, 110.0)]

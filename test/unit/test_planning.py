@@ -12,7 +12,8 @@ import pytest
 pytest.importorskip('fcl', reason='python-fcl is in the extra applications')
 base = pytest.importorskip('ompl.base', reason='ompl is in the extra applications')
 
-from fogros2_examples.meshes import (  # noqa: E402 - only where its libraries are
+from fogros2_examples.files import BadInput  # noqa: E402 - only where its libraries are
+from fogros2_examples.meshes import (  # noqa: E402
     box,
     cylinder,
     joined,
@@ -21,7 +22,7 @@ from fogros2_examples.meshes import (  # noqa: E402 - only where its libraries a
     sphere,
     turned,
 )
-from fogros2_examples.planning.app_files import BadFile, loaded  # noqa: E402
+from fogros2_examples.planning.app_files import loaded  # noqa: E402
 from fogros2_examples.planning.picture import between, picture, spaced  # noqa: E402
 from fogros2_examples.planning.scene import pose, Scene  # noqa: E402
 from fogros2_examples.planning.search import Space  # noqa: E402
@@ -147,14 +148,14 @@ def test_problem_of_ompl_app_is_read(tmp_path):
             ({'robot': 'none.obj'}, 'there is no .*none.obj'), ({'theta': 'x'}, 'could not'),
             ({'robot': 'room.cfg'}, "can't be read as a mesh")]:
         path.write_text(CFG.format(**{'robot': 'body.obj', 'theta': 0, 'axis': 1, **words}))
-        with pytest.raises(BadFile, match=text):
+        with pytest.raises(BadInput, match=text):
             loaded(path)
     for text, said in [('[problem]\nworld=a\n', "has no 'robot'"),
                        ('nothing', "can't be read: File contains no section headers. file: ")]:
         path.write_text(text)
-        with pytest.raises(BadFile, match=said):
+        with pytest.raises(BadInput, match=said):
             loaded(path)
-    with pytest.raises(BadFile, match="missing.cfg can't be read: No such file or directory$"):
+    with pytest.raises(BadInput, match="missing.cfg can't be read: No such file or directory$"):
         loaded(tmp_path / 'missing.cfg')
 
 

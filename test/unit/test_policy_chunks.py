@@ -59,14 +59,6 @@ def test_no_action_is_executed_past_the_horizon(measured, velocity, expected):
     assert at(made, 300, numpy.array([9.0, 9.0])) == (expected, None)
 
 
-def test_robot_stops_in_the_first_tick_after_a_horizon():
-    made = queue(0)
-    made.add(chunk(0, *range(50), apart=1000 / 30), START)
-    ticks = [at(made, ms)[1] for ms in range(0, 2000, 33)]
-    last = 49_000 / 30
-    assert [age is None for age in ticks] == [ms > last for ms in range(0, 2000, 33)]
-
-
 def test_robot_moves_again_with_the_next_chunk():
     made = queue(0, 500)
     made.add(chunk(0, 1, 1), START)

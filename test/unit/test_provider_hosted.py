@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import dataclasses
 import io
 import json
 from pathlib import Path
-import re
 import socket
 import tarfile
 from typing import Any
@@ -27,19 +27,21 @@ from fogros2.errors import (
 )
 from fogros2.model import (
     Command,
+    CreateRequest,
     Endpoint,
     MachineSpec,
     MachineState,
     Result,
     to_json,
 )
+from fogros2.provider.container import ContainerProvider
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import machine as container_machine
 from fogros2.shell.local import LocalShell
 from fogros2.store import Record, Store
-from fogros2_features.hosts import hosted
+from fogros2_features.hosts import hosted, served
 from fogros2_features.hosts.hosted import HostedProvider, program, result_of
-from fogros2_testing import FakeShell, request_for
+from fogros2_testing import FakeProvider, FakeShell, ProviderContract, request_for
 
 ID = 'podman:0123456789ab:0123-token'
 REPORT = {
@@ -62,6 +64,47 @@ def shell(monkeypatch: pytest.MonkeyPatch) -> FakeShell:
     fake.said = ''  # type: ignore[attr-defined]
     monkeypatch.setattr(hosted, 'connect', lambda endpoint, name: fake)
     return fake
+
+
+class Engine(FakeProvider):
+    """A host's container provider, whose containers are entries of a dictionary."""
+
+    def check(self, spec: MachineSpec) -> None:
+        assert spec.provider == ContainerProvider.name
+
+    def create(self, spec: MachineSpec, request: CreateRequest) -> str:
+        made = super().create(spec, request)
+        if made.startswith('fake-'):  # it is new
+            identity = f'podman:{made[5:]:0>12}:{request.token}'
+            self.machines[identity] = dataclasses.replace(self.machines.pop(made), id=identity)
+            self._tokens[request.token], self._waits[identity] = identity, 0
+        return self._tokens[request.token]
+
+
+class TestHostedProvider(ProviderContract):
+    """Against a host in memory; the contract of real containers is ``ContainerProvider``'s."""
+
+    @pytest.fixture(autouse=True)
+    def place(self, on: dict[str, Any], shell: FakeShell) -> None:
+        self.options = {'on': on}
+        engine = Engine(shell=Endpoint('ssh', '198.51.100.2', 40001, 'fog', 'ssh-ed25519 AA'))
+
+        def serve(command: Command) -> Result:
+            ask = json.loads(command.input or b'')
+            reply: dict[str, Any]
+            try:
+                reply = {'result': served.answer(engine, ask['call'], ask['given'])}
+            except FogError as error:
+                reply = {'error': type(error).__name__, 'message': error.args[0],
+                         'hint': error.hint}
+            return Result(0, to_json(reply), '')
+
+        shell._handlers['sh'] = serve
+
+    def make(self) -> tuple[HostedProvider, dict[str, Any]]:
+        provider = HostedProvider()
+        provider.check(MachineSpec('any', 'hosted', self.options))
+        return provider, self.options
 
 
 def spec_on(on: dict[str, Any], **options: Any) -> MachineSpec:
@@ -99,19 +142,6 @@ def test_host_may_go_on_with_a_lost_request(on: dict[str, Any], shell: FakeShell
     Store().set_aside(record)
     shell._handlers['sh'] = lambda command: Result(0, json.dumps({'result': [REPORT]}), '')
     assert [found.name for found in HostedProvider().find({})] == ['planner']
-
-
-def test_robots_have_containers_of_different_names(
-    on: dict[str, Any], shell: FakeShell, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    shell.said = json.dumps({'result': ID})  # type: ignore[attr-defined]
-    names = set()
-    for robot in ('one', 'two'):
-        monkeypatch.setattr(hosted, 'robot_id', lambda: robot)  # noqa: B023
-        HostedProvider().create(spec_on(on), request_for(spec_on(on)))
-        names.add(container_machine.container_name(
-            'planner', asked(shell)['given']['request']['tags']))
-    assert len(names) == 2 and all(re.fullmatch('fogros2-planner-[0-9a-f]{8}', n) for n in names)
 
 
 def test_machine_has_the_ports_of_its_host(on: dict[str, Any], shell: FakeShell) -> None:

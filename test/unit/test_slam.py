@@ -14,6 +14,7 @@ cv2 = pytest.importorskip('cv2', reason='OpenCV (the extra "applications") is no
 pytest.importorskip('gtsam', reason='GTSAM (the extra "applications") is not installed')
 pytest.importorskip('evo', reason='evo (the extra "applications") is not installed')
 
+from fogros2_examples.files import BadInput  # noqa: E402
 from fogros2_examples.slam import (  # noqa: E402
     geometry,
     mapping,
@@ -122,10 +123,18 @@ FRAMES = [(numpy.full((HEIGHT, WIDTH, 3), 40 * number, numpy.uint8),
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Return a folder in TUM's format with five frames and their true poses."""
-    tum.write(tmp_path / 'set', CAMERA,
-              [(10 + number / 30, *frame) for number, frame in enumerate(FRAMES)],
-              [(10.005 + number / 30, pose) for number, pose in enumerate(POSES)])
-    return tmp_path / 'set'
+    top, names = tmp_path / 'set', [f'{10 + number / 30:.6f}' for number in range(5)]
+    for kind in ('rgb', 'depth'):
+        (top / kind).mkdir(parents=True)
+        (top / f'{kind}.txt').write_text(''.join(f'{name} {kind}/{name}.png\n' for name in names))
+    for name, (image, depth) in zip(names, FRAMES):
+        cv2.imwrite(str(top / f'rgb/{name}.png'), image)
+        cv2.imwrite(str(top / f'depth/{name}.png'), 5 * depth)
+    numpy.savetxt(top / 'groundtruth.txt', [
+        (10.005 + number / 30, *pose[:3, 3], *geometry.quaternion(pose))
+        for number, pose in enumerate(POSES)], header='time tx ty tz qx qy qz qw')
+    (top / 'camera.txt').write_text(f'{CAMERA.fx} {CAMERA.fy} {CAMERA.cx} {CAMERA.cy}\n')
+    return top
 
 
 def test_dataset_is_read_as_it_was_written(folder: Path) -> None:
@@ -204,7 +213,7 @@ def test_bad_dataset_is_reported_with_its_line(
         (folder / name).unlink()
     else:
         (folder / name).write_text(text)
-    with pytest.raises(tum.DatasetError) as caught:
+    with pytest.raises(BadInput) as caught:
         list(sources.dataset(folder).shots)
     assert said in str(caught.value)
 
