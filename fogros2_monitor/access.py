@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 import contextlib
 from pathlib import Path
 import re
 import socket
-import threading
 from typing import Optional
 
 from fogros2 import untrusted
@@ -18,7 +16,6 @@ from fogros2.model import Command
 from fogros2.shell import Shell
 from fogros2.store import Store
 from fogros2_monitor import addresses, credentials
-from fogros2_monitor.tunnel import Tunnel
 from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Entry
 
@@ -26,24 +23,6 @@ from ros2fog_cli.api.machines import Entry
 _TIMEOUT = 15.0
 #: The form of ``credentials.make_token``.
 _TOKEN = re.compile('[A-Za-z0-9_-]{1,100}')
-
-
-@contextlib.contextmanager
-def carrying(tunnel: Tunnel) -> Iterator[threading.Event]:
-    """Serve a tunnel in a thread; yield an event that is set when the tunnel ends."""
-    ended = threading.Event()
-
-    def carry() -> None:
-        tunnel.serve()
-        ended.set()
-
-    thread = threading.Thread(target=carry, name='fog-monitor', daemon=True)
-    thread.start()
-    try:
-        yield ended
-    finally:
-        tunnel.close()
-        thread.join(5.0)
 
 
 def on_robot(name: str) -> Optional[tuple[int, str]]:

@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from http.server import ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import ipaddress
 import os
 import socket
 import struct
+import threading
 from typing import Any, Optional
 
 #: Header of a netlink message: length, type, flags, sequence number, port.
@@ -19,9 +20,26 @@ _USER = 64
 
 
 class OwnServer(ThreadingHTTPServer):
-    """An HTTP server on the loopback interface for this account and root alone."""
+    """
+    An HTTP server on the loopback interface for this account and root alone, in a thread.
 
+    :param port: 0: any free port.
+    :raises OSError: the port is in use.
+    """
+
+    # threads, because browsers open connections in advance that send no request
     daemon_threads = True
+
+    def __init__(self, port: int, handler: type[BaseHTTPRequestHandler]) -> None:
+        super().__init__(('127.0.0.1', port), handler)
+        self._thread = threading.Thread(target=self.serve_forever, name='fog-http', daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop the server."""
+        self.shutdown()
+        self._thread.join()
+        self.server_close()
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
         """Refuse other accounts of this computer: each connection takes a thread."""

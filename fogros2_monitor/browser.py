@@ -50,18 +50,9 @@ class Ticket:
             def log_message(self, format: str, *args: object) -> None:
                 """Log nothing: the terminal shows the pages."""
 
-        # Threads, because browsers open connections in advance that send no request.
-        self._server = OwnServer(('127.0.0.1', 0), Handler)
-        self.url = f'http://127.0.0.1:{self._server.server_port}{target}'
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, name='fog-ticket', daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop the server."""
-        self._server.shutdown()
-        self._thread.join()
-        self._server.server_close()
+        server = OwnServer(0, Handler)
+        self.url = f'http://127.0.0.1:{server.server_port}{target}'
+        self.close = server.close
 
 
 @contextlib.contextmanager

@@ -250,18 +250,6 @@ def endpoint(text: str) -> tuple[str, int]:
     return host.strip('[]'), int(port)
 
 
-def network(text: str) -> Network:
-    """
-    Return a network in the form ``198.51.100.0/28``.
-
-    :raises argparse.ArgumentTypeError: the text has another form.
-    """
-    try:
-        return ipaddress.ip_network(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
 def _listen(address: tuple[str, int]) -> socket.socket:
     host, port = address
     if host == '':  # all addresses of the machine
@@ -320,7 +308,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
                         help='end with the process that has the other end of the input')
     parser.add_argument('--public', type=endpoint,
                         help='where to listen with TLS; :PORT for every address')
-    parser.add_argument('--allow', type=network, action='append', default=[],
+    parser.add_argument('--allow', type=ipaddress.ip_network, action='append', default=[],
                         help='network (CIDR) that may knock there; all unless given')
     parser.add_argument('--certificate', help='PEM file')
     parser.add_argument('--key', help='PEM file')
@@ -330,11 +318,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
     parser.add_argument('--name', default=socket.gethostname(), help="the machine's, for people")
     options = parser.parse_args(arguments)
     if options.vpn is not None:
-        if VPN_ADDRESS not in os.environ:
-            parser.error(f'--vpn takes {VPN_ADDRESS}, which nodes on a machine have')
         options.listen.append((os.environ[VPN_ADDRESS], options.vpn))
-    if options.public and not (options.certificate and options.key):
-        parser.error('--public takes --certificate and --key')
     asyncio.run(_run(options))
 
 

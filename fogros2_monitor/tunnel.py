@@ -61,9 +61,11 @@ class Tunnel:
         self._open: set[socket.socket] = set()
         self._listener = socket.create_server(('127.0.0.1', port))
         self.port: int = self._listener.getsockname()[1]
+        #: The thread that accepts connections.
+        self.serving = threading.Thread(target=self._serve, name='fog-tunnel', daemon=True)
+        self.serving.start()
 
-    def serve(self) -> None:
-        """Accept connections until a signal, or until another thread calls close()."""
+    def _serve(self) -> None:
         while True:
             try:
                 link, _ = self._listener.accept()
@@ -78,7 +80,7 @@ class Tunnel:
                              daemon=True).start()
 
     def close(self) -> None:
-        """Close all connections."""
+        """Close all connections, and stop accepting."""
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)  # wakes accept()
         self._listener.close()
@@ -86,6 +88,7 @@ class Tunnel:
             for link in self._open:
                 with contextlib.suppress(OSError):
                     link.shutdown(socket.SHUT_RDWR)
+        self.serving.join()
 
     def _carry(self, link: socket.socket) -> None:
         host, port = self._to

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import threading
 from typing import TYPE_CHECKING
 
 from ros2fog_cli.verb import add_name, add_region, VerbExtension, warn
@@ -85,12 +87,12 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
             tunnel = Tunnel(shell, ('127.0.0.1', remote_port), port=port, say=warn)
         except OSError as error:
             raise taken(port, error) from error
-        with access.carrying(tunnel) as ended:
+        with contextlib.closing(tunnel):
             try:
                 page = say(f'{entry.name} is at {{}} until Ctrl-C; in a browser:',
                            host_port('localhost', tunnel.port), token)
                 with browser_at(page, start=browser):
-                    ended.wait()
+                    tunnel.serving.join()
             except KeyboardInterrupt:
                 print()
     return 0
@@ -155,7 +157,7 @@ class DashboardVerb(VerbExtension):
               'Everyone who has this address can see and delete machines.', flush=True)
         try:
             with browser_at(dashboard.url, start=not args.no_browser):
-                dashboard.serve()
+                threading.Event().wait()
         except KeyboardInterrupt:
             print()
         finally:

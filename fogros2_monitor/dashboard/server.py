@@ -11,7 +11,6 @@ sends it, must be the page's own.
 from __future__ import annotations
 
 import base64
-import contextlib
 import hashlib
 import hmac
 from http import HTTPStatus
@@ -21,12 +20,15 @@ from pathlib import Path
 import re
 import secrets
 import socket
-import threading
-from typing import Any, Optional, Protocol
+import sys
+from typing import Any, Optional, TYPE_CHECKING
 import urllib.parse
 
 from fogros2.errors import FogError
 from fogros2_monitor import accounts
+
+if TYPE_CHECKING:
+    from ros2fog_cli.api.live import Live
 
 #: The header with the token.
 HEADER = 'X-Fogros2-Token'
@@ -37,76 +39,33 @@ _REFUSAL = ('the token is missing or wrong: open the address that `ros2 fog dash
 PAGE = Path(__file__).with_name('page.html')
 
 
-class Source(Protocol):
-    """The data of the dashboard."""
-
-    def state(self, after: int, timeout: float) -> dict[str, Any]:
-        """Return the state as JSON values; wait for a version above ``after``."""
-
-    def log(self, machine: str, after: int) -> list[dict[str, Any]]:
-        """Return a machine's log lines with numbers above ``after``."""
-
-    def picture(self, stream: str) -> Optional[bytes]:
-        """Return the last picture of a stream, by its id in the state, as JPEG."""
-
-    def delete(self, machine: str, force: bool) -> None:
-        """
-        Start to delete a machine.
-
-        :raises FogError: the machine cannot be deleted.
-        """
-
-
-class Dashboard:
+class Dashboard(accounts.OwnServer):
     """
-    The HTTP server; it listens as soon as it is constructed.
+    The HTTP server.
 
     :param port: port on the loopback interface; 0: any free port.
     :raises OSError: the port is in use.
     """
 
-    def __init__(self, source: Source, *, port: int = 0) -> None:
+    def __init__(self, source: Live, *, port: int = 0) -> None:
         self.source = source
         self.token = secrets.token_urlsafe(24)
         self.page = PAGE.read_bytes()
         self.policy = content_policy(self.page.decode())
-        self._server = _Server(('127.0.0.1', port), self)
-        self._serving, self._closed = threading.Lock(), False
-        self.port: int = self._server.server_address[1]
-        self.hosts = (f'127.0.0.1:{self.port}', f'localhost:{self.port}')
+        super().__init__(port, _Handler)
+
+    @property
+    def hosts(self) -> tuple[str, ...]:
+        """The server's own names with port."""
+        return f'127.0.0.1:{self.server_port}', f'localhost:{self.server_port}'
 
     @property
     def url(self) -> str:
         """The URL for a browser; everyone who knows it can read the page and delete machines."""
         return f'http://{self.hosts[0]}/#{self.token}'
 
-    def serve(self) -> None:
-        """Answer requests until a signal, or until another thread calls close()."""
-        with self._serving:
-            while not self._closed:
-                self._server.handle_request()
-
-    def close(self) -> None:
-        """Close the listening socket, and wait until serve() has returned."""
-        self._closed = True
-        # Only this wakes serve(). It would wait on for the socket's number, which the process
-        # gives to the next file that it opens.
-        with contextlib.suppress(OSError):
-            self._server.socket.shutdown(socket.SHUT_RDWR)
-        with self._serving:
-            self._server.server_close()
-
-
-class _Server(accounts.OwnServer):
-    block_on_close = False
-
-    def __init__(self, address: tuple[str, int], dashboard: Dashboard) -> None:
-        self.dashboard = dashboard
-        super().__init__(address, _Handler)
-
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore errors of clients that disconnect."""
-        import sys
         if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):
             super().handle_error(request, client_address)
 
@@ -123,7 +82,7 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = 'HTTP/1.1'
     server_version, sys_version = 'fogros2', ''
     timeout = SILENCE
-    server: _Server
+    server: Dashboard
 
     def setup(self) -> None:
         super().setup()
@@ -143,11 +102,11 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, do: Any) -> None:
         try:
             check_host(self.headers.get('Host'), self.headers.get('Origin'),
-                       self.headers.get('Sec-Fetch-Site'), self.server.dashboard.hosts)
+                       self.headers.get('Sec-Fetch-Site'), self.server.hosts)
             path, _, query = self.path.partition('?')
             if path.startswith('/api/') and not hmac.compare_digest(
                     self.headers.get(HEADER, '').encode(),
-                    self.server.dashboard.token.encode()):
+                    self.server.token.encode()):
                 raise _Refused(HTTPStatus.UNAUTHORIZED, _REFUSAL)
             do(path, dict(urllib.parse.parse_qsl(query)))
         except _Refused as error:
@@ -157,9 +116,9 @@ class _Handler(BaseHTTPRequestHandler):
             self._json({'error': str(error.args[0]), 'hint': error.hint}, HTTPStatus.CONFLICT)
 
     def _get(self, path: str, query: dict[str, str]) -> None:
-        source = self.server.dashboard.source
+        source = self.server.source
         if path == '/':
-            self._send(self.server.dashboard.page, 'text/html; charset=utf-8')
+            self._send(self.server.page, 'text/html; charset=utf-8')
         elif path == '/api/state':
             self._json(source.state(_number(query, 'after', -1), TIMEOUT))
         elif path == '/api/log':
@@ -192,7 +151,7 @@ class _Handler(BaseHTTPRequestHandler):
         force = request.get('force', False)
         if not isinstance(force, bool):
             raise _Refused(HTTPStatus.BAD_REQUEST, "'force' in a request must be true or false")
-        self.server.dashboard.source.delete(request['name'], force)
+        self.server.source.delete(request['name'], force)
         self._json({})
 
     def _json(self, data: Any, status: HTTPStatus = HTTPStatus.OK) -> None:
@@ -202,7 +161,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(status)
         for name, value in (
                 ('Content-Type', kind), ('Content-Length', str(len(data))),
-                ('Content-Security-Policy', self.server.dashboard.policy),
+                ('Content-Security-Policy', self.server.policy),
                 ('X-Content-Type-Options', 'nosniff'), ('Referrer-Policy', 'no-referrer'),
                 ('Cross-Origin-Resource-Policy', 'same-origin'),
                 ('Cross-Origin-Opener-Policy', 'same-origin'), ('Cache-Control', 'no-store')):

@@ -34,8 +34,6 @@ class Live:
     """
     The live state, updated by threads that :meth:`start` starts and :meth:`close` ends.
 
-    It is a :class:`fogros2_monitor.dashboard.server.Source`.
-
     :param name: name of the one machine to watch; None: all machines.
     :param regions: regions to ask, for providers with regions.
     :param topics: whether to join launches and measure the rates of topics.

@@ -102,7 +102,6 @@ def story() -> Story:
 @pytest.fixture
 def page(story: Story, browser: Browser) -> Iterator[Browser]:
     dashboard = Dashboard(story)
-    threading.Thread(target=dashboard.serve, daemon=True).start()
     browser.complaints.clear()
     browser.open(dashboard.url)
     browser.until('document.getElementById("link").textContent === "live"')
@@ -260,8 +259,6 @@ def test_page_fits_dark_mode_and_narrow_screens(story: Story, page: Browser) -> 
 
 def test_page_survives_a_reload_and_needs_its_own_token(story: Story, browser: Browser) -> None:
     dashboard = Dashboard(story)
-    thread = threading.Thread(target=dashboard.serve, daemon=True)
-    thread.start()
     with contextlib.closing(Ticket(dashboard.url)) as ticket:
         browser.open(ticket.url)
         browser.until('document.getElementById("link").textContent === "live"')
@@ -269,7 +266,7 @@ def test_page_survives_a_reload_and_needs_its_own_token(story: Story, browser: B
     browser.until('document.getElementById("link").textContent === "live"')
     # nobody but the page may ask, not even from the same browser
     other = browser.ask(
-        f'fetch("http://localhost:{dashboard.port}/api/state").then(() => 1, () => 0)')
+        f'fetch("http://localhost:{dashboard.server_port}/api/state").then(() => 1, () => 0)')
     assert other == 0
     began = time.monotonic()
     assert browser.ask('fetch("/api/state").then(answer => answer.status)') == 401

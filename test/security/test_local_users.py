@@ -268,12 +268,11 @@ def test_no_account_can_connect_to_a_sync() -> None:
 
 def test_no_account_takes_up_the_dashboard_s_threads(root: None) -> None:
     dashboard = Dashboard(None)  # type: ignore[arg-type]
-    threading.Thread(target=dashboard.serve, daemon=True).start()
     before = threading.active_count()
-    with stranger(MANY, str(dashboard.port), '127.0.0.1', '20') as child:
+    with stranger(MANY, str(dashboard.server_port), '127.0.0.1', '20') as child:
         assert child.stdout and child.stdout.readline() == b'20\n'
         assert threading.active_count() == before
-        with socket.create_connection(('127.0.0.1', dashboard.port)) as own:
+        with socket.create_connection(('127.0.0.1', dashboard.server_port)) as own:
             own.sendall(b'GET / HTTP/1.0\r\nHost: %b\r\n\r\n' % dashboard.hosts[0].encode())
             assert own.recv(100).startswith(b'HTTP/1.1 200 OK')
     dashboard.close()
@@ -282,7 +281,6 @@ def test_no_account_takes_up_the_dashboard_s_threads(root: None) -> None:
 def test_no_account_starts_programs_through_the_tunnel(root: None) -> None:
     shell = FakeShell(streams=[])
     made = Tunnel(shell, ('127.0.0.1', 9))
-    threading.Thread(target=made.serve, daemon=True).start()
     with stranger(MANY, str(made.port), '127.0.0.1', '20') as child:
         assert child.stdout and child.stdout.readline() == b'20\n'
     assert shell.opened == []

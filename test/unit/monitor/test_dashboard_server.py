@@ -8,7 +8,6 @@ import http.client
 import json
 import re
 import socket
-import threading
 from typing import Any, Optional
 
 import pytest
@@ -44,8 +43,6 @@ class Canned:
 @pytest.fixture
 def dashboard() -> Iterator[Dashboard]:
     made = Dashboard(Canned())
-    thread = threading.Thread(target=made.serve, daemon=True)
-    thread.start()
     yield made
     made.close()
 
@@ -54,7 +51,7 @@ def ask(
     dashboard: Dashboard, path: str, *, method: str = 'GET', body: Any = None,
     **headers: Optional[str],
 ) -> tuple[int, bytes, dict[str, str]]:
-    link = http.client.HTTPConnection('127.0.0.1', dashboard.port, timeout=10)
+    link = http.client.HTTPConnection('127.0.0.1', dashboard.server_port, timeout=10)
     told = {HEADER: dashboard.token, **{
         key.replace('_', '-'): value for key, value in headers.items()}}
     if body is not None:
@@ -120,7 +117,7 @@ def test_dashboard_deletes_a_machine(dashboard: Dashboard) -> None:
 def test_requests_need_token_host_and_origin(
     dashboard: Dashboard, headers: dict[str, Optional[str]], status: int,
 ) -> None:
-    told = {key: value and value.replace('{port}', str(dashboard.port))
+    told = {key: value and value.replace('{port}', str(dashboard.server_port))
             for key, value in headers.items()}
     assert ask(dashboard, '/api/state', **told)[0] == status
     request = json.dumps({'name': 'planner'})
@@ -173,29 +170,17 @@ def test_dashboard_listens_only_on_the_loopback(dashboard: Dashboard) -> None:
             probe.connect(('198.51.100.1', 9))  # sends nothing: only asks for our own address
             own = probe.getsockname()[0]
     with pytest.raises(ConnectionRefusedError):
-        socket.create_connection((own, dashboard.port), timeout=5).close()
+        socket.create_connection((own, dashboard.server_port), timeout=5).close()
 
 
 def test_each_dashboard_has_its_own_token() -> None:
     one, other = Dashboard(Canned()), Dashboard(Canned())
     try:
         assert one.token != other.token and len(one.token) >= 32
-        assert one.url == f'http://127.0.0.1:{one.port}/#{one.token}'
+        assert one.url == f'http://127.0.0.1:{one.server_port}/#{one.token}'
     finally:
         one.close()
         other.close()
-
-
-def test_closed_dashboard_waits_for_no_file() -> None:
-    dashboard = Dashboard(Canned())
-    thread = threading.Thread(target=dashboard.serve, daemon=True)
-    thread.start()
-    assert ask(dashboard, '/')[0] == 200
-    dashboard.close()
-    # a thread that waits for the closed socket's number keeps the next file with it open
-    thread.join(60.0)
-    assert not thread.is_alive()
-    dashboard.close()
 
 
 def test_page_loads_nothing_and_escapes_its_data() -> None:

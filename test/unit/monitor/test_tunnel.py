@@ -43,15 +43,12 @@ def tunnel(port: int) -> Iterator[tuple[int, list[str]]]:
     said: list[str] = []
     shell = LocalShell(Endpoint('local'), name='here')
     made = Tunnel(shell, ('127.0.0.1', port), say=said.append)
-    thread = threading.Thread(target=made.serve)
-    thread.start()
     try:
         yield made.port, said
     finally:
         made.close()
-        thread.join(60)
         shell.close()
-        assert not thread.is_alive()
+        assert not made.serving.is_alive()
 
 
 def received(link: socket.socket, size: int) -> bytes:
