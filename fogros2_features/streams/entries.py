@@ -11,7 +11,7 @@ from fogros2 import plugin_system
 from fogros2.describe import values
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.model import NodeSpec
-from fogros2_features.streams import topics
+from fogros2.ros_names import local_topic
 from fogros2_features.streams.topics import camera_info_topic, carries_info, check
 from fogros2_features.streams.transport import GROUP, ImageTransport, Stream
 
@@ -155,9 +155,21 @@ def nodes(streams: Iterable[Stream]) -> dict[Optional[str], list[NodeSpec]]:
 
 
 def remappings(streams: Iterable[Stream], machine: Optional[str]) -> dict[str, str]:
-    """Return the new names of streamed topics for nodes on a host; empty on the robot."""
-    return topics.remappings(
-        [(one, _transport(one).camera_info) for one in streams], machine)
+    """
+    Return the new names of streamed topics for nodes on a host; empty on the robot.
+
+    They apply to nodes that subscribe to a topic or publish it.
+
+    :param machine: the machine of the nodes, None for the robot.
+    """
+    names: dict[str, str] = {}
+    for one in streams:
+        if machine is not None and machine in (one.source, one.target):
+            names[one.topic] = local_topic(one.topic, machine)
+            if _transport(one).camera_info and carries_info(one):
+                info = camera_info_topic(one.topic)
+                names[info] = local_topic(info, machine)
+    return names
 
 
 def _transport(one: Stream) -> ImageTransport:

@@ -10,7 +10,7 @@ from typing import ClassVar, Optional
 from fogros2.errors import PrerequisiteError
 from fogros2.model import NodeSpec
 from fogros2.ros_names import local_topic
-from fogros2_features.streams.topics import check, names_of
+from fogros2_features.streams.topics import names_of
 from fogros2_features.streams.transport import ImageTransport, Stream
 
 
@@ -55,7 +55,6 @@ class Republish(ImageTransport):
         self, stream: Stream, role: str, machine: Optional[str], raw: str, encoded: str,
     ) -> NodeSpec:
         """Return a node; ``raw`` and ``encoded`` are its sides, 'in' or 'out'."""
-        check(stream)
         label, full, between = names_of(stream, role, self.plugin)
         image = local_topic(stream.topic, machine)
         words = ['--ros-args', '-r', f'__node:={full}', '-p', f'{raw}_transport:=raw',

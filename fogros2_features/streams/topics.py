@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 import json
 import shlex
-from typing import Any, Optional
+from typing import Any
 
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.host import modules
@@ -91,29 +91,6 @@ def check_modules(package: str = 'image_transport_h264', what: str = 'images') -
             f'pip install {shlex.join(lacking)}')
 
 
-def remappings(
-    streams: Iterable[tuple[Stream, bool]], machine: Optional[str],
-) -> dict[str, str]:
-    """
-    Return the new names of streamed topics for nodes on a host; empty on the robot.
-
-    They apply to nodes that subscribe to a topic or publish it.
-
-    :param streams: each with whether its nodes also carry camera info.
-    :param machine: the machine of the nodes, None for the robot.
-    """
-    names: dict[str, str] = {}
-    if machine is None:
-        return names
-    for stream, informed in streams:
-        if machine in (stream.source, stream.target):
-            names[stream.topic] = local_topic(stream.topic, machine)
-            if informed and carries_info(stream):
-                info = camera_info_topic(stream.topic)
-                names[info] = local_topic(info, machine)
-    return names
-
-
 def node(
     stream: Stream, *, role: str, name: str, package: str, topic: str,
     options: Iterable[str], parameters: Mapping[str, Any],
@@ -126,9 +103,8 @@ def node(
     :param topic: the nodes' name of the topic, which is remapped.
     :param options: the options of the stream that are parameters of the decoder.
     :param parameters: more parameters of the node.
-    :raises ConfigurationError: see ``check``; or an option that cannot be a parameter.
+    :raises ConfigurationError: an option cannot be a parameter.
     """
-    check(stream)
     machine = stream.source if role == 'encoder' else stream.target
     local = local_topic(stream.topic, machine)
     label, full, between = names_of(stream, role, name)

@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import http.client
 import os
-import shutil
 import socket
 import threading
 import time
@@ -22,12 +21,12 @@ from fogros2 import ContainerInstance, Foxglove, ros_names
 from fogros2.deploy import RunningMachine, undo
 from fogros2.deploy.steps.creating import Creation
 from fogros2.errors import AgentError, ConfigurationError, ProviderError, Unsupported
-from fogros2.model import Endpoint, Machine, MachineSpec, MachineState, Result, VpnInterface
+from fogros2.model import Endpoint, Machine, MachineSpec, MachineState, VpnInterface
 from fogros2.provider.kubernetes import manifests, ways
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.runtime import added_process
 from fogros2.store import Made, process_start, Record, Store
-from fogros2_monitor import access, action, addresses, credentials
+from fogros2_monitor import access, action, addresses
 from fogros2_monitor.browser import Ticket
 from fogros2_monitor.feature import Monitor
 from fogros2_testing.fakes import FakeProvider, FakeShell
@@ -136,22 +135,13 @@ def test_monitor_address_is_shown_while_a_launch_serves_it():
         assert [shown[key] for key in NOTES] == [None, None]
 
 
-def test_share_reads_token_and_certificate(tmp_path):
-    if shutil.which('openssl') is None:
-        pytest.skip('needs openssl')
-    made = credentials.make(tmp_path / 'monitor' / 'x', 'planner')
-    text = made.token.read_text() + made.certificate.read_text()
-    shell = FakeShell(handlers={'cat': lambda command: Result(0, text, '')})
-    where, token, fingerprint = access.credentials_of(entry(), shell)
-    assert (where, token) == ('198.51.100.9:8766', made.token.read_text().strip())
-    assert fingerprint == credentials.fingerprint(made.certificate.read_text())
-    assert shell.commands[0].argv[1] == '/run/fogros2/monitor-8765/abc123/token'
-    for changes, kind, said in (
-            ({'notes': {}}, AgentError, 'serves the topics'),
-            ({'pid': 0}, AgentError, 'serves the topics'),
-            ({'notes': {**NOTES, 'monitor_open': ''}}, ConfigurationError, 'only this robot')):
-        with pytest.raises(kind, match=said):
-            access.credentials_of(entry(**changes), shell)
+@pytest.mark.parametrize(('changes', 'kind', 'said'), [
+    ({'notes': {}}, AgentError, 'serves the topics'),
+    ({'pid': 0}, AgentError, 'serves the topics'),
+    ({'notes': {**NOTES, 'monitor_open': ''}}, ConfigurationError, 'only this robot')])
+def test_share_of_a_closed_bridge_is_refused(changes, kind, said):
+    with pytest.raises(kind, match=said):
+        access.credentials_of(entry(**changes), FakeShell())
 
 
 def test_browser_is_led_to_the_page_once_and_in_time(monkeypatch):
