@@ -232,10 +232,10 @@ class Decoder:
 
     def _decode_deep(self, packet: bytes) -> Optional[Picture]:
         try:
-            tag, _, _ = split(packet)
+            tag, extra, coded = split(packet)
             if self._is_old(tag):
                 return None
-            tag, picture = self._deep.decode(packet, self.max_pixels)
+            picture = self._deep.decode(tag, extra, coded, self.max_pixels)
         except CodecError as error:
             raise Damaged(str(error), error.cause) from error
         self._last, self.needs_key, self._codec = tag, False, None

@@ -29,7 +29,6 @@ from image_transport_h264.picture import (
     check_size,
     CodecError,
     LAYOUTS,
-    MAX_PIXELS,
     Picture,
     Pixels,
 )
@@ -72,13 +71,12 @@ class DeepDecoder:
         self._codec: Optional[VideoCodecContext] = None
         self._extra = b''
 
-    def decode(self, packet: bytes, max_pixels: int = MAX_PIXELS) -> tuple[Tag, Picture]:
+    def decode(self, tag: Tag, extra: bytes, coded: bytes, max_pixels: int) -> Picture:
         """
-        Decode a packet to its tag and picture.
+        Decode a packet, as :func:`split` returns it.
 
         :raises CodecError: the packet is damaged, or its picture is larger than ``max_pixels``.
         """
-        tag, extra, coded = split(packet)
         layout = LAYOUTS.get(tag.encoding)
         if layout is None or layout.kind != 'deep':
             raise CodecError(f"a packet of encoding '{tag.encoding}'", 'damage')
@@ -102,7 +100,7 @@ class DeepDecoder:
                     max(NARROWEST, tag.width), tag.height * halves)):
             self._codec = None
             raise CodecError('an FFV1 picture of another size than its tag says', 'damage')
-        return tag, _picture(frames[0], tag, halves)
+        return _picture(frames[0], tag, halves)
 
 
 def split(packet: bytes) -> tuple[Tag, bytes, bytes]:
