@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import array
 from collections.abc import Callable
+import functools
 from typing import Any
 
 import pytest
@@ -41,10 +42,11 @@ def start(bench: Bench, role: str, *words: str) -> list[str]:
     return bench.start(role, *words, package='point_cloud_stream')
 
 
-def pair(bench: Bench, *words: str, topic: str = '/points') -> None:
-    """Start both, from a topic to the same one below /seen."""
-    start(bench, 'encoder', '-r', f'points:={topic}', *words)
-    start(bench, 'decoder', '-r', f'points:=/seen{topic}', '-p', f'stream:={topic}/pointcloud')
+def pair(bench: Bench, *words: str, topic: str = '/points') -> tuple[list[str], list[str]]:
+    """Start both, from a topic to the same one below /seen; return what each writes."""
+    return (start(bench, 'encoder', '-r', f'points:={topic}', *words),
+            start(bench, 'decoder', '-r', f'points:=/seen{topic}', '-p',
+                  f'stream:={topic}/pointcloud'))
 
 
 def points(got: PointCloud2) -> Any:
@@ -53,7 +55,7 @@ def points(got: PointCloud2) -> Any:
 
 def test_clouds_of_several_streams_come_out_as_they_went_in(bench: Bench) -> None:
     pair(bench)
-    pair(bench, topic='/rear')
+    encoder, decoder = pair(bench, topic='/rear')
     publish = [source(bench), source(bench, '/rear')]
     seen = bench.heard(PointCloud2, '/seen/points', BEST_EFFORT)
     bench.until(lambda: len(seen) >= 5, 'clouds', meanwhile=lambda: [p() for p in publish])
@@ -83,12 +85,31 @@ def test_clouds_of_several_streams_come_out_as_they_went_in(bench: Bench) -> Non
                 assert (after[name] == SCAN[name]).all()
     # a busy computer's encoder may have taken a coarser resolution
     assert min(errors) <= 0.0005 and max(errors) <= COARSEST / 2
-    # one that dies stops nobody
+    damage_is_one_warning(bench, encoder, decoder)
+    # good clouds go on, also when a decoder dies
     process, _, _ = bench.processes.pop()
     process.kill()
     process.wait(60)
-    before = len(seen)
-    bench.until(lambda: len(seen) >= before + 10, 'clouds', meanwhile=publish[0])
+    before = len(seen), len(rear)
+    bench.until(lambda: len(seen) >= before[0] + 10 and len(rear) > before[1], 'clouds',
+                meanwhile=lambda: [p() for p in publish])
+
+
+def damage_is_one_warning(bench: Bench, encoder: list[str], decoder: list[str]) -> None:
+    """Send coded clouds to the decoder and clouds to the encoder that are damaged."""
+    cut = b'\0\1\0\0\1'
+    for kind, topic, lines, damaged in (
+            (CompressedImage, '/rear/pointcloud', decoder, {
+                'no point cloud': CompressedImage(data=array.array('B', bytes(100))),
+                'a layout that was cut': CompressedImage(), 'ends too soon': cut}),
+            (PointCloud2, '/rear', encoder, {
+                'ends too soon': cut, 'not float32': PointCloud2(
+                    height=1, width=1, point_step=4, row_step=4,
+                    data=array.array('B', bytes(4)))})):
+        publisher = bench.node.create_publisher(kind, topic, RELIABLE)
+        for text, bad in damaged.items():
+            bench.until(lambda text=text, lines=lines: any(text in line for line in lines),
+                        'a warning', meanwhile=functools.partial(publisher.publish, bad))
 
 
 def test_large_clouds_cross_a_link_that_loses_messages(root: None, bench: Bench) -> None:
@@ -98,23 +119,3 @@ def test_large_clouds_cross_a_link_that_loses_messages(root: None, bench: Bench)
         seen = bench.heard(PointCloud2, '/seen/points')
         bench.until(lambda: len(seen) >= 3, 'clouds', timeout=60, meanwhile=source(bench))
     assert all(bytes(got.data) == SCAN.tobytes() for got in seen)
-
-
-def test_what_is_damaged_is_one_warning(bench: Bench) -> None:
-    """Coded clouds for the decoder and clouds for the encoder; good clouds go on."""
-    decoder = start(bench, 'decoder', '-r', 'points:=/seen/points', '-p', 'stream:=/s')
-    seen = bench.heard(PointCloud2, '/seen/points')
-    stream = bench.node.create_publisher(CompressedImage, '/s', RELIABLE)
-    bench.until(stream.get_subscription_count, 'the decoder')
-    cut = b'\0\1\0\0\1'
-    for text, bad in (('no point cloud', CompressedImage(data=array.array('B', bytes(100)))),
-                      ('a layout that was cut', CompressedImage()), ('ends too soon', cut)):
-        bench.until(lambda text=text: any(text in line for line in decoder), 'a warning',
-                    meanwhile=lambda bad=bad: stream.publish(bad))
-    encoder = start(bench, 'encoder', '-r', 'points:=/points', '-p', 'stream:=/s')
-    clouds = bench.node.create_publisher(PointCloud2, '/points', RELIABLE)
-    for text, bad in (('ends too soon', cut), ('not float32', PointCloud2(
-            height=1, width=1, point_step=4, row_step=4, data=array.array('B', bytes(4))))):
-        bench.until(lambda text=text: any(text in line for line in encoder), 'a warning',
-                    meanwhile=lambda bad=bad: clouds.publish(bad))
-    bench.until(lambda: seen, 'a cloud', meanwhile=source(bench))

@@ -321,7 +321,7 @@ class _Link:
 
 @contextlib.contextmanager
 def _dashboard() -> Iterator[Target]:
-    page = dashboard.Dashboard(_Source())
+    page = dashboard.Dashboard(cast(Any, _Source()))
     page.token = TOKEN
     host = f'Host: {page.hosts[0]}\r\n{dashboard.HEADER}: {TOKEN}\r\n'
     body = '{"name": "m", "force": true}'
@@ -332,7 +332,7 @@ def _dashboard() -> Iterator[Target]:
     try:
         yield Target(
             [each.encode() for each in valid], lambda data: dashboard._Handler(
-                cast(Any, _Link(data)), ('127.0.0.1', 1), page._server),
+                cast(Any, _Link(data)), ('127.0.0.1', 1), page),
             (ConnectionError, TimeoutError))
     finally:
         page.close()

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Callable, Iterator
 import dataclasses
 from fractions import Fraction
 import json
-from pathlib import Path
 import struct
 import subprocess
 import sys
@@ -26,42 +26,59 @@ from image_transport_h264.codec import Damaged, Decoder, Encoder, Packet, Pictur
 #: Bytes that decoding may take.
 LIMIT = 300e6
 SIDE = 4096
-#: Decodes what a file has, as a node does, and prints how many bytes more the process held.
+#: Decodes what a file has, as a node does, in a fork for each line of the input. Prints how many
+#: bytes more the process held.
 DECODE = """\
-import base64, json, re, sys
+import base64, json, os, re, sys
 from pathlib import Path
 from image_transport_h264 import stills
 from image_transport_h264.codec import CodecError, Decoder, Encoder, Picture
-packets = [(form, base64.b64decode(data))
-           for form, data in json.loads(Path(sys.argv[1]).read_text())]
-decoder = Decoder()
-small = Picture(64, 64, 'bgr8', 192, bytes(64 * 64 * 3))
-decoder.decode(Encoder().encode(small).data)
-stills.decode('', stills.encode(small, 'png')[1])
-Path('/proc/self/clear_refs').write_text('5')
 def peak():
     return 1024 * int(re.search(r'VmHWM:\\s*(\\d+)', Path('/proc/self/status').read_text())[1])
-before = peak()
-shown, why = None, ''
-for form, data in packets:
-    try:
-        shown = stills.decode(form, data) if form else decoder.decode(data)
-    except CodecError as error:
-        shown, why = None, why or str(error)
-print(peak() - before, shown and (shown.width, shown.height), why, sep=';')
+for line in sys.stdin:
+    if os.fork():
+        if os.wait()[1]:
+            print(0, 'killed', '', sep=';', flush=True)
+        continue
+    packets = [(form, base64.b64decode(data))
+               for form, data in json.loads(Path(line.strip()).read_text())]
+    decoder = Decoder()
+    small = Picture(64, 64, 'bgr8', 192, bytes(64 * 64 * 3))
+    decoder.decode(Encoder().encode(small).data)
+    stills.decode('', stills.encode(small, 'png')[1])
+    Path('/proc/self/clear_refs').write_text('5')
+    before = peak()
+    shown, why = None, ''
+    for form, data in packets:
+        try:
+            shown = stills.decode(form, data) if form else decoder.decode(data)
+        except CodecError as error:
+            shown, why = None, why or str(error)
+    print(peak() - before, shown and (shown.width, shown.height), why, sep=';', flush=True)
+    os._exit(0)
 """
+#: Decodes packets in a process of their own; returns its additional memory, the size shown, the
+#: error.
+Decode = Callable[..., tuple[int, str, str]]
 
 
-def decode(folder: Path, *packets: tuple[str, bytes]) -> tuple[int, str, str]:
-    """Decode in a process of its own; return its additional memory, the size shown, the error."""
-    (folder / 'packets').write_text(json.dumps(
-        [(form, base64.b64encode(data).decode()) for form, data in packets]))
-    done = subprocess.run([sys.executable, '-c', DECODE, str(folder / 'packets')],
-                          capture_output=True, text=True, timeout=60, cwd=folder)
-    assert done.returncode == 0, done.stderr
-    taken, shown, why = done.stdout.strip().split(';')
-    print(f'{int(taken) / 1e6:.0f} MB, shown {shown}, {why}')
-    return int(taken), shown, why
+@pytest.fixture(scope='module')
+def decode(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Decode]:
+    file = tmp_path_factory.mktemp('bombs') / 'packets'
+    with subprocess.Popen([sys.executable, '-c', DECODE], stdin=subprocess.PIPE,
+                          stdout=subprocess.PIPE, text=True) as judge:
+        assert judge.stdin and judge.stdout
+        reader, writer = judge.stdout, judge.stdin
+
+        def decode(*packets: tuple[str, bytes]) -> tuple[int, str, str]:
+            file.write_text(json.dumps(
+                [(form, base64.b64encode(data).decode()) for form, data in packets]))
+            print(file, file=writer, flush=True)
+            taken, shown, why = reader.readline().strip().split(';')
+            return int(taken), shown, why
+
+        yield decode
+        writer.close()
 
 
 def png(width: int, height: int, depth: int, colours: int) -> bytes:
@@ -93,31 +110,31 @@ def retag(packet: Packet, **fields: int) -> bytes:
     return annexb.insert(dataclasses.replace(tag, **fields), coded)
 
 
-def test_a_large_png_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
+def test_a_large_png_is_refused_before_it_is_decoded(decode: Decode) -> None:
     data = png(12000, 12000, 8, 6)
     assert len(data) < 700_000
-    taken, shown, why = decode(tmp_path, ('bgra8; png compressed bgra8', data))
+    taken, shown, why = decode(('bgra8; png compressed bgra8', data))
     assert taken < LIMIT and shown == 'None' and 'max_pixels' in why, (taken, why)
 
 
-def test_a_png_chunk_longer_than_its_file_is_refused(tmp_path: Path) -> None:
+def test_a_png_chunk_longer_than_its_file_is_refused(decode: Decode) -> None:
     data = bytearray(png(64, 48, 8, 2))
     data[33:37] = struct.pack('>I', 1_900_000_000)  # the length of IDAT
-    taken, shown, why = decode(tmp_path, ('png', bytes(data)))
+    taken, shown, why = decode(('png', bytes(data)))
     assert taken < LIMIT and shown == 'None' and 'longer than the file' in why, (taken, why)
 
 
-def test_a_png_of_deep_colours_is_refused(tmp_path: Path) -> None:
-    taken, shown, why = decode(tmp_path, ('bgra8; png', png(SIDE, SIDE, 16, 6)))
+def test_a_png_of_deep_colours_is_refused(decode: Decode) -> None:
+    taken, shown, why = decode(('bgra8; png', png(SIDE, SIDE, 16, 6)))
     assert taken < LIMIT and shown == 'None' and '16-bit' in why, (taken, why)
 
 
-def test_a_large_jpeg_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
+def test_a_large_jpeg_is_refused_before_it_is_decoded(decode: Decode) -> None:
     _, coded = cv2.imencode('.jpg', numpy.zeros((16, 16, 3), numpy.uint8))
     data = bytearray(coded.tobytes())
     at = data.index(b'\xff\xc0')
     data[at + 5:at + 9] = struct.pack('>HH', 20000, 20000)
-    taken, shown, why = decode(tmp_path, ('bgr8; jpeg', bytes(data)))
+    taken, shown, why = decode(('bgr8; jpeg', bytes(data)))
     assert taken < LIMIT and shown == 'None' and 'max_pixels' in why, (taken, why)
 
 
@@ -138,17 +155,17 @@ def test_other_formats_never_reach_their_decoders(data: bytes) -> None:
         stills.decode('', data)
 
 
-def test_a_large_h264_picture_is_refused_before_decoding(tmp_path: Path) -> None:
+def test_a_large_h264_picture_is_refused_before_decoding(decode: Decode) -> None:
     data = Encoder(Settings(preset='ultrafast')).encode(black(10240, 8192)).data
     assert len(data) < 400_000
-    taken, shown, why = decode(tmp_path, ('', data))
+    taken, shown, why = decode(('', data))
     assert taken < LIMIT and shown == 'None' and 'max_pixels' in why, (taken, why)
     # as from another encoder
-    taken, shown, why = decode(tmp_path, ('', annexb.extract(data)[1]))
+    taken, shown, why = decode(('', annexb.extract(data)[1]))
     assert taken < LIMIT and shown == 'None' and 'max_pixels' in why, (taken, why)
 
 
-def test_many_reference_frames_are_refused(tmp_path: Path) -> None:
+def test_many_reference_frames_are_refused(decode: Decode) -> None:
     """The size is allowed, but 16 frames of it would be kept."""
     import av
     codec = av.CodecContext.create('libx264', 'w')
@@ -161,7 +178,7 @@ def test_many_reference_frames_are_refused(tmp_path: Path) -> None:
         deep.lines(frame, 1)[:] = deep.lines(frame, 2)[:] = 128
         frame.pts = number
         packets += [('', bytes(packet)) for packet in codec.encode(frame)]
-    taken, shown, why = decode(tmp_path, *packets)
+    taken, shown, why = decode(*packets)
     assert taken < LIMIT and shown == 'None' and 'max_pixels' in why, (taken, why)
 
 
@@ -172,7 +189,7 @@ def wrapped(tag: annexb.Tag, extra: bytes, coded: bytes) -> bytes:
             + extra + coded)
 
 
-def test_many_slices_of_a_deep_picture_are_refused(tmp_path: Path) -> None:
+def test_many_slices_of_a_deep_picture_are_refused(decode: Decode) -> None:
     """Each slice has contexts of its own, however small the picture is."""
     import av
     codec = av.CodecContext.create('ffv1', 'w')
@@ -185,13 +202,13 @@ def test_many_slices_of_a_deep_picture_are_refused(tmp_path: Path) -> None:
     tag = annexb.Tag(1, 0, True, 1024, 1024, '16UC1', 2048, False)
     data = wrapped(tag, bytes(codec.extradata), coded)
     assert len(data) < 20_000
-    taken, shown, why = decode(tmp_path, ('', data))
+    taken, shown, why = decode(('', data))
     assert taken < 100e6 and shown == 'None', (taken, shown)
 
 
 @pytest.mark.parametrize('encoding, pixel_bytes', [('bgr8', 3), ('16UC1', 2)])
 def test_rows_longer_than_any_picture_s_are_refused(
-    encoding: str, pixel_bytes: int, tmp_path: Path,
+    encoding: str, pixel_bytes: int, decode: Decode,
 ) -> None:
     packet = Encoder().encode(black(64, 1024, encoding, pixel_bytes))
     if packet.format == 'h264':
@@ -199,24 +216,24 @@ def test_rows_longer_than_any_picture_s_are_refused(
     else:
         tag, extra, coded = deep.split(packet.data)
         data = wrapped(dataclasses.replace(tag, step=2 ** 20), extra, coded)
-    taken, shown, why = decode(tmp_path, ('', data))
+    taken, shown, why = decode(('', data))
     assert taken < LIMIT and shown == 'None', (taken, shown)
 
 
 @pytest.mark.parametrize('encoding, pixel_bytes, lossless', [
     ('rgba8', 4, False), ('bgr8', 3, True), ('16UC1', 2, False)])
 def test_the_largest_allowed_picture_stays_below_the_limit(
-    encoding: str, pixel_bytes: int, lossless: bool, tmp_path: Path,
+    encoding: str, pixel_bytes: int, lossless: bool, decode: Decode,
 ) -> None:
     encoder = Encoder(Settings(lossless=lossless))
     packets = [('', encoder.encode(black(SIDE, SIDE, encoding, pixel_bytes)).data)
                for _ in range(2)]
-    taken, shown, why = decode(tmp_path, *packets)
+    taken, shown, why = decode(*packets)
     assert shown == f'({SIDE}, {SIDE})' and taken < LIMIT, (taken, why)
 
 
-def test_the_largest_allowed_png_stays_below_the_limit(tmp_path: Path) -> None:
-    taken, shown, why = decode(tmp_path, ('bgra8; png', png(SIDE, SIDE, 8, 6)))
+def test_the_largest_allowed_png_stays_below_the_limit(decode: Decode) -> None:
+    taken, shown, why = decode(('bgra8; png', png(SIDE, SIDE, 8, 6)))
     assert shown == f'({SIDE}, {SIDE})' and taken < LIMIT, (taken, why)
 
 

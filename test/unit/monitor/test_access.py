@@ -225,19 +225,6 @@ def coordinated(monkeypatch, spec, *, on_robot=False):
         launch=SimpleNamespace(id='abc123', provider=lambda _: FakeProvider()))))
 
 
-@pytest.mark.parametrize(('launch_foxglove', 'beside'), [(True, True), (False, False)])
-def test_gate_forwards_to_the_providers_application(
-    monkeypatch, made, launch_foxglove, beside,
-):
-    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(containers=False))
-    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(application_port=8080))
-    coordinated(monkeypatch, MachineSpec(
-        'pod', 'fake', features={'monitor': {'launch_foxglove': launch_foxglove}}))
-    Foxglove('pod').execute(LaunchContext())
-    words = ' '.join(made[0].arguments)
-    assert ('--application 127.0.0.1:8080' in words) is beside and '--image' not in words
-
-
 @pytest.mark.parametrize(('runs', 'on_robot'), [(True, False), (False, False), (True, True)])
 def test_bridge_gets_the_options_of_the_machine(monkeypatch, made, runs, on_robot):
     monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(containers=runs))
