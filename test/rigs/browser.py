@@ -34,10 +34,9 @@ class Browser:
     One page in a browser of its own.
 
     :param width: of the window, ``height`` too, in pixels.
-    :param dark: whether the user prefers dark colours.
     """
 
-    def __init__(self, *, width: int = 1280, height: int = 900, dark: bool = False) -> None:
+    def __init__(self, *, width: int = 1280, height: int = 900) -> None:
         import websocket
         found = program()
         assert found is not None
@@ -48,7 +47,7 @@ class Browser:
                 [found, '--headless=new', '--disable-gpu', '--no-first-run', '--mute-audio',
                  '--disable-background-networking', '--disable-component-update',
                  '--disable-dev-shm-usage', '--disable-sync', '--no-proxy-server',
-                 '--remote-debugging-port=0', f'--window-size={width},{height}',
+                 '--remote-debugging-port=0',
                  f'--user-data-dir={self._folder}/profile',
                  # as root it has no sandbox
                  *(['--no-sandbox'] if os.geteuid() == 0 else []), 'about:blank'],
@@ -74,7 +73,7 @@ class Browser:
         self.requested: list[str] = []
         for part in ('Page', 'Runtime', 'Network', 'Log'):
             self.do(f'{part}.enable')
-        self.prefer(dark=dark)
+        self.prefer(dark=False)
         self.size(width, height)
 
     def do(self, method: str, **parameters: Any) -> dict[str, Any]:
@@ -132,11 +131,9 @@ class Browser:
 
     def until(self, expression: str, *, timeout: float = 60.0) -> Any:
         """Wait until an expression is true in the page, and return its value."""
-        def there() -> Any:
-            return self.ask(expression)
-
         try:
-            return wait_until(there, timeout=timeout, what=expression, longest=0.1)
+            return wait_until(lambda: self.ask(expression), timeout=timeout, what=expression,
+                              longest=0.1)
         except RuntimeError as error:
             raise AssertionError(
                 f'{error}; the page shows: {self.text()[:3000]} {self.complaints}') from error
@@ -152,12 +149,10 @@ class Browser:
             self.do('Input.dispatchKeyEvent', type=kind, key=key, code=key,
                     windowsVirtualKeyCode=code, **(text if kind == 'keyDown' else {}))
 
-    def screenshot(self, path: Path, *, whole: bool = False) -> None:
-        """Write what is seen (or the whole page) as PNG."""
-        more: dict[str, Any] = {'captureBeyondViewport': whole}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(base64.b64decode(
-            self.do('Page.captureScreenshot', format='png', **more)['data']))
+    def screenshot(self, path: Path) -> None:
+        """Write the whole page as PNG."""
+        path.write_bytes(base64.b64decode(self.do(
+            'Page.captureScreenshot', format='png', captureBeyondViewport=True)['data']))
 
     def close(self) -> None:
         """End the browser and forget what it kept."""

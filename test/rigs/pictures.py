@@ -116,7 +116,7 @@ def dashboard(path: Path) -> None:
         launched.wait_for('I heard', times=WATCHED)
         browser.until('[...document.querySelectorAll("figure img")].filter('
                       'image => image.complete && image.naturalWidth === 640).length === 2')
-        browser.screenshot(path, whole=True)
+        browser.screenshot(path)
 
 
 def main() -> int:
