@@ -144,12 +144,13 @@ class LazyNode(Node):
         self._counts[publisher] = 0
         return publisher
 
-    def fitting(self, topic: str, qos: QoSProfile) -> QoSProfile:
-        """Return the profile, with best effort unless all publishers of the topic are reliable."""
-        kinds = [info.qos_profile.reliability for info in self.get_publishers_info_by_topic(topic)]
-        if kinds and all(kind == ReliabilityPolicy.RELIABLE for kind in kinds):
-            return qos
-        return best_effort(qos)
+
+def fitting(node: Node, topic: str, qos: QoSProfile) -> QoSProfile:
+    """Return the profile, with best effort unless all publishers of the topic are reliable."""
+    kinds = [info.qos_profile.reliability for info in node.get_publishers_info_by_topic(topic)]
+    if kinds and all(kind == ReliabilityPolicy.RELIABLE for kind in kinds):
+        return qos
+    return best_effort(qos)
 
 
 class Tap:
@@ -160,7 +161,7 @@ class Tap:
     """
 
     def __init__(
-        self, node: LazyNode, kind: Any, topic: str, qos: QoSProfile,
+        self, node: Node, kind: Any, topic: str, qos: QoSProfile,
         heard: Callable[[bytes], None], *, adapt: bool = True,
     ) -> None:
         self._node, self._kind, self._topic = node, kind, topic
@@ -186,15 +187,15 @@ class Tap:
         self._node.destroy_subscription(old)
 
     def _subscribe(self) -> None:
-        qos = self._node.fitting(self._topic, self._qos) if self._adapt else self._qos
+        qos = fitting(self._node, self._topic, self._qos) if self._adapt else self._qos
         self._reliability = qos.reliability
         events = SubscriptionEventCallbacks(matched=self._matched if self._adapt else None)
         self._subscription = self._node.create_subscription(
             self._kind, self._topic, self._heard, qos, event_callbacks=events, raw=True)
 
     def _matched(self, _: Any) -> None:
-        fitting = self._node.fitting(self._topic, self._qos).reliability
-        if self._subscription is not None and fitting != self._reliability:
+        reliability = fitting(self._node, self._topic, self._qos).reliability
+        if self._subscription is not None and reliability != self._reliability:
             self.want(False)
             self._subscribe()
 

@@ -30,7 +30,6 @@ from typing import Any, Optional, TYPE_CHECKING
 import rclpy
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray
 
 from fogros2 import ros_types
@@ -46,6 +45,7 @@ from fogros2_monitor.dashboard.ways import (
     Topic,
 )
 from image_transport_h264 import ending
+from image_transport_h264.lazy import Tap
 from image_transport_h264.sharing import claim_of, UNLIMITED, VALID
 
 if TYPE_CHECKING:
@@ -66,19 +66,11 @@ class _Ear:
 
     def __init__(self, node: Node, topic: str, kind: str) -> None:
         self.meter = Meter(time.monotonic())
-        self._node, self._topic = node, topic
-        self._class = ros_types.message(kind)
-        self._subscription: Optional[Subscription] = None
+        self._tap = Tap(node, ros_types.message(kind), topic, _QOS, self._heard, adapt=False)
 
     def look(self, *, wanted: bool) -> None:
         """Subscribe or unsubscribe."""
-        wanted = self.meter.wants(time.monotonic()) and wanted
-        if wanted and self._subscription is None:
-            self._subscription = self._node.create_subscription(
-                self._class, self._topic, self._heard, _QOS, raw=True)
-        elif not wanted and self._subscription is not None:
-            self._node.destroy_subscription(self._subscription)
-            self._subscription = None
+        self._tap.want(self.meter.wants(time.monotonic()) and wanted)
 
     def _heard(self, data: bytes) -> None:
         self.meter.heard(time.monotonic(), len(data))

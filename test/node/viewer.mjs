@@ -6,9 +6,8 @@
 //
 // Takes {subscribe: TOPIC}, {unsubscribe: TOPIC}, {publish: TOPIC, schemaName, definition, message},
 // {call: SERVICE, request} or with {payload: BASE64}, {get: PARAMETERS}, {set: [{name, value}]},
-// {follow: PARAMETERS}, {fetch: URI} and {pause: true}, after which it reads nothing more. Tells
-// {open}, {channel}, {gone}, {message}, {service}, {withdrawn}, {called, response}, {parameters},
-// {asset}, {capabilities}, {status} and {error}.
+// {follow: PARAMETERS} and {fetch: URI}. Tells {open}, {channel}, {gone}, {message}, {service},
+// {withdrawn}, {called, response}, {parameters}, {asset}, {capabilities}, {status} and {error}.
 import protocol from '@foxglove/ws-protocol';
 import rosmsg from '@foxglove/rosmsg';
 import serialization from '@foxglove/rosmsg2-serialization';
@@ -91,7 +90,7 @@ readline.createInterface({ input: process.stdin }).on('line', (line) => {
   const wish = JSON.parse(line);
   if (wish.subscribe) {
     const channel = channels.get(wish.subscribe);
-    const reader = channel.encoding === 'cdr' && !wish.raw
+    const reader = channel.encoding === 'cdr'
       ? new serialization.MessageReader(rosmsg.parse(channel.schema, { ros2: true })) : undefined;
     subscriptions.set(client.subscribe(channel.id), { topic: wish.subscribe, reader });
   } else if (wish.unsubscribe) {
@@ -121,7 +120,5 @@ readline.createInterface({ input: process.stdin }).on('line', (line) => {
   } else if (wish.fetch) {
     assets.set(assets.size + 1, wish.fetch);
     client.fetchAsset(wish.fetch, assets.size);
-  } else if (wish.pause) {
-    socket._socket.pause();
   }
 }).on('close', () => process.exit(0));

@@ -99,7 +99,7 @@ class Viewer:
         self._process.stdin.write(json.dumps(what) + '\n')
         self._process.stdin.flush()
 
-    def until(self, key: str, value: Any = None, *, timeout: float = 60.0) -> dict[str, Any]:
+    def until(self, key: str, value: Any = None) -> dict[str, Any]:
         """Return the next of what it tells that has ``key``, and under it ``value`` if given."""
         def fits(told: dict[str, Any]) -> bool:
             return key in told and value in (None, told[key])
@@ -108,7 +108,7 @@ class Viewer:
             if fits(told):
                 self._kept.remove(told)
                 return told
-        deadline = time.monotonic() + timeout
+        deadline = time.monotonic() + 60.0
         while True:
             told = self._told.get(timeout=max(0.0, deadline - time.monotonic()))
             if fits(told):
@@ -121,10 +121,10 @@ class Viewer:
             self._kept.append(self._told.get())
         return self._kept
 
-    def look(self, topic: str, **more: Any) -> dict[str, Any]:
+    def look(self, topic: str) -> dict[str, Any]:
         """Look at a topic once it is there; return its channel."""
         channel = self.until('channel', topic)
-        self.wish(subscribe=topic, **more)
+        self.wish(subscribe=topic)
         return channel
 
     def message(self, topic: str) -> Any:

@@ -39,31 +39,6 @@ class Bench:
             cancel=lambda: setattr(self, 'running', False))
 
 
-def test_newest_message_of_a_period_is_sent() -> None:
-    bench = Bench('std_msgs/msg/String')
-    for data in (b'a', b'b', b'c'):
-        bench.leaving.heard(data)
-    assert bench.sent == [b'a']
-    bench.expire()
-    assert bench.sent == [b'a', b'c'] and bench.running
-    bench.expire()
-    assert not bench.running
-    bench.leaving.heard(b'd')
-    assert bench.sent == [b'a', b'c', b'd']
-
-
-def test_newest_transform_of_each_child_frame_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, 'deserialize_message', lambda data, kind: SimpleNamespace(
-        transforms=[SimpleNamespace(child_frame_id=word[0], at=word[1:])
-                    for word in data.decode().split()]))
-    bench = Bench(limits.TRANSFORMS)
-    for data in (b'a0', b'b1', b'a2 c2', b'b3'):
-        bench.leaving.heard(data)
-    bench.expire()
-    assert [[one.child_frame_id + one.at for one in message] for message in bench.sent] == [
-        ['a0'], ['b3', 'a2', 'c2']]
-
-
 def test_message_does_not_return() -> None:
     bench = Bench('std_msgs/msg/String')
     bench.leaving.subscription = object()
