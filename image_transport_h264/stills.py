@@ -128,14 +128,11 @@ def bgr(picture: Picture) -> Pixels:
     """
     Return a checked picture as an array of OpenCV's: grey, BGR or BGRA.
 
-    :raises BadPicture: OpenCV has no such pixels.
+    :param picture: of another encoding than '32FC1', which OpenCV does not have.
     """
     layout = picture.layout
     rows = numpy.ascontiguousarray(picture.rows())
     if layout.kind == 'deep':
-        if layout.pixel_bytes != 2:
-            raise BadPicture(f'OpenCV has no picture of {picture.encoding}',
-                             f'encoding {picture.encoding!r}')
         values = rows.view('>u2' if picture.is_bigendian else '<u2')
         return values.astype(numpy.uint16)
     if layout.kind == 'grey':

@@ -19,7 +19,6 @@ import json
 from pathlib import Path
 import re
 import secrets
-import socket
 import sys
 from typing import Any, Optional, TYPE_CHECKING
 import urllib.parse
@@ -82,11 +81,8 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = 'HTTP/1.1'
     server_version, sys_version = 'fogros2', ''
     timeout = SILENCE
+    disable_nagle_algorithm = True
     server: Dashboard
-
-    def setup(self) -> None:
-        super().setup()
-        self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def log_message(self, format: str, *args: Any) -> None:
         """Log nothing: the terminal shows the URL of the page."""
