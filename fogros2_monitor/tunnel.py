@@ -61,15 +61,17 @@ class Tunnel:
         self._open: set[socket.socket] = set()
         self._listener = socket.create_server(('127.0.0.1', port))
         self.port: int = self._listener.getsockname()[1]
-        #: The thread that accepts connections.
-        self.serving = threading.Thread(target=self._serve, name='fog-tunnel', daemon=True)
-        self.serving.start()
+        #: Set when no connection is accepted any more.
+        self.ended = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name='fog-monitor', daemon=True)
+        self._thread.start()
 
     def _serve(self) -> None:
         while True:
             try:
                 link, _ = self._listener.accept()
             except OSError:
+                self.ended.set()
                 return
             if accounts.is_foreign(link):  # each connection runs a program on the machine
                 link.close()
@@ -88,7 +90,7 @@ class Tunnel:
             for link in self._open:
                 with contextlib.suppress(OSError):
                     link.shutdown(socket.SHUT_RDWR)
-        self.serving.join()
+        self._thread.join()
 
     def _carry(self, link: socket.socket) -> None:
         host, port = self._to

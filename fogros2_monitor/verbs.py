@@ -92,7 +92,7 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
                 page = say(f'{entry.name} is at {{}} until Ctrl-C; in a browser:',
                            host_port('localhost', tunnel.port), token)
                 with browser_at(page, start=browser):
-                    tunnel.serving.join()
+                    tunnel.ended.wait()
             except KeyboardInterrupt:
                 print()
     return 0

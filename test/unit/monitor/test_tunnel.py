@@ -48,7 +48,7 @@ def tunnel(port: int) -> Iterator[tuple[int, list[str]]]:
     finally:
         made.close()
         shell.close()
-        assert not made.serving.is_alive()
+        assert made.ended.is_set()
 
 
 def received(link: socket.socket, size: int) -> bytes:
