@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import threading
 from typing import TYPE_CHECKING
 
 from ros2fog_cli.verb import add_name, add_region, VerbExtension, warn
@@ -69,6 +67,8 @@ class MonitorVerb(VerbExtension):
 
 def serve(entry: Entry, port: int, browser: bool) -> int:
     """Forward a port of this computer to the machine's bridge until Ctrl-C."""
+    import contextlib
+
     from fogros2.errors import ConfigurationError
     from fogros2.model import host_port
     from fogros2_monitor import access, addresses
@@ -144,6 +144,8 @@ class DashboardVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Serve the page until Ctrl-C."""
+        import threading
+
         from fogros2_monitor.browser import browser_at
         from fogros2_monitor.dashboard.server import Dashboard
         from ros2fog_cli.api.live import Live
