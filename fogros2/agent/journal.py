@@ -7,7 +7,11 @@ import contextlib
 import os
 import time
 
-from fogros2.agent.protocol import say
+from fogros2.agent.protocol import dump, say
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from fogros2.events import AgentEvent
 
 #: Bytes to read or send at once.
 BLOCK = 1 << 18
@@ -106,16 +110,14 @@ class Journal:
         """The oldest seq that exists; the next seq if the journal is empty."""
         return self.files[0].first
 
-    def append(self, lines: list[bytes]) -> None:
-        """Number and write events, given without the first brace: ``"event":...}``."""
-        stamp = b'"time":%.6f,' % time.time()
-        first, self.next = self.next, self.next + len(lines)
-        data = b''.join(
-            b'{"seq":%d,' % seq + stamp + line for seq, line in enumerate(lines, first))
+    def append(self, event: AgentEvent) -> None:
+        """Number and write an event."""
+        number, self.next = self.next, self.next + 1
+        data = dump({'seq': number, 'time': time.time(), **event})
         try:
             file = self.files[-1]
             if file.size and file.size + len(data) > self.limit:
-                file = self.rotate(first)
+                file = self.rotate(number)
             written = os.write(file.fd, data)
             if written < len(data):
                 os.ftruncate(file.fd, file.size)

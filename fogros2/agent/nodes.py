@@ -17,14 +17,14 @@ import time
 from fogros2.agent.loop import Loop, Timer
 from fogros2.agent.processes import MARK, Processes, remove_tree, search_path
 from fogros2.agent.programs import check_program, find_executable, interpreter, resolve
-from fogros2.agent.protocol import dump, Refused
+from fogros2.agent.protocol import Refused
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any, Optional
 
     from fogros2.agent.protocol import Json
-    from fogros2.events import AgentRestarted, NodeStatus
+    from fogros2.events import NodeStatus
 
 #: Maximum number of bytes in one output event, and of such pieces in a pipe.
 CHUNK, CHUNKS = 1 << 16, 16
@@ -118,18 +118,18 @@ class Nodes:
     The nodes of a machine.
 
     :param config: the agent's configuration, see ``CONFIG``.
-    :param write: appends events to the journal, see ``Journal.append``.
+    :param emit: sends an event to the robot.
     """
 
     def __init__(
         self, processes: Processes, directory: str, config: Json,
-        write: Callable[[list[bytes]], None],
+        emit: Callable[[Any], None],
     ) -> None:
         self.processes = processes
         self.loop = processes.loop
         self.directory = directory
         self.config = config
-        self.write = write
+        self.emit = emit
         self.mark = f'{os.getpid()}-{time.time_ns()}'
         #: The nodes of the launch that have been started, by id.
         self.known: dict[str, Node] = {}
@@ -244,8 +244,7 @@ class Nodes:
     # -- processes ------------------------------------------------------------------------------
 
     def _report(self, node: Node, event: str, **fields: Any) -> None:
-        self.write([dump({
-            'event': event, 'node': node.id, 'name': node.status['name'], **fields})[1:]])
+        self.emit({'event': event, 'node': node.id, 'name': node.status['name'], **fields})
 
     def _run(self, node: Node) -> None:
         """Start a node's process, or report why it cannot start."""
@@ -417,8 +416,7 @@ class Nodes:
     def sweep_former(self) -> None:
         """End the nodes of an agent that died here, and report it."""
         def swept() -> None:
-            event: AgentRestarted = {'event': 'restarted'}
-            self.write([dump(event)[1:]])
+            self.emit({'event': 'restarted'})
             self._swept()
 
         self.stopping = True

@@ -172,7 +172,7 @@ class Agent:
         self.loop = Loop()
         self.processes = Processes(self.loop, self.identity)
         self.watches = Watches(self.processes, self.emit)
-        self.nodes = Nodes(self.processes, self.directory, self.config, self.write)
+        self.nodes = Nodes(self.processes, self.directory, self.config, self.emit)
         self.watchdog = Watchdog(self.config, self.loop.clock())
         self.heartbeats = Heartbeats(
             self.loop, self.config, self.watchdog, self.save_deadlines)
@@ -373,11 +373,7 @@ class Agent:
 
     def emit(self, event: AgentEvent) -> None:
         """Append an event to the journal, and send it to the clients that follow."""
-        self.write([dump(event)[1:]])
-
-    def write(self, lines: list[bytes]) -> None:
-        """Append events as ``Journal.append`` does, and send them to the clients that follow."""
-        self.journal.append(lines)
+        self.journal.append(event)
         for client in list(self.clients):
             if client.position is not None and not client.out:
                 client.send()
@@ -400,11 +396,10 @@ class Agent:
             if not isinstance(request, dict):
                 raise Refused('a request is a JSON object')
             number, command = request.get('id'), request.get('command')
-            handler = HANDLERS.get(command) if isinstance(command, str) else None
+            handler = getattr(self, f'do_{command}', None)
             if handler is None:
-                raise Refused(f'no such command: {json.dumps(command)[:80]}',
-                              f"there are: {', '.join(sorted(HANDLERS))}", 'unknown')
-            answer = handler(self, client, request)
+                raise Refused(f'no such command: {json.dumps(command)[:80]}', kind='unknown')
+            answer = handler(client, request)
         except Refused as error:
             answer = error.answer
         except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
@@ -652,10 +647,6 @@ class Agent:
             if folder is not parent or os.path.basename(parent) == 'fogros2':
                 with self.identity.root(), contextlib.suppress(OSError):
                     os.rmdir(folder)
-
-
-HANDLERS: dict[str, Callable[[Agent, Client, Json], Any]] = {
-    name[3:]: getattr(Agent, name) for name in vars(Agent) if name.startswith('do_')}
 
 
 def detach() -> int:

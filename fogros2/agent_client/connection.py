@@ -299,7 +299,7 @@ class AgentClient:
     def _follow_on(self, stream: Stream) -> None:
         self._log_request = next(self._numbers)
         self._send(stream, to_json({
-            'id': self._log_request, 'command': 'log', 'from': self._next, 'follow': True,
+            'id': self._log_request, 'command': 'log', 'from': self._next,
         }).encode() + b'\n')
 
     def _send(self, stream: Stream, line: bytes) -> None:

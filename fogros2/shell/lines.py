@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Describe channels to programs on a machine, and read a program's output line by line."""
+"""Read the output of programs on a machine line by line."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 import contextlib
-import threading
-from typing import Optional, Protocol
+from typing import Optional, TYPE_CHECKING, Union
 
 from fogros2.errors import ConnectError, FogError
 from fogros2.process import Tail
 from fogros2.untrusted import DIGITS
+
+if TYPE_CHECKING:
+    import paramiko
+
+    from fogros2.shell import multiplexed
 
 #: Maximum bytes of a line, so that a machine cannot fill the robot's memory: JSON of empty lists
 #: takes 40 times as much when it is parsed. An agent's longest messages are output of 64 K
@@ -19,65 +23,9 @@ MAX_LINE = 1 << 20
 #: Maximum bytes that a command's standard output and standard error keep each; the oldest go.
 KEPT = 4 << 20
 _CHUNK = 1 << 16
-
-
-class Connection(Protocol):
-    """A connection to a machine, with many channels."""
-
-    def is_alive(self) -> bool:
-        """Return whether commands can start."""
-
-    def close(self) -> None:
-        """Close the connection, and its channels."""
-
-
-class Channel(Protocol):
-    """
-    A program on a machine: paramiko's Channel, or an object with the same interface.
-
-    Errors are OSErrors or FogErrors; a read that timed out raises TimeoutError.
-    """
-
-    #: Set when the exit status is known, or will never be known.
-    status_event: threading.Event
-    #: Whether an exit status of -1 means that a signal ended the program.
-    eof_received: int
-
-    def get_transport(self) -> Connection:
-        """Return the channel's connection."""
-
-    def settimeout(self, timeout: Optional[float], /) -> None:
-        """Set the time-out of reads in seconds, None: no time-out."""
-
-    def recv(self, size: int, /) -> bytes:
-        """Wait for standard output, and return up to ``size`` bytes; b'' at the end."""
-
-    def recv_stderr(self, size: int, /) -> bytes:
-        """Wait for standard error, and return up to ``size`` bytes; b'' at the end."""
-
-    def recv_stderr_ready(self) -> bool:
-        """Return whether standard error has arrived."""
-
-    def send(self, data: bytes, /) -> int:
-        """Send to standard input as much as there is room for; return the number of bytes."""
-
-    def sendall(self, data: bytes, /) -> None:
-        """Send to standard input, as fast as the program reads."""
-
-    def shutdown_write(self) -> None:
-        """Close standard input."""
-
-    def resize_pty(self, width: int, height: int, /) -> None:
-        """Set the size of the program's terminal, in characters."""
-
-    def exit_status_ready(self) -> bool:
-        """Return whether the exit status is known, or will never be known."""
-
-    def recv_exit_status(self) -> int:
-        """Wait for the exit, and return the exit status; -1 if it will never be known."""
-
-    def close(self) -> None:
-        """Close the channel, which ends a running program."""
+#: A program on a machine. Errors are OSErrors or FogErrors; a read that timed out raises
+#: TimeoutError.
+Channel = Union['paramiko.Channel', 'multiplexed.Channel']
 
 
 def take_errors(channel: Channel) -> bytes:

@@ -10,20 +10,26 @@ import dataclasses
 import getpass
 import threading
 import time
-from typing import Generic, Optional, TypeVar
+from typing import Generic, Optional, TYPE_CHECKING, TypeVar
 
 from fogros2.errors import Cancelled, ConnectError, DeadlineExceeded, FogError
 from fogros2.model import Command, Endpoint, Result
 from fogros2.shell import command_line, lines, relay, Stream, sync, terminal
-from fogros2.shell.lines import Channel, Connection, LineStream, Output, take_errors
+from fogros2.shell.lines import Channel, LineStream, Output, take_errors
 from fogros2.waiting import cancellable, noted, wait_until
+
+if TYPE_CHECKING:
+    import paramiko
+
+    from fogros2.shell import multiplexed
 
 #: Seconds to wait for further output after a command's end, as its children may still write.
 _DRAIN = 2.0
 #: Largest input in bytes that fits into a channel's window, and needs no thread.
 _INLINE = 1 << 16
 
-Link = TypeVar('Link', bound=Connection)
+#: A connection with many channels.
+Link = TypeVar('Link', 'paramiko.Transport', 'multiplexed.Link')
 
 
 class RemoteShell(sync.RsyncShell, Generic[Link]):
