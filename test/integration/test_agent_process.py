@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import contextlib
-import io
 import json
 import os
 from pathlib import Path
@@ -23,9 +22,13 @@ from typing import Any, Optional
 import pytest
 
 from fogros2.agent.processes import SWEEP
+from fogros2.agent.protocol import Refused
+from fogros2.agent.server import Agent
 from fogros2.agent_client import agent_program, AgentClient, Heartbeat
-from fogros2.errors import AgentError, ConnectError
-from fogros2.model import Command, NodeSpec
+from fogros2.errors import AgentError
+from fogros2.model import Command, Endpoint, NodeSpec
+from fogros2.shell import Stream
+from fogros2.shell.local import LocalShell
 from fogros2.waiting import wait_until
 
 ME = pwd.getpwuid(os.getuid()).pw_name
@@ -35,60 +38,20 @@ ROS_VARIABLES = ('PATH', 'PYTHONPATH', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH')
 KEY = '5a' * 32
 
 
-class PipeStream:
-    """A program here in the place of one on a machine."""
-
-    def __init__(self, command: Command) -> None:
-        self.child = subprocess.Popen(
-            command.argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
-
-    def write(self, data: bytes) -> None:
-        assert self.child.stdin is not None
-        try:
-            while data:
-                data = data[self.child.stdin.write(data):]
-        except (OSError, ValueError) as error:
-            raise ConnectError('the pipe is gone') from error
-
-    def readline(self) -> bytes:
-        assert self.child.stdout is not None
-        try:
-            return self._lines.readline()
-        except ValueError:
-            return b''
-
-    @property
-    def _lines(self) -> Any:
-        if not hasattr(self, '_buffered'):
-            self._buffered = io.BufferedReader(self.child.stdout)  # type: ignore[arg-type]
-        return self._buffered
-
-    def close(self) -> None:
-        self.child.kill()
-        self.child.wait()
-
-
-class PipeShell:
-    """The part of a Shell that the client uses; ``cut`` loses the link, ``down`` keeps it so."""
+class CutShell(LocalShell):
+    """Reaches the agent of this computer; ``cut`` loses the connection."""
 
     def __init__(self) -> None:
-        self.streams: list[PipeStream] = []
-        self.down = False
+        super().__init__(Endpoint('local'), name='planner')
+        self.streams: list[Any] = []
 
-    def open(self, command: Command) -> PipeStream:
-        if self.down:
-            raise ConnectError('no route')
-        self.streams.append(PipeStream(command))
-        return self.streams[-1]
+    def open(self, command: Command) -> Stream:
+        self.streams.append(super().open(command))
+        stream: Stream = self.streams[-1]
+        return stream
 
     def cut(self) -> None:
-        self.streams[-1].child.kill()
-
-    def close(self) -> None:
-        for stream in self.streams:
-            stream.close()
-            stream.child.stdin.close()  # type: ignore[union-attr]
-            stream._lines.close()
+        self.streams[-1]._child.kill()
 
 
 def program(folder: Path) -> Path:
@@ -108,7 +71,7 @@ class Rig:
         self.prefix = folder / 'prefix'
         (self.prefix / 'share/ament_index/resource_index/packages').mkdir(parents=True)
         (self.prefix / 'share/ament_index/resource_index/packages/pack').touch()
-        self.shell = PipeShell()
+        self.shell = CutShell()
         self.events: list[dict[str, Any]] = []
         self.agents: list[subprocess.Popen[bytes]] = []
         self.clients: list[AgentClient] = []
@@ -143,8 +106,7 @@ class Rig:
 
     def client(self, *, follow: bool = True) -> AgentClient:
         client = AgentClient(
-            self.shell, str(self.directory),  # type: ignore[arg-type]
-            agent_path=str(self.program))
+            self.shell, str(self.directory), agent_path=str(self.program))
         self.clients.append(client)
         if follow:
             client.subscribe(self.events.append, since=1)
@@ -168,8 +130,20 @@ class Rig:
         return ''.join(e['text'] for e in list(self.events)
                        if e['event'] == 'output' and (e['node'], e['stream']) == (node, stream))
 
-    def ended(self, agent: subprocess.Popen[bytes], timeout: float = 60) -> int:
-        return agent.wait(timeout)
+    def started(self, **config: Any) -> AgentClient:
+        """Start an agent; return a client that follows its events."""
+        self.serve(**config)
+        return self.client()
+
+    def kill(self) -> None:
+        self.agents[-1].kill()
+        self.agents[-1].wait(60)
+
+    def run(self, *nodes: NodeSpec) -> None:
+        """Start nodes, and wait for their first output."""
+        self.clients[-1].request('start', nodes=nodes)
+        for node in nodes:
+            self.wait('output', node=node.id)
 
     def close(self) -> None:
         for client in self.clients:
@@ -180,7 +154,6 @@ class Rig:
                 agent.wait(60)
             assert agent.stderr is not None
             agent.stderr.close()
-        self.shell.close()
 
 
 @pytest.fixture
@@ -188,6 +161,25 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     rig = Rig(tmp_path)
     yield rig
     rig.close()
+
+
+@pytest.fixture(scope='module')
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    """Run one agent for the tests that only run nodes of their own."""
+    rig = Rig(tmp_path_factory.mktemp('shared'))
+    rig.started()
+    yield rig
+    rig.close()
+
+
+@pytest.fixture
+def heartbeat(free_udp_port: int) -> dict[str, Any]:
+    """Return settings of heartbeats."""
+    return {'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1', 'key': KEY}
+
+
+def states(client: AgentClient) -> dict[str, str]:
+    return {node['id']: node['state'] for node in client.request('status')['nodes']}
 
 
 def gone(pid: int) -> Callable[[], bool]:
@@ -204,8 +196,7 @@ SLEEP = 'import time\nprint("up")\ntime.sleep(600)\n'
 
 
 def test_output_and_exit_status_of_a_node_arrive(rig):
-    rig.serve()
-    client = rig.client()
+    client = rig.started()
     client.request('start', nodes=[rig.node('n', (
         'import os, sys\n'
         'print("hello", os.environ["X"], os.getcwd())\n'
@@ -224,41 +215,37 @@ def test_output_and_exit_status_of_a_node_arrive(rig):
     assert [e['seq'] for e in rig.events] == list(range(1, len(rig.events) + 1))
 
 
-def test_signals_and_negative_exit_statuses(rig):
-    rig.serve()
-    client = rig.client()
-    client.request('start', nodes=[
-        rig.node('asked', (
+def test_signals_and_negative_exit_statuses(shared):
+    client = shared.clients[0]
+    shared.run(
+        shared.node('signalled', (
             'import signal, sys, time\n'
             'signal.signal(signal.SIGUSR1, lambda *_: sys.exit(42))\n'
             'print("up")\ntime.sleep(600)\n')),
-        rig.node('killed', SLEEP)])
-    for name in ('asked', 'killed'):
-        rig.wait('output', node=name)
-    client.request('signal', node='asked', signal='SIGUSR1')
+        shared.node('killed', SLEEP))
+    client.request('signal', node='signalled', signal='SIGUSR1')
     client.request('signal', node='killed', signal='SIGKILL')
-    assert rig.wait('exited', node='asked')['returncode'] == 42
-    assert rig.wait('exited', node='killed')['returncode'] == -9
+    assert shared.wait('exited', node='signalled')['returncode'] == 42
+    assert shared.wait('exited', node='killed')['returncode'] == -9
     with pytest.raises(AgentError, match="isn't running"):
         client.request('signal', node='killed', signal='SIGINT')
     with pytest.raises(AgentError, match="no signal 'SIGNONSENSE'"):
         client.request('signal', node='killed', signal='SIGNONSENSE')
 
 
-def test_nodes_start_as_their_specs_say(rig):
+def test_nodes_start_as_their_specs_say(shared):
     """A program that cannot be executed harms no other, and a second request starts nothing."""
-    rig.serve()
-    client = rig.client()
-    (rig.folder / 'broken').write_bytes(b'\x7fELFnot')
-    (rig.folder / 'broken').chmod(0o700)
+    client = shared.clients[0]
+    (shared.folder / 'broken').write_bytes(b'\x7fELFnot')
+    (shared.folder / 'broken').chmod(0o700)
     nodes = [
         NodeSpec('cat', 'c-1', arguments=('cat',)),
-        NodeSpec('broken', 'b-1', arguments=(str(rig.folder / 'broken'),)),
+        NodeSpec('broken', 'b-1', arguments=(str(shared.folder / 'broken'),)),
         NodeSpec('shell', 's-1', shell=True,  # noqa: S604 (a constant)
                  arguments=('echo one two | tr a-z', 'A-Z')),
         NodeSpec('tty', 't-1', arguments=('test', '-t', '1'), emulate_tty=True),
         NodeSpec('prefix', 'p-1', arguments=('echo', 'hi'), prefix=('env', 'X=1')),
-        rig.node('binary', (
+        shared.node('binary', (
             'import os, time\n'
             'os.write(1, b"\\xff\\xfe\\x00ok \\xc3")\n'
             'time.sleep(0.1)\n'  # splits a character in two
@@ -266,47 +253,43 @@ def test_nodes_start_as_their_specs_say(rig):
     assert client.request('start', nodes=nodes)['known'] == []
     assert client.request('start', nodes=nodes)['known'] == [node.id for node in nodes]
     for node in ('shell', 'tty', 'prefix', 'binary'):
-        assert rig.wait('exited', node=node)['returncode'] == 0
-    assert (rig.text('shell'), rig.text('prefix')) == ('ONE TWO\n', 'hi\n')
-    assert rig.text('binary') == '\ufffd\ufffd\ufffdok \u00e9 no newline \ufffd'
-    assert 'could not be executed' in rig.wait('refused', node='broken')['error']
+        assert shared.wait('exited', node=node)['returncode'] == 0
+    assert (shared.text('shell'), shared.text('prefix')) == ('ONE TWO\n', 'hi\n')
+    assert shared.text('binary') == '\ufffd\ufffd\ufffdok \u00e9 no newline \ufffd'
+    assert 'could not be executed' in shared.wait('refused', node='broken')['error']
     # its input has no end
-    states = {node['id']: node['state'] for node in client.request('status')['nodes']}
-    assert (states['cat'], states['broken']) == ('running', 'refused')
-    assert [e['event'] for e in rig.events].count('started') == 5
+    assert states(client)['cat'] == 'running' and states(client)['broken'] == 'refused'
+    assert [e['node'] for e in shared.events if e['event'] == 'started'].count('shell') == 1
 
 
-def test_nodes_respawn_as_their_specs_say(rig):
-    rig.serve()
-    client = rig.client()
+def test_nodes_respawn_as_their_specs_say(shared):
+    client = shared.clients[0]
     client.request('start', nodes=[
-        rig.node('fails', 'raise SystemExit(1)\n', respawn=True, respawn_max_retries=2),
-        rig.node('killed', SLEEP, respawn=True, respawn_delay=0.2),
-        rig.node('stopped', 'raise SystemExit(3)\n', respawn=True, respawn_delay=0.3)])
-    rig.wait('exited', node='stopped', respawns=True)
+        shared.node('fails', 'raise SystemExit(1)\n', respawn=True, respawn_max_retries=2),
+        shared.node('again', SLEEP, respawn=True, respawn_delay=0.2),
+        shared.node('stopped', 'raise SystemExit(3)\n', respawn=True, respawn_delay=0.3)])
+    shared.wait('exited', node='stopped', respawns=True)
     client.request('stop', nodes=['stopped'])
-    before = client.request('status')['nodes'][2]
-    first = rig.wait('started', node='killed')['pid']
+    first = shared.wait('started', node='again')['pid']
     os.kill(first, signal.SIGKILL)
-    exited = rig.wait('exited', node='killed', returncode=-9, respawns=True)
+    exited = shared.wait('exited', node='again', returncode=-9, respawns=True)
     second = wait_until(lambda: next((
-        e for e in list(rig.events) if e['event'] == 'started' and e['node'] == 'killed'
+        e for e in list(shared.events) if e['event'] == 'started' and e['node'] == 'again'
         and e['pid'] != first), None), timeout=60, what='the second start')
     assert second['time'] - exited['time'] >= 0.2
-    rig.wait('exited', node='fails', respawns=False)
-    assert [e['respawns'] for e in rig.events
+    shared.wait('exited', node='fails', respawns=False)
+    assert [e['respawns'] for e in shared.events
             if e['event'] == 'exited' and e['node'] == 'fails'] == [True, True, False]
-    client.request('start', nodes=[rig.node('later', 'import time\ntime.sleep(0.6)\n')])
-    rig.wait('exited', node='later')
-    fails, _, stopped, _ = client.request('status')['nodes']
-    assert fails['restarts'] == 2
-    assert (stopped['state'], stopped['pid']) == ('exited', None)
-    assert stopped['restarts'] == before['restarts']
+    client.request('start', nodes=[shared.node('later', 'import time\ntime.sleep(0.6)\n')])
+    shared.wait('exited', node='later')
+    nodes = {node['id']: node for node in client.request('status')['nodes']}
+    assert nodes['fails']['restarts'] == 2
+    assert (nodes['stopped']['state'], nodes['stopped']['pid']) == ('exited', None)
+    client.request('stop', nodes=['again'])
 
 
 def test_stop_goes_from_sigint_to_sigkill(rig):
-    rig.serve()
-    client = rig.client()
+    client = rig.started()
     stubborn = (
         'import signal, time\n'
         'for number in (signal.SIGINT, signal.SIGTERM):\n'
@@ -314,57 +297,28 @@ def test_stop_goes_from_sigint_to_sigkill(rig):
         'print("up")\n'
         'while True:\n'
         '    time.sleep(0.05)\n')
-    client.request('start', nodes=[
-        rig.node('stubborn', stubborn, sigterm_timeout=0.2, sigkill_timeout=0.2, respawn=True),
-        rig.node('polite', SLEEP)])
-    for name in ('stubborn', 'polite'):
-        rig.wait('output', node=name)
+    rig.run(rig.node('stubborn', stubborn, sigterm_timeout=0.2, sigkill_timeout=0.2, respawn=True),
+            rig.node('polite', SLEEP))
     client.request('stop', nodes=['stubborn'])
     exited = rig.wait('exited', node='stubborn')
     assert (exited['returncode'], exited['respawns']) == (-9, False)
     assert 'not 2\n' in rig.text('stubborn') and 'not 15\n' in rig.text('stubborn')
-    states = {n['id']: n['state'] for n in client.request('status')['nodes']}
-    assert states == {'stubborn': 'exited', 'polite': 'running'}
+    assert states(client) == {'stubborn': 'exited', 'polite': 'running'}
     client.request('stop', nodes=None)
     assert rig.wait('exited', node='polite')['returncode'] == -2
 
 
-def test_much_output_fills_neither_memory_nor_disk(rig):
-    agent = rig.serve(log_bytes=2 << 20)
-    client = rig.client(follow=False)
-    client.request('start', nodes=[rig.node('n', (
-        'import sys\n'
-        'block = b"x" * 99 + b"\\n"\n'
-        'for _ in range(3000):\n'
-        '    sys.stdout.buffer.write(block * 100)\n'))])  # 30 MB
-    def state():
-        return client.request('status')['nodes'][0]['state'] == 'exited'
-    wait_until(state, timeout=60, what='the node')
-    assert client.request('status')['rss_kb'] < 30_000
-    sizes = [path.stat().st_size for path in rig.directory.glob('events*.jsonl')]
-    assert len(sizes) == 2 and sum(sizes) < 5 << 20
-    status = client.request('status')
-    assert status['first'] > 1
-    client.subscribe(rig.events.append, since=1)
-    rig.wait('exited', node='n')
-    assert rig.events[0] == {'event': 'gap', 'count': status['first'] - 1}
-    assert [e['seq'] for e in rig.events[1:]] == list(range(status['first'], status['next']))
-    assert agent.poll() is None
-
-
 def test_lost_connection_loses_and_repeats_no_event(rig):
-    rig.serve()
-    client = rig.client()
-    client.request('start', nodes=[rig.node('n', (
+    rig.started().request('start', nodes=[rig.node('n', (
         'import time\n'
-        'for n in range(150):\n'
+        'for n in range(100):\n'
         '    print(n)\n'
         '    time.sleep(0.01)\n'))])
 
     def connections() -> list[str]:
         return [e['state'] for e in list(rig.events) if e['event'] == 'connection']
 
-    for number, count in enumerate((20, 60, 100), 1):
+    for number, count in enumerate((20, 60), 1):
         wait_until(lambda count=count: len(rig.text('n').split()) > count, timeout=60,
                    what='lines', longest=0.02)
         rig.shell.cut()
@@ -372,10 +326,10 @@ def test_lost_connection_loses_and_repeats_no_event(rig):
         wait_until(lambda number=number: connections().count('back') == number, timeout=60,
                    what='the connection', longest=0.02)
     rig.wait('exited', node='n')
-    assert rig.text('n').split() == [str(n) for n in range(150)]
+    assert rig.text('n').split() == [str(n) for n in range(100)]
     seqs = [e['seq'] for e in rig.events if 'seq' in e]
     assert seqs == list(range(1, len(seqs) + 1))
-    assert connections() == 3 * ['lost', 'back']
+    assert connections() == 2 * ['lost', 'back']
 
 
 class Raw:
@@ -416,9 +370,8 @@ BAD_REQUESTS = [
 ]
 
 
-def test_invalid_requests_are_refused_and_connection_stays(rig):
-    agent = rig.serve()
-    raw = Raw(rig)
+def test_invalid_requests_are_refused_and_connection_stays(shared):
+    raw = Raw(shared)
     for line, answer in BAD_REQUESTS:
         reply = raw.ask(line)
         assert reply['ok'] is False and answer in reply['error'], line
@@ -431,13 +384,13 @@ def test_invalid_requests_are_refused_and_connection_stays(rig):
     with contextlib.suppress(ConnectionResetError):
         assert raw.lines.readline() == b''
     raw.close()
-    assert agent.poll() is None
+    assert shared.agents[0].poll() is None
 
 
-def test_lost_and_silent_clients_harm_no_other(rig):
-    rig.serve(log_bytes=1 << 20)
+def test_output_and_clients_fill_neither_memory_nor_disk(rig):
+    rig.serve(log_bytes=2 << 20)
     silent = Raw(rig)
-    silent.ask(b'{"id": 1, "command": "log", "follow": true}\n')
+    silent.ask(b'{"id": 1, "command": "log"}\n')
     for data in (b'{"id": 1, "comm', b'', b'{"id": 1, "command": "status"}\n' * 50):
         raw = Raw(rig)
         raw.link.sendall(data)
@@ -446,25 +399,36 @@ def test_lost_and_silent_clients_harm_no_other(rig):
     assert crowd[-1].ask(b'{"id": 1, "command": "status"}\n')['ok']
     for raw in crowd:
         raw.close()
-    client = rig.client()
-    client.request('start', nodes=[rig.node('n', 'for _ in range(30000): print("x" * 99)\n')])
-    assert rig.wait('exited', node='n')['returncode'] == 0
-    assert client.request('status')['rss_kb'] < 30_000
+    client = rig.client(follow=False)
+    client.request('start', nodes=[rig.node('n', (
+        'import sys\n'
+        'block = b"x" * 99 + b"\\n"\n'
+        'for _ in range(3000):\n'
+        '    sys.stdout.buffer.write(block * 100)\n'))])  # 30 MB
+    wait_until(lambda: states(client)['n'] == 'exited', timeout=60, what='the node')
+    status = client.request('status')
+    assert status['rss_kb'] < 30_000
+    sizes = [path.stat().st_size for path in rig.directory.glob('events*.jsonl')]
+    assert len(sizes) == 2 and sum(sizes) < 5 << 20
+    assert status['first'] > 1
+    client.subscribe(rig.events.append, since=1)
+    rig.wait('exited', node='n')
+    assert rig.events[0] == {'event': 'gap', 'count': status['first'] - 1}
+    assert [e['seq'] for e in rig.events[1:]] == list(range(status['first'], status['next']))
     silent.close()
 
 
-def test_requests_are_answered_after_the_end_of_input(rig):
-    def connect() -> subprocess.CompletedProcess[bytes]:
+def test_requests_are_answered_after_the_end_of_input(shared, tmp_path):
+    def connect(directory: Path) -> subprocess.CompletedProcess[bytes]:
         return subprocess.run(
-            [sys.executable, '-IS', str(rig.program), 'connect', '--directory',
-             str(rig.directory)],
-            input=b'{"id": 9, "command": "log", "from": 1}\n{"id": 8, "command": "status"}\n',
+            [sys.executable, '-IS', str(shared.program), 'connect', '--directory',
+             str(directory)],
+            input=b'{"id": 9, "command": "log", "from": 1000000}\n{"id": 8, "command": "status"}\n',
             capture_output=True, timeout=60)
 
-    absent = connect()
+    absent = connect(tmp_path)
     assert (absent.returncode, json.loads(absent.stdout)['kind']) == (3, 'absent')
-    rig.serve()
-    done = connect()
+    done = connect(shared.directory)
     assert [json.loads(line)['id'] for line in done.stdout.splitlines()] == [9, 8]
     assert done.returncode == 0
 
@@ -487,63 +451,33 @@ def test_second_agent_is_refused_and_stale_socket_replaced(rig):
     ({'directory': '/proc/nothing/here'}, "can't be used"),
     ({'directory': '/'}, "can't have the directory '/'"),
     ({'user': 'nobody-of-that-name'}, "no user 'nobody-of-that-name'"),
-    (None, "can't be read"),
 ])
-def test_invalid_configuration_is_reported_in_one_line(rig, config, reason):
-    path = rig.config(**config or {})
-    if config is None:
-        path.write_text('{')
+def test_invalid_configuration_is_refused(tmp_path, config, reason):
+    with pytest.raises(Refused, match=reason):
+        Agent({'machine': 'planner', 'directory': str(tmp_path / 'agent'), **config}).open()
+
+
+@pytest.mark.parametrize('words', [(), ('--detach',)])
+def test_damaged_configuration_is_reported_in_one_line(tmp_path, words):
+    (tmp_path / 'config.json').write_text('{')
     done = subprocess.run(
-        [sys.executable, '-IS', str(rig.program), 'serve', '--config', str(path)],
-        capture_output=True, timeout=60, cwd=rig.folder)
-    assert done.returncode == 1
-    assert reason in done.stderr.decode() and done.stderr.count(b'\n') == 1
-    detached = subprocess.run(
-        [sys.executable, '-IS', str(rig.program), 'serve', '--detach', '--config', str(path)],
-        capture_output=True, timeout=60, cwd=rig.folder)
-    assert detached.returncode == 1
-    assert reason in json.loads(detached.stdout)['error']
-
-
-def test_detached_agent_reports_when_it_is_ready(rig):
-    done = subprocess.run(
-        [sys.executable, '-IS', str(rig.program), 'serve', '--detach', '--config',
-         str(rig.config())], capture_output=True, timeout=60)
-    ready = json.loads(done.stdout)
-    assert ready['ready'] is True and ready['socket'] == str(rig.directory / 'agent.sock')
-    client = rig.client()
-    assert client.request('status')['pid'] == ready['pid']
-    client.request('release', exit=True)
-    wait_until(gone(ready['pid']), timeout=60, what='the agent to leave')
-    assert not rig.directory.exists()
-
-
-def test_stopped_nodes_leave_no_descendant(rig):
-    rig.serve(on_exit='keep')
-    client = rig.client()
-    client.request('start', nodes=[rig.node('n', (
-        'import subprocess, time\n'
-        'child = subprocess.Popen(["sleep", "600"], start_new_session=True)\n'
-        'print(child.pid)\n'
-        'time.sleep(600)\n'))])
-    wait_until(lambda: '\n' in rig.text('n'), timeout=60, what='the child')
-    client.request('release', on_exit='keep')
-    assert gone(int(rig.text('n')))()
+        [sys.executable, '-IS', str(program(tmp_path)), 'serve', *words, '--config',
+         str(tmp_path / 'config.json')], capture_output=True, timeout=60)
+    line = done.stdout if words else done.stderr
+    assert (done.returncode, line.count(b'\n')) == (1, 1)
+    assert "can't be read" in (json.loads(line)['error'] if words else line.decode())
 
 
 def test_setup_files_are_sourced(rig):
     setup = rig.folder / "it's a setup.bash"
     setup.write_text('echo printed\nexport SOURCED="from ${BASH_SOURCE[0]##*/} $# $LISTED"\n')
-    rig.serve(setup=[str(setup)], environment={
+    client = rig.started(setup=[str(setup)], environment={
         'LISTED': 'configured',
         **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ}})
-    client = rig.client()
-    client.request('start', nodes=[rig.node('n', 'import os\nprint(os.environ["SOURCED"])\n')])
-    rig.wait('exited', node='n')
+    rig.run(rig.node('n', 'import os\nprint(os.environ["SOURCED"])\n'))
     assert rig.text('n') == "from it's a setup.bash 0 configured\n"
     client.request('configure', environment={'LISTED': 'later', 'PATH': os.environ['PATH']})
-    client.request('start', nodes=[rig.node('m', 'import os\nprint(os.environ["SOURCED"])\n')])
-    rig.wait('exited', node='m')
+    rig.run(rig.node('m', 'import os\nprint(os.environ["SOURCED"])\n'))
     assert rig.text('m') == "from it's a setup.bash 0 later\n"
     client.request('configure', setup=['/no/such/setup.bash'])
     with pytest.raises(AgentError, match='setup.bash to be sourced is not there'):
@@ -552,7 +486,7 @@ def test_setup_files_are_sourced(rig):
     client.request('configure', setup=[str(setup)], environment={'PATH': os.environ['PATH']})
     with pytest.raises(AgentError, match="can't be sourced: exit status 3"):
         client.request('start', nodes=[rig.node('later', SLEEP)])
-    assert [node['id'] for node in client.request('status')['nodes']] == ['n', 'm']
+    assert list(states(client)) == ['n', 'm']
 
 
 def ends(rig: Rig) -> list[str]:
@@ -560,23 +494,21 @@ def ends(rig: Rig) -> list[str]:
     return ['touch', str(rig.folder / 'ended')]
 
 
-def test_missing_heartbeats_end_the_machine(rig, free_udp_port):
-    rig.serve(robot_timeout=2.0, end_command=ends(rig))
-    client = rig.client()
+def test_missing_heartbeats_end_the_machine(rig, heartbeat):
+    client = rig.started(robot_timeout=2.0, end_command=ends(rig))
     client.request('start', nodes=[rig.node('n', SLEEP)])
     node = rig.wait('started', node='n')['pid']
-    client.request('configure', heartbeat={
-        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1', 'key': KEY})
-    heartbeat = Heartbeat('127.0.0.1', free_udp_port, KEY, interval=0.1)
+    client.request('configure', heartbeat=heartbeat)
+    robot = Heartbeat('127.0.0.1', heartbeat['port'], KEY, interval=0.1)
     begin = time.monotonic()
     wait_until(lambda: time.monotonic() - begin > 2.5, timeout=60, what='longer than the timeout')
-    assert heartbeat.round_trip is not None and 0 < heartbeat.round_trip < 2.0
-    assert heartbeat.age is not None and heartbeat.age < 2.0
+    assert robot.round_trip is not None and 0 < robot.round_trip < 2.0
+    assert robot.age is not None and robot.age < 2.0
     # the agent answers with the machine's time, here the robot's own
-    offset = heartbeat.clock_offset
+    offset = robot.clock_offset
     assert offset is not None and abs(offset.seconds) <= offset.uncertainty + 1e-3
     assert client.request('status')['heartbeat_age'] < 2.0
-    heartbeat.close()
+    robot.close()
     gone_at = time.monotonic()
     watchdog = rig.wait('watchdog')
     assert (watchdog['reason'], watchdog['action']) == ('robot gone', 'end the machine')
@@ -587,30 +519,28 @@ def test_missing_heartbeats_end_the_machine(rig, free_udp_port):
         client.request('start', nodes=[rig.node('late', SLEEP)])
 
 
-def test_heartbeats_of_another_address_do_not_count(rig, free_udp_port):
-    rig.serve(robot_timeout=0.8, end_command=ends(rig))
-    rig.client().request('configure', heartbeat={
-        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.2', 'key': KEY})
-    heartbeat = Heartbeat('127.0.0.1', free_udp_port, KEY, interval=0.05)
-    with contextlib.closing(heartbeat):
+def test_heartbeats_of_another_address_do_not_count(rig, heartbeat):
+    rig.started(robot_timeout=0.8, end_command=['false']).request(
+        'configure', heartbeat={**heartbeat, 'peer': '127.0.0.2'})
+    with contextlib.closing(Heartbeat('127.0.0.1', heartbeat['port'], KEY, interval=0.05)) as robot:
         assert rig.wait('watchdog')['reason'] == 'robot gone'
-        assert heartbeat.round_trip is None
+        assert robot.round_trip is None
+    assert rig.wait('end_failed')['returncode'] == 1
 
 
-def test_kept_machine_stops_nodes_and_stays_for_its_lifetime(rig, free_udp_port):
-    rig.serve(robot_timeout=0.5, on_exit='keep', end_command=ends(rig))
-    client = rig.client()
+def test_kept_machine_stops_nodes_and_stays_for_its_lifetime(rig, heartbeat):
+    client = rig.started(robot_timeout=0.5, on_exit='keep', end_command=ends(rig))
     client.request('start', nodes=[rig.node('n', SLEEP)])
     rig.wait('started', node='n')
-    client.request('configure', heartbeat={
-        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1', 'key': KEY})
+    client.request('configure', heartbeat=heartbeat)
     assert rig.wait('watchdog', reason='robot gone')['action'] == 'stop the nodes'
     rig.wait('exited', node='n')
-    assert not (rig.folder / 'ended').exists()
     assert client.request('status')['heartbeat_age'] is None
-    # the next launch takes it over without being asked whether it may
-    client.request('configure', launch='def456')
+    # the next launch takes it over without being asked whether it may, and dies in its setup
+    client.request('configure', launch='def456', boot_timeout=0.5)
     assert client.request('status')['nodes'] == []
+    assert rig.wait('watchdog', reason='no launch came')['action'] == 'stop the nodes'
+    assert not (rig.folder / 'ended').exists()
     client.request('configure', lifetime=1.0)
     assert rig.wait('watchdog', reason='lifetime')['action'] == 'end the machine'
     wait_until((rig.folder / 'ended').exists, timeout=60, what='the end of the machine')
@@ -626,57 +556,35 @@ def test_computer_without_end_command_is_cleaned_up(rig):
     client.request('watch', what='vpn', argv=['true'], repair=[], down=[['touch', str(mark)]])
     client.request('configure', boot_timeout=0.5)
     assert rig.wait('watchdog')['action'] == 'leave'
-    assert rig.ended(agent) == 0
+    assert agent.wait(60) == 0
     assert mark.exists() and not rig.directory.exists()
 
 
-def test_kept_machine_outlives_a_launch_that_dies_in_setup(rig):
-    rig.serve(launch='first', on_exit='keep', boot_timeout=60.0, end_command=ends(rig))
-    client = rig.client()
-    client.request('release', on_exit='keep')
-    client.request('configure', launch='second', boot_timeout=0.5)
-    assert rig.wait('watchdog', reason='no launch came')['action'] == 'stop the nodes'
-    client.request('status')
-    assert not (rig.folder / 'ended').exists()
-
-
 def test_kept_machine_without_launch_outlives_its_agent(rig):
-    agent = rig.serve(on_exit='keep', lifetime=2.0, end_command=ends(rig))
-    rig.client().request('release', on_exit='keep')
-    agent.kill()
-    agent.wait(60)
+    rig.started(on_exit='keep', lifetime=2.0, end_command=ends(rig)).request(
+        'release', on_exit='keep')
+    rig.kill()
     rig.serve(on_exit='keep', boot_timeout=0.3, lifetime=2.0, end_command=ends(rig))
     assert rig.wait('watchdog')['reason'] == 'lifetime'
 
 
 def test_kept_machine_outlives_a_reboot(rig):
     """Which empties the agent's directory; the boot's configuration knows nothing of a launch."""
-    mark, boot = rig.folder / 'kept_until', {'boot_timeout': 0.3, 'end_command': ends(rig)}
-    agent = rig.serve(launch='', kept_until=str(mark), **{**boot, 'boot_timeout': 60.0})
-    client = rig.client()
+    mark, boot = rig.folder / 'kept_until', {'boot_timeout': 60.0, 'end_command': ends(rig)}
+    client = rig.started(launch='', kept_until=str(mark), **boot)
     client.request('configure', launch='second', on_exit='keep', lifetime=1000.0,
                    boot_timeout=60.0, kept_until='/etc/passwd')
     client.request('release', launch='second')
     assert 900 < float(mark.read_text()) - time.time() <= 1000
-    for left in (500, 1):
-        agent.kill()
-        agent.wait(60)
-        shutil.rmtree(rig.directory)
-        mark.write_text(f'{time.time() + left}')
-        agent = rig.serve(launch='', kept_until=str(mark), **boot)
-        if left == 500:
-            status = rig.client().request('status')
-            assert 400 < status['lifetime_left'] < 500 and status['on_exit'] == 'keep'
-    rig.client()
-    assert rig.wait('watchdog')['reason'] == 'lifetime'
-
-
-def test_machine_of_a_later_launch_is_not_kept_after_a_reboot(rig):
-    mark = rig.folder / 'kept_until'
-    rig.serve(on_exit='keep', kept_until=str(mark), boot_timeout=60.0)
-    client = rig.client()
-    client.request('configure', launch='abc123')
-    assert mark.exists()
+    rig.kill()
+    shutil.rmtree(rig.directory)
+    mark.write_text(f'{time.time() + 500}')
+    client = rig.started(launch='', kept_until=str(mark), **{**boot, 'boot_timeout': 0.001})
+    status = client.request('status')
+    assert 400 < status['lifetime_left'] < 500 and status['on_exit'] == 'keep'
+    assert not [event for event in rig.events if event['event'] == 'watchdog']
+    # a later launch does not keep it
+    client.request('configure', launch='third', boot_timeout=60.0)
     client.request('release', on_exit='stop')
     assert not mark.exists()
 
@@ -701,17 +609,15 @@ def test_machine_belongs_to_one_launch_until_its_release(rig):
 
 
 def test_release_during_a_takeover_leaves_the_machine_free(rig):
-    rig.serve(launch='first', on_exit='keep')
-    client = rig.client()
-    client.request('start', nodes=[rig.node('n', (
+    client = rig.started(launch='first', on_exit='keep')
+    rig.run(rig.node('n', (
         'import signal, time\n'
         'signal.signal(signal.SIGINT, lambda *_: print("no"))\n'
         'signal.signal(signal.SIGTERM, signal.SIG_IGN)\n'
         'print("up")\n'
         'while True:\n'
-        '    time.sleep(0.05)\n'), sigterm_timeout=0.2, sigkill_timeout=60)])
+        '    time.sleep(0.05)\n'), sigterm_timeout=0.2, sigkill_timeout=60))
     node = rig.wait('started', node='n')['pid']
-    rig.wait('output', node='n')
     refused: list[AgentError] = []
 
     def take() -> None:
@@ -737,19 +643,31 @@ def test_release_during_a_takeover_leaves_the_machine_free(rig):
     assert client.request('status')['launch'] == ''
 
 
-@pytest.mark.parametrize('how', [
-    {'command': 'release', 'on_exit': 'keep'},
-    {'command': 'configure', 'launch': 'another', 'force': 'abc123'}])
-def test_health_check_ends_with_its_launch(rig, how):
+def test_health_check_repairs_until_its_launch_ends(rig):
     thing = rig.folder / 'thing'
-    rig.serve(on_exit='keep')
-    client = rig.client()
-    client.request('watch', what='vpn', interval=0.05, argv=['test', '-e', str(thing)],
-                   repair=[['touch', str(thing)]], down=[['rm', '-f', str(thing)]])
-    wait_until(thing.exists, timeout=60, what='the repair')
-    client.request(**how)
-    assert not thing.exists()
-    assert client.request('status')['kept'] == []
+    client = rig.started(on_exit='keep')
+    client.request('watch', what='vpn', interval=0.05, argv=['false'],
+                   repair=[['/no/such/program']])
+    wait_until(lambda: client.request('status')['kept'][0]['ok'] is False, timeout=60,
+               what='the failure')
+    assert all(event['event'] != 'vpn_repaired' for event in rig.events)
+    for how in ({'command': 'configure', 'launch': 'another', 'force': 'abc123'},
+                {'command': 'release', 'exit': True}):
+        # it takes the place of the former one
+        client.request('watch', what='vpn', interval=0.05, argv=['test', '-e', str(thing)],
+                       repair=[['true'], ['touch', str(thing)]], down=[['rm', str(thing)]])
+        wait_until(thing.exists, timeout=60, what='the repair')
+        before = sum(event['event'] == 'vpn_repaired' for event in list(rig.events))
+        thing.unlink()
+        wait_until(lambda before=before: sum(
+            event['event'] == 'vpn_repaired' for event in list(rig.events)) > before,
+            timeout=60, what='the event')
+        wait_until(lambda: client.request('status')['kept'][0]['ok'] and thing.exists(),
+                   timeout=60, what='the repair')
+        assert client.request('status')['kept'][0]['repairs'] >= 1
+        client.request(**how)
+        wait_until(lambda: not thing.exists(), timeout=60, what='the end of the thing')
+    assert rig.agents[0].wait(60) == 0
 
 
 def test_watch_reports_its_command_once(rig):
@@ -774,19 +692,15 @@ def test_watch_reports_its_command_once(rig):
             client.request('watch', **wrong)
 
 
-def test_failed_end_command_is_reported(rig):
-    rig.serve(boot_timeout=0.2, end_command=['false'])
-    rig.client()
-    assert rig.wait('end_failed')['returncode'] == 1
-
-
-def test_machine_with_heartbeats_is_not_taken_over(rig, free_udp_port):
-    rig.serve()
-    client = rig.client()
-    client.request('configure', heartbeat={
-        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1', 'key': KEY})
-    client.request('start', nodes=[rig.node('n', SLEEP)])
-    rig.wait('output', node='n')
+def test_machine_with_heartbeats_is_not_taken_over(rig, heartbeat):
+    client = rig.started()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(('127.0.0.1', 0))
+        with pytest.raises(AgentError, match='no heartbeats at 127.0.0.1:'):
+            client.request('configure', heartbeat={
+                **heartbeat, 'port': other.getsockname()[1]})
+    client.request('configure', heartbeat=heartbeat)
+    rig.run(rig.node('n', SLEEP))
     with pytest.raises(AgentError, match="belongs to launch 'abc123'"):
         client.request('configure', launch='def456')
     client.request('configure', launch='def456', force='abc123')
@@ -797,61 +711,16 @@ def test_machine_with_heartbeats_is_not_taken_over(rig, free_udp_port):
     wait_until(lambda: 'mine' in rig.text('n'), timeout=60, what='the new node')
 
 
-def test_busy_heartbeat_port_is_refused(rig):
-    rig.serve()
-    client = rig.client()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(('127.0.0.1', 0))
-        with pytest.raises(AgentError, match='no heartbeats at 127.0.0.1:'):
-            client.request('configure', heartbeat={
-                'bind': '127.0.0.1', 'port': other.getsockname()[1], 'peer': '127.0.0.1',
-                'key': KEY})
-
-
-def test_health_check_repairs_and_takes_down(rig):
-    thing = rig.folder / 'thing'
-    agent = rig.serve()
-    client = rig.client()
-    client.request(
-        'watch', what='vpn', interval=0.05, argv=['test', '-e', str(thing)],
-        repair=[['true'], ['touch', str(thing)]], down=[['rm', str(thing)]])
-    for _ in range(2):
-        wait_until(thing.exists, timeout=60, what='the repair')
-        count = sum(e['event'] == 'vpn_repaired' for e in list(rig.events))
-        thing.unlink()
-        wait_until(lambda count=count: sum(
-            e['event'] == 'vpn_repaired' for e in list(rig.events)) > count,
-            timeout=60, what='the event')
-    wait_until(thing.exists, timeout=60, what='the repair')
-    kept, = client.request('status')['kept']
-    assert kept['what'] == 'vpn' and kept['repairs'] >= 2
-    client.request('release', exit=True)
-    assert rig.ended(agent) == 0
-    assert not thing.exists()
-
-
-def test_failed_repair_is_tried_again(rig):
-    rig.serve()
-    client = rig.client()
-    client.request('watch', what='vpn', interval=0.05, argv=['false'],
-                   repair=[['/no/such/program']])
-    wait_until(lambda: client.request('status')['kept'][0]['ok'] is False, timeout=60,
-               what='the failure')
-    client.request('watch', what='vpn', interval=0.05, argv=['true'], repair=[])
-    wait_until(lambda: client.request('status')['kept'][0]['ok'] is True, timeout=60,
-               what='its replacement')
-    assert all(e['event'] != 'vpn_repaired' for e in rig.events)
-
-
 def test_release_stops_the_nodes_before_it_answers(rig):
-    rig.serve(on_exit='delete')
-    client = rig.client()
-    client.request('start', nodes=[rig.node('n', SLEEP)])
-    node = rig.wait('started', node='n')['pid']
+    client = rig.started(on_exit='delete')
+    rig.run(rig.node('n', (
+        'import os, subprocess, time\n'
+        'child = subprocess.Popen(["sleep", "600"], start_new_session=True)\n'
+        'print(os.getpid(), child.pid)\n'
+        'time.sleep(600)\n')))
     client.request('release', on_exit='keep')
-    assert gone(node)()
-    status = client.request('status')
-    assert status['on_exit'] == 'keep'
+    assert all(gone(int(pid))() for pid in rig.text('n').split())
+    assert client.request('status')['on_exit'] == 'keep'
     # what comes too late starts nothing
     for late in ({'command': 'start', 'nodes': [rig.node('late', SLEEP)]},
                  {'command': 'watch', 'what': 'vpn', 'argv': ['true'], 'repair': [['true']]}):
@@ -859,8 +728,7 @@ def test_release_stops_the_nodes_before_it_answers(rig):
             client.request(**late)
     # and it is ready for the next one
     client.request('configure', launch='next')
-    client.request('start', nodes=[rig.node('next', 'print("here")\n')])
-    rig.wait('exited', node='next')
+    rig.run(rig.node('next', 'print("here")\n'))
 
 
 STUBBORN = (
@@ -874,13 +742,12 @@ STUBBORN = (
 
 def test_signalled_agent_ends_all_processes_soon(rig):
     agent = rig.serve()
-    client = rig.client()
-    client.request('start', nodes=[rig.node('n', STUBBORN)])
-    wait_until(lambda: '\n' in rig.text('n'), timeout=60, what='the node')
+    rig.client()
+    rig.run(rig.node('n', STUBBORN))
     pids = [int(word) for word in rig.text('n').split()]
     begin = time.monotonic()
     agent.send_signal(signal.SIGTERM)
-    assert rig.ended(agent) == 0
+    assert agent.wait(60) == 0
     # in one second on an idle computer; unhurried, it would send no SIGKILL before
     assert time.monotonic() - begin < SWEEP[-1][0]
     assert all(gone(pid)() for pid in pids)
@@ -889,17 +756,13 @@ def test_signalled_agent_ends_all_processes_soon(rig):
     assert 'exited' not in kinds or kinds.index('ending') < kinds.index('exited')
 
 
-def test_restarted_agent_ends_nodes_and_keeps_its_watchdog(rig, free_udp_port):
-    first = rig.serve(robot_timeout=15.0, end_command=ends(rig))
-    client = rig.client()
-    client.request('configure', launch='def456', force='abc123', heartbeat={
-        'bind': '127.0.0.1', 'port': free_udp_port, 'peer': '127.0.0.1', 'key': KEY})
-    client.request('start', nodes=[rig.node('n', SLEEP), rig.node('stubborn', STUBBORN)])
+def test_restarted_agent_ends_nodes_and_keeps_its_watchdog(rig, heartbeat):
+    client = rig.started(robot_timeout=15.0, end_command=ends(rig))
+    client.request('configure', launch='def456', force='abc123', heartbeat=heartbeat)
+    rig.run(rig.node('n', SLEEP), rig.node('stubborn', STUBBORN))
     node = rig.wait('started', node='n')['pid']
-    wait_until(lambda: '\n' in rig.text('stubborn'), timeout=60, what='the stubborn node')
     pids = [int(word) for word in rig.text('stubborn').split()]
-    first.kill()
-    first.wait(60)
+    rig.kill()
     wait_until(gone(node), timeout=60, what='the node to end, without an agent')
     # another path than the directory's own: as a machine's boot has it
     second = rig.serve(robot_timeout=15.0, end_command=ends(rig))
@@ -958,7 +821,7 @@ def test_root_agent_runs_nodes_as_the_login_user(login, tmp_path):
     wait_until(lambda: (record / 'root').exists() and (record / 'root').read_text() == '0\n',
                timeout=60, what='a command as root')
     client.request('release', exit=True)
-    assert rig.ended(agent) == 0
+    assert agent.wait(60) == 0
     assert not rig.directory.exists()
     rig.close()
 
@@ -1003,7 +866,7 @@ def test_agent_as_process_1_reaps_orphans_and_ends(root, tmp_path):
     inner = int(Path(f'/proc/{agent.pid}/task/{agent.pid}/children').read_text())
     begin = time.monotonic()
     os.kill(inner, signal.SIGTERM)
-    assert rig.ended(agent) == 0
+    assert agent.wait(60) == 0
     # in one second on an idle computer; unhurried, it would send no SIGKILL before
     assert time.monotonic() - begin < SWEEP[-1][0]
     rig.close()
