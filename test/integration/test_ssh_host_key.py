@@ -33,9 +33,9 @@ def test_a_server_gets_a_new_key_and_connections_go_on(root, tmp_path):
     if os.geteuid() != 0:
         pytest.skip("the server of this test is its user's, not root's")
     folder = tmp_path / 'sshd'
-    process.run(Command(('ssh-keygen', '-q', '-t', 'rsa', '-N', '', '-f', str(tmp_path / 'rsa'))),
-                timeout=30)
-    with private_sshd(folder, f'HostKey {tmp_path / "rsa"}\n') as server:
+    process.run(Command(('ssh-keygen', '-q', '-t', 'ecdsa', '-N', '', '-f',
+                         str(tmp_path / 'other'))), timeout=30)
+    with private_sshd(folder, f'HostKey {tmp_path / "other"}\n') as server:
         before = server.host_key
         shell = SSHShell(server.endpoint, name='it', timeout=60)
         stream = shell.open(Command(('cat',)))
