@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import contextlib
 import json
 import os
@@ -17,143 +17,18 @@ import sys
 import tempfile
 import threading
 import time
-from typing import Any, Optional
+from typing import Any
 
 import pytest
 
 from fogros2.agent.processes import SWEEP
 from fogros2.agent.protocol import Refused
 from fogros2.agent.server import Agent
-from fogros2.agent_client import agent_program, AgentClient, Heartbeat
+from fogros2.agent_client import AgentClient, Heartbeat
 from fogros2.errors import AgentError
-from fogros2.model import Command, Endpoint, NodeSpec
-from fogros2.shell import Stream
-from fogros2.shell.local import LocalShell
+from fogros2.model import NodeSpec
 from fogros2.waiting import wait_until
-
-ME = pwd.getpwuid(os.getuid()).pw_name
-#: What a sourced ROS 2 needs; an agent that runs as root gives nodes a login's environment.
-ROS_VARIABLES = ('PATH', 'PYTHONPATH', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH')
-#: Signs the heartbeats.
-KEY = '5a' * 32
-
-
-class CutShell(LocalShell):
-    """Reaches the agent of this computer; ``cut`` loses the connection."""
-
-    def __init__(self) -> None:
-        super().__init__(Endpoint('local'), name='planner')
-        self.streams: list[Any] = []
-
-    def open(self, command: Command) -> Stream:
-        self.streams.append(super().open(command))
-        stream: Stream = self.streams[-1]
-        return stream
-
-    def cut(self) -> None:
-        self.streams[-1]._child.kill()
-
-
-def program(folder: Path) -> Path:
-    """Write the agent's program into a folder."""
-    path = folder / 'joined-agent.py'
-    path.write_text(agent_program())
-    return path
-
-
-class Rig:
-    """An agent in a folder of its own, a client of it, and the events that came."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.program = program(folder)
-        self.directory = folder / 'agent'
-        self.prefix = folder / 'prefix'
-        (self.prefix / 'share/ament_index/resource_index/packages').mkdir(parents=True)
-        (self.prefix / 'share/ament_index/resource_index/packages/pack').touch()
-        self.shell = CutShell()
-        self.events: list[dict[str, Any]] = []
-        self.agents: list[subprocess.Popen[bytes]] = []
-        self.clients: list[AgentClient] = []
-
-    def config(self, **more: Any) -> Path:
-        config = {
-            'machine': 'planner', 'launch': 'abc123', 'directory': str(self.directory),
-            'user': ME, 'environment': {
-                **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ},
-                'AMENT_PREFIX_PATH': str(self.prefix)},
-            **more}
-        path = self.folder / 'config.json'
-        path.write_text(json.dumps(config))
-        return path
-
-    def serve(
-        self, program: Optional[Path] = None, **config: Any,
-    ) -> subprocess.Popen[bytes]:
-        agent = subprocess.Popen(
-            [sys.executable, '-IS', str(program or self.program), 'serve', '--config',
-             str(self.config(**config))], stderr=subprocess.PIPE)
-        self.agents.append(agent)
-        wait_until(lambda: self.can_connect() or agent.poll() is not None, timeout=60,
-                   what='the agent')
-        return agent
-
-    def can_connect(self) -> bool:
-        with socket.socket(socket.AF_UNIX) as probe, contextlib.suppress(OSError):
-            probe.connect(str(self.directory / 'agent.sock'))
-            return True
-        return False
-
-    def client(self, *, follow: bool = True) -> AgentClient:
-        client = AgentClient(
-            self.shell, str(self.directory), agent_path=str(self.program))
-        self.clients.append(client)
-        if follow:
-            client.subscribe(self.events.append, since=1)
-        return client
-
-    def node(self, name: str, code: str, **more: Any) -> NodeSpec:
-        path = self.folder / f'{name}.py'
-        path.write_text(code)
-        return NodeSpec(id=name, name=f'{name}-1', arguments=(sys.executable, str(path)), **more)
-
-    def wait(self, event: str, timeout: float = 60, **match: Any) -> dict[str, Any]:
-        def find() -> Optional[dict[str, Any]]:
-            for seen in list(self.events):
-                if seen['event'] == event and all(seen.get(k) == v for k, v in match.items()):
-                    return seen
-            return None
-        return wait_until(find, timeout=timeout, what=f'{event} {match} in {self.events}',
-                          interval=0.005, longest=0.02)
-
-    def text(self, node: str, stream: str = 'stdout') -> str:
-        return ''.join(e['text'] for e in list(self.events)
-                       if e['event'] == 'output' and (e['node'], e['stream']) == (node, stream))
-
-    def started(self, **config: Any) -> AgentClient:
-        """Start an agent; return a client that follows its events."""
-        self.serve(**config)
-        return self.client()
-
-    def kill(self) -> None:
-        self.agents[-1].kill()
-        self.agents[-1].wait(60)
-
-    def run(self, *nodes: NodeSpec) -> None:
-        """Start nodes, and wait for their first output."""
-        self.clients[-1].request('start', nodes=nodes)
-        for node in nodes:
-            self.wait('output', node=node.id)
-
-    def close(self) -> None:
-        for client in self.clients:
-            client.close()
-        for agent in self.agents:
-            if agent.poll() is None:
-                agent.send_signal(signal.SIGTERM)
-                agent.wait(60)
-            assert agent.stderr is not None
-            agent.stderr.close()
+from rigs.agents import gone, KEY, Raw, Rig
 
 
 @pytest.fixture
@@ -180,16 +55,6 @@ def heartbeat(free_udp_port: int) -> dict[str, Any]:
 
 def states(client: AgentClient) -> dict[str, str]:
     return {node['id']: node['state'] for node in client.request('status')['nodes']}
-
-
-def gone(pid: int) -> Callable[[], bool]:
-    """Return what tells whether a process has ended (a zombie has)."""
-    def probe() -> bool:
-        try:
-            return b') Z ' in Path(f'/proc/{pid}/stat').read_bytes()
-        except OSError:
-            return True
-    return probe
 
 
 SLEEP = 'import time\nprint("up")\ntime.sleep(600)\n'
@@ -332,25 +197,6 @@ def test_lost_connection_loses_and_repeats_no_event(rig):
     assert connections() == 2 * ['lost', 'back']
 
 
-class Raw:
-    """A connection without manners."""
-
-    def __init__(self, rig: Rig) -> None:
-        self.link = socket.socket(socket.AF_UNIX)
-        self.link.settimeout(60)
-        self.link.connect(str(rig.directory / 'agent.sock'))
-        self.lines = self.link.makefile('rb')
-
-    def ask(self, data: bytes) -> dict[str, Any]:
-        self.link.sendall(data)
-        answer: dict[str, Any] = json.loads(self.lines.readline())
-        return answer
-
-    def close(self) -> None:
-        self.lines.close()
-        self.link.close()
-
-
 BAD_REQUESTS = [
     (b'nonsense\n', 'malformed request'),
     (b'[1]\n', 'a request is a JSON object'),
@@ -371,7 +217,7 @@ BAD_REQUESTS = [
 
 
 def test_invalid_requests_are_refused_and_connection_stays(shared):
-    raw = Raw(shared)
+    raw = Raw(shared.directory)
     for line, answer in BAD_REQUESTS:
         reply = raw.ask(line)
         assert reply['ok'] is False and answer in reply['error'], line
@@ -389,13 +235,13 @@ def test_invalid_requests_are_refused_and_connection_stays(shared):
 
 def test_output_and_clients_fill_neither_memory_nor_disk(rig):
     rig.serve(log_bytes=2 << 20)
-    silent = Raw(rig)
+    silent = Raw(rig.directory)
     silent.ask(b'{"id": 1, "command": "log"}\n')
     for data in (b'{"id": 1, "comm', b'', b'{"id": 1, "command": "status"}\n' * 50):
-        raw = Raw(rig)
+        raw = Raw(rig.directory)
         raw.link.sendall(data)
         raw.close()
-    crowd = [Raw(rig) for _ in range(100)]  # beyond what is kept open
+    crowd = [Raw(rig.directory) for _ in range(100)]  # beyond what is kept open
     assert crowd[-1].ask(b'{"id": 1, "command": "status"}\n')['ok']
     for raw in crowd:
         raw.close()
@@ -423,7 +269,7 @@ def test_requests_are_answered_after_the_end_of_input(shared, tmp_path):
         return subprocess.run(
             [sys.executable, '-IS', str(shared.program), 'connect', '--directory',
              str(directory)],
-            input=b'{"id": 9, "command": "log", "from": 1000000}\n{"id": 8, "command": "status"}\n',
+            input=b'{"id": 9, "command": "log", "from": 99999}\n{"id": 8, "command": "status"}\n',
             capture_output=True, timeout=60)
 
     absent = connect(tmp_path)
@@ -459,21 +305,18 @@ def test_invalid_configuration_is_refused(tmp_path, config, reason):
 
 @pytest.mark.parametrize('words', [(), ('--detach',)])
 def test_damaged_configuration_is_reported_in_one_line(tmp_path, words):
-    (tmp_path / 'config.json').write_text('{')
     done = subprocess.run(
-        [sys.executable, '-IS', str(program(tmp_path)), 'serve', *words, '--config',
-         str(tmp_path / 'config.json')], capture_output=True, timeout=60)
+        Rig(tmp_path).words(*words, directory=''), capture_output=True, timeout=60)
     line = done.stdout if words else done.stderr
     assert (done.returncode, line.count(b'\n')) == (1, 1)
-    assert "can't be read" in (json.loads(line)['error'] if words else line.decode())
+    assert "names no 'directory'" in (json.loads(line)['error'] if words else line.decode())
 
 
 def test_setup_files_are_sourced(rig):
     setup = rig.folder / "it's a setup.bash"
     setup.write_text('echo printed\nexport SOURCED="from ${BASH_SOURCE[0]##*/} $# $LISTED"\n')
     client = rig.started(setup=[str(setup)], environment={
-        'LISTED': 'configured',
-        **{key: os.environ[key] for key in ROS_VARIABLES if key in os.environ}})
+        'LISTED': 'configured', 'PATH': os.environ['PATH']})
     rig.run(rig.node('n', 'import os\nprint(os.environ["SOURCED"])\n'))
     assert rig.text('n') == "from it's a setup.bash 0 configured\n"
     client.request('configure', environment={'LISTED': 'later', 'PATH': os.environ['PATH']})
@@ -522,7 +365,8 @@ def test_missing_heartbeats_end_the_machine(rig, heartbeat):
 def test_heartbeats_of_another_address_do_not_count(rig, heartbeat):
     rig.started(robot_timeout=0.8, end_command=['false']).request(
         'configure', heartbeat={**heartbeat, 'peer': '127.0.0.2'})
-    with contextlib.closing(Heartbeat('127.0.0.1', heartbeat['port'], KEY, interval=0.05)) as robot:
+    robot = Heartbeat('127.0.0.1', heartbeat['port'], KEY, interval=0.05)
+    with contextlib.closing(robot):
         assert rig.wait('watchdog')['reason'] == 'robot gone'
         assert robot.round_trip is None
     assert rig.wait('end_failed')['returncode'] == 1
@@ -848,10 +692,10 @@ def test_agent_as_process_1_reaps_orphans_and_ends(root, tmp_path):
         pytest.skip('needs process namespaces')
     rig = Rig(tmp_path)
     agent = subprocess.Popen(
-        ['unshare', '--pid', '--fork', '--kill-child', '--mount-proc', sys.executable, '-IS',
-         str(rig.program), 'serve', '--config', str(rig.config())], stderr=subprocess.PIPE)
+        ['unshare', '--pid', '--fork', '--kill-child', '--mount-proc', *rig.words()],
+        stderr=subprocess.PIPE)
     rig.agents.append(agent)
-    wait_until(rig.can_connect, timeout=60, what='the agent')
+    wait_until(lambda: rig.ask('ping'), timeout=60, what='the agent')
     client = rig.client()
     assert client.request('status')['pid'] == 1
     client.request('start', nodes=[rig.node('n', (

@@ -317,7 +317,7 @@ def test_cancelled_command_ends_behind_a_talking_shell(server, tmp_path, home):
 
 
 @pytest.mark.parametrize(('words', 'error'), [
-    ('echo; echo This account is closed.; exit 1', "of 'planner' runs no command, it prints: This"),
+    ('echo; echo This account is closed.; exit 1', "'planner' runs no command, it prints: This"),
     ('exit 0', r'runs no command \(see'),
     ('echo closed >&2; exit 1', r'runs no command, it prints: closed \(see')])
 def test_login_shell_that_runs_no_command_is_named(server, home, words, error):

@@ -10,17 +10,14 @@ import json
 import os
 from pathlib import Path
 import signal
-import socket
 import subprocess
-import sys
 import tarfile
-from typing import Any
 
 import pytest
 
-from fogros2.agent_client import agent_program
 from fogros2.provider.container import entry
 from fogros2.waiting import wait_until
+from rigs.agents import gone, Rig
 
 
 def parent(pid: int) -> int:
@@ -28,39 +25,15 @@ def parent(pid: int) -> int:
     return int(Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[1])
 
 
-def runs(pid: int) -> bool:
-    """Return whether a process runs; one that only its parent remembers does not."""
-    with contextlib.suppress(OSError):
-        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
-    return False
-
-
-class Detached:
+class Detached(Rig):
     """An agent of a computer that is the user's own: started over SSH, or with a pod's exec."""
 
     def __init__(self, folder: Path) -> None:
-        self.directory = folder / 'planner'
-        program = folder / 'agent.py'
-        program.write_text(agent_program())
-        config = folder / 'start.json'
-        config.write_text(json.dumps({
-            'machine': 'planner', 'launch': 'abc123', 'directory': str(self.directory)}))
-        done = subprocess.run(
-            [sys.executable, '-IS', str(program), 'serve', '--detach', '--config', str(config)],
-            capture_output=True, timeout=60, check=True)
-        config.unlink()
-        program.unlink()
+        super().__init__(folder)
+        done = subprocess.run(self.words('--detach'), capture_output=True, timeout=60, check=True)
+        self.program.unlink()
         self.pid: int = json.loads(done.stdout)['pid']
         self.supervisor = parent(self.pid)
-
-    def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
-        with socket.socket(socket.AF_UNIX) as link, contextlib.suppress(OSError):
-            link.settimeout(60)
-            link.connect(str(self.directory / 'agent.sock'))
-            link.sendall(json.dumps({'id': 1, 'command': command, **arguments}).encode() + b'\n')
-            answer: dict[str, Any] = json.loads(link.makefile('rb').readline() or b'{}')
-            return answer
-        return {}
 
     def successor(self) -> int:
         """Return the pid of the agent after this one."""
@@ -96,14 +69,15 @@ def test_agent_that_ends_in_order_stays_away(agent: Detached, how: str) -> None:
         agent.ask('release', exit=True)
     else:
         os.kill(agent.pid, signal.SIGTERM)
-    wait_until(lambda: not runs(agent.supervisor), timeout=60, what='its supervisor to end')
-    assert not runs(agent.pid) and not agent.ask('ping')
+    wait_until(gone(agent.supervisor), timeout=60, what='its supervisor to end')
+    assert gone(agent.pid)() and not agent.ask('ping')
+    assert agent.directory.exists() == (how == 'signal')
 
 
 def test_agent_whose_folder_was_removed_stays_away(agent: Detached) -> None:
     agent.directory.rename(agent.directory.with_name('aside'))
     os.kill(agent.pid, signal.SIGKILL)
-    wait_until(lambda: not runs(agent.supervisor), timeout=60, what='its supervisor to end')
+    wait_until(gone(agent.supervisor), timeout=60, what='its supervisor to end')
     assert not agent.directory.exists()
 
 
@@ -114,7 +88,7 @@ def test_supervisor_leaves_the_folder_to_another_agent(agent: Detached) -> None:
     other = Detached(agent.directory.parent)
     with contextlib.closing(other):
         os.kill(agent.supervisor, signal.SIGCONT)
-        wait_until(lambda: not runs(agent.supervisor), timeout=60, what='its supervisor to end')
+        wait_until(gone(agent.supervisor), timeout=60, what='its supervisor to end')
         assert other.ask('status')['pid'] == other.pid
 
 

@@ -392,7 +392,9 @@ def test_heartbeats_are_sent_and_answers_measured():
             data, robot = machine.recvfrom(2048)
             beat = verify(KEY, BEAT, data)
             assert beat is not None and beat[0] == number
-        for nonsense in (b'', b'x', b'[]', data, sign(KEY, ANSWER.pack(number, 0.0, nan)),
+        for nonsense in (b'', b'[' * 2000, data, b'{"launch": "x", "t": 1.0}',
+                         sign('a5' * 32, ANSWER.pack(*beat, time.time())),
+                         sign(KEY, ANSWER.pack(number, 0.0, nan)),
                          sign(KEY, ANSWER.pack(number, -inf, 0.0)), sign(KEY, b'{"t": 0}')):
             machine.sendto(nonsense, robot)
         machine.recvfrom(2048)
