@@ -87,7 +87,9 @@ class Client:
             data = b''
         self.ended = not data
         self.received += data
-        *lines, self.received = self.received.split(b'\n')
+        lines = []
+        if b'\n' in data:
+            *lines, self.received = self.received.split(b'\n')
         self.active = self.loop.clock()
         for line in lines:
             if line.strip() and self in self.agent.clients:

@@ -21,7 +21,7 @@ from rigs.memory import measure
 
 LIMIT = 100e6
 #: A hijacked machine sends so much in pieces of so many bytes.
-AMOUNT, PIECE = 600 << 20, 1 << 15
+AMOUNT, PIECE = 200 << 20, 1 << 15
 
 #: Reads lines of an agent's stream that never come; prints whether the stream has ended.
 READS = """\

@@ -7,10 +7,8 @@ import argparse
 from collections.abc import Iterator
 import dataclasses
 import io
-import json
 import logging
 from pathlib import Path
-import queue
 import re
 import sys
 from typing import Any
@@ -25,6 +23,7 @@ from fogros2.shell import command_line, sync
 from fogros2.waiting import wait_until
 from fogros2_features.replacement.snapshots import Checkpoint
 from fogros2_testing import FakeShell
+from rigs.recorded_agent import ScriptedShell, ScriptedStream
 from ros2fog_cli.api import output, progress, table
 from ros2fog_cli.api.log import Lines
 from ros2fog_cli.command.fog import FogCommand
@@ -39,42 +38,18 @@ RED = '\x1b[1;31mred\x1b[0m'
 ALLOWED = re.compile('\x1b\\[[0-9;]*m')
 
 
-class Machine:
-    """An agent that answers requests, and sends events when the log is followed."""
-
-    def __init__(self, sent: list[dict[str, Any]]) -> None:
-        self.sent, self.lines = sent, queue.Queue[bytes]()
-
-    def open(self, command: object) -> Machine:
-        return self
-
-    def write(self, data: bytes) -> None:
-        for line in data.splitlines():
-            request = json.loads(line)
-            if request['command'] != 'log':
-                continue
-            answer = {'id': request['id'], 'ok': True, 'first': 1, 'next': 1, 'lost': 0}
-            for message in (answer, *self.sent):
-                self.lines.put(json.dumps(message).encode() + b'\n')
-
-    def readline(self) -> bytes:
-        return self.lines.get()
-
-    def close(self) -> None:
-        self.lines.put(b'')
-
-
 def received(sent: list[dict[str, Any]]) -> list[Any]:
     """Return the events as the robot's programs get them."""
-    found: list[Any] = []
-    shell: Any = Machine(sent)
+    events: list[Any] = []
+    shell: Any = ScriptedShell(ScriptedStream(lambda request: [
+        {'id': request['id'], 'ok': True, 'first': 1, 'next': 1, 'lost': 0}, *sent]))
     client = AgentClient(shell, '/run/x', agent_path='/run/x/agent.py')
     try:
-        client.subscribe(found.append, since=1)
-        wait_until(lambda: len(found) == len(sent) or None, timeout=60, what='the events')
+        client.subscribe(events.append, since=1)
+        wait_until(lambda: len(events) == len(sent) or None, timeout=60, what='the events')
     finally:
         client.close()
-    return found
+    return events
 
 
 def harmless(text: str) -> bool:

@@ -9,8 +9,6 @@ from pathlib import Path
 import subprocess
 import sys
 
-import pytest
-
 from fogros2 import agent
 from fogros2.agent_client import agent_program
 
@@ -62,12 +60,9 @@ def test_joined_program_does_what_its_modules_do():
     assert tree(agent_program()) == sum(parts, [])
 
 
-@pytest.mark.parametrize(('arguments', 'status'), [
-    (['fly'], 2), (['serve', '--config', '/nowhere'], 1),
-    (['connect', '--directory', '/nowhere'], 3)])
-def test_joined_program_runs_alone(tmp_path, arguments, status):
+def test_joined_program_runs_alone(tmp_path):
     path = tmp_path / 'agent.py'
     path.write_text(agent_program())
     done = subprocess.run(
-        [sys.executable, '-IS', str(path), *arguments], capture_output=True, timeout=30)
-    assert done.returncode == status and b'Traceback' not in done.stderr
+        [sys.executable, '-IS', str(path), 'fly'], capture_output=True, timeout=30)
+    assert done.returncode == 2 and done.stderr.startswith(b'usage: ')

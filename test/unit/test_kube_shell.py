@@ -227,12 +227,6 @@ def test_ctrl_c_ends_an_exec_that_never_begins(api, shell, monkeypatch):
                what='its exec to end')
 
 
-def test_missing_pod_is_reported_at_once(api, shell):
-    api.refusals = [ApiError('pods "a-pod" not found', status=404, reason='NotFound')]
-    error = raised(ShellError, lambda: shell.run(Command(('true',)), timeout=20.0))
-    assert 'is gone' in str(error)
-
-
 @pytest.mark.parametrize('noticed', [True, False])
 def test_refusal_after_a_restart_is_retried(api, shell, noticed):
     """Its list of who may what is empty at first."""
@@ -243,10 +237,13 @@ def test_refusal_after_a_restart_is_retried(api, shell, noticed):
     assert shell.run(Command(('echo', 'x')), timeout=20.0).stdout == 'x\n'
 
 
-def test_missing_rights_are_named(api, shell):
-    api.refusals = [ApiError('cannot create resource "pods/exec"', status=403)]
+@pytest.mark.parametrize(('refusal', 'words'), [
+    (ApiError('cannot create resource "pods/exec"', status=403), 'pods/exec'),
+    (ApiError('pods "a-pod" not found', status=404, reason='NotFound'), 'is gone')])
+def test_lasting_refusal_is_reported_at_once(api, shell, refusal, words):
+    api.refusals = [refusal]
     error = raised(ShellError, lambda: shell.run(Command(('true',)), timeout=20.0))
-    assert 'pods/exec' in error.hint
+    assert words in f'{error} {error.hint}'
 
 
 def test_close_ends_running_commands(api, shell, tmp_path):

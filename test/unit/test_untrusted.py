@@ -60,11 +60,11 @@ class Whole(TypedDict, total=False):
 
 
 def test_json_of_a_type_is_returned_without_control_characters() -> None:
-    text = ('{"parts": [{"number": 1, "new": [[]]}], "names": {"\\u001b[a": "\\u001b[2Jb"}, '
-            '"size": null, "kind": "a"}')
+    text = ('{"parts": [{"number": -9007199254740992, "new": [[]]}], "size": null, '
+            '"names": {"\\u001b[a": "\\u001b[2Jb"}, "kind": "a"}')
     assert untrusted.parsed(text, Whole) == {
-        'parts': [{'number': 1, 'new': [[]]}], 'names': {'\ufffd[a': '\ufffd[2Jb'}, 'size': None,
-        'kind': 'a'}
+        'parts': [{'number': -untrusted.LARGEST, 'new': [[]]}], 'size': None,
+        'names': {'\ufffd[a': '\ufffd[2Jb'}, 'kind': 'a'}
     assert untrusted.parsed(text.encode()) == untrusted.parsed(text)
 
 
@@ -73,6 +73,9 @@ def test_json_of_a_type_is_returned_without_control_characters() -> None:
     ('{"size": 1e999}', "field 'size': a number out of range"),
     ('{"parts": [{"number": %s}]}' % ('9' * 5000), "field 'number': a number out of range"),
     ('{"parts": [{"number": 9007199254740993}]}', "field 'parts.number': expected int, got a nu"),
+    ('{"parts": [{"number": 1.5}]}', "field 'parts.number': expected int, got float"),
+    ('{"parts": [{"number": true}]}', "field 'parts.number': expected int, got bool"),
+    ('{"parts": [{"number": null}]}', "field 'parts.number': expected int, got NoneType"),
     ('{"parts": [{}]}', "field 'parts.number' is missing"),
     ('{"parts": {}}', "field 'parts': expected list, got dict"),
     ('{"names": {"a": 1}}', "field 'names': expected str, got int"),
