@@ -18,7 +18,7 @@ from figures import Row, write
 
 from fogros2.errors import FogError
 from fogros2.model import Command, Endpoint
-from fogros2.shell import multiplexed, multiplexer, Shell, Stream
+from fogros2.shell import multiplexed, multiplexer, remote, Shell, Stream
 from fogros2.shell.ssh import SSHShell
 from rigs.sshd import private_sshd
 
@@ -29,7 +29,7 @@ TARGET = 1.0
 RATE = ('tbf', 'rate', '1mbit', 'burst', '16kb', 'latency', '100ms')
 
 
-class PodShell(multiplexed.MultiplexedShell):
+class PodShell(remote.MultiplexedShell):
     """A pod's multiplexer behind a connection of loopback, without API server and kubelet."""
 
     def _connect(

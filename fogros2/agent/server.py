@@ -565,12 +565,11 @@ class Agent:
         client.position = journal.find(begin)
         client.send()
 
-    def do_release(self, client: Client, request: Json) -> None:
+    def do_release(self, client: Client, request: Json) -> Optional[Empty]:
         """Stop the nodes of a launch and release the machine."""
         launch, has = request.get('launch'), self.claimed or self.config['launch']
         if launch and has and launch != has:
-            client.reply(request.get('id'), {})
-            return
+            return {}
         self.config.update(checked({'on_exit': request.get('on_exit', self.config['on_exit'])}))
         self.claimed = ''
         self.released = True
@@ -592,6 +591,7 @@ class Agent:
         if request.get('exit'):
             self._hurry()
         self.nodes.stop_all(stopped)
+        return None
 
     # -- the end ------------------------------------------------------------------------------
 

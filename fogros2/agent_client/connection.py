@@ -22,7 +22,7 @@ from fogros2.errors import (
 )
 from fogros2.model import Command, to_json
 from fogros2.shell import Shell, Stream
-from fogros2.waiting import wait_until
+from fogros2.waiting import Periodic, wait_until
 
 #: Seconds without data, although a ping was sent, after which a connection counts as lost. TCP
 #: would need 15 minutes after the robot has changed networks.
@@ -105,7 +105,7 @@ class AgentClient:
             self._thread = threading.Thread(
                 target=self._read_all, name='fogros2-agent', daemon=True)
             self._thread.start()
-            threading.Thread(target=self._watch, name='fogros2-agent-watch', daemon=True).start()
+            Periodic('fogros2-agent-watch', SILENCE / 4, self._watch, stop=self._closed)
 
     def request(
         self, command: str, *, timeout: float = 30.0, silent: Optional[float] = None,
@@ -309,19 +309,15 @@ class AgentClient:
 
     def _watch(self) -> None:
         """Ping a silent connection, and close it if nothing comes back."""
-        thread = self._thread
-        while thread is not None and thread.is_alive():
-            if self._closed.wait(SILENCE / 4):
-                return
-            stream, silent = self._stream, time.monotonic() - self._heard
-            if stream is None or silent < SILENCE / 4:
-                continue
-            if silent > SILENCE:
-                stream.close()
-            elif self._writing.acquire(timeout=SILENCE / 4):
-                # a thread that holds the lock for longer is stuck in a dead connection
-                self._writing.release()
-                self._send(stream, _PING)
+        stream, silent = self._stream, time.monotonic() - self._heard
+        if stream is None or silent < SILENCE / 4:
+            return
+        if silent > SILENCE:
+            stream.close()
+        elif self._writing.acquire(timeout=SILENCE / 4):
+            # a thread that holds the lock for longer is stuck in a dead connection
+            self._writing.release()
+            self._send(stream, _PING)
 
     def _reopen(self) -> None:
         """Reconnect, with increasing pauses, until the client is closed."""

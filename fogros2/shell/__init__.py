@@ -2,15 +2,15 @@
 """
 The plugin interface to a machine's command line: run, put, sync, open.
 
-``command_line`` builds command lines for a login shell, ``lines`` reads output. ``relay`` connects
-local streams to a program on a machine (``rsh`` is rsync's end of it), ``terminal`` the user's
-terminal. ``flow`` keeps little of a long transfer under way. ``ssh_config`` asks OpenSSH for the
-user's settings of a host, ``known_hosts`` has the host keys, and ``proxy`` leads through other
-computers; ``ssh_connection`` opens SSH connections. ``sync`` calls rsync. ``local`` is the shell
-of this computer. ``remote`` is the base of the shells with a connection. ``ssh`` is one of them.
-``multiplexer`` is a program on a machine that runs many commands over one connection, and
-``multiplexed`` the robot's end of it. So do pods by ``kubernetes_link`` and ``kubernetes``, the
-connection and the shell. ``movable`` replaces a shell in use, ``host_key`` a machine's host key.
+``command_line`` builds command lines for a login shell. ``flow`` keeps little of a long transfer
+under way. ``multiplexer`` is a program on a machine that runs many commands over one connection,
+and ``multiplexed`` the robot's end of it. ``ssh_config`` asks OpenSSH for the user's settings of a
+host, ``known_hosts`` has the host keys, and ``proxy`` leads through programs; ``ssh_connection``
+opens SSH connections. ``lines`` reads output. ``relay`` connects local streams to a program on a
+machine (``rsh`` is rsync's end of it), ``terminal`` the user's terminal. ``sync`` calls rsync.
+``local`` is the shell of this computer. ``remote`` is the base of the shells with a connection:
+``ssh``, and pods by ``kubernetes_link`` and ``kubernetes``, the connection and the shell.
+``movable`` replaces a shell in use, ``host_key`` a machine's host key.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shlex
 
 from fogros2.errors import CommandError
@@ -22,6 +23,12 @@ def words(command: Command, *, root: bool) -> list[str]:
     line = [f'{name}={value}' for name, value in command.environment.items()]
     argv = ['env', *line, *command.argv] if line else list(command.argv)
     return ['sudo', '-n', '--', *argv] if command.sudo and not root else argv
+
+
+def quiet(command: Command) -> Command:
+    """Return a command without standard error, which would stop it if nobody reads it."""
+    return dataclasses.replace(
+        command, argv=('sh', '-c', 'exec "$@" 2>/dev/null', 'sh', *command.argv))
 
 
 def remote_line(command: Command, *, user: str) -> str:

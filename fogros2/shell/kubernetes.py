@@ -13,7 +13,7 @@ from typing import Optional
 
 from fogros2.errors import ConnectError, DeadlineExceeded, FogError
 from fogros2.shell.kubernetes_link import Link
-from fogros2.shell.multiplexed import MultiplexedShell
+from fogros2.shell.remote import MultiplexedShell
 from fogros2.waiting import wait_until
 
 #: Time-out of one attempt to connect, in seconds.

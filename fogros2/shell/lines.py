@@ -14,7 +14,7 @@ from fogros2.untrusted import DIGITS
 if TYPE_CHECKING:
     import paramiko
 
-    from fogros2.shell import multiplexed
+    from fogros2.shell import multiplexed, proxy
 
 #: Maximum bytes of a line, so that a machine cannot fill the robot's memory: JSON of empty lists
 #: takes 40 times as much when it is parsed. An agent's longest messages are output of 64 K
@@ -26,6 +26,8 @@ _CHUNK = 1 << 16
 #: A program on a machine. Errors are OSErrors or FogErrors; a read that timed out raises
 #: TimeoutError.
 Channel = Union['paramiko.Channel', 'multiplexed.Channel']
+#: Of these, what carries lines; or a program of this computer.
+Lines = Union[Channel, 'proxy.ProxySocket']
 
 
 def take_errors(channel: Channel) -> bytes:
@@ -36,7 +38,7 @@ def take_errors(channel: Channel) -> bytes:
     return b''.join(parts)
 
 
-def close(channel: Channel) -> None:
+def close(channel: Lines) -> None:
     """Close a channel, whose connection may be gone."""
     # paramiko sends a message for it
     with contextlib.suppress(OSError):
@@ -50,7 +52,7 @@ class LineStream:
     :param name: the machine's name, for messages.
     """
 
-    def __init__(self, channel: Channel, name: str) -> None:
+    def __init__(self, channel: Lines, name: str) -> None:
         self._channel = channel
         self._name = name
         self._buffer = b''

@@ -12,9 +12,9 @@ import threading
 from typing import Optional
 
 from fogros2 import process
-from fogros2.errors import ConnectError, PrerequisiteError
 from fogros2.model import Command, Endpoint, Result
-from fogros2.shell import relay, Stream, sync
+from fogros2.shell import command_line, proxy, relay, Stream, sync
+from fogros2.shell.lines import LineStream
 
 
 class LocalShell(sync.RsyncShell):
@@ -41,17 +41,9 @@ class LocalShell(sync.RsyncShell):
 
     def open(self, command: Command) -> Stream:
         """Start a program; closing the returned stream ends the program."""
-        try:
-            child = process.start(
-                command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL,
-                environment={**os.environ, **command.environment})
-        except FileNotFoundError as error:
-            raise PrerequisiteError(f'{error.filename} not found on this computer',
-                                    'ros2 fog doctor names the package that brings it') from error
-        stream = LocalStream(child)
-        if command.input:
-            stream.write(command.input)
-        return stream
+        program = proxy.dial(command_line.quiet(command), None)
+        program.sendall(command.input)
+        return LineStream(program, self.name)
 
     def interactive(self, command: Optional[Command] = None) -> int:
         """Run the user's shell, or ``command``, in this terminal."""
@@ -61,38 +53,3 @@ class LocalShell(sync.RsyncShell):
 
     def close(self) -> None:
         """Do nothing: there is no connection."""
-
-
-class LocalStream:
-    """Standard input and output of a program on this computer, line by line."""
-
-    def __init__(self, child: subprocess.Popen[bytes]) -> None:
-        self._child = child
-
-    def write(self, data: bytes) -> None:
-        """Send bytes to the program's standard input."""
-        assert self._child.stdin is not None
-        try:
-            self._child.stdin.write(data)
-            self._child.stdin.flush()
-        except (OSError, ValueError) as error:
-            raise ConnectError(f'the program has ended: {error}') from error
-
-    def readline(self) -> bytes:
-        """Return the next line of output with its newline, b'' at the end."""
-        assert self._child.stdout is not None
-        return self._child.stdout.readline()
-
-    def close(self) -> None:
-        """End the program; a ``readline`` in another thread returns b''."""
-        self._child.terminate()
-        if self._child.stdin is not None:
-            try:
-                self._child.stdin.close()
-            except BrokenPipeError:
-                pass  # the program ended before it read all input
-        try:
-            self._child.wait(2.0)
-        except subprocess.TimeoutExpired:
-            self._child.kill()
-            self._child.wait()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot's end of a machine's multiplexer: a connection, its channels, and a shell over it."""
+"""The robot's end of a machine's multiplexer: a connection and its channels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from fogros2.errors import ConnectError, FogError
 from fogros2.model import Command
 from fogros2.shell import flow
 from fogros2.shell import multiplexer as mux
-from fogros2.shell.remote import RemoteShell
 
 #: Seconds between two signs of life, and of silence after which the robot sends a ping.
 ASK = 15.0
@@ -329,14 +328,3 @@ class Link:
             with self._using():
                 self._incoming += self._read()
             heard = time.monotonic()
-
-
-class MultiplexedShell(RemoteShell[Link]):
-    """A Shell whose commands share one connection; a subclass connects."""
-
-    def _start(
-        self, connection: Link, command: Command | str | None, timeout: float,
-        cancel: Optional[threading.Event] = None, size: Optional[tuple[int, int, str]] = None,
-    ) -> Channel:
-        return connection.open(
-            Command(('sh', '-c', command)) if isinstance(command, str) else command, size)

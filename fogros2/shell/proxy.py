@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A connection through a program: OpenSSH's ``ProxyCommand`` and ``ProxyJump``."""
+"""A connection to a program of this computer, such as OpenSSH's ``ProxyCommand``."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import contextlib
-import os
-import signal
 import socket
 import subprocess
+from typing import Optional
 
 from fogros2 import process
 from fogros2.errors import ConnectError
@@ -21,11 +19,12 @@ class ProxySocket(socket.socket):
     child: subprocess.Popen[bytes]
 
     def close(self) -> None:
-        """Close the streams, and end the program."""
+        """End the program; a read in another thread returns b''."""
+        with contextlib.suppress(OSError):
+            self.shutdown(socket.SHUT_RDWR)
+        if self.child.returncode is None:
+            process.end(self.child, sudo=False)
         super().close()
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self.child.pid, signal.SIGKILL)
-        self.child.wait()
 
     def complaint(self) -> str:
         """Return the last line that a program wrote to standard error, after its end."""
@@ -34,7 +33,7 @@ class ProxySocket(socket.socket):
         return next((line.strip() for line in reversed(lines) if line.strip()), '')
 
 
-def dial(words: Sequence[str], timeout: float) -> ProxySocket:
+def dial(command: Command, timeout: Optional[float]) -> ProxySocket:
     """
     Start a program, and return a socket whose other end is its standard input and output.
 
@@ -43,11 +42,11 @@ def dial(words: Sequence[str], timeout: float) -> ProxySocket:
     ours, theirs = socket.socketpair()
     with theirs:
         try:
-            child = process.start(Command(tuple(words)), stdin=theirs.fileno(),
-                                  stdout=theirs.fileno(), stderr=subprocess.PIPE)
+            child = process.start(command, stdin=theirs.fileno(), stdout=theirs.fileno(),
+                                  stderr=subprocess.PIPE)
         except OSError as error:
             ours.close()
-            raise ConnectError(f"{words[0]} can't be started: {error.strerror}") from error
+            raise ConnectError(f"{command.argv[0]} can't be started: {error.strerror}") from error
     proxy = ProxySocket(ours.family, ours.type, fileno=ours.detach())
     proxy.child = child
     proxy.settimeout(timeout)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable
 import contextlib
-import dataclasses
 import getpass
 import threading
 import time
@@ -245,9 +244,7 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
 
     def open(self, command: Command) -> Stream:
         """Start a program on the machine; closing the returned stream ends the program."""
-        # nobody reads its errors, which would stop it
-        channel = self.start(dataclasses.replace(
-            command, argv=('sh', '-c', 'exec "$@" 2>/dev/null', 'sh', *command.argv)))
+        channel = self.start(command_line.quiet(command))
         _feed(channel, command.input, end=False)
         channel.settimeout(None)
         return LineStream(channel, self.name)
@@ -282,3 +279,14 @@ def _feed(channel: Channel, data: bytes, *, end: bool = True) -> Optional[thread
     thread = threading.Thread(target=send, name='fog-feed', daemon=True)
     thread.start()
     return thread
+
+
+class MultiplexedShell(RemoteShell['multiplexed.Link']):
+    """A Shell whose commands share one connection to a multiplexer; a subclass connects."""
+
+    def _start(
+        self, connection: multiplexed.Link, command: Command | str | None, timeout: float,
+        cancel: Optional[threading.Event] = None, size: Optional[tuple[int, int, str]] = None,
+    ) -> Channel:
+        return connection.open(
+            Command(('sh', '-c', command)) if isinstance(command, str) else command, size)

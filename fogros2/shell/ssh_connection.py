@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import warnings
 
 from fogros2.errors import AuthenticationError, ConnectError, HostKeyError, PrerequisiteError
-from fogros2.model import Endpoint
+from fogros2.model import Command, Endpoint
 from fogros2.shell import flow, known_hosts, proxy, ssh_config
 from fogros2.shell.known_hosts import Known
 from fogros2.shell.ssh_config import Settings
@@ -106,7 +106,7 @@ def connect(endpoint: Endpoint, *, name: str, timeout: float) -> paramiko.Transp
 
     settings = ssh_config.of(endpoint)
     known = known_keys(endpoint, settings)
-    sock = proxy.dial(settings.proxy, timeout) if settings.proxy \
+    sock = proxy.dial(Command(settings.proxy), timeout) if settings.proxy \
         else _dial(settings, name, timeout)
     transport = transport_over(sock)
     # paramiko's own limits follow the clock, which may be set back meanwhile

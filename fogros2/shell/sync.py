@@ -71,7 +71,9 @@ class RsyncShell(Shell):
         """Make the folder ``target`` on the machine equal to ``source``; see the protocol."""
         begin = time.monotonic()
         process.require(['rsync'])
-        check_source(source)
+        if not source.is_dir():
+            raise WorkspaceError(f'{source} is no folder that could be sent',
+                                 'ros_workspace= takes the folder that src and install are in')
         path = command_line.remote_path(target)
         answer = self.run(
             Command.script(
@@ -164,17 +166,6 @@ class Room(threading.Event):
                 raise ShellError(self._message, 'the machine may be hijacked: delete it')
         # a tenth of the time at most
         self._next = time.monotonic() + max(0.1, 10 * (time.monotonic() - begin))
-
-
-def check_source(source: Path) -> None:
-    """
-    Check that a folder can be sent.
-
-    :raises WorkspaceError: the folder does not exist, or is no folder.
-    """
-    if not source.is_dir():
-        raise WorkspaceError(f'{source} is no folder that could be sent',
-                             'ros_workspace= takes the folder that src and install are in')
 
 
 def is_large(source: Path, limit: int) -> bool:

@@ -18,7 +18,8 @@ from typing import Optional
 
 from fogros2.errors import AuthenticationError, ConnectError
 from fogros2.model import Endpoint
-from fogros2.shell.multiplexed import Link, MultiplexedShell
+from fogros2.shell.multiplexed import Link
+from fogros2.shell.remote import MultiplexedShell
 
 #: Bytes of the challenge, and of the longest answer to its proof.
 _CHALLENGE, _LINE = 32, 300

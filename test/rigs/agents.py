@@ -13,7 +13,7 @@ import signal
 import socket
 import subprocess
 import sys
-from typing import Any, Optional
+from typing import Any
 
 from fogros2.agent_client import agent_program, AgentClient
 from fogros2.model import Command, Endpoint, NodeSpec
@@ -38,7 +38,7 @@ class CutShell(LocalShell):
         return stream
 
     def cut(self) -> None:
-        self.streams[-1]._child.kill()
+        self.streams[-1]._channel.child.kill()
 
 
 class Raw:
@@ -74,7 +74,7 @@ class Rig:
         self.program.write_text(agent_program())
         self.directory = folder / 'agent'
         self.shell = CutShell()
-        self.events: list[dict[str, Any]] = []
+        self.events: list[Any] = []
         self.agents: list[subprocess.Popen[bytes]] = []
         self.clients: list[AgentClient] = []
 
@@ -127,13 +127,15 @@ class Rig:
             self.wait('output', node=node.id)
 
     def wait(self, event: str, timeout: float = 60, **match: Any) -> dict[str, Any]:
-        def find() -> Optional[dict[str, Any]]:
+        def find() -> Any:
             for seen in list(self.events):
                 if seen['event'] == event and all(seen.get(k) == v for k, v in match.items()):
                     return seen
             return None
-        return wait_until(find, timeout=timeout, what=f'{event} {match} in {self.events}',
-                          interval=0.005, longest=0.02)
+        message: dict[str, Any] = wait_until(
+            find, timeout=timeout, what=f'{event} {match} in {self.events}', interval=0.005,
+            longest=0.02)
+        return message
 
     def text(self, node: str, stream: str = 'stdout') -> str:
         return ''.join(e['text'] for e in list(self.events)

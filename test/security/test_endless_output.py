@@ -34,7 +34,8 @@ print(stream.readline().endswith(b'\\n'))
 """
 BY_LINK = """\
 import socket
-from fogros2.shell.multiplexed import Link, MultiplexedShell
+from fogros2.shell.multiplexed import Link
+from fogros2.shell.remote import MultiplexedShell
 class Shell(MultiplexedShell):
     def _connect(self, timeout, cancel):
         return Link(socket.create_connection(('127.0.0.1', {port})), self.name, self.user)

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from math import inf, nan
 import socket
-import threading
 import time
 from typing import Any
 
@@ -20,7 +20,7 @@ from fogros2.errors import (
     ConnectError,
     DeadlineExceeded,
 )
-from fogros2.waiting import wait_until
+from fogros2.waiting import in_thread, wait_until
 from rigs import recorded_agent
 from rigs.recorded_agent import ScriptedShell, ScriptedStream
 
@@ -57,6 +57,18 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., AgentClient]
     yield build
     for client in clients:
         client.close()
+
+
+def followed(client: AgentClient) -> list[dict[str, Any]]:
+    """Subscribe to the events of an agent; return them as they come."""
+    seen: list[Any] = []
+    client.subscribe(seen.append, since=1)
+    return seen
+
+
+def request(client: AgentClient, command: str) -> Future[Any]:
+    """Send a request in a thread."""
+    return in_thread(lambda: client.request(command))
 
 
 def until(probe: Callable[[], Any]) -> None:
@@ -104,8 +116,7 @@ def test_no_reply_in_time(make):
 def test_events_arrive_once_and_in_order_over_connections(make):
     first, second = agent(), agent(next_seq=6)
     client = make(first, ConnectError('not yet'), second)
-    seen: list[dict[str, Any]] = []
-    client.subscribe(seen.append, since=1)
+    seen = followed(client)
     for seq in (1, 2, 2, 3):
         first.say(ending(seq))
     first.say(None)
@@ -120,8 +131,7 @@ def test_events_arrive_once_and_in_order_over_connections(make):
 def test_new_log_of_an_agent_is_read_from_its_beginning(make):
     first, second = agent(next_seq=60), agent(next_seq=3)
     client = make(first, second)
-    seen: list[dict[str, Any]] = []
-    client.subscribe(seen.append, since=1)
+    seen = followed(client)
     first.say(ending(59))
     until(lambda: seen)
     first.say(None)
@@ -135,8 +145,7 @@ def test_new_log_of_an_agent_is_read_from_its_beginning(make):
 
 def test_events_lost_by_rotation_are_reported(make):
     client = make(agent(next_seq=10, lost=4))
-    seen: list[dict[str, Any]] = []
-    client.subscribe(seen.append, since=1)
+    seen = followed(client)
     until(lambda: seen)
     assert seen == [{'event': 'gap', 'count': 4}]
 
@@ -144,22 +153,11 @@ def test_events_lost_by_rotation_are_reported(make):
 def test_lost_requests_are_repeated_except_signals(make):
     mute = ScriptedStream(lambda request: [])
     client = make(mute, agent())
-    results: dict[str, Any] = {}
-
-    def ask(command: str) -> None:
-        try:
-            results[command] = client.request(command)
-        except AgentError as error:
-            results[command] = error
-    threads = [threading.Thread(target=ask, args=(name,)) for name in ('stop', 'signal')]
-    for thread in threads:
-        thread.start()
+    stopping, signalling = request(client, 'stop'), request(client, 'signal')
     until(lambda: len(mute.asked) == 2)
     mute.say(None)
-    for thread in threads:
-        thread.join(60)
-    assert results['stop']['ok'] is True
-    assert 'connection was lost' in str(results['signal'])
+    assert stopping.result(60)['ok'] is True
+    assert 'connection was lost' in str(signalling.exception(60))
 
 
 def test_machine_without_agent_is_given_up(make):
@@ -180,8 +178,7 @@ def test_agent_that_does_not_come_back_is_given_up(make):
     # it may take a moment to restart
     first, second = agent(), agent()
     client = make(first, absent(), absent(), second, *(absent() for _ in range(50)), restart=0.5)
-    seen: list[dict[str, Any]] = []
-    client.subscribe(seen.append, since=1)
+    seen = followed(client)
     client.request('status')
     first.say(None)
     until(lambda: len(seen) == 2)
@@ -204,8 +201,7 @@ def test_program_that_ends_without_output_is_given_up(make):
 def test_machine_that_refuses_the_key_is_given_up(make):
     first = agent()
     client = make(first, AuthenticationError('key refused'), agent())
-    seen: list[dict[str, Any]] = []
-    client.subscribe(seen.append, since=1)
+    seen = followed(client)
     first.say(None)
     until(lambda: len(seen) == 2)
     assert [e['state'] for e in seen] == ['lost', 'absent']
@@ -216,19 +212,10 @@ def test_machine_that_refuses_the_key_is_given_up(make):
 def test_close_ends_the_thread_and_waiting_requests(make):
     stream = ScriptedStream(lambda request: [])
     client = make(stream)
-    caught: list[Exception] = []
-
-    def ask() -> None:
-        try:
-            client.request('status')
-        except AgentError as error:
-            caught.append(error)
-    thread = threading.Thread(target=ask)
-    thread.start()
+    asking = request(client, 'status')
     until(lambda: stream.asked)
     client.close()
-    thread.join(60)
-    assert 'closed' in str(caught[0])
+    assert 'closed' in str(asking.exception(60))
     with pytest.raises(AgentError, match='closed'):
         client.request('status')
 
@@ -255,8 +242,7 @@ def test_silent_connection_is_replaced(make):
     second = agent()
     # a busy computer may take a while over a thread's turn
     client = make(mute, second, silence=0.8)
-    seen: list[dict[str, Any]] = []
-    client.subscribe(seen.append, since=1)
+    seen = followed(client)
     until(lambda: len(seen) == 2)
     assert 'ping' in [request['command'] for request in mute.asked]
     assert [e['state'] for e in seen] == ['lost', 'back']
@@ -282,24 +268,14 @@ INVALID = [
 def test_invalid_message_is_reported_once_and_fails_the_machine(make, line, field):
     stream = ScriptedStream(lambda request: [])
     client = make(stream, agent())
-    seen: list[dict[str, Any]] = []
-    client.subscribe(seen.append, since=1)
-    caught: list[Exception] = []
-
-    def ask() -> None:
-        try:
-            client.status()
-        except AgentError as error:
-            caught.append(error)
-
-    asking = threading.Thread(target=ask)
-    asking.start()
+    seen = followed(client)
+    asking = request(client, 'status')
     until(lambda: len(stream.asked) == 2)
     stream.say({'event': 'unheard of'})  # from a newer agent: ignored
     stream.say(line.encode() + b'\n')
     stream.say(ending(1))
-    asking.join(60)
-    assert 'sent an invalid message' in str(caught[0]) and field in str(caught[0])
+    error = str(asking.exception(60))
+    assert 'sent an invalid message' in error and field in error
     until(lambda: not client._thread.is_alive())
     assert [(e['event'], e.get('state')) for e in seen] == [('connection', 'absent')]
     assert field in seen[0]['error'] and len(client._shell.opened) == 1
@@ -311,8 +287,7 @@ def test_invalid_message_is_reported_once_and_fails_the_machine(make, line, fiel
 def test_agent_cannot_forge_events_of_the_robot(make, name):
     stream = agent()
     client = make(stream)
-    seen: list[dict[str, Any]] = []
-    client.subscribe(seen.append, since=1)
+    seen = followed(client)
     stream.say({'event': name, 'seq': 1, 'state': 'absent', 'reason': 'x', 'count': 1})
     stream.say(ending(2))
     until(lambda: seen)
@@ -322,8 +297,7 @@ def test_agent_cannot_forge_events_of_the_robot(make, name):
 def test_torn_line_at_the_end_of_a_connection_is_no_fault(make):
     first = agent()
     client = make(first, agent())
-    seen: list[dict[str, Any]] = []
-    client.subscribe(seen.append, since=1)
+    seen = followed(client)
     client.status()
     first.say(b'{"event": "outp')
     first.say(None)

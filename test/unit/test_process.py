@@ -26,8 +26,7 @@ def as_user(root: None, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def started(command: Command) -> subprocess.Popen[bytes]:
-    return process.start(command, environment=os.environ, stdin=subprocess.DEVNULL,
-                         stderr=subprocess.DEVNULL)
+    return process.start(command, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 def test_sudo_stays_in_the_session_whose_ticket_it_has(as_user: None) -> None:

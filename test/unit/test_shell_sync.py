@@ -18,7 +18,7 @@ import pytest
 from fogros2 import process
 from fogros2.errors import CommandError, ConnectError, ShellError
 from fogros2.model import Endpoint, Result
-from fogros2.shell import multiplexed, multiplexer, relay, sync
+from fogros2.shell import multiplexed, multiplexer, relay, remote, sync
 
 PINNED = Endpoint('ssh', '198.51.100.7', 2222, 'fog', 'ssh-ed25519 AAAA', '/keys/my key')
 
@@ -113,7 +113,7 @@ def test_large_folders_are_told_from_small_ones(tmp_path):
     assert not sync.is_large(tmp_path, 1000)
 
 
-class Here(multiplexed.MultiplexedShell):
+class Here(remote.MultiplexedShell):
     """A shell by a multiplexer on this computer."""
 
     def __init__(self) -> None:
