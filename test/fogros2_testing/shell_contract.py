@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The contract of every shell, as tests."""
 
-
-
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
+import functools
 from pathlib import Path
 import threading
 import time
@@ -23,6 +22,7 @@ from fogros2.errors import (
 )
 from fogros2.model import Command
 from fogros2.shell import Shell
+from fogros2.waiting import in_thread
 
 
 class ShellContract:
@@ -124,16 +124,9 @@ class ShellContract:
         assert time.monotonic() - begin < 30.0
 
     def test_many_threads_use_one_shell(self, shell: Shell) -> None:
-        outputs: dict[int, str] = {}
-        def ask(number: int) -> None:
-            outputs[number] = shell.run(Command(('echo', str(number))), timeout=30.0).stdout
-
-        threads = [threading.Thread(target=ask, args=(n,)) for n in range(24)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(60.0)
-        assert outputs == {n: f'{n}\n' for n in range(24)}
+        calls = [in_thread(functools.partial(
+            shell.run, Command(('echo', str(number))), timeout=30.0)) for number in range(24)]
+        assert [call.result(60.0).stdout for call in calls] == [f'{n}\n' for n in range(24)]
 
     def test_put_makes_folders_and_sets_the_mode(self, shell: Shell, there: str) -> None:
         path = f'{there}/new folder/é'
@@ -195,13 +188,10 @@ class ShellContract:
         assert stream.readline() == b''
 
     def test_closing_a_stream_wakes_its_reader(self, shell: Shell) -> None:
-        got: list[bytes] = []
         stream = shell.open(Command(('cat',)))
-        reader = threading.Thread(target=lambda: got.append(stream.readline()))
-        reader.start()
+        line = in_thread(stream.readline)
         stream.close()
-        reader.join(10.0)
-        assert got == [b'']
+        assert line.result(10.0) == b''
 
     def test_it_opens_again_after_close(self, shell: Shell) -> None:
         shell.run(Command(('true',)), timeout=30.0)

@@ -294,7 +294,7 @@ def test_what_a_login_shell_prints_is_no_output(server, tmp_path, home, words):
         source = tmp_path / 'source'
         source.mkdir()
         (source / 'a').write_text('a')
-        shell.sync(source, f'{there}/copy', excludes=(), timeout=60.0)
+        shell.sync(source, '~/copy', excludes=(), timeout=60.0)
         assert (there / 'copy/a').read_text() == 'a'
         shell.fetch(f'{there}/copy', tmp_path / 'back', known=None, limit=1 << 20,
                     timeout=60.0)

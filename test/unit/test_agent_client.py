@@ -143,13 +143,6 @@ def test_new_log_of_an_agent_is_read_from_its_beginning(make):
     until(lambda: seen[-1].get('seq') == 1)
 
 
-def test_events_lost_by_rotation_are_reported(make):
-    client = make(agent(next_seq=10, lost=4))
-    seen = followed(client)
-    until(lambda: seen)
-    assert seen == [{'event': 'gap', 'count': 4}]
-
-
 def test_lost_requests_are_repeated_except_signals(make):
     mute = ScriptedStream(lambda request: [])
     client = make(mute, agent())

@@ -22,7 +22,7 @@ from fogros2.kubernetes_client import ApiError, Unreachable
 from fogros2.model import Command, Endpoint
 from fogros2.shell import kubernetes_link, relay
 from fogros2.shell.kubernetes import KubernetesShell
-from fogros2.waiting import ON_ITS_WAY, wait_until
+from fogros2.waiting import in_thread, ON_ITS_WAY, wait_until
 from fogros2_testing.shell_contract import raised
 
 pytestmark = pytest.mark.skipif(
@@ -155,12 +155,14 @@ def test_broken_connection_fails_the_command_alone(api, shell):
     assert len(api.links) == 2
 
 
-def test_broken_connection_ends_its_commands(api, shell, tmp_path):
+@pytest.mark.parametrize('end', [lambda api, shell: api.cut(), lambda api, shell: shell.close()])
+def test_end_of_a_connection_ends_its_commands(api, shell, tmp_path, end):
     pid = tmp_path / 'pid'
     stream = shell.open(Command(('sh', '-c', f'echo $$ >{pid}; echo up; exec sleep 60')))
     assert stream.readline() == b'up\n'
-    api.cut()
+    end(api, shell)
     ended(int(pid.read_text()))
+    assert stream.readline() == b''
 
 
 def test_incomplete_message_does_not_block_others(api, shell, monkeypatch):
@@ -172,10 +174,7 @@ def test_incomplete_message_does_not_block_others(api, shell, monkeypatch):
     assert shell.run(Command(('echo', 'three')), timeout=60.0).stdout == 'three\n'
     assert len(api.links) == 2
     api.links[-1].stand_still()
-    closing = threading.Thread(target=shell.close, daemon=True)
-    closing.start()
-    closing.join(60.0)
-    assert not closing.is_alive()
+    in_thread(shell.close).result(60.0)
 
 
 def test_restart_of_the_api_server_is_waited_for(api, shell):
@@ -185,26 +184,15 @@ def test_restart_of_the_api_server_is_waited_for(api, shell):
 
 def test_ctrl_c_ends_the_wait_for_a_silent_cluster(api, shell):
     api.refusals += [Unreachable('refused')] * 1000
-    cancel, ended, before = threading.Event(), [], threading.active_count()
-
-    def ask() -> None:
-        with pytest.raises(Cancelled):
-            shell.run(Command(('true',)), timeout=30.0, cancel=cancel)
-        ended.append('cancelled')
-
-    thread = threading.Thread(target=ask)
-    thread.start()
+    cancel, before = threading.Event(), threading.active_count()
+    asking = in_thread(lambda: shell.run(Command(('true',)), timeout=30.0, cancel=cancel))
     wait_until(lambda: len(api.refusals) < 1000, timeout=60.0, what='an attempt')
     with pytest.raises(ConnectError):
         shell.run(Command(('true',)), timeout=0.2)  # one attempt at a time; its own patience
-    closing = threading.Thread(target=shell.close, daemon=True)
-    closing.start()
-    closing.join(60.0)
-    assert not closing.is_alive()
-    assert thread.is_alive()
+    in_thread(shell.close).result(60.0)
+    assert not asking.done()
     cancel.set()
-    thread.join(60.0)
-    assert ended == ['cancelled']
+    assert isinstance(asking.exception(60.0), Cancelled)
     wait_until(lambda: threading.active_count() <= before, timeout=60.0,
                what='the thread that connects to end')
 
@@ -244,15 +232,6 @@ def test_lasting_refusal_is_reported_at_once(api, shell, refusal, words):
     api.refusals = [refusal]
     error = raised(ShellError, lambda: shell.run(Command(('true',)), timeout=20.0))
     assert words in f'{error} {error.hint}'
-
-
-def test_close_ends_running_commands(api, shell, tmp_path):
-    pid = tmp_path / 'pid'
-    stream = shell.open(Command(('sh', '-c', f'echo $$ >{pid}; echo up; exec sleep 60')))
-    assert stream.readline() == b'up\n'
-    shell.close()
-    ended(int(pid.read_text()))
-    assert stream.readline() == b''
 
 
 def test_commands_run_as_login_user_or_on_request_as_root(api):
