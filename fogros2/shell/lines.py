@@ -26,7 +26,7 @@ _CHUNK = 1 << 16
 #: A program on a machine. Errors are OSErrors or FogErrors; a read that timed out raises
 #: TimeoutError.
 Channel = Union['paramiko.Channel', 'multiplexed.Channel']
-#: Of these, what carries lines; or a program of this computer.
+#: What carries lines: a channel, or a program of this computer.
 Lines = Union[Channel, 'proxy.ProxySocket']
 
 

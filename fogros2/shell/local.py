@@ -41,9 +41,9 @@ class LocalShell(sync.RsyncShell):
 
     def open(self, command: Command) -> Stream:
         """Start a program; closing the returned stream ends the program."""
-        program = proxy.dial(command_line.quiet(command), None)
-        program.sendall(command.input)
-        return LineStream(program, self.name)
+        stream = LineStream(proxy.dial(command_line.quiet(command), None), self.name)
+        stream.write(command.input)
+        return stream
 
     def interactive(self, command: Optional[Command] = None) -> int:
         """Run the user's shell, or ``command``, in this terminal."""

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import signal
 import socket
 import subprocess
 from typing import Optional
@@ -22,8 +24,9 @@ class ProxySocket(socket.socket):
         """End the program; a read in another thread returns b''."""
         with contextlib.suppress(OSError):
             self.shutdown(socket.SHUT_RDWR)
-        if self.child.returncode is None:
-            process.end(self.child, sudo=False)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.child.pid, signal.SIGKILL)
+        self.child.wait()
         super().close()
 
     def complaint(self) -> str:
