@@ -33,7 +33,7 @@ from fogros2.errors import (
 from fogros2.model import Command, Endpoint
 from fogros2.shell import host_key, lines, relay, sync
 from fogros2.shell.ssh import SSHShell
-from fogros2.waiting import in_thread, wait_until
+from fogros2.waiting import in_thread, Periodic, wait_until
 from fogros2_testing import ShellContract
 from rigs.sshd import free_port, private_sshd, PrivateSshd
 
@@ -552,12 +552,13 @@ def test_a_lost_connection_under_sync_is_an_error(server, shell, tmp_path, monke
 @pytest.mark.parametrize('bulk', [True, False])
 def test_sync_can_be_cancelled(shell, tmp_path, monkeypatch, bulk):
     monkeypatch.setattr(sync, 'BULK', 1000 if bulk else 1 << 40)
-    # a second's work would be over before a busy computer looks at the event
-    source = sized(tmp_path / 'source', 16 << 30)
+    source, target = sized(tmp_path / 'source', 16 << 30), tmp_path / 'sync-target'
     cancel = threading.Event()
+    # rsync writes under another name
+    Periodic('a cancel', 0.02, lambda: cancel.set() if [*target.glob('.big.*')] else None,
+             stop=cancel)
     with pytest.raises(Cancelled):
-        shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0,
-                   cancel=cancel, on_progress=lambda done, total: cancel.set())
+        shell.sync(source, str(target), excludes=[], timeout=60.0, cancel=cancel)
     wait_until(lambda: not rsyncs(), timeout=60.0, what='rsync to end')
     assert shell.run(Command(('true',)), timeout=60.0).returncode == 0
 
