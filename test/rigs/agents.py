@@ -121,10 +121,11 @@ class Rig:
         return NodeSpec(id=name, name=f'{name}-1', arguments=(sys.executable, str(path)), **more)
 
     def run(self, *nodes: NodeSpec) -> None:
-        """Start nodes, and wait for their first output."""
+        """Start nodes, and wait for the first line of each."""
         self.clients[-1].request('start', nodes=nodes)
-        for node in nodes:
-            self.wait('output', node=node.id)
+        # Python writes the text of a line and its end apart
+        wait_until(lambda: all('\n' in self.text(node.id) for node in nodes), timeout=60,
+                   what=f'a line of each node in {self.events}', longest=0.02)
 
     def wait(self, event: str, timeout: float = 60, **match: Any) -> dict[str, Any]:
         def find() -> Any:
