@@ -17,13 +17,11 @@ import pytest
 
 from fogros2 import ros2_daemon
 from fogros2.deploy import Launch
-from fogros2.deploy import launch as launched
 from fogros2.errors import FogError, NameTaken
 from fogros2.feature import Feature
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
-from fogros2.report import StepDone, StepFailed, StepStarted
-from fogros2.store import Store
+from fogros2.report import StepDone, StepStarted
 from fogros2.waiting import wait_until
 from fogros2_testing.plugins import instead
 
@@ -85,123 +83,6 @@ def test_launch_stops_the_daemon_of_its_terminals_before_its_vpn():
     assert seen == [True] and not interface.exists() and not folder.exists()
 
 
-STEPS = ['machine', 'connect', 'ROS 2', 'watchdog', 'VPN', 'agent']
-
-
-@pytest.mark.parametrize('step', ['VPN interface', *STEPS])
-def test_a_fault_in_any_step_leaves_nothing(spec, step):
-    def fault(event):
-        if isinstance(event, StepStarted) and event.step == step:
-            raise Injected(f'fault in {step}')
-
-    launch = Launch(report=fault)
-    with pytest.raises(Injected):
-        launch.up(spec())
-    assert launch.down() == []
-
-
-@pytest.mark.parametrize('step', ['machine', 'ROS 2', 'agent'])
-def test_a_cancel_in_any_step_leaves_nothing(spec, step):
-    launch = Launch(report=lambda event: cancel.set() if (
-        isinstance(event, StepStarted) and event.step == step) else None)
-    cancel = launch.cancel
-    # a step that only starts the last command may still succeed: down() then ends the machine
-    try:
-        launch.up(spec())
-    except FogError:
-        pass
-    assert launch.down() == []
-
-
-def test_an_undo_that_fails_is_reported_and_the_others_run(spec, monkeypatch):
-    def failing(folder):
-        clear(folder)
-        raise Injected('the undo failed')
-
-    events, clear = [], launched.clear
-    monkeypatch.setattr(launched, 'clear', failing)
-    launch = Launch(report=events.append)
-    launch.up(spec())
-    failures = launch.down()
-    assert [str(failure) for failure in failures] == ['the undo failed']
-    assert any(isinstance(e, StepFailed) and e.reason == 'the undo failed' for e in events)
-
-
-def test_machines_come_up_in_parallel_and_reach_each_other(spec):
-    events, heard = [], []
-    launch = Launch(report=events.append)
-    specs = [spec('one'), spec('two')]
-    launch.prepare(specs)
-    launch.expect(each.name for each in specs)
-    try:
-        with ThreadPoolExecutor(2) as pool:
-            machines = list(pool.map(launch.up, specs))
-        for machine, other in zip(machines, reversed(machines)):
-            machine.shell.run(
-                Command(('ping', '-c', '1', '-W', '5', other.vpn_address)), timeout=60)
-        machines[0].subscribe(heard.append)
-        code = 'import os, socket; print(socket.gethostname(), os.getuid(), flush=True)'
-        machines[0].start([NodeSpec('a-1', 'node-1', arguments=('python3', '-c', code))])
-        wait_until(lambda: any(e['event'] == 'exited' for e in heard), timeout=60,
-                   what='the node to end')
-    finally:
-        assert launch.down() == []
-    name, user = ''.join(e['text'] for e in heard if e['event'] == 'output').split()[:2]
-    assert name == f'one-{RUN}' and user != '0', 'nodes must not run as root'
-    started = [(e.machine, e.step) for e in events if isinstance(e, StepStarted)]
-    done = [(e.machine, e.step) for e in events if isinstance(e, StepDone)]
-    assert sorted(started) == sorted(done)
-
-
-def test_two_launches_at_once_do_not_meet(spec):
-    first, second = Launch(), Launch()
-    try:
-        one, two = first.up(spec('one')), second.up(spec('two'))
-        assert one.vpn_address != two.vpn_address
-        with pytest.raises(NameTaken, match='another launch on this robot'):
-            second.up(spec('one'))
-        assert first.down() == []
-        assert two.agent.request('status')['machine'] == f'two-{RUN}'
-    finally:
-        assert first.down() == []
-        assert second.down() == []
-
-
-@pytest.mark.parametrize('on_exit', ['keep', 'stop'])
-def test_the_next_launch_reuses_a_machine(spec, on_exit):
-    store = Store()
-    first = Launch(store=store)
-    machine_id = first.up(spec(on_exit=on_exit)).machine.id
-    assert [made.kind for made in store.load(spec().name).made] == ['VPN', 'nodes']
-    assert first.down() == []
-    assert store.load(spec().name).made == ()
-    second = Launch(store=store)
-    try:
-        assert second.up(spec()).machine.id == machine_id
-    finally:
-        assert second.down() == []
-
-
-@pytest.mark.parametrize('limit', ['1MB', '1kB'])
-def test_folders_come_home_before_the_machine_goes(spec, tmp_path, limit):
-    launch = Launch()
-    machine = launch.up(spec(features={'results': {
-        'fetch': ['~/bags'], 'fetch_to': str(tmp_path / 'home'), 'fetch_limit': limit}}))
-    try:
-        machine.shell.run(Command(
-            ('sh', '-c', 'mkdir -p ~/bags/deep && echo here >~/bags/deep/one'),
-            what='write'), timeout=60)
-    finally:
-        failures = launch.down()
-    if limit == '1kB':  # folders themselves have more
-        assert 'more than fetch_limit=1e-06 GB' in str(failures[0]) and len(failures) == 1
-        assert not (tmp_path / 'home').exists()
-    else:
-        assert failures == []
-        one, = (tmp_path / 'home').glob(f'planner-{RUN}-*/bags/deep/one')
-        assert one.read_text() == 'here\n'
-
-
 class Failing(Feature):
     """Ends the machine that it is used on."""
 
@@ -214,28 +95,90 @@ class Failing(Feature):
         raise Injected('no')
 
 
-def test_machine_whose_feature_fails_is_deleted(spec, monkeypatch):
-    instead(monkeypatch, 'fogros2.feature', {'failing': Failing})
-    launch = Launch()
+# without a shell, without a VPN, and when all of it is there
+@pytest.mark.parametrize('step', ['connect', 'VPN', 'feature'])
+def test_a_fault_in_any_step_leaves_nothing(spec, monkeypatch, step):
+    def fault(event):
+        if isinstance(event, StepStarted) and event.step == step:
+            raise Injected(f'fault in {step}')
+
+    instead(monkeypatch, 'fogros2.feature', {'failing': Failing} if step == 'feature' else {})
+    launch = Launch(report=fault)
     with pytest.raises(Injected):
-        launch.up(spec(on_exit='keep', features={'failing': {}}))
+        launch.up(spec(on_exit='keep'))
     assert launch.down() == [] and not launch.store.exists(spec().name)
 
 
-def test_a_killed_wireguard_comes_back(spec):
-    launch = Launch()
+def test_a_cancel_in_a_step_leaves_nothing(spec):
+    launch = Launch(report=lambda event: cancel.set() if (
+        isinstance(event, StepStarted) and event.step == 'ROS 2') else None)
+    cancel = launch.cancel
+    with pytest.raises(FogError):
+        launch.up(spec())
+    assert launch.down() == []
+
+
+def test_machines_come_up_in_parallel_and_reach_each_other(spec, tmp_path):
+    """Their folders come home, and a VPN that is killed comes back."""
+    events, heard = [], []
+    launch = Launch(report=events.append)
+    specs = [spec('one', features={'results': {
+        'fetch': ['~/bags'], 'fetch_to': str(tmp_path / 'home')}}), spec('two')]
+    launch.prepare(specs)
+    launch.expect(each.name for each in specs)
     try:
-        machine = launch.up(spec())
+        with ThreadPoolExecutor(2) as pool:
+            machines = list(pool.map(launch.up, specs))
+        for machine, other in zip(machines, reversed(machines)):
+            machine.shell.run(
+                Command(('ping', '-c', '1', '-W', '5', other.vpn_address)), timeout=60)
+        machines[0].subscribe(heard.append)
+        code = ('import os, pathlib, socket; print(socket.gethostname(), os.getuid(), flush=True);'
+                'folder = pathlib.Path.home() / "bags/deep"; folder.mkdir(parents=True);'
+                '(folder / "one").write_text("here")')
+        machines[0].start([NodeSpec('a-1', 'node-1', arguments=('python3', '-c', code))])
+        wait_until(lambda: any(e['event'] == 'exited' for e in heard), timeout=60,
+                   what='the node to end')
         interface = launch.robot_vpn().interface.name
         before = wireguard_of(interface)
         run(Command(('sh', '-c', 'kill -9 "$@"', 'sh', *map(str, before)), sudo=True), timeout=60)
         wait_until(lambda: wireguard_of(interface) - before, timeout=60,
                    what='another wireguard-go')
         begin = time.monotonic()
-        wait_until(lambda: machine.heartbeat.age < time.monotonic() - begin, timeout=60,
+        wait_until(lambda: machines[0].heartbeat.age < time.monotonic() - begin, timeout=60,
                    what='an answer through the VPN')
     finally:
         assert launch.down() == []
+    name, user = ''.join(e['text'] for e in heard if e['event'] == 'output').split()[:2]
+    assert name == f'one-{RUN}' and user != '0', 'nodes must not run as root'
+    one, = (tmp_path / 'home').glob(f'one-{RUN}-*/bags/deep/one')
+    assert one.read_text() == 'here'
+    started = [(e.machine, e.step) for e in events if isinstance(e, StepStarted)]
+    done = [(e.machine, e.step) for e in events if isinstance(e, StepDone)]
+    assert sorted(started) == sorted(done)
+
+
+def test_two_launches_at_once_do_not_meet(spec):
+    """The next one reuses a machine that was stopped."""
+    first, second = Launch(), Launch()
+    stopped = spec('one', on_exit='stop')
+    try:
+        one, two = first.up(stopped), second.up(spec('two'))
+        assert one.vpn_address != two.vpn_address
+        with pytest.raises(NameTaken, match='another launch on this robot'):
+            second.up(spec('one'))
+        assert [made.kind for made in first.store.load(stopped.name).made] == ['VPN', 'nodes']
+        assert first.down() == []
+        assert first.store.load(stopped.name).made == ()
+        assert two.agent.request('status')['machine'] == f'two-{RUN}'
+    finally:
+        assert first.down() == []
+        assert second.down() == []
+    third = Launch()
+    try:
+        assert third.up(spec('one')).machine.id == one.machine.id
+    finally:
+        assert third.down() == []
 
 
 def wireguard_of(interface):

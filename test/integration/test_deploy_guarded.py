@@ -110,50 +110,72 @@ def server_address(machine):
     return words[2]
 
 
-def test_firewalled_machine_is_reached_only_through_the_vpn(cloud, spec):
+def test_firewalled_machine_is_reached_only_through_the_vpn(cloud, spec, monkeypatch):
+    """From the robot's new address, and by a later launch, which sees the machine's end."""
+    monkeypatch.setattr('fogros2.deploy.steps.connecting.POLL_INTERVAL', 0.5)
+    monkeypatch.setattr('fogros2.deploy.steps.connecting.LOGIN_TIMEOUT', 1.0)
+    monkeypatch.setattr('fogros2.deploy.steps.watching.SILENCE', 2.5)
     store = Store()
     first = Launch(store=store)
     kept = spec(on_exit='keep')
     handed_over = []
-    describe = cloud.describe
+    create = cloud.create
 
-    def note(machine_id):
-        machine = describe(machine_id)
-        if machine.shell is not None and not handed_over:
-            handed_over.append(machine.shell.host_key)
-        return machine
+    def shut(spec, request):
+        machine_id = create(spec, request)
+        machine = cloud.reachable(machine_id, name=spec.name, timeout=30)
+        handed_over.append(machine.shell.host_key)
+        cloud.allow(machine_id, 22, ['192.0.2.7/32'])
+        return machine_id
 
-    cloud.describe = note
+    monkeypatch.setattr(cloud, 'create', shut)
     try:
         machine = first.up(kept)
         outside = machine.machine.shell.host
         key = store.load(kept.name).host_key
         assert key and key not in handed_over
         assert cloud.pinned == {machine.machine.id: key}
-        assert cloud.asked == [(22, [])]
+        assert cloud.asked == [(22, ['192.0.2.7/32']), (22, [cloud.robot]), (22, [])]
         assert server_address(machine) == machine.vpn_address
         assert not answers(outside)
         heard = []
         machine.subscribe(heard.append)
         machine.start([NodeSpec('n-1', 'n-1', arguments=('echo', 'hello'))])
-        wait_until(lambda: any(e['event'] == 'exited' for e in heard), timeout=60,
-                   what='the node to end')
+        wait_for(heard, 'exited')
+        cloud.asked.clear()
     finally:
         assert first.down() == []
-    assert cloud.asked == [(22, []), (22, [cloud.robot]), (22, [])]
+    assert cloud.asked == [(22, [cloud.robot]), (22, [])]
     assert not answers(outside)
 
     # a later launch gets in all the same, and finds the key that the machine made
     cloud.asked.clear()
     second = Launch(store=store)
+    heard = []
     try:
         again = second.up(spec())
         assert again.machine.id == machine.machine.id
         assert store.load(kept.name).host_key == key
         assert cloud.asked == [(22, [cloud.robot]), (22, [])]
         assert server_address(again) == again.vpn_address
+        again.subscribe(heard.append)
+        again.shell.run(Command.script('echo soon gone >/run/notice', sudo=True), timeout=60)
+        wait_for(heard, 'notice')
+        engine, identity, _ = container_machine.parse_id(again.machine.id)
+        engine.call('kill', identity, what='take the machine away')
+        wait_for(heard, 'lost')
+        assert not again.reclaimed(0.0), 'it is gone, so nobody has to confirm a notice'
     finally:
+        begin = time.monotonic()
         assert second.down() == []
+        # a command of a machine that answers has 60 s
+        assert time.monotonic() - begin < 45
+    notice, lost = (e['reason'] for e in heard if e['event'] in ('notice', 'lost'))
+    assert notice == 'soon gone' and (identity in lost or 'stopped' in lost)
+
+
+def wait_for(heard, event):
+    wait_until(lambda: any(e['event'] == event for e in heard), timeout=60, what=event)
 
 
 def test_vpn_leaves_udp_and_returns(cloud, spec, cloud_network, monkeypatch):
@@ -189,53 +211,6 @@ def test_vpn_leaves_udp_and_returns(cloud, spec, cloud_network, monkeypatch):
         assert launch.down() == []
 
 
-def test_a_robot_that_comes_from_another_address_is_let_in(cloud, spec, monkeypatch):
-    monkeypatch.setattr('fogros2.deploy.steps.connecting.POLL_INTERVAL', 0.5)
-    create = cloud.create
-
-    def shut(spec, request):
-        machine_id = create(spec, request)
-        cloud.reachable(machine_id, name=spec.name, timeout=30)
-        cloud.allow(machine_id, 22, ['192.0.2.7/32'])
-        return machine_id
-
-    monkeypatch.setattr(cloud, 'create', shut)
-    monkeypatch.setattr('fogros2.deploy.steps.connecting.LOGIN_TIMEOUT', 1.0)
-    launch = Launch()
-    try:
-        launch.up(spec())
-    finally:
-        assert launch.down() == []
-    assert cloud.asked == [(22, ['192.0.2.7/32']), (22, [cloud.robot]), (22, [])]
-
-
-def test_end_of_a_machine_is_reported(cloud, spec, monkeypatch):
-    monkeypatch.setattr('fogros2.deploy.steps.watching.SILENCE', 2.5)
-    launch = Launch()
-    heard = []
-    try:
-        machine = launch.up(spec())
-        machine.subscribe(heard.append)
-        machine.shell.run(Command.script('echo soon gone >/run/notice', sudo=True), timeout=60)
-        wait_until(lambda: any(e['event'] == 'notice' for e in heard), timeout=60,
-                   what='the notice')
-        engine, identity, _ = container_machine.parse_id(machine.machine.id)
-        begin = time.monotonic()
-        engine.call('kill', identity, what='take the machine away')
-        wait_until(lambda: any(e['event'] == 'lost' for e in heard), timeout=60,
-                   what='the loss')
-        assert not machine.reclaimed(0.0), 'it is gone, so nobody has to confirm a notice'
-    finally:
-        begin = time.monotonic()
-        assert launch.down() == []
-        # a command of a machine that answers has 60 s
-        assert time.monotonic() - begin < 45
-    told = [e for e in heard if e['event'] in ('notice', 'lost')]
-    assert [e['event'] for e in told] == ['notice', 'lost']
-    assert told[0]['reason'] == 'soon gone'
-    assert identity in told[1]['reason'] or 'stopped' in told[1]['reason']
-
-
 def hide(cloud, monkeypatch, robots):
     """Make machines those that nobody dials; they dial the robot at the last of ``robots``."""
     monkeypatch.setattr(CloudLike, 'capabilities', ContainerProvider.capabilities)
@@ -250,35 +225,6 @@ def hide(cloud, monkeypatch, robots):
             private_ip=machine.vpn_host)
 
     monkeypatch.setattr(cloud, 'describe', hidden)
-
-
-def test_unreachable_machines_dial_the_robot_and_each_other(
-        cloud, spec, monkeypatch):
-    robot = cloud.robot.partition('/')[0]
-    hide(cloud, monkeypatch, [robot])
-
-    def prompt():
-        events = []
-        launch = Launch(report=events.append)
-        names = [spec(name).name for name in ('one', 'two')]
-        launch.expect(names)
-        try:
-            with ThreadPoolExecutor(2) as pool:
-                one, two = pool.map(lambda name: launch.up(spec(name)), ('one', 'two'))
-            assert one.heartbeat.round_trip is not None
-            one.shell.run(Command(('ping', '-c', '1', '-W', '8', two.vpn_address)), timeout=60)
-            two.shell.run(Command(('ping', '-c', '1', '-W', '8', one.vpn_address)), timeout=60)
-        finally:
-            assert launch.down() == []
-        done = [event for event in events if isinstance(event, StepDone)]
-        dials = [event for event in done if event.step == 'VPN']
-        assert all(f'dials {robot}:' in event.detail for event in dials) and len(dials) == 2
-        # the robot takes a handshake that comes before it knows the machine for nobody's, and
-        # the next one comes after 5 s
-        return all(event.seconds < 5 for event in done if event.step == 'agent')
-
-    # the first ones on an idle computer
-    wait_until(prompt, timeout=90, what='machines with a handshake at once')
 
 
 #: What lies between a machine and where the robot was; SSH isn't what this is about.
@@ -296,8 +242,9 @@ table inet moved {
 """
 
 
-def test_a_machine_that_dials_a_robot_that_moves_dials_it_there(
+def test_unreachable_machines_dial_the_robot_and_each_other(
         cloud, spec, monkeypatch, cloud_network):
+    """And the robot where it has moved to."""
     monkeypatch.setattr('fogros2.deploy.steps.watching.SILENCE', 2.5)
     robots = [cloud.robot.partition('/')[0]]
     hide(cloud, monkeypatch, robots)
@@ -307,22 +254,32 @@ def test_a_machine_that_dials_a_robot_that_moves_dials_it_there(
     subnet = ipaddress.ip_network(network['subnets'][0]['subnet'])
     events = []
     launch = Launch(report=events.append)
+    names = ('one', 'two')
+    launch.expect(spec(name).name for name in names)
+
+    def dials(step, robot):
+        return [event for event in events if isinstance(event, StepDone)
+                and event.step.startswith(step) and f'dials {robot}:' in event.detail]
+
     try:
-        machine = launch.up(spec('moving'))
-        # neither the machine's nor the one that nobody has: addresses are handed out in a circle
-        later = next(str(host) for host in list(subnet.hosts())[-2:-4:-1]
-                     if str(host) != machine.machine.shell.host)
+        with ThreadPoolExecutor(2) as pool:
+            one, two = pool.map(lambda name: launch.up(spec(name)), names)
+        one.shell.run(Command(('ping', '-c', '1', '-W', '8', two.vpn_address)), timeout=60)
+        two.shell.run(Command(('ping', '-c', '1', '-W', '8', one.vpn_address)), timeout=60)
+        assert len(dials('VPN', robots[0])) == 2
+        # neither a machine's nor the one that nobody has: addresses are handed out in a circle
+        hosts = [machine.machine.shell.host for machine in (one, two)]
+        later = next(str(host) for host in list(subnet.hosts())[-2:-5:-1]
+                     if str(host) not in hosts)
         run(Command(('ip', 'address', 'add', f'{later}/32', 'dev', bridge), sudo=True), timeout=60)
-        machine.shell.run(Command(
+        one.shell.run(Command(
             ('nft', '-f', '-'), input=(MOVED % (robots[0], robots[0])).encode(), sudo=True),
             timeout=60)
         robots.append(later)
-        wait_until(lambda: any(
-            isinstance(event, StepDone) and f'dials {later}:' in event.detail
-            and event.step.startswith('VPN, from') for event in events),
-            timeout=60, what='the machine to dial again')
+        wait_until(lambda: dials('VPN, from', later), timeout=60,
+                   what='the machine to dial again')
         begin = time.monotonic()
-        wait_until(lambda: machine.heartbeat.age < time.monotonic() - begin, timeout=60,
+        wait_until(lambda: one.heartbeat.age < time.monotonic() - begin, timeout=60,
                    what='the heartbeat')
     finally:
         assert launch.down() == []

@@ -140,12 +140,15 @@ def launched(tmp_path, cloud_network):
         launch.child.wait(60)
 
 
-# test_deploy.py cancels a launch in each of its steps, launch/test_signals.py has all signals
-@pytest.mark.parametrize(('number', 'step'), [(signal.SIGINT, 'vpn'), (signal.SIGTERM, 'running')])
-def test_a_signal_takes_everything_back(launched, number, step):
-    """A second one does not stop the way back."""
+# launch/test_signals.py has all signals
+def test_a_signal_takes_everything_back(launched):
     launch = launched()
-    launch.wait_for(STEPS[step])
+    launch.wait_for(STEPS['vpn'])
+    end_twice(launch, signal.SIGINT)
+
+
+def end_twice(launch, number):
+    """End a launch; a second signal does not stop the way back."""
     for _ in range(2):
         launch.child.send_signal(number)
         launch.wait_for(number.name)
@@ -177,8 +180,7 @@ def test_closed_output_takes_everything_back(launched, request, step, output):
     end_at(launch, step, lambda: launch.deafen(close=output != 'unread pipe'))
 
 
-@pytest.mark.parametrize('step', ['create', 'running'])
-def test_full_disk_takes_everything_back(launched, monkeypatch, tmp_path, step):
+def test_full_disk_takes_everything_back(launched, monkeypatch, tmp_path):
     disk = tmp_path / 'small'
     disk.mkdir()
     if process.run(Command(('mount', '-t', 'tmpfs', '-o', 'size=1m,mode=1777', 'tmpfs',
@@ -188,7 +190,7 @@ def test_full_disk_takes_everything_back(launched, monkeypatch, tmp_path, step):
         for variable in ('ROS_LOG_DIR', 'FOGROS2_STATE_HOME', 'TMPDIR'):
             monkeypatch.setenv(variable, str(disk))
         launch = launched()
-        end_at(launch, step, lambda: fill(disk))
+        end_at(launch, 'running', lambda: fill(disk))
         assert 'Logging error' not in ''.join(launch.said)
     finally:
         process.run(Command(('umount', '-l', str(disk)), sudo=True), timeout=60.0)
@@ -203,9 +205,8 @@ def fill(disk: Path) -> None:
                     file.write(b'x' * size)
 
 
-# without a machine, with an agent that waits for the launch, with one that had heartbeats;
-# benchmarks/chaos.py kills launches at any time
-@pytest.mark.parametrize('step', ['create', 'vpn', 'running'])
+# without a machine, with an agent that had heartbeats; benchmarks/chaos.py kills at any time
+@pytest.mark.parametrize('step', ['create', 'running'])
 def test_a_killed_launch_leaves_a_machine_that_ends_itself(launched, step):
     launch = launched(timeout=6)
     launch.wait_for(STEPS[step])
@@ -214,7 +215,7 @@ def test_a_killed_launch_leaves_a_machine_that_ends_itself(launched, step):
     # orphaned robot nodes are the user's to end, as with any launch that was killed
     end_group(launch.child.pid)
     # before, it has minutes to be found by its launch
-    if step in ('vpn', 'running'):
+    if step == 'running':
         wait_until(lambda: not containers(), timeout=60,
                    what='the machine to end itself')
     # killed early, it may have had no machine yet; an engine may still be making one
@@ -253,5 +254,4 @@ def test_nodes_respawn_when_their_agent_is_killed(launched):
     launch.wait_for('its agent died and was started again')
     launch.wait_for('process started with pid')
     launch.wait_for('Publishing')
-    launch.child.send_signal(signal.SIGINT)
-    assert launch.ended() == 0, ''.join(launch.said)
+    end_twice(launch, signal.SIGTERM)
