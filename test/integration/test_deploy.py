@@ -102,11 +102,13 @@ def test_a_fault_in_any_step_leaves_nothing(spec, monkeypatch, step):
         if isinstance(event, StepStarted) and event.step == step:
             raise Injected(f'fault in {step}')
 
-    instead(monkeypatch, 'fogros2.feature', {'failing': Failing} if step == 'feature' else {})
+    instead(monkeypatch, 'fogros2.feature', {'failing': Failing})
     launch = Launch(report=fault)
-    with pytest.raises(Injected):
-        launch.up(spec(on_exit='keep'))
-    assert launch.down() == [] and not launch.store.exists(spec().name)
+    try:
+        with pytest.raises(Injected):
+            launch.up(spec(on_exit='keep', features={'failing': {}} if step == 'feature' else {}))
+    finally:
+        assert launch.down() == [] and not launch.store.exists(spec().name)
 
 
 def test_a_cancel_in_a_step_leaves_nothing(spec):

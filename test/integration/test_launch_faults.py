@@ -8,12 +8,10 @@ import fcntl
 import os
 from pathlib import Path
 import pty
-import selectors
 import shutil
 import signal
 import subprocess
 import termios
-import threading
 import uuid
 
 import pytest
@@ -22,6 +20,7 @@ from fogros2 import process
 from fogros2.model import Command
 from fogros2.store import Store
 from fogros2.waiting import wait_until
+from rigs.launched import launching, ROS2, WITH_SIGINT
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
@@ -46,104 +45,28 @@ def generate_launch_description():
 """
 
 #: What a launch prints as a step begins, and at last when messages arrive.
-STEPS = {
-    'create': f'{NAME}: machine ...', 'vpn': f'{NAME}: VPN ...', 'running': 'I heard',
-}
-
-
-def own_group() -> None:
-    # not a session: sudo's ticket is for the terminal's
-    os.setpgrp()
-    # a shell that starts tests in the background has SIGINT ignored
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def own_terminal() -> None:
-    os.setsid()
-    fcntl.ioctl(1, termios.TIOCSCTTY, 0)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-class Launched:
-    """
-    A ``ros2 launch`` process, its output read until ``deafen``.
-
-    :param terminal: give it a terminal of its own instead of a pipe.
-    """
-
-    def __init__(self, path: Path, *, terminal: bool = False) -> None:
-        self.said: list[str] = []
-        reader, writer = pty.openpty() if terminal else os.pipe()
-        self.child = subprocess.Popen(
-            ['ros2', 'launch', '--debug', str(path)], stdin=writer if terminal else None,
-            stdout=writer, stderr=writer, preexec_fn=own_terminal if terminal else own_group)
-        os.close(writer)
-        self._output = os.fdopen(reader, 'rb', buffering=0)
-        self._deaf = threading.Event()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        rest = b''
-        with selectors.DefaultSelector() as chosen, contextlib.suppress(OSError):
-            chosen.register(self._output, selectors.EVENT_READ)
-            while not self._deaf.is_set():
-                if not chosen.select(0.05):
-                    continue
-                data = self._output.read(4096)
-                if not data:
-                    break
-                *lines, rest = (rest + data).split(b'\n')
-                self.said += [f'{line.decode(errors="replace")}\n' for line in lines]
-
-    def deafen(self, *, close: bool) -> None:
-        """Read no more of its output; ``close`` the terminal or the pipe."""
-        self._deaf.set()
-        self._reader.join(5)
-        if close:
-            self._output.close()
-
-    def wait_for(self, words: str, timeout: float = 60.0) -> None:
-        """Wait until a line with ``words`` came."""
-        def there() -> bool:
-            if any(words in line for line in list(self.said)):
-                return True
-            if self.child.poll() is not None:
-                pytest.fail(f'the launch ended before {words!r}:\n{"".join(self.said)}')
-            return False
-
-        wait_until(there, timeout=timeout, what=repr(words), longest=0.005, interval=0.002)
-
-    def ended(self, timeout: float = 60.0) -> int:
-        """Return the exit status."""
-        code = self.child.wait(timeout)
-        self._reader.join(5)
-        if not self._output.closed:
-            self._output.close()
-        return code
+CREATE, VPN, RUNNING = f'{NAME}: machine ...', f'{NAME}: VPN ...', 'I heard'
 
 
 @pytest.fixture
-def launched(tmp_path, cloud_network):
-    started = []
-
-    def start(timeout=120, **words):
+def write(tmp_path, cloud_network):
+    def write(timeout=120):
         path = tmp_path / 'planner.launch.py'
         path.write_text(LAUNCH.format(name=NAME, network=cloud_network, timeout=timeout))
-        started.append(Launched(path, **words))
-        return started[-1]
+        return str(path)
+    return write
 
-    yield start
-    for launch in started:
-        if launch.child.poll() is None:
-            os.killpg(launch.child.pid, signal.SIGKILL)
-        launch.child.wait(60)
+
+@pytest.fixture
+def launched(write):
+    with launching() as start:
+        yield lambda **words: start('--debug', write(**words))
 
 
 # launch/test_signals.py has all signals
 def test_a_signal_takes_everything_back(launched):
     launch = launched()
-    launch.wait_for(STEPS['vpn'])
+    launch.wait_for(VPN)
     end_twice(launch, signal.SIGINT)
 
 
@@ -153,31 +76,41 @@ def end_twice(launch, number):
         launch.child.send_signal(number)
         launch.wait_for(number.name)
     code = launch.ended()
-    assert 'Traceback' not in ''.join(launch.said)
-    assert code in (0, 1), ''.join(launch.said)
+    assert code in (0, 1) and 'Traceback' not in launch.text, launch.text
 
 
-def end_at(launch, step, deafen):
-    """Make a launch's output fail in a step, and end the launch."""
-    launch.wait_for(STEPS['running' if step == 'ending' else step])
-    if step == 'ending':
-        launch.child.send_signal(signal.SIGINT)
-        launch.wait_for('SIGINT')
-    deafen()
-    if step != 'ending' and launch.child.poll() is None:
-        launch.child.send_signal(signal.SIGINT)
-    assert launch.ended() in (0, 1)
-    assert containers() == [] and not Store().exists(NAME)
+def own_terminal() -> None:
+    os.setsid()
+    fcntl.ioctl(1, termios.TIOCSCTTY, 0)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 # test_runtime_console.py has all kinds of screens
-@pytest.mark.parametrize(('step', 'output'), [('ending', 'terminal'), ('running', 'unread pipe')])
-def test_closed_output_takes_everything_back(launched, request, step, output):
+@pytest.mark.parametrize('output', ['terminal', 'unread pipe'])
+def test_closed_output_takes_everything_back(write, request, output):
     """A closed terminal also sends SIGHUP; `| less` does not read until it is asked to."""
-    if output == 'terminal':
+    terminal = output == 'terminal'
+    if terminal:
         request.getfixturevalue('root_at_login')
-    launch = launched(terminal=output == 'terminal')
-    end_at(launch, step, lambda: launch.deafen(close=output != 'unread pipe'))
+    reader, writer = pty.openpty() if terminal else os.pipe()
+    child = subprocess.Popen(
+        [*(() if terminal else WITH_SIGINT), ROS2, 'launch', '--debug', write()],
+        stdin=writer, stdout=writer, stderr=writer,
+        preexec_fn=own_terminal if terminal else None)
+    os.close(writer)
+    said = os.fdopen(reader, 'rb')
+    try:
+        next(line for line in said if RUNNING.encode() in line)
+        child.send_signal(signal.SIGINT)
+        if terminal:
+            next(line for line in said if b'SIGINT' in line)
+            said.close()
+        assert child.wait(60) in (0, 1)
+    finally:
+        said.close()
+        end_group(child.pid)
+        child.wait(60)
+    assert containers() == [] and not Store().exists(NAME)
 
 
 def test_full_disk_takes_everything_back(launched, monkeypatch, tmp_path):
@@ -190,8 +123,11 @@ def test_full_disk_takes_everything_back(launched, monkeypatch, tmp_path):
         for variable in ('ROS_LOG_DIR', 'FOGROS2_STATE_HOME', 'TMPDIR'):
             monkeypatch.setenv(variable, str(disk))
         launch = launched()
-        end_at(launch, 'running', lambda: fill(disk))
-        assert 'Logging error' not in ''.join(launch.said)
+        launch.wait_for(RUNNING)
+        fill(disk)
+        launch.interrupt()
+        assert launch.ended() in (0, 1) and 'Logging error' not in launch.text, launch.text
+        assert containers() == [] and not Store().exists(NAME)
     finally:
         process.run(Command(('umount', '-l', str(disk)), sudo=True), timeout=60.0)
 
@@ -206,16 +142,16 @@ def fill(disk: Path) -> None:
 
 
 # without a machine, with an agent that had heartbeats; benchmarks/chaos.py kills at any time
-@pytest.mark.parametrize('step', ['create', 'running'])
+@pytest.mark.parametrize('step', [CREATE, RUNNING], ids=['create', 'running'])
 def test_a_killed_launch_leaves_a_machine_that_ends_itself(launched, step):
     launch = launched(timeout=6)
-    launch.wait_for(STEPS[step])
+    launch.wait_for(step)
     launch.child.kill()
     launch.ended()
     # orphaned robot nodes are the user's to end, as with any launch that was killed
     end_group(launch.child.pid)
     # before, it has minutes to be found by its launch
-    if step == 'running':
+    if step == RUNNING:
         wait_until(lambda: not containers(), timeout=60,
                    what='the machine to end itself')
     # killed early, it may have had no machine yet; an engine may still be making one
@@ -225,10 +161,8 @@ def test_a_killed_launch_leaves_a_machine_that_ends_itself(launched, step):
 
 
 def end_group(group: int) -> None:
-    try:
+    with contextlib.suppress(ProcessLookupError):
         os.killpg(group, signal.SIGKILL)
-    except ProcessLookupError:
-        pass
 
 
 def containers() -> list[str]:
@@ -244,7 +178,7 @@ def fog(*words: str) -> int:
 
 def test_nodes_respawn_when_their_agent_is_killed(launched):
     launch = launched()
-    launch.wait_for(STEPS['running'])
+    launch.wait_for(RUNNING)
     launch.said.clear()
     killed = subprocess.run(
         ['ros2', 'fog', 'connect', NAME, '--', 'sh', '-c',

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from typing import Optional
+from typing import Any, Optional
 
 from fogros2.waiting import wait_until
 
@@ -46,20 +46,20 @@ class Launched:
     """
     A ``ros2 launch`` process, its output read all the time.
 
-    :param words: what follows ``ros2 launch``.
+    :param words: what follows ``ros2 launch``, or another program.
     :param environment: its variables, this process's unless given.
     :param prefix: words before ``ros2``, such as what leads into a network namespace.
     """
 
     def __init__(
         self, *words: str, environment: Optional[Mapping[str, str]] = None,
-        prefix: Sequence[str] = (),
+        prefix: Sequence[str] = (), program: Sequence[str] = (ROS2, 'launch'),
     ) -> None:
         self.said: list[str] = []
         #: When each line came, on ``time.monotonic``'s clock.
         self.times: list[float] = []
         self.child = subprocess.Popen(
-            [*WITH_SIGINT, *prefix, ROS2, 'launch', *words], stdin=subprocess.DEVNULL,
+            [*WITH_SIGINT, *prefix, *program, *words], stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors='replace',
             env=None if environment is None else dict(environment))
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -145,10 +145,8 @@ def launching() -> Iterator[Callable[..., Launched]]:
     """Yield what starts launches; those that still run at the block's end are ended, in order."""
     started: list[Launched] = []
 
-    def start(
-        *words: str, environment: Optional[Mapping[str, str]] = None, prefix: Sequence[str] = (),
-    ) -> Launched:
-        started.append(Launched(*words, environment=environment, prefix=prefix))
+    def start(*words: str, **named: Any) -> Launched:
+        started.append(Launched(*words, **named))
         return started[-1]
 
     try:
