@@ -255,7 +255,7 @@ class Launch:
                     [self._address(index) for index in range(robot_router.MACHINES)], user)
                 if router is not None:
                     # ends after the robot's nodes have ended, and before the VPN goes down
-                    self.undo.callback(robot_router.RobotRouter(router, path.parent, user).close)
+                    self.undo.callback(robot_router.run(router, path.parent, user))
                     if router.beside and robot_router.answers(*router.beside):
                         self.report(Warned(
                             '', "the launch's nodes do not reach the nodes of another "

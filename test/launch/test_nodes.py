@@ -248,18 +248,6 @@ def test_xml_node_takes_the_settings_of_a_cloud_node(run, fake, streams):
     assert '/map:=/fogros2/planner/map' in spec.arguments
 
 
-def test_node_in_a_launch_file_takes_keywords_of_features(run, fake):
-    fake.on_start = ends
-    assert run(load('''
-launch:
-- fog_machine: {name: planner, provider: container, ros_workspace: '', on_interrupt: replace,
-                max_replacements: 2}
-- cloud_node: {machine: planner, pkg: demo, exec: talker, checkpoint: $HOME/map}
-''', 'test.launch.yaml')) == 0
-    (spec,) = fake.machines['planner'].all
-    assert spec.features == {'replacement': {'checkpoint': '$HOME/map'}}
-
-
 @pytest.mark.parametrize('where', ['xml', 'yaml', 'xml in xml', 'xml in python'])
 def test_included_files_take_machine_on_a_node(run, fake, tmp_path, where):
     fake.on_start = ends
@@ -348,12 +336,9 @@ def test_machine_is_for_fogros_launch_alone(registry, tmp_path):
 
 
 @pytest.mark.parametrize(('text', 'said'), [
-    ('<node_container machine="p" pkg="a" exec="b" name="c" namespace=""/>',
-     'node_container takes a machine only below fogros_launch'),
     ('<lifecycle_node machine="p" pkg="a" exec="b" name="c" namespace=""/>',
      'lifecycle_node takes a machine only below fogros_launch'),
     ('<group machine="p"/>', 'group takes no machine .write cloud_group'),
-    ('<fogros_launch><group machine="p"/></fogros_launch>', 'group takes no machine'),
     ('<include file="a" machine="p"/>', 'include takes no machine .put it into a cloud_group')])
 def test_element_given_a_machine_says_which_takes_one(registry, text, said):
     with pytest.raises(ConfigurationError, match=said):
@@ -368,8 +353,6 @@ class Derived(launch_ros.actions.Node):
     (launch_ros.actions.Node, {'executable': 'a'}, r'Node of launch_ros\S* takes no machine '
      r'\(use the Node of fogros2: from fogros2 import Node\)'),
     (Derived, {'executable': 'a'}, 'Derived of .* from fogros2 import Node'),
-    (launch_ros.actions.LifecycleNode, {'executable': 'a', 'name': 'b', 'namespace': ''},
-     'from fogros2 import LifecycleNode'),
     (launch_ros.actions.ComposableNodeContainer,
      {'executable': 'a', 'name': 'b', 'namespace': ''},
      'from fogros2 import ComposableNodeContainer'),

@@ -7,7 +7,9 @@ from concurrent.futures import Future
 import contextlib
 import dataclasses
 import json
+import os
 from pathlib import Path
+import signal
 import socket
 import threading
 import time
@@ -17,7 +19,8 @@ import pytest
 
 from fogros2 import plan, process
 from fogros2.agent_client import AgentClient
-from fogros2.deploy import Launch, robot_vpn, undo
+from fogros2.dds import Router
+from fogros2.deploy import Launch, robot_router, robot_vpn, undo
 from fogros2.deploy import launch as deployed
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.robot_vpn import VpnMember
@@ -58,7 +61,7 @@ from fogros2.model import (
 )
 from fogros2.report import StepDone, StepFailed
 from fogros2.shell import host_key
-from fogros2.store import Made, Store
+from fogros2.store import Made, process_start, Store
 from fogros2.vpn import addresses, STAYS
 from fogros2.waiting import Periodic, Timeouts, wait_until
 from fogros2_features.guests import invitation
@@ -475,6 +478,35 @@ def test_interface_does_not_come_up_after_the_end(launch, monkeypatch):
     monkeypatch.setattr(process, 'run', None)
     with pytest.raises(Cancelled):
         robot.ensure()
+
+
+@pytest.mark.parametrize('killed', [False, True])
+def test_router_of_the_robot_runs_again_until_its_launch_ends(tmp_path, monkeypatch, killed):
+    monkeypatch.setattr(robot_router, 'PAUSE', 0.01)
+    program = tmp_path / 'lib/pack/router'
+    program.parent.mkdir(parents=True)
+    program.write_text('#!/bin/sh\necho $$ $SETTINGS; exec sleep 60\n')
+    program.chmod(0o755)
+    pipes, pipe = [], os.pipe
+    monkeypatch.setattr(os, 'pipe', lambda: pipes.append(pipe()) or pipes[-1])
+    end = robot_router.run(
+        Router('pack', 'router', 'SETTINGS', 'text'), tmp_path,
+        {**os.environ, 'AMENT_PREFIX_PATH': str(tmp_path)})
+
+    def started(times):
+        lines = [line.split() for line in (tmp_path / 'router.log').read_text().splitlines()]
+        starts = [words for words in lines if words[-1].endswith('router.json5')]
+        return len(starts) >= times and starts[-1]
+
+    pid, config = wait_until(lambda: started(1), timeout=60, what='the router')
+    assert Path(config).read_text() == 'text'
+    os.kill(int(pid), signal.SIGKILL)
+    again, _ = wait_until(lambda: started(2), timeout=60, what='its restart')
+    if killed:
+        os.close(pipes[0][1])
+    else:
+        end()
+    wait_until(lambda: process_start(int(again)) is None, timeout=60, what='its end')
 
 
 def test_known_errors_are_reported_before_unknown_ones(launch, events):

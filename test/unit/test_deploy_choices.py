@@ -16,7 +16,7 @@ from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.running import RunningMachine
 from fogros2.deploy.steps.creating import Creation
-from fogros2.errors import AgentError, ConfigurationError, NameTaken, ProviderError, WorkspaceError
+from fogros2.errors import AgentError, ConfigurationError, ProviderError, WorkspaceError
 from fogros2.feature import Cost
 from fogros2.model import MachineSpec
 from fogros2.report import StepDone, StepFailed, StepStarted, Warned
@@ -86,34 +86,6 @@ def test_a_budget_limits_the_lifetime_by_the_price(launch, provider, monkeypatch
     assert create(launch, other).spec.lifetime == pytest.approx(1740.0, abs=1.0)
 
 
-@pytest.mark.parametrize(('size', 'budget', 'said'), [
-    ('medium', '5 USD', "price of 'planner' is unknown"),
-    ('large', '0.3', r'has \$0.30 of its budget of \$0.30 left, which pays for 480 s')])
-def test_budget_that_can_not_be_kept_is_refused_first(launch, provider, size, budget, said):
-    spec = dataclasses.replace(SPEC, options={'size': size},
-                               features={'budget': {'budget': budget}})
-    with pytest.raises(ConfigurationError, match=said):
-        launch.prepare([spec])
-    assert 'create' not in provider.calls
-
-
-def test_a_replacement_gets_what_is_left_of_a_budget(launch, provider, monkeypatch):
-    clock = [1000.0]
-    monkeypatch.setattr(choosing.time, 'monotonic', lambda: clock[0])
-    spec = dataclasses.replace(SPEC, features={'budget': {'budget': '1'}})
-    mine = create(launch, spec)
-    assert mine.spec.lifetime == 7140.0
-    provider.destroy(mine.machine_id)
-    clock[0] += 5400.0
-    launch.store.delete('planner')
-    assert create(launch, spec).spec.lifetime == 1740.0
-    clock[0] += 1500.0
-    launch.store.delete('planner')
-    provider.machines.clear()
-    with pytest.raises(ConfigurationError, match='pays for 240 s'):
-        create(launch, spec)
-
-
 def test_machines_of_a_launch_end_when_all_have_spent_its_budget(launch, provider):
     first, second = (dataclasses.replace(SPEC, name=name, lifetime=1e6) for name in ('a', 'b'))
     # one machine has the keyword; both count before any is created
@@ -160,14 +132,6 @@ def test_machine_that_runs_gets_less_time_when_another_costs(launch, provider):
     assert len(requests) == 2
 
 
-def test_choice_without_a_match_ends_the_launch_at_once(
-        launch, provider):
-    provider.failures['resolve'] = ProviderError('nothing costs less than $0.1')
-    with pytest.raises(ProviderError, match='nothing costs less'):
-        launch.prepare([SPEC])
-    assert 'create' not in provider.calls
-
-
 def test_compiled_workspace_is_refused_before_creation(launch, provider, tmp_path, monkeypatch):
     prefix = tmp_path / 'ws/install/arm'
     (prefix / 'share/ament_index/resource_index/packages').mkdir(parents=True)
@@ -203,11 +167,10 @@ def test_undeclared_pip_packages_are_reported_before_creation(
     assert 'create' not in provider.calls
 
 
-@pytest.mark.parametrize('error', [ConfigurationError('not installed'), PermissionError()])
 def test_launch_goes_on_where_packages_cannot_be_looked_at(
-        launch, provider, events, tmp_path, monkeypatch, error):
+        launch, provider, events, tmp_path, monkeypatch):
     def names():
-        raise error
+        raise ConfigurationError('not installed')
 
     monkeypatch.setattr('fogros2.host.wheels.names', names)
     package(tmp_path / 'ws', 'rob_tools')
@@ -260,14 +223,6 @@ def test_kept_machine_fits_though_today_differs(
     mine.enter('up')
     mine.undo.close()
     assert list(provider.find({})) == []
-
-
-def test_kept_machine_does_not_fit_an_explicit_choice(
-        launch, provider, tmp_path):
-    keep(launch, SPEC)
-    again = Launch(store=Store(tmp_path), environment={})
-    with pytest.raises(NameTaken, match='another size'):
-        create(again, MachineSpec('planner', 'fake', {'size': 'small'}))
 
 
 def test_kept_machine_gets_its_owner_before_it_starts(

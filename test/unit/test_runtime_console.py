@@ -28,7 +28,6 @@ from fogros2.report import (
     StepStarted,
     Warned,
 )
-from fogros2.runtime import console as runtime_console
 from fogros2.runtime import log_files
 from fogros2.runtime.console import Console, Screen
 from fogros2.waiting import cancellable, doing, everything, noted, wait_until
@@ -82,14 +81,6 @@ def test_lines(lines):
         ('WARNING', 'planner: no answer for 5 s (VPN); nodes keep running'),
         ('INFO', 'planner: answers again, after 12 s'),
         ('WARNING', "it may lack x\nadd pip=['x']")]
-
-
-def test_log_level(lines):
-    launch.logging.launch_config.level = logging.WARNING
-    console = Console(Terminal())
-    console(StepDone('planner', 'sync', 1.0))
-    console.close()
-    assert lines == []
 
 
 def test_progress_on_a_terminal_only():
@@ -166,19 +157,6 @@ def test_running_time_is_on_a_terminal(lines):
     before = terminal.getvalue()
     console._tick()
     assert terminal.getvalue() == before, 'it is drawn no more'
-
-
-def test_clock_of_the_console_ticks_until_it_closes(monkeypatch):
-    monkeypatch.setattr(runtime_console, 'TICK', 0.01)
-    ticks = []
-    monkeypatch.setattr(Console, '_tick', lambda self: ticks.append(1) and None)
-    console = Console(io.StringIO())
-    wait_until(lambda: len(ticks) > 3, timeout=60.0, what='the clock')
-    console.close()
-    time.sleep(0.1)
-    count = len(ticks)
-    time.sleep(0.1)
-    assert len(ticks) == count
 
 
 def test_what_threads_do_is_noted_and_forgotten():
