@@ -15,7 +15,7 @@ import os
 from pathlib import Path
 import threading
 import time
-from typing import Any, Optional
+from typing import Optional
 
 from fogros2.clock import ClockOffset
 from fogros2.report import (
@@ -32,6 +32,8 @@ from fogros2.report import (
 FILE = 'steps.jsonl'
 #: Minimum interval in seconds between two progress lines of a step.
 PROGRESS_INTERVAL = 0.25
+_KINDS = {StepStarted: 'started', StepDone: 'done', StepFailed: 'failed', Progress: 'progress',
+          ClockMeasured: 'clock'}
 
 
 class Journal:
@@ -73,27 +75,19 @@ class Journal:
                 file.write(line)
 
     def _line(self, event: Event, now: float) -> Optional[str]:
-        about: dict[str, Any]
-        if isinstance(event, ClockMeasured):
-            return json.dumps({
-                'time': round(now, 3), 'machine': event.machine, 'event': 'clock',
-                **dataclasses.asdict(event.offset)}) + '\n'
-        if isinstance(event, StepStarted):
-            about = {'event': 'started'}
-        elif isinstance(event, StepDone):
-            about = {'event': 'done', 'seconds': event.seconds, 'detail': event.detail}
-        elif isinstance(event, StepFailed):
-            about = {'event': 'failed', 'seconds': event.seconds, 'detail': event.reason}
-        elif isinstance(event, Progress):
+        kind = _KINDS.get(type(event))
+        if kind is None:
+            return None
+        if isinstance(event, Progress):
             key = (event.machine, event.step)
             if now - self._told.get(key, 0.0) < PROGRESS_INTERVAL and event.done < event.total:
                 return None
             self._told[key] = now
-            about = {'event': 'progress', 'done': event.done, 'total': event.total}
-        else:
-            return None
-        return json.dumps({'time': round(now, 3), 'machine': event.machine, 'step': event.step,
-                           **about}) + '\n'
+        fields = dataclasses.asdict(event)
+        fields |= fields.pop('offset', {})
+        if isinstance(event, StepFailed):
+            fields['detail'] = fields.pop('reason')
+        return json.dumps({'time': round(now, 3), 'event': kind, **fields}) + '\n'
 
 
 @dataclasses.dataclass(frozen=True)

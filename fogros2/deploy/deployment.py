@@ -81,19 +81,19 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
             job, ros_step, vpn_step, dds_step,
             pool.submit(installing.send_workspaces, context, job, ros, ros_step.result),
             pool.submit(install_modules), pool.submit(use_features))
-    for name in feature.names(job.spec):
+    used = list(zip(feature.names(job.spec), feature.used(job.spec)))
+    for name, (each, own) in used:
         for link in joining.links(connection):
             carrying = contextlib.ExitStack()
             job.undo.add(name, carrying.close)
-            carrying.enter_context(feature.load(name).vpn(
-                link, feature.options(name, job.spec.features.get(name, {}))))
+            carrying.enter_context(each.vpn(link, own))
     environment = plan.extended({**ros.environment, **dds_step.result()}, job.spec.environment)
     with job.step('agent') as detail:
         arming.start_heartbeat(ros.setup, environment)
         detail.append(f'VPN round trip {(job.heartbeat.round_trip or 0) * 1e3:.2f} ms')
     # pushed now, so that they end after the nodes and before the machine
-    features = {name: contextlib.ExitStack() for name in feature.names(job.spec)}
-    for name, ending in features.items():
+    endings = [contextlib.ExitStack() for _ in used]
+    for ending, (name, _) in zip(endings, used):
         job.may_make(name)
         job.undo.add(name, ending.close)
     # a second time, so that the nodes stop first on the way down
@@ -102,9 +102,8 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
     connection.enter_vpn()
     job.undo.callback(ClockComparison(job.name, job.heartbeat, context.report).close)
     running = RunningMachine(context, job, modules, environment, joining.redial)
-    for name, ending in features.items():
-        ending.enter_context(feature.load(name).machine(
-            running, feature.options(name, job.spec.features.get(name, {}))))
+    for ending, (_, (each, own)) in zip(endings, used):
+        ending.enter_context(each.machine(running, own))
     running.begin()
     return running
 

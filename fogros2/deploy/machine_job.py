@@ -54,7 +54,7 @@ class MachineJob(Site):
         self.expires = 0.0
         self.name = spec.name
         self.record = Record(spec.name, spec.provider, spec, asked=spec.options)
-        self._saving = threading.Lock()
+        self._saving = threading.RLock()
         self.undo = UndoStack(context.report, spec.name, context.failures)
         self.undo.callback(self._report_left)
         self._left: list[str] = []
@@ -111,8 +111,8 @@ class MachineJob(Site):
         """Record what the launch makes, before it makes it."""
         made = Made(kind, port)
         with self._saving:
-            self._save(made=(*(other for other in self.record.made if other != made), made),
-                       **changes)
+            self.save(made=(*(other for other in self.record.made if other != made), made),
+                      **changes)
 
     def _unmake(self, made: Made) -> None:
         if made not in self.record.made:
@@ -163,12 +163,9 @@ class MachineJob(Site):
     def save(self, **changes: Any) -> None:
         """Change fields of the record and write it to disk."""
         with self._saving:
-            self._save(**changes)
-
-    def _save(self, **changes: Any) -> None:
-        # the way down needs the changes even if they cannot be written
-        self.record = dataclasses.replace(self.record, **changes)
-        self._context.store.save(self.record)
+            # the way down needs the changes even if they cannot be written
+            self.record = dataclasses.replace(self.record, **changes)
+            self._context.store.save(self.record)
 
     @property
     def provider(self) -> Provider:

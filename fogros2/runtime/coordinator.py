@@ -185,19 +185,14 @@ class Coordinator:
         programs: dict[str, list[tuple[str, str]]] = {}
         for machine, program in planned:
             with contextlib.suppress(FogError, SubstitutionFailure):
-                spec = self._spec_now(machine)
+                # its values may still change
+                spec = self._spec(copy.copy(self._instance(machine or '')))
                 if spec.provider == ROBOT or any(map(callable, spec.options.values())):
                     continue
                 specs.setdefault(spec.name, spec)
                 programs.setdefault(spec.name, []).extend([] if program is None else [program])
         with defaults.named(self._context.environment):
             self.launch.check_here(list(specs.values()), programs)
-
-    def _spec_now(self, machine: Optional[SomeMachine]) -> MachineSpec:
-        """Return the spec of a machine whose values may still change."""
-        if not isinstance(machine, CloudInstance):
-            machine = self._by_name(self._resolved(machine) or '')
-        return self._spec(copy.copy(machine))
 
     def use_dds(self, name: str) -> None:
         """
@@ -253,6 +248,10 @@ class Coordinator:
             return machine
         return str(values.resolve(self._context, machine))
 
+    def _instance(self, machine: SomeMachine) -> CloudInstance:
+        machine = self.resolve(machine)
+        return self._by_name(machine) if isinstance(machine, str) else machine
+
     def on_robot(self, machine: SomeMachine) -> bool:
         """
         Return whether a machine's processes run on the robot, because its provider is 'robot'.
@@ -262,10 +261,7 @@ class Coordinator:
         if self._overrides is None and all(
                 known.provider != ROBOT for known in self._instances.values()):
             return False
-        machine = self.resolve(machine)
-        if isinstance(machine, str):
-            machine = self._by_name(machine)
-        return self._spec(machine).provider == ROBOT
+        return self._spec(self._instance(machine)).provider == ROBOT
 
     def engage_for(self, planned: Sequence[Planned], *, settled: bool = True) -> None:
         """
@@ -305,9 +301,7 @@ class Coordinator:
         :raises ConfigurationError: a wrong value, an unknown name, or a duplicate name.
         """
         self.engage([(machine, None)])
-        machine = self.resolve(machine)
-        if isinstance(machine, str):
-            machine = self._by_name(machine)
+        machine = self._instance(machine)
         spec = self._spec(machine)
         self._instances[spec.name] = machine
         session = self._sessions.get(spec.name)
