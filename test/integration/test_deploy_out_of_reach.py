@@ -106,6 +106,11 @@ def test_of_two_robots_that_come_at_once_one_gets_the_computer(root, tmp_path):
     assert isinstance(error, AgentError), error
     assert error.hint and name in str(error) or 'belongs to launch' in str(error), error
     assert outcomes[winner].request('status')['launch'] == contexts[winner].launch_id
+    # a third one that comes later takes nothing from the winner
+    third = Launch(store=Store(tmp_path / 'third')).context(spec)
+    late = arm(threading.Barrier(1), machine, (third, MachineJob(third, spec)))
+    assert isinstance(late, AgentError) and 'belongs to launch' in str(late), late
+    assert outcomes[winner].request('status')['launch'] == contexts[winner].launch_id
     robots[winner][1].undo.close()
     assert not os.path.exists(f'/run/fogros2/{name}')
 

@@ -152,18 +152,16 @@ def test_a_later_node_joins_a_running_machine(run, fake, planner):
     assert len(fake.noted('up')) == 1 and len(fake.noted('start')) == 2
 
 
-def test_unknown_machine_name_is_refused(run, fake, planner, capfd):
-    assert run(LaunchDescription([talker(planner), talker('planer')])) == 1
-    assert "this launch has no machine named 'planer' (did you mean 'planner'?)" in (
-        capfd.readouterr().out)
-    assert not fake.noted('up')
-
-
-def test_two_machines_of_one_name_are_refused(run, fake, planner, capfd):
-    twin = ContainerInstance(name='planner', ros_workspace='', memory='1g')
-    assert run(LaunchDescription([talker(planner), talker(twin)])) == 1
-    assert "two machines of this launch have the name 'planner'" in capfd.readouterr().out
-    assert not fake.noted('up')
+@pytest.mark.parametrize(('second', 'reason'), [
+    (lambda: talker('planer'), "no machine named 'planer' (did you mean 'planner'?)"),
+    (lambda: talker(ContainerInstance(name='planner', ros_workspace='', memory='1g')),
+     "two machines of this launch have the name 'planner'"),
+    (lambda: CloudNode(machine=ContainerInstance(name='other', ros_workspace=''), package='dmo',
+                       executable='talker'), "there is no package 'dmo' (did you mean 'demo'?)")])
+def test_wrong_second_node_is_refused_before_any_machine(
+        run, fake, planner, capfd, second, reason):
+    assert run(LaunchDescription([talker(planner), second()])) == 1
+    assert reason in capfd.readouterr().out and not fake.noted('up')
 
 
 def test_description_shows_that_its_machine_exists(run, fake, planner):
@@ -305,19 +303,11 @@ def test_remote_exit_status_is_reported(run, fake, planner, capfd):
     """A node that dies is reported; the launch's own status is as with local nodes."""
     fake.on_start = lambda machine, node: machine.say(
         'exited', node, returncode=3, respawns=False)
-    codes = []
-    node = talker(planner, on_exit=lambda event, context: codes.append(event.returncode))
-    assert run(LaunchDescription([node])) == 0
-    assert codes == [3] and node.return_code == 3
+    node = talker(planner, on_exit=[Shutdown()])
+    assert run(LaunchDescription([*robot(fake, 'sleep', '60'), node])) == 0
+    assert order(fake, 'robot ends', 'down') == ['robot ends', 'down'] and node.return_code == 3
     assert "process has died [pid 4001, exit code 3, cmd '/there/program']" in (
         capfd.readouterr().out)
-
-
-def test_on_exit_of_a_remote_node_shuts_down(run, fake, planner):
-    fake.on_start = ends
-    assert run(LaunchDescription([
-        *robot(fake, 'sleep', '60'), talker(planner, on_exit=[Shutdown()])])) == 0
-    assert order(fake, 'robot ends', 'down') == ['robot ends', 'down']
 
 
 def test_machine_respawns_and_the_launch_sees_it(run, fake, planner):
@@ -536,15 +526,6 @@ def test_early_checks_take_only_values_that_stay(run, fake, later):
     assert fake.noted('check here') == [
         ([], {}) if later else (['planner'], {'planner': [('demo', 'talker')]})]
     assert machine.spec(None).options['image'] == ('second' if later else 'first')
-
-
-def test_unknown_program_is_found_before_any_machine(run, fake, planner, capfd):
-    other = ContainerInstance(name='other', ros_workspace='')
-    assert run(LaunchDescription([
-        talker(other), CloudNode(machine=planner, package='dmo', executable='talker'),
-    ])) == 1
-    assert "there is no package 'dmo' (did you mean 'demo'?)" in capfd.readouterr().out
-    assert not fake.noted('up')
 
 
 def test_failing_undo_gives_status_1(run, fake, planner, capfd):

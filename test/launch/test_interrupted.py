@@ -139,27 +139,23 @@ def test_notice_that_the_provider_denies_ends_nothing(
     assert ('its provider has not confirmed' in said) == (not confirmed)
 
 
-def test_lost_machine_ends_the_launch_by_default(run, fake, talker, watch, capfd):
+@pytest.mark.parametrize('features', [True, False])
+def test_lost_machine_ends_the_launch_by_default(
+        run, fake, talker, watch, monkeypatch, capfd, features):
+    """Without features, a notice alone ends nothing."""
+    if not features:
+        instead(monkeypatch, 'fogros2.feature', {})
     machine = ContainerInstance(name='planner', ros_workspace='')
-    watch.at_start = {1: says(fake, 'lost', reason='it was deleted')}
+    watch.at_start = {1: lambda event: [
+        *([] if features else says(fake, 'notice', reason=REASON)()),
+        *says(fake, 'lost', reason='it was deleted')()]}
     assert run(LaunchDescription([*watch(), talker(machine=machine)])) == 1
     assert "the machine 'planner' is gone: it was deleted" in watch.shutdowns[0]
+    assert watch.interrupted == [('planner', 'it was deleted', True)]
     # nobody is asked there any more, and nobody waits for an answer
     assert fake.machines['planner'].stops == []
     errors = [line for line in capfd.readouterr().out.splitlines() if 'ERROR' in line]
     assert len(errors) == 1
-
-
-def test_without_features_a_lost_machine_ends_the_launch(
-        run, fake, talker, watch, monkeypatch):
-    """A notice alone ends nothing there."""
-    instead(monkeypatch, 'fogros2.feature', {})
-    machine = ContainerInstance(name='planner', ros_workspace='')
-    watch.at_start = {1: lambda event: [
-        *says(fake, 'notice', reason=REASON)(), *says(fake, 'lost', reason='it was deleted')()]}
-    assert run(LaunchDescription([*watch(), talker(machine=machine)])) == 1
-    assert "the machine 'planner' is gone: it was deleted" in watch.shutdowns[0]
-    assert watch.interrupted == [('planner', 'it was deleted', True)]
 
 
 def test_nodes_of_a_lost_machine_continue_on_the_robot(run, fake, package, planner, talker, watch):

@@ -14,7 +14,7 @@ from launch.event_handlers import OnProcessExit, OnProcessIO
 from launch.events import Shutdown as ShutdownEvent
 import pytest
 
-from fogros2 import CloudNode, ContainerInstance, feature, Node
+from fogros2 import CloudNode, ContainerInstance
 from fogros2.errors import ConfigurationError, ConnectError, ProviderError
 from fogros2.model import Endpoint, MachineSpec
 from fogros2.process import which
@@ -96,26 +96,6 @@ def test_lost_machine_is_deleted_before_nodes_start_here(
     order = [note[0] for note in fake.notes if note[0] in ('retire', 'here')]
     assert order[:4] == ['retire', 'retire', 'retire', 'here']
     assert len(watch.starts) == 3
-
-
-def test_agent_that_is_silent_lets_nothing_start_here(
-        run, fake, planner, talker, watch, monkeypatch):
-    """The nodes did not confirm their end: the machine is deleted first."""
-    monkeypatch.setattr(replacer, 'GRACE', 0.2)
-
-    def silent(event):
-        fake.machines['planner'].exits_on_stop = False
-        return says(fake, 'notice', reason='at 12:00')(event)
-
-    def here(event):
-        fake.note('here')
-
-    notice, free = held(fake, silent)
-    watch.at_start = {1: notice, 2: here, 3: end}
-    node = talker(machine=planner, sigterm_timeout='0.1', sigkill_timeout='0.1')
-    assert run(LaunchDescription([*watch(), free, node])) == 0
-    order = [note[0] for note in fake.notes if note[0] in ('stop', 'retire', 'here')]
-    assert order[:3] == ['stop', 'retire', 'here']
 
 
 def test_creations_that_fail_end_a_launch_whose_nodes_wait(
@@ -273,32 +253,21 @@ def test_folder_is_copied_at_intervals(run, fake, watch, tmp_path, capfd, monkey
     assert (said.out + said.err).count('a checkpoint at most') == 1
 
 
-@pytest.mark.parametrize('how', ['robot', 'shutdown'])
-def test_checkpoint_of_a_node_needs_a_replacement(run, fake, package, how, capfd):
-    machine = ContainerInstance(name='planner', ros_workspace='', on_interrupt=how)
+def test_checkpoint_of_a_node_needs_a_replacement(run, fake, package, capfd):
+    machine = ContainerInstance(name='planner', ros_workspace='', on_interrupt='robot')
     assert run(LaunchDescription([CloudNode(
         machine=machine, package='demo', executable='talker', checkpoint='$HOME/map')])) == 1
     assert fake.noted('up') == []
     assert "a node of 'planner' has a checkpoint, and nothing" in capfd.readouterr().out
 
 
-def test_checkpoint_of_a_node_needs_a_machine():
-    with pytest.raises(ConfigurationError, match='checkpoint= of a node is for a machine'):
-        Node(package='demo', executable='talker', checkpoint='$HOME/map')
-
-
 @pytest.mark.parametrize('words, message', [
     ({'on_interrupt': 'shutdown', 'checkpoint': '~/map'}, 'nothing would restore it'),
     ({'on_loss_after': 60}, 'on_loss_after=60 s is shorter than robot_timeout=120 s'),
-    ({'provider': 'ssh'}, 'exists already: no launch can replace it')])
+    ({'provider': 'ssh'}, 'exists already: no launch can replace it'),
+    ({'max_replacements': 0}, 'max_replacements=0 is no number of machines')])
 def test_what_can_replace_nothing_is_refused(words, message):
     own = {'on_interrupt': 'replace', **words}
-    spec = MachineSpec('planner', own.pop('provider', 'container'), features={'replacement': own})
-    found = next(one for one in feature.used(spec) if isinstance(one[0], Replacement))
+    spec = MachineSpec('planner', own.pop('provider', 'container'))
     with pytest.raises(ConfigurationError, match=message):
-        found[0].check(spec, found[1])
-
-
-def test_wrong_limit_is_refused():
-    with pytest.raises(ConfigurationError, match='max_replacements=0 is no number of machines'):
-        ContainerInstance(name='planner', max_replacements=0)
+        Replacement().check(spec, Replacement.options(**own))

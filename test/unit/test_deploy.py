@@ -6,7 +6,6 @@ from __future__ import annotations
 from concurrent.futures import Future
 import contextlib
 import dataclasses
-import json
 import os
 from pathlib import Path
 import signal
@@ -32,7 +31,6 @@ from fogros2.deploy.steps.creating import Creation
 from fogros2.deploy.steps.joining import Joining
 from fogros2.deploy.steps.watching import Watch
 from fogros2.errors import (
-    AgentError,
     Cancelled,
     CommandError,
     ConfigurationError,
@@ -329,33 +327,6 @@ def test_a_step_that_fails_ends_those_beside_it(launch, provider, monkeypatch, s
         launch.up(SPEC)
     assert time.monotonic() - begin < 45
     assert not launch.cancel.is_set(), 'other machines of the launch go on'
-
-
-class BusyAgent(FakeStream):
-    """The agent of another launch, which has the machine."""
-
-    def write(self, data):
-        for line in data.splitlines():
-            number = json.loads(line)['id']
-            reply = {'id': number, 'ok': False, 'kind': 'busy', 'hint': '',
-                     'error': "this machine belongs to launch 'abc'"}
-            self.say(json.dumps(reply).encode() + b'\n')
-
-
-def test_computer_of_another_robot_is_left_alone(
-        launch, provider, monkeypatch):
-    shell = FakeShell(
-        handlers={'sh': lambda command: Result(0, 'there\n', '')},
-        streams=[BusyAgent()])
-    machine = Machine('x', 'planner', 'ssh', MachineState.RUNNING, owned=False,
-                      shell=Endpoint('fake', user='fog'))
-    monkeypatch.setattr(Creation, 'run', lambda self: setattr(self._job, 'machine', machine))
-    monkeypatch.setattr(Connection, 'open', lambda self: setattr(self._job, 'shell', shell))
-    with pytest.raises(AgentError, match="belongs to launch 'abc'"):
-        launch.up(MachineSpec('planner', 'ssh'))
-    assert shell.files == {}
-    assert not [command for command in shell.commands if command.argv[0] != 'sh']
-    assert not [command for command in shell.commands if 'install' in command.argv[-1]]
 
 
 @pytest.fixture
@@ -833,19 +804,6 @@ def test_retired_machine_is_deleted_and_created_anew(launch, provider, monkeypat
     assert launch.up(spec) is not first
     launch.retire('planner')
     launch.retire('planner')
-
-
-def test_machine_that_is_ended_in_order_is_not_lost(launch, provider):
-    """Its last steps, such as results that come home, may use it."""
-    context, mine = begun(launch)
-    mine.machine = mine.shell = mine.agent = None
-    mine.heartbeat = SimpleNamespace(age=0.0)
-    mine.interface = SimpleNamespace(address='198.18.7.2')
-    running = RunningMachine(context, mine, None, None)
-    seen = []
-    mine.undo.callback(lambda: seen.append(running.lost))
-    running.end('nobody has used it')
-    assert seen == ['']
 
 
 def test_undo_of_another_version_is_reported_others_are_done(launch, provider):

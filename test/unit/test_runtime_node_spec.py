@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import pathlib
 import tempfile
 
 from launch import LaunchContext
@@ -187,14 +186,6 @@ def test_paths_of_a_workspace_that_a_guest_sends_are_looked_up(context, tmp_path
         ExecuteProcess(cmd=['look', map_file]), context, {'AMENT_PREFIX_PATH': str(install)},
         dataclasses.replace(SPEC, workspace=str(tmp_path / 'ws')), moved=moved)
     assert found.arguments[-1] == (({'share': 'mine'}, '/map.yaml') if moved else map_file)
-
-
-def test_paths_are_read_as_they_are(context, tmp_path):
-    """A pathlib path as parameter file is one too."""
-    file = pathlib.Path(tmp_path, 'p.yaml')
-    file.write_text('a: 1\n')
-    spec = convert(Node(package='demo', executable='talker', parameters=[file]), context)
-    assert list(spec.files.values()) == ['a: 1\n']
 
 
 @pytest.mark.parametrize(('changes', 'found'), [
