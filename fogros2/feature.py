@@ -92,17 +92,22 @@ class RunningMachine(ReachedMachine, Protocol):
 
     :ivar machine: as the provider reported it.
     :ivar shell: copies files; for commands there is ``run``.
-    :ivar interface: its end of the launch's VPN, and ``vpn_address`` the address there.
+    :ivar interface: its end of the launch's VPN.
     :ivar environment: the variables of its nodes.
-    :ivar dds_file: path of the middleware's configuration there, which ``environment`` names.
     """
 
     machine: Machine
     shell: Shell
     interface: VpnInterface
-    vpn_address: str
     environment: Mapping[str, str]
-    dds_file: str
+
+    @property
+    def vpn_address(self) -> str:
+        """The machine's address in the VPN."""
+
+    @property
+    def dds_file(self) -> str:
+        """Path of the middleware's configuration there, which ``environment`` names."""
 
     @property
     def directory(self) -> str:
@@ -118,7 +123,7 @@ class RunningMachine(ReachedMachine, Protocol):
     def note(self, name: str, text: str) -> None:
         """Let ``ros2 fog`` show a text while the launch runs: see ``Feature.notes``."""
 
-    def makes(self, name: str) -> None:
+    def makes(self, name: str, /) -> None:
         """Record that ``clean_up`` of the feature with this name undoes what it makes next."""
 
     def open_port(self, port: int, sources: Sequence[str]) -> tuple[str, int]:

@@ -34,15 +34,15 @@ def bring_up(context: Context, spec: MachineSpec) -> RunningMachine:
 
     :raises FogError: a step failed.
     """
-    job = MachineJob(context, spec)
+    machine = RunningMachine(context, spec)
     with contextlib.ExitStack() as failed:
-        failed.push(job.undo)
-        running = _run(context, job)
+        failed.push(machine.undo)
+        _run(context, machine)
         failed.pop_all()
-        return running
+        return machine
 
 
-def _run(context: Context, job: MachineJob) -> RunningMachine:
+def _run(context: Context, job: RunningMachine) -> None:
     job.undo.enter_context(context.store.lock(job.name))
     connection, arming = Connection(context, job), Arming(context, job)
     joining = (Joining if context.other_vpn is None else Joined)(context, job)
@@ -64,13 +64,13 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
         except BaseException:
             job.cancel.set()
             raise
-        modules = installing.Modules(context, job, ros)
+        job.modules = installing.Modules(context, job, ros)
         vpn_step = pool.submit(joining.join)
         dds_step = pool.submit(dds.configure, context, job)
 
         def install_modules() -> None:
             ros_step.result()
-            modules.ensure(programs_of(context.nodes))
+            job.modules.ensure(programs_of(context.nodes))
 
         def use_features() -> None:
             ros_step.result()
@@ -87,9 +87,10 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
             carrying = contextlib.ExitStack()
             job.undo.add(name, carrying.close)
             carrying.enter_context(each.vpn(link, own))
-    environment = plan.extended({**ros.environment, **dds_step.result()}, job.spec.environment)
+    job.environment = plan.extended(
+        {**ros.environment, **dds_step.result()}, job.spec.environment)
     with job.step('agent') as detail:
-        arming.start_heartbeat(ros.setup, environment)
+        arming.start_heartbeat(ros.setup, job.environment)
         detail.append(f'VPN round trip {(job.heartbeat.round_trip or 0) * 1e3:.2f} ms')
     # pushed now, so that they end after the nodes and before the machine
     endings = [contextlib.ExitStack() for _ in used]
@@ -97,15 +98,14 @@ def _run(context: Context, job: MachineJob) -> RunningMachine:
         job.may_make(name)
         job.undo.add(name, ending.close)
     # a second time, so that the nodes stop first on the way down
-    job.makes(NODES)
+    job.push(NODES)
     dds.start_router(context, job)
     connection.enter_vpn()
     job.undo.callback(ClockComparison(job.name, job.heartbeat, context.report).close)
-    running = RunningMachine(context, job, modules, environment, joining.redial)
+    job.undo.callback(job.ending.set)
     for ending, (_, (each, own)) in zip(endings, used):
-        ending.enter_context(each.machine(running, own))
-    running.begin()
-    return running
+        ending.enter_context(each.machine(job, own))
+    job.begin(joining.redial)
 
 
 def _wait_for_all(job: MachineJob, *tasks: Future[Any]) -> None:

@@ -34,7 +34,7 @@ AGENT_FOLDER = '/run/fogros2'
 
 class MachineJob(Site):
     """
-    One machine's deployment.
+    One machine's deployment, of which :class:`~.running.RunningMachine` is the rest.
 
     :param spec: the launch file's spec; the creation replaces it by one with all choices made.
     """
@@ -77,6 +77,8 @@ class MachineJob(Site):
         self.advice: list[str] = []
         #: Set when the launch is cancelled, or when a step fails: parallel steps then end.
         self.cancel = Either(context.cancel)
+        #: Set when the undo steps of a machine that was up have begun.
+        self.ending = threading.Event()
 
     def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
         """Report a step of this machine around a block; see :func:`fogros2.report.step`."""
@@ -98,16 +100,16 @@ class MachineJob(Site):
         self.expires = time.monotonic() + seconds
         self.save(spec=self.spec, armed=time.time())
 
-    def makes(self, kind: str, port: int = 0, **changes: Any) -> None:
+    def push(self, kind: str, port: int = 0, **changes: Any) -> None:
         """Push the undo of what the next step makes, and record it with other changes."""
         self.may_make(kind, port)
-        self.note(kind, port, **changes)
+        self.makes(kind, port, **changes)
 
     def may_make(self, kind: str, port: int = 0) -> None:
-        """Push the undo of what may be noted later."""
+        """Push the undo of what may be recorded later."""
         self.undoing(kind, lambda: self._unmake(Made(kind, port)))
 
-    def note(self, kind: str, port: int = 0, **changes: Any) -> None:
+    def makes(self, kind: str, port: int = 0, **changes: Any) -> None:
         """Record what the launch makes, before it makes it."""
         made = Made(kind, port)
         with self._saving:
@@ -214,11 +216,18 @@ class MachineJob(Site):
             self.spec.on_exit, owned=self._context.capabilities.owned, stopped=stopped)
 
     def run(self, *commands: Command, timeout: Optional[float] = None) -> str:
-        """Run commands on the machine on the way up; return the last one's output."""
-        output = ''
+        """
+        Run commands on the machine; return the last one's output.
+
+        :raises ShellError: one failed, or the machine does not answer.
+        :raises Cancelled: the launch is ending, and the machine still came up.
+        """
+        output, ending = '', self.ending.is_set()
         for command in commands:
-            output = self.shell.run(command, timeout=timeout or self._context.timeouts.vpn,
-                                    cancel=self.cancel).stdout
+            seconds = timeout or self._context.timeouts.vpn
+            output = self.shell.run(
+                command, timeout=self.timeout(seconds) if ending else seconds,
+                cancel=None if ending else self.cancel).stdout
         return output
 
     def clean_up(self, commands: Iterable[Command]) -> str:

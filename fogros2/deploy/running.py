@@ -14,85 +14,51 @@ from fogros2 import feature
 from fogros2.agent_client import EventCallback
 from fogros2.deploy.context import Context
 from fogros2.deploy.life import Phase
-from fogros2.deploy.machine_job import MachineJob, SILENCE_TIMEOUT, Step
+from fogros2.deploy.machine_job import MachineJob, SILENCE_TIMEOUT
 from fogros2.deploy.steps.installing import Modules
 from fogros2.deploy.steps.watching import POLL_INTERVAL, Watch
 from fogros2.deploy.undo import OPEN_PORT
 from fogros2.errors import AgentError, DeadlineExceeded, FogError
 from fogros2.events import Event
-from fogros2.model import Command, Machine, NodeSpec
+from fogros2.model import Machine, MachineSpec, NodeSpec
 from fogros2.report import Warned
 from fogros2.waiting import wait_until
 
 
-class RunningMachine(Step):
-    """
-    A machine of the launch that is up, and the nodes on it.
+class RunningMachine(MachineJob):
+    """A machine of the launch that comes up or is up, and the nodes on it."""
 
-    :param modules: installs what some nodes import.
-    :param environment: the variables of its nodes.
-    :param found: called with the provider's report when the machine exists but is silent.
-    """
+    #: Installs what some nodes import.
+    modules: Modules
+    #: The variables of its nodes.
+    environment: Mapping[str, str]
 
-    def __init__(
-        self, context: Context, job: MachineJob, modules: Modules,
-        environment: Mapping[str, str] = {},
-        found: Callable[[Machine], None] = lambda machine: None,
-    ) -> None:
-        super().__init__(context, job)
-        self.spec = job.spec
-        self.machine = job.machine
-        self.provider = job.provider
-        self.shell = job.shell
-        self.agent = job.agent
-        self.heartbeat = job.heartbeat
-        self.interface = job.interface
-        self.vpn_address = job.interface.address
-        self.launch = context.launch_id
-        self.dds_file = job.dds_file
-        self.rmw = job.rmw
-        self.environment = environment
-        self._modules = modules
+    def __init__(self, context: Context, spec: MachineSpec) -> None:
+        super().__init__(context, spec)
         self._lock = threading.Lock()
         self._shortening = threading.Lock()
         self._callback: Optional[EventCallback] = None
-        #: Set when undo steps have begun.
-        self._ending = threading.Event()
         self._published: dict[int, tuple[str, int]] = {}
         self._watches: dict[str, Callable[[str], None]] = {}
-        self._found = found
-        job.undo.callback(self._ending.set)
 
-    def begin(self) -> None:
-        """Watch the machine, which is up now, until its end."""
-        self._job.enter('up')
-        self._job.undo.callback(
-            Watch(self._context, self._job, over=self._is_over, found=self._found).close)
+    def begin(self, found: Callable[[Machine], None] = lambda machine: None) -> None:
+        """
+        Watch the machine, which is up now, until its end.
+
+        :param found: called with the provider's report when the machine exists but is silent.
+        """
+        self.enter('up')
+        self.undo.callback(Watch(self._context, self, over=self._is_over, found=found).close)
+
+    @property
+    def vpn_address(self) -> str:
+        """The machine's address in the VPN."""
+        return self.interface.address
 
     @property
     def lost(self) -> str:
         """Why the machine is gone or must not be used any more, '' while it is there."""
-        return self._job.life.lost
-
-    @property
-    def directory(self) -> str:
-        """The agent's folder on the machine."""
-        return self._job.directory
-
-    def run(self, command: Command, *, timeout: float) -> str:
-        """
-        Run a command on the machine; return its output.
-
-        :raises ShellError: it failed, or the machine does not answer.
-        :raises Cancelled: the launch is ending, and the machine still came up.
-        """
-        if not self._ending.is_set():
-            return self._job.run(command, timeout=timeout)
-        return self.shell.run(command, timeout=self._job.timeout(timeout)).stdout
-
-    def step(self, name: str) -> contextlib.AbstractContextManager[list[str]]:
-        """Report a step of this machine around a block; see :func:`fogros2.report.step`."""
-        return self._job.step(name)
+        return self.life.lost
 
     def warn(self, text: str, remedy: str) -> None:
         """Warn the user, with what to do about it on a line of its own."""
@@ -106,7 +72,7 @@ class RunningMachine(Step):
         """
         for each, own in feature.used(self.spec):
             nodes = each.starting(self, nodes, own)
-        self.agent.request('start', nodes=self._modules.fitted(nodes))
+        self.agent.request('start', nodes=self.modules.fitted(nodes))
 
     def watch(
         self, name: str, argv: Sequence[str], interval: float, then: Callable[[str], None],
@@ -126,18 +92,14 @@ class RunningMachine(Step):
     def _request(self, command: str, **arguments: Any) -> None:
         """Send the agent a request, with a shorter time-out while the launch ends."""
         if self._context.cancel.is_set():
-            self.agent.request(command, timeout=self._job.timeout(30.0),
+            self.agent.request(command, timeout=self.timeout(30.0),
                                silent=SILENCE_TIMEOUT, **arguments)
         else:
             self.agent.request(command, timeout=30.0, **arguments)
 
     def note(self, name: str, text: str) -> None:
         """Let ``ros2 fog`` show a note; see :class:`fogros2.feature.RunningMachine`."""
-        self._job.save(notes={**self._job.record.notes, name: text})
-
-    def makes(self, name: str) -> None:
-        """Record what a feature makes; see :class:`fogros2.feature.RunningMachine`."""
-        self._job.note(name)
+        self.save(notes={**self.record.notes, name: text})
 
     def open_port(self, port: int, sources: Sequence[str]) -> tuple[str, int]:
         """
@@ -146,10 +108,9 @@ class RunningMachine(Step):
         :param sources: networks (CIDR) that may connect.
         :raises FogError: the provider cannot open the port.
         """
-        job = self._job
         if port not in self._published:  # a program that listens there may have restarted
-            job.makes(OPEN_PORT, port)
-            self._published[port] = job.provider.open_port(self.machine, port, sources)
+            self.push(OPEN_PORT, port)
+            self._published[port] = self.provider.open_port(self.machine, port, sources)
         return self._published[port]
 
     def subscribe(self, callback: EventCallback) -> None:
@@ -162,7 +123,7 @@ class RunningMachine(Step):
         def tell(event: Event) -> None:
             # an agent that exits at the end of the launch is expected
             expected = event['event'] == 'connection' and self._context.ending.is_set()
-            if self._job.life.over or expected:
+            if self.life.over or expected:
                 return
             if event['event'] != 'watched':
                 callback(event)
@@ -170,12 +131,12 @@ class RunningMachine(Step):
                 then(event['reason'])
 
         with self._lock:
-            self._callback, life = callback, self._job.life
+            self._callback, life = callback, self.life
         if life.over:
             callback({'event': 'lost', 'reason': life.reason})
             return
         try:
-            self.agent.subscribe(tell, since=self._job.first_event)
+            self.agent.subscribe(tell, since=self.first_event)
         except AgentError:
             # another thread may have reported the loss and closed the connection meanwhile
             if not self.lost:
@@ -201,7 +162,7 @@ class RunningMachine(Step):
     def _enter(self, phase: Phase, reason: str = '') -> Optional[EventCallback]:
         """Enter a phase; return the subscriber of its events."""
         with self._lock:
-            self._job.enter(phase, reason)
+            self.enter(phase, reason)
             return self._callback
 
     def reclaimed(self, timeout: float) -> bool:
@@ -212,7 +173,7 @@ class RunningMachine(Step):
         """
         def confirmed() -> bool:
             with contextlib.suppress(FogError):  # it does not answer: asked again
-                return self._context.provider.reclaims(self._job.machine_id)
+                return self.provider.reclaims(self.machine_id)
             return False
 
         try:
@@ -231,7 +192,7 @@ class RunningMachine(Step):
         """
         self._enter('lost', 'it is replaced')
         self.heartbeat.close()
-        self._context.provider.destroy(self._job.machine_id)
+        self.provider.destroy(self.machine_id)
         self._enter('deleted')
         self.close()
 
@@ -248,29 +209,28 @@ class RunningMachine(Step):
 
         :raises FogError: the agent does not answer.
         """
-        job = self._job
         with self._shortening:
-            seconds = job.expires - time.monotonic()
+            seconds = self.expires - time.monotonic()
             try:
                 allowed = self._context.choices.limited(
-                    dataclasses.replace(job.spec, lifetime=seconds), made=True).lifetime
+                    dataclasses.replace(self.spec, lifetime=seconds), made=True).lifetime
             except FogError:
                 return  # its time is over
-            if self._job.life.over or self._ending.is_set() or allowed > seconds - 1.0:
+            if self.life.over or self.ending.is_set() or allowed > seconds - 1.0:
                 return
             try:
                 self.agent.request(
                     'configure', timeout=self._context.timeouts.agent,
                     launch=self._context.launch_id, again=True, lifetime=allowed)
             except FogError:
-                if self._job.life.over or self._ending.is_set():
+                if self.life.over or self.ending.is_set():
                     return
                 raise
-            job.restart_lifetime(allowed)
+            self.restart_lifetime(allowed)
 
     def lose_after(self, seconds: float) -> None:
         """Count a silent machine as lost after this time, even if its provider says it runs."""
-        self._job.longest_silence = seconds
+        self.longest_silence = seconds
 
     def end(self, reason: str) -> None:
         """End the machine as its ``on_exit`` says; its further events are ignored."""
@@ -279,4 +239,4 @@ class RunningMachine(Step):
 
     def close(self) -> None:
         """End the machine as its ``on_exit`` says."""
-        self._job.undo.close()
+        self.undo.close()

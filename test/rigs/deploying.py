@@ -10,8 +10,8 @@ from typing import Any
 from fogros2.dds.fastdds import FastDds
 from fogros2.deploy.choosing import Choices
 from fogros2.deploy.context import Context
-from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.robot_vpn import RobotVpn
+from fogros2.deploy.running import RunningMachine
 from fogros2.model import MachineSpec, VpnInterface
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent
@@ -26,7 +26,7 @@ ROBOT = VpnInterface('fog0a0b0c', '198.18.7.1', '198.18.7.0/24', 0, '/nowhere/ke
 def job(
     folder: Path, spec: MachineSpec, *, provider: Provider | None = None,
     report: Reporter = silent, **changes: Any,
-) -> tuple[Context, MachineJob]:
+) -> tuple[Context, RunningMachine]:
     """
     Return the context and the job of a machine that is about to be deployed.
 
@@ -45,4 +45,4 @@ def job(
                         choose_port=addresses.choose_port),
         'dds': FastDds(), **changes}
     context = Context(**fields)
-    return context, MachineJob(context, spec)
+    return context, RunningMachine(context, spec)

@@ -610,7 +610,7 @@ def test_a_computer_that_stays_keeps_no_container(monkeypatch, survives, used):
     job.shell = shell = FakeShell()
     job.may_make('containers')
     if used:
-        job.note('containers')
+        job.makes('containers')
     job.undo.close()
     assert shell.commands == ([containers.remove('abc')] if survives and used else [])
 

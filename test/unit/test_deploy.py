@@ -21,7 +21,6 @@ from fogros2.agent_client import AgentClient
 from fogros2.dds import Router
 from fogros2.deploy import Launch, robot_router, robot_vpn, undo
 from fogros2.deploy import launch as deployed
-from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.robot_vpn import VpnMember
 from fogros2.deploy.running import RunningMachine
 from fogros2.deploy.steps import connecting, dds, installing, watching
@@ -99,7 +98,7 @@ def launch(tmp_path, monkeypatch, events):
 def begun(launch, spec=SPEC, **changes):
     """Return the context and the job of a machine that is about to be deployed."""
     context = dataclasses.replace(launch.context(spec), **changes)
-    return context, MachineJob(context, spec)
+    return context, RunningMachine(context, spec)
 
 
 # -- what is checked before the VPN ---------------------------------------------------------
@@ -695,16 +694,13 @@ def cut(request, launch, provider, monkeypatch):
         owned=getattr(request, 'param', True)))
     reported, events = [], []
     provider.machines['fake-1'] = Machine('fake-1', 'planner', 'fake', MachineState.RUNNING)
-    context, mine = begun(launch, report=reported.append)
-    mine.machine = mine.shell = None
-    mine.interface = SimpleNamespace(address='198.18.7.2')
+    _, mine = begun(launch, report=reported.append)
     mine.agent = mine.heartbeat = link = Cut()
     mine.record = dataclasses.replace(mine.record, machine_id='fake-1')
-    running = RunningMachine(context, mine, None, None)
-    running.begin()
-    running.subscribe(events.append)
+    mine.begin()
+    mine.subscribe(events.append)
     yield link, reported, events
-    running.close()
+    mine.close()
 
 
 def test_silence_is_reported_and_its_end(cut, provider):
@@ -781,16 +777,13 @@ def test_retired_machine_is_deleted_and_created_anew(launch, provider, monkeypat
     ended = []
 
     def bring_up(context, spec):
-        mine = MachineJob(context, spec)
+        mine = RunningMachine(context, spec)
         mine.heartbeat = SimpleNamespace(age=0.0, close=lambda: ended.append('heartbeat'))
-        mine.machine = mine.shell = None
         mine.agent = SimpleNamespace(request=lambda *words, **named: None)
-        mine.interface = SimpleNamespace(address='198.18.7.2')
         Creation(context, mine)._claim('token')
         mine.save(machine_id=provider.create(spec, CreateRequest('t', '', {}, 1)))
-        running = RunningMachine(context, mine, None, None)
-        running.begin()
-        return running
+        mine.begin()
+        return mine
 
     monkeypatch.setattr(deployed, 'bring_up', bring_up)
     spec = dataclasses.replace(SPEC, on_exit='keep')
@@ -820,10 +813,10 @@ def test_what_could_not_be_undone_stays_in_the_record(launch, provider):
     ended = [1, 0]
     mine.shell = FakeShell(handlers={'sh': lambda c: Result(ended.pop(0), '', 'no')})
     with mine.undo:
-        mine.makes(undo.WATCHDOG, agent='/run/fogros2/planner')
+        mine.push(undo.WATCHDOG, agent='/run/fogros2/planner')
     assert context.failures and mine.record.made == (Made(undo.WATCHDOG),)
     with mine.undo:
-        mine.makes(undo.WATCHDOG)
+        mine.push(undo.WATCHDOG)
     assert mine.record.made == ()
 
 
@@ -835,7 +828,7 @@ def test_vpn_that_guests_keep_stays_in_the_record(launch, provider):
     mine.released = True
     mine.shell = FakeShell(handlers={'true': lambda c: Result(0, f'{STAYS}\n', '')})
     with mine.undo:
-        mine.makes(undo.VPN)
+        mine.push(undo.VPN)
     assert joining._former is None and mine.record.made == (Made(undo.VPN),)
     # the next launch needs its port
     joining.choose_interface()

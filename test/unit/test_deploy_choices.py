@@ -13,7 +13,6 @@ import pytest
 from fogros2.deploy import choosing, Launch
 from fogros2.deploy import launch as launches
 from fogros2.deploy.context import Context
-from fogros2.deploy.machine_job import MachineJob
 from fogros2.deploy.running import RunningMachine
 from fogros2.deploy.steps.creating import Creation
 from fogros2.errors import AgentError, ConfigurationError, ProviderError, WorkspaceError
@@ -52,7 +51,7 @@ def launch(tmp_path, monkeypatch, events):
 def create(launch, spec=SPEC):
     """Take a machine through its first steps; returns what they share."""
     context = launch.context(spec)
-    mine = MachineJob(context, spec)
+    mine = RunningMachine(context, spec)
     Creation(context, mine).run()
     return mine
 
@@ -103,8 +102,6 @@ def test_machine_that_runs_gets_less_time_when_another_costs(launch, provider):
     spec = dataclasses.replace(SPEC, lifetime=1e6, features={'budget': {'launch_budget': '1'}})
     first = create(launch, spec)
     first.restart_lifetime(first.spec.lifetime)
-    first.heartbeat = SimpleNamespace(age=0.0)
-    first.interface, first.shell = SimpleNamespace(address='198.18.7.2'), None
     requests, answers = [], [AgentError('silent')]
 
     def request(command, *, lifetime=None, **arguments):
@@ -114,21 +111,20 @@ def test_machine_that_runs_gets_less_time_when_another_costs(launch, provider):
                 raise answers.pop()
 
     first.agent = SimpleNamespace(request=request)
-    running = RunningMachine(launch.context(spec), first, None, None)
-    running.shorten()
+    first.shorten()
     assert requests == []
     create(launch, dataclasses.replace(spec, name='other', features={}))
     # the launch creates no other machine before the agent knows
     with pytest.raises(AgentError):
-        running.shorten()
-    running.shorten()
-    running.shorten()
+        first.shorten()
+    first.shorten()
+    first.shorten()
     assert requests == pytest.approx([3540.0, 3540.0], abs=2.0)
     record = launch.store.load('planner')
     assert record.armed + record.spec.lifetime == pytest.approx(time.time() + 3540.0, abs=2.0)
     create(launch, dataclasses.replace(spec, name='third', features={}))
-    running.end('nobody uses it')
-    running.shorten()
+    first.end('nobody uses it')
+    first.shorten()
     assert len(requests) == 2
 
 
@@ -186,7 +182,7 @@ def test_leftovers_of_a_creation_are_reported_with_its_error(
     error.undo_failures = (ProviderError('the key is left'),)
     provider.failures['create'] = error
     context = launch.context(SPEC)
-    mine = MachineJob(context, SPEC)
+    mine = RunningMachine(context, SPEC)
     with pytest.raises(ProviderError, match='no room'):
         Creation(context, mine).run()
     mine.undo.close()

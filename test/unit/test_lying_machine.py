@@ -12,7 +12,6 @@ import pytest
 
 pytest.importorskip('launch.actions', reason='launch is not installed')
 
-from fogros2.deploy import RunningMachine
 from fogros2.errors import AgentError, ConnectError
 from fogros2.model import Command, Endpoint, MachineSpec
 from fogros2.shell import lines, relay, ssh_connection
@@ -164,9 +163,7 @@ def test_machine_lost_at_subscription_affects_no_other(
         def close(self):
             pass
 
-    context, job = deploying.job(tmp_path, MachineSpec('planner', 'fake'))
-    job.machine = job.shell = job.heartbeat = None
-    job.agent, job.interface = Closing(), deploying.ROBOT
-    machine = RunningMachine(context, job, None, None)
+    _, machine = deploying.job(tmp_path, MachineSpec('planner', 'fake'))
+    machine.agent = Closing()
     machine.subscribe(heard.append)
     assert heard == [{'event': 'lost', 'reason': 'it was deleted'}]

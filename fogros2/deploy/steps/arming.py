@@ -85,7 +85,7 @@ class Arming(Step):
                         what='look for an agent')).strip():
                     # of a launch that died, or of another robot, which keeps it
                     agent = self._claim(program, config)
-                job.makes(WATCHDOG, agent=job.directory, agent_program=program)
+                job.push(WATCHDOG, agent=job.directory, agent_program=program)
                 if agent is None:
                     self._install(program, config)
             else:
@@ -103,7 +103,7 @@ class Arming(Step):
             # a busy machine gets more time to answer, as long as it sends anything
             job.probes.insert(0, lambda seconds: agent.request(
                 'ping', timeout=3 * seconds, silent=seconds))
-            job.makes(NODES)
+            job.push(NODES)
             job.rearming = Periodic('fog-rearm', job.spec.robot_timeout / 4, self._rearm)
             job.undo.callback(job.rearming.close)
 

@@ -75,7 +75,7 @@ class Connection(Step):
                     host_key=job.record.host_key or endpoint.host_key)
             job.save(shell=endpoint)
             if context.capabilities.firewall:
-                job.makes(SSH_PORT, endpoint.port)
+                job.push(SSH_PORT, endpoint.port)
                 job.undo.callback(self._leave)
                 if job.life.phase == 'kept':
                     # the earlier launch closed the port, or the robot's address has changed
@@ -147,7 +147,7 @@ class Connection(Step):
             self._job.forget(Made(SSH_PORT, self._outside.port))
 
     def _note_and_open(self) -> None:
-        self._job.note(SSH_PORT, self._outside.port)
+        self._job.makes(SSH_PORT, self._outside.port)
         self._open_port()
 
     def _leave(self) -> None:

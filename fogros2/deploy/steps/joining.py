@@ -69,7 +69,7 @@ class Joining(Step):
         """
         job, interface, robot = self._job, self._job.interface, self._context.vpn
         with job.step('VPN') as detail:
-            job.makes(VPN)
+            job.push(VPN)
             job.undoing(VPN, lambda: robot.remove(job.name))
             if self._former is not None:
                 # others still use it, and its port is needed

@@ -18,7 +18,7 @@ from launch.substitutions import TextSubstitution
 import pytest
 
 from fogros2 import ContainerInstance, Foxglove, ros_names
-from fogros2.deploy import RunningMachine, undo
+from fogros2.deploy import undo
 from fogros2.deploy.steps.creating import Creation
 from fogros2.errors import AgentError, ConfigurationError, ProviderError, Unsupported
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState, VpnInterface
@@ -84,15 +84,12 @@ def provider(monkeypatch):
     ('on_exit', 'closed'), [('keep', True), ('stop', True), ('delete', False)])
 def test_port_is_closed_at_the_end_of_the_launch(
         tmp_path, provider, on_exit, closed):
-    context, job = deploying.job(
+    _, running = deploying.job(
         tmp_path, MachineSpec('planner', 'fake', on_exit=on_exit), provider=provider)
-    job.save(machine_id='fake-1')
-    job.enter('up')
-    job.machine = Machine(
+    running.save(machine_id='fake-1')
+    running.enter('up')
+    running.machine = Machine(
         'fake-1', 'planner', 'fake', MachineState.RUNNING, vpn_host='198.51.100.9')
-    job.shell, job.interface = FakeShell(), VPN
-    job.agent, job.heartbeat = None, SimpleNamespace(age=None)
-    running = RunningMachine(context, job, None, None)
     assert running.open_port(8766, SOURCES) == ('198.51.100.9', 8766)
     assert provider.allowed == {('fake-1', 8766): list(SOURCES)}
     # the bridge was started again: nothing is opened twice
