@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import stat
 import tempfile
@@ -11,12 +12,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from fogros2 import ContainerInstance, events
+from fogros2 import CloudNode, ContainerInstance, events
 from fogros2.deploy.context import programs_of
 from fogros2.errors import Cancelled
 from fogros2.provider import Capabilities
 from fogros2.report import step
 from fogros2.store import Store
+from rigs.launching import HERE, Watch
 
 
 class FakeMachine:
@@ -194,6 +196,20 @@ def package(tmp_path, monkeypatch):
     before = os.environ.get('AMENT_PREFIX_PATH')
     monkeypatch.setenv('AMENT_PREFIX_PATH', f'{prefix}:{before}' if before else str(prefix))
     return prefix
+
+
+@pytest.fixture
+def talker(package):
+    """Return what makes a cloud node that says on the robot how it was called."""
+    program = package / 'lib/demo/says'
+    program.write_text(HERE)
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    return functools.partial(CloudNode, package='demo', executable='says', output='screen')
+
+
+@pytest.fixture
+def watch():
+    return Watch()
 
 
 @pytest.fixture

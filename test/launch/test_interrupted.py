@@ -38,7 +38,7 @@ from fogros2.model import MachineSpec
 from fogros2.runtime import remote_run
 from fogros2_features.replacement import session
 from fogros2_testing.plugins import instead
-from rigs.launching import end, Harmless, HERE, says, Watch
+from rigs.launching import end, Harmless, says
 
 REASON = 'spot instance, at 12:00'
 
@@ -46,20 +46,6 @@ REASON = 'spot instance, at 12:00'
 @pytest.fixture
 def planner():
     return ContainerInstance(name='planner', ros_workspace='', on_interrupt='robot')
-
-
-@pytest.fixture
-def talker(package):
-    """Return what makes a cloud node that says on the robot how it was called."""
-    program = package / 'lib/demo/says'
-    program.write_text(HERE)
-    program.chmod(program.stat().st_mode | stat.S_IXUSR)
-    return functools.partial(CloudNode, package='demo', executable='says', output='screen')
-
-
-@pytest.fixture
-def watch():
-    return Watch()
 
 
 def end_when(true):
@@ -159,12 +145,16 @@ def test_lost_machine_ends_the_launch_by_default(
 
 
 def test_nodes_of_a_lost_machine_continue_on_the_robot(run, fake, package, planner, talker, watch):
-    watch.at_start = {1: says(fake, 'lost', reason='evicted'), 2: end}
-    assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
+    """And end there when launch asks them to."""
+    node = talker(machine=planner)
+    watch.at_start = {1: says(fake, 'lost', reason='evicted'), 2: lambda event: [EmitEvent(
+        event=ShutdownProcess(process_matcher=matches_action(node)))]}
+    assert run(LaunchDescription([*watch(), node])) == 0
     assert watch.starts[1][1] == str(package / 'lib/demo/says')
     assert fake.machines['planner'].stops == []
     assert watch.interrupted == [('planner', 'evicted', True)]
     assert [code for _, code in watch.exits] == [-2], 'that of the one here, at the end'
+    assert fake.machines['planner'].signals == []
 
 
 def vanishes(machine, ids):
@@ -203,17 +193,6 @@ def test_robot_respawns_nodes_of_a_lost_machine(run, fake, package, planner, wat
     assert [code for _, code in watch.exits] == [3, 3, 3]
 
 
-def test_shutdown_event_reaches_a_moved_process(run, fake, planner, talker, watch):
-    node = talker(machine=planner)
-    watch.at_start = {
-        1: says(fake, 'lost', reason='evicted'),
-        2: lambda event: [EmitEvent(event=ShutdownProcess(
-            process_matcher=matches_action(node)))]}
-    assert run(LaunchDescription([*watch(), node])) == 0
-    assert [code for _, code in watch.exits] == [-2]
-    assert fake.machines['planner'].signals == []
-
-
 def test_later_node_of_a_lost_machine_runs_here(run, fake, package, planner, talker, watch):
     late = talker(machine=planner, exec_name='late')
     watch.at_start = {
@@ -224,11 +203,8 @@ def test_later_node_of_a_lost_machine_runs_here(run, fake, package, planner, tal
     assert len(fake.machines['planner'].all) == 1
 
 
-def test_groups_continue_with_names_and_plain_programs(run, fake, planner, watch, package):
+def test_groups_continue_with_names_and_plain_programs(run, fake, planner, watch, talker):
     """A group's names, and programs that are no nodes."""
-    program = package / 'lib/demo/says'
-    program.write_text(HERE)
-    program.chmod(program.stat().st_mode | stat.S_IXUSR)
     watch.at_start = {2: says(fake, 'lost', reason='evicted'), 4: end_when(
         lambda: all(words in ''.join(watch.said) for words in ('__ns:=/arm', 'no node')))}
     assert run(LaunchDescription([*watch(), CloudGroup(planner, [

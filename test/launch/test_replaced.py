@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-import stat
 import threading
 
 from launch import LaunchDescription
@@ -22,7 +20,7 @@ from fogros2.shell.local import LocalShell
 from fogros2.store import Store
 from fogros2.waiting import wait_until
 from fogros2_features.replacement import Replacement, replacer, snapshots
-from rigs.launching import end, HERE, says, Watch
+from rigs.launching import end, says
 
 THERE = '/there/program'
 
@@ -30,19 +28,6 @@ THERE = '/there/program'
 @pytest.fixture
 def planner():
     return ContainerInstance(name='planner', ros_workspace='', on_interrupt='replace')
-
-
-@pytest.fixture
-def talker(package):
-    program = package / 'lib/demo/says'
-    program.write_text(HERE)
-    program.chmod(program.stat().st_mode | stat.S_IXUSR)
-    return functools.partial(CloudNode, package='demo', executable='says', output='screen')
-
-
-@pytest.fixture
-def watch():
-    return Watch()
 
 
 def held(fake, event, handler=OnProcessIO):

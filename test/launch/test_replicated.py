@@ -202,7 +202,6 @@ def test_on_the_robot_the_nodes_run_once_with_their_own_names(run, fake, first):
 
 
 @pytest.mark.parametrize(('given', 'said'), [
-    ({'machines': []}, 'need two machines or more, not 0'),
     ({'machines': ['one']}, 'need two machines or more, not 1'),
     ({'machines': ['one', 'one']}, "have the machine 'one' twice"),
     ({'services': ['/plan', 'plan']}, "have the name '/plan' twice"),
@@ -211,13 +210,10 @@ def test_on_the_robot_the_nodes_run_once_with_their_own_names(run, fake, first):
     ({'services': ['/go/_action/send_goal']}, 'belongs to a ROS action'),
     ({'services': ['/a b']}, "'/a b' is not the full name"),
     ({'topics': [('/a',)]}, 'is no pair of topics'),
-    ({'topics': ['/a']}, 'is no pair of topics'),
     ({'hedge_after': -1}, 'hedge_after=-1 is no time'),
     ({'hedge_after': 'soon'}, "'soon' is no number"),
     ({'deadline': 0.2}, 'the robot answers last'),
     ({'machines': ['one', 'two', None]}, 'the robot answers last'),
-    ({'machines': ['one', None], 'deadline': 0}, 'the robot answers last'),
-    ({'machines': ['one', None], 'deadline': 'soon'}, 'is no number'),
     ({'machines': ['one', None], 'deadline': float('inf')}, 'the robot answers last'),
     ({'machines': ['one', None, 'robot'], 'deadline': 0.2}, "the machine 'robot' twice"),
     ({'topics': [('/image', '/seen')],

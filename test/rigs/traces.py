@@ -269,13 +269,17 @@ def _read_json(process: Path, path: str) -> dict[str, Any]:
         path = f'{_variables(process).get("HOME", "")}{path[1:]}'
     if not path.startswith('/'):
         return {}
-    words = ('cat', f'{process}/root{path}')
-    text = run(Command(words, sudo=True), timeout=60.0, check=False).stdout
     try:
-        value = json.loads(text)
-    except ValueError:
+        value = json.loads(_read(f'{process}/root{path}'))
+    except (OSError, ValueError):
         return {}
     return value if isinstance(value, dict) else {}
+
+
+def _read(path: str) -> str:
+    if os.geteuid() == 0:  # a program for each agent of this computer takes long
+        return Path(path).read_text()
+    return run(Command(('cat', path), sudo=True), timeout=60.0, check=False).stdout
 
 
 def _known(folder: Path) -> set[str]:
