@@ -217,23 +217,6 @@ def test_machine_on_an_element_anywhere_below(run, fake, text):
     assert started(fake) == [('planner', 'one')]
 
 
-def test_machine_on_a_node_in_yaml(run, fake):
-    fake.on_start = ends
-    assert run(load('''
-launch:
-- fogros_launch:
-  - fog_machine: {name: planner, provider: container, ros_workspace: ''}
-  - group:
-    - node:
-        machine: planner
-        pkg: demo
-        exec: talker
-        exec_name: one
-        param: [{name: rate, value: 3}]
-''', 'test.launch.yaml')) == 0
-    assert started(fake) == [('planner', 'one')]
-
-
 def test_xml_node_takes_the_settings_of_a_cloud_node(run, fake, streams):
     fake.on_start = ends
     assert run(fogros_launch('''
