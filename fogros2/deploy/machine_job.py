@@ -34,7 +34,7 @@ AGENT_FOLDER = '/run/fogros2'
 
 class MachineJob(Site):
     """
-    One machine's deployment, of which :class:`~.running.RunningMachine` is the rest.
+    One machine's deployment: the base of :class:`~.running.RunningMachine`.
 
     :param spec: the launch file's spec; the creation replaces it by one with all choices made.
     """

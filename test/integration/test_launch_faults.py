@@ -65,16 +65,12 @@ def launched(write):
 
 # launch/test_signals.py has all signals
 def test_a_signal_takes_everything_back(launched):
+    """A second one does not stop the way back."""
     launch = launched()
     launch.wait_for(VPN)
-    end_twice(launch, signal.SIGINT)
-
-
-def end_twice(launch, number):
-    """End a launch; a second signal does not stop the way back."""
     for _ in range(2):
-        launch.child.send_signal(number)
-        launch.wait_for(number.name)
+        launch.interrupt()
+        launch.wait_for('SIGINT')
     code = launch.ended()
     assert code in (0, 1) and 'Traceback' not in launch.text, launch.text
 
@@ -98,16 +94,16 @@ def test_closed_output_takes_everything_back(write, request, output):
         stdin=writer, stdout=writer, stderr=writer,
         preexec_fn=own_terminal if terminal else None)
     os.close(writer)
-    said = os.fdopen(reader, 'rb')
+    lines = os.fdopen(reader, 'rb')
     try:
-        next(line for line in said if RUNNING.encode() in line)
+        next(line for line in lines if RUNNING.encode() in line)
         child.send_signal(signal.SIGINT)
         if terminal:
-            next(line for line in said if b'SIGINT' in line)
-            said.close()
+            next(line for line in lines if b'SIGINT' in line)
+            lines.close()
         assert child.wait(60) in (0, 1)
     finally:
-        said.close()
+        lines.close()
         end_group(child.pid)
         child.wait(60)
     assert containers() == [] and not Store().exists(NAME)
@@ -144,8 +140,11 @@ def fill(disk: Path) -> None:
 # without a machine, with an agent that had heartbeats; benchmarks/chaos.py kills at any time
 @pytest.mark.parametrize('step', [CREATE, RUNNING], ids=['create', 'running'])
 def test_a_killed_launch_leaves_a_machine_that_ends_itself(launched, step):
-    launch = launched(timeout=6)
+    """Whose agent was killed before, too; its nodes respawn then."""
+    launch = launched(timeout=6 if step == CREATE else 20)
     launch.wait_for(step)
+    if step == RUNNING:
+        kill_agent(launch)
     launch.child.kill()
     launch.ended()
     # orphaned robot nodes are the user's to end, as with any launch that was killed
@@ -158,6 +157,19 @@ def test_a_killed_launch_leaves_a_machine_that_ends_itself(launched, step):
     wait_until(lambda: fog('delete', NAME, '--yes') is not None and not containers(),
                timeout=60, what='ros2 fog delete')
     assert fog('gc') == 0
+
+
+def kill_agent(launch) -> None:
+    """Kill the agent of a machine, whose node starts again."""
+    launch.said.clear()
+    killed = subprocess.run(
+        ['ros2', 'fog', 'connect', NAME, '--', 'sh', '-c',
+         'sudo kill -9 $(cat /run/fogros2/agent.pid)'],
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60)
+    assert killed.returncode == 0, killed
+    for words in ('its agent died and was started again', 'process started with pid',
+                  'Publishing'):
+        launch.wait_for(words)
 
 
 def end_group(group: int) -> None:
@@ -174,18 +186,3 @@ def containers() -> list[str]:
 
 def fog(*words: str) -> int:
     return subprocess.run(['ros2', 'fog', *words], capture_output=True, timeout=60).returncode
-
-
-def test_nodes_respawn_when_their_agent_is_killed(launched):
-    launch = launched()
-    launch.wait_for(RUNNING)
-    launch.said.clear()
-    killed = subprocess.run(
-        ['ros2', 'fog', 'connect', NAME, '--', 'sh', '-c',
-         'sudo kill -9 $(cat /run/fogros2/agent.pid)'],
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60)
-    assert killed.returncode == 0, killed
-    launch.wait_for('its agent died and was started again')
-    launch.wait_for('process started with pid')
-    launch.wait_for('Publishing')
-    end_twice(launch, signal.SIGTERM)
