@@ -71,6 +71,7 @@ from fogros2_testing.fakes import (
     FakeVpn,
 )
 from fogros2_testing.plugins import instead
+from ros2fog_cli.api import endings
 
 SPEC = MachineSpec('planner', 'fake')
 
@@ -439,6 +440,29 @@ def test_failing_repair_is_reported_ever_more_seldom(launch, events, monkeypatch
     assert [robot.check_health() for _ in range(9)] == [
         2.0, 4.0, 8.0, 15.0, 15.0, 15.0, 15.0, 1.0, 1.0]
     assert len([event for event in events if isinstance(event, StepFailed)]) == 5
+
+
+@pytest.mark.parametrize('refused', [False, True])
+def test_launch_folder_stays_as_long_as_the_interface(launch, monkeypatch, refused):
+    """Such as where sudo wants a password again."""
+    down = Command(('false' if refused else 'true',), what='take it down')
+    monkeypatch.setattr(FakeVpn, 'down', lambda self, interface: iter([down]))
+    launch.robot_vpn().ensure()
+    folder = launch.store.launch_folder(launch.id)
+    assert len(launch.down()) == refused
+    assert folder.exists() == refused
+    # what gc sees when this process has gone
+    monkeypatch.setattr(endings, 'launch_process', lambda folder: (1, False))
+    assert [one.name for one in endings.leftovers(launch.store)] == [launch.id] * refused
+
+
+def test_user_is_warned_each_time_sudo_wants_a_password(launch, events, monkeypatch):
+    robot = launch.robot_vpn()
+    for granted in (True, False, False, True, False):
+        monkeypatch.setattr(process, 'sudo_trouble',
+                            lambda granted=granted: None if granted else process.PASSWORD)
+        robot._refresh_ticket()
+    assert [event.fatal for event in events if isinstance(event, StepFailed)] == [False, False]
 
 
 def test_interface_does_not_come_up_after_the_end(launch, monkeypatch):
