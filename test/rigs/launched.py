@@ -172,9 +172,10 @@ def ros2(
         timeout=timeout, env=None if environment is None else dict(environment))
 
 
-#: A shell that starts something in the background has SIGINT ignored, and all that it starts.
+#: The background jobs of a shell ignore SIGINT, and what nohup starts ignores SIGHUP.
 #: A group of its own, not a session: sudo's ticket is the terminal's, and goes for its session.
 WITH_SIGINT: Sequence[str] = (
     sys.executable, '-c', 'import os, signal, sys; '
     'os.setpgrp(); signal.signal(signal.SIGINT, signal.default_int_handler); '
+    'signal.signal(signal.SIGHUP, signal.SIG_DFL); '
     'os.execvp(sys.argv[1], sys.argv[1:])')

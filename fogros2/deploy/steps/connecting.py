@@ -116,7 +116,7 @@ class Connection(Step):
             with self._entering:
                 if self._leaving:
                     raise Cancelled('opening the SSH port')
-                self._note_and_open()
+                self._open_port()
         return self._outside
 
     def close_outside(self) -> None:
@@ -146,10 +146,6 @@ class Connection(Step):
             self._allow([])
             self._job.forget(Made(SSH_PORT, self._outside.port))
 
-    def _note_and_open(self) -> None:
-        self._job.makes(SSH_PORT, self._outside.port)
-        self._open_port()
-
     def _leave(self) -> None:
         """Let no feature open the port or move the shell from now on."""
         with self._entering:
@@ -159,7 +155,7 @@ class Connection(Step):
         """Reach a kept machine from outside again, before the VPN is taken down."""
         self._leave()
         if self._inside and self._job.survives():
-            self._note_and_open()
+            self._open_port()
             self._shell.move(self._shell_to(self._outside))
 
     @property
@@ -170,7 +166,8 @@ class Connection(Step):
         return outside
 
     def _open_port(self) -> None:
-        """Open the SSH port to the robot's current public address."""
+        """Record that the SSH port is open, and open it to the robot's public address."""
+        self._job.makes(SSH_PORT, self._outside.port)
         address = self._context.provider.robot_address()
         self._allow([address])
         self._allowed = address
