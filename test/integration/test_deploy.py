@@ -97,7 +97,7 @@ class Failing(Feature):
 
 # without a shell, without a VPN, and when all of it is there
 @pytest.mark.parametrize('step', ['connect', 'VPN', 'feature'])
-def test_a_fault_in_any_step_leaves_nothing(spec, monkeypatch, step):
+def test_a_fault_in_a_step_leaves_nothing(spec, monkeypatch, step):
     def fault(event):
         if isinstance(event, StepStarted) and event.step == step:
             raise Injected(f'fault in {step}')
@@ -155,9 +155,10 @@ def test_machines_come_up_in_parallel_and_reach_each_other(spec, tmp_path):
     assert name == f'one-{RUN}' and user != '0', 'nodes must not run as root'
     one, = (tmp_path / 'home').glob(f'one-{RUN}-*/bags/deep/one')
     assert one.read_text() == 'here'
-    started = [(e.machine, e.step) for e in events if isinstance(e, StepStarted)]
-    done = [(e.machine, e.step) for e in events if isinstance(e, StepDone)]
-    assert sorted(started) == sorted(done)
+    # a repair of the robot's may fail before it succeeds
+    started, done = (sorted((e.machine, e.step) for e in events if isinstance(e, kind)
+                            and e.machine) for kind in (StepStarted, StepDone))
+    assert started == done
 
 
 def test_two_launches_at_once_do_not_meet(spec):
