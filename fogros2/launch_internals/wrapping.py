@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Iterable, Iterator
 import contextlib
 from typing import Any, Optional
@@ -28,10 +29,6 @@ class Wrapped(LaunchDescriptionEntity):
     def __init__(self, entity: LaunchDescriptionEntity, apply: Apply) -> None:
         self._entity = entity
         self._apply = apply
-        # launch asks the wrapper for these, and they are the entity's own
-        for name in ('get_asyncio_future', 'describe', 'describe_sub_entities',
-                     'describe_conditional_sub_entities'):
-            setattr(self, name, getattr(entity, name))
 
     def visit(self, context: LaunchContext) -> Optional[list[LaunchDescriptionEntity]]:
         """Apply the function to the entity, visit it, and wrap the results."""
@@ -43,6 +40,25 @@ class Wrapped(LaunchDescriptionEntity):
             return wrap(entity.visit(context), self._apply)
         with _intercepted(context, self._apply):
             return wrap(entity.visit(context), self._apply)
+
+    def get_asyncio_future(self) -> Optional[asyncio.Future[Any]]:
+        """Return the entity's own future."""
+        future: Optional[asyncio.Future[Any]] = self._entity.get_asyncio_future()
+        return future
+
+    def describe(self) -> str:
+        """Return the entity's own description."""
+        return str(self._entity.describe())
+
+    def describe_sub_entities(self) -> list[LaunchDescriptionEntity]:
+        """Return the entity's own sub-entities."""
+        return list(self._entity.describe_sub_entities())
+
+    def describe_conditional_sub_entities(
+        self,
+    ) -> list[tuple[str, Iterable[LaunchDescriptionEntity]]]:
+        """Return the entity's own conditional sub-entities."""
+        return list(self._entity.describe_conditional_sub_entities())
 
 
 def below(entity: LaunchDescriptionEntity) -> list[Iterable[LaunchDescriptionEntity]]:
