@@ -632,6 +632,24 @@ def test_machine_keeps_a_network_that_overlaps_the_vpn(launch, provider):
     assert mine.interface.host_routes and launch.store.load('planner').vpn == mine.interface
 
 
+@pytest.mark.parametrize(('report', 'order'), [
+    ({'vpn_host': '198.51.100.2'}, ['machine', 'robot']),
+    ({'robot_host': '192.0.2.7'}, ['robot', 'machine'])])
+def test_end_that_is_dialled_knows_its_peer_first(launch, provider, monkeypatch, report, order):
+    """A handshake that comes before is nobody's, and the next one comes after 5 s."""
+    context, mine = begun(launch)
+    mine.machine = Machine('id', 'planner', 'fake', MachineState.RUNNING, **report)
+    mine.shell = FakeShell()
+    configured = []
+    monkeypatch.setattr(VpnMember, 'up', lambda *_: configured.append('machine'))
+    monkeypatch.setattr(robot_vpn.RobotVpn, 'admit', lambda *_: configured.append('robot'))
+    monkeypatch.setattr(robot_vpn.RobotVpn, 'spread', lambda *_: None)
+    joining = Joining(context, mine)
+    joining.choose_interface()
+    joining.join()
+    assert configured == order
+
+
 @pytest.mark.parametrize('there', [True, False])
 def test_connection_that_breaks_at_the_end_is_opened_again(launch, provider, there):
     ran = []
