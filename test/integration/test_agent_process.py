@@ -695,7 +695,7 @@ def test_agent_as_process_1_reaps_orphans_and_ends(root, tmp_path):
         ['unshare', '--pid', '--fork', '--kill-child', '--mount-proc', *rig.words()],
         stderr=subprocess.PIPE)
     rig.agents.append(agent)
-    wait_until(lambda: rig.ask('ping'), timeout=60, what='the agent')
+    wait_until(lambda: rig.ask('ping').get('ok', False), timeout=60, what='the agent')
     client = rig.client()
     assert client.request('status')['pid'] == 1
     client.request('start', nodes=[rig.node('n', (

@@ -69,7 +69,8 @@ def terminal(path: Path) -> None:
         text = screen(*words, folder=Path(folder), columns=COLUMNS, timeout=120.0,
                       until=lambda text: text.count('I heard') >= HEARD)
     # neither this computer nor its user matter
-    for own, other in ((str(Path.home()), '/home/robot'), (f'-{os.uname().nodename}-', '-robot-')):
+    log = os.environ.get('ROS_LOG_DIR', f'{Path.home()}/.ros/log')
+    for own, other in ((log, '/home/robot/.ros/log'), (f'-{os.uname().nodename}-', '-robot-')):
         text = text.replace(own, other)
     path.write_text(svg([f"$ {' '.join(words)}", *lines(text)]))
 

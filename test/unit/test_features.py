@@ -95,7 +95,7 @@ def test_command_line_and_defaults_know_the_keywords(home: Path) -> None:
         'fetch': ['~/bags'], 'fetch_limit': '1GB', 'fetch_to': '/tmp/here'}}
     assert spec(AWSCloudInstance(name='a')).features == {'results': {'fetch_limit': '5GB'}}
     path.write_text('fetch = 3\n')
-    with pytest.raises(ConfigurationError, match='fetch = 3 has the wrong type'):
+    with pytest.raises(ConfigurationError, match='fetch=3 has the wrong type'):
         spec(made)
 
 
