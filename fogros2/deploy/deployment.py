@@ -52,14 +52,16 @@ def _run(context: Context, job: RunningMachine) -> None:
         Creation(context, job).run()
         connection.open()
         joining.choose_interface()
-        arming.arm()
-        robot.result()
+        armed = pool.submit(arming.arm)
         planned: Future[RosInstall] = Future()
-        ros_step = pool.submit(installing.install_ros, context, job, planned.set_result)
+        # looks at the machine meanwhile, and changes nothing before the watchdog is armed
+        ros_step = pool.submit(
+            installing.install_ros, context, job, armed.result, planned.set_result)
         wait([planned, ros_step], return_when=FIRST_COMPLETED)
         # in parallel with the installation on the machine
         try:
             ros = planned.result() if planned.done() else ros_step.result()
+            robot.result()
             joining.avoid(ros.facts.routes)
         except BaseException:
             job.cancel.set()

@@ -150,7 +150,7 @@ def dependencies(spec: MachineSpec, under: Underlay, packages: Sequence[str] = (
 
 def ensure(
     shell: Shell, under: Underlay, spec: MachineSpec, *, timeout: float,
-    cancel: Optional[threading.Event] = None,
+    cancel: Optional[threading.Event] = None, ready: Callable[[], object] = lambda: None,
     on_plan: Callable[[RosInstall], object] = lambda install: None, elsewhere: bool = False,
     packages: Sequence[str] = (), at_home: bool = False,
     warn: Callable[[str, str], object] = lambda text, hint: None,
@@ -160,6 +160,7 @@ def ensure(
 
     :param under: environment of the robot's launch.
     :param timeout: time-out of each command in seconds.
+    :param ready: waits until the machine may be changed; to look at it takes a round trip.
     :param on_plan: callback with the plan, as soon as files can be sent and the VPN set up; these
         steps need not wait for the slowest ones.
     :param elsewhere: refuse a machine with this computer's network, see ``check_elsewhere``.
@@ -209,6 +210,7 @@ def ensure(
         install.setup)
     if needed.pip or needed.keys:
         install = dataclasses.replace(install, environment=needed.with_folder(install.environment))
+    ready()
     for command in todo.tools:
         run(command)
     on_plan(install)

