@@ -71,7 +71,9 @@ def test_dashboard_has_pictures_of_all_streams(bench: Bench, graph: Graph) -> No
     graph.know({'one': (), 'two': ()}, pictures=True)
     bench.until(lambda: all(heard), 'streams that flow')
     bench.until(lambda: {'/camera', '/map'} <= graph.pictures.keys(), 'a picture of each')
-    assert near(colour(graph, '/camera'), red) and near(colour(graph, '/map'), blue)
+    # on a busy computer, the first image of a stream may be coarse
+    bench.until(lambda: near(colour(graph, '/camera'), red) and near(colour(graph, '/map'), blue),
+                'their colours')
     found = {one['topic']: one for one in graph.state()}
     assert (found['/camera']['source'], found['/camera']['target']) == ('', 'one')
     assert (found['/map']['source'], found['/map']['target']) == ('one', 'two')

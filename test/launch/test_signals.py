@@ -37,7 +37,7 @@ class Fake(FakeLaunch):
         return []
 
 def fail(which):
-    print(f'note: {{which}} handler fails', flush=True)
+    sys.stdout.write(f'note: {{which}} handler fails\\n')
     raise OSError('the handler failed')
 
 fake = Fake()
