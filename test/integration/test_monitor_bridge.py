@@ -621,7 +621,7 @@ def test_recording_and_viewer_have_streams_as_they_came(bench, tmp_path):
 
 
 def test_recording_ends_before_the_disk_is_full(bench, tmp_path):
-    recorder = bench.run('-c', RECORD.format('recorder.FREE = 1 << 62; '), str(tmp_path), '/silence')
+    recorder = bench.run('-c', RECORD.format('recorder.FREE = 1 << 62; '), str(tmp_path), '/quiet')
     bench.processes.remove(recorder)
     assert recorder.wait(60) == 1
     bench.until(lambda: 'GB are free: ' in ''.join(bench.lines), 'the reason')
