@@ -132,6 +132,8 @@ def state_home(
     monkeypatch.setenv('FOGROS2_STATE_HOME', str(path))
     monkeypatch.setenv('XDG_CONFIG_HOME', str(config))
     yield path
+    if 'launch.logging' in sys.modules:  # its log file is in the folder
+        sys.modules['launch.logging'].reset()
     shutil.rmtree(folder, ignore_errors=True)
 
 
