@@ -131,8 +131,14 @@ setup(
         'fogros2.configured': [
             'aws = fogros2.provider.aws.login:configured',
             'azure = fogros2.provider.azure.login:configured',
+            'cheapest = fogros2.provider:known_by_records',
             'gcp = fogros2.provider.gcp.login:configured',
+            'joined = fogros2.provider:known_by_records',
             'kubernetes = fogros2.kubernetes_client:configured',
+            'ssh = fogros2.provider:known_by_records',
+        ],
+        'fogros2.listed': [
+            'volumes = fogros2_features.volumes.listing:listed',
         ],
         'fogros2.feature': [
             'budget = fogros2_features.budget:Budget',

@@ -42,6 +42,8 @@ RATE = 30.0
 LINK = 10e6
 #: The features of a machine behind a :class:`Link`, whose packets must not leave it.
 UDP = {'vpn_path': {'vpn_path': 'udp'}}
+#: Codecs with a program of this folder for both ends.
+PROGRAMS = ('theora', 'ordinary')
 #: Settings of DDS for nodes on this computer alone. A launch's own are for its domain.
 THIS_COMPUTER = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_DOMAIN_ID': '83'}
 #: Frames rendered, and of those that arrive, how many apart are held against the original.
@@ -350,6 +352,8 @@ class Case:
         return f'{fps} FPS, {latency} ms, delay not stated'
 
 
+#: Ends the name of a row whose nodes are as most of rclpy's: see ``ordinary``.
+ORDINARY = ', ordinary nodes'
 #: What Table I has, with the delays of a near and of a far cloud.
 COMPARED = {'raw': 'raw', 'jpeg': 'compressed, JPEG 80', 'theora': 'Theora by FFmpeg in a pipe',
             'h264': 'H.264'}
@@ -360,6 +364,8 @@ CASES = [
     Case('H.264, 20 ms and 2 % loss', 'h264', delay=0.02, loss=0.02),
     Case('H.264 720p', 'h264', size='720p'),
     Case('H.264 1080p', 'h264', size='1080p'),
+    *(Case(f'H.264{size}{ORDINARY}', 'ordinary', size=size.strip() or 'VGA')
+      for size in ('', ' 1080p')),
 ]
 
 
@@ -393,9 +399,9 @@ class Outcome:
 
 def pair(case: Case) -> tuple[list[str], list[str]]:
     """Return the command lines of the nodes on both sides."""
-    if case.codec == 'theora':
-        return ([sys.executable, f'{HERE}/theora.py', 'encode'],
-                [sys.executable, f'{FOLDER}/theora.py', 'decode'])
+    if case.codec in PROGRAMS:
+        return ([sys.executable, f'{HERE}/{case.codec}.py', 'encode'],
+                [sys.executable, f'{FOLDER}/{case.codec}.py', 'decode'])
 
     def words(role: str, image: str) -> list[str]:
         program = f'from image_transport_h264.{role} import main; main()'
@@ -455,9 +461,9 @@ def run(case: Case, launch: Any, machine: Any, link: Link, output: Output, count
         assert source.stdout is not None
         source.stdout.readline()
         names = [('image_transport_h264.encoder ',), ('image_transport_h264.decoder ',)]
-        if case.codec == 'theora':
-            # FFmpeg's own program encodes
-            names = [('theora.py\0encode', 'libtheora'), ('theora.py\0decode',)]
+        if case.codec in PROGRAMS:
+            # FFmpeg's own program encodes Theora
+            names = [(f'{case.codec}.py\0encode', 'libtheora'), (f'{case.codec}.py\0decode',)]
         begin = time.monotonic(), link.sent(), cpu(*names[0]), cpu(*names[1])
         before = busy()
         told = answer_of(source, 'the camera', count / RATE + 120)
@@ -632,6 +638,7 @@ def rows(outcomes: list[Outcome], limits: dict[str, float], video: bool) -> Iter
         'H.264': {'fps': 30.0, 'psnr': 35.0},
         'H.264, 20 ms and 2 % loss': {'fps': 29.5},
         'H.264 1080p': {'fps': 30.0}}
+    medians = {o.case.name: o.median for o in outcomes}
     for o in outcomes:
         wanted = targets.get(o.case.name, {})
         for field, what, unit in (('fps', 'images', '1/s'), ('median', 'median', 'ms'),
@@ -651,6 +658,9 @@ def rows(outcomes: list[Outcome], limits: dict[str, float], video: bool) -> Iter
             yield Row(f'{o.case.name}: median over limit', o.median / limits[o.case.name], '',
                       1.3)
             yield Row(f'{o.case.name}: p99 over median', o.p99 / o.median, '', 2.0)
+        if o.case.name + ORDINARY in medians:
+            yield Row(f'{o.case.name}: median over that of ordinary nodes',
+                      o.median / medians[o.case.name + ORDINARY], '', 1.1)
 
 
 def put(machine: Any, *names: str) -> None:
@@ -665,7 +675,8 @@ def prepare(machine: Any, video: str = '') -> None:
     """Put onto the machine what its nodes need."""
     if video:
         machine.shell.put(Path(video).read_bytes(), VIDEO, mode=0o644)
-    put(machine, 'image_transport_h264', 'fogros2_examples', 'streaming.py', 'theora.py')
+    put(machine, 'image_transport_h264', 'fogros2_examples', 'streaming.py',
+        *(f'{name}.py' for name in PROGRAMS))
 
 
 def main() -> None:

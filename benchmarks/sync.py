@@ -52,7 +52,7 @@ def main() -> None:
         launch = Launch()
         try:
             machine = launch.up(MachineSpec('bench-sync', 'container'))
-            endpoint = machine.machine.shell
+            endpoint = machine.machine.endpoint
             assert endpoint is not None
             known = Path(top, 'known_hosts')
             known.write_text(f'{endpoint.host} {endpoint.host_key}\n')

@@ -91,7 +91,7 @@ class Path10(Link):
     def __init__(self, launch: Any, machine: Any) -> None:
         self.interface = f'fog{launch.id}'
         name = f'fogros2-{machine.spec.name}'
-        host = machine.machine.shell.host
+        host = machine.machine.endpoint.host
         pid = _printed('podman', 'inspect', '--format', '{{.State.Pid}}', name)
         robot = _printed('ip', '-o', 'route', 'get', host).split(' src ')[1].split()[0]
         self.process = subprocess.Popen(

@@ -490,18 +490,6 @@ class Feature:
         """Return a row of the table for people."""
         return ()
 
-    def listed(
-        self, regions: Optional[Sequence[str]],
-    ) -> Optional[tuple[Sequence[Mapping[str, Any]], str]]:
-        """
-        Return what exists beside machines, and a line about it, for ``ros2 fog list``.
-
-        ``--json`` prints the first by the feature's name. The line is '' for none.
-
-        :param regions: as the user has named them, None for the usual ones.
-        """
-        return None
-
     def status(self, shown: Mapping[str, Any], own: Any) -> Iterable[tuple[str, str]]:
         """
         Return rows, each a name and a text, for ``ros2 fog status`` of a machine.

@@ -108,7 +108,7 @@ class Machine:
     :param id: opaque to the core; contains its location (region, context, engine).
     :param created: seconds since the epoch, None if the provider does not know.
     :param stopped: when a stopped machine was stopped, in the same form.
-    :param shell: None until the machine can be reached.
+    :param endpoint: None until the machine can be reached.
     :param vpn_host: address at which the robot reaches the machine's VPN port (UDP); '' if it
         cannot, so that the machine has to dial the robot.
     :param robot_host: if ``vpn_host`` is '': address at which the machine reaches the robot's
@@ -135,7 +135,7 @@ class Machine:
     provider: str
     state: MachineState
     created: Optional[float] = None
-    shell: Optional[Endpoint] = None
+    endpoint: Optional[Endpoint] = None
     vpn_host: str = ''
     vpn_port: int = 0
     robot_host: str = ''

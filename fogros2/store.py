@@ -166,7 +166,7 @@ class Record:
         'nearest') are made.
     :param pid: process of that launch; ``pid_start`` (clock ticks) and ``boot`` (id of the boot)
         detect a reused process id.
-    :param shell: how to reach the machine from outside the VPN.
+    :param endpoint: how to reach the machine from outside the VPN.
     :param host_key: the key that the machine generated, '' if the provider's key is used.
     :param vpn: the machine's own VPN interface.
     :param public_key: the machine's VPN public key.
@@ -192,7 +192,7 @@ class Record:
     pid_start: int = 0
     boot: str = ''
     asked: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    shell: Optional[Endpoint] = None
+    endpoint: Optional[Endpoint] = None
     host_key: str = ''
     vpn: Optional[VpnInterface] = None
     public_key: str = ''
@@ -528,7 +528,7 @@ def record_from_json(data: Mapping[str, Any]) -> Record:
     for key in ('underlays', 'apt', 'pip'):
         spec[key] = tuple(spec[key])
     values['spec'] = MachineSpec(**spec)
-    for key, kind in (('shell', Endpoint), ('vpn', VpnInterface), ('robot_vpn', VpnInterface)):
+    for key, kind in (('endpoint', Endpoint), ('vpn', VpnInterface), ('robot_vpn', VpnInterface)):
         if values.get(key) is not None:
             values[key] = kind(**values[key])
     values['made'] = tuple(Made(**each) for each in values.get('made', ()))

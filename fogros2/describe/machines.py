@@ -166,7 +166,7 @@ class CloudInstance:
 
         :param flush_to_disk: accepted for FogROS2's launch files; the record is on disk already.
         """
-        shell = self._running.machine.shell if self._running else None
+        endpoint = self._running.machine.endpoint if self._running else None
         return {
             'name': self.name,
             'cloud_service_provider':
@@ -174,7 +174,7 @@ class CloudInstance:
             'ros_workspace': self._spec.workspace if self._spec else values.describe(
                 self._workspace),
             'working_dir': self._working_dir_base and values.describe(self._working_dir_base),
-            'ssh_key_path': shell.key_file if shell else None,
+            'ssh_key_path': endpoint.key_file if endpoint else None,
             'public_ip': self.ip,
             'vpn_ip': self.vpn_ip,
         }

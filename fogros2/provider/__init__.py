@@ -117,6 +117,11 @@ def made_without(machine: str, volume: str) -> NameTaken:
                      f'give the machine another name=, or: ros2 fog delete {machine}')
 
 
+def known_by_records() -> bool:
+    """Return False, in the place of :meth:`Provider.configured`: no search finds more."""
+    return False
+
+
 class Provider(abc.ABC):
     """
     A source of machines.
@@ -279,9 +284,9 @@ class Provider(abc.ABC):
         """
         Return the current state of a machine.
 
-        ``shell`` is set, with the host key to pin, as soon as a connection can be tried. From then
-        on ``vpn_host`` is the address of the machine's VPN port. If nobody outside can reach that
-        port, ``robot_host`` is the robot's current address, to which the machine connects.
+        ``endpoint`` is set, with the host key to pin, as soon as a connection can be tried. From
+        then on ``vpn_host`` is the address of the machine's VPN port. If nobody outside can reach
+        that port, ``robot_host`` is the robot's current address, to which the machine connects.
         ``end_command`` is required for a machine that was created for a launch: the agent runs it
         as root when the robot is gone, and it must end the billing.
 
@@ -355,7 +360,7 @@ class Provider(abc.ABC):
             if machine.state in (MachineState.DELETED, MachineState.STOPPING):
                 raise ProviderError(f"the machine '{name}' ended while it was coming up",
                                     "the provider's own log says why")
-            return machine if machine.state is MachineState.RUNNING and machine.shell else None
+            return machine if machine.state is MachineState.RUNNING and machine.endpoint else None
 
         return wait_until(look, timeout=timeout, cancel=self.cancel, longest=self.poll_interval,
                           what=f"the machine '{name}' to run")

@@ -154,14 +154,15 @@ class SSHProvider(Provider):
         except (KeyError, ValueError) as error:
             raise MachineNotFound(f"'{machine_id}' is no SSH machine") from error
         settings = ssh_config.read(alias, user, number)
-        shell = Endpoint('ssh', settings.host, settings.port, user, host_key, key_file, alias)
+        endpoint = Endpoint(
+            'ssh', settings.host, settings.port, user, host_key, key_file, alias)
         try:
             address = reach(settings)
         except OSError:
             return Machine(machine_id, name, self.name, MachineState.STOPPED, owned=False)
         return Machine(
-            machine_id, name, self.name, MachineState.RUNNING, shell=shell, vpn_host=address,
-            owned=False)
+            machine_id, name, self.name, MachineState.RUNNING, endpoint=endpoint,
+            vpn_host=address, owned=False)
 
     def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
         """Raise Unsupported: an existing computer stores no tags."""
@@ -200,8 +201,8 @@ class SSHProvider(Provider):
     def _run(self, host: str, script: str, *words: str) -> str:
         machine = self.describe(self.create(
             MachineSpec(host, self.name, {'host': host}), CreateRequest('', '', {}, 0)))
-        assert machine.shell is not None  # it has just answered
-        shell = connect(machine.shell, name=host)
+        assert machine.endpoint is not None  # it has just answered
+        shell = connect(machine.endpoint, name=host)
         try:
             return shell.run(Command(('sh', '-c', script, 'sh', *words),
                                      what=f'look at volumes on {host}'),

@@ -8,13 +8,12 @@ import contextlib
 import dataclasses
 from typing import ClassVar
 
-from fogros2.deploy.robot import clear
 from fogros2.errors import DdsError, MachineNotFound, Unsupported
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState, OtherVpn
 from fogros2.provider import Capabilities, Provider
 from fogros2.provider.options import parsed
 from fogros2.store import other_vpn, Store, this_process
-from fogros2_features.guests import membership, network, program
+from fogros2_features.guests import network, program
 from fogros2_features.guests.invitation import DOOR_KEY, Invitation, own_key, unseal
 
 _SCHEME = 'joined:'
@@ -51,6 +50,8 @@ class JoinedProvider(Provider):
 
     def other_vpn(self, spec: MachineSpec) -> OtherVpn:
         """Return the VPN that the invitation leads to."""
+        # not above: it imports what launches do
+        from fogros2_features.guests import membership
         return membership.other_vpn(self._unsealed(spec), Store())
 
     @contextlib.contextmanager
@@ -58,6 +59,8 @@ class JoinedProvider(Provider):
         self, spec: MachineSpec, rmw: str, domain: int, environment: Mapping[str, str],
     ) -> Iterator[None]:
         """Be in that VPN, unless ``ros2 fog join`` has joined it already."""
+        from fogros2.deploy.robot import clear
+        from fogros2_features.guests import membership
         invitation = self._unsealed(spec)
         if (invitation.rmw, invitation.domain) != (rmw, domain):
             raise DdsError(
@@ -86,15 +89,15 @@ class JoinedProvider(Provider):
             raise MachineNotFound(f"this computer has left the machine '{name}'")
         return Machine(
             machine_id, name, self.name, MachineState.RUNNING, owned=False,
-            region=other.machine.name, shell=Endpoint(
+            region=other.machine.name, endpoint=Endpoint(
                 'guest', other.interface.address, network.PORT,
                 program.account(other.interface.name, other.own.address),
                 key_file=str(folder / DOOR_KEY)))
 
     def capabilities_of(self, machine: Machine) -> Capabilities:
         """Return the capabilities with the place of the agent, which each guest has."""
-        assert machine.shell is not None
-        home = program.HOMES / machine.shell.user
+        assert machine.endpoint is not None
+        home = program.HOMES / machine.endpoint.user
         return dataclasses.replace(self.capabilities, agent_directory=f'{home}/agent',
                                    agent_program=f'{home}/agent.py')
 

@@ -9,7 +9,7 @@ robot reaches the container at ports that the engine publishes on the host.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
 from decimal import Decimal
@@ -81,7 +81,7 @@ class _Answer(TypedDict, total=False):
     hint: str
 
 
-class _Shell(TypedDict):
+class _Endpoint(TypedDict):
     port: int
     user: str
     host_key: str
@@ -93,7 +93,7 @@ class _Machine(TypedDict):
     id: str
     state: str
     created: float
-    shell: Optional[_Shell]
+    endpoint: Optional[_Endpoint]
     vpn_host: str
     vpn_port: int
     image: str
@@ -162,10 +162,10 @@ class HostedProvider(Provider):
     def _host(self, host: str) -> tuple[Machine, Shell]:
         if host not in self._hosts:
             machine = self._ssh.describe(host)
-            if machine.shell is None:
+            if machine.endpoint is None:
                 raise errors.ConnectError(f"the host '{machine.name}' does not answer",
                                           'is it on, and reachable from this robot?')
-            self._hosts[host] = machine, connect(machine.shell, name=machine.name)
+            self._hosts[host] = machine, connect(machine.endpoint, name=machine.name)
         return self._hosts[host]
 
     def _call(self, host: str, call: str, timeout: float = _TIMEOUT, **given: Any) -> Any:
@@ -258,19 +258,19 @@ class HostedProvider(Provider):
     def _machine(self, host: str, report: Any) -> Machine:
         """Return a machine as the robot sees it, from the report of its host."""
         outside, _ = self._host(host)
-        assert outside.shell is not None
+        assert outside.endpoint is not None
         with self._reading(host):
             untrusted.checked(report, _Machine)
             found: _Machine = report
-            login = found['shell']
+            login = found['endpoint']
             return Machine(
                 f"{_SCHEME}{untrusted.matched(ID, found['id'])}@{host}",
                 found['tags'].get(TAG_NAME, ''), self.name, MachineState(found['state']),
                 found['created'], login and Endpoint(
-                    'ssh', outside.shell.host, untrusted.port(login['port']),
+                    'ssh', outside.endpoint.host, untrusted.port(login['port']),
                     untrusted.matched(untrusted.NAME, login['user']),
                     untrusted.matched(untrusted.HOST_KEY, login['host_key']),
-                    alias=outside.shell.alias),
+                    alias=outside.endpoint.alias),
                 # the host's packet filter admits no machine to the host's ports
                 outside.vpn_host, untrusted.port(found['vpn_port']), private_network=host,
                 private_ip=untrusted.address(found['vpn_host']), region=outside.name,
@@ -283,8 +283,9 @@ class HostedProvider(Provider):
         :raises Unsupported: it knows no host.
         :raises FogError: a host does not answer, after the machines of all others.
         """
-        yield from (machine for machine in self._everywhere('find', self._machine, tags=tags)
-                    if HOSTED in machine.tags)
+        yield from (
+            machine for machine in self._everywhere(
+                self._known(), 'find', self._machine, tags=tags) if HOSTED in machine.tags)
 
     def tidy(self, dead: Collection[str] = ()) -> list[str]:
         """Remove what is left of machines on the hosts that this robot's records name."""
@@ -294,18 +295,14 @@ class HostedProvider(Provider):
             return f'{words} on {self._host(host)[0].name}'
 
         with contextlib.suppress(Unsupported):
-            return list(self._everywhere('tidy', read, dead=list(dead)))
+            return list(self._everywhere(self._known(), 'tidy', read, dead=list(dead)))
         return []
 
-    def _everywhere(
-        self, call: str, read: Callable[[str, Any], T], **given: Any,
-    ) -> Iterator[T]:
+    def _known(self) -> list[Mapping[str, Any]]:
         """
-        Call a method that returns a list on the hosts that this robot's records name.
+        Return the hosts that this robot's records name, as ``on=`` does.
 
-        :param read: checks and converts an item, which the host with this id has sent.
         :raises Unsupported: it knows no host.
-        :raises FogError: a host does not answer, after the answers of all others.
         """
         known = [*self._asked, *(
             record.spec.options['on'] for record in (
@@ -313,9 +310,22 @@ class HostedProvider(Provider):
             if record.provider == self.name)]
         if not known:
             raise Unsupported('only its host knows a container machine on another computer')
+        return known
+
+    def _everywhere(
+        self, hosts: Iterable[Mapping[str, Any]], call: str, read: Callable[[str, Any], T],
+        **given: Any,
+    ) -> Iterator[T]:
+        """
+        Call a method that returns a list on several hosts.
+
+        :param hosts: as ``on=`` names them.
+        :param read: checks and converts an item, which the host with this id has sent.
+        :raises FogError: a host does not answer, after the answers of all others.
+        """
         asked: set[str] = set()
         failure: Optional[FogError] = None
-        for on in known:
+        for on in hosts:
             try:
                 host = self._find_host(on)
                 if host in asked:
@@ -346,15 +356,14 @@ class HostedProvider(Provider):
 
     def volumes(self, hosts: Sequence[str] = ()) -> Iterator[Volume]:
         """Yield the volumes of the engines on these computers, which nobody else lists."""
-        for name in hosts:
-            host = self._find_host({'host': name})
+        def read(host: str, report: Any) -> Volume:
             with self._reading(host):
-                reports = self._call(host, 'volumes')
-                untrusted.checked(reports, list[_Volume])
-                for report in reports:
-                    identity = untrusted.matched(_VOLUME, report['id'])
-                    yield Volume(f'{_SCHEME}{identity}@{host}', _VOLUME.sub(r'\1', identity),
-                                 self.name, name, user=report['user'])
+                untrusted.checked(report, _Volume)
+                identity = untrusted.matched(_VOLUME, report['id'])
+            return Volume(f'{_SCHEME}{identity}@{host}', _VOLUME.sub(r'\1', identity),
+                          self.name, self._host(host)[0].name, user=report['user'])
+
+        return self._everywhere(({'host': name} for name in hosts), 'volumes', read)
 
     def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
         """Return nothing: the engine on the host has mounted the volume."""

@@ -16,7 +16,7 @@ import contextlib
 import dataclasses
 import itertools
 import re
-from typing import Any, Optional, TYPE_CHECKING
+from typing import Optional, TYPE_CHECKING
 
 from fogros2 import plugin_system
 from fogros2.errors import ConfigurationError, Unsupported
@@ -152,13 +152,6 @@ class Volumes(Feature):
         """Have the machine created with the volumes."""
         return dataclasses.replace(request, with_volumes=own)
 
-    def listed(
-        self, regions: Optional[Sequence[str]],
-    ) -> Optional[tuple[Sequence[Mapping[str, Any]], str]]:
-        """Return all volumes, and what they cost together."""
-        from fogros2_features.volumes import listing  # machines have no command line
-        return listing.listed(regions)
-
     @contextlib.contextmanager
     def machine(
         self, running: RunningMachine, own: Mapping[str, tuple[str, int]],
@@ -172,9 +165,9 @@ class Volumes(Feature):
                     undo.callback(_detach, running, keeper, name, path, ways)
                     attached = keeper.attach(running.machine.id, name, size)
                     ways.append(attached)
-                    assert running.machine.shell is not None
+                    assert running.machine.endpoint is not None
                     output = running.run(Command(
-                        ('sh', '-ec', _MOUNT, 'sh', name, path, running.machine.shell.user,
+                        ('sh', '-ec', _MOUNT, 'sh', name, path, running.machine.endpoint.user,
                          running.interface.name, attached.folder, *attached.devices),
                         sudo=True, what=f"mount the volume '{name}'"), timeout=900.0)
                     detail.append(f'{name} at {path}{", new" if "new" in output else ""}')

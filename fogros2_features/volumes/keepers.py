@@ -3,16 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-import dataclasses
-from typing import Optional, Protocol, runtime_checkable
+from collections.abc import Iterable, Sequence
+from typing import Protocol, runtime_checkable
 
 from fogros2.errors import Unsupported
 from fogros2.model import Volume
 from fogros2.provider import Attached, Provider
-from fogros2.provider.vm.cloud import Disk, END_TIMEOUT
-from fogros2.provider.vm.provider import disk_in_use, first_disk, VmProvider
-from fogros2.waiting import wait_until
 
 
 @runtime_checkable
@@ -20,7 +16,7 @@ class VolumeKeeper(Protocol):
     """
     A keeper of volumes: a provider with the capability ``keeps_volumes`` has these methods.
 
-    For clouds of virtual machines, :class:`CloudVolumes` has them, by the adapter's disks.
+    For clouds of virtual machines, ``clouds.CloudVolumes`` has them, by the adapter's disks.
     """
 
     def volumes(self, hosts: Sequence[str] = ()) -> Iterable[Volume]:
@@ -50,75 +46,6 @@ class VolumeKeeper(Protocol):
         """
 
 
-class CloudVolumes:
-    """The keeper of the disks of a cloud of virtual machines."""
-
-    def __init__(self, provider: VmProvider) -> None:
-        self._provider = provider
-
-    def volumes(self, hosts: Sequence[str] = ()) -> Iterator[Volume]:
-        """Yield the volumes of all regions."""
-        for disk in self._disks():
-            yield Volume(
-                self._volume_id(disk), disk.name, self._provider.name, disk.zone or disk.region,
-                disk.size_gb, disk.vm, self._provider.cloud.gb_month)
-
-    def _disks(self) -> list[Disk]:
-        cloud = self._provider.until()
-        by_region = self._provider.everywhere(cloud, lambda region: list(cloud.disks(region)))
-        return [disk for disks in by_region for disk in disks]
-
-    def _volume_id(self, disk: Disk) -> str:
-        return f'{self._provider.name}:{disk.region}/{disk.id}'
-
-    def attach(self, machine_id: str, name: str, size_gb: int) -> Attached:
-        """Attach the first volume of this name; two launches that make one keep the first."""
-        machine = self._provider.vm_id(machine_id)
-        cloud = self._provider.cloud.beside(machine).until(self._provider.cancel)
-        made = '' if first_disk(cloud.disks(machine.region, name)) else cloud.make_disk(
-            machine, name, size_gb)
-
-        def look(attached: bool) -> Optional[Disk]:
-            disks = list(cloud.disks(machine.region, name))
-            disk = first_disk(disks)
-            if disk is None:
-                return None
-            if made not in ('', disk.id):
-                if any(one.id == made and not one.ready for one in disks):
-                    return None  # EC2 deletes no disk that it still makes
-                cloud.until(None).delete_disk(dataclasses.replace(disk, id=made))
-                raise disk_in_use(disk)
-            if disk.vm not in ('', machine.vm):
-                raise disk_in_use(disk)
-            return disk if disk.ready and (disk.vm or not attached) else None
-
-        def wait(state: str) -> Disk:
-            return wait_until(
-                lambda: look(state == 'attached'), timeout=END_TIMEOUT,
-                cancel=self._provider.cancel, first=0.3, interval=1.0, longest=3.0,
-                what=f"the volume '{name}' to be {state}")
-
-        devices = cloud.attach_disk(machine, wait('ready'))
-        wait('attached')
-        return Attached(devices)
-
-    def detach(self, machine_id: str, name: str) -> None:
-        """Detach all volumes of this name."""
-        machine = self._provider.vm_id(machine_id)
-        cloud = self._provider.cloud.beside(machine)
-        for disk in cloud.disks(machine.region, name):
-            if disk.vm == machine.vm:
-                cloud.detach_disk(machine, disk)
-
-    def delete_volume(self, volume_id: str) -> None:
-        """Delete a disk that no machine has."""
-        for disk in self._disks():
-            if self._volume_id(disk) == volume_id:
-                if disk.vm:
-                    raise disk_in_use(disk)
-                self._provider.cloud.delete_disk(disk)
-
-
 def volume_keeper(provider: Provider) -> VolumeKeeper:
     """
     Return what keeps the volumes of a provider.
@@ -126,9 +53,12 @@ def volume_keeper(provider: Provider) -> VolumeKeeper:
     :raises Unsupported: the provider has none.
     """
     if provider.capabilities.keeps_volumes:
-        if isinstance(provider, VmProvider):
-            return CloudVolumes(provider)
         if isinstance(provider, VolumeKeeper):
             return provider
+        # not above: it imports what clouds share
+        from fogros2.provider.vm.provider import VmProvider
+        from fogros2_features.volumes.clouds import CloudVolumes
+        if isinstance(provider, VmProvider):
+            return CloudVolumes(provider)
     raise Unsupported(f"provider '{provider.name}' has no volumes",
                       'AWS, Azure, Google Cloud, Kubernetes, containers and SSH hosts do')

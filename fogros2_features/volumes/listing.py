@@ -38,7 +38,13 @@ def to_json(volume: Volume) -> dict[str, Any]:
 
 
 def listed(regions: Optional[Sequence[str]]) -> tuple[list[dict[str, Any]], str]:
-    """Return volumes as JSON data, and what they cost together, '' without a known price."""
+    """
+    Return volumes as JSON data, and what they cost together, for ``ros2 fog list``.
+
+    ``--json`` prints the first by the name of the entry point. The text is '' without a price.
+
+    :param regions: as the user has named them, None for the usual ones.
+    """
     volumes = survey(lambda text: None, regions=regions)  # the list of machines warns
     costs = [each for volume in volumes if (each := volume.cost_per_month) is not None]
     return list(map(to_json, volumes)), (

@@ -229,10 +229,10 @@ class _Left(undo.Site):
 
 def _leave(record: Record, machine: Machine, *, force: bool) -> None:
     """Undo what a launch has made on a computer that FogROS2 does not own."""
-    if record.shell is None:
+    if record.endpoint is None:
         return
     account = machines.load(record.provider).capabilities.account
-    shell = shells.connect(record.shell, name=record.name, timeout=10.0)
+    shell = shells.connect(record.endpoint, name=record.name, timeout=10.0)
     try:
         with _agent(record, shell) as client, contextlib.suppress(AgentError):
             if client is not None:

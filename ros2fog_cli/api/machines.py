@@ -113,9 +113,9 @@ class Entry:
 
     @property
     def address(self) -> str:
-        """The host of the machine's shell, '' if there is none."""
-        shell = self.known.shell or (self.record.shell if self.record is not None else None)
-        return shell.host if shell is not None else ''
+        """The host of the machine's endpoint, '' if there is none."""
+        endpoint = self.known.endpoint or (self.record and self.record.endpoint)
+        return endpoint.host if endpoint else ''
 
     @property
     def notes(self) -> dict[str, Optional[str]]:
@@ -166,7 +166,7 @@ class Entry:
             'created': self.created,
             'age': None if self.created is None else max(0.0, now - self.created),
             'address': self.address,
-            'host_key': self.known.shell.host_key or None if self.known.shell else None,
+            'host_key': self.known.endpoint.host_key or None if self.known.endpoint else None,
             'expires': self.expires,
             'time_left': None if self.expires is None else self.expires - now,
             'place': self.known.region, 'kind': self.known.kind,
@@ -274,8 +274,10 @@ def gather(
     warn: Warn, regions: Optional[Sequence[str]], ask: Callable[[str], Iterable[T]],
 ) -> list[T]:
     """Return what ``ask(name)`` yields for all providers that are configured here."""
-    answers = ask_all(warn, configured(regions), lambda name: list(ask(name)))
-    return [each for answer in answers for each in answer or ()]
+    found: dict[str, list[T]] = {name: [] for name in configured(regions)}
+    # one that fails has answered in part, perhaps
+    ask_all(warn, [*found], lambda name: found[name].extend(ask(name)))
+    return [each for answer in found.values() for each in answer]
 
 
 def configured(regions: Optional[Sequence[str]]) -> list[str]:

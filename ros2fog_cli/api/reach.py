@@ -56,9 +56,9 @@ def endpoint(entry: Entry, user: Optional[str] = None) -> Endpoint:
 
     :raises ConnectError: the machine has no shell, because it does not run.
     """
-    result = entry.machine.shell if entry.machine is not None else None
-    if entry.record is not None and entry.record.shell is not None:
-        stored = entry.record.shell
+    result = entry.machine.endpoint if entry.machine is not None else None
+    if entry.record is not None and entry.record.endpoint is not None:
+        stored = entry.record.endpoint
         # The provider knows the current address, the record knows the key.
         result = dataclasses.replace(
             result, key_file=stored.key_file, user=stored.user,

@@ -21,13 +21,13 @@ class ListVerb(VerbExtension):
         """Print the table, or JSON."""
         from concurrent.futures import ThreadPoolExecutor
 
-        from fogros2 import feature
+        from fogros2 import plugin_system
         from ros2fog_cli.api import machines, table
         with ThreadPoolExecutor(1, 'fog-list') as pool:
-            asked = {name: pool.submit(each.listed, args.region)
-                     for name, each in feature.installed().items()}
+            asked = {name: pool.submit(plugin_system.load('fogros2.listed', name), args.region)
+                     for name in plugin_system.names('fogros2.listed')}
             entries = machines.survey(warn, regions=args.region)
-            others = {name: each for name, one in asked.items() if (each := one.result())}
+            others = {name: one.result() for name, one in asked.items()}
         now = time.time()
         if args.json:
             print_json(machines=[entry.to_json(now) for entry in entries],
@@ -49,9 +49,11 @@ class ListVerb(VerbExtension):
             width=table.terminal_width(),
             optional=('KIND', 'PLACE', 'ADDRESS', 'COST', 'AGE', 'COST/H', 'PROVIDER')))
         for entry in entries:
-            for key, line in machines.notes().items():
-                if line and entry.notes[key]:
-                    print(f'{entry.name}:', line.format(name=entry.name, note=entry.notes[key]))
+            if entry.record is not None and entry.record.notes:  # or no feature need be loaded
+                for key, line in machines.notes().items():
+                    if line and entry.notes[key]:
+                        print(f'{entry.name}:',
+                              line.format(name=entry.name, note=entry.notes[key]))
         total = machines.total(entries, now)
         if total is not None:
             unknown = sum(entry.runs and entry.cost is None for entry in entries)

@@ -48,7 +48,7 @@ class FakeProvider(Provider):
     A provider whose machines are entries of a dictionary.
 
     :param polls: number of ``describe`` calls for which a new machine is pending.
-    :param shell: endpoint of every running machine.
+    :param endpoint: of every running machine.
     :param failures: by method name, the error that the next call of the method raises.
     :param prices: US dollars per hour by size; 'cheapest' stands for the size with the lowest
         price.
@@ -63,7 +63,7 @@ class FakeProvider(Provider):
     poll_interval: ClassVar[float] = 0.05
 
     def __init__(
-        self, *, polls: int = 0, shell: Endpoint = FAKE_ENDPOINT,
+        self, *, polls: int = 0, endpoint: Endpoint = FAKE_ENDPOINT,
         failures: Optional[dict[str, FogError]] = None,
         prices: Optional[Mapping[str, Decimal]] = None,
     ) -> None:
@@ -74,7 +74,7 @@ class FakeProvider(Provider):
         self.prices = dict(prices or {})
         self.failures = failures if failures is not None else {}
         self._polls = polls
-        self._shell = shell
+        self._endpoint = endpoint
         self._lock = threading.Lock()
         #: By id; a class may have them for all of its objects.
         self.machines: dict[str, Machine] = getattr(self, 'machines', {})
@@ -132,13 +132,13 @@ class FakeProvider(Provider):
                 self._waits[machine_id] -= 1
                 if self._waits[machine_id] < 0:
                     machine = dataclasses.replace(
-                        machine, state=MachineState.RUNNING, shell=self._shell,
-                        vpn_host=self._shell.host)
+                        machine, state=MachineState.RUNNING, endpoint=self._endpoint,
+                        vpn_host=self._endpoint.host)
                     self.machines[machine_id] = machine
             key = self.host_keys.get(machine_id)
-            if key is not None and machine.shell is not None:
+            if key is not None and machine.endpoint is not None:
                 return dataclasses.replace(
-                    machine, shell=dataclasses.replace(machine.shell, host_key=key))
+                    machine, endpoint=dataclasses.replace(machine.endpoint, host_key=key))
             return machine
 
     def find(self, tags: Mapping[str, str]) -> Iterable[Machine]:
@@ -159,7 +159,7 @@ class FakeProvider(Provider):
         with self._lock:
             self._called('stop')
             self.machines[machine_id] = dataclasses.replace(
-                self._found(machine_id), state=MachineState.STOPPED, shell=None)
+                self._found(machine_id), state=MachineState.STOPPED, endpoint=None)
 
     def start(self, machine_id: str) -> None:
         """Start a stopped machine."""

@@ -140,9 +140,9 @@ class ProviderContract:
             assert machine.provider == provider.name
             assert machine.state is MachineState.RUNNING
             assert machine.vpn_host or machine.robot_host
-            assert machine.shell is not None
-            assert machine.shell.kind == provider.capabilities.shell_kind
-            assert provider.describe(machine_id).shell == machine.shell
+            assert machine.endpoint is not None
+            assert machine.endpoint.kind == provider.capabilities.shell_kind
+            assert provider.describe(machine_id).endpoint == machine.endpoint
             assert machine.owned is provider.capabilities.owned
             assert isinstance(provider.capabilities_of(machine), Capabilities)
             if provider.capabilities.owned:
@@ -255,7 +255,7 @@ class ProviderContract:
             provider.pin(machine_id, key)
             another, _ = self.make()
             machine = another.describe(machine_id)
-            assert machine.shell is not None and machine.shell.host_key == key
+            assert machine.endpoint is not None and machine.endpoint.host_key == key
             assert request.tags.items() <= machine.tags.items()
 
     # -- images, regions, prices ----------------------------------------------------------------

@@ -92,9 +92,10 @@ class VmContract(ProviderContract):
             settings = json.loads(config)
             assert PUBLIC_KEY in settings['ssh_authorized_keys']
             assert 'of-the-contract' in json.dumps(settings['bootcmd'])
-            shell = self.reached(provider, machine_id).shell
-            assert shell is not None and shell.host_key is not None
-            assert settings['ssh_keys']['ed25519_public'].split()[:2] == shell.host_key.split()[:2]
+            endpoint = self.reached(provider, machine_id).endpoint
+            assert endpoint is not None and endpoint.host_key is not None
+            assert settings['ssh_keys']['ed25519_public'].split()[:2] \
+                == endpoint.host_key.split()[:2]
 
     def test_machine_has_the_tags_of_its_user(self) -> None:
         with self.machine(options={'tags': {'team': 'Lab 3'}}) as (provider, spec, _, machine_id):

@@ -61,7 +61,7 @@ class TestContainerProvider(ProviderContract):
         cloud.provider.stop(first.id)
         stopped = cloud.provider.describe(first.id)
         assert stopped.state is MachineState.STOPPED
-        assert stopped.shell is None
+        assert stopped.endpoint is None
         assert [m.state for m in cloud.provider.find({'fogros2-name': spec.name})] == [
             MachineState.STOPPED]
         cloud.provider.start(first.id)
@@ -145,9 +145,9 @@ def test_a_machine_writes_and_mounts_nothing_here(one):
 def test_the_host_key_is_the_machine_s_own_and_pinned(clouds, one):
     machine, shell = one
     own = said(shell, 'cat', '/etc/ssh/fogros2_host_ed25519_key.pub').split()[:2]
-    assert machine.shell.host_key.split() == own
+    assert machine.endpoint.host_key.split() == own
     pinned = dataclasses.replace(
-        machine, shell=dataclasses.replace(machine.shell, host_key=(
+        machine, endpoint=dataclasses.replace(machine.endpoint, host_key=(
             'ssh-ed25519 '
             'AAAAC3NzaC1lZDI1NTE5AAAAINhr1xZ0GZJ4Mqbso1vdFbxmsNCtINbcVrdTGUPNy8U9')))
     with clouds.shell(pinned, user='fog') as other, pytest.raises(HostKeyError):
@@ -182,7 +182,7 @@ def test_options_and_agent_reach_a_machine_until_it_ends(cloud, tmp_path):
         'user': 'rosuser', 'mounts': [f'{tmp_path}/data:/data'], 'memory': '200m', 'cpus': 0.5,
     }), agent_config=agent_config(robot_timeout=60, boot_timeout=600)))
     with cloud.shell(machine) as shell:
-        assert machine.shell.user == 'rosuser'
+        assert machine.endpoint.user == 'rosuser'
         assert said(shell, 'pwd') == '/home/rosuser'
         assert said(shell, 'id', '-u', sudo=True) == '0'
         assert said(shell, 'cat', '/data/file') == 'here'
@@ -312,7 +312,7 @@ def test_an_image_gets_user_key_and_server_at_boot(image, cloud):
     cloud.provider.start(machine.id)
     assert cloud.traces().count(packet_filter) == 2
     again = cloud.reached(machine.id)
-    assert again.shell.host_key == machine.shell.host_key
+    assert again.shell.host_key == machine.endpoint.host_key
     with cloud.shell(again) as shell:
         assert said(shell, 'cat', 'file') == 'kept'
 

@@ -124,14 +124,14 @@ def test_firewalled_machine_is_reached_only_through_the_vpn(cloud, spec, monkeyp
     def shut(spec, request):
         machine_id = create(spec, request)
         machine = cloud.reachable(machine_id, name=spec.name, timeout=30)
-        handed_over.append(machine.shell.host_key)
+        handed_over.append(machine.endpoint.host_key)
         cloud.allow(machine_id, 22, ['192.0.2.7/32'])
         return machine_id
 
     monkeypatch.setattr(cloud, 'create', shut)
     try:
         machine = first.up(kept)
-        outside = machine.machine.shell.host
+        outside = machine.machine.endpoint.host
         key = store.load(kept.name).host_key
         assert key and key not in handed_over
         assert cloud.pinned == {machine.machine.id: key}
@@ -197,7 +197,7 @@ def test_vpn_leaves_udp_and_returns(cloud, spec, cloud_network, monkeypatch):
         assert re.search(rf'^VPN path +{path}$', status, re.MULTILINE)
         kinds = [made.kind for made in launch.store.load(machine.spec.name).made]
         assert not sources or 'firewall' in kinds, 'nothing would close the port after a kill'
-        return answers(machine.machine.shell.host) == bool(sources)
+        return answers(machine.machine.endpoint.host) == bool(sources)
 
     try:
         with without_udp(cloud_network):
@@ -268,7 +268,7 @@ def test_unreachable_machines_dial_the_robot_and_each_other(
         two.shell.run(Command(('ping', '-c', '1', '-W', '8', one.vpn_address)), timeout=60)
         assert len(dials('VPN', robots[0])) == 2
         # neither a machine's nor the one that nobody has: addresses are handed out in a circle
-        hosts = [machine.machine.shell.host for machine in (one, two)]
+        hosts = [machine.machine.endpoint.host for machine in (one, two)]
         later = next(str(host) for host in list(subnet.hosts())[-2:-5:-1]
                      if str(host) not in hosts)
         run(Command(('ip', 'address', 'add', f'{later}/32', 'dev', bridge), sudo=True), timeout=60)

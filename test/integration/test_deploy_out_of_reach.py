@@ -94,7 +94,7 @@ def test_of_two_robots_that_come_at_once_one_gets_the_computer(root, tmp_path):
         pytest.skip('the agent is started here as root')
     name = f'shared-{RUN}'
     machine = Machine('ssh:', name, 'ssh', MachineState.RUNNING, owned=False,
-                      shell=Endpoint('local', user='root'))
+                      endpoint=Endpoint('local', user='root'))
     spec = MachineSpec(name, 'ssh', {'host': 'localhost'})
     contexts = [Launch(store=Store(tmp_path / f'{number}')).context(spec)
                 for number in range(2)]

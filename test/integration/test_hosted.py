@@ -65,9 +65,9 @@ def test_robots_have_machines_of_the_same_name(
         assert container['HostConfig']['Memory'] == 300 << 20
         assert container['HostConfig']['NanoCpus'] == 500_000_000
     machine = one.reachable(first, name='planner', timeout=60.0)
-    assert machine.shell is not None and machine.shell.host == '127.0.0.1'
-    assert len({22, host.on['port'], machine.shell.port, machine.vpn_port}) == 4
-    shell = SSHShell(dataclasses.replace(machine.shell, key_file=str(key)), name='planner')
+    assert machine.endpoint is not None and machine.endpoint.host == '127.0.0.1'
+    assert len({22, host.on['port'], machine.endpoint.port, machine.vpn_port}) == 4
+    shell = SSHShell(dataclasses.replace(machine.endpoint, key_file=str(key)), name='planner')
 
     def answers() -> bool:
         with contextlib.suppress(ShellError):

@@ -139,7 +139,7 @@ def test_viewers_need_the_token(nothing_left, engine, cloud_network, tmp_path):
             r'Foxglove for (\S+) at wss://(\S+):(\d+); with its token: (.*)', launched.text)
         assert (told[1], told[4]) == (f'{gateway}/32', f'ros2 fog monitor {name} --share')
         at = told[2], int(told[3])
-        assert at == (Store().load(name).shell.host, 8766)
+        assert at == (Store().load(name).endpoint.host, 8766)
 
         shared = ros2('fog', 'monitor', name, '--share').stdout.splitlines()
         url = shared[0]

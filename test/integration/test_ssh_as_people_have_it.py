@@ -85,7 +85,7 @@ def computer(host: str, **options: object) -> Endpoint:
     """Return the endpoint of a machine as the provider makes it."""
     spec = MachineSpec('planner', 'ssh', {'host': host, **options})
     provider = SSHProvider()
-    found = provider.describe(provider.create(spec, request_for(spec))).shell
+    found = provider.describe(provider.create(spec, request_for(spec))).endpoint
     assert found is not None
     return found
 
@@ -346,7 +346,7 @@ def test_other_programs_reach_a_machine_by_its_name(
 ) -> None:
     """As ``ros2 fog ssh-config`` writes it, for ssh and what uses it."""
     store = Store()
-    record = Record('planner', 'ssh', MachineSpec('planner', 'ssh'), shell=server.endpoint)
+    record = Record('planner', 'ssh', MachineSpec('planner', 'ssh'), endpoint=server.endpoint)
     store.save(record)
     ssh_settings.write(Entry('planner', 'ssh', None, record), store)
     config = home / '.ssh/config'

@@ -27,7 +27,7 @@ class FakeMachine:
     def __init__(self, launch, spec):
         self.launch = launch
         self.spec = spec
-        self.machine = SimpleNamespace(vpn_host='192.0.2.7', shell=None)
+        self.machine = SimpleNamespace(vpn_host='192.0.2.7', endpoint=None)
         self.vpn_address = '10.99.0.2'
         self.callback = None
         self.nodes = {}

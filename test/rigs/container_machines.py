@@ -97,13 +97,13 @@ class Cloud:
     def reached(self, machine_id: str) -> Machine:
         def look() -> Machine | None:
             machine = self.provider.describe(machine_id)
-            return machine if machine.shell else None
+            return machine if machine.endpoint else None
         return wait_until(look, timeout=60.0, what='the machine')
 
     @contextlib.contextmanager
     def shell(self, machine: Machine, user: str = '') -> Iterator[SSHShell]:
-        assert machine.shell is not None
-        endpoint = dataclasses.replace(machine.shell, key_file=str(self.key))
+        assert machine.endpoint is not None
+        endpoint = dataclasses.replace(machine.endpoint, key_file=str(self.key))
         if user:
             endpoint = dataclasses.replace(endpoint, user=user)
         shell = SSHShell(endpoint, name=machine.name, timeout=20.0)

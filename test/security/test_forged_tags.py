@@ -41,14 +41,14 @@ def machine_of(address: str = '203.0.113.1', **tags: str) -> Machine:
 @pytest.mark.parametrize('user', [
     "x' -o ProxyCommand='touch /tmp/pwned", '-oProxyCommand=true', 'a b', 'fog\n', ''])
 def test_machine_whose_login_is_no_name_is_not_reached(user: str) -> None:
-    assert machine_of().shell is not None
+    assert machine_of().endpoint is not None
     found = machine_of(**{TAG_USER: user})
-    assert found.shell is None and found.name == 'planner', 'it is listed'
+    assert found.endpoint is None and found.name == 'planner', 'it is listed'
 
 
 @pytest.mark.parametrize('key', ['', 'ssh-ed25519 AA\n* ssh-ed25519 BB', '@cert-authority AA'])
 def test_machine_whose_host_key_is_none_is_not_reached(key: str) -> None:
-    assert machine_of(**{TAG_HOST_KEY: key}).shell is None
+    assert machine_of(**{TAG_HOST_KEY: key}).endpoint is None
 
 
 @pytest.mark.parametrize('address', [
@@ -56,7 +56,7 @@ def test_machine_whose_host_key_is_none_is_not_reached(key: str) -> None:
 def test_machine_whose_address_is_none_is_not_reached(address: str) -> None:
     """Azure reports no address with a machine, but a tag has it."""
     found = machine_of(address)
-    assert (found.shell, found.vpn_host, found.private_ip) == (None, '', '')
+    assert (found.endpoint, found.vpn_host, found.private_ip) == (None, '', '')
     assert machine_of('2001:db8::1').vpn_host == '2001:db8::1'
 
 

@@ -19,7 +19,7 @@ from fogros2_testing import FakeShell, request_for
 ID = 'podman:0123456789ab:0123-token'
 LOGIN = {'port': 40001, 'user': 'fog', 'host_key': 'ssh-ed25519 AA'}
 REPORT = {'id': ID, 'state': 'running', 'created': 17e8, 'vpn_host': '198.51.100.2', 'image': '',
-          'shell': LOGIN, 'vpn_port': 40002, 'tags': {'fogros2-hosted': '-1234abcd'}}
+          'endpoint': LOGIN, 'vpn_port': 40002, 'tags': {'fogros2-hosted': '-1234abcd'}}
 #: Words of OpenSSH, of rsync's option ``-e``, and of ids of machines.
 NAMES = ["x' -o ProxyCommand='touch /tmp/pwned", '-oProxyCommand=true', 'a b', 'fog\n', '', None]
 
@@ -56,10 +56,10 @@ def described(host: Host, report: object) -> None:
 
 
 @pytest.mark.parametrize('wrong', [
-    *({'shell': {**LOGIN, 'user': name}} for name in NAMES),
-    *({'shell': {**LOGIN, 'host_key': key}} for key in (
+    *({'endpoint': {**LOGIN, 'user': name}} for name in NAMES),
+    *({'endpoint': {**LOGIN, 'host_key': key}} for key in (
         '', 'ssh-ed25519', 'ssh-ed25519 AA\n* ssh-ed25519 BB', '@cert-authority AA')),
-    *({'shell': {**LOGIN, 'port': port}} for port in (-1, 1 << 16, '22', 1.5, True)),
+    *({'endpoint': {**LOGIN, 'port': port}} for port in (-1, 1 << 16, '22', 1.5, True)),
     {'id': f'{ID}@ssh:host=203.0.113.1'}, {'id': 'x'}, {'vpn_host': '203.0.113.1 -x'},
     {'vpn_host': 'fe80::1%$(reboot)'}, {'vpn_host': 1}, {'id': ID + 64 * 'x'},
     {'created': float('-inf')}, {'created': '-Infinity'}, {'vpn_port': 1 << 16}, {'state': 'odd'},

@@ -208,12 +208,12 @@ def test_machine_gets_dns_and_no_token_from_a_cloud(
         pair: tuple[Machine, SSHShell, SSHShell]) -> None:
     """Another machine has the address of clouds' metadata services, and this computer a route."""
     service, far, shell = pair
-    assert service.shell is not None
+    assert service.endpoint is not None
     far.run(Command(('ip', 'address', 'add', f'{METADATA}/32', 'dev', 'lo'), sudo=True),
             timeout=60)
     far.run(Command(('sh', '-c', 'python3 -c "$1" >/dev/null 2>&1 &', 'sh', SERVICE), sudo=True),
             timeout=60)
-    route = METADATA, 'via', service.shell.host
+    route = METADATA, 'via', service.endpoint.host
     run(Command(('ip', 'route', 'add', *route), sudo=True), timeout=60)
     try:
         ask = Command(('python3', '-c', ASK_SERVICE, METADATA))
@@ -227,13 +227,13 @@ def test_machine_gets_dns_and_no_token_from_a_cloud(
 def test_machine_reaches_no_port_of_the_robot(
         pair: tuple[Machine, SSHShell, SSHShell], robot: Robot, published: int) -> None:
     other, _, shell = pair
-    assert other.shell is not None
+    assert other.endpoint is not None
     _, gateway, _ = bridge_of(DEFAULT)
-    said = attack(robot, shell, DEFAULT, f'{other.shell.host} 22', f'{gateway} {published}')
+    said = attack(robot, shell, DEFAULT, f'{other.endpoint.host} 22', f'{gateway} {published}')
     assert robot.heard == []
     # the other machine itself answers, but not at the port that the robot lends it
     assert said.splitlines() == [
-        f'{state} SOCK_STREAM answered by {other.shell.host} 22'
+        f'{state} SOCK_STREAM answered by {other.endpoint.host} 22'
         for state in ('plain', 'stolen address', 'stolen link address')]
 
 

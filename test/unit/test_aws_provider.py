@@ -230,7 +230,7 @@ def test_an_instance_becomes_a_machine():
     assert machine.id == 'aws:eu-central-1/i-0abc/0123456789abcdef'
     assert (machine.name, machine.state, machine.region) == (
         'planner', MachineState.RUNNING, 'eu-central-1')
-    assert (machine.shell.host, machine.shell.user, machine.shell.host_key) == (
+    assert (machine.endpoint.host, machine.endpoint.user, machine.endpoint.host_key) == (
         '198.51.100.9', 'ubuntu', 'ssh-ed25519 AAAA')
     assert (machine.vpn_host, machine.private_network, machine.private_ip) == (
         '198.51.100.9', 'aws:vpc-1', '10.0.0.9')
@@ -246,7 +246,7 @@ def test_an_instance_becomes_a_machine():
 def test_every_state_has_a_word(state, ours):
     machine = machine_of(instance(state))
     assert str(machine.state) == ours
-    assert (machine.shell is not None) == (state == 'running')
+    assert (machine.endpoint is not None) == (state == 'running')
 
 
 def test_a_machine_says_since_when_it_is_stopped():

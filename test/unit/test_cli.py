@@ -127,7 +127,7 @@ def lab(monkeypatch: pytest.MonkeyPatch, shell: FakeShell, **changes: Any) -> No
     monkeypatch.setattr(endings.shells, 'connect', lambda *_, **__: shell)
     made = machine('lab', provider='untagged', owned=False)
     record('lab', **{
-        'provider': 'untagged', 'shell': made.shell, 'agent': '/run/fogros2/lab',
+        'provider': 'untagged', 'endpoint': made.endpoint, 'agent': '/run/fogros2/lab',
         'agent_program': '/run/fogros2/lab/agent.py', **dead(), **changes})
 
 
@@ -189,7 +189,7 @@ def test_list_shows_what_providers_and_the_store_know(
 
 def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     machine('a', cost_per_hour=Decimal('0.5'), image='ami-1', key='fogros2-a', disk_gb=40,
-            shell=Endpoint('ssh', '198.51.100.7', 22, 'fog', 'ssh-ed25519 AAAA'))
+            endpoint=Endpoint('ssh', '198.51.100.7', 22, 'fog', 'ssh-ed25519 AAAA'))
     record('a', **alive())
     record('b')
     assert run('list', '--json') == 0
@@ -715,13 +715,13 @@ def test_help_imports_no_core(tmp_path: Path) -> None:
 
 
 def test_list_loads_no_cloud_that_is_not_set_up(tmp_path: Path) -> None:
-    code = ('import sys\nimport ros2fog_cli.verb.list\n'
-            'from ros2fog_cli.api.machines import configured\n'
-            'configured(None)\nprint([name for name in sys.modules if name.startswith(("boto3", '
-            '"cryptography", "google", "urllib.request", "fogros2.provider.vm"))])')
+    code = ('import argparse, sys\nfrom ros2fog_cli.verb.list import ListVerb\n'
+            'ListVerb().main(args=argparse.Namespace(region=None, json=False))\n'
+            'print([name for name in sys.modules if name.startswith(("boto3", "cryptography", '
+            '"google", "paramiko", "urllib.request", "fogros2.deploy", "fogros2.provider.vm"))])')
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                           cwd=tmp_path, check=True,
-                          env={'PATH': os.environ['PATH'], 'HOME': str(tmp_path), **{
+                          env={'PATH': str(tmp_path), 'HOME': str(tmp_path), **{
                               name: os.environ[name] for name in ('PYTHONPATH', 'LD_LIBRARY_PATH')
                               if name in os.environ}})
-    assert done.stdout == '[]\n'
+    assert done.stdout == 'no machines\n[]\n'

@@ -150,7 +150,7 @@ def record(name: str, *, alive: bool = False, **changes: Any) -> Record:
     made = Record(name, 'cloud', MachineSpec(name, 'cloud'), machine_id=f'id-{name}',
                   created=time.time() - 600, launch='abc123' if alive else '',
                   pid=process[0], pid_start=process[1],
-                  shell=Endpoint('ssh', '198.51.100.7', 22, 'ubuntu', 'ssh-ed25519 BBBB',
+                  endpoint=Endpoint('ssh', '198.51.100.7', 22, 'ubuntu', 'ssh-ed25519 BBBB',
                                  '/keys/id_ed25519'))
     return Store().save(dataclasses.replace(made, **changes))
 
@@ -389,9 +389,9 @@ def test_session_changes_the_firewall_of_its_robot(
 def test_session_prefers_the_vpn(shells: list[Endpoint]) -> None:
     with socket.create_server(('127.0.0.1', 0)) as server:
         port = server.getsockname()[1]
-        machine('slam', shell=Endpoint('ssh', '198.51.100.7', port, 'ubuntu'))
+        machine('slam', endpoint=Endpoint('ssh', '198.51.100.7', port, 'ubuntu'))
         record('slam', alive=True, vpn=VpnInterface('fog', '127.0.0.1', '127.0.0.0/8', 1, ''),
-               shell=Endpoint('ssh', '198.51.100.7', port, 'ubuntu', 'ssh-ed25519 BBBB'))
+               endpoint=Endpoint('ssh', '198.51.100.7', port, 'ubuntu', 'ssh-ed25519 BBBB'))
         assert run('connect', 'slam') == 0
     assert [call[0] for call in Cloud.asked] == ['connect']
     assert shells[0].host == '127.0.0.1' and shells[0].host_key == 'ssh-ed25519 BBBB'

@@ -59,7 +59,7 @@ def run(*words: str) -> Any:
 
 def machine(name: str, **changes: Any) -> Machine:
     made = Machine(f'id-{name}', name, 'memory', MachineState.RUNNING,
-                   shell=Endpoint('ssh', '198.51.100.7', 2200, 'fog', 'ssh-ed25519 AAAA'),
+                   endpoint=Endpoint('ssh', '198.51.100.7', 2200, 'fog', 'ssh-ed25519 AAAA'),
                    tags={TAG_NAME: name, TAG_ROBOT: robot_name()})
     made = dataclasses.replace(made, **changes)
     Cloud.machines[made.id] = made
@@ -192,7 +192,7 @@ def test_ssh_reads_the_settings_of_a_machine(
     monkeypatch.setenv('HOME', str(tmp_path))
     key = str(tmp_path / 'a key%h')
     machine('a')
-    record('a', shell=Endpoint('ssh', '203.0.113.1', 22, 'ubuntu', 'ssh-ed25519 AAAA', key))
+    record('a', endpoint=Endpoint('ssh', '203.0.113.1', 22, 'ubuntu', 'ssh-ed25519 AAAA', key))
     assert run('ssh-config', 'a') == 0
     line = capsys.readouterr().out.splitlines()[-1]
     config = tmp_path / 'config'
@@ -235,7 +235,7 @@ def test_line_for_ssh_is_shown_until_it_is_there(
 def test_machine_adds_no_settings_of_its_own(
     changes: dict[str, Any], capsys: pytest.CaptureFixture[str],
 ) -> None:
-    machine('a', shell=dataclasses.replace(
+    machine('a', endpoint=dataclasses.replace(
         Endpoint('ssh', '198.51.100.7', 22, 'fog', 'ssh-ed25519 AAAA'), **changes))
     record('a')
     assert run('ssh-config', 'a') == 1
@@ -245,7 +245,7 @@ def test_machine_adds_no_settings_of_its_own(
 
 
 def test_machine_without_ssh_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    machine('pod', shell=Endpoint('kubernetes', 'pod'))
+    machine('pod', endpoint=Endpoint('kubernetes', 'pod'))
     record('pod')
     assert run('ssh-config', 'pod') == 1
     assert "'pod' has no SSH server that this computer reaches (ros2 fog connect pod)" \

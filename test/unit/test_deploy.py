@@ -339,7 +339,7 @@ def mute():
 def reach(launch, port):
     context, mine = begun(launch, MachineSpec('planner', 'ssh'))
     mine.machine = Machine(
-        'x', 'planner', 'ssh', MachineState.RUNNING, owned=False, shell=Endpoint(
+        'x', 'planner', 'ssh', MachineState.RUNNING, owned=False, endpoint=Endpoint(
             'ssh', '127.0.0.1', port, 'fog', host_key='ssh-ed25519 AAAA', key_file='/nowhere'))
     with mine.undo:
         Connection(context, mine).open()
@@ -371,7 +371,7 @@ def test_wait_ends_when_a_booting_machine_ends(
     monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(firewall=True))
     context, mine = begun(launch, timeouts=Timeouts(ssh=60.0 if ended else 0.8))
     Creation(context, mine).run()
-    mine.machine = dataclasses.replace(provider.describe(mine.machine_id), shell=Endpoint(
+    mine.machine = dataclasses.replace(provider.describe(mine.machine_id), endpoint=Endpoint(
         'ssh', '127.0.0.1', closed_port, 'fog', host_key='ssh-ed25519 AAAA', key_file='/nowhere'))
     if ended:
         provider.destroy(mine.machine_id)
@@ -389,7 +389,7 @@ def test_ssh_port_stays_closed_after_the_launch_has_left(launch, provider, monke
                         raising=False)
     context, mine = begun(launch)
     Creation(context, mine).run()
-    mine.save(shell=FAKE_ENDPOINT, carried='stream')
+    mine.save(endpoint=FAKE_ENDPOINT, carried='stream')
     connection = Connection(context, mine)
     connection.enter_vpn()
     assert connection.open_outside() == FAKE_ENDPOINT

@@ -135,7 +135,7 @@ def test_info_has_fogros2_s_keys(context):
     machine.is_up(SimpleNamespace(
         spec=SimpleNamespace(
             provider='aws', options={'region': 'us-west-2', 'ec2_instance_type': 't3.nano'}),
-        machine=SimpleNamespace(id='aws:us-west-2/i-0123', vpn_host='198.51.100.7', shell=None),
+        machine=SimpleNamespace(id='aws:us-west-2/i-0123', vpn_host='198.51.100.7', endpoint=None),
         vpn_address='198.18.0.2'))
     told = machine.info()
     assert (told['ec2_region'], told['ec2_instance_type']) == ('us-west-2', 't3.nano')

@@ -42,11 +42,13 @@ from fogros2.store import Record, Store
 from fogros2_features.hosts import hosted, served
 from fogros2_features.hosts.hosted import HostedProvider, program, result_of
 from fogros2_testing import FakeProvider, FakeShell, ProviderContract, request_for
+from ros2fog_cli.api import machines
 
 ID = 'podman:0123456789ab:0123-token'
 REPORT = {
     'id': ID, 'state': 'running', 'created': 1700000000.5, 'vpn_host': '198.51.100.2', 'image': '',
-    'shell': {'host': '198.51.100.2', 'port': 40001, 'user': 'fog', 'host_key': 'ssh-ed25519 AA'},
+    'endpoint': {
+        'host': '198.51.100.2', 'port': 40001, 'user': 'fog', 'host_key': 'ssh-ed25519 AA'},
     'vpn_port': 40002, 'tags': {'fogros2-name': 'planner', 'fogros2-hosted': '-1234abcd'}}
 
 
@@ -87,7 +89,7 @@ class TestHostedProvider(ProviderContract):
     @pytest.fixture(autouse=True)
     def place(self, on: dict[str, Any], shell: FakeShell) -> None:
         self.options = {'on': on}
-        engine = Engine(shell=Endpoint('ssh', '198.51.100.2', 40001, 'fog', 'ssh-ed25519 AA'))
+        engine = Engine(endpoint=Endpoint('ssh', '198.51.100.2', 40001, 'fog', 'ssh-ed25519 AA'))
 
         def serve(command: Command) -> Result:
             ask = json.loads(command.input or b'')
@@ -150,8 +152,8 @@ def test_machine_has_the_ports_of_its_host(on: dict[str, Any], shell: FakeShell)
     machine_id = provider.create(spec_on(on), request_for(spec_on(on)))
     shell.said = json.dumps({'result': REPORT})  # type: ignore[attr-defined]
     machine = provider.describe(machine_id)
-    assert machine.shell == Endpoint('ssh', '127.0.0.1', 40001, 'fog', 'ssh-ed25519 AA',
-                                     alias='127.0.0.1')
+    assert machine.endpoint == Endpoint('ssh', '127.0.0.1', 40001, 'fog', 'ssh-ed25519 AA',
+                                        alias='127.0.0.1')
     assert (machine.vpn_host, machine.vpn_port) == ('127.0.0.1', 40002)
     assert (machine.id, machine.name, machine.region) == (machine_id, 'planner', '127.0.0.1')
     assert machine.state is MachineState.RUNNING and machine.end_command
@@ -160,8 +162,8 @@ def test_machine_has_the_ports_of_its_host(on: dict[str, Any], shell: FakeShell)
     assert asked(shell)['given'] == {'id': ID}
     # before the first boot has made a host key
     shell.said = json.dumps(  # type: ignore[attr-defined]
-        {'result': {**REPORT, 'shell': None}})
-    assert provider.describe(machine_id).shell is None
+        {'result': {**REPORT, 'endpoint': None}})
+    assert provider.describe(machine_id).endpoint is None
 
 
 @pytest.mark.parametrize(('kind', 'raised'), [
@@ -278,6 +280,27 @@ def test_host_that_is_off_hides_no_machine_of_another(
         next(search)
 
 
+def test_host_that_is_off_hides_no_volume_of_another(
+    monkeypatch: pytest.MonkeyPatch, on: dict[str, Any], shell: FakeShell,
+) -> None:
+    find_host = HostedProvider._find_host
+
+    def found(provider: HostedProvider, host: dict[str, Any]) -> str:
+        if host['host'] == 'off':
+            raise ConnectError('it is off')
+        return find_host(provider, on)
+
+    monkeypatch.setattr(HostedProvider, '_find_host', found)
+    shell.said = json.dumps({  # type: ignore[attr-defined]
+        'result': [{'id': 'podman:fogros2-volume-maps', 'user': 'planner'}]})
+    warned: list[str] = []
+    volumes = machines.gather(warned.append, [], lambda name: HostedProvider().volumes(
+        ['off', '127.0.0.1']) if name == 'hosted' else ())
+    assert [(one.name, one.region, one.user) for one in volumes] == [
+        ('maps', '127.0.0.1', 'planner')]
+    assert warned == ['hosted: it is off']
+
+
 # -- the program on the host ---------------------------------------------------------------------
 
 def test_machine_of_a_robot_is_reached_at_published_ports() -> None:
@@ -289,8 +312,8 @@ def test_machine_of_a_robot_is_reached_at_published_ports() -> None:
         'NetworkSettings': {'Ports': ports, 'Networks': {'n': {'IPAddress': '198.51.100.2'}}},
         'Config': {'Image': 'ros', 'Labels': {**labels, 'fogros2-hosted': '-1234abcd'}}}
     machine = container_machine.machine_of(container_engine.docker(), entry, 'ssh-ed25519 AA')
-    assert machine.shell is not None
-    assert (machine.shell.port, machine.vpn_port) == (41001, 41002)
+    assert machine.endpoint is not None
+    assert (machine.endpoint.port, machine.vpn_port) == (41001, 41002)
     assert json.loads(to_json(machine))['state'] == 'running'
     assert machine.image == 'ros'
     entry['NetworkSettings']['Ports'] = {'22/tcp': None, '51820/udp': []}
@@ -299,7 +322,7 @@ def test_machine_of_a_robot_is_reached_at_published_ports() -> None:
     entry['NetworkSettings']['Ports'] = ports
     entry['Config']['Labels'] = labels
     machine = container_machine.machine_of(container_engine.docker(), entry, 'ssh-ed25519 AA')
-    assert machine.shell is not None and (machine.shell.port, machine.vpn_port) == (22, 0)
+    assert machine.endpoint is not None and (machine.endpoint.port, machine.vpn_port) == (22, 0)
 
 
 def test_program_holds_no_more_than_it_imports() -> None:

@@ -42,19 +42,20 @@ def test_everything_is_in_the_id(listener, tmp_path):
     assert machine.vpn_host == '127.0.0.1'
     assert not machine.owned
     assert machine.end_command == ()
-    shell = machine.shell
-    assert (shell.kind, shell.host, shell.port, shell.user) == ('ssh', '127.0.0.1', port, 'me')
-    assert shell.host_key == 'ssh-ed25519 AA+/A= comment'
-    assert shell.key_file == str(tmp_path / 'a key')
+    endpoint = machine.endpoint
+    assert (endpoint.kind, endpoint.host, endpoint.port, endpoint.user) == (
+        'ssh', '127.0.0.1', port, 'me')
+    assert endpoint.host_key == 'ssh-ed25519 AA+/A= comment'
+    assert endpoint.key_file == str(tmp_path / 'a key')
 
 
 def test_without_a_key_and_a_host_key_the_user_s_own_decide(listener):
     spec = MachineSpec('planner', 'ssh', {
         'host': '127.0.0.1', 'port': listener.getsockname()[1], 'key': None, 'host_key': None})
-    shell = SSHProvider().describe(SSHProvider().create(spec, request_for(spec))).shell
-    assert shell.host_key is None
-    assert shell.key_file is None
-    assert shell.user
+    endpoint = SSHProvider().describe(SSHProvider().create(spec, request_for(spec))).endpoint
+    assert endpoint.host_key is None
+    assert endpoint.key_file is None
+    assert endpoint.user
 
 
 def test_a_computer_that_is_off_is_stopped(listener):
@@ -64,7 +65,7 @@ def test_a_computer_that_is_off_is_stopped(listener):
     listener.close()
     machine = SSHProvider().describe(machine_id)
     assert machine.state is MachineState.STOPPED
-    assert machine.shell is None
+    assert machine.endpoint is None
 
 
 @pytest.mark.parametrize('host, words', [

@@ -38,7 +38,7 @@ def record(name='planner', **changes):
 
 def test_a_record_comes_back_as_it_was_saved(store):
     saved = record(
-        shell=Endpoint('ssh', '198.51.100.7', user='fog', host_key='ssh-ed25519 AAAA'),
+        endpoint=Endpoint('ssh', '198.51.100.7', user='fog', host_key='ssh-ed25519 AAAA'),
         vpn=VpnInterface('fog1m0', '198.18.0.2', '198.18.0.0/24', 50000, '/run/k'),
         machine_id='abc', asked={'size': 'cheapest'})
     store.save(saved)

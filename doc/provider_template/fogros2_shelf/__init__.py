@@ -102,7 +102,7 @@ class ShelfProvider(Provider):
         return Machine(
             self._id(path, loan), loan['name'], self.name, MachineState.RUNNING,
             created=loan['created'], tags=loan['tags'], vpn_host=computer['host'],
-            shell=Endpoint('ssh', computer['host'], user=loan['user'],
+            endpoint=Endpoint('ssh', computer['host'], user=loan['user'],
                            host_key=computer['host_key']),
             # nothing is billed; the computer must only stop the work of the launch
             end_command=('systemctl', 'reboot'))

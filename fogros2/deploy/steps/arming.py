@@ -66,7 +66,7 @@ class Arming(Step):
         :raises AgentError: another launch uses the machine.
         """
         context, job, program = self._context, self._job, self._job.capabilities.agent_program
-        endpoint = job.machine.shell
+        endpoint = job.machine.endpoint
         notice = context.provider.capabilities_of(job.machine).preemption_notice
         config = {
             **plan.agent_config(

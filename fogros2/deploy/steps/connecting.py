@@ -66,14 +66,14 @@ class Connection(Step):
 
         :raises ShellError: the machine refuses the login.
         """
-        context, job, endpoint = self._context, self._job, self._job.machine.shell
+        context, job, endpoint = self._context, self._job, self._job.machine.endpoint
         assert endpoint is not None
         with job.step('connect') as detail:
             if context.capabilities.owned:
                 endpoint = dataclasses.replace(
                     endpoint, key_file=str(context.store.key_file(job.name)),
                     host_key=job.record.host_key or endpoint.host_key)
-            job.save(shell=endpoint)
+            job.save(endpoint=endpoint)
             if context.capabilities.firewall:
                 job.push(SSH_PORT, endpoint.port)
                 job.undo.callback(self._leave)
@@ -161,7 +161,7 @@ class Connection(Step):
     @property
     def _outside(self) -> Endpoint:
         """How a shell reaches the machine without the VPN."""
-        outside = self._job.record.shell
+        outside = self._job.record.endpoint
         assert outside is not None
         return outside
 
@@ -251,7 +251,7 @@ class Connection(Step):
         job = self._job
         key = host_key.parse(job.run(host_key.renew()))
         endpoint = dataclasses.replace(endpoint, host_key=key)
-        job.save(shell=endpoint, host_key=key)
+        job.save(endpoint=endpoint, host_key=key)
         self._context.provider.pin(job.machine_id, key)
         self._shell.move(self._shell_to(endpoint))
         # the SSH server may need a moment to load the new key

@@ -65,8 +65,8 @@ class Creation(Step):
             job.limit(made=True)
             if price:
                 detail.append(plan.price(price))
-            job.save(shell=machine.shell, spec=job.spec)
-            detail.append(machine.shell.host if machine.shell else machine.id[:20])
+            job.save(endpoint=machine.endpoint, spec=job.spec)
+            detail.append(machine.endpoint.host if machine.endpoint else machine.id[:20])
             if machine.note:
                 detail.append(machine.note)
             job.machine = machine

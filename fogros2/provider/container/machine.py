@@ -147,12 +147,13 @@ def machine_of(engine: Engine, entry: Mapping[str, Any], host_key: Optional[str]
     labels = labels_of(entry)
     address = address_of(entry)
     port, vpn_port = published(entry) if HOSTED in labels else (22, 0)
-    shell = None
+    endpoint = None
     if host_key and address:
-        shell = Endpoint('ssh', address, port, labels[LOGIN], host_key)
+        endpoint = Endpoint('ssh', address, port, labels[LOGIN], host_key)
     return Machine(
         id=machine_id(engine, str(entry['Id']), labels[ATTEMPT]), name=labels.get(MACHINE, ''),
         provider='container', state=state_of(entry), created=timestamp(str(entry['Created'])),
-        shell=shell, vpn_host=address, vpn_port=vpn_port, image=entry['Config'].get('Image') or '',
+        endpoint=endpoint, vpn_host=address, vpn_port=vpn_port,
+        image=entry['Config'].get('Image') or '',
         tags={key: value for key, value in labels.items() if key not in _OURS},
         end_command=container_entry.END_COMMAND)

@@ -380,10 +380,10 @@ class KubernetesProvider(Provider):
         state = pods.state_of(job, pod)
         tags = names.tags_of(job)
         status = (pod or {}).get('status') or {}
-        shell = None
+        endpoint = None
         user = names.annotation(job, names.LOGIN)
         if pod is not None and state is MachineState.RUNNING and untrusted.NAME.fullmatch(user):
-            shell = Endpoint(
+            endpoint = Endpoint(
                 'kubernetes', names.endpoint_host(
                     where.namespace, str(pod['metadata']['name']), where.context),
                 0, user)
@@ -391,7 +391,7 @@ class KubernetesProvider(Provider):
         return Machine(
             id=str(where), name=tags.get('fogros2-name', where.job), provider=self.name,
             state=state, created=pods.timestamp(str(job['metadata']['creationTimestamp'])),
-            shell=shell, vpn_host=address if exposure is None else exposure.host,
+            endpoint=endpoint, vpn_host=address if exposure is None else exposure.host,
             vpn_port=0 if exposure is None else exposure.port,
             robot_host=ways.robot_host(api, job),
             private_network=f'kubernetes {api.server}', private_ip=address,

@@ -248,13 +248,13 @@ class VmProvider(Provider):
         tags, running = vm.tags, vm.state is MachineState.RUNNING
         user, key = tags.get(TAG_USER, 'ubuntu'), tags.get(TAG_HOST_KEY, '')
         address, private_ip = _ip(vm.address), _ip(vm.private_ip)
-        shell = Endpoint('ssh', address, user=user, host_key=key) if running and address \
+        endpoint = Endpoint('ssh', address, user=user, host_key=key) if running and address \
             and untrusted.NAME.fullmatch(user) and untrusted.HOST_KEY.fullmatch(key) else None
         disk, attempt = tags.get(TAG_DISK, ''), tags.get(TAG_ATTEMPT, '')
         machine = VmId(vm.region, vm.id, attempt if ATTEMPT.fullmatch(attempt) else '0' * 16)
         return Machine(
             self._text(machine), tags.get(TAG_NAME, ''), self.name, vm.state, created=vm.created,
-            shell=shell, vpn_host=address if running else '',
+            endpoint=endpoint, vpn_host=address if running else '',
             private_network=vm.private_network, private_ip=private_ip, region=vm.region,
             kind=f'{vm.kind}{_SPOT}' if vm.spot else vm.kind, image=vm.image, key=vm.key,
             disk_gb=int(disk) if disk.isdecimal() and len(disk) < 7 else None, tags=tags,
@@ -286,7 +286,7 @@ class VmProvider(Provider):
                     f'the console of {cloud.title} has its system log')
             report = self.machine_of(vm)
             return dataclasses.replace(report, id=machine_id, note='; '.join(
-                cloud.notes[machine.vm])) if report.shell is not None else None
+                cloud.notes[machine.vm])) if report.endpoint is not None else None
 
         # a cloud needs some ten seconds: few requests, but a fast machine is noticed soon
         return wait_until(

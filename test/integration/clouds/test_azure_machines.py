@@ -56,7 +56,7 @@ def test_machine_that_stops_at_its_end_deallocates_itself(cloud, provider, box, 
     assert provider.describe(machine.id).state is MachineState.STOPPED
     provider.start(machine.id)
     box.wait_for(instance.id, 'running', computer=True)
-    assert provider.reachable(machine.id, name=name, timeout=60).shell == machine.shell
+    assert provider.reachable(machine.id, name=name, timeout=60).endpoint == machine.endpoint
     assert box.run(instance.id, 'cat /root/kept').strip() == 'kept'
     provider.destroy(machine.id)
     with pytest.raises(MachineNotFound):

@@ -77,14 +77,14 @@ class TestShell(ShellContract):
         self.pod = pod
 
     def make(self, folder):
-        shell = KubernetesShell(self.pod.shell, name='shells')
+        shell = KubernetesShell(self.pod.endpoint, name='shells')
         there = f'/tmp/{secrets.token_hex(4)}'
         shell.run(Command(('mkdir', there)), timeout=30.0)
         return shell, there
 
 
 def test_pod_has_no_token_of_the_cluster(pod):
-    with contextlib.closing(KubernetesShell(pod.shell, name='shells')) as shell:
+    with contextlib.closing(KubernetesShell(pod.endpoint, name='shells')) as shell:
         found = shell.run(Command(('ls', '/var/run/secrets/kubernetes.io'), sudo=True),
                           timeout=30.0, check=False)
         assert found.returncode != 0
@@ -107,7 +107,7 @@ def test_launch_makes_few_requests_to_the_cluster(place, monkeypatch):
     counted('websocket')
     provider, machine_id, machine = run('counted')
     try:
-        shell = KubernetesShell(machine.shell, name='counted')
+        shell = KubernetesShell(machine.endpoint, name='counted')
         with contextlib.closing(shell):
             for _ in range(30):
                 shell.run(Command(('true',)), timeout=30.0)
@@ -131,7 +131,7 @@ def test_pod_without_agent_ends_itself(place, monkeypatch):
 def test_end_command_ends_the_pod(place):
     provider, machine_id, machine = run('ended')
     try:
-        with contextlib.closing(KubernetesShell(machine.shell, name='ended')) as shell:
+        with contextlib.closing(KubernetesShell(machine.endpoint, name='ended')) as shell:
             # the connection goes with the pod
             raised(ShellError, lambda: shell.run(
                 Command((*machine.end_command[:2], f'{machine.end_command[2]}; exec sleep 30'),
@@ -291,7 +291,7 @@ def test_volume_outlives_its_pod(place, client, tmp_path):
 
     def within(machine_id, script):
         machine = provider.reachable(machine_id, name='holds', timeout=60.0)
-        with contextlib.closing(KubernetesShell(machine.shell, name='holds')) as shell:
+        with contextlib.closing(KubernetesShell(machine.endpoint, name='holds')) as shell:
             running = SimpleNamespace(
                 lost='', machine=machine, provider=provider, interface=SimpleNamespace(name='lo'),
                 spec=MachineSpec('holds', provider.name),

@@ -120,7 +120,7 @@ def entry(**changes):
         pid=os.getpid(), pid_start=process_start(os.getpid()) or 0, vpn=VPN, notes=NOTES,
         agent='/run/fogros2')
     return Entry('planner', 'fake', Machine(
-        'fake-1', 'planner', 'fake', MachineState.RUNNING, shell=Endpoint('fake')),
+        'fake-1', 'planner', 'fake', MachineState.RUNNING, endpoint=Endpoint('fake')),
         dataclasses.replace(made, **changes))
 
 
