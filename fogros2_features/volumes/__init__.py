@@ -5,8 +5,8 @@ Give machines disks and folders that outlive them.
 The provider attaches a volume and keeps two machines apart. The script here makes a file system on
 a new disk, mounts it and unmounts it.
 
-In reading order: ``keepers`` (providers that keep volumes), ``listing`` and ``verbs`` (for
-``ros2 fog``).
+In reading order: ``clouds`` (their disks), ``keepers`` (providers that keep volumes), ``listing``
+and ``verbs`` (for ``ros2 fog``).
 """
 
 from __future__ import annotations

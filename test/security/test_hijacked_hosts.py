@@ -103,7 +103,7 @@ def test_host_reports_its_own_volumes_alone(
     monkeypatch.setattr(host.provider, '_find_host', lambda on: find(host.spec.options['on']))
     host.answers([{'id': 'podman:fogros2-volume-a', 'user': 'x'}])
     volume, = host.provider.volumes(['lab'])
-    assert (volume.name, volume.region, volume.user) == ('a', 'lab', 'x')
+    assert (volume.name, volume.region, volume.user) == ('a', '127.0.0.1', 'x')
     host.answers([report])
     with pytest.raises(ProviderError, match="the host '127.0.0.1' reports a machine wrongly"):
         list(host.provider.volumes(['lab']))

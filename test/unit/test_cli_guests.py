@@ -235,7 +235,7 @@ def test_folder_of_a_joined_machine_stays_until_a_reboot(
     cleared: list[Path] = []
     monkeypatch.setattr(membership, 'is_up', lambda invitation: True)
     monkeypatch.setattr(provider, 'Store', lambda: store)
-    monkeypatch.setattr(provider, 'clear', cleared.append)
+    monkeypatch.setattr('fogros2.deploy.robot.clear', cleared.append)
     spec = MachineSpec('m', 'joined', options={'invitation': text})
     for ends in ([folder], []):
         with provider.JoinedProvider().join(spec, 'rmw_cyclonedds_cpp', 7, {}):
