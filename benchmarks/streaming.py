@@ -24,6 +24,7 @@ import json
 import math
 import os
 from pathlib import Path
+import re
 import shutil
 import signal
 import statistics
@@ -684,7 +685,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--short', action='store_true')
     parser.add_argument('--count', type=int, default=3000)
-    parser.add_argument('--only', default='', help='cases whose name has this in it')
+    parser.add_argument('--only', default='', help='cases whose name has this expression in it')
     parser.add_argument('--video', default='', help='a video file instead of the scene')
     parser.add_argument('--again', action='store_true',
                         help='measure nothing, write the tables from the figures that were stored')
@@ -714,7 +715,7 @@ def main() -> None:
         return None
 
     count = arguments.count // 10 if arguments.short else arguments.count
-    cases = [case for case in CASES if arguments.only in case.name and not (
+    cases = [case for case in CASES if re.search(arguments.only, case.name) and not (
         arguments.short and (case.size != 'VGA' or case.delay and not case.loss))]
     if shutil.which('ffmpeg') is None:
         cases = [case for case in cases if case.codec != 'theora']
