@@ -81,7 +81,7 @@ def main() -> None:
     """Train the policy unless its file exists."""
     path = Path(sys.argv[1])
     if not path.exists():
-        print(f'training the policy {path}, once: it takes some minutes', flush=True)
+        print(f'training the policy {path}, once: it takes a minute or more', flush=True)
         images = {f'observation.images.{name}': (1, 3, HEIGHT, WIDTH) for name in VIEWS}
         model = perceptron(images, train(*demonstrations(SAMPLES, 0), EPOCHS), STEPS)
         path.with_suffix('.part').write_bytes(model)

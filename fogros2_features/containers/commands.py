@@ -213,7 +213,7 @@ def check(container: Container, rmw: str) -> None:
         raise DdsError(
             f"the container '{container.image}' mounts {FOGROS2_FILE} for rmw_cyclonedds_cpp, and"
             f" the launch's nodes have {rmw}: they would not hear each other",
-            'unset RMW_IMPLEMENTATION, or leave the mount out')
+            'set RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or leave the mount out')
 
 
 def _pairs(container: Container) -> Iterable[tuple[str, str]]:
