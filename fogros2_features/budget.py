@@ -135,7 +135,8 @@ class Spending(LaunchPart):
                     else f"{WARNING:.0%} of the launch's"
                 launch.logging.get_logger('fogros2').warning(
                     f'{what} budget of {_dollars(budget)} is spent\n'
-                    'what it pays for ends with the rest, as on_exit= says')
+                    'what it pays for ends with the rest: it is deleted, or stopped with '
+                    "on_exit='stop'")
             rests.append((machine, _dollars(budget), _dollars(max(budget - spent, Decimal(0)))))
         if rests != self._noted:
             self._noted = rests
