@@ -13,6 +13,7 @@ from typing import ClassVar, Optional
 
 from fogros2.errors import DdsError
 from fogros2.model import Command, DdsInterface
+from fogros2.vpn.addresses import dds_ports
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,8 +45,6 @@ class DdsVendor(abc.ABC):
 
     #: Value of RMW_IMPLEMENTATION.
     rmw: ClassVar[str]
-    #: Further ranges of UDP ports, (first, last), on which the robot's nodes listen.
-    ports: ClassVar[Sequence[tuple[int, int]]] = ()
     #: Whether the VPN interface is configured by its address instead of its name.
     by_address: ClassVar[bool] = False
     #: Whether the robot's nodes announce themselves to each machine's address, too.
@@ -59,6 +58,11 @@ class DdsVendor(abc.ABC):
         if not 0 <= domain <= self.last_domain:
             raise DdsError(f'ROS_DOMAIN_ID {domain} has no DDS ports', 'use 0 to 101')
         self.domain = domain
+
+    @property
+    def ports(self) -> Sequence[tuple[int, int]]:
+        """The ranges of UDP ports, (first, last), on which the robot's nodes listen."""
+        return [dds_ports(self.domain)]
 
     def asked(self, user: Mapping[str, str]) -> list[str]:
         """Return the hosts that the user configured for nodes to ask, names or addresses."""

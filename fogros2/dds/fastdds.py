@@ -87,9 +87,16 @@ class FastDds(DdsVendor):
     rmw: ClassVar[str] = 'rmw_fastrtps_cpp'
     by_address: ClassVar[bool] = True
     asks_machines: ClassVar[bool] = True
-    #: Ports at which each process receives the node lists of others (``ros_discovery_info``).
-    #: They are the same in every domain, because the middleware itself sets the port.
-    ports: ClassVar[Sequence[tuple[int, int]]] = ((7000, 7119),)
+
+    @property
+    def ports(self) -> Sequence[tuple[int, int]]:
+        """
+        The ranges of UDP ports on which the robot's nodes listen.
+
+        At those of the second, each process receives the node lists of others
+        (``ros_discovery_info``), in every domain: the middleware itself sets the port.
+        """
+        return [*super().ports, (7000, 7119)]
 
     def asked(self, user: Mapping[str, str]) -> list[str]:
         """Return the hosts of ROS_STATIC_PEERS, and those of the user's profiles."""

@@ -45,6 +45,11 @@ class Zenoh(DdsVendor):
     by_address: ClassVar[bool] = True
     file_name: ClassVar[str] = 'dds.json5'
 
+    @property
+    def ports(self) -> Sequence[tuple[int, int]]:
+        """None: the robot's router connects to those of machines, by TCP."""
+        return []
+
     def robot_interfaces(
         self, vpn: str, lan: Optional[str], user: Mapping[str, str],
     ) -> list[DdsInterface]:

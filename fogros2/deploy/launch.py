@@ -305,7 +305,7 @@ class Launch:
                 write_private(
                     folder / 'process.json', model.to_json(this_process()).encode())
                 vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
-                    domain=self.domain, ports=self.dds().ports,
+                    ports=self.dds().ports,
                     asked=addresses_of(self.dds().asked(self.user_environment)))
                 self._vpn = RobotVpn(
                     choose_interface(

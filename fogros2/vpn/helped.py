@@ -84,8 +84,7 @@ class HelpedWireGuard(WireGuard):
         return self._ask(
             'up', interface, super().up(interface, peers), peers=_peers(peers),
             network=interface.network, address=interface.address, port=interface.port,
-            domain=self.domain, ports=[list(pair) for pair in self.ports[1:]],
-            asked=list(self.asked))
+            ports=[list(pair) for pair in self.ports], asked=list(self.asked))
 
     def peers(self, interface: VpnInterface, peers: Sequence[Peer]) -> Iterator[Command]:
         """Yield the commands that set the peers."""

@@ -22,7 +22,7 @@ import shlex
 from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
 from fogros2.vpn import addresses, STAYS, Vpn
-from fogros2.vpn.addresses import dds_ports, DISCOVERY_GROUP
+from fogros2.vpn.addresses import DISCOVERY_GROUP
 
 #: Programs that each host needs, and their Debian and Ubuntu packages. ``wireguard-go`` is only
 #: for kernels without the module.
@@ -68,17 +68,14 @@ class WireGuard(Vpn):
     """
     Commands for a WireGuard interface; they need root and the programs of ``PACKAGES``.
 
-    :param domain: ROS_DOMAIN_ID, whose DDS ports an interface with a firewall admits; the DDS
-        plugin checks that there are such ports.
-    :param ports: further ranges of UDP ports to admit, as (first, last).
+    :param ports: ranges of UDP ports that an interface with a firewall admits, as (first, last).
     :param asked: IPv4 addresses that the user configured for the robot's nodes to ask.
     """
 
     def __init__(
-        self, domain: int = 0, ports: Sequence[tuple[int, int]] = (), asked: Sequence[str] = (),
+        self, ports: Sequence[tuple[int, int]] = (), asked: Sequence[str] = (),
     ) -> None:
-        self.domain = domain
-        self.ports = (dds_ports(domain), *ports)
+        self.ports = tuple(ports)
         self.asked = tuple(asked)
 
     def keys(self, interface: VpnInterface) -> Command:
@@ -255,13 +252,13 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
     if interface.firewall:
         rules += [
             # an address of the LAN is known if it sends DDS from where an answer would go
-            f'    {outside} udp dport {_set(ports)} {RTPS} fib saddr . iif oif exists'
-            ' update @lan { ip saddr }',
+            f'    {outside} {_to(ports)} {RTPS} fib saddr . iif oif exists update @lan {{ ip saddr }}'
+            if ports else '',
             f'    iifname != "{name}" accept',
             # a peer may send to any address of this computer, a LAN's included
             f'    ip daddr != {destinations} drop',
             '    ct state established,related accept',
-            f'    udp dport {_set(ports)} accept',
+            f'    {_to(ports)} accept' if ports else '',
             '    icmp type echo-request accept',
             '    drop',
             '  }',
@@ -313,10 +310,10 @@ def _confine(
     if interface.firewall:
         rules = [
             'chain confined {',
-            f'udp dport != {_set(ports)} drop',
-            'oifname "lo" accept',
-            f'ip daddr {{ {", ".join([DISCOVERY_GROUP, group, *addressees])} }} accept',
-            'ip daddr @lan accept',
+            *([f'{_to(ports, "!=")} drop',
+               'oifname "lo" accept',
+               f'ip daddr {{ {", ".join([DISCOVERY_GROUP, group, *addressees])} }} accept',
+               'ip daddr @lan accept'] if ports else []),
             'drop',
             '}',
             'chain output {',
@@ -377,8 +374,10 @@ def _outside(interface: VpnInterface) -> str:
     return f'iifname != {{ "lo", "{_name(interface)}" }}'
 
 
-def _set(ports: Sequence[tuple[int, int]]) -> str:
-    return f'{{ {", ".join(f"{first}-{last}" for first, last in ports)} }}'
+def _to(ports: Sequence[tuple[int, int]], how: str = '') -> str:
+    """Return what matches UDP packets to ports."""
+    ranges = ', '.join(f'{first}-{last}' for first, last in ports)
+    return f'udp dport {how} {{ {ranges} }}' if how else f'udp dport {{ {ranges} }}'
 
 
 def _link(interface: VpnInterface) -> _Step:

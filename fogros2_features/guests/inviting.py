@@ -15,7 +15,6 @@ from fogros2.model import host_port
 from fogros2.shell import multiplexer
 from fogros2.store import Record, Store
 from fogros2.vpn import addresses, Vpn
-from fogros2.vpn.addresses import dds_ports
 from fogros2_features.guests import invitation, listing, membership, network
 from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry
@@ -54,7 +53,7 @@ def invite(
         guests = listing.ask(shell, record, 'admit', {
             'key': public, 'label': label, 'seconds': seconds, 'secret': secret,
             'left': (record.armed or time.time()) + record.spec.lifetime - time.time(),
-            'rules': network.rules(record.vpn, (dds_ports(domain), *dds.ports)),
+            'rules': network.rules(record.vpn, dds.ports),
             'door': door(record),
             'patience': max(PATIENCE, record.spec.robot_timeout),
             'addresses': [str(address) for address in network.guests(record.vpn.network)

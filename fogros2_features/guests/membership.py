@@ -73,8 +73,7 @@ def join(
         _check_free(invitation)
     interface = dataclasses.replace(other.own, port=addresses.choose_port(environment))
     vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
-        domain=invitation.domain, ports=vendor.ports,
-        asked=addresses_of(vendor.asked(environment)))
+        ports=vendor.ports, asked=addresses_of(vendor.asked(environment)))
     private = base64.b64encode(key).decode()
     store.launch_folder(invitation.number)
     try:

@@ -178,7 +178,7 @@ def own_address(value: object, network: str) -> str:
 #: Fields of a request, by its verb.
 FIELDS = {
     'check': set[str](), 'keys': {'name', 'pid', 'private'},
-    'up': {'name', 'network', 'address', 'port', 'domain', 'ports', 'asked', 'peers'},
+    'up': {'name', 'network', 'address', 'port', 'ports', 'asked', 'peers'},
     'peers': {'name', 'peers'}, 'repair': {'name', 'peers'}, 'status': {'name'}, 'down': {'name'}}
 
 
@@ -220,7 +220,6 @@ class Record:
     network: str = ''
     address: str = '127.0.0.1'
     port: int = 0
-    domain: int = 0
     ports: tuple[tuple[int, int], ...] = ()
     asked: tuple[str, ...] = ()
 
@@ -233,7 +232,7 @@ class Record:
 
     def vpn(self) -> WireGuard:
         """Return what knows the commands."""
-        return WireGuard(domain=self.domain, ports=self.ports, asked=self.asked)
+        return WireGuard(ports=self.ports, asked=self.asked)
 
     def alive(self) -> bool:
         """Return whether the launch goes on: another process may have its id by now."""
@@ -430,14 +429,12 @@ def up(request: Mapping[str, Any], uid: int) -> None:
     """Bring an interface up, in a network that nobody has."""
     network = network_of(request['network'], pools())
     port = number(request['port'], FIRST_PORT, 65535, 'the port')
-    domain = number(request['domain'], 0, 232, 'the ROS domain')
     ports, asked = ports_of(request['ports']), asked_of(request['asked'])
     address = own_address(request['address'], network)
     peers = peers_of(request['peers'], network, address)
     with own(request['name'], uid) as before:
         record = dataclasses.replace(
-            before, network=network, address=address, port=port, domain=domain, ports=ports,
-            asked=asked)
+            before, network=network, address=address, port=port, ports=ports, asked=asked)
         if before.network and before != record:
             raise Refused(f'{record.name} is up already, with other settings')
         with locked(RECORDS):

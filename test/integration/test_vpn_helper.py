@@ -143,7 +143,7 @@ def interface(copy: Copy, user: str, name: str, network: str, port: int) -> Iter
     made = copy.ask(user, 'keys', name=name, pid=copy.launch(user))
     assert made.returncode == 0, made.stderr
     try:
-        up = copy.ask(user, 'up', name=name, network=network, port=port, domain=0, ports=[],
+        up = copy.ask(user, 'up', name=name, network=network, port=port, ports=[],
                       asked=[], peers=[])
         assert up.returncode == 0, up.stderr
         yield made.stdout.strip()
@@ -189,7 +189,7 @@ def test_interfaces_of_others_are_refused(copy: Copy) -> None:
             for verb, more in (
                     ('keys', {'pid': pid}), ('down', {}), ('status', {}),
                     ('peers', {'peers': []}), ('repair', {'peers': []}),
-                    ('up', {'network': '198.18.8.0/24', 'port': 5000, 'domain': 0, 'ports': [],
+                    ('up', {'network': '198.18.8.0/24', 'port': 5000, 'ports': [],
                             'asked': [], 'peers': []})):
                 said = copy.ask('fogbob', verb, name=NAME, **more)
                 assert said.returncode == 2 and 'another user' in said.stderr, (verb, said)
@@ -203,10 +203,10 @@ def test_interfaces_of_others_are_refused(copy: Copy) -> None:
             for network, why in (('198.18.7.0/24', 'in use'), ('127.0.0.0/24', 'not in'),
                                  ('10.0.0.0/24', 'not in'), ('0.0.0.0/0', '24 bits')):
                 said = copy.ask('fogbob', 'up', name='fogbbbbbb', network=network, port=5000,
-                                domain=0, ports=[], asked=[], peers=[])
+                                ports=[], asked=[], peers=[])
                 assert said.returncode == 2 and why in said.stderr, said
             said = copy.ask('fogbob', 'up', name='fogbbbbbb', network='198.18.9.0/24', port=53,
-                            domain=0, ports=[], asked=[], peers=[])
+                            ports=[], asked=[], peers=[])
             assert said.returncode == 2 and '1024' in said.stderr
             assert copy.ask('fogbob', 'down', name='fogbbbbbb').returncode == 0
             # somebody else's process would keep it for ever

@@ -354,7 +354,7 @@ def helper() -> ModuleType:
 def _vpn_helper() -> Iterator[Target]:
     vpn: Any = helper()
     up = {'name': 'fogabc123', 'network': '198.18.7.0/24', 'address': '198.18.7.1',
-          'port': 40000, 'domain': 0, 'asked': [], 'ports': [[7000, 7119]],
+          'port': 40000, 'asked': [], 'ports': [[7000, 7119]],
           'peers': [{'key': KEY, 'address': '198.18.7.2', 'endpoint': 'host:51820'}]}
 
     def read(data: bytes) -> None:
@@ -367,7 +367,7 @@ def _vpn_helper() -> Iterator[Target]:
         own = vpn.own_address(request.get('address', '198.18.7.1'), network)
         peers = vpn.peers_of(request.get('peers', []), network, own)
         record = vpn.Record(request.get('name', 'fogabc123'), 0, 1, 1, network=network,
-                            address=own, port=40000, domain=0, ports=ports)
+                            address=own, port=40000, ports=ports)
         for command in record.vpn().up(record.interface(), peers):
             assert '\0' not in ''.join(command.argv)
     yield Target([b'up ' + json.dumps(up).encode(), b'down {"name": "fogabc123"}',

@@ -15,7 +15,6 @@ from typing import Any
 import pytest
 
 from fogros2.model import Command, Peer, VpnInterface
-from fogros2.vpn.addresses import dds_ports
 from fogros2.waiting import wait_until
 from fogros2_features.guests import listing, network
 from rigs.second_robot import NAT
@@ -65,8 +64,7 @@ class Guest:
         self.lab.run('machine', listing.install(interface))
         (own,) = self.ask('admit', key=self.key, label='second', seconds=seconds,
                           patience=patience, left=3600.0, secret='5a' * 32, addresses=[GUEST],
-                          rules=network.rules(
-                              interface, [dds_ports(dds.domain), *dds.ports]))
+                          rules=network.rules(interface, dds.ports))
         assert own['address'] == GUEST and own['heard'] is None
 
     def up(self, *, answered: bool = True) -> None:

@@ -18,6 +18,7 @@ import subprocess
 import pytest
 
 from fogros2 import process
+from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.model import Command, VpnInterface
 from fogros2.vpn.wireguard import WireGuard
 from rigs.stranger import NOBODY
@@ -28,7 +29,7 @@ TOP = next((path for path in (Path('/sys/fs/cgroup'), Path('/sys/fs/cgroup/unifi
             if (path / 'cgroup.procs').exists()), None)
 #: `ip netns exec` hides the control groups.
 ENTER = 'mount -t cgroup2 cgroup2 /sys/fs/cgroup; exec "$@"'
-VPN = WireGuard()
+VPN = WireGuard(CycloneDds().ports)
 
 
 def sudo(*words: str, check: bool = True) -> str:

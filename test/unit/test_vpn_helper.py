@@ -185,7 +185,7 @@ PEERS = [Peer('first', KEY, '198.18.7.2', '203.0.113.9:51820'), Peer('b', OTHER,
 
 
 def test_what_is_asked_of_it_is_what_it_takes() -> None:
-    plugin = helped.HelpedWireGuard(domain=3, ports=((7000, 7119),), asked=['192.0.2.7'])
+    plugin = helped.HelpedWireGuard(((8150, 8399), (7000, 7119)), ['192.0.2.7'])
     made = interface(helped.key_file('fog0a1b2c'))
     commands = [plugin.keys(made), *plugin.up(made, []), *plugin.peers(made, PEERS),
                 *plugin.repair(made, PEERS), plugin.status(made), *plugin.down(made)]
@@ -195,7 +195,7 @@ def test_what_is_asked_of_it_is_what_it_takes() -> None:
         if verb == 'up':
             record = vpn.Record('fog0a1b2c', 1000, 1, 1, vpn.network_of(
                 request['network'], vpn.pools()), vpn.own_address(
-                    request['address'], NETWORK), request['port'], request['domain'],
+                    request['address'], NETWORK), request['port'],
                 vpn.ports_of(request['ports']), vpn.asked_of(request['asked']))
             assert record.interface() == made
             assert record.vpn().ports == plugin.ports

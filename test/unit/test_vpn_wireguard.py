@@ -10,9 +10,11 @@ import subprocess
 
 import pytest
 
+from fogros2.dds.cyclonedds import CycloneDds
+from fogros2.dds.fastdds import FastDds
+from fogros2.dds.zenoh import Zenoh
 from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
-from fogros2.vpn.addresses import dds_ports
 from fogros2.vpn.wireguard import WireGuard
 
 KEY = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
@@ -71,7 +73,7 @@ def test_filter_exists_before_and_after_the_interface() -> None:
 
 def test_robot_sends_to_the_hosts_that_the_user_names() -> None:
     robot = dataclasses.replace(ROBOT, process='77')
-    text = script(*WireGuard(asked=['192.0.2.7']).up(robot, []))
+    text = script(*WireGuard(FastDds().ports, ['192.0.2.7']).up(robot, []))
     assert 'ip daddr { 239.255.0.1, 239.18.7.1, 192.0.2.7 } accept' in text
     assert 'pid=77\n' in text
 
@@ -101,11 +103,16 @@ def test_group_with_an_odd_name_enters_no_rule(tmp_path: Path, odd: str) -> None
 
 @pytest.mark.parametrize('domain, ports', [(0, '7400-7649'), (5, '8650-8899')])
 def test_the_filter_lets_in_the_ports_of_the_ros_domain(domain: int, ports: str) -> None:
-    text = script(*WireGuard(domain).up(ROBOT, []))
+    text = script(*WireGuard(CycloneDds(domain).ports).up(ROBOT, []))
     assert f'udp dport {{ {ports} }} accept' in text
-    text = next(WireGuard(domain, [(7000, 7119)]).up(ROBOT, [])).argv[-1]
+    text = next(WireGuard(FastDds(domain).ports).up(ROBOT, [])).argv[-1]
     assert f'udp dport {{ {ports}, 7000-7119 }} accept' in text
-    assert '-'.join(map(str, dds_ports(domain))) == ports
+
+
+def test_a_launch_with_zenoh_lets_nothing_in() -> None:
+    text = script(*WireGuard(Zenoh(domain=3).ports).up(
+        dataclasses.replace(ROBOT, process='1'), []))
+    assert 'dport' not in text and 'icmp type echo-request accept' in text
 
 
 def test_peers_get_their_address_and_group_one_the_common_one() -> None:
