@@ -13,8 +13,10 @@ import sys
 import pytest
 
 from fogros2 import process
+from fogros2.dds.zenoh import Zenoh
 from fogros2.errors import CommandError
 from fogros2.model import Command, Peer
+from fogros2.vpn.wireguard import WireGuard
 from fogros2.waiting import wait_until
 from rigs.vpn_lab import Lab, MACHINE, opened, ROBOT
 
