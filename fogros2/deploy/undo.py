@@ -180,7 +180,7 @@ def close_ports(site: Site) -> tuple[Made, ...]:
     """
     Close the ports of a launch that died; return the rest of what it has made.
 
-    The machine's agent undoes the rest by itself.
+    The machine's agent undoes the rest by itself, of a kept machine with its next launch.
 
     :raises FogError: one may still be open; the others are closed.
     """

@@ -13,7 +13,7 @@ from fogros2.model import NodeSpec
 def configure(context: Context, job: MachineJob) -> dict[str, str]:
     """Write the DDS configuration on the machine; return the variables that nodes need."""
     vendor, interface = context.dds, job.interface
-    # the robot finds a machine by multicast; machines find each other by unicast to peers
+    # how machines find each other depends on the middleware
     text = vendor.render(vendor.machine_interfaces(
         interface.address if vendor.by_address else interface.name), context.others())
     # users inside containers read it too; the folder's mode excludes other users
