@@ -72,9 +72,7 @@ class WireGuard(Vpn):
     :param asked: IPv4 addresses that the user configured for the robot's nodes to ask.
     """
 
-    def __init__(
-        self, ports: Sequence[tuple[int, int]] = (), asked: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, ports: Sequence[tuple[int, int]] = (), asked: Sequence[str] = ()) -> None:
         self.ports = tuple(ports)
         self.asked = tuple(asked)
 
@@ -310,7 +308,7 @@ def _confine(
     if interface.firewall:
         rules = [
             'chain confined {',
-            *([f'{_to(ports, "!=")} drop',
+            *([f'{_to(ports, "!= ")} drop',
                'oifname "lo" accept',
                f'ip daddr {{ {", ".join([DISCOVERY_GROUP, group, *addressees])} }} accept',
                'ip daddr @lan accept'] if ports else []),
@@ -377,7 +375,7 @@ def _outside(interface: VpnInterface) -> str:
 def _to(ports: Sequence[tuple[int, int]], how: str = '') -> str:
     """Return what matches UDP packets to ports."""
     ranges = ', '.join(f'{first}-{last}' for first, last in ports)
-    return f'udp dport {how} {{ {ranges} }}' if how else f'udp dport {{ {ranges} }}'
+    return f'udp dport {how}{{ {ranges} }}'
 
 
 def _link(interface: VpnInterface) -> _Step:
