@@ -38,8 +38,9 @@ LARGEST, OPEN = 1 << 28, 4
 QUICK, SLOW = 0.004, 0.1
 #: Slices in the link's queue above which fewer are sent; while one waits, the link has no pause.
 QUEUED = 1.25
-#: Fine slices: at least so many of a message, but of half of LEAST bytes or more, and in flight.
-MANY, AT_LEAST = 8, 2
+#: Fine slices: at least so many of a message, if they do not fit a datagram of Fast DDS's, whose
+#: bytes this is without headers; and slices in flight.
+MANY, DATAGRAM, AT_LEAST = 8, 8192, 2
 #: Factor from one size of slices to the next.
 STEP = 4
 #: Sender's identity, number of the slice, size of the message, place of the slice in it.
@@ -111,7 +112,7 @@ class SliceSender:
         # all of a size, as the pace compares their times
         count = -(-len(data) // self._size)
         if self._fine:
-            count = max(count, min(MANY, len(data) // (LEAST // 2)))
+            count = max(count, min(MANY, -(-len(data) // DATAGRAM)))
         size = -(-len(data) // count)
         with self._news:
             self._pacemaker = min
