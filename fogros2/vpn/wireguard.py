@@ -250,8 +250,8 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
     if interface.firewall:
         rules += [
             # an address of the LAN is known if it sends DDS from where an answer would go
-            f'    {outside} {_to(ports)} {RTPS} fib saddr . iif oif exists update @lan {{ ip saddr }}'
-            if ports else '',
+            f'    {outside} {_to(ports)} {RTPS} fib saddr . iif oif exists'
+            ' update @lan { ip saddr }' if ports else '',
             f'    iifname != "{name}" accept',
             # a peer may send to any address of this computer, a LAN's included
             f'    ip daddr != {destinations} drop',

@@ -42,7 +42,7 @@ _OUTER = re.compile(r'/(home|media|mnt|opt|root|srv|var)?|/home/[^/]+|/opt/ros(/
 
 # $1 name, $2 path, $3 login user, $4 the launch's interface, $5 folder; then paths of a device.
 # A folder and its path have locks, which a process holds as long as the launch's VPN is there: it
-# goes with the next launch at the latest if this one was killed. A disk is attached to one machine.
+# goes with the next launch at the latest if this one was killed. One machine has a disk.
 _MOUNT = """\
 path=$2 user=$3 link=$4 folder=$5 mark=/run/$4.volume-$1
 shift 5
