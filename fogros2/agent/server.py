@@ -570,6 +570,9 @@ class Agent:
         launch, has = request.get('launch'), self.claimed or self.config['launch']
         if launch and has and launch != has:
             return {}
+        ends = request.get('exit', False)
+        if not isinstance(ends, bool):
+            raise Refused("'exit' is true or false")
         self.config.update(checked({'on_exit': request.get('on_exit', self.config['on_exit'])}))
         self.claimed = ''
         self.released = True
@@ -581,14 +584,14 @@ class Agent:
         reply = client.reply_later(request.get('id'))
 
         def stopped() -> None:
-            if request.get('exit'):
+            if ends:
                 reply({})
                 self.watches.take_down(self._leave_for_good)
             else:
                 # end the health check first: it would recreate the VPN interface
                 self.watches.take_down(lambda: reply({}))
 
-        if request.get('exit'):
+        if ends:
             self._hurry()
         self.nodes.stop_all(stopped)
         return None

@@ -209,6 +209,7 @@ BAD_REQUESTS = [
     (b'{"command": "start", "nodes": 7}\n', "'nodes' is a list"),
     (b'{"command": "start", "nodes": [{"id": 1}]}\n', "has an 'id' and a 'name'"),
     (b'{"command": "stop", "nodes": ["x"]}\n', "no node 'x'"),
+    (b'{"command": "release", "exit": "keep"}\n', "'exit' is true or false"),
     (b'{"command": "configure", "lifetime": -1}\n', "'lifetime' has to be above 0"),
     (b'{"command": "configure", "environment": {"A=B": "x"}}\n', "can't set"),
     (b'{"command": "watch", "what": "x", "argv": "ls"}\n', 'no list of words'),

@@ -28,7 +28,7 @@ CLOUDS = ('aws',)
 
 class Tutorial:
     """
-    The tutorial's files and commands.
+    The tutorial's launch files and commands.
 
     :param name: in place of ``first``.
     """
@@ -36,18 +36,20 @@ class Tutorial:
     def __init__(self, name: str, folder: Path) -> None:
         text = re.sub(r'\bfirst\b(?!\.launch)', name, PAGE.read_text())
         blocks = re.findall(r'```(\w+)\n(.*?)```', text, re.DOTALL)
-        self.files = []
-        for number, source in enumerate(text for kind, text in blocks if kind == 'python'):
-            path = folder / f'{number}.launch.py'
-            path.write_text(source)
-            self.files.append(str(path))
+        (source,) = [block for kind, block in blocks if kind == 'python']
+        (machine,) = re.findall(r'`(AWSCloudInstance\(.*?\))`', text)
+        (container,) = re.findall(r'machine = (.*)', source)
+        self.file, self.cloud_file = str(folder / FILE), str(folder / 'cloud.launch.py')
+        Path(self.file).write_text(source)
+        Path(self.cloud_file).write_text(source.replace(container, machine).replace(
+            'ContainerInstance', 'AWSCloudInstance'))
         self.commands = [line[2:] for kind, block in blocks if kind == 'console'
                          for line in block.splitlines()]
 
     def words(self, pattern: str) -> list[str]:
         """Return the words after ``ros2`` of the one command that looks so."""
         (line,) = [line for line in self.commands if re.fullmatch(pattern, line)]
-        return [self.files[0] if word == f'./{FILE}' else word for word in shlex.split(line)[1:]]
+        return [self.file if word == f'./{FILE}' else word for word in shlex.split(line)[1:]]
 
 
 def activated(line: str, home: Path) -> dict[str, str]:
@@ -90,7 +92,7 @@ def test_the_same_on_ec2(tutorial, robot, name):
     for verb, expected in (('regions', 'us-east-1'), ('price .*', 't3')):
         said = robot.ros2(*tutorial.words(f'ros2 fog {verb}'))
         assert said.returncode == 0 and expected in said.stdout, said
-    for launch in (tutorial.words('ros2 launch .* --machine .*')[1:], [tutorial.files[1]]):
+    for launch in (tutorial.words('ros2 launch .* --machine .*')[1:], [tutorial.cloud_file]):
         run = robot.launch(*launch)
         run.wait_for(f'I heard: [Hello World from {name} ')
         listed = robot.ros2('fog', 'list').stdout
