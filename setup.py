@@ -135,7 +135,6 @@ setup(
             'gcp = fogros2.provider.gcp.login:configured',
             'joined = fogros2.provider:known_by_records',
             'kubernetes = fogros2.kubernetes_client:configured',
-            'ssh = fogros2.provider:known_by_records',
         ],
         'fogros2.listed': [
             'volumes = fogros2_features.volumes.listing:listed',

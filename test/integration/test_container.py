@@ -67,7 +67,7 @@ class TestContainerProvider(ProviderContract):
         cloud.provider.start(first.id)
         again = cloud.reached(first.id)
         assert again.id == first.id
-        assert again.shell.host_key == first.shell.host_key
+        assert again.endpoint.host_key == first.endpoint.host_key
         with cloud.shell(again) as shell:
             assert said(shell, 'cat', 'file') == 'kept'
             said(shell, 'ls', '/usr/local/bin/kept', '/var/lib/kept', '/etc/kept')
@@ -312,7 +312,7 @@ def test_an_image_gets_user_key_and_server_at_boot(image, cloud):
     cloud.provider.start(machine.id)
     assert cloud.traces().count(packet_filter) == 2
     again = cloud.reached(machine.id)
-    assert again.shell.host_key == machine.endpoint.host_key
+    assert again.endpoint.host_key == machine.endpoint.host_key
     with cloud.shell(again) as shell:
         assert said(shell, 'cat', 'file') == 'kept'
 
