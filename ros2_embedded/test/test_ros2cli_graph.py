@@ -58,10 +58,10 @@ def no_daemon(command):
 def ros2(commands):
     """Return what runs a command of ros2 and returns its output."""
     with commands() as answer:
-        def run(*command, status=0):
+        def run(*command, status=0, shows=''):
             for _ in range(3):  # a busy computer may discover nothing within the command's time
                 code, output = answer(*no_daemon(command))
-                if code == status:
+                if code == status and shows in output:
                     return output
             raise AssertionError(output)
 
@@ -88,7 +88,7 @@ def stopped(*command, until, by=signal.SIGINT):
 
 
 def test_topic_list_and_info_show_topics(worker, ros2):
-    listed = ros2('topic', 'list', '-t').splitlines()
+    listed = ros2('topic', 'list', '-t', shows='/cell/chatter').splitlines()
     assert '/cell/chatter [std_msgs/msg/String]' in listed and '/rosout [' in str(listed)
     info = ros2('topic', 'info', '/cell/chatter')
     assert info == 'Type: std_msgs/msg/String\nPublisher count: 1\nSubscription count: 0\n'
