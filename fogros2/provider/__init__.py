@@ -118,7 +118,7 @@ def made_without(machine: str, volume: str) -> NameTaken:
 
 
 def known_by_records() -> bool:
-    """Return False, in the place of :meth:`Provider.configured`: no search finds more."""
+    """Return False for :meth:`Provider.configured`: records alone know the machines."""
     return False
 
 

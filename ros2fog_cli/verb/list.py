@@ -49,7 +49,8 @@ class ListVerb(VerbExtension):
             width=table.terminal_width(),
             optional=('KIND', 'PLACE', 'ADDRESS', 'COST', 'AGE', 'COST/H', 'PROVIDER')))
         for entry in entries:
-            if entry.record is not None and entry.record.notes:  # or no feature need be loaded
+            # all features are loaded for their lines, which takes long
+            if entry.record is not None and entry.record.notes:
                 for key, line in machines.notes().items():
                     if line and entry.notes[key]:
                         print(f'{entry.name}:',
