@@ -95,8 +95,10 @@ def note(notes, name):
     (PathSubstitution(Path('/a')) / PathJoinSubstitution(['b', 'c']), '/a/b/c'),
     (ThisLaunchFileDir() / 'x.py', '/launch/x.py'),
     (FindPackageShare(['p', 'kg']) / 'launch' / Path('x.py'), '{}/share/pkg/launch/x.py'),
-    # launch of later distributions takes a list for one part of the path, Jazzy's does not
-    (PathJoinSubstitution(['/a', [A, '.yaml']]), '/a/1/.yaml'),
+    (PathJoinSubstitution(['/a', [A, '.yaml']]), '/a/1.yaml'),
+    (PathSubstitution('a') / ('m_', A, '.x'), 'a/m_1.x'),
+    # one part each, unlike in a part of PathJoinSubstitution
+    (PathSubstitution(['/a', A]), '/a/1'),
 ])
 def test_slash_joins_paths(package, path, text):
     context = LaunchContext()

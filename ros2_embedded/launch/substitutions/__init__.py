@@ -135,27 +135,26 @@ class LocalSubstitution(Substitution):
 
 
 class PathJoinSubstitution(Substitution):
-    """Parts of a path, joined; ``/`` adds one more."""
+    """Parts of a path, joined; ``/`` adds one more. A part is a substitution or a list of them."""
 
     def __init__(self, substitutions: Iterable[SomeSubstitutionsType]) -> None:
-        self.substitutions = [
-            sub for part in substitutions for sub in normalize_to_list_of_substitutions(part)]
+        self.substitutions = [normalize_to_list_of_substitutions(part) for part in substitutions]
 
     def __truediv__(self, part: SomeSubstitutionsType) -> PathJoinSubstitution:
         return PathJoinSubstitution([self, part])
 
     def describe(self) -> str:
-        return f"PathJoin('{described(self.substitutions)}')"
+        return f"PathJoin('{' + '.join(map(described, self.substitutions))}')"
 
     def perform(self, context: LaunchContext) -> str:
-        return os.path.join(*(sub.perform(context) for sub in self.substitutions))
+        return os.path.join(*(perform_substitutions(context, part) for part in self.substitutions))
 
 
 class PathSubstitution(PathJoinSubstitution):
     """A path to which ``/`` adds parts; base of substitutions that find a directory."""
 
     def __init__(self, path: SomeSubstitutionsType) -> None:
-        super().__init__([path])
+        super().__init__(normalize_to_list_of_substitutions(path))
 
 
 @expose_substitution('filename')
