@@ -75,13 +75,14 @@ class ParameterFile:
         path = Path(perform_substitutions(context, self.__param_file))
         if self.allow_substs:
             import yaml
-            text = perform_substitutions(context, parse_substitution(path.read_text()))
+            text = perform_substitutions(context, parse_substitution(path.read_text('utf-8')))
             try:
                 yaml.safe_load(text)
             except yaml.YAMLError as exc:
                 raise SubstitutionFailure(
                     'The substituted parameter file is not a valid yaml file') from exc
-            with NamedTemporaryFile(mode='w', prefix='launch_params_', delete=False) as file:
+            with NamedTemporaryFile(
+                    mode='w', prefix='launch_params_', delete=False, encoding='utf-8') as file:
                 path = Path(file.name)
                 file.write(text)
         self.__evaluated = path

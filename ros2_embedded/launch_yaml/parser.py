@@ -22,7 +22,7 @@ class Parser(frontend.Parser):
         :raises RuntimeError: for a file with more than one root, or none.
         """
         if not hasattr(file, 'read'):
-            with open(file) as opened:
+            with open(file, encoding='utf-8') as opened:
                 return cls.load(opened)
         tree = load_launch_file(file)
         if not isinstance(tree, dict) or len(tree) != 1:

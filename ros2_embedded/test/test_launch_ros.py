@@ -182,6 +182,45 @@ def test_parameter_dictionary_becomes_a_file():
         'nested.7x': 2, 'nothing': ''}}}
 
 
+#: Launch files whose node has a parameter that is no ASCII, by their names' end.
+ACCENTED = {
+    'py': """
+from launch import LaunchDescription
+from launch_ros.actions import Node
+def generate_launch_description():
+    return LaunchDescription([
+        Node(package='pkg', executable='exe', parameters=[{'p': 'caf\xe9'}])])
+""",
+    'xml': '<launch><node pkg="pkg" exec="exe"><param name="p" value="caf\xe9"/></node></launch>',
+    'yaml': 'launch: [node: {pkg: pkg, exec: exe, param: [{name: p, value: caf\xe9}]}]',
+    'file.xml': '<launch><node pkg="pkg" exec="exe"><param from="$(dirname)/p.yaml" '
+                'allow_substs="true"/></node></launch>'}
+RUN = """
+import sys
+from launch import LaunchDescription, LaunchService
+from launch.actions import IncludeLaunchDescription
+service = LaunchService(noninteractive=True)
+service.include_launch_description(LaunchDescription([IncludeLaunchDescription(sys.argv[1])]))
+sys.exit(service.run())
+"""
+
+
+@pytest.mark.parametrize('kind', ['py', *(pytest.param(kind, marks=pytest.mark.skipif(
+    not importlib.util.find_spec('embedded_default'), reason='ROS 2 reads files by the locale'))
+    for kind in ('xml', 'yaml', 'file.xml'))])
+def test_text_is_utf_8_in_any_locale(tmp_path, package, kind):
+    (package / 'lib/pkg/exe').write_text(
+        f'#!/bin/sh\nfor word; do [ ! -f "$word" ] || cat "$word" >{tmp_path}/seen; done\n')
+    (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {p: caf\xe9}}', 'utf-8')
+    file = tmp_path / f'a.launch.{kind}'
+    file.write_text(ACCENTED[kind], 'utf-8')
+    # else Python takes UTF-8 in place of ASCII, which is this locale's encoding
+    subprocess.run([sys.executable, '-c', RUN, file], check=True, env={
+        **os.environ, 'LC_ALL': 'C', 'PYTHONUTF8': '0', 'PYTHONCOERCECLOCALE': '0'})
+    seen = yaml.safe_load((tmp_path / 'seen').read_text('utf-8'))
+    assert seen == {'/**': {'ros__parameters': {'p': 'caf\xe9'}}}
+
+
 def test_parameter_file_is_passed_or_substituted(tmp_path, capsys):
     file = tmp_path / 'p.yaml'
     file.write_text('/**: {ros__parameters: {a: $(var i)}}')

@@ -92,7 +92,7 @@ class Parser:
         :raises InvalidFrontendLaunchFileError: if none could.
         """
         if isinstance(file, (str, bytes, os.PathLike)):
-            with open(file) as opened:
+            with open(file, encoding='utf-8') as opened:
                 return cls.load(opened)
         name = getattr(file, 'name', '')
         errors: list[Exception] = []

@@ -122,7 +122,8 @@ class Node(ExecuteProcess):
 
     def _create_params_file_from_dict(self, params: dict[str, Any]) -> str:
         node = self.node_name if self.is_node_name_fully_specified() else '/**'
-        with NamedTemporaryFile(mode='w', prefix='launch_params_', delete=False) as file:
+        with NamedTemporaryFile(
+                mode='w', prefix='launch_params_', delete=False, encoding='utf-8') as file:
             file.write(dump({node: {'ros__parameters': params}}))
         # not sooner: a node that is started again reads it again
         atexit.register(pathlib.Path(file.name).unlink, missing_ok=True)

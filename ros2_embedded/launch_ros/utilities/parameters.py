@@ -184,7 +184,7 @@ def _matches(pattern: str, node: str) -> bool:
 
 def _read(path: pathlib.Path, node: str) -> list[dict[str, Any]]:
     """Return the parts of a parameter file that are for a node; a later part wins, as in rcl."""
-    content = load(path.read_text()) or {}
+    content = load(path.read_text('utf-8')) or {}
     nodes = list(_nodes_of(content))
     return [values or {} for pattern, values in nodes if _matches(pattern, node)] if nodes else [
         content]
