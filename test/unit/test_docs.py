@@ -112,7 +112,7 @@ def test_command_of_a_page_is_accepted(line, monkeypatch):
         # other people's programs, which take an account, a network or a workspace
         assert words[0] in ('.', 'aws', 'colcon', 'docker', 'echo', 'git', 'kubectl', 'npm',
                             'rosdep', 'source', 'ssh', 'sudo', 'PIP_BREAK_SYSTEM_PACKAGES=1',
-                            'python'), line
+                            'python', 'python3'), line
 
 
 def test_extras_are_spelt_as_every_pip_takes_them():

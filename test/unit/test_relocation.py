@@ -123,6 +123,14 @@ def test_interrupted_relocation_leaves_the_library_whole(tmp_path: Path) -> None
     assert relocate(tmp_path, site, PATCHELF) == 1
 
 
+def test_relocation_outside_an_environment_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sysconfig, 'get_path', lambda name: '/usr/local')
+    with pytest.raises(SystemExit) as end:
+        relocation.main()
+    text = str(end.value.code)  # exit status 1
+    assert 'virtual environment' in text and len(text.splitlines()) == 1
+
+
 def test_relocation_program_ends_with_one_error(tmp_path: Path) -> None:
     subprocess.run([sys.executable, '-m', 'venv', '--without-pip', tmp_path / 'env'], check=True)
     python = tmp_path / 'env/bin/python'
