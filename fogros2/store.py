@@ -92,10 +92,10 @@ def check_name(name: str) -> str:
 def process_start(pid: int) -> Optional[int]:
     """Return a process's start time in clock ticks since boot, None without such a process."""
     try:
-        stat = Path(f'/proc/{pid}/stat').read_text()
+        stat = Path(f'/proc/{pid}/stat').read_text(errors='replace')
     except OSError:
         return None
-    # the command's name, in parentheses, may contain spaces
+    # the command's name, in parentheses, may contain spaces and bytes that are no text
     fields = stat.rpartition(')')[2].split()
     return None if fields[0] == 'Z' else int(fields[19])
 

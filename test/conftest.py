@@ -77,7 +77,8 @@ def remove_shared_memory(folder: Path = Path('/dev/shm')) -> None:
     used: set[str] = set()
     for maps in Path('/proc').glob('[0-9]*/maps'):
         with contextlib.suppress(OSError):
-            used.update(re.findall(r'/(fastrtps_\w+)$', maps.read_text(), re.MULTILINE))
+            used.update(re.findall(
+                r'/(fastrtps_\w+)$', maps.read_text(errors='replace'), re.MULTILINE))
     for path in folder.glob('*fastrtps_*'):
         name = re.sub(r'^sem\.|_mutex$|_el$', '', path.name)
         with contextlib.suppress(OSError):
@@ -156,6 +157,16 @@ def jammy(tmp_path: Path) -> dict[str, str]:
         "def get_os_release():\n    return {'RELEASE': '22.04'}\n")
     before = os.environ.get('PYTHONPATH')
     return {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, (str(modules), before)))}
+
+
+@pytest.fixture
+def name_of_no_text() -> Iterator[None]:
+    """Give this process a name that is no UTF-8, as a longer name has whose end was cut off."""
+    name = Path('/proc/self/comm')
+    before = name.read_bytes()
+    name.write_bytes(b'caf\xc3')
+    yield
+    name.write_bytes(before)
 
 
 @pytest.fixture

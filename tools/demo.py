@@ -159,7 +159,7 @@ def traces() -> Iterator[str]:
     for entry in Path('/proc').iterdir():
         if entry.name.isdigit():
             try:
-                words = (entry / 'cmdline').read_bytes().replace(b'\0', b' ').decode().strip()
+                words = (entry / 'cmdline').read_text(errors='replace').replace('\0', ' ').strip()
             except OSError:
                 continue
             if words and int(entry.name) != os.getpid():

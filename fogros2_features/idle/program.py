@@ -84,7 +84,8 @@ class Idle:
 def _fields(pid: str) -> list[str]:
     """Return the fields of /proc/PID/stat after the name, none if the process has ended."""
     with contextlib.suppress(OSError):
-        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+        # the name may contain any bytes
+        return Path(f'/proc/{pid}/stat').read_text(errors='replace').rpartition(')')[2].split()
     return []
 
 

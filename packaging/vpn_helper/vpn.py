@@ -348,11 +348,13 @@ def begun(pid: int, uid: Optional[int] = None) -> int:
     :raises Refused: there is none, or it is another user's.
     """
     try:
-        folder = Path('/proc', str(pid))
-        real = re.search(r'^Uid:\s*(\d+)', (folder / 'status').read_text(), re.MULTILINE)
+        # a process may give itself a name of any bytes
+        status, stat = (Path('/proc', str(pid), name).read_text(errors='replace')
+                        for name in ('status', 'stat'))
+        real = re.search(r'^Uid:\s*(\d+)', status, re.MULTILINE)
         if uid is not None and (real is None or int(real[1]) != uid):
             raise Refused('pid is a process of another user')
-        return int((folder / 'stat').read_text().rpartition(')')[2].split()[19])
+        return int(stat.rpartition(')')[2].split()[19])
     except OSError:
         raise Refused('pid is no process') from None
 

@@ -189,7 +189,7 @@ def wireguard_of(interface):
     found = set()
     for pid in filter(str.isdigit, os.listdir('/proc')):
         try:
-            with open(f'/proc/{pid}/cmdline') as cmdline:
+            with open(f'/proc/{pid}/cmdline', errors='replace') as cmdline:
                 words = cmdline.read().split('\0')
         except OSError:
             continue

@@ -159,6 +159,11 @@ def test_thread_that_others_keep_from_the_processor_is_ready():
     assert ready([threads['works']]) == {}  # it has ended
 
 
+@pytest.mark.usefixtures('name_of_no_text')
+def test_name_of_a_node_may_be_no_text():
+    assert computed([str(os.getpid())]) > 0
+
+
 def test_traffic_is_that_of_the_interface():
     before = carried('lo')
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:

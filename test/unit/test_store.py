@@ -155,6 +155,11 @@ def test_process_differs_from_another_with_its_id():
     assert not record().launch_alive
 
 
+@pytest.mark.usefixtures('name_of_no_text')
+def test_name_of_a_process_may_be_no_text():
+    assert process_start(os.getpid()) is not None
+
+
 def test_after_a_boot_no_process_is_one_from_before(monkeypatch):
     mine = {'pid': os.getpid(), 'pid_start': process_start(os.getpid())}
     assert record(boot=boot_id(), **mine).launch_alive

@@ -217,6 +217,11 @@ def test_own_address_is_one_of_the_network(value: object) -> None:
         vpn.own_address(value, NETWORK)
 
 
+@pytest.mark.usefixtures('name_of_no_text')
+def test_name_of_the_caller_may_be_no_text() -> None:
+    assert vpn.begun(os.getpid(), os.getuid()) > 0
+
+
 def test_all_other_interfaces_are_root_s_commands() -> None:
     plugin, plain = helped.HelpedWireGuard(), WireGuard()
     for path in ('/home/eve/.ros/vpn.key', helped.key_file('fogffffff')):

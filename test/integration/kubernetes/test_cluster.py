@@ -37,7 +37,7 @@ def process_namespace(folder: Path) -> str:
     own = os.readlink('/proc/self/ns/pid')
     for process in Path('/proc').glob('[0-9]*'):
         try:
-            words = (process / 'cmdline').read_text().split('\0')
+            words = (process / 'cmdline').read_text(errors='replace').split('\0')
             there = os.readlink(process / 'ns/pid')
         except OSError:
             continue
