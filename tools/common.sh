@@ -10,12 +10,15 @@ VENV_ROS=${FOGROS2_VENV_ROS:-$PWD/.venv-ros}
 # Prints the set-up script of ROS 2 Jazzy, or nothing where it isn't installed.
 ros_setup() {
     if [ "${ROS_DISTRO:-}" = jazzy ] && [ -n "${AMENT_PREFIX_PATH:-}" ]; then
-        # sourced already: the prefix that has rclpy is the one to source
+        # sourced already: the prefix that has rclpy is the one to source, or the folder around it
+        # where colcon gave each package a prefix
         old_ifs=$IFS; IFS=:
         for prefix in $AMENT_PREFIX_PATH; do
-            if [ -d "$prefix/share/rclpy" ] && [ -f "$prefix/setup.sh" ]; then
-                IFS=$old_ifs; printf '%s\n' "$prefix/setup.sh"; return
-            fi
+            [ -d "$prefix/share/rclpy" ] || continue
+            for setup in "$prefix/setup.sh" "${prefix%/*}/setup.sh"; do
+                [ -f "$setup" ] || continue
+                IFS=$old_ifs; printf '%s\n' "$setup"; return
+            done
         done
         IFS=$old_ifs
     fi
@@ -23,6 +26,9 @@ ros_setup() {
         printf '%s\n' /opt/ros/jazzy/setup.sh
     fi
 }
+
+# Prints a word in quotes, as a shell reads it.
+quoted() { printf "'%s'" "$(printf '%s' "$1" | sed "s/'/'\\\\''/g")"; }
 
 # teach_activate VENV SETUP: makes `. VENV/bin/activate` set what `run.sh ros` sets, and deactivate
 # undo it. SETUP is the set-up script of ROS 2, which is sourced where the terminal has not.
@@ -39,11 +45,24 @@ _fogros2_deactivate() {
 $(sed 's/^deactivate () {$/&\n    _fogros2_deactivate/' "$script")
 _OLD_FOGROS2_AMENT_PREFIX_PATH=\${AMENT_PREFIX_PATH:-} _OLD_FOGROS2_PYTHONPATH=\${PYTHONPATH:-}
 if [ -z "\${AMENT_PREFIX_PATH:-}" ]; then
-    . '${2%sh}'"\${BASH_VERSION:+ba}\${ZSH_VERSION:+z}sh"
+    . $(quoted "${2%sh}")"\${BASH_VERSION:+ba}\${ZSH_VERSION:+z}sh"
 fi
-. '$PWD/tools/ros_environment.sh'
+. $(quoted "$PWD/tools/ros_environment.sh")
 END
     mv "$script.new" "$script"
+}
+
+# make_ros2 VENV: writes the program ros2 of the environment. ROS's own has /usr/bin/python3 in its
+# first line, which wouldn't see ours. The lines before Python's are a text for Python, and a
+# command for sh: a first line can't name an interpreter whose path has a space.
+make_ros2() {
+    { cat - tools/ros2.py <<'END'
+#!/bin/sh
+'''exec' "$(dirname "$0")/python" "$0" "$@"
+' '''
+END
+    } >"$1/bin/ros2"
+    chmod 755 "$1/bin/ros2"
 }
 
 # Runs a command as root: as it is, or through sudo, whose password was asked before.

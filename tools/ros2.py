@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The program ``ros2`` of .venv-ros: tools/setup.sh puts the interpreter's line before it."""
+"""The program ``ros2`` of .venv-ros: tools/common.sh adds the lines that start Python."""
 
 import sys
 

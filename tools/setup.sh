@@ -26,7 +26,12 @@ fi
 # The container of the demo sees the system's folders, not a home: a system Python comes first.
 # rclpy has wheels for 3.10 to 3.14, so a newer one comes last.
 find_python() {
-    if [ -n "${FOGROS2_PYTHON:-}" ]; then command -v "$FOGROS2_PYTHON"; return; fi
+    if [ -n "${FOGROS2_PYTHON:-}" ]; then
+        command -v "$FOGROS2_PYTHON" || fail "FOGROS2_PYTHON names no program: $FOGROS2_PYTHON"
+        "$FOGROS2_PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null \
+            || fail "FOGROS2_PYTHON names no Python 3.10 or newer: $FOGROS2_PYTHON"
+        return
+    fi
     for want in '(3, 10) <= v <= (3, 14)' 'v >= (3, 10)'; do
         for python in /usr/bin/python3 /usr/bin/python3.14 /usr/bin/python3.13 /usr/bin/python3.12 \
                 /usr/bin/python3.11 /usr/bin/python3.10 /usr/local/bin/python3 python3 \
@@ -369,9 +374,7 @@ if [ -n "$ros" ] && [ "$target" != lint ] && [ "$target" != docs ]; then
         "$interpreter" -c 'import rclpy' 2>/dev/null || interpreter=$(command -v python3)
         prepare "$VENV_ROS" "$interpreter" --system-site-packages "ROS 2 $ROS_DISTRO" \
             .cache/source
-        # ROS's own ros2 has /usr/bin/python3 in its first line, which wouldn't see ours
-        { printf '#!%s\n' "$VENV_ROS/bin/python"; cat tools/ros2.py; } >"$VENV_ROS/bin/ros2"
-        chmod 755 "$VENV_ROS/bin/ros2"
+        make_ros2 "$VENV_ROS"
         teach_activate "$VENV_ROS" "$ros"
     )
 fi

@@ -1,37 +1,57 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``. .venv-ros/bin/activate`` sets what ``tools/run.sh ros`` sets."""
+"""
+What tools/setup.sh makes and finds, in folders whose names have a space and a quote.
+
+``. .venv-ros/bin/activate`` sets what ``tools/run.sh ros`` sets.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
+import shlex
+import shutil
 import subprocess
 import sys
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+TOOLS = Path(__file__).parents[2] / 'tools'
 VARIABLES = ('VIRTUAL_ENV', 'AMENT_PREFIX_PATH', 'PYTHONPATH')
 SETUP = 'export ROS_DISTRO=jazzy AMENT_PREFIX_PATH={0} PYTHONPATH={0}/lib PATH={0}/bin:$PATH\n'
 
 
 @pytest.fixture
-def ros(tmp_path: Path) -> Path:
+def project(tmp_path: Path) -> Path:
+    """Return a project's folder with the tools."""
+    folder = tmp_path / "a robot's"
+    shutil.copytree(TOOLS, folder / 'tools', ignore=shutil.ignore_patterns('__pycache__'))
+    return folder
+
+
+@pytest.fixture
+def ros(project: Path) -> Path:
     """Return the folder of something that looks like ROS 2 Jazzy."""
-    prefix = tmp_path / 'jazzy'
+    prefix = project / 'jazzy'
     (prefix / 'share' / 'rclpy').mkdir(parents=True)
     for shell in ('sh', 'bash', 'zsh'):
-        (prefix / f'setup.{shell}').write_text(SETUP.format(prefix))
+        (prefix / f'setup.{shell}').write_text(SETUP.format(shlex.quote(str(prefix))))
     return prefix
 
 
 @pytest.fixture
-def venv(tmp_path: Path, ros: Path) -> Path:
+def venv(project: Path, ros: Path) -> Path:
     """Return an environment as tools/setup.sh makes it, its activate script done twice."""
-    folder = tmp_path / 'venv'
+    folder = project / 'venv'
     subprocess.run([sys.executable, '-m', 'venv', '--without-pip', str(folder)], check=True)
-    teach = f"teach_activate '{folder}' '{ros}/setup.sh'"
-    subprocess.run(['sh', '-euc', f'. tools/common.sh; {teach}; {teach}'], cwd=ROOT, check=True)
+    subprocess.run(
+        ['sh', '-euc', '. tools/common.sh; teach_activate "$@"; teach_activate "$@"; '
+         'make_ros2 "$1"', 'sh', str(folder), f'{ros}/setup.sh'], cwd=project, check=True)
     return folder
+
+
+def sourced(path: Path) -> str:
+    """Return a shell's line that sources a file."""
+    return f'. {shlex.quote(str(path))}; '
 
 
 def environment(*command: str, **variables: str) -> dict[str, str]:
@@ -43,14 +63,14 @@ def environment(*command: str, **variables: str) -> dict[str, str]:
 
 
 @pytest.mark.parametrize('shell', ['bash', 'sh'])
-@pytest.mark.parametrize('sourced', [False, True], ids=['fresh', 'ros sourced'])
+@pytest.mark.parametrize('before', [False, True], ids=['fresh', 'ros sourced'])
 def test_activation_sets_the_variables_of_run(
-    ros: Path, venv: Path, shell: str, sourced: bool,
+    project: Path, ros: Path, venv: Path, shell: str, before: bool,
 ) -> None:
-    before = f'. {ros}/setup.{shell}; ' if sourced else ''
-    found = environment(shell, '-c', f'{before}. {venv}/bin/activate; env -0')
+    script = sourced(ros / f'setup.{shell}') if before else ''
+    found = environment(shell, '-c', f"{script}{sourced(venv / 'bin/activate')}env -0")
     expected = environment(
-        str(ROOT / 'tools' / 'run.sh'), 'ros', '--', 'env', '-0', FOGROS2_VENV_ROS=str(venv),
+        str(project / 'tools' / 'run.sh'), 'ros', '--', 'env', '-0', FOGROS2_VENV_ROS=str(venv),
         ROS_DISTRO='jazzy', AMENT_PREFIX_PATH=str(ros))
     assert {name: found[name] for name in VARIABLES} == {
         name: expected[name] for name in VARIABLES}
@@ -58,7 +78,44 @@ def test_activation_sets_the_variables_of_run(
 
 
 def test_deactivate_restores_the_variables(ros: Path, venv: Path) -> None:
-    script = f'. {ros}/setup.bash; . {venv}/bin/activate; deactivate; env -0'
+    script = sourced(ros / 'setup.bash') + sourced(venv / 'bin/activate') + 'deactivate; env -0'
     found = environment('bash', '-c', script)
     assert (found['AMENT_PREFIX_PATH'], found['PYTHONPATH']) == (str(ros), f'{ros}/lib')
     assert found['PATH'].startswith(f'{ros}/bin:') and str(venv) not in found['PATH']
+
+
+def test_program_ros2_runs_in_its_environment(venv: Path) -> None:
+    # it has no ROS 2, which this message of ours says
+    done = subprocess.run([venv / 'bin/ros2', 'topic', 'list'], capture_output=True, text=True,
+                          env={'PATH': '/usr/bin:/bin'})
+    assert (done.returncode, done.stdout) == (1, '')
+    assert done.stderr.startswith('ros2: ROS 2 is not sourced here')
+
+
+def test_each_package_may_have_a_prefix_of_its_own(project: Path) -> None:
+    install = project / 'install'
+    (install / 'rclpy/share/rclpy').mkdir(parents=True)
+    (install / 'setup.sh').touch()
+    done = subprocess.run(
+        ['sh', '-euc', '. tools/common.sh; ros_setup'], cwd=project, check=True, text=True,
+        capture_output=True, env={
+            'PATH': '/usr/bin:/bin', 'ROS_DISTRO': 'jazzy',
+            'AMENT_PREFIX_PATH': f'{install}/rosidl:{install}/rclpy'})
+    assert done.stdout == f'{install}/setup.sh\n'
+
+
+@pytest.mark.parametrize(('interpreter', 'message'), [
+    ('nowhere', 'FOGROS2_PYTHON names no program: nowhere'),
+    ('too-old', 'FOGROS2_PYTHON names no Python 3.10 or newer: too-old')])
+def test_interpreter_that_cannot_be_used_is_named(
+    project: Path, interpreter: str, message: str,
+) -> None:
+    programs = project / 'bin'  # without what would install something
+    programs.mkdir()
+    for name in ('dirname', 'id'):
+        (programs / name).symlink_to(f'/usr/bin/{name}')
+    (programs / 'too-old').write_text('#!/bin/sh\nexit 1\n')
+    (programs / 'too-old').chmod(0o755)
+    done = subprocess.run(['/bin/sh', project / 'tools/setup.sh', 'demo'], capture_output=True,
+                          text=True, env={'PATH': str(programs), 'FOGROS2_PYTHON': interpreter})
+    assert (done.returncode, done.stderr) == (1, f'** {message}\n')
