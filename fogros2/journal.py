@@ -101,6 +101,7 @@ class Step:
     :param seconds: its duration, None while it runs.
     :param detail: a few words; for a failed step the reason.
     :param done: bytes of ``total``; both 0 if unknown.
+    :param fatal: False if it failed and the launch goes on without it.
     """
 
     machine: str
@@ -111,6 +112,7 @@ class Step:
     detail: str = ''
     done: int = 0
     total: int = 0
+    fatal: bool = True
 
 
 def steps(lines: list[str]) -> list[Step]:
@@ -141,7 +143,8 @@ def steps(lines: list[str]) -> list[Step]:
                     entries.append(Step(machine, name, at - seconds))
                     index = len(entries) - 1
                 entries[index] = dataclasses.replace(
-                    entries[index], state=kind, seconds=seconds, detail=str(event['detail']))
+                    entries[index], state=kind, seconds=seconds, detail=str(event['detail']),
+                    fatal=bool(event.get('fatal', True)))
         except (ValueError, TypeError, KeyError, RecursionError):
             continue
     return entries

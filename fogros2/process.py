@@ -24,6 +24,12 @@ from fogros2.waiting import noted
 HERE = 'this computer'
 #: sudo's reason for refusing without a password, and the remedy.
 PASSWORD = 'sudo wants a password', 'run `sudo -v` first'
+#: The same for a user without rights.
+NO_RIGHTS = ('this user may not use sudo',
+             "ask the computer's administrator, or let a user who may launch it")
+#: Debian packages of programs, where these have another name.
+PACKAGES = {'ip': 'iproute2', 'nft': 'nftables', 'ping': 'iputils-ping',
+            'ssh': 'openssh-client', 'ssh-keygen': 'openssh-client', 'wg': 'wireguard-tools'}
 #: Maximum bytes of a line of output; a longer one is several.
 _LINE = 1 << 16
 #: A copy: launch empties ``os.environ`` briefly when a scoped group ends, while threads run.
@@ -58,7 +64,10 @@ def start(
             'preexec_fn': os.setpgrp}
     if environment is None:
         path = _ENVIRONMENT.get('PATH', os.defpath)
-        environment = {**_ENVIRONMENT, 'PATH': f'{path}:/usr/sbin:/sbin', **command.environment}
+        environment = {**_ENVIRONMENT, 'PATH': f'{path}:/usr/sbin:/sbin'}
+        if _through_sudo(command):
+            environment['LC_ALL'] = 'C'  # the reasons for which sudo refuses, in English
+        environment.update(command.environment)
     return subprocess.Popen(argv(command), env=environment, stdin=stdin, stdout=stdout,
                             stderr=stderr, **apart)
 
@@ -98,12 +107,12 @@ def sudo_trouble(*, timeout: float = 10.0) -> tuple[str, str] | None:
     text = result.stderr
     if 'password is required' in text:
         # sudo gives this reason to users without rights, too; ``sudo -v`` distinguishes them
-        text = run(Command(('sudo', '-n', '-v')), timeout=timeout, check=False).stderr or text
+        text = run(Command(('sudo', '-n', '-v'), environment={'LC_ALL': 'C'}), timeout=timeout,
+                   check=False).stderr or text
     if 'password is required' in text or 'terminal is required' in text:
         return PASSWORD
     if 'may not run sudo' in text or 'not in the sudoers' in text or 'not allowed' in text:
-        return ('this user may not use sudo',
-                "ask the computer's administrator, or let a user who may launch it")
+        return NO_RIGHTS
     reason = (text.strip().splitlines() or ['it says nothing'])[-1].removeprefix('sudo: ')
     return f"sudo doesn't work here: {reason}", 'run it as root'
 
@@ -161,7 +170,7 @@ def run(
         raise PrerequisiteError(
             f'{words[0]} not found on this computer',
             'run it as root, or install sudo' if words[0] == 'sudo'
-            else f'sudo apt-get install {words[0]}') from error
+            else f'sudo apt-get install {PACKAGES.get(words[0], words[0])}') from error
     except OSError as error:
         raise PrerequisiteError(
             f"{words[0]} can't be started on this computer: {error.strerror}",

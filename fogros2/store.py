@@ -32,6 +32,7 @@ from fogros2.model import Endpoint, MachineSpec, OtherVpn, Peer, VpnInterface
 _UNFINISHED = re.compile(r'\..+\.([0-9]+)\.[a-z0-9_]{8}')
 #: File in the folder of another robot's VPN, which is like a launch's folder; see ``OtherVpn``.
 OTHER_VPN = 'other_vpn.json'
+_ELSEWHERE = 'FOGROS2_STATE_HOME names another folder for it'
 _NAME = re.compile(r'[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?')
 
 
@@ -215,10 +216,13 @@ class Store:
     The state folder, with a folder for each machine and each launch.
 
     A machine's folder has its record and its keys. The lock on its name is beside the folder.
+
+    :raises StoreError: this user may not read the folder.
     """
 
     def __init__(self, root: Optional[Path] = None) -> None:
         self.root = root or state_home()
+        _check_readable(self.root)
 
     def launch_folder(self, launch_id: str) -> Path:
         """Return a launch's folder (0700); create it if needed."""
@@ -494,6 +498,22 @@ def process_folder() -> Path:
     return Path(folder)
 
 
+def _check_readable(root: Path) -> None:
+    """
+    Check that this user may read a state folder, such as one that a launch as root has made.
+
+    :raises StoreError: this user may not.
+    """
+    for folder in (*reversed(root.parents), root,
+                   *(root / name for name in ('machines', 'launches', 'requests'))):
+        inside = root in (folder, *folder.parents)
+        if os.path.isdir(folder) and not os.access(
+                folder, os.X_OK | (os.R_OK if inside else 0), effective_ids=True):
+            raise StoreError(
+                f"{folder} can't be read by this user",
+                f'sudo chown -R {os.geteuid()} {root}' if inside else _ELSEWHERE)
+
+
 def _make_folder(path: Path) -> Path:
     try:
         # parents=True would create the parent folders with the default mode
@@ -507,7 +527,7 @@ def _make_folder(path: Path) -> Path:
 
 def _not_written(path: Path, error: OSError) -> StoreError:
     return StoreError(f"{path} can't be written: {error.strerror}",
-                      'FOGROS2_STATE_HOME names another folder for it')
+                      _ELSEWHERE)
 
 
 def other_vpn(folder: Path) -> Optional[OtherVpn]:

@@ -18,10 +18,8 @@ from fogros2.vpn import helped, Vpn
 from fogros2.waiting import Timeouts
 
 #: Programs that the robot's side calls, and the Debian packages that contain them.
-ROBOT_PROGRAMS = {
-    'ip': 'iproute2', 'wg': 'wireguard-tools', 'nft': 'nftables', 'rsync': 'rsync',
-    'ssh-keygen': 'openssh-client',
-}
+ROBOT_PROGRAMS = {program: process.PACKAGES.get(program, program)
+                  for program in ('ip', 'wg', 'nft', 'rsync', 'ssh-keygen')}
 
 #: Held while sudo may ask for a password, so that only one thread asks.
 _ASKING = threading.Lock()
@@ -72,7 +70,9 @@ def check_sudo(*, ask: bool = False) -> None:
         raise PrerequisiteError('a VPN interface needs root, and there is no sudo here',
                                 'run the launch as root, or install sudo')
     trouble = process.sudo_trouble()
-    if ask and trouble == process.PASSWORD and process.ask_for_ticket('for the VPN interface'):
+    # a version of sudo may say in other words that it wants a password
+    if ask and trouble not in (None, process.NO_RIGHTS) \
+            and process.ask_for_ticket('for the VPN interface'):
         trouble = process.sudo_trouble()
     if trouble is not None:
         reason, remedy = trouble

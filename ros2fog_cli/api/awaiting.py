@@ -9,7 +9,7 @@ from typing import Optional
 
 from fogros2 import journal
 from fogros2.errors import ConfigurationError
-from fogros2.store import check_name, Store
+from fogros2.store import check_name, launch_process, Store
 from fogros2.waiting import wait_until
 from ros2fog_cli.api import machines, shown
 
@@ -22,18 +22,19 @@ def up(name: str, timeout: float) -> None:
     :raises ConfigurationError: its launch ended meanwhile.
     :raises DeadlineExceeded: after ``timeout`` seconds.
     """
-    store, seen = Store(), False
+    store, seen = Store(), ''
     check_name(name)
 
     def probe() -> bool:
         nonlocal seen
         record = machines.recorded(store, name).get(name)
         if record is None or not record.launch or not record.launch_alive:
-            if seen:
+            # the record is away for a moment while the launch replaces the machine
+            if seen and not launch_process(store.root / 'launches' / seen)[1]:
                 raise ConfigurationError(f"the launch of '{name}' ended before it was up",
                                          'its own output says why')
             return False
-        seen = True
+        seen = record.launch
         steps = journal.read_steps(store.root / 'launches' / record.launch)
         return shown.phase(tuple(step for step in steps if step.machine == name)) == 'running'
 

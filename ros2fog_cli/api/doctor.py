@@ -33,7 +33,7 @@ from ros2fog_cli.api import lan, reach
 Verdict = Literal['ok', 'warning', 'failed']
 #: Python packages that launches import, and the Debian package of each.
 _PACKAGES = {'paramiko': 'python3-paramiko', 'yaml': 'python3-yaml'}
-_OPTIONAL = {'ssh': 'openssh-client', 'ping': 'iputils-ping'}
+_OPTIONAL = {program: process.PACKAGES[program] for program in ('ssh', 'ping')}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,12 +70,23 @@ def examine(*, lan_seconds: float = 1.5, providers: Sequence[str] = ()) -> list[
     checks: list[Callable[[], Check]] = [
         python, packages, programs, root, tun, wireguard, engine, overlay, firewall_program, ros,
         rmw, cyclone_uri, machine_defaults, receive_buffer, udp_port, ssh_keys, firewall, state,
-        clocks, vpn_paths, lambda: lan_peers(lan_seconds)]
+        clocks, vpn_paths, functools.partial(lan_peers, lan_seconds)]
     others = [name for name in plugin_system.names('fogros2.provider') if name not in _LOOKED_AT]
     for name in dict.fromkeys([*others, *providers]):
         checks.append(functools.partial(provider, name, needed=name in providers))
     with ThreadPoolExecutor(6, 'fog-doctor') as pool:
-        return [done for done in pool.map(lambda check: check(), checks) if done.detail]
+        return [done for done in pool.map(_result, checks) if done.detail]
+
+
+def _result(check: Callable[[], Check]) -> Check:
+    """Return the result of a check; a check that can't be made has failed."""
+    try:
+        return check()
+    except (FogError, OSError) as error:
+        name = getattr(check, 'func', check).__name__.replace('_', ' ')
+        if isinstance(error, FogError):
+            return _failed(name, error)
+        return Check(name, 'failed', f'can not be looked at: {error}')
 
 
 def provider(name: str, *, needed: bool = False, timeout: float = TIMEOUT) -> Check:
@@ -382,7 +393,11 @@ def lan_peers(seconds: float) -> Check:
         return Check(name, 'ok', 'not looked for')
     try:
         domain = int(os.environ.get('ROS_DOMAIN_ID') or 0)
+        if not 0 <= domain <= lan.HIGHEST_DOMAIN:
+            raise ValueError(f'ROS_DOMAIN_ID is {domain}, not 0 to {lan.HIGHEST_DOMAIN}')
         counts = lan.participants(domain, seconds)
+    except FogError as error:
+        return _failed(name, error)
     except (ValueError, OSError) as error:
         return Check(name, 'warning', f'can not be looked for: {error}')
     if (total := sum(counts.values())) > PARTICIPANTS:

@@ -68,11 +68,15 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
 
     :param force: also delete a machine that a running launch uses, and forget a machine that
         cannot be reached.
-    :raises FogError: the machine or one of its resources still exists.
+    :raises FogError: the machine or one of its resources still exists, or a launch has got the
+        machine or its name since ``entry`` was found.
     """
     check_free(entry, force=force)
     with contextlib.nullcontext() if entry.record is None or force \
             else store.lock(entry.name):
+        if not force:
+            record = _current(entry.name, entry.record, entry.machine, store)
+            entry = dataclasses.replace(entry, record=record or entry.record)
         if not entry.asked and not force:
             raise ConfigurationError(
                 f"the provider '{entry.provider}' of '{entry.name}' can't be asked",
@@ -101,6 +105,26 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
             with step(report, record.name, 'VPN interface'):
                 clear(store.root / 'launches' / record.launch)
         store.delete(record.name)
+
+
+def _current(
+    name: str, record: Optional[Record], machine: Optional[Machine], store: Store,
+) -> Optional[Record]:
+    """
+    Return this robot's record of a machine as it is now, None if there is none any more.
+
+    :param record: as it was found with ``machine``.
+    :raises NameTaken: another launch has written the record meanwhile.
+    """
+    records = machines.recorded(store, name)
+    current = records.get(name)
+    if record is None and machine is not None:
+        current = machines.record_of(machine, records)
+    if current is not None and (record is None or any(
+            getattr(current, each) != getattr(record, each)
+            for each in ('token', 'machine_id', 'last'))):
+        raise NameTaken(f"'{name}' has changed meanwhile", 'try again')
+    return current
 
 
 def delete_all(
@@ -343,6 +367,8 @@ def why_end(
         # also if it was made and not started yet; without an id, no launch can keep it
         return 'its launch is gone'
     if entry.machine.state is MachineState.STOPPED:
+        if not entry.machine.owned:
+            return ''  # a computer of the user that does not answer, perhaps for weeks
         since = stopped_at if stopped_at is not None else entry.created
         if since is not None and now - since > keep_stopped:
             return f'stopped for more than {keep_stopped / 86400:g} days'
@@ -383,10 +409,13 @@ def let_go(record: Record, machine: Optional[Machine], store: Store) -> None:
     :raises FogError: a resource could not be cleaned up.
     """
     with store.lock(record.name):
-        if record.launch:
-            clear(store.root / 'launches' / record.launch)
+        current = _current(record.name, record, machine, store)
+        if current is None:
+            return  # somebody has deleted it
+        if current.launch:
+            clear(store.root / 'launches' / current.launch)
         record = store.save(dataclasses.replace(
-            record, launch='', pid=0, pid_start=0, robot_vpn=None))
+            current, launch='', pid=0, pid_start=0, robot_vpn=None))
         if machine is not None:
             store.save(dataclasses.replace(
                 record, notes={}, made=undo.close_ports(_Left(record, machine))))

@@ -21,6 +21,8 @@ from fogros2.model import Command
 GROUP = '239.255.0.1'
 HERE = 'this computer'
 PORT_BASE, PORTS_PER_DOMAIN = 7400, 250
+#: ROS domain id whose ports are the last ones.
+HIGHEST_DOMAIN = 232
 #: Vendor id of the specification for an unknown vendor.
 _VENDOR = b'\x00\x00'
 _PARTICIPANT = b'\x00\x00\x01\xc1'

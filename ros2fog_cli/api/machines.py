@@ -58,7 +58,13 @@ class Entry:
     @property
     def gone(self) -> bool:
         """Whether the provider no longer knows the machine, or reports it as deleted."""
-        return self.asked and self.known.state is MachineState.DELETED
+        return self.asked and self.known.state is MachineState.DELETED and not self.requested
+
+    @property
+    def requested(self) -> bool:
+        """Whether a launch is creating the machine, and has no id of it yet."""
+        return self.machine is None and self.record is not None \
+            and self.record.machine_id is None and self.record.launch_alive
 
     @property
     def state(self) -> str:
@@ -70,8 +76,12 @@ class Entry:
             return 'unknown'
         if self.gone:
             return 'gone'
+        if self.requested:
+            return str(MachineState.PENDING)
         text = str(self.known.state)
         if self.known.state is MachineState.STOPPED:
+            if not self.known.owned:
+                return 'unknown (does not answer)'
             return f"{text} ({'still billed' if self.known.billed else 'keeps its disk'})"
         if self.record is None:
             return f'{text} (orphan)' if self.own else f'{text} (robot {self.robot})'
@@ -240,7 +250,7 @@ def combined(
     matched: set[str] = set()
     for answer in answers.values():
         for machine in answer.machines if answer else []:
-            record = _record_of(machine, records)
+            record = record_of(machine, records)
             if record is not None:
                 matched.add(record.name)
             entries.append(Entry(machine.name or machine.tags.get(TAG_NAME, ''),
@@ -297,7 +307,7 @@ def wanted(name: str, regions: Optional[Sequence[str]]) -> bool:
     return kind.configured() or bool(regions) and kind.capabilities.regions
 
 
-def _record_of(machine: Machine, records: Mapping[str, Record]) -> Optional[Record]:
+def record_of(machine: Machine, records: Mapping[str, Record]) -> Optional[Record]:
     """Return this robot's record of a machine, None for another robot's machine of that name."""
     record = records.get(machine.name or machine.tags.get(TAG_NAME, ''))
     if record is None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses
+import math
 import os
 from pathlib import Path
 import re
@@ -22,11 +23,16 @@ from fogros2.clock import ClockOffset
 from fogros2.errors import AgentError, ConnectError, DdsError, FogError, MachineNotFound
 from fogros2.events import Event
 from fogros2.model import Command, Endpoint, MachineState, VpnInterface
+from fogros2.provider import TAG_ON_EXIT
 from fogros2.shell import Shell
 from fogros2.store import Record, Store
 from fogros2.vpn import Vpn
 from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Entry
+
+#: Seconds without an event after which a log that is not followed counts as cut off, and between
+#: two looks at the time.
+SILENCE, LOOK = 30.0, 0.5
 
 
 def find(
@@ -66,7 +72,8 @@ def endpoint(entry: Entry, user: Optional[str] = None) -> Endpoint:
     stopped = entry.machine is not None and entry.machine.state is MachineState.STOPPED
     if result is None or stopped:
         raise ConnectError(f"the machine '{entry.name}' can't be reached: {entry.state}",
-                           'a launch that names it starts it again' if stopped else '')
+                           '' if not stopped else 'a launch that names it starts it again'
+                           if entry.known.owned else 'is it on?')
     return dataclasses.replace(result, user=user) if user else result
 
 
@@ -123,7 +130,11 @@ def _open(entry: Entry, port: int, undo: contextlib.ExitStack) -> None:
         if record is not None:
             with contextlib.suppress(FogError):
                 record = Store().load(entry.name)
-        if record is None or not record.launch_alive:
+        if record is None and entry.known.tags.get(TAG_ON_EXIT) == 'keep':
+            # without a record, the networks of its fleet, if it has one, are unknown
+            print(f'{entry.name}: its TCP port {port} stays open to this computer, which has no '
+                  'record of the machine', file=sys.stderr)
+        elif record is None or not record.launch_alive:
             try:
                 provider.allow(
                     machine_id, port, provider.ssh_networks(record.spec) if record else ())
@@ -236,33 +247,37 @@ def follow(
     """
     Pass the agent's events to ``show``, from the first one to the last, or until Ctrl-C.
 
-    Return False if the agent disappeared, or sent no event for 30 s without ``forever``.
+    Return False if the agent disappeared, or sent no event for ``SILENCE`` s, without ``forever``.
 
     :param forever: also pass future events.
     :raises BrokenPipeError: the reader of the output is gone.
     """
     last = client.status()['next'] - 1
     over, absent, unheard = threading.Event(), threading.Event(), threading.Event()
+    heard = time.monotonic()
 
     def take(event: Event) -> None:
+        nonlocal heard
         if event['event'] == 'connection':
             if event['state'] == 'absent':
                 absent.set()
                 over.set()
             return
+        heard = math.inf  # an output that blocks, such as of `less`, is no silence
         try:
             show(event)
         except BrokenPipeError:
             unheard.set()  # as with `| head`
             over.set()
+        heard = time.monotonic()
         if not forever and cast(int, event.get('seq', 0)) >= last:
             over.set()
 
     if last < 1 and not forever:
         return True
     client.subscribe(take, since=1)
-    while not over.wait(0.5 if forever else 30.0):
-        if not forever:
+    while not over.wait(LOOK):
+        if not forever and time.monotonic() - heard > SILENCE:
             return False
     if unheard.is_set():
         raise BrokenPipeError

@@ -16,8 +16,9 @@ from fogros2.clock import ClockOffset
 from ros2fog_cli.api.follower import Follower
 from ros2fog_cli.api.machines import Entry
 
-#: The step after which a machine is up, and the steps that end it.
-UP, DOWN = 'agent', ('delete', 'stop', 'keep', 'let go')
+#: The step with which a machine begins, also anew; the step after which it is up; the steps that
+#: end it.
+BEGIN, UP, DOWN = 'machine', 'agent', ('delete', 'stop', 'keep', 'let go')
 
 
 @dataclasses.dataclass
@@ -140,12 +141,13 @@ def phase(steps: tuple[journal.Step, ...]) -> str:
     """Return the phase of a machine by its steps: 'coming', 'running' or 'ending'."""
     result = 'coming'
     for step in steps:
-        if step.step in DOWN:
-            return 'ending'
-        if step.step == UP and step.state == 'done':
+        if step.step == BEGIN:
+            result = 'coming'
+        if step.step in DOWN or (
+                step.state == 'failed' and step.fatal and result == 'coming'):
+            result = 'ending'
+        elif step.step == UP and step.state == 'done':
             result = 'running'
-        elif step.state == 'failed' and result == 'coming':
-            return 'ending'
     return result
 
 

@@ -40,13 +40,14 @@ class LogsVerb(VerbExtension):
         with reach.session(entry) as shell:
             client = reach.agent(entry, shell)
             try:
-                alive = reach.follow(client, take, forever=args.follow)
-                for (name, stream), line in log.begun.items():
+                try:
+                    alive = reach.follow(client, take, forever=args.follow)
+                finally:
+                    client.close()
+                for (name, stream), line in list(log.begun.items()):
                     show(name, stream, [line], args.node)
             except (KeyboardInterrupt, BrokenPipeError):
                 return 0
-            finally:
-                client.close()
         if not alive:
             warn(f"the agent of '{args.name}' is gone")
         elif args.node and args.node not in names:

@@ -26,6 +26,7 @@ from fogros2.deploy import undo
 from fogros2.errors import (
     ConnectError,
     MachineNotFound,
+    NameTaken,
     PrerequisiteError,
     ProviderError,
     Unsupported,
@@ -272,6 +273,22 @@ def test_stopped_machine_is_not_connected_to() -> None:
         assert "'a' can't be reached: stopped" in said and 'starts it again' in said
 
 
+def test_host_that_is_off_is_no_stopped_machine() -> None:
+    found = machine('lab', provider='untagged', state=MachineState.STOPPED, owned=False)
+    entry = Entry('lab', 'untagged', found, record('lab', provider='untagged', launch=''))
+    assert entry.state == 'unknown (does not answer)'
+    said = run('connect', 'lab')
+    assert "can't be reached" in said and 'is it on?' in said and 'starts it again' not in said
+
+
+def test_machine_that_a_launch_is_creating_is_pending() -> None:
+    record('a', machine_id=None, **alive())
+    record('b', machine_id=None, **dead())
+    assert [(entry.state, entry.gone) for entry in machines.survey(lambda text: None)] == [
+        ('pending', False), ('gone', True)]
+    assert "'a' can't be reached: pending" in run('connect', 'a')
+
+
 def test_machines_are_listed_where_one_host_does_not_answer(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -325,6 +342,47 @@ def test_delete_refuses_under_a_running_launch(capsys: pytest.CaptureFixture[str
     assert not Memory.machines
     # its launch takes the record down itself
     assert Store().exists('a')
+
+
+@pytest.mark.parametrize('end', [
+    lambda entry: endings.delete(entry, Store(), report.silent),
+    lambda entry: endings.let_go(entry.record, entry.machine, Store())])
+def test_machine_that_changed_meanwhile_stays(end: Any) -> None:
+    """Such as while a verb waited for its user's answer."""
+    machine('a')
+    record('a', token='t1', last='abc123', **dead())
+    (entry,) = machines.survey(lambda text: None)
+    machine('a', 'id-2')
+    new = record('a', 'id-2', token='t2', last='def456', launch='', on_exit='keep')
+    Store().key_file('a').touch()
+    with pytest.raises(NameTaken, match="'a' has changed meanwhile .*try again"):
+        end(entry)
+    assert Store().load('a') == new and Store().key_file('a').exists()
+    assert [*Memory.machines] == ['id-a', 'id-2']
+
+
+@pytest.mark.parametrize(('machine_id', 'refused'), [('id-a', True), (None, True), ('x', False)])
+def test_machine_that_got_a_record_meanwhile_is_no_orphan(
+    machine_id: Optional[str], refused: bool,
+) -> None:
+    machine('a')
+    (entry,) = machines.survey(lambda text: None)
+    assert entry.record is None
+    record('a', machine_id, last='abc123', **alive())
+    if refused:
+        with pytest.raises(NameTaken, match='has changed meanwhile'):
+            endings.delete(entry, Store(), report.silent)
+    else:
+        endings.delete(entry, Store(), report.silent)
+    assert bool(Memory.machines) == refused and Store().exists('a')
+
+
+def test_leftovers_of_a_deleted_machine_are_not_recorded_again() -> None:
+    machine('a')
+    known = record('a', on_exit='keep', **dead())
+    Store().delete('a')
+    endings.let_go(known, Memory.machines['id-a'], Store())
+    assert not Store().exists('a')
 
 
 def test_delete_works_with_a_damaged_record() -> None:
@@ -387,6 +445,8 @@ def test_machine_of_a_silent_provider_is_not_forgotten() -> None:
     # made, and not started yet; and of a launch that did not learn its id
     ({}, {'pid': 1, 'pid_start': 1, 'on_exit': 'stop', 'machine_id': None}, 'its launch is gone'),
     ({'state': MachineState.STOPPED}, {'pid': 1, 'pid_start': 1}, 'its launch is gone'),
+    # a computer of the user that is off
+    ({'state': MachineState.STOPPED, 'owned': False}, {'launch': '', 'created': 1.0}, ''),
     ({'state': MachineState.DELETED}, {'launch': ''}, 'gone at its provider'),
 ])
 def test_gc_ends_machines_that_nobody_needs(

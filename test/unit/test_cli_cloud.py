@@ -42,6 +42,7 @@ from fogros2.provider import (
     TAG_EXPIRES,
     TAG_LAUNCH,
     TAG_NAME,
+    TAG_ON_EXIT,
     TAG_ROBOT,
 )
 from fogros2.provider.machine_types import Region
@@ -384,6 +385,94 @@ def test_session_changes_the_firewall_of_its_robot(
     assert [call[0] for call in Cloud.asked if call[0] != 'find'] == calls
     if not of_launch:
         assert shells[0].host_key == 'ssh-ed25519 AAAA' and shells[0].key_file is None
+
+
+def test_session_without_a_record_keeps_a_fleets_networks(
+    shells: list[Endpoint], capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Only a record has them, and a machine of a fleet is kept."""
+    own = machine('slam')
+    machine('slam', tags={**own.tags, TAG_ON_EXIT: 'keep'})
+    assert run('connect', 'slam') == 0
+    assert Cloud.asked[-2:] == [
+        ('allow', 'id-slam', 22, '198.51.100.9/32'), ('connect', '198.51.100.7')]
+    assert 'slam: its TCP port 22 stays open to this computer' in capsys.readouterr().err
+
+
+# -- logs ---------------------------------------------------------------------------------
+
+
+class Log:
+    """
+    An agent's log, whose events come one after the other in a thread.
+
+    :param events: what happens before each event.
+    """
+
+    def __init__(self, events: Sequence[Callable[[], object]]) -> None:
+        self._events = events
+
+    def status(self) -> dict[str, int]:
+        return {'next': len(self._events) + 1}
+
+    def subscribe(self, take: Callable[[Any], None], since: int) -> None:
+        threading.Thread(target=self._send, args=(take,), daemon=True).start()
+
+    def _send(self, take: Callable[[Any], None]) -> None:
+        for number, before in enumerate(self._events, 1):
+            before()
+            take({'event': 'output', 'seq': number})
+
+
+class Time:
+    """A clock that another thread sets."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self._read = threading.Semaphore(0)
+
+    def monotonic(self) -> float:
+        self._read.release()
+        return self.now
+
+    def pass_(self, seconds: float) -> None:
+        """Let time pass, until it has been looked at twice."""
+        self.now += seconds
+        while self._read.acquire(blocking=False):
+            pass
+        for _ in range(2):
+            assert self._read.acquire(timeout=60)
+
+
+@pytest.mark.parametrize(('before', 'blocked', 'shown', 'whole'), [
+    (20.0, 0.0, 5, True),   # 100 s together
+    (0.0, 100.0, 5, True),  # the reader of the output takes its time
+    (40.0, 0.0, 0, False)])
+def test_log_is_whole_unless_its_agent_is_silent(
+    monkeypatch: pytest.MonkeyPatch, before: float, blocked: float, shown: int, whole: bool,
+) -> None:
+    clock, lines = Time(), []
+    monkeypatch.setattr(reach, 'LOOK', 0.001)
+    monkeypatch.setattr(reach, 'time', clock)
+    over = threading.Event()
+
+    def show(event: Any) -> None:
+        if blocked:
+            clock.pass_(blocked)
+        lines.append(event)
+
+    def wait() -> None:
+        if whole:
+            clock.pass_(before)
+        else:
+            clock.now += before
+            assert over.wait(60)
+
+    try:
+        assert reach.follow(Log([wait] * 5), show, forever=False) is whole  # type: ignore
+        assert len(lines) == shown
+    finally:
+        over.set()
 
 
 def test_session_prefers_the_vpn(shells: list[Endpoint]) -> None:

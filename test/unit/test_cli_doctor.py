@@ -7,9 +7,11 @@ import ast
 import json
 import os
 from pathlib import Path
+import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import types
 from unittest.mock import Mock
 
@@ -17,8 +19,9 @@ import pytest
 from ros2cli.cli import main
 
 from fogros2 import process
-from fogros2.errors import PrerequisiteError
+from fogros2.errors import PrerequisiteError, StoreError
 from fogros2.model import Result
+from fogros2.store import Store
 from ros2fog_cli.api import doctor, lan
 
 
@@ -158,6 +161,53 @@ def test_participants_on_the_lan_are_reported(
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', ros_range)
     check = doctor.lan_peers(1)
     assert check.verdict == verdict and detail in check.detail
+
+
+def test_domain_without_ports_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv('ROS_DOMAIN_ID', '240')
+    assert doctor.lan_peers(0.1) == doctor.Check(
+        'ROS 2 on the LAN', 'warning',
+        'can not be looked for: ROS_DOMAIN_ID is 240, not 0 to 232')
+
+
+def test_check_that_cannot_be_made_ends_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(*_: object, **__: object) -> None:
+        raise FileNotFoundError
+
+    def unreadable() -> doctor.Check:
+        raise PermissionError(13, 'Permission denied')
+
+    monkeypatch.setattr(process, 'start', missing)
+    monkeypatch.setattr(doctor, 'clocks', unreadable)
+    unreadable.__name__ = 'clocks'
+    checks = {check.name: check for check in doctor.examine(lan_seconds=0.1)}
+    assert len(checks) >= 15
+    lan_check = checks['ROS 2 on the LAN']
+    assert lan_check.verdict == 'failed' and lan_check.remedy == 'sudo apt-get install iproute2'
+    assert checks['clocks'].verdict == 'failed' and 'Permission denied' in checks['clocks'].detail
+
+
+def test_state_folder_of_root_fails_its_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a launch by root."""
+    state = Path(tempfile.mkdtemp(dir='/tmp'))  # pytest's own folders are the user's alone
+    try:
+        state.chmod(0o755)
+        (state / 'fogros2').mkdir(mode=0o700)
+        monkeypatch.setenv('FOGROS2_STATE_HOME', str(state / 'fogros2'))
+        if os.geteuid() != 0:
+            pytest.skip('takes root, to become another user')
+        os.seteuid(65534)
+        try:
+            with pytest.raises(StoreError, match='sudo chown -R 65534'):
+                Store()
+            found = {check.name: check for check in map(
+                doctor._result, (doctor.state, doctor.clocks, doctor.vpn_paths))}
+        finally:
+            os.seteuid(0)
+    finally:
+        shutil.rmtree(state)
+    assert {check.verdict for check in found.values()} == {'failed'}
+    assert f'sudo chown -R 65534 {state}/fogros2' in found['clocks'].remedy
 
 
 _PEER = """

@@ -117,6 +117,29 @@ def test_wait_fails_when_the_launch_ends(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "the launch of 'a' ended before it was up" in status[0]
 
 
+def test_wait_goes_on_while_a_launch_replaces_the_machine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looks: list[str] = []
+    recorded = awaiting.machines.recorded
+
+    def look(store: Store, name: str) -> dict[str, Record]:
+        looks.append(name)
+        if len(looks) == 2:
+            store.delete('a')
+        elif len(looks) == 3:
+            steps(('a', 'delete', 'done'), ('a', 'machine', 'done'), ('a', 'agent', 'done'))
+            record('a')
+        return recorded(store, name)
+
+    monkeypatch.setattr(awaiting.machines, 'recorded', look)
+    record('a')
+    steps(('a', 'machine', 'failed'))
+    (Store().launch_folder('abc123') / 'process.json').write_text(json.dumps(
+        {'pid': os.getpid(), 'pid_start': process_start(os.getpid())}))
+    assert run('wait', 'a', '--timeout', '20') == 0 and len(looks) == 3
+
+
 def test_wait_fails_after_its_time() -> None:
     assert "timed out after 0 s waiting for 'a'" in run('wait', 'a', '--timeout', '0')
     machine('a')

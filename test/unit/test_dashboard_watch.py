@@ -115,9 +115,26 @@ def test_step_that_only_failed_has_its_begin() -> None:
     ([('agent', 'done'), ('Python modules', 'failed')], 'running'),
     ([('agent', 'done'), ('delete', 'running')], 'ending'),
     ([('agent', 'done'), ('let go', 'done')], 'ending'),
+    # a replacement, and the next offer of a cloud
+    ([('machine', 'done'), ('agent', 'done'), ('delete', 'done'), ('machine', 'running')],
+     'coming'),
+    ([('machine', 'done'), ('agent', 'done'), ('delete', 'done'), ('machine', 'done'),
+      ('agent', 'done')], 'running'),
+    ([('machine', 'failed'), ('delete', 'done'), ('machine', 'done'), ('agent', 'done')],
+     'running'),
+    ([('machine', 'failed'), ('delete', 'done'), ('machine', 'failed')], 'ending'),
 ])
 def test_phase_follows_from_the_steps(steps: list[tuple[str, str]], expected: str) -> None:
     assert phase(tuple(Step('a', name, 1.0, state) for name, state in steps)) == expected
+
+
+def test_failure_that_is_not_fatal_ends_no_machine(tmp_path: Path) -> None:
+    keep = Journal(silent, tmp_path)
+    keep(StepDone('a', 'machine', 1.0, ''))
+    keep(StepFailed('a', 'DDS filter', 0.0, 'no control groups', fatal=False))
+    assert phase(tuple(read(tmp_path))) == 'coming'
+    keep(StepDone('a', 'agent', 1.0, ''))
+    assert phase(tuple(read(tmp_path))) == 'running'
 
 
 @pytest.mark.parametrize(('words', 'expected'), [

@@ -12,7 +12,8 @@ import uuid
 import pytest
 
 from fogros2 import process
-from fogros2.errors import DeadlineExceeded, PrerequisiteError
+from fogros2.deploy import robot
+from fogros2.errors import CommandError, DeadlineExceeded, PrerequisiteError
 from fogros2.model import Command, Result
 from fogros2.waiting import wait_until
 
@@ -105,6 +106,51 @@ def test_failure_of_sudo_has_its_reason(monkeypatch, said, reason, hint):
     trouble = process.sudo_trouble()
     assert trouble is not None and not answers
     assert reason in trouble[0] and hint in trouble[1]
+
+
+@pytest.fixture
+def sudo(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Return a program that stands in for sudo, of a user with a German locale."""
+    program = tmp_path / 'sudo'
+    program.write_text("""#!/bin/sh
+[ "$LC_ALL" = C ] && echo 'sudo: a password is required' >&2 && exit 1
+echo 'sudo: Ein Passwort ist notwendig' >&2; exit 1
+""")
+    program.chmod(0o755)
+    monkeypatch.setattr(os, 'geteuid', lambda: 1000)
+    monkeypatch.setattr(process, '_ENVIRONMENT', {
+        **os.environ, 'PATH': f'{tmp_path}:{os.environ["PATH"]}', 'LC_ALL': 'de_DE.UTF-8'})
+    monkeypatch.setenv('PATH', f'{tmp_path}:{os.environ["PATH"]}')
+    return program
+
+
+def test_sudo_wants_a_password_in_any_language(sudo: Path) -> None:
+    assert process.sudo_trouble() == process.PASSWORD
+    with pytest.raises(CommandError, match='run `sudo -v` first'):
+        process.run(Command(('true',), sudo=True), timeout=10.0)
+
+
+@pytest.mark.parametrize(('words', 'asks'), [
+    ('a password is required', True), ('interactive authentication is required', True),
+    ('eve is not in the sudoers file.', False)])
+def test_password_is_asked_for_whatever_sudo_calls_it(
+    sudo: Path, monkeypatch: pytest.MonkeyPatch, words: str, asks: bool,
+) -> None:
+    sudo.write_text(f'#!/bin/sh\necho "sudo: {words}" >&2; exit 1\n')
+    asked: list[str] = []
+
+    def ask(what: str) -> bool:
+        asked.append(what)
+        sudo.write_text('#!/bin/sh\nexit 0\n')
+        return True
+
+    monkeypatch.setattr(process, 'ask_for_ticket', ask)
+    if asks:
+        robot.check_sudo(ask=True)
+    else:
+        with pytest.raises(PrerequisiteError, match='may not use sudo'):
+            robot.check_sudo(ask=True)
+    assert asked == ['for the VPN interface'] * asks
 
 
 def test_user_without_sudo_rights_is_reported(root, monkeypatch):
