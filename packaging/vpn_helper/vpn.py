@@ -103,6 +103,8 @@ def network_of(value: object, pools: Iterable[str]) -> str:
         raise Refused('a network is like 198.18.7.0/24') from None
     if network.prefixlen != addresses.NETWORK_PREFIX:
         raise Refused(f'a network has {addresses.NETWORK_PREFIX} bits')
+    if addresses.uses_lan_groups(str(network)):
+        raise Refused(f"the multicast groups of {network} would be the LAN's")
     allowed = list(pools)
     if not any(network.subnet_of(ipaddress.IPv4Network(pool)) for pool in allowed):
         raise Refused(f'{network} is not in {", ".join(allowed) or "any pool"}: the administrator '
