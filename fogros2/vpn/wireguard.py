@@ -53,7 +53,7 @@ _GROUPS = (
     'top=/sys/fs/cgroup; [ -e $top/cgroup.procs ] || top=$top/unified; '
     '[ -e $top/cgroup.procs ] || { echo "version 2 is missing"; return 1; }')
 _KEY = re.compile('[A-Za-z0-9+/]{43}=')
-_ENDPOINT = re.compile(r'([\w.-]+|\[[0-9a-fA-F:.%\w]+\]):\d+', re.ASCII)
+_ENDPOINT = re.compile(r'([\w.-]+|\[[0-9a-fA-F:.]+(%[\w.-]+)?\]):\d+', re.ASCII)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -70,7 +70,9 @@ FIRST_PORT = 1024
 _NAME = re.compile('fog[0-9a-f]{6}')
 _KEY = re.compile('[A-Za-z0-9+/]{42}[AEIMQUYcgkosw048]=')
 _PRIVATE = re.compile('[A-Za-z0-9+/]{43}=')
-_HOST = re.compile(r'[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?|\[[0-9a-fA-F:.]{2,45}\]')
+_HOST = re.compile(
+    r'[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?|'
+    r'\[[0-9a-fA-F:.]{2,45}(%[A-Za-z0-9_.-]{1,15})?\]')
 
 
 class Refused(Exception):

@@ -51,7 +51,8 @@ BAD = st.recursive(
         '../fog123456', 'fog12345;', '-h', '', '\0', 'fog12345\u0661', '0.0.0.0/0',
         '198.18.7.0/24 ', '198.18.7.1/24', '198.18.0.0/16', '10.0.0.0/24', '::/24',
         '/etc/shadow', '$(id)', '`id`', "';id;'", '198.18.7.1', '198.18.7.255', 'a:b', 'a b:1',
-        'host:0', 'host:65536', 'host:1\nPrivateKey = x', '-x:1', '[::1]', '[::1%eth0]:1']),
+        'host:0', 'host:65536', 'host:1\nPrivateKey = x', '-x:1', '[::1]', '[::1%]:1',
+        '[::1%e;id]:1', '[::1%' + 16 * 'e' + ']:1']),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
     max_leaves=6)
 
@@ -123,7 +124,8 @@ def test_peers_that_are_refused(value: object, why: str) -> None:
         vpn.peers_of(value, NETWORK, '198.18.7.1')
 
 
-@pytest.mark.parametrize('value', ['203.0.113.9:1', 'vpn.example.org:65535', '[2001:db8::1]:9'])
+@pytest.mark.parametrize('value', ['203.0.113.9:1', 'vpn.example.org:65535', '[2001:db8::1]:9',
+                                   '[fe80::1%br-lan.2]:9'])
 def test_endpoints_as_providers_give_them(value: str) -> None:
     entry = {'key': KEY, 'address': '198.18.7.2', 'endpoint': value}
     (peer,) = vpn.peers_of([entry], NETWORK, '198.18.7.1')
