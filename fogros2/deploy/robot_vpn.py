@@ -230,7 +230,11 @@ class RobotVpn:
 
     def _refresh_ticket(self) -> None:
         """Refresh sudo's ticket, so that the way down needs no password; warn if it has ended."""
-        before, self._ticket_valid = self._ticket_valid, process.sudo_trouble() is None
+        try:
+            valid = process.sudo_trouble() is None
+        except FogError:
+            return  # sudo is slow now; the next refresh tries again
+        before, self._ticket_valid = self._ticket_valid, valid
         if before and not self._ticket_valid:
             self.report(StepFailed(
                 '', 'sudo ticket', 0.0,

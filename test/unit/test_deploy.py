@@ -465,6 +465,22 @@ def test_user_is_warned_each_time_sudo_wants_a_password(launch, events, monkeypa
     assert [event.fatal for event in events if isinstance(event, StepFailed)] == [False, False]
 
 
+@pytest.mark.parametrize('error', [DeadlineExceeded('10 s'), PrerequisiteError('no memory')])
+def test_sudo_that_fails_once_ends_no_health_check(launch, events, monkeypatch, error):
+    robot = launch.robot_vpn()
+    robot.ensure()
+
+    def slow():
+        raise error
+
+    looked = []
+    monkeypatch.setattr(process, 'sudo_trouble', slow)
+    monkeypatch.setattr(process, 'run', lambda *_, **__: looked.append(1) or Result(0, '', ''))
+    robot._ticket, robot._ticket_refreshed = True, -1e9
+    assert robot.check_health() == robot_vpn.POLL_INTERVAL and looked == [1]
+    assert not [event for event in events if isinstance(event, StepFailed)]
+
+
 def test_interface_does_not_come_up_after_the_end(launch, monkeypatch):
     robot = launch.robot_vpn()
     robot.ensure()
