@@ -311,6 +311,12 @@ class VpnMember:
                 self._health_check(peers)
                 self._checked = peers
 
+    def restore(self, robot: RobotVpn) -> None:
+        """Send the current peers to an agent that was started again, and so checks nothing."""
+        with self._lock:
+            self._checked = None
+        self.update(robot)
+
     def redial(self, robot: RobotVpn, endpoint: str) -> None:
         """Make the machine dial the robot at another ``host:port`` from now on."""
         before = self.route
