@@ -439,8 +439,8 @@ def up(request: Mapping[str, Any], uid: int) -> None:
     with own(request['name'], uid) as before:
         record = dataclasses.replace(
             before, network=network, address=address, port=port, ports=ports, asked=asked)
-        if before.network and before != record:
-            raise Refused(f'{record.name} is up already, with other settings')
+        if before.network and (before.network, before.address) != (network, address):
+            raise Refused(f'{record.name} has another address already')
         with locked(RECORDS):
             others = [other.network for other in records()
                       if other.name != record.name and other.network]
