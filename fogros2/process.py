@@ -289,8 +289,10 @@ def _signal_as_root(group: int, number: signal.Signals) -> None:
     try:
         killer.communicate(timeout=10.0)
     except subprocess.TimeoutExpired:
-        killer.kill()
-        killer.wait()
+        with contextlib.suppress(PermissionError):  # sudo runs as root
+            killer.kill()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            killer.wait(1.0)
     if killer.returncode != 0:
         # the ticket has expired, or the processes have ended
         try:

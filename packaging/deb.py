@@ -82,9 +82,11 @@ set -e
 [ ! -d /run/systemd/system ] || systemctl stop --quiet {TIMER} || :
 """ + """\
 if [ "$1" = remove ]; then
+    # of `sudo apt`: the helper would take it for the owner of an interface
+    unset SUDO_UID
     for each in /run/fogros2-vpn/fog*; do
         [ -d "$each" ] || continue
-        printf '{"name": "%s"}' "${each##*/}" | /usr/libexec/fogros2/vpn down
+        printf '{"name": "%s"}' "${each##*/}" | /usr/libexec/fogros2/vpn down || :
     done
     rm -rf /run/fogros2-vpn
 fi

@@ -11,6 +11,7 @@ from concurrent.futures import (
     wait,
 )
 import contextlib
+import functools
 from typing import Any
 
 from fogros2 import feature, plan
@@ -101,7 +102,9 @@ def _run(context: Context, job: RunningMachine) -> None:
         job.undo.add(name, ending.close)
     # a second time, so that the nodes stop first on the way down
     job.push(NODES)
-    dds.start_router(context, job)
+    start_router = functools.partial(dds.start_router, context, job)
+    start_router()
+    job.restoring = (joining.restore, start_router)
     connection.enter_vpn()
     job.undo.callback(ClockComparison(job.name, job.heartbeat, context.report).close)
     job.undo.callback(job.ending.set)

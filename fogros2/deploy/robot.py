@@ -14,7 +14,7 @@ from fogros2.errors import PrerequisiteError
 from fogros2.model import Command
 from fogros2.provider import Provider
 from fogros2.store import delete_folder
-from fogros2.vpn import helped, Vpn
+from fogros2.vpn import helped, owner, Vpn
 from fogros2.waiting import Timeouts
 
 #: Programs that the robot's side calls, and the Debian packages that contain them.
@@ -89,9 +89,12 @@ def clear(folder: Path) -> None:
 
     :raises FogError: a resource could not be deleted.
     """
-    name = f'fog{folder.name}'
-    interface = plan.robot_interface(
-        folder.name, '127.0.0.0/24', 0, helped.key_of(name) or str(folder / 'vpn.key'), 0)
+    name, own = f'fog{folder.name}', folder / 'vpn.key'
+    key = helped.key_of(name) or str(own)
+    if not own.exists() and not (owner.INTERFACES / name).exists() and helped.permitted():
+        # nothing is left that needs root: root's commands make the key first, and remove it last
+        key = helped.key_file(name)
+    interface = plan.robot_interface(folder.name, '127.0.0.0/24', 0, key, 0)
     ros2_daemon.stop(folder)
     vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')()
     run(vpn.down(interface), timeout=Timeouts().vpn)

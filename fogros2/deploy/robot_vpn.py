@@ -230,7 +230,11 @@ class RobotVpn:
 
     def _refresh_ticket(self) -> None:
         """Refresh sudo's ticket, so that the way down needs no password; warn if it has ended."""
-        before, self._ticket_valid = self._ticket_valid, process.sudo_trouble() is None
+        try:
+            valid = process.sudo_trouble() is None
+        except FogError:
+            return  # sudo is slow now; the next refresh tries again
+        before, self._ticket_valid = self._ticket_valid, valid
         if before and not self._ticket_valid:
             self.report(StepFailed(
                 '', 'sudo ticket', 0.0,
@@ -306,6 +310,12 @@ class VpnMember:
             if peers != self._checked:
                 self._health_check(peers)
                 self._checked = peers
+
+    def restore(self, robot: RobotVpn) -> None:
+        """Send the current peers to an agent that was started again, and so checks nothing."""
+        with self._lock:
+            self._checked = None
+        self.update(robot)
 
     def redial(self, robot: RobotVpn, endpoint: str) -> None:
         """Make the machine dial the robot at another ``host:port`` from now on."""

@@ -218,6 +218,12 @@ def reach(settings: ssh_config.Settings) -> str:
     :raises OSError: no answer, or no address.
     """
     if settings.proxy:
-        return str(socket.getaddrinfo(settings.host, settings.port)[0][4][0])
+        return _address(socket.getaddrinfo(settings.host, settings.port)[0][4])
     with socket.create_connection((settings.host, settings.port), timeout=_TIMEOUT) as connection:
-        return str(connection.getpeername()[0])
+        return _address(connection.getpeername())
+
+
+def _address(socket_address: tuple[Any, ...]) -> str:
+    """Return the address of a socket address, a link-local one with its interface."""
+    host, _, *rest = socket_address
+    return f'{host}%{socket.if_indextoname(rest[1])}' if rest and rest[1] else str(host)

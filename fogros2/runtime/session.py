@@ -372,10 +372,20 @@ class Session:
             self._preempted(self, reason)
 
     def _restarted(self) -> None:
-        """Start nodes with respawn again: the agent has died, and the nodes with it."""
+        """Restore the agent, which has died, and start its nodes with respawn again."""
         respawning = self._respawning()
         self._end_unreported(respawning)
+        self.request(self._restore)
         self._start_again(respawning)
+
+    async def _restore(self) -> None:
+        assert self.running is not None
+        try:
+            async with self._order:
+                await self._in_thread(self.running.restore)
+        except FogError as error:
+            self._logger.error(
+                f'{self.spec.name}: the new agent does not check the VPN: {error}')
 
     def _agent_gone(self) -> None:
         """End all processes: nobody knows of them any more."""

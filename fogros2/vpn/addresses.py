@@ -37,7 +37,8 @@ def pool_from(environment: Mapping[str, str]) -> str:
     """
     Return the pool in CIDR form: the environment's, or :data:`POOL`.
 
-    :raises ConfigurationError: the environment's pool is not an IPv4 network with room for a /24.
+    :raises ConfigurationError: the environment's pool is not an IPv4 network with room for a /24,
+        or its multicast groups are those of the LAN.
     """
     text = environment.get(POOL_VARIABLE) or POOL
     return str(_pool(text))
@@ -54,9 +55,10 @@ def choose_subnet(used: Iterable[str], *, launch_id: str, pool: str = POOL) -> s
         IPv6 networks and those that mean "everything" are ignored.
     :param launch_id: hexadecimal digits.
     :raises VpnError: the whole pool is in use.
-    :raises ConfigurationError: the pool is not an IPv4 network with room for a /24.
+    :raises ConfigurationError: the pool is unfit, as for :func:`pool_from`.
     """
-    candidates = list(_pool(pool).subnets(new_prefix=NETWORK_PREFIX))
+    candidates = [network for network in _pool(pool).subnets(new_prefix=NETWORK_PREFIX)
+                  if not uses_lan_groups(str(network))]
     networks = [network for network in map(_network, used) if network is not None]
     begin = int(launch_id, 16) % len(candidates)
     for candidate in candidates[begin:] + candidates[:begin]:
@@ -78,15 +80,26 @@ def multicast_group(address: str) -> str:
     return f"239.{address.partition('.')[2]}"
 
 
+def uses_lan_groups(network: str) -> bool:
+    """
+    Return whether the groups of a VPN's hosts are in 239.255.0.0/16, whose groups LANs use.
+
+    That range (RFC 2365) has the discovery of DDS and of UPnP.
+
+    :param network: a /24 or smaller, in CIDR form.
+    """
+    return multicast_group(network).startswith('239.255.')
+
+
 def dds_ports(domain: int) -> tuple[int, int]:
     """
     Return the first and last UDP port of DDS in a ROS domain (RTPS 2.5, 9.6.2.3).
 
     The range contains multicast discovery (+0) and data (+1), and for each participant i unicast
-    discovery (+10 + 2 i) and data (+11 + 2 i), i up to 119.
+    discovery (+10 + 2 i) and data (+11 + 2 i), i up to 119. Domain 232 has fewer.
     """
     begin = 7400 + 250 * domain
-    return begin, begin + 249
+    return begin, min(begin + 249, 65535)
 
 
 def overlapping(subnet: str, used: Iterable[str]) -> list[str]:
@@ -172,6 +185,10 @@ def _pool(text: str) -> _Network:
     if network.prefixlen > NETWORK_PREFIX:
         raise ConfigurationError(
             f"'{text}' is smaller than a /{NETWORK_PREFIX}", f'{POOL_VARIABLE} is like {POOL}')
+    if network.prefixlen >= 16 and uses_lan_groups(str(network)):
+        raise ConfigurationError(
+            f"'{text}' has no network for the VPN: its multicast groups would be those of the LAN",
+            f'{POOL_VARIABLE} is like {POOL}')
     return network
 
 

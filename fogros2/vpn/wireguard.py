@@ -53,7 +53,7 @@ _GROUPS = (
     'top=/sys/fs/cgroup; [ -e $top/cgroup.procs ] || top=$top/unified; '
     '[ -e $top/cgroup.procs ] || { echo "version 2 is missing"; return 1; }')
 _KEY = re.compile('[A-Za-z0-9+/]{43}=')
-_ENDPOINT = re.compile(r'([\w.-]+|\[[0-9a-fA-F:.%\w]+\]):\d+', re.ASCII)
+_ENDPOINT = re.compile(r'([\w.-]+|\[[0-9a-fA-F:.]+(%[\w.-]+)?\]):\d+', re.ASCII)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -294,6 +294,9 @@ def _confine(
     and from the machine only. Multicast is an exception there: one packet is for all processes of
     the host, the user's own included.
 
+    The parent of an agent, which has the same command line, is in the group, too: it starts
+    another agent when that one dies.
+
     The group is a child of the group of the process, so that limits and systemd's units stay. The
     step prints a line and does not fail where control groups (version 2) cannot be used.
 
@@ -322,7 +325,11 @@ def _confine(
         rules = ['chain input {', f'{_outside(interface)} ip daddr != 224.0.0.0/4 {match} drop']
     text = shlex.quote('\n'.join([f'table inet {name} {{', *rules, '}', '}', '']))
     process = interface.process
-    pid = process if process.isdigit() else f'$(cat {shlex.quote(process)})'
+    members = f'pid={process}\n  parent='
+    if not process.isdigit():
+        members = (f'pid=$(cat {shlex.quote(process)})\n'
+                   "  parent=$(sed -n 's/^PPid:[[:space:]]*//p' \"/proc/$pid/status\")\n"
+                   '  cmp -s "/proc/$pid/cmdline" "/proc/$parent/cmdline" || parent=')
     ends = f"""\
 empty_group() {{
   n=0
@@ -347,7 +354,7 @@ end_groups() {{
     do = f"""\
 {ends}
 confine() {{
-  pid={pid}
+  {members}
   {_GROUPS}
   group=$(sed -n 's/^0:://p' "/proc/$pid/cgroup") || return
   read -r kept 2>/dev/null <{record} || kept=none
@@ -358,7 +365,8 @@ confine() {{
   case $group in *[!-A-Za-z0-9/_.@:\\\\]* | */..*) echo "odd name: $group"; return 1;; esac
   [ "$kept" = "$top$group" ] || {{
     printf "%s\\n" "$top$group" >{record}
-    mkdir -p "$top$group" && echo "$pid" >"$top$group/cgroup.procs" || return
+    mkdir -p "$top$group" || return
+    for each in $parent "$pid"; do echo "$each" >"$top$group/cgroup.procs"; done || return
   }}
   path=${{top#/sys/fs/cgroup}}$group
   printf {text} "$(($(printf %s "$group" | tr -cd / | wc -c)))" "${{path#/}}" | nft -f -

@@ -23,6 +23,7 @@ from fogros2 import untrusted
 from fogros2.errors import ConfigurationError
 from fogros2.model import NETWORK_PREFIX, to_json
 from fogros2.store import check_name, robot_name, Store, write_private
+from fogros2.vpn.addresses import uses_lan_groups
 
 _PREFIX = 'fog1.'
 #: File with the secret for ``GuestShell`` in the folder of a machine's VPN (``Store.other_vpns``).
@@ -69,6 +70,8 @@ class Invitation:
             raise ValueError(f'{subnet} is larger than the network of a launch')
         if subnet.is_loopback or subnet.is_link_local or subnet.is_multicast or subnet.is_reserved:
             raise ValueError(f'{subnet} is the network of no computer')
+        if uses_lan_groups(str(subnet)):
+            raise ValueError(f"the multicast groups of {subnet} would be the LAN's")
         inside = {ipaddress.IPv4Address(self.address), ipaddress.IPv4Address(self.joiner)}
         if len(inside) != 2 or not all(address in subnet for address in inside):
             raise ValueError('its addresses are not those of one network')

@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable, Mapping
 import dataclasses
+import functools
 import os
 from pathlib import Path
 from typing import Optional
@@ -76,15 +77,20 @@ def join(
         ports=vendor.ports, asked=addresses_of(vendor.asked(environment)))
     private = base64.b64encode(key).decode()
     store.launch_folder(invitation.number)
+    write = functools.partial(_write, folder, invitation, other, vendor, environment, owner)
     try:
-        _write(folder, invitation, other, vendor, environment, owner)
+        if not up:  # else the former ones hold until the interface has changed
+            write()
         if helped.made(interface):
             process.run(helped.lend(interface, private), timeout=Timeouts().vpn)
         else:
             write_private(Path(interface.key_file), f'{private}\n'.encode())
         run(vpn.up(interface, [other.machine]), timeout=Timeouts().vpn)
+        if up:
+            write()
     except BaseException:
-        clear(folder)
+        if not up:
+            clear(folder)
         raise
     return folder
 

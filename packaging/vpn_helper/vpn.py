@@ -70,7 +70,9 @@ FIRST_PORT = 1024
 _NAME = re.compile('fog[0-9a-f]{6}')
 _KEY = re.compile('[A-Za-z0-9+/]{42}[AEIMQUYcgkosw048]=')
 _PRIVATE = re.compile('[A-Za-z0-9+/]{43}=')
-_HOST = re.compile(r'[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?|\[[0-9a-fA-F:.]{2,45}\]')
+_HOST = re.compile(
+    r'[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?|'
+    r'\[[0-9a-fA-F:.]{2,45}(%[A-Za-z0-9_.-]{1,15})?\]')
 
 
 class Refused(Exception):
@@ -103,6 +105,8 @@ def network_of(value: object, pools: Iterable[str]) -> str:
         raise Refused('a network is like 198.18.7.0/24') from None
     if network.prefixlen != addresses.NETWORK_PREFIX:
         raise Refused(f'a network has {addresses.NETWORK_PREFIX} bits')
+    if addresses.uses_lan_groups(str(network)):
+        raise Refused(f"the multicast groups of {network} would be the LAN's")
     allowed = list(pools)
     if not any(network.subnet_of(ipaddress.IPv4Network(pool)) for pool in allowed):
         raise Refused(f'{network} is not in {", ".join(allowed) or "any pool"}: the administrator '
@@ -437,8 +441,8 @@ def up(request: Mapping[str, Any], uid: int) -> None:
     with own(request['name'], uid) as before:
         record = dataclasses.replace(
             before, network=network, address=address, port=port, ports=ports, asked=asked)
-        if before.network and before != record:
-            raise Refused(f'{record.name} is up already, with other settings')
+        if before.network and (before.network, before.address) != (network, address):
+            raise Refused(f'{record.name} has another address already')
         with locked(RECORDS):
             others = [other.network for other in records()
                       if other.name != record.name and other.network]

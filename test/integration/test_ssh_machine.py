@@ -14,6 +14,7 @@ import uuid
 import pytest
 
 from fogros2.provider.container import root as container_root
+from fogros2.waiting import wait_until
 from rigs.bare_computer import bare_computer
 from rigs.colcon_workspace import colcon_workspace
 from rigs.launched import embedded, launching, ros2
@@ -76,6 +77,36 @@ def test_bare_computer_gets_missing_packages(computer, launch):
     assert ('ROS 2 installed by pip' in run.text) == embedded()
     assert 'WARNING' not in run.text and run.errors == []
     assert computer.leftovers() == []
+
+
+def test_agent_that_died_repairs_and_removes_the_vpn(computer, launch, tmp_path):
+    name = f'dies-{RUN}'
+    path = tmp_path / 'dies.launch.py'
+    path.write_text(textwrap.dedent(f"""
+        from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
+
+
+        def generate_launch_description():
+            machine = SSHInstance(
+                '{computer.address}', '{computer.user}', key='{computer.key}',
+                host_key='{computer.host_key}', name='{name}', robot_timeout=10)
+            return FogROSLaunchDescription([CloudNode(
+                machine=machine, package='fogros2_examples', executable='talker', respawn=True,
+                output='screen')])
+        """))
+    run = launch(str(path))
+    run.wait_for('Publishing')
+    run.said.clear()
+    computer.run(f'kill -9 $(cat /run/fogros2/{name}/agent.pid)')
+    for words in ('its agent died and was started again', 'Publishing'):
+        run.wait_for(words)
+    computer.run('ip link set $(ls /sys/class/net | grep ^fog) down')
+    run.wait_for('the VPN was down for')
+    run.kill()
+    # the agent misses the heartbeats
+    wait_until(lambda: computer.leftovers() == [], timeout=60, what='the end of the VPN there')
+    assert 'table inet fog' not in computer.run('nft list tables').stdout
+    assert ros2('fog', 'gc').returncode == 0
 
 
 NODE = """\

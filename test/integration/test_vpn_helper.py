@@ -167,6 +167,11 @@ def test_a_user_makes_changes_and_takes_away_an_interface(copy: Copy) -> None:
         told = copy.ask('fogada', 'peers', name=NAME, peers=[peer('198.18.7.2')])
         assert told.returncode == 0, told.stderr
         assert copy.ask('fogada', 'status', name=NAME).stdout.count(KEY) == 2
+        # a guest takes another invitation, or the port is taken
+        again = copy.ask('fogada', 'up', name=NAME, network='198.18.7.0/24', port=51821,
+                         ports=[], asked=[], peers=[peer('198.18.7.2')])
+        assert again.returncode == 0, again.stderr
+        assert copy.run('root', 'wg', 'show', NAME, 'listen-port').stdout == '51821\n'
         # the program that serves it dies, and is got going again
         copy.run('root', 'sh', '-c', f'kill -9 $(pgrep -f "^wireguard-go {NAME}$")')
         again = copy.ask('fogada', 'repair', name=NAME, peers=[peer('198.18.7.2')])
@@ -296,7 +301,10 @@ sys.stdin.readline()
 """
 
 
-def test_what_a_killed_launch_has_made_goes_by_gc(copy: Copy, product: None) -> None:
+@pytest.mark.parametrize('tidied', [False, True])
+def test_what_a_killed_launch_has_made_goes_by_gc(
+    copy: Copy, product: None, tidied: bool,
+) -> None:
     words = process.argv(Command(tuple(copy.argv(
         'fogada', sys.executable, '-c', PRODUCT, '/home/fogada/state')), sudo=True))
     child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -308,10 +316,13 @@ def test_what_a_killed_launch_has_made_goes_by_gc(copy: Copy, product: None) -> 
         assert key == f'/run/fogros2-vpn/{name}/key' and name in copy.links()
         copy.run('fogada', 'kill', '-9', str(pid), check=True)
         child.wait(60.0)
+        if tidied:  # by the timer
+            assert name in copy.run('root', HELPER, 'tidy', check=True).stdout
         said = copy.run('fogada', 'env', 'FOGROS2_STATE_HOME=/home/fogada/state', 'ros2', 'fog',
                         'gc')
         assert said.returncode == 0, said
         assert name not in copy.links()
+        assert copy.run('root', 'ls', '/home/fogada/state/launches').stdout == ''
     finally:
         timer.cancel()
         child.kill()
@@ -402,7 +413,8 @@ def test_it_is_removed_without_a_trace(copy: Copy) -> None:
     install = str(ROOT / 'packaging/vpn_helper/install')
     with contextlib.suppress(AssertionError), \
             interface(copy, 'fogada', NAME, '198.18.7.0/24', 51820):
-        copy.run('root', install, '--remove', check=True)
+        # of an administrator's sudo
+        copy.run('root', 'env', 'SUDO_UID=4711', install, '--remove', check=True)
         assert NAME not in copy.links()
         for path in (HELPER, str(Path(HELPER).parent), RULES, '/run/fogros2-vpn'):
             assert copy.run('root', 'test', '-e', path).returncode == 1, path

@@ -51,6 +51,11 @@ class FakeMachine:
             if on_start is not None:
                 on_start(self, node)
 
+    def restore(self):
+        self.launch.note('restore', self.spec.name)
+        if self.launch.restore_error is not None:
+            raise self.launch.restore_error
+
     def stop(self, ids=None):
         self.stops.append(list(ids))
         self.launch.note('stop', self.spec.name, *ids)
@@ -107,6 +112,8 @@ class FakeLaunch:
         self.here_error = None
         #: What machines refuse nodes with.
         self.start_error = None
+        #: Why machines do not restore an agent.
+        self.restore_error = None
         self.prepare_error = None
         self.down_errors = []
         self.spent = []

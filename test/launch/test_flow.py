@@ -385,6 +385,8 @@ def test_nodes_respawn_after_the_death_of_their_agent(
             OpaqueFunction(function=lambda context, name=name: seen.append(name))]}))
           for handler, name in ((OnProcessStart, 'on_start'), (OnProcessExit, 'on_exit')))])) == 0
     assert seen == ['on_start', 'on_exit'] * 3
+    kinds = [kind for kind, *_ in fake.notes if kind in ('start', 'restore')]
+    assert kinds == ['start', 'restore'] * 2 + ['start']
     assert len({life.id for life in lives}) == 3
     assert [life.respawn_max_retries for life in lives] == [5, 4, 3]
 
@@ -404,12 +406,14 @@ def test_agent_that_starts_no_node_ends_no_launch(run, fake, planner, capfd, err
 def test_nodes_respawn_at_most_as_often_as_they_may(run, fake, planner, monkeypatch, capfd):
     monkeypatch.setattr(session, '_RESPAWN_DELAY', 0.01)
     fake.on_start = lambda machine, node: len(machine.all) > 1 and machine.say('restarted')
+    fake.restore_error = AgentError('no')
     once = talker(planner)
     assert run(LaunchDescription([
         talker(planner, respawn=True, respawn_max_retries=1), once])) == 0
     assert len(fake.noted('start')) == 3 and once.return_code == -9
-    assert 'planner: its agent died and was started again; the nodes have ended' in (
-        capfd.readouterr().out)
+    output = capfd.readouterr().out
+    assert 'planner: its agent died and was started again; the nodes have ended' in output
+    assert 'planner: the new agent does not check the VPN: no' in output
 
 
 def test_shutdown_before_a_node_respawns(run, fake, planner):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 import contextlib
 import dataclasses
 import json
@@ -242,6 +242,33 @@ def test_folder_of_a_joined_machine_stays_until_a_reboot(
             assert endings.leftovers(store) == []
         assert cleared == ends
         cleared.clear()  # the folder stays here, and its owner runs
+
+
+def test_invitation_that_fails_leaves_the_former_vpn(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    store = Store(tmp_path / 'second')
+    first, second = (invitation.seal(invitation.Invitation(
+        'planner', OTHER, '198.18.7.2', '203.0.113.9:30000', '198.18.7.224', '198.18.7.0/24',
+        'rmw_cyclonedds_cpp', 7, time.time() + 60, 'foga1b2c3m0', secret), invitation.public_text(
+            invitation.own_key(store))) for secret in (32 * 'aa', 32 * 'bb'))
+    refusals: list[VpnError] = []
+
+    def run(commands: Iterable[Command], **_: object) -> str:
+        if refusals and any(command.what.endswith(' up') for command in commands):
+            raise refusals.pop()
+        return ''
+
+    monkeypatch.setattr(membership, 'check_robot', lambda: None)
+    monkeypatch.setattr(membership, 'run', run)
+    folder = membership.join(first, store, {})
+    monkeypatch.setattr(membership, 'is_up', lambda invitation: True)
+    refusals.append(VpnError('no'))
+    with pytest.raises(VpnError, match='no'):
+        membership.join(second, store, {})
+    assert membership.secret_of(folder) == 32 * 'aa'
+    assert membership.join(second, store, {}) == folder
+    assert membership.secret_of(folder) == 32 * 'bb'
 
 
 def test_leave_names_the_nearest_machine() -> None:

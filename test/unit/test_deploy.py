@@ -19,6 +19,7 @@ import pytest
 from fogros2 import plan, process
 from fogros2.agent_client import AgentClient
 from fogros2.dds import Router
+from fogros2.dds.zenoh import Zenoh
 from fogros2.deploy import Launch, robot_router, robot_vpn, undo
 from fogros2.deploy import launch as deployed
 from fogros2.deploy.robot_vpn import VpnMember
@@ -465,6 +466,22 @@ def test_user_is_warned_each_time_sudo_wants_a_password(launch, events, monkeypa
     assert [event.fatal for event in events if isinstance(event, StepFailed)] == [False, False]
 
 
+@pytest.mark.parametrize('error', [DeadlineExceeded('10 s'), PrerequisiteError('no memory')])
+def test_sudo_that_fails_once_ends_no_health_check(launch, events, monkeypatch, error):
+    robot = launch.robot_vpn()
+    robot.ensure()
+
+    def slow():
+        raise error
+
+    looked = []
+    monkeypatch.setattr(process, 'sudo_trouble', slow)
+    monkeypatch.setattr(process, 'run', lambda *_, **__: looked.append(1) or Result(0, '', ''))
+    robot._ticket, robot._ticket_refreshed = True, -1e9
+    assert robot.check_health() == robot_vpn.POLL_INTERVAL and looked == [1]
+    assert not [event for event in events if isinstance(event, StepFailed)]
+
+
 def test_interface_does_not_come_up_after_the_end(launch, monkeypatch):
     robot = launch.robot_vpn()
     robot.ensure()
@@ -529,6 +546,7 @@ class Members:
         self.robot = robot
         self.away = set()
         self.told = []
+        self.watched = []
 
     def add(self, number):
         name = f'm{number}'
@@ -541,7 +559,8 @@ class Members:
                 self.told.append((name, [*command.argv[1:]]))
             return ''
 
-        member = VpnMember(route, self.robot.interface, run, lambda peers: None)
+        member = VpnMember(route, self.robot.interface, run, lambda peers: self.watched.append(
+            (name, [peer.name for peer in peers])))
         member.up(self.robot)
         self.robot.admit(member)
         self.robot.spread(member)
@@ -567,6 +586,31 @@ def test_everybody_knows_of_a_new_machine_when_it_is_up(members, monkeypatch):
     assert members.told[-2:] in (
         [('m2', ['m3', 'm4', 'robot']), ('m3', ['m2', 'm4', 'robot'])],
         [('m3', ['m2', 'm4', 'robot']), ('m2', ['m3', 'm4', 'robot'])])
+
+
+def test_agent_that_was_started_again_checks_the_vpn_again(members):
+    member = members.add(2)
+    assert members.watched == [('m2', ['robot'])]
+    member.update(members.robot)
+    assert len(members.watched) == 1
+    member.restore(members.robot)
+    assert members.watched == [('m2', ['robot'])] * 2
+
+
+def test_agent_that_was_started_again_gets_router_and_watches(launch, provider):
+    context, mine = begun(launch, dds=Zenoh())
+    mine.interface = plan.machine_interface(launch.id, '198.18.7.0/24', 0, 50_000, '/key')
+    requests, steps = [], []
+    mine.agent = SimpleNamespace(
+        request=lambda command, **words: requests.append((command, words)))
+    mine.watch('idle', ['look'], 5.0, print)
+    before = list(requests)
+    mine.restoring = [lambda: steps.append('VPN'), lambda: dds.start_router(context, mine)]
+    mine.restore()
+    assert steps == ['VPN']
+    assert [command for command, _ in requests] == ['watch', 'start', 'watch']
+    assert requests[1][1]['nodes'][0].executable == 'rmw_zenohd'
+    assert requests[2:] == before
 
 
 def test_robot_alone_uses_a_relay(members, monkeypatch):

@@ -81,8 +81,9 @@ def test_expired_invitation_is_refused(store: Store, valid: Invitation) -> None:
 
 @pytest.mark.parametrize('change', [
     {'machine': '../planner'}, {'address': '198.18.8.2'}, {'joiner': '198.18.7.2'},
-    {'network': '198.18.7.0/33'}, {'domain': '3'}, {'domain': 233}, {'expires': 'never'},
-    {'more': 1}])
+    {'network': '198.18.7.0/33'},
+    {'network': '10.255.0.0/24', 'address': '10.255.0.2', 'joiner': '10.255.0.224'},
+    {'domain': '3'}, {'domain': 233}, {'expires': 'never'}, {'more': 1}])
 def test_content_that_makes_no_sense_is_refused(
     store: Store, valid: Invitation, change: dict[str, object], monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -169,6 +169,25 @@ def test_user_without_sudo_rights_is_reported(root, monkeypatch):
     assert trouble is not None and trouble[0] == 'this user may not use sudo'
 
 
+def test_sudo_that_hangs_and_cannot_be_killed_is_left(monkeypatch):
+    class Hanging:
+        returncode = None
+
+        def communicate(self, timeout):
+            raise subprocess.TimeoutExpired('sudo', timeout)
+
+        def kill(self):
+            raise PermissionError
+
+        wait = communicate
+
+    signalled = []
+    monkeypatch.setattr(process, 'start', lambda *_, **__: Hanging())
+    monkeypatch.setattr(process.os, 'killpg', lambda *words: signalled.append(words))
+    process._signal_as_root(77, signal.SIGTERM)
+    assert signalled == [(77, signal.SIGTERM)]
+
+
 def test_an_interrupt_ends_the_command(tmp_path: Path) -> None:
     written = tmp_path / 'pid'
 

@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 import socket
+from types import SimpleNamespace
 
 import pytest
 
 from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
 from fogros2.model import MachineSpec, MachineState
-from fogros2.provider.ssh import Options, SSHProvider
+from fogros2.provider.ssh import Options, reach, SSHProvider
+from fogros2.shell import ssh_config
 from fogros2_testing import ProviderContract, request_for
 
 
@@ -80,6 +83,21 @@ def test_a_computer_that_can_t_be_reached_is_refused_at_once(listener, host, wor
     with pytest.raises(ProviderError, match=words):
         SSHProvider().check_here(spec)
     SSHProvider().check(spec)
+
+
+@pytest.mark.parametrize('proxy', ['', 'jump'])
+@pytest.mark.parametrize(('peer', 'expected'), [
+    (('fe80::1', 22, 0, 1), 'fe80::1%lo'), (('2001:db8::1', 22, 0, 0), '2001:db8::1'),
+    (('192.0.2.7', 22), '192.0.2.7')])
+def test_link_local_address_names_its_interface(monkeypatch, proxy, peer, expected):
+    class Connection(contextlib.nullcontext):
+        def __enter__(self):
+            return SimpleNamespace(getpeername=lambda: peer)
+
+    monkeypatch.setattr(socket, 'create_connection', lambda *_, **__: Connection())
+    monkeypatch.setattr(socket, 'getaddrinfo', lambda *_: [(None, None, None, '', peer)])
+    monkeypatch.setattr(socket, 'if_indextoname', {1: 'lo'}.__getitem__)
+    assert reach(ssh_config.Settings('host', proxy=proxy)) == expected
 
 
 @pytest.mark.parametrize('given, words', [

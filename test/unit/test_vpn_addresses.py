@@ -59,6 +59,18 @@ def test_the_pool_can_be_another() -> None:
     assert addresses.pool_from({}) == addresses.pool_from({'FOGROS2_VPN_POOL': ''})
 
 
+def test_multicast_groups_of_the_lan_are_no_launchs() -> None:
+    taken = ['10.254.0.0/16']
+    with pytest.raises(VpnError, match='is free for the VPN'):
+        addresses.choose_subnet(taken, launch_id='1', pool='10.254.0.0/15')
+    for launch_id in ('000000', '000100', '0001ff'):
+        assert addresses.choose_subnet(
+            [], launch_id=launch_id, pool='10.254.0.0/15').startswith('10.254.')
+    for pool in ('10.255.0.0/16', '192.255.0.0/24'):
+        with pytest.raises(ConfigurationError, match='multicast groups would be those of the LAN'):
+            addresses.pool_from({'FOGROS2_VPN_POOL': pool})
+
+
 @pytest.mark.parametrize('text', ['10.0.0.0/25', '10.0.0.1/8', 'fd00::/16', 'lan'])
 def test_a_pool_that_is_none_is_refused(text: str) -> None:
     with pytest.raises(ConfigurationError, match='FOGROS2_VPN_POOL'):

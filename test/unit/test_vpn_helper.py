@@ -20,7 +20,7 @@ from fogros2 import process
 from fogros2.deploy import robot
 from fogros2.errors import CommandError, PrerequisiteError
 from fogros2.model import Command, Peer, Result, VpnInterface
-from fogros2.vpn import helped
+from fogros2.vpn import helped, owner
 from fogros2.vpn.wireguard import WireGuard
 from ros2fog_cli.api import doctor
 
@@ -51,7 +51,8 @@ BAD = st.recursive(
         '../fog123456', 'fog12345;', '-h', '', '\0', 'fog12345\u0661', '0.0.0.0/0',
         '198.18.7.0/24 ', '198.18.7.1/24', '198.18.0.0/16', '10.0.0.0/24', '::/24',
         '/etc/shadow', '$(id)', '`id`', "';id;'", '198.18.7.1', '198.18.7.255', 'a:b', 'a b:1',
-        'host:0', 'host:65536', 'host:1\nPrivateKey = x', '-x:1', '[::1]', '[::1%eth0]:1']),
+        'host:0', 'host:65536', 'host:1\nPrivateKey = x', '-x:1', '[::1]', '[::1%]:1',
+        '[::1%e;id]:1', '[::1%' + 16 * 'e' + ']:1']),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
     max_leaves=6)
 
@@ -123,7 +124,8 @@ def test_peers_that_are_refused(value: object, why: str) -> None:
         vpn.peers_of(value, NETWORK, '198.18.7.1')
 
 
-@pytest.mark.parametrize('value', ['203.0.113.9:1', 'vpn.example.org:65535', '[2001:db8::1]:9'])
+@pytest.mark.parametrize('value', ['203.0.113.9:1', 'vpn.example.org:65535', '[2001:db8::1]:9',
+                                   '[fe80::1%br-lan.2]:9'])
 def test_endpoints_as_providers_give_them(value: str) -> None:
     entry = {'key': KEY, 'address': '198.18.7.2', 'endpoint': value}
     (peer,) = vpn.peers_of([entry], NETWORK, '198.18.7.1')
@@ -134,6 +136,33 @@ def test_endpoints_as_providers_give_them(value: str) -> None:
 def test_a_number_is_one_of_its_range(value: object) -> None:
     with pytest.raises(vpn.Refused):
         vpn.number(value, 1, 65535, 'x')
+
+
+def test_groups_of_the_lan_are_refused() -> None:
+    assert vpn.network_of('10.254.7.0/24', ['10.0.0.0/8']) == '10.254.7.0/24'
+    with pytest.raises(vpn.Refused, match="would be the LAN's"):
+        vpn.network_of('10.255.0.0/24', ['10.0.0.0/8'])
+
+
+def test_port_may_change_and_address_may_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(vpn, 'RECORDS', tmp_path)
+    monkeypatch.setattr(vpn, 'taken', lambda but: [])
+    ran: list[Command] = []
+    monkeypatch.setattr(vpn, 'run', lambda commands: ran.extend(commands))
+    (tmp_path / 'fog0a1b2c').mkdir()
+    vpn.Record('fog0a1b2c', 1000, 0, 0).save(tmp_path / 'fog0a1b2c')
+    request = {'name': 'fog0a1b2c', 'network': NETWORK, 'address': '198.18.7.224', 'port': 51820,
+               'ports': [[7400, 7649]], 'asked': [], 'peers': []}
+    for changes in ({}, {'port': 51821}, {'ports': [[7650, 7899]], 'asked': ['192.0.2.7']}):
+        vpn.up({**request, **changes}, 1000)
+    assert ['51821' in command.argv[-1] for command in ran] == [False, True, False]
+    for changes in ({'address': '198.18.7.225'},
+                    {'network': '198.18.8.0/24', 'address': '198.18.8.1'}):
+        with pytest.raises(vpn.Refused, match='has another address already'):
+            vpn.up({**request, **changes}, 1000)
+    assert len(ran) == 3
 
 
 def test_deep_nesting_is_refused() -> None:
@@ -270,6 +299,50 @@ def test_doctor_asks_root_for_nothing_where_the_helper_is_enough(
         monkeypatch.setattr(helped, 'permitted', lambda permitted=permitted: permitted)
         found = [doctor.root(), doctor.firewall_program(), doctor.firewall()]
         assert [check.verdict for check in found] == verdicts
+
+
+@pytest.mark.parametrize(('left', 'permitted', 'helped_down'), [
+    ('', True, True), ('0a1b2c/vpn.key', True, False), ('net/fog0a1b2c', True, False),
+    ('run/fog0a1b2c', True, True), ('', False, False)])
+def test_launch_whose_interface_has_gone_is_cleared_by_its_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: str, permitted: bool,
+    helped_down: bool,
+) -> None:
+    """The timer or a reboot has removed what the helper made; sudo allows the helper alone."""
+    folder = tmp_path / '0a1b2c'
+    for path in (folder, tmp_path / 'run', tmp_path / 'net'):
+        path.mkdir()
+    if left:
+        (tmp_path / left).touch()
+    monkeypatch.setattr(owner, 'INTERFACES', tmp_path / 'net')
+    monkeypatch.setattr(helped, 'KEYS', str(tmp_path / 'run'))
+    monkeypatch.setattr(helped, 'permitted', lambda: permitted)
+    monkeypatch.setattr(robot.ros2_daemon, 'stop', lambda folder: None)
+    ran: list[Command] = []
+    monkeypatch.setattr(robot, 'run', lambda commands, **more: ran.extend(commands))
+    robot.clear(folder)
+    assert [command.argv[0] == helped.HELPER for command in ran] == [helped_down]
+    assert not folder.exists()
+
+
+def test_package_is_removed_while_another_user_has_an_interface(tmp_path: Path) -> None:
+    """``sudo apt purge`` names the administrator; nor does a refusal end the script."""
+    spec = importlib.util.spec_from_file_location('deb', FOLDER.parent / 'deb.py')
+    assert spec and spec.loader
+    deb = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(deb)
+    helper = tmp_path / 'vpn'
+    helper.write_text(f'#!/bin/sh\necho "$(cat) ${{SUDO_UID-root}}" >>{tmp_path}/said; exit 2\n')
+    helper.chmod(0o755)
+    records = tmp_path / 'run/fogros2-vpn'
+    for name in ('fog0a1b2c', 'fog0a1b2d'):
+        (records / name).mkdir(parents=True)
+    text = deb.PRERM.replace('/run/', f'{tmp_path}/run/').replace(helped.HELPER, str(helper))
+    subprocess.run(['sh', '-c', text, 'prerm', 'remove'], check=True, stderr=subprocess.DEVNULL,
+                   env={**os.environ, 'SUDO_UID': '1000'})
+    assert (tmp_path / 'said').read_text().splitlines() == [
+        '{"name": "fog0a1b2c"} root', '{"name": "fog0a1b2d"} root']
+    assert not records.exists()
 
 
 def test_user_outside_of_the_group_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

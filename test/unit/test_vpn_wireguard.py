@@ -10,6 +10,7 @@ import subprocess
 
 import pytest
 
+from fogros2.dds import DdsVendor
 from fogros2.dds.cyclonedds import CycloneDds
 from fogros2.dds.fastdds import FastDds
 from fogros2.dds.zenoh import Zenoh
@@ -87,18 +88,52 @@ def test_groups_of_the_vpn_leave_the_robot_by_the_vpn_only() -> None:
     assert 'ip daddr != { 198.18.7.1, 239.255.0.1, 239.18.7.1 } drop' in text
 
 
+def confining(interface: VpnInterface, folder: Path) -> str:
+    """Return the step that confines a process, with a folder in place of the system's."""
+    text = script(*WireGuard().up(interface, []))
+    text = text[text.index('empty_group() {'):text.index('[ -e /sys/class/net')]
+    for path in ('/proc/', '/sys/fs/cgroup', '/run/'):
+        text = text.replace(path, f'{folder}{"/" * path.endswith("/")}')
+    return text
+
+
 @pytest.mark.parametrize('odd', ['/a" accept; #', '/a/../b', '/a b', '/a$(id)', '/a\\"'])
 def test_group_with_an_odd_name_enters_no_rule(tmp_path: Path, odd: str) -> None:
     (tmp_path / '77').mkdir()
     (tmp_path / '77/cgroup').write_text(f'0::{odd}\n')
     (tmp_path / 'cgroup.procs').touch()
-    robot = dataclasses.replace(ROBOT, process='77')
-    text = script(*WireGuard().up(robot, []))
-    text = text[text.index('empty_group() {'):text.index('[ -e /sys/class/net')]
-    text = text.replace('/proc/', f'{tmp_path}/').replace('/sys/fs/cgroup', str(tmp_path))
+    text = confining(dataclasses.replace(ROBOT, process='77'), tmp_path)
     said = subprocess.run(['sh', '-ec', text], capture_output=True, text=True, check=True).stdout
     assert said.startswith('no control group for process 77: odd name: /a')
     assert not list(tmp_path.glob('a*'))
+
+
+@pytest.mark.parametrize('vendor', [CycloneDds, FastDds, Zenoh])
+def test_ports_of_the_last_domain_exist(vendor: type[DdsVendor]) -> None:
+    assert max((last for _, last in vendor(232).ports), default=0) <= 65535
+
+
+@pytest.mark.parametrize(('words', 'members'), [('agent.py serve', ['5', '77']), ('init', ['77'])])
+def test_parent_that_starts_an_agent_again_is_confined(
+    tmp_path: Path, words: str, members: list[str],
+) -> None:
+    for number, line in (('77', 'agent.py serve'), ('5', words)):
+        (tmp_path / number).mkdir()
+        (tmp_path / number / 'cmdline').write_text(line)
+    (tmp_path / '77/status').write_text('Pid:\t77\nPPid:\t5\n')
+    (tmp_path / '77/cgroup').write_text('0::/a\n')
+    (tmp_path / 'cgroup.procs').touch()
+    (tmp_path / 'agent.pid').write_text('77\n')
+    group = tmp_path / 'a' / MACHINE.name
+    group.mkdir(parents=True)
+    moved = group / 'cgroup.procs'
+    moved.touch()
+    machine = dataclasses.replace(MACHINE, process=str(tmp_path / 'agent.pid'))
+    text = confining(machine, tmp_path).replace('| nft -f -', '>/dev/null')
+    # a control group takes one process after the other
+    text = text.replace('>"$top$group/cgroup.procs"', f'>>"{moved}"')
+    said = subprocess.run(['sh', '-ec', text], capture_output=True, text=True, check=True).stdout
+    assert said == '' and moved.read_text().split() == members
 
 
 @pytest.mark.parametrize('domain, ports', [(0, '7400-7649'), (5, '8650-8899')])
@@ -160,7 +195,8 @@ def test_what_a_machine_says_of_itself_cant_say_more(change: dict[str, str]) -> 
         list(WireGuard().peers(ROBOT, [dataclasses.replace(TO_MACHINE, **change)]))
 
 
-@pytest.mark.parametrize('endpoint', ['host.example.org:1', '[2001:db8::1]:51820'])
+@pytest.mark.parametrize('endpoint', [
+    'host.example.org:1', '[2001:db8::1]:51820', '[fe80::1%br-lan]:1'])
 def test_endpoints_may_be_names_and_ipv6(endpoint: str) -> None:
     peer = dataclasses.replace(TO_MACHINE, endpoint=endpoint)
     assert f"'Endpoint = {endpoint}'" in script(*WireGuard().peers(ROBOT, [peer]))

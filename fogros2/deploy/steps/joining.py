@@ -120,6 +120,11 @@ class Joining(Step):
             repair=[list(c.argv) for c in vpn.repair(job.interface, peers)],
             down=[list(c.argv) for c in vpn_down(job.record)])
 
+    def restore(self) -> None:
+        """Let an agent that was started again check the machine's VPN."""
+        if self._member is not None:
+            self._member.restore(self._context.vpn)
+
     def links(self, connection: Connection) -> Sequence[RobotLink]:
         """Return the link to the machine, for features that may carry its packets."""
         return [RobotLink(self._context, self._job, self._member, connection)] \
