@@ -24,9 +24,9 @@ import tempfile
 import time
 from typing import Any, Optional
 
-from fogros2 import model
+from fogros2 import model, process
 from fogros2.errors import ConfigurationError, did_you_mean, NameTaken, StoreError
-from fogros2.model import Endpoint, MachineSpec, OtherVpn, Peer, VpnInterface
+from fogros2.model import Command, Endpoint, MachineSpec, OtherVpn, Peer, VpnInterface
 
 #: Name of a file or folder that only one process uses, with that process.
 _UNFINISHED = re.compile(r'\..+\.([0-9]+)\.[a-z0-9_]{8}')
@@ -34,6 +34,8 @@ _UNFINISHED = re.compile(r'\..+\.([0-9]+)\.[a-z0-9_]{8}')
 OTHER_VPN = 'other_vpn.json'
 _ELSEWHERE = 'FOGROS2_STATE_HOME names another folder for it'
 _NAME = re.compile(r'[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?')
+#: Seconds for the deletion of a folder that Python can't delete.
+_DELETION = 600.0
 
 
 def state_home() -> Path:
@@ -344,7 +346,9 @@ class Store:
 
     def sweep(self) -> None:
         """Remove the locks, unfinished files and folders that killed launches left."""
-        for path in list(self.root.rglob('.*')):
+        # no deeper: copies of nodes' folders are there
+        for path in [path for pattern in ('.*', '*/.*', '*/*/.*')
+                     for path in self.root.glob(pattern)]:
             unfinished = _UNFINISHED.fullmatch(path.name)
             if not unfinished or process_start(int(unfinished[1])) is not None:
                 continue
@@ -468,19 +472,34 @@ def write_private(path: Path, data: bytes) -> None:
 
 def delete_folder(path: Path) -> None:
     """
-    Delete a folder with its content, also with folders inside that nobody may write.
+    Delete a folder with its content, also with folders inside that nobody may write, or very deep.
 
     Nodes may have made such folders, of which a copy is here.
     """
-    shutil.rmtree(path, ignore_errors=True)
-    if path.is_dir():
-        path.chmod(0o700)
-        for parent, names, _ in os.walk(path):
-            for name in names:
-                with contextlib.suppress(OSError):
-                    if not os.path.islink(folder := os.path.join(parent, name)):
-                        os.chmod(folder, 0o700)
+    with contextlib.suppress(RecursionError):  # before Python 3.12.4
         shutil.rmtree(path, ignore_errors=True)
+    if path.is_dir():
+        for words in (('find', str(path), '-type', 'd', '-exec', 'chmod', 'u+rwx', '{}', ';'),
+                      ('rm', '-rf', '--', str(path))):
+            process.run(Command(words), timeout=_DELETION, check=False, kept=1e4)
+
+
+def entries(folder: Path, *, without: str = '') -> Iterator[os.DirEntry[str]]:
+    """
+    Yield the content of a folder and of all folders below, at any depth; follow no link.
+
+    :param without: name of folders that are left out.
+    """
+    folders = [str(folder)]
+    while folders:
+        # deleted meanwhile
+        with contextlib.suppress(OSError), os.scandir(folders.pop()) as found:
+            for entry in found:
+                if entry.is_dir(follow_symlinks=False):
+                    if entry.name == without:
+                        continue
+                    folders.append(entry.path)
+                yield entry
 
 
 def process_folder() -> Path:

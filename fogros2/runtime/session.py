@@ -68,6 +68,10 @@ class Robot(Protocol):
     def launch(self) -> Launch:
         """The deployment."""
 
+    @property
+    def machines(self) -> Mapping[str, Session]:
+        """The sessions of the launch's machines, by name."""
+
     def take_over(self, machine: str) -> list[Action]:
         """Let features use the robot in a machine's place; return processes to start."""
 
@@ -287,25 +291,37 @@ class Session:
 
     async def _start_waiting(self) -> None:
         # one request for all, so that many nodes start at once
-        runs = self._waiting
-        if not runs or self.running is None:
+        runs, running = self._waiting, self.running
+        if not runs or running is None:
             return
         for run in runs:
             run.on('sent')
         try:
             async with self._order:
                 await self._in_thread(
-                    self.running.start,
+                    running.start,
                     self._starting([remapped(run.node, self.renamed) for run in runs]))
-        except (AgentError, ConnectError, DeadlineExceeded) as error:
-            # the machine's doing: the nodes of the robot go on
-            for run in runs:
-                run.on_event({'event': 'refused', 'node': run.node.id, 'name': run.node.name,
-                              'error': str(error.args[0]), 'hint': error.hint})
-        except FogError:
+        except FogError as error:
+            if not self._repeats(runs, running, error):
+                self._refused(runs, error)
+
+    def _repeats(self, runs: list[RemoteRun], running: RunningMachine, error: FogError) -> bool:
+        """Return whether processes that a machine did not start will start later."""
+        return False
+
+    def _refused(self, runs: list[RemoteRun], error: FogError) -> None:
+        """
+        End processes that did not start.
+
+        :raises FogError: the error, unless it is the machine's doing: others go on then.
+        """
+        if not isinstance(error, (AgentError, ConnectError, DeadlineExceeded)):
             for run in runs:
                 run.on('over')
-            raise
+            raise error
+        for run in runs:
+            run.on_event({'event': 'refused', 'node': run.node.id, 'name': run.node.name,
+                          'error': str(error.args[0]), 'hint': error.hint})
 
     async def _stop_collected(self) -> None:
         runs, self._to_stop = self._to_stop, []

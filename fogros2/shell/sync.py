@@ -33,6 +33,7 @@ from fogros2.errors import (
 from fogros2.model import Command, Endpoint, Result, SyncReport
 from fogros2.shell import command_line, relay, Shell, ssh_connection
 from fogros2.shell.lines import KEPT
+from fogros2.store import entries
 
 #: Bytes from which a separate connection of OpenSSH is faster.
 BULK = 64 << 20
@@ -158,10 +159,9 @@ class Room(threading.Event):
         :raises ShellError: it is too large.
         """
         begin, size = time.monotonic(), 0
-        for folder, folders, files in os.walk(self._folder):
-            for name in (*folders, *files):
-                with contextlib.suppress(OSError):  # deleted meanwhile
-                    size += max(BLOCK, 512 * os.lstat(os.path.join(folder, name)).st_blocks)
+        for entry in entries(self._folder):
+            with contextlib.suppress(OSError):  # deleted meanwhile
+                size += max(BLOCK, 512 * entry.stat(follow_symlinks=False).st_blocks)
             if size > self._limit:
                 raise ShellError(self._message, 'the machine may be hijacked: delete it')
         # a tenth of the time at most
@@ -171,11 +171,10 @@ class Room(threading.Event):
 def is_large(source: Path, limit: int) -> bool:
     """Return whether a folder's files exceed ``limit`` bytes; stop counting at the limit."""
     size = 0
-    for folder, folders, files in os.walk(source):
-        folders[:] = set(folders) - {'.git'}
-        for name in files:
-            with contextlib.suppress(OSError):  # deleted meanwhile
-                size += os.lstat(os.path.join(folder, name)).st_size
+    for entry in entries(source, without='.git'):
+        with contextlib.suppress(OSError):  # deleted meanwhile
+            if not entry.is_dir():
+                size += entry.stat(follow_symlinks=False).st_size
         if size > limit:
             return True
     return False

@@ -14,7 +14,7 @@ import contextlib
 import inspect
 from typing import Any, ClassVar, Optional, TYPE_CHECKING
 
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, ConnectError
 from fogros2.feature import (
     Feature,
     LaunchPart,
@@ -148,7 +148,10 @@ class Containers(Feature):
         self, running: RunningMachine, nodes: Sequence[NodeSpec], own: Sequence[Container],
     ) -> Sequence[NodeSpec]:
         """Return nodes with the commands of their containers; download missing images."""
-        return _ENGINES[running.launch, running.spec.name].inside(running, nodes)
+        engine = _ENGINES.get((running.launch, running.spec.name))
+        if engine is None:
+            raise ConnectError(f"the launch has given '{running.spec.name}' up meanwhile")
+        return engine.inside(running, nodes)
 
     def clean_up(self, launch: str) -> Sequence[Command]:
         """Return the command that removes all containers of a launch."""

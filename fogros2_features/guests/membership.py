@@ -69,10 +69,12 @@ def join(
     check_robot()
     before = store.other_vpns().get(invitation.machine, folder)
     if before != folder:
-        clear(before)  # of a launch with this machine that has ended
+        _check_left(before, invitation)
+        clear(before)  # of a launch with this machine that has ended, or of this machine before
     if not up:
         _check_free(invitation)
-    interface = dataclasses.replace(other.own, port=addresses.choose_port(environment))
+    # not the port that the user chose: that is for the robot's end of a launch's own VPN
+    interface = dataclasses.replace(other.own, port=addresses.choose_port())
     vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
         ports=vendor.ports, asked=addresses_of(vendor.asked(environment)))
     private = base64.b64encode(key).decode()
@@ -141,6 +143,21 @@ def _vendor(invitation: Invitation, environment: Mapping[str, str]) -> DdsVendor
     vendor: DdsVendor = plugin_system.load('fogros2.dds', invitation.rmw)(
         domain=invitation.domain)
     return vendor
+
+
+def _check_left(folder: Path, invitation: Invitation) -> None:
+    """
+    Check that nothing here uses the VPN of another machine with the name of an invitation's.
+
+    :raises ConfigurationError: a launch uses it, or it was joined by hand at another endpoint.
+    """
+    name, (pid, alive) = invitation.machine, launch_process(folder)
+    if alive and pid != 1:
+        raise ConfigurationError(f"a launch here uses another machine '{name}'", 'end it first')
+    before = stored_vpn(folder)
+    if alive and before is not None and before.machine.endpoint != invitation.endpoint:
+        raise ConfigurationError(f"this computer has joined another machine '{name}'",
+                                 f'ros2 fog leave {name} leaves that one')
 
 
 def _check_free(invitation: Invitation) -> None:

@@ -41,7 +41,6 @@ from pathlib import Path
 import pwd
 import re
 import secrets
-import shutil
 import socket
 import socketserver
 import subprocess
@@ -73,14 +72,10 @@ exec >/dev/null 2>&1 </dev/null
     find /var/spool -xdev -uid "$1" -delete
 }} &
 """
-#: Ends all other processes of an account; fails until there are none.
+#: Ends all other processes of the account that runs it.
 KILL = """\
 import os
-try:
-    os.kill(-1, 9)
-except ProcessLookupError:
-    raise SystemExit(0)
-raise SystemExit(1)
+os.kill(-1, 9)
 """
 
 #: What the guest's account runs: its agent, unless that runs, then its shell on the connection.
@@ -138,6 +133,8 @@ def admitted(guests: list[Guest], request: dict[str, Any], now: float) -> list[G
 
 def due(guest: Guest) -> float:
     """Return when a guest's time is over, in seconds since boot, unless it is heard again."""
+    if guest.get('leaving'):
+        return 0.0
     until: float = guest['until']
     if guest['heard'] is not None:
         until = max(until, guest['heard'] + guest['patience'])
@@ -153,7 +150,7 @@ def rendered(guests: list[Guest]) -> str:
 
 def again(guests: list[Guest], now: float) -> int:
     """Return when to look at guests again, in seconds since boot."""
-    return int(min(guest['until'] if guest['until'] > now else now + INTERVAL
+    return int(min(guest['until'] if now < guest['until'] and now < due(guest) else now + INTERVAL
                    for guest in guests)) + 1
 
 
@@ -192,7 +189,12 @@ class Guests:
             yield json.loads(self.state.read_text()) if self.state.exists() else []
 
     def change(self, before: list[Guest], verb: str, request: dict[str, Any]) -> list[Guest]:
-        """Run one request, with the lock held; return the guests that there are afterwards."""
+        """
+        Run one request, with the lock held; return the guests that there are afterwards.
+
+        :raises OSError: one could not be evicted, and will be by the next look.
+        """
+        before = self.finish(before)
         now = uptime()
         output = subprocess.run(('wg', 'show', self.name, 'latest-handshakes'), check=True,
                                 stdout=subprocess.PIPE, text=True).stdout
@@ -201,15 +203,13 @@ class Guests:
             guest for guest in before if verb != 'remove'
             or request['keys'] is not None and guest['key'] not in request['keys']]
         after = [guest for guest in after if now < due(guest)]
-        write(self.state, json.dumps(after))
-        if after:
-            write(self.due, f'{again(after, now)}\n')
+        keys = [guest['key'] for guest in after]
+        listed = self.leave(
+            [*after, *(guest for guest in before if guest['key'] not in keys)], keys)
+        if listed:
+            write(self.due, f'{again(listed, now)}\n')
         else:
             self.due.unlink(missing_ok=True)
-        for guest in [guest for guest in before if guest not in after and not any(
-                guest['key'] == other['key'] for other in after)]:
-            subprocess.run(('wg', 'set', self.name, 'peer', guest['key'], 'remove'), check=True)
-            evict(account(self.name, guest['address']))
         if verb == 'admit':
             write(self.rules, request['rules'])
         if after:
@@ -220,14 +220,43 @@ class Guests:
             # a machine whose networks overlap the VPN's has no route to the VPN as a whole
             subprocess.run(('ip', 'route', 'replace', f"{guest['address']}/32", 'dev', self.name),
                            check=True)
+        if len(listed) > len(after):
+            raise OSError('the account of a guest is not deleted yet')
         return after
+
+    def leave(self, guests: list[Guest], staying: list[str], *, peers: bool = True) -> list[Guest]:
+        """
+        Evict guests; each stays in the list until it is, so that a look may continue.
+
+        :param staying: keys of the others.
+        :param peers: whether the interface stays, too.
+        :return: the list.
+        """
+        marked = [{**guest, 'leaving': guest['key'] not in staying} for guest in guests]
+        if len(marked) > len(staying):
+            write(self.due, '0\n')
+        write(self.state, json.dumps(marked))
+        return self.finish(marked, peers=peers)
+
+    def finish(self, guests: list[Guest], *, peers: bool = True) -> list[Guest]:
+        """Evict the guests that leave; return the list without those that have left."""
+        for guest in [guest for guest in guests if guest.get('leaving')]:
+            # the others don't wait for one that can't be evicted now
+            with contextlib.suppress(OSError, subprocess.SubprocessError):
+                if peers:
+                    subprocess.run(('wg', 'set', self.name, 'peer', guest['key'], 'remove'),
+                                   check=True)
+                evict(account(self.name, guest['address']))
+                guests = [other for other in guests if other is not guest]
+                write(self.state, json.dumps(guests))
+        return guests
 
     def clear(self, guests: list[Guest]) -> None:
         """End the accounts of all guests, and their rules."""
-        self.state.unlink(missing_ok=True)  # a door that runs admits nobody any more
         self.left.unlink(missing_ok=True)
-        for guest in guests:
-            evict(account(self.name, guest['address']))
+        self.leave(guests, [], peers=False)  # a door that runs admits nobody any more
+        self.state.unlink(missing_ok=True)
+        self.due.unlink(missing_ok=True)
         subprocess.run(('nft', 'delete', 'table', 'inet', f'{self.name}g'),
                        stderr=subprocess.DEVNULL)
 
@@ -245,6 +274,17 @@ def uptime() -> float:
     return float(Path('/proc/uptime').read_text().split()[0])
 
 
+def runs(uid: int) -> bool:
+    """Return whether a process with a user id runs."""
+    for path in Path('/proc').glob('[0-9]*/status'):
+        with contextlib.suppress(OSError):  # it has ended
+            fields = dict(line.split(':\t', 1) for line in path.read_bytes().decode(
+                errors='replace').splitlines() if ':\t' in line)
+            if str(uid) in fields['Uid'].split() and fields['State'][0] not in 'ZX':
+                return True
+    return False
+
+
 def evict(user: str) -> None:
     """End a guest's processes, and delete its account and its files; idempotent."""
     try:
@@ -252,9 +292,9 @@ def evict(user: str) -> None:
     except KeyError:
         return
     until = time.monotonic() + 5.0
-    while time.monotonic() < until and subprocess.run(
-            (sys.executable, '-ISc', KILL), user=entry.pw_uid, group=entry.pw_gid,
-            extra_groups=(), stderr=subprocess.DEVNULL).returncode:
+    while runs(entry.pw_uid) and time.monotonic() < until:
+        subprocess.run((sys.executable, '-ISc', KILL), user=entry.pw_uid, group=entry.pw_gid,
+                       extra_groups=(), stderr=subprocess.DEVNULL)
         time.sleep(0.02)
     with contextlib.suppress(FileNotFoundError):
         # memory of System V outlives its processes; of other accounts' it removes nothing
@@ -264,7 +304,7 @@ def evict(user: str) -> None:
         subprocess.run(words, stderr=subprocess.DEVNULL)
     with contextlib.suppress(FileNotFoundError):
         subprocess.run(('nft', 'delete', 'table', 'inet', user), stderr=subprocess.DEVNULL)
-    shutil.rmtree(HOMES / user, ignore_errors=True)
+    subprocess.run(('rm', '-rf', '--', HOMES / user), stderr=subprocess.DEVNULL)  # at any depth
     subprocess.run(('sh', '-c', CLEAN, 'sh', str(entry.pw_uid)), start_new_session=True)
     with contextlib.suppress(OSError):
         HOMES.rmdir()  # of the last guest
@@ -381,7 +421,7 @@ class Door(socketserver.ThreadingTCPServer):
         return any(proof is None or hmac.compare_digest(
             hmac.digest(bytes.fromhex(guest['secret']), challenge, 'sha256'), proof)
             for guest in json.loads(self.guests.state.read_text())
-            if guest['address'] == address and guest['secret'])
+            if guest['address'] == address and guest['secret'] and not guest.get('leaving'))
 
     def begin(self, link: socket.socket, user: str) -> subprocess.Popen[bytes]:
         """
@@ -448,9 +488,9 @@ def main(name: str, verb: str, folder: Path = Path('/run')) -> None:
             guests.clear(before)
             return
         if verb == 'peers':
-            if before:
+            if staying := [guest for guest in before if not guest.get('leaving')]:
                 guests.confine()
-                print(rendered(before))
+                print(rendered(staying))
             return
         after = guests.change(before, verb, request) if before or verb == 'admit' else []
         if verb == 'stay':

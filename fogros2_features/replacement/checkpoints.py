@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+import contextlib
 import logging
 from pathlib import Path
 import threading
@@ -30,6 +31,8 @@ class Nodes(Protocol):
 
     spec: MachineSpec
     own: Options
+    #: See ``machine_state``.
+    phase: str
 
     @property
     def shell(self) -> Optional[Shell]:
@@ -74,6 +77,11 @@ class Checkpoints:
     def __bool__(self) -> bool:
         return bool(self._folders)
 
+    @property
+    def folders(self) -> list[str]:
+        """The folders."""
+        return list(self._folders)
+
     def add(self, folder: str) -> None:
         """Add a folder, as ``check_folder`` returns it."""
         if not self._folders:
@@ -93,7 +101,7 @@ class Checkpoints:
             begin = self._context.asyncio_loop.time()
             await self.take()
             self._later(self._context.asyncio_loop.time() - begin)
-        if not self._context.is_shutdown:
+        if not (self._context.is_shutdown or self._session.phase == 'over'):
             self._session.request(save)
 
     async def take(self) -> None:
@@ -115,17 +123,20 @@ class Checkpoints:
 
     def _ask(self, nodes: list[NodeSpec]) -> list[bool]:
         from launch_ros.ros_adapters import get_ros_node
-        from rclpy.exceptions import InvalidHandle
+        from rclpy.exceptions import InvalidHandle, NameValidationException
         from std_srvs.srv import Trigger
         waits, until = [], time.monotonic() + ANSWER
         try:
             for name in map(full_name, nodes):
                 if name not in self._clients:
-                    self._clients[name] = get_ros_node(self._context).create_client(
-                        Trigger, f'{name}/checkpoint')
-                if self._clients[name].service_is_ready():
-                    future, answered = self._clients[name].call_async(
-                        Trigger.Request()), threading.Event()
+                    self._clients[name] = None
+                    # without name=, the name is a program's, such as slam.py, and no ROS name
+                    with contextlib.suppress(NameValidationException, ValueError):
+                        self._clients[name] = get_ros_node(self._context).create_client(
+                            Trigger, f'{name}/checkpoint')
+                client = self._clients[name]
+                if client is not None and client.service_is_ready():
+                    future, answered = client.call_async(Trigger.Request()), threading.Event()
                     future.add_done_callback(lambda _, answered=answered: answered.set())
                     waits.append((future, answered))
         except InvalidHandle:

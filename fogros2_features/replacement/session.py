@@ -6,9 +6,11 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Mapping
 import functools
+import os
 from typing import Any, Optional, TYPE_CHECKING
 
-from fogros2.errors import ConfigurationError
+from fogros2 import plan
+from fogros2.errors import ConfigurationError, ConnectError, DeadlineExceeded, FogError
 from fogros2.events import Event
 from fogros2.model import NodeSpec
 from fogros2.runtime.interruption import MachineInterrupted
@@ -32,6 +34,8 @@ _LAST_EVENTS = ('watchdog', 'ending')
 _HOLD = 60.0
 #: Seconds in which the provider may confirm a notice; EC2 gives two minutes' notice.
 _CONFIRM = 150.0
+#: Seconds until processes are started again that a machine did not start.
+_AGAIN = 1.0
 
 
 class Interruptible(Session):
@@ -56,6 +60,8 @@ class Interruptible(Session):
         if own.replaces:
             assert self._robot is not None
             context, launch = self._robot.context, self._robot.launch
+            if own.checkpoint:
+                self._check_alone(own.checkpoint)
             self.replacer = Replacer(
                 self, launch, self._loop, in_thread=self._in_thread, fail=self._fail,
                 is_over=lambda: context.is_shutdown, logger=self._logger)
@@ -96,7 +102,9 @@ class Interruptible(Session):
     @property
     def shell(self) -> Optional[Shell]:
         """The shell of the machine, None while the machine does not run the nodes."""
-        return None if self.running is None or self.interrupted else self.running.shell
+        if self.running is None or self.interrupted or self.phase == 'over':
+            return None
+        return self.running.shell
 
     def nodes(self) -> list[NodeSpec]:
         """Return the machine's nodes that have started."""
@@ -108,6 +116,7 @@ class Interruptible(Session):
             super().submit(run)
             return
         if self.checkpoints is not None and (folder := folder_of(run.node)):
+            self._check_alone(folder)
             self.checkpoints.add(folder)
         self.replacer.allow(run.node)
         if self.interrupted:
@@ -115,6 +124,45 @@ class Interruptible(Session):
             run.on('halt_gone')
         else:
             super().submit(run)
+
+    def _check_alone(self, folder: str) -> None:
+        """
+        Check that no other machine's nodes would use a folder of this one's on the robot.
+
+        :raises ConfigurationError: some would.
+        """
+        assert self._robot is not None
+        here = os.path.expanduser(folder)
+        for other in self._robot.machines.values():
+            kept = getattr(other, 'checkpoints', None)
+            for used in kept.folders if kept is not None and other is not self else ():
+                there = os.path.expanduser(used)
+                if plan.below(here, [there]) or plan.below(there, [here]):
+                    raise ConfigurationError(
+                        f"'{other.spec.name}' and '{self.spec.name}' have one checkpoint folder, "
+                        f'which both would use on the robot: {folder}',
+                        'give each machine a folder of its own')
+
+    def _repeats(self, runs: list[RemoteRun], running: RunningMachine, error: FogError) -> bool:
+        """Return whether processes start later: on this machine, or on one in its place."""
+        if not self.fenced or self.phase == 'over':
+            return False
+        assert self._robot is not None
+        if self._robot.context.is_shutdown:
+            return False
+        if running.lost or running is not self.running:
+            return True  # they leave it as all its processes do
+        if not isinstance(error, (ConnectError, DeadlineExceeded)):
+            return False
+        self._logger.warning(
+            f'{self.spec.name}: {len(runs)} nodes did not start: {error}; trying again')
+        for run in runs:
+            # a process that the machine has started nevertheless is not in this phase, or leaves
+            # it when the machine reports that
+            if run.state.phase == 'sent' and not run.state.stopping:
+                run.on('back')
+        self._loop.call_later(_AGAIN, self.request, self._start_waiting)
+        return True
 
     def stop(self, run: RemoteRun) -> bool:
         """Stop a process; return False if it does not run there and never will."""

@@ -27,7 +27,7 @@ LIMIT = 2 << 30
 _HASH = re.compile('[0-9a-f]{64}')
 #: Seconds for one copy.
 TIMEOUT = 600.0
-#: Attempts to copy a folder that changes meanwhile.
+#: Attempts to copy a folder that changes meanwhile, and to restore one on broken connections.
 ATTEMPTS = 3
 
 # Print the size of the folder $1 in bytes, and a hash of its files' names, sizes and times.
@@ -58,6 +58,8 @@ class Checkpoint:
         self._store = store
         self._cancel = cancel
         self._last: tuple[int, str] = (0, '')
+        #: Whether the nodes' folder lacks what the newest snapshot has.
+        self._unrestored = False
 
     @property
     def newest(self) -> Optional[Path]:
@@ -73,6 +75,8 @@ class Checkpoint:
         :return: False if there is no folder, or nothing has changed.
         :raises FogError: the folder was not copied; the last snapshot stays.
         """
+        if self._unrestored:
+            raise ShellError('the last one was not restored, and stays for the next machine')
         for _ in range(ATTEMPTS):
             before = self._look(shell)
             if not before or (id(shell), before) == self._last:
@@ -133,9 +137,17 @@ class Checkpoint:
         newest = self.newest
         if newest is None:
             return False
+        self._unrestored = True
         if aside:
             shell.run(Command.script(_ASIDE.format(
                 remote_path(self.folder), remote_path(self.folder + aside)),
                 what=f'keep {self.folder}'), timeout=60.0)
-        shell.sync(newest, self.folder, excludes=(), timeout=TIMEOUT, cancel=self._cancel)
+        for attempt in range(1, ATTEMPTS + 1):
+            try:
+                shell.sync(newest, self.folder, excludes=(), timeout=TIMEOUT, cancel=self._cancel)
+                break
+            except ConnectError:
+                if attempt == ATTEMPTS:
+                    raise  # rsync kept what has arrived
+        self._unrestored = False
         return True

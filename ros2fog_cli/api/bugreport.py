@@ -17,7 +17,7 @@ import re
 import sys
 
 from fogros2 import journal
-from fogros2.store import Record, Store
+from fogros2.store import entries, Record, Store
 from ros2fog_cli.api.doctor import Check
 
 #: Replaces a secret.
@@ -125,7 +125,7 @@ def last_lines(path: Path) -> Sequence[str]:
 def known_secrets(environment: Mapping[str, str], store: Store) -> set[str]:
     """Return the values of variables that name secrets, and the lines of files with keys."""
     texts = {value for name, value in environment.items() if _SECRET_NAME.search(name)}
-    for path in store.root.rglob('*'):
+    for path in (Path(entry.path) for entry in entries(store.root)):
         with contextlib.suppress(OSError):
             if path.is_file() and path.suffix != '.json' and path.stat().st_size < 1 << 16 and (
                     path.suffix == '.key' or path.name.startswith('id_')):

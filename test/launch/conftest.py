@@ -14,7 +14,7 @@ import pytest
 
 from fogros2 import CloudNode, ContainerInstance, events
 from fogros2.deploy.context import programs_of
-from fogros2.errors import Cancelled
+from fogros2.errors import AgentError, Cancelled
 from fogros2.provider import Capabilities
 from fogros2.report import step
 from fogros2.store import Store
@@ -35,11 +35,17 @@ class FakeMachine:
         self.stops = []
         self.signals = []
         self.exits_on_stop = True
+        #: Why the machine is gone, '' while it is there.
+        self.lost = ''
         #: Whether the provider confirms a notice: its answers, of which the last stays.
         self.confirms = [True]
         self.pids = iter(range(4001, 5000))
 
     def start(self, nodes):
+        if self.lost:
+            raise AgentError('the connection to the agent was closed')
+        if self.launch.start_errors:
+            raise self.launch.start_errors.pop(0)
         if self.launch.start_error is not None:
             raise self.launch.start_error
         for node in nodes:
@@ -76,6 +82,8 @@ class FakeMachine:
 
     def subscribe(self, callback):
         self.callback = callback
+        if self.lost:
+            callback({'event': 'lost', 'reason': self.lost})
 
     def say(self, name, node=None, **fields):
         """Send an event, from another thread as the agent's connection does."""
@@ -114,6 +122,8 @@ class FakeLaunch:
         self.start_error = None
         #: Why machines do not restore an agent.
         self.restore_error = None
+        #: Errors of the next requests to start nodes, one for each.
+        self.start_errors = []
         self.prepare_error = None
         self.down_errors = []
         self.spent = []

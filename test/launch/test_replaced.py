@@ -13,13 +13,13 @@ from launch.events import Shutdown as ShutdownEvent
 import pytest
 
 from fogros2 import CloudNode, ContainerInstance
-from fogros2.errors import ConfigurationError, ConnectError, ProviderError
+from fogros2.errors import ConfigurationError, ConnectError, DeadlineExceeded, ProviderError
 from fogros2.model import Endpoint, MachineSpec
 from fogros2.process import which
 from fogros2.shell.local import LocalShell
 from fogros2.store import Store
 from fogros2.waiting import wait_until
-from fogros2_features.replacement import Replacement, replacer, snapshots
+from fogros2_features.replacement import Replacement, replacer, session, snapshots
 from rigs.launching import end, says
 
 THERE = '/there/program'
@@ -120,6 +120,52 @@ def test_node_that_ended_on_the_robot_stays_ended(run, fake, package, planner, t
     fake.up = up
     assert run(LaunchDescription([*watch(), free, other, node])) == 0
     assert fake.noted('start') == [('planner', node.process_details['name'])]
+
+
+@pytest.mark.parametrize('when', [1, 2])
+def test_nodes_start_when_the_network_is_back(
+        run, fake, planner, watch, monkeypatch, when, capfd):
+    """On the first machine, or on the one in its place."""
+    monkeypatch.setattr(session, '_AGAIN', 0.01)
+    planner._options['image'] = 'mine'
+    node = CloudNode(machine=planner, package='absent', executable='says')
+    cut = [DeadlineExceeded("the agent didn't answer 'start' within 30 s"), ConnectError('cut')]
+
+    def lost(event):
+        fake.start_errors += cut if when == 2 else []
+        return says(fake, 'lost', reason='no answer')(event)
+
+    fake.start_errors += cut if when == 1 else []
+    watch.at_start = {1: lost, 2: end}
+    assert run(LaunchDescription([*watch(), node])) == 0
+    assert [cmd for _, cmd in watch.starts] == [THERE, THERE] and fake.start_errors == []
+    assert len(fake.noted('up')) == 2
+    assert capfd.readouterr().out.count('nodes did not start: ') == 2
+
+
+def test_machine_that_is_lost_while_nodes_come_back_is_replaced(
+        run, fake, package, planner, talker, watch):
+    """The loss comes before the launch listens to the new machine."""
+    up = fake.up
+
+    def second_is_lost(spec):
+        machine = up(spec)
+        machine.lost = 'no answer' if len(fake.noted('up')) == 2 else ''
+        return machine
+
+    fake.up = second_is_lost
+    watch.at_start = {1: says(fake, 'lost', reason='no answer')}
+
+    def at_third(machine, node):
+        if len(fake.noted('up')) == 3:
+            run.context.asyncio_loop.call_soon_threadsafe(
+                run.context.emit_event_sync, ShutdownEvent(reason='over'))
+
+    fake.on_start = at_third
+    assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
+    assert len(fake.noted('up')) == 3 and len(fake.noted('start')) == 2
+    assert [cmd for _, cmd in watch.starts][-1] == THERE
+    assert [name for name, _ in watch.exits] == ['says']
 
 
 class There(LocalShell):
@@ -236,6 +282,81 @@ def test_folder_is_copied_at_intervals(run, fake, watch, tmp_path, capfd, monkey
     assert worked[0].exception() is None
     said = capfd.readouterr()
     assert (said.out + said.err).count('a checkpoint at most') == 1
+
+
+@pytest.mark.skipif(which('rsync') is None, reason='needs rsync')
+def test_machine_that_was_given_up_is_copied_no_more(run, fake, watch, tmp_path):
+    fake.store = Store(tmp_path / 'state')
+    up, looks = fake.up, []
+
+    class Noted(LocalShell):
+        def run(self, command, **words):
+            looks.append(command)
+            return super().run(command, **words)
+
+    def with_shell(spec):
+        machine = up(spec)
+        machine.shell = Noted(Endpoint('local'), name='planner')
+        return machine
+
+    fake.up = with_shell
+    machine = ContainerInstance(
+        name='planner', ros_workspace='', on_interrupt='replace', checkpoint=str(tmp_path / 'map'),
+        checkpoint_interval=0.05)
+    machine._options['image'] = 'mine'
+    node = CloudNode(machine=machine, package='absent', executable='says')
+    other = ExecuteProcess(cmd=['sleep', '60'], name='other')
+
+    def give_up(event):
+        def wait(context):
+            if not looks:
+                context.asyncio_loop.call_later(0.01, wait, context)
+                return
+            fake.machines['planner'].say('given_up', reason='idle')
+        return [OpaqueFunction(function=lambda context: wait(context))]
+
+    def ended(name, *what):
+        note(name, *what)
+        if name == 'end':
+            before = len(looks)
+            loop = run.context.asyncio_loop
+
+            def compare():
+                later.append(len(looks) - before)
+                run.context.emit_event_sync(ShutdownEvent(reason='over'))
+            # six intervals
+            loop.call_soon_threadsafe(loop.call_later, 0.3, compare)
+
+    later = []
+    note, fake.note = fake.note, ended
+    watch.at_start = {2: give_up}
+    assert run(LaunchDescription([*watch(), other, node])) == 0
+    assert later in ([0], [1]), 'at most the end of a copy that had begun'
+
+
+@pytest.mark.parametrize('folders', [
+    ({'checkpoint': '~/map'}, {'checkpoint': '$HOME/map/a'}, {}),
+    ({'checkpoint': '~/map'}, {}, {'checkpoint': '$HOME/map'}),
+    ({}, {'checkpoint': '~/map'}, {'checkpoint': '~/map'})])
+def test_machines_with_one_checkpoint_folder_are_refused(run, fake, package, capfd, folders):
+    first, second, of_node = folders
+    machines = [ContainerInstance(name=f'slam-{letter}', ros_workspace='', on_interrupt='replace',
+                                  **own) for letter, own in zip('ab', (first, second))]
+    words = {'package': 'demo', 'executable': 'talker'}
+    nodes = [CloudNode(machine=machines[0], **words, **({} if first else of_node)),
+             CloudNode(machine=machines[1], **words, **({} if second else of_node))]
+    assert run(LaunchDescription(nodes)) == 1
+    assert fake.noted('up') == []
+    assert "'slam-a' and 'slam-b' have one checkpoint folder, which both would use on the rob" in (
+        capfd.readouterr().out.replace('\n', ''))
+
+
+def test_one_machine_may_have_a_checkpoint_folder_twice(run, fake, package, watch):
+    machine = ContainerInstance(
+        name='slam-a', ros_workspace='', on_interrupt='replace', checkpoint='~/map')
+    node = CloudNode(machine=machine, package='demo', executable='talker', checkpoint='~/map/a')
+    watch.at_start = {1: end}
+    assert run(LaunchDescription([*watch(), node])) == 0
 
 
 def test_checkpoint_of_a_node_needs_a_replacement(run, fake, package, capfd):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import ipaddress
 import json
 from pathlib import Path
@@ -13,7 +14,14 @@ import pytest
 
 from fogros2.errors import ConfigurationError
 from fogros2.model import Command
-from fogros2.store import Store
+from fogros2.store import (
+    boot_id,
+    delete_folder,
+    process_start,
+    Store,
+    this_process,
+    write_private,
+)
 from fogros2_features.guests import invitation, membership
 from fogros2_features.guests.invitation import Invitation
 from ros2fog_cli import verb
@@ -21,13 +29,16 @@ from ros2fog_cli import verb
 KEY = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
 
 
-def text(store: Store, network: str, monkeypatch: pytest.MonkeyPatch) -> str:
+def text(
+    store: Store, network: str, monkeypatch: pytest.MonkeyPatch,
+    endpoint: str = '203.0.113.9:30000',
+) -> str:
     """Return an invitation that another program wrote, for a network."""
     first = ipaddress.IPv4Network(network, strict=False).network_address
     monkeypatch.setattr(invitation, 'to_json', json.dumps)
     content: Any = {
         'machine': 'planner', 'key': KEY, 'address': str(first + 2),
-        'endpoint': '203.0.113.9:30000', 'joiner': str(first + 1), 'network': network,
+        'endpoint': endpoint, 'joiner': str(first + 1), 'network': network,
         'rmw': 'rmw_cyclonedds_cpp', 'domain': 7, 'expires': time.time() + 60}
     return invitation.seal(content, invitation.public_text(invitation.own_key(store)))
 
@@ -42,10 +53,13 @@ class Robot:
         monkeypatch.setattr(
             membership, 'run', lambda commands, **_: self.ran.extend(commands) or '')
 
-    def join(self, network: str, **options: Any) -> None:
+    def join(
+        self, network: str, *, endpoint: str = '203.0.113.9:30000',
+        environment: Mapping[str, str] = {}, **options: Any,
+    ) -> None:
         with self.monkeypatch.context() as patch:
-            written = text(self.store, network, patch)
-        membership.join(written, self.store, {}, **options)
+            written = text(self.store, network, patch, endpoint)
+        membership.join(written, self.store, environment, **options)
 
     def agree(self, question: str) -> bool:
         self.asked.append(question)
@@ -83,6 +97,34 @@ def test_network_that_no_launch_has_is_refused(robot: Robot, network: str) -> No
 def test_private_addresses_need_no_question(robot: Robot, network: str) -> None:
     robot.join(network)
     assert robot.ran and robot.asked == []
+
+
+def test_joining_takes_no_vpn_away_that_is_used(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(membership, 'clear', delete_folder)
+    robot.join('198.18.7.0/24', owner=this_process())
+    (first,) = robot.store.other_vpns().values()
+    with pytest.raises(ConfigurationError, match="a launch here uses another machine 'planner'"):
+        robot.join('198.18.8.0/24')
+    by_hand = {'pid': 1, 'pid_start': process_start(1) or 0, 'boot': boot_id()}
+    write_private(first / 'process.json', json.dumps(by_hand).encode())
+    with pytest.raises(ConfigurationError, match="has joined another machine 'planner'") as raised:
+        robot.join('198.18.8.0/24', endpoint='203.0.113.10:30000')
+    assert raised.value.hint.startswith('ros2 fog leave planner ')
+    assert list(robot.store.other_vpns().values()) == [first]
+    robot.join('198.18.8.0/24')
+    (second,) = robot.store.other_vpns().values()
+    assert second != first and not first.exists(), 'the same machine, of a later launch'
+    write_private(second / 'process.json', json.dumps({**this_process(), 'pid_start': 1}).encode())
+    robot.join('198.18.9.0/24', endpoint='203.0.113.10:30000')
+    assert not second.exists(), 'of a launch that died'
+
+
+def test_port_of_the_robot_is_left_to_its_own_vpn(robot: Robot) -> None:
+    robot.join('198.18.7.0/24', environment={'FOGROS2_VPN_PORT': '45678'})
+    script = robot.ran[-1].argv[-1]
+    assert 'ListenPort = ' in script and 'ListenPort = 45678' not in script
 
 
 @pytest.mark.parametrize('network', [7, None, ['198.18.7.0/24'], '198.18.7.0/24\n'])

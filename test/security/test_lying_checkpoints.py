@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import inspect
 import os
 from pathlib import Path
 import subprocess
@@ -16,10 +17,12 @@ from fogros2 import process
 from fogros2.errors import ShellError
 from fogros2.model import Endpoint, Result
 from fogros2.shell.local import LocalShell
-from fogros2.store import delete_folder
+from fogros2.shell.sync import Room
+from fogros2.store import delete_folder, Store
 from fogros2_features.replacement import snapshots
 from fogros2_features.replacement.snapshots import Checkpoint
 from rigs.stranger import NOBODY
+from ros2fog_cli.api.bugreport import known_secrets
 
 pytestmark = pytest.mark.skipif(process.which('rsync') is None, reason='needs rsync')
 
@@ -140,6 +143,68 @@ def test_snapshots_of_folders_without_rights_are_deleted(home: Path) -> None:
                           timeout=60)
     assert done.stdout.splitlines() == [
         *(str([f'{number:08}']) for number in range(1, 7)), '[]'], done.stderr
+
+
+#: Levels of folders, and calls that a function may make in each other before a RecursionError:
+#: Python's own limit of 1000 takes minutes on some file systems.
+DEEP, CALLS = 180, 120
+
+
+def make_deep(folder: Path, mode: int = 0o755) -> None:
+    """Make folders in a folder, and a file of a block in the last one."""
+    path = folder / '/'.join('d' * DEEP)
+    for level in reversed([path, *path.parents][:DEEP]):
+        os.mkdir(level)
+    (path / 'file').write_bytes(bytes(4096))
+    for level in [path, *path.parents][:DEEP]:
+        level.chmod(mode)
+
+
+@pytest.fixture
+def few_calls() -> Iterator[None]:
+    before = sys.getrecursionlimit()
+    sys.setrecursionlimit(len(inspect.stack()) + CALLS)
+    yield
+    sys.setrecursionlimit(before)
+
+
+def test_folder_of_any_depth_is_counted_and_deleted(tmp_path: Path, few_calls: None) -> None:
+    source, store = tmp_path / 'map', Store(tmp_path / 'state')
+    source.mkdir()
+    make_deep(source)
+    kept = Checkpoint(str(source), store.launch_folder('abcdef') / 'checkpoints/planner')
+    shell = LocalShell(Endpoint('local'), name='planner')
+    for number in range(2):
+        (source / 'number').write_text(str(number))
+        assert kept.save(shell, still=True)
+    assert kept.restore(shell)
+    with pytest.raises(ShellError, match='too much'):
+        Room(source, DEEP * 4096, None, 'too much').measure()
+    store.sweep()
+    known_secrets({}, store)
+    delete_folder(store.root)
+    delete_folder(source)
+    assert list(tmp_path.iterdir()) == []
+
+
+#: Deletes a folder, as another account if this one is root.
+DELETE = f"""\
+import os, sys
+from pathlib import Path
+from fogros2.store import delete_folder
+if os.geteuid() == 0:
+    os.setgroups([]), os.setgid({NOBODY}), os.setuid({NOBODY})
+sys.setrecursionlimit({CALLS})
+delete_folder(Path(sys.argv[1]))
+"""
+
+
+def test_deep_folder_that_nobody_may_write_is_deleted(home: Path) -> None:
+    make_deep(home, 0o500)
+    if os.geteuid() == 0:
+        subprocess.run(['chown', '-R', f'{NOBODY}:{NOBODY}', str(home / 'd')], check=True)
+    subprocess.run([sys.executable, '-c', DELETE, str(home / 'd')], timeout=60, check=True)
+    assert list(home.iterdir()) == []
 
 
 def test_deletion_follows_no_link(tmp_path: Path) -> None:

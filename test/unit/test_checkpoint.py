@@ -108,6 +108,46 @@ def test_copy_that_was_cut_off_is_not_used(kept, folder, torn, shell):
     assert texts(kept.newest) == {'parts/1': 'one', 'parts/2': 'two'}
 
 
+class Cut(LocalShell):
+    """A shell whose next copies to the machine break."""
+
+    cuts = 0
+
+    def sync(self, source, target, **words):
+        if self.cuts:
+            self.cuts -= 1
+            raise ConnectError('the connection is lost')
+        return super().sync(source, target, **words)
+
+
+@pytest.mark.parametrize('aside', ['', '.before-abc'], ids=['machine', 'robot'])
+def test_folder_that_was_not_restored_replaces_no_snapshot(kept, folder, shell, tmp_path, aside):
+    kept.save(shell, still=True)
+    other = Cut(Endpoint('local'), name='next')
+    other.cuts = snapshots.ATTEMPTS
+    (folder / 'parts/1').unlink()
+    with pytest.raises(ConnectError):
+        kept.restore(other, aside)
+    (folder / 'parts').mkdir(parents=True, exist_ok=True)
+    (folder / 'parts/half').write_text('of a node that began anew')
+    for still in (False, True):
+        with pytest.raises(ShellError, match='the last one was not restored, and stays'):
+            kept.save(other, still=still)
+    assert texts(kept.newest) == {'parts/1': 'one'}
+    assert kept.restore(shell) and texts(folder) == {'parts/1': 'one'}
+    (folder / 'parts/2').write_text('two')
+    assert kept.save(shell, still=True)
+    assert texts(kept.newest) == {'parts/1': 'one', 'parts/2': 'two'}
+
+
+def test_restoring_goes_on_after_a_short_cut(kept, folder, shell):
+    kept.save(shell, still=True)
+    (folder / 'parts/1').unlink()
+    other = Cut(Endpoint('local'), name='next')
+    other.cuts = snapshots.ATTEMPTS - 1
+    assert kept.restore(other) and texts(folder) == {'parts/1': 'one'}
+
+
 def test_missing_folder_has_no_snapshot(shell, tmp_path):
     kept = Checkpoint(str(tmp_path / 'nothing'), tmp_path / 'robot')
     assert not kept.save(shell, still=False) and kept.newest is None

@@ -14,6 +14,7 @@ from launch import LaunchContext
 import pytest
 from rclpy.exceptions import InvalidHandle
 from rclpy.task import Future
+from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2_features.replacement import checkpoints
@@ -36,24 +37,51 @@ class Silent:
         return SimpleNamespace(service_is_ready=lambda: True, call_async=lambda request: Future())
 
 
-@pytest.mark.parametrize('node', [Destroyed(), Silent()])
-def test_ending_launch_and_silence_count_as_no_consent(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, node: Any,
-) -> None:
-    monkeypatch.setattr('launch_ros.ros_adapters.get_ros_node', lambda context: node)
-    monkeypatch.setattr(checkpoints, 'ANSWER', 0.5)
+class Strict:
+    """A ROS node without other nodes' services, which takes names as rclpy does."""
+
+    def create_client(self, _: object, name: str) -> Any:
+        if '{' in name:
+            raise ValueError('unknown substitution')
+        validate_full_topic_name(name, is_service=True)
+        return SimpleNamespace(service_is_ready=lambda: False)
+
+
+def asked(tmp_path: Path, nodes: list[NodeSpec]) -> Optional[bool]:
+    """Return what nodes with a checkpoint answer."""
     session: Any = SimpleNamespace(
         spec=MachineSpec('planner', 'container'), own=Options(checkpoint=str(tmp_path / 'map')),
-        nodes=lambda: [NodeSpec(f'planner/{number}', name=f'n{number}', package='demo')
-                       for number in range(100)])
+        nodes=lambda: nodes)
 
     async def ask() -> Optional[bool]:
         context = LaunchContext()
         context._set_asyncio_loop(asyncio.get_running_loop())
         kept = Checkpoints(session, context, tmp_path, '', None, in_thread=asyncio.to_thread,
                            logger=logging.getLogger())
+        await kept.ask()
         return await kept.ask()
 
+    return loops.run(ask())
+
+
+def test_program_without_a_ros_name_offers_no_service(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    node = Strict()
+    monkeypatch.setattr('launch_ros.ros_adapters.get_ros_node', lambda context: node)
+    assert asked(tmp_path, [
+        NodeSpec('1', name='python3-1'), NodeSpec('2', name='a', executable='slam_node.py'),
+        NodeSpec('3', name='ubuntu:24.04'), NodeSpec('4', name='{x}'), NodeSpec('5', name='ok'),
+        NodeSpec('6', name='a' * 300)]) is None
+
+
+@pytest.mark.parametrize('node', [Destroyed(), Silent()])
+def test_ending_launch_and_silence_count_as_no_consent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, node: Any,
+) -> None:
+    monkeypatch.setattr('launch_ros.ros_adapters.get_ros_node', lambda context: node)
+    monkeypatch.setattr(checkpoints, 'ANSWER', 0.5)
     begin = time.monotonic()
-    assert loops.run(ask()) is False
+    assert asked(tmp_path, [NodeSpec(f'planner/{number}', name=f'n{number}', package='demo')
+                            for number in range(100)]) is False
     assert time.monotonic() - begin < 25.0  # the nodes have their time together

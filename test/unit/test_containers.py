@@ -23,7 +23,13 @@ from fogros2.dds.zenoh import Zenoh
 from fogros2.deploy import Launch
 from fogros2.describe import values
 from fogros2.describe.machines import ContainerInstance
-from fogros2.errors import ConfigurationError, DdsError, PrerequisiteError, Unsupported
+from fogros2.errors import (
+    ConfigurationError,
+    ConnectError,
+    DdsError,
+    PrerequisiteError,
+    Unsupported,
+)
 from fogros2.model import Command, MachineSpec, NodeSpec, Result
 from fogros2.provider.container import ContainerProvider
 from fogros2.store import Store
@@ -600,6 +606,8 @@ def test_machine_that_was_replaced_may_end_after_its_successor():
         feature.installing(second, (), ())
         with feature.machine(second, ()):
             assert feature.starting(second, [], ()) == []
+    with pytest.raises(ConnectError, match='given .* up meanwhile'):
+        feature.starting(second, [], ())
 
 
 @pytest.mark.parametrize(('survives', 'used'), [(True, True), (True, False), (False, True)])

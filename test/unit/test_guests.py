@@ -3,8 +3,15 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import os
 from pathlib import Path
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -84,6 +91,120 @@ def test_list_is_private_and_replaces_no_file_of_others(tmp_path: Path) -> None:
     guests.write(path, json.dumps([1]))
     assert path.read_text() == '[1]' and path.stat().st_mode & 0o777 == 0o600
     assert (tmp_path / 'other').read_text() == ''
+
+
+class Machine:
+    """
+    A machine with an interface whose guests have accounts, which are all it keeps.
+
+    :ivar stuck: accounts that cannot be deleted, with the error.
+    """
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.guests = guests.Guests('fogabc123m0', folder)
+        self.ran: list[str] = []
+        self.accounts: set[str] = set()
+        self.stuck: dict[str, BaseException] = {}
+        monkeypatch.setattr(guests, 'uptime', lambda: 100.0)
+        monkeypatch.setattr(guests, 'evict', self.evict)
+        monkeypatch.setattr(guests, 'subprocess', SimpleNamespace(
+            run=self.run, PIPE=subprocess.PIPE, DEVNULL=subprocess.DEVNULL,
+            SubprocessError=subprocess.SubprocessError))
+
+    def run(self, words: tuple[object, ...], **_: Any) -> Any:
+        self.ran.append(' '.join(map(str, words)))
+        return SimpleNamespace(stdout='')
+
+    def evict(self, user: str) -> None:
+        if user in self.stuck:
+            raise self.stuck[user]
+        self.accounts.discard(user)
+
+    def change(self, verb: str, **request: Any) -> list[str]:
+        """Run a request; return the keys of the guests that are there afterwards."""
+        with self.guests.locked() as before:
+            after = self.guests.change(before, verb, request)
+        if verb == 'admit':
+            self.accounts.update(guests.account('fogabc123m0', one['address']) for one in after)
+        return [one['key'] for one in after]
+
+    def admits(self, address: str) -> bool:
+        door = guests.Door.__new__(guests.Door)
+        door.guests = self.guests
+        return door.admits(address, b'', None)
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
+    found = Machine(tmp_path, monkeypatch)
+    for key in (KEY, OTHER):
+        found.change('admit', **asked(key, rules=''))
+    assert len(found.accounts) == 2 and found.admits('198.18.7.225')
+    return found
+
+
+@pytest.mark.parametrize('verb', ['remove', 'clear'])
+def test_next_look_goes_on_where_a_killed_one_ended(machine: Machine, verb: str) -> None:
+    machine.stuck = {'fogabc123m0g225': KeyboardInterrupt()}
+    with pytest.raises(KeyboardInterrupt), machine.guests.locked() as before:
+        if verb == 'clear':
+            machine.guests.clear(before)
+        else:
+            machine.guests.change(before, 'remove', {'keys': None})
+    assert machine.accounts == {'fogabc123m0g225'} and not machine.admits('198.18.7.225')
+    assert machine.guests.due.read_text() == '0\n', 'the health check looks at once'
+    machine.stuck = {}
+    assert machine.change('look') == [] and machine.accounts == set()
+    assert json.loads(machine.guests.state.read_text()) == []
+    assert not machine.guests.due.exists()
+    assert machine.ran.count(f'wg set fogabc123m0 peer {OTHER} remove') >= 1
+
+
+def test_guest_that_cannot_be_evicted_keeps_no_other_one(machine: Machine) -> None:
+    machine.stuck = {'fogabc123m0g224': OSError('no memory')}
+    with pytest.raises(OSError, match='is not deleted yet'):
+        machine.change('remove', keys=[KEY, OTHER])
+    assert machine.accounts == {'fogabc123m0g224'} and not machine.admits('198.18.7.224')
+    assert machine.guests.due.read_text() == '111\n'
+    with pytest.raises(OSError, match='is not deleted yet'):
+        machine.change('admit', **asked('third=', rules=''))
+    assert machine.admits('198.18.7.225') and not machine.admits('198.18.7.224')
+    machine.stuck = {}
+    assert machine.change('look') == ['third=']
+    assert KEY not in machine.guests.state.read_text()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='root alone starts processes of another account')
+@pytest.mark.parametrize('idle', [True, False])
+def test_eviction_waits_for_no_process_of_others(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, idle: bool,
+) -> None:
+    number = guests.new_id()
+    monkeypatch.setattr(guests.pwd, 'getpwnam', lambda user: SimpleNamespace(
+        pw_uid=number, pw_gid=number))
+    monkeypatch.setattr(guests, 'HOMES', tmp_path / 'homes')
+    monkeypatch.setattr(guests, 'CLEAN', ':')
+    deep = tmp_path / 'homes/fogabc123m0g224'
+    deep.mkdir(parents=True)
+    for _ in range(100):
+        deep /= 'd'
+        deep.mkdir()
+    child = subprocess.Popen([sys.executable, '-ISc', 'input()'], stdin=subprocess.PIPE,
+                             **({} if idle else {'user': number}))
+    try:
+        assert guests.runs(number) != idle
+        begin, limit = time.monotonic(), sys.getrecursionlimit()
+        sys.setrecursionlimit(len(inspect.stack()) + 60)
+        try:
+            guests.evict('fogabc123m0g224')
+        finally:
+            sys.setrecursionlimit(limit)
+        assert time.monotonic() - begin < 4.0
+        assert not guests.runs(number) and not (tmp_path / 'homes').exists()
+        assert (child.poll() is None) == idle
+    finally:
+        child.kill()
+        child.communicate()
 
 
 @pytest.mark.parametrize('secret', [None, 'damaged'])
