@@ -114,6 +114,19 @@ class Market:
                 f'{region}', 'ros2 fog price --region shows the types that a region has')
         return price
 
+    def cost_of(self, region: str, name: str, options: VmOptions) -> Decimal:
+        """
+        Return the price that counts for a machine's cost, in US dollars per hour.
+
+        For a spot machine it is that of the dearest zone within ``max_price``, because the cloud
+        chooses the zone.
+
+        :raises ProviderError: the region does not sell it.
+        """
+        price, limit = self.price_of(region, name, spot=options.spot), options.max_price
+        zones = self.spot(region, [name])[name].values() if options.spot else ()
+        return max((zone for zone in zones if limit is None or zone <= limit), default=price)
+
     def check(self, region: str, name: str, options: VmOptions) -> None:
         """
         Check that a type costs at most ``max_price``.

@@ -10,8 +10,8 @@ from typing import Optional
 from fogros2.model import Volume
 from fogros2.provider import Attached
 from fogros2.provider.vm.cloud import Disk, END_TIMEOUT
+from fogros2.provider.vm.failures import wait_through
 from fogros2.provider.vm.provider import disk_in_use, first_disk, VmProvider
-from fogros2.waiting import wait_until
 
 
 class CloudVolumes:
@@ -57,7 +57,7 @@ class CloudVolumes:
             return disk if disk.ready and (disk.vm or not attached) else None
 
         def wait(state: str) -> Disk:
-            return wait_until(
+            return wait_through(
                 lambda: look(state == 'attached'), timeout=END_TIMEOUT,
                 cancel=self._provider.cancel, first=0.3, interval=1.0, longest=3.0,
                 what=f"the volume '{name}' to be {state}")

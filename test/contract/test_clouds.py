@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from fogros2.errors import NameTaken, ProviderError, Unsupported
+from fogros2.errors import NameTaken, PrerequisiteError, ProviderError, Unsupported
 from fogros2.model import MachineSpec
 from fogros2.provider import TAG_ON_EXIT
 from fogros2.waiting import wait_until
@@ -179,6 +179,26 @@ def test_launch_takes_few_requests(memory):
     provider.destroy(machine)
     gone(memory)
     assert memory.calls() <= memory.launching
+
+
+def test_lost_connection_ends_no_wait(memory):
+    provider = memory.provider()
+    machine, _ = create(memory)
+    provider.describe(machine)  # the report of the creation is used once
+    with memory.unconnected(2) as failed:
+        provider.reachable(machine, name='planner', timeout=60.0)
+    assert len(failed) == 2
+    with memory.unconnected(2, after=memory.deletion) as failed:
+        provider.destroy(machine)
+    assert len(failed) == 2
+    gone(memory)
+
+
+def test_first_request_without_connection_is_an_error(memory):
+    machine, _ = create(memory)
+    with memory.unconnected(1) as failed, pytest.raises(PrerequisiteError, match='not answer'):
+        memory.provider().destroy(machine)
+    assert len(failed) == 1
 
 
 def test_launch_that_waits_for_the_boot_changes_no_rule(memory):

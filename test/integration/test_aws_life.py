@@ -151,6 +151,32 @@ def test_image_is_baked_reused_and_deleted_with_snapshots(aws):
     assert not ours & kept
 
 
+def test_image_has_the_driver_of_its_machine(aws):
+    plain = aws.provider.create(*ask())
+    seeing = aws.provider.create(*ask('seer', ec2_instance_type='g5.xlarge'))
+    baked = {}
+    for machine_id in (plain, seeing):
+        image = image_keeper(aws.provider).bake(machine_id, 'planner', 'abcd')
+        baked[machine_id] = image.rpartition('/')[2]
+        # no image fits the other kind of machine, or its own does, though it is older
+        for kind, like in (('t3.large', plain), ('g5.xlarge', seeing)):
+            new = aws.provider.create(*ask(
+                f'{len(baked)} {kind}', dependencies='abcd', ec2_instance_type=kind))
+            taken = described(new)['ImageId']
+            assert taken == baked[like] if like in baked else taken not in baked.values()
+
+
+def test_image_leaves_volumes_out(aws):
+    machine_id = aws.provider.create(*ask())
+    volume = ec2().create_volume(AvailabilityZone=f'{HOME}a', Size=200)['VolumeId']
+    ec2().attach_volume(VolumeId=volume, InstanceId=machine_id.split('/')[1], Device='/dev/sdf')
+    image = image_keeper(aws.provider).bake(machine_id, 'planner', 'abcd')
+    (request,) = aws.asked('CreateImage')
+    assert request['BlockDeviceMappings'] == [{'DeviceName': '/dev/sdf', 'NoDevice': ''}]
+    (entry,) = ec2().describe_images(ImageIds=[image.rpartition('/')[2]])['Images']
+    assert len(entry['BlockDeviceMappings']) == 1
+
+
 def test_an_image_of_somebody_else_is_not_deleted(aws):
     theirs = ec2().describe_images(Owners=['self'])['Images'][0]['ImageId']
     with pytest.raises(ProviderError, match='no image of FogROS2'):
@@ -336,6 +362,25 @@ def test_a_group_in_use_is_deleted_as_soon_as_it_is_free(aws):
     assert aws.count()['ec2:DeleteSecurityGroup'] == 3
 
 
+@pytest.mark.parametrize(('operation', 'code'), [
+    ('AuthorizeSecurityGroupIngress', 'InvalidGroup.NotFound'),
+    ('RunInstances', 'InvalidGroup.NotFound'), ('RunInstances', 'InvalidKeyPair.NotFound')])
+def test_new_group_or_key_unknown_to_ec2_yet_is_waited_for(aws, operation, code):
+    aws.refuse(operation, code)
+    machine_id = aws.provider.create(*ask())
+    assert aws.sent == [code]
+    aws.provider.destroy(machine_id)
+    assert left() == NOTHING
+
+
+def test_new_group_unknown_to_ec2_yet_is_deleted(aws):
+    aws.refuse('RunInstances', 'InvalidParameterValue')
+    aws.refuse('DeleteSecurityGroup', 'InvalidGroup.NotFound')
+    with pytest.raises(AwsError, match='InvalidParameterValue') as caught:
+        aws.provider.create(*ask())
+    assert left() == NOTHING and not caught.value.undo_failures
+
+
 def test_machine_unknown_to_ec2_yet_is_deleted(aws):
     machine_id = aws.provider.create(*ask())
     aws.refuse('TerminateInstances', 'InvalidInstanceID.NotFound')
@@ -358,6 +403,20 @@ def test_no_room_in_a_zone_leads_to_the_next(aws):
     assert aws.sent == ['InsufficientInstanceCapacity', 'Unsupported']
     assert tries[1]['NetworkInterfaces'][0]['AssociatePublicIpAddress'] is True
     assert len(left()['groups']) == 1
+
+
+def test_spot_machine_costs_no_more_than_is_counted(aws, monkeypatch):
+    zones = {f'{HOME}a': Decimal('0.35'), f'{HOME}b': Decimal('0.60')}
+    monkeypatch.setattr('fogros2.provider.aws.prices.Ec2Prices.spot_prices',
+                        lambda *words: {'t3.medium': zones})
+    spec, request = ask(spot=True)
+    assert aws.provider.cost_per_hour(spec) == Decimal('0.60')
+    aws.refuse('RunInstances', 'InsufficientInstanceCapacity')
+    machine_id = aws.provider.create(spec, request)
+    assert aws.provider.describe(machine_id).cost_per_hour == Decimal('0.60')
+    # the dearest zone is above the limit, and the others are tried
+    capped = aws.provider.create(*ask('mapper', spot=True, max_price=0.4))
+    assert aws.provider.describe(capped).cost_per_hour == Decimal('0.35')
 
 
 def test_next_type_keeps_to_the_price_cap(aws, monkeypatch):

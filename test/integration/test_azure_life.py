@@ -95,6 +95,39 @@ def test_interrupted_creation_is_taken_up_where_it_was(robot, monkeypatch):
     assert robot.azure.groups == {}
 
 
+@pytest.mark.parametrize(('rights', 'kind'), [
+    (service.OPERATOR, 'roleassignments'), (service.CONTRIBUTOR, 'schedules')])
+def test_machine_without_room_yet_ends_without_its_robot(robot, monkeypatch, rights, kind):
+    def killed(own, name, what):
+        raise ProviderError('the process dies here')
+
+    robot.azure.rights = rights
+    with monkeypatch.context() as patch, pytest.raises(ProviderError, match='dies here'):
+        patch.setattr('fogros2.provider.azure.cloud.Azure._drop', lambda *_, **__: None)
+        patch.setattr('fogros2.provider.azure.cloud.Azure._allocated', killed)
+        robot.create()
+    (vm,) = robot.azure.vms()
+    assert [key for key in robot.azure.resources if f'/{kind}/' in key]
+
+
+def test_schedule_refused_before_the_allocation_is_set_after_it(robot):
+    robot.azure.rights = service.CONTRIBUTOR
+    robot.azure.faults.append(Fault('ResourceNotFound', 404, 'PUT', 'schedules'))
+    machine_id = robot.create()
+    assert robot.asked('schedules', 'PUT') == ['ResourceNotFound', '']
+    assert 'is billed' in robot.reach(machine_id).note
+    robot.provider.destroy(machine_id)
+
+
+@pytest.mark.parametrize('kind', ['networkSecurityGroups', 'virtualMachines'])
+def test_group_that_is_not_known_everywhere_yet_is_waited_for(robot, kind):
+    robot.azure.faults.append(Fault('ResourceGroupNotFound', 404, 'PUT', kind))
+    machine_id = robot.create()
+    assert robot.asked(kind.lower(), 'PUT') == ['ResourceGroupNotFound', '']
+    robot.provider.destroy(machine_id)
+    assert robot.azure.groups == {}
+
+
 # -- undo ---------------------------------------------------------------------------------------
 
 
@@ -256,6 +289,9 @@ def test_role_of_the_page_has_exactly_the_actions_needed(robot):
     for sources in ([], ['198.51.100.9/32']):
         robot.provider.open_port(machine, 8766, sources)
         robot.provider.allow(machine_id, 22, sources)
+    robot.azure.faults.append(Fault('Wrong', 400, 'PUT', 'galleries', late=True))
+    with pytest.raises(ProviderError, match='Wrong'):
+        image_keeper(robot.provider).bake(machine_id, 'planner', 'abcd')
     image_id = image_keeper(robot.provider).bake(machine_id, 'planner', 'abcd')
     wait_until(lambda: [one.state for one in image_keeper(robot.provider).images()]
                == ['available'], timeout=60.0, what='the image')
@@ -271,9 +307,10 @@ def test_role_of_the_page_has_exactly_the_actions_needed(robot):
         volume_keeper(robot.provider).delete_volume(volume.id)
     # Azure asks for these of resources that a request names
     linked = {action for action in role['Actions'] if '/join/' in action or 'GetAccess' in action}
-    asked = robot.azure.actions - {''}
-    # operations are polled by their resource
-    polled = {action for action in role['Actions'] if action.endswith('/read')}
+    asked = robot.azure.actions
+    # a PUT is polled by its resource; some operations of networks may have a result alone
+    polled = {action for action in role['Actions'] if action.endswith('/read')
+              and 'perations/' not in action and '/operationresults/' not in action}
     assert asked <= set(role['Actions']) - linked
     assert set(role['Actions']) - linked - polled <= asked
 
@@ -295,6 +332,29 @@ def test_image_is_baked_reused_and_deleted(robot):
     assert len(robot.azure.groups) == 1
     image_keeper(robot.provider).delete_image(image_id)
     assert robot.azure.groups == {}
+
+
+def test_machine_of_an_image_fits_its_disk_and_its_controller(robot):
+    machine_id = robot.create(disk_size=100)
+    image_keeper(robot.provider).bake(machine_id, 'planner', 'abcd')
+    wait_until(lambda: [one.state for one in image_keeper(robot.provider).images()]
+               == ['available'], timeout=60.0, what='the image')
+    again = robot.provider.create(robot.spec('mapper', vm_size='Standard_D2s_v6'),
+                                  robot.request(dependencies='abcd'))
+    assert robot.provider.describe(again).disk_gb == 100
+    (version,) = [entry['id'] for key, entry in robot.azure.resources.items()
+                  if '/versions/' in key]
+    named = robot.provider.create(robot.spec('seer', image=version), robot.request())
+    assert robot.provider.describe(named).image == version
+    for one in (machine_id, again, named):
+        robot.provider.destroy(one)
+
+
+def test_cheapest_size_is_one_that_takes_the_request(robot):
+    spec = robot.spec(vm_size='cheapest', arch='x86_64', min_cpu=2, min_memory_gb=4)
+    machine_id = robot.provider.create(robot.provider.resolve(spec), robot.request())
+    assert robot.provider.describe(machine_id).kind == SMALL
+    robot.provider.destroy(machine_id)
 
 
 def test_group_of_somebody_else_is_no_image(robot):
@@ -387,6 +447,15 @@ def test_service_that_does_not_answer_is_one_line(robot, monkeypatch):
     monkeypatch.setattr('fogros2.provider.azure.cloud._USUAL', Account())
     with pytest.raises(PrerequisiteError, match='Azure gives no token|no credentials'):
         Robot(robot.azure).create()
+
+
+def test_list_of_several_pages_is_read_to_its_end(robot):
+    made = [robot.provider.create(robot.spec(name), robot.request())
+            for name in ('planner', 'mapper', 'seer')]
+    robot.azure.page = 2
+    assert sorted(machine.id for machine in robot.provider.find({})) == sorted(made)
+    for machine_id in made:
+        robot.provider.destroy(machine_id)
 
 
 def test_another_server_gets_no_token(robot, monkeypatch):

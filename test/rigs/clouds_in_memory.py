@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import abc
 import base64
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import re
 import threading
 from typing import Any, ClassVar
+from urllib.parse import parse_qsl
 
 import pytest
 
@@ -39,6 +40,8 @@ class Memory(abc.ABC):
     listing: ClassVar[int]
     #: The most requests of a launch.
     launching: ClassVar[int] = 25
+    #: The method (or operation) of the request that deletes a machine.
+    deletion: ClassVar[str] = 'DELETE'
     #: Whether a machine that has switched itself off is billed.
     billed_when_off: ClassVar[bool] = True
 
@@ -71,6 +74,43 @@ class Memory(abc.ABC):
             return send(*words, **options)
 
         patch.setattr(requests.Session, 'request', held)
+
+    @contextlib.contextmanager
+    def unconnected(self, times: int, *, after: str = '') -> Iterator[list[str]]:
+        """
+        Let no connection be made for the next ``times`` requests in the block.
+
+        :param after: only those after a request with this method, or operation of EC2.
+        :returns: the requests that failed.
+        """
+        failed: list[str] = []
+        begun = not after
+
+        def refused(word: str) -> bool:
+            nonlocal begun
+            lost = begun and len(failed) < times
+            if lost:
+                failed.append(word)
+            begun = begun or word == after
+            return lost
+
+        with self.patch.context() as patch:
+            self.disconnect(patch, refused)
+            yield failed
+
+    def disconnect(
+        self, patch: pytest.MonkeyPatch, refused: Callable[[str], bool],
+    ) -> None:
+        """Let a request fail if ``refused`` returns True for its method."""
+        import requests
+        send = requests.Session.request
+
+        def sent(own: Any, method: str, *words: Any, **options: Any) -> Any:
+            if refused(method):
+                raise requests.ConnectTimeout('the test cuts the network')
+            return send(own, method, *words, **options)
+
+        patch.setattr(requests.Session, 'request', sent)
 
     @abc.abstractmethod
     def order(
@@ -142,6 +182,7 @@ class Aws(Memory):
         for how in ('refused', 'lost'))
     listing = 2  # there are two regions
     launching = 17
+    deletion = 'TerminateInstances'
 
     def __init__(self, served: Any, patch: pytest.MonkeyPatch) -> None:
         super().__init__(served, patch)
@@ -172,6 +213,23 @@ class Aws(Memory):
             return send(*words)
 
         patch.setattr(URLLib3Session, 'send', held)
+
+    def disconnect(
+        self, patch: pytest.MonkeyPatch, refused: Callable[[str], bool],
+    ) -> None:
+        """Let a request of botocore fail if ``refused`` returns True for its operation."""
+        from botocore.exceptions import ConnectTimeoutError
+        from botocore.httpsession import URLLib3Session
+        send = URLLib3Session.send
+
+        def sent(own: Any, request: Any) -> Any:
+            body = request.body or b''
+            text = body.decode() if isinstance(body, bytes) else str(body)
+            if refused(dict(parse_qsl(text)).get('Action', '')):
+                raise ConnectTimeoutError(endpoint_url=request.url)
+            return send(own, request)
+
+        patch.setattr(URLLib3Session, 'send', sent)
 
     def order(
         self, patch: pytest.MonkeyPatch, how: str, times: int, met: threading.Event,

@@ -12,17 +12,18 @@ import re
 import pytest
 
 from fogros2 import AzureCloudInstance
-from fogros2.errors import ConfigurationError, PrerequisiteError
+from fogros2.errors import ConfigurationError, PrerequisiteError, ProviderError
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider.azure import account, ending, failures, login, machines, prices
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
 from fogros2.provider.vm.cloud import Order, Place
+from fogros2.provider.vm.rest import Answer
 from rigs.azure import catalogue, schema
 
 SPEC = MachineSpec('planner', 'azure', {'region': 'westeurope'})
 REQUEST = CreateRequest('5f0c7ab8', 'ssh-ed25519 AAAA robot\n', {'fogros2-launch': 'l1'}, 51820)
-KNOWN = Prepared({'id': '/image'}, False, True, '', True)
+KNOWN = Prepared({'id': '/image'}, 30, False, True, '', True)
 PLACE = Place('westeurope', 'Standard_B2als_v2')
 
 
@@ -135,6 +136,7 @@ def test_time_of_azure_is_read_with_any_decimals():
     ('SkuNotAvailable', 'not in westeurope', 'zone', 'vm_sizes='),
     ('OverconstrainedAllocationRequest', 'x', 'zone', 'no free machine'),
     ('AllocationFailed', 'x', 'zone', 'no free machine'),
+    ('SpotPriceGreaterThanProvidedMaxPrice', 'x', 'zone', 'above max_price='),
     ('QuotaExceeded', 'x', 'region', 'quota'),
     ('OperationNotAllowed', 'exceeding approved Total Regional Cores quota', 'region', 'quota'),
     ('OperationNotAllowed', 'another operation is in progress', '', 'try again'),
@@ -218,3 +220,23 @@ def test_subscription_is_that_of_the_environment_or_of_the_login(monkeypatch, tm
     assert login.configured() and account.subscription() == 'two'
     monkeypatch.setenv('AZURE_SUBSCRIPTION_ID', 'three')
     assert account.subscription() == 'three'
+
+
+@pytest.mark.parametrize(('link', 'followed'), [
+    ('https://management.azure.com/next', True), ('https://management.azure.com:443/next', True),
+    ('https://MANAGEMENT.azure.com/next', True), ('http://management.azure.com/next', False),
+    ('https://management.azure.com:444/next', False), ('https://azure.example/next', False),
+    ('https://management.azure.com.example/next', False), ('https://[', False),
+    ('https://azure.example\\@management.azure.com/next', False),
+    ('https://me@management.azure.com/next', False)])
+def test_next_page_is_asked_for_at_azure_alone(monkeypatch, link, followed):
+    monkeypatch.delenv(account.ENDPOINT_VARIABLE, raising=False)
+    pages = iter([{'value': [1], 'nextLink': link}, {'value': [2]}])
+    own = account.Account()
+    monkeypatch.setattr(own, 'ask', lambda *words, **options: Answer(200, {}, next(pages)))
+    found = own.pages('/subscriptions', 'looking')
+    if followed:
+        assert list(found) == [1, 2]
+    else:
+        with pytest.raises(ProviderError, match='named another server'):
+            list(found)

@@ -137,7 +137,7 @@ def test_one_table_has_the_prices_of_all_clouds(
         '  12 ms',
         'Standard_D2s_v5    azure     westeurope    2     8 GB    x86_64  Intel  $0.0960  $0.0192'
         '  46 ms',
-        '8 more cost as much or more (--limit 0)']
+        '9 more cost as much or more (--limit 0)']
     assert said.err == ''
     assert run('--arch', 'x86_64', '--spot', '--limit', '2', '--json') == 0
     offers = json.loads(capsys.readouterr().out)['offers']

@@ -24,6 +24,7 @@ from fogros2.provider.gcp.provider import GCPProvider
 from fogros2.provider.vm import cloud
 from fogros2.provider.vm.cloud import Order, Place
 from fogros2.waiting import wait_until
+from fogros2_features.images.keepers import image_keeper
 from fogros2_features.prices.market import seller
 from fogros2_features.prices.offers import wants
 from fogros2_testing import request_for
@@ -77,13 +78,15 @@ def test_wrong_option_is_named_with_what_to_do(options, words):
 @pytest.mark.parametrize(('name', 'gpus', 'spot', 'price'), [
     ('e2-standard-4', {}, False, '0.17267112'), ('e2-medium', {}, True, '0.0086319'),
     ('n1-standard-1', {'nvidia-tesla-t4': 2}, False, '0.8811975'),
+    ('e2-medium', {'nvidia-tesla-t4': 1}, True, '0.1286319'),
     ('g2-standard-4', {}, False, '0.90912'),
     ('c4-standard-2', {}, False, None), ('e2-medium', {'nvidia-l4': 1}, True, None)])
 def test_price_is_the_sum_of_a_types_parts(name, gpus, spot, price):
-    table = {key: value for sku in catalogue.skus() for key, value in prices.parts(sku).items()}
     entry = catalogue.machine_types('europe-west3-b')[name]
-    cost = prices.price(table, 'europe-west3', entry, gpus, spot)
-    assert cost == (None if price is None else Decimal(price))
+    for skus in (catalogue.skus(), catalogue.skus()[::-1]):
+        table = {key: value for sku in skus for key, value in prices.parts(sku).items()}
+        cost = prices.price(table, 'europe-west3', entry, gpus, spot)
+        assert cost == (None if price is None else Decimal(price))
 
 
 def test_regions_share_one_answer_of_the_catalogue(gce, monkeypatch):
@@ -247,6 +250,33 @@ def test_machine_that_shut_itself_down_is_a_leftover(gce):
 
 
 # -- firewall ---------------------------------------------------------------------------------
+
+
+def test_image_has_the_driver_of_its_machine(gce):
+    provider = GCPProvider()
+    keeper = image_keeper(provider)
+
+    def create(name, kind, dependencies='', **options):
+        spec = MachineSpec(name, 'gcp', {
+            'region': 'us-central1', 'machine_type': kind, **options})
+        return provider.create(spec, dataclasses.replace(
+            request_for(spec), dependencies=dependencies))
+
+    accelerated = {'accelerators': 'nvidia-tesla-t4'}
+    machines = {'plain': create('plain', 'e2-medium'), 'l4': create('l4', 'g2-standard-4'),
+                't4': create('t4', 'n1-standard-1', **accelerated)}
+    for name, machine_id in machines.items():
+        keeper.bake(machine_id, name, f'of-{name}')
+    wait_until(lambda: all(image.state == 'available' for image in keeper.images()),
+               timeout=60.0, what='the images')
+    for name in machines:
+        images = {
+            number: provider.describe(create(
+                f'{name}-{number}', kind, f'of-{name}', **options)).image
+            for number, (kind, options) in enumerate((
+                ('e2-medium', {}), ('g2-standard-4', {}), ('n1-standard-1', accelerated)))}
+        assert [f'fogros2-{name}-' in images[number] for number in images] == [
+            name == 'plain', name != 'plain', name != 'plain']
 
 
 def test_denial_is_between_our_rules_and_googles(gce):

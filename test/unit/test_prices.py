@@ -23,6 +23,7 @@ from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.aws.provider import AWSProvider
 from fogros2.provider.machine_types import MachineType
 from fogros2.provider.vm.cloud import PRICES_AGE
+from fogros2.provider.vm.options import VmOptions
 from fogros2_features.prices import choices
 from fogros2_features.prices.market import CloudSeller, Market, seller
 from fogros2_features.prices.offers import Wants, wants
@@ -189,6 +190,15 @@ def test_price_of_one_type(source: Any, market: Market) -> None:
     assert source.asked == [('prices', REGION), ('spot', REGION)]
     with pytest.raises(ProviderError, match='no price of m9.huge in eu-central-1'):
         market.price_of(REGION, 'm9.huge')
+
+
+def test_spot_machine_is_counted_with_its_dearest_zone(market: Market) -> None:
+    for limit, price in ((None, '0.0196'), ('0.016', '0.0151'), ('0.01', '0.0151')):
+        options = VmOptions(spot=True, max_price=limit and Decimal(limit))
+        assert market.cost_of(REGION, 't3.medium', options) == Decimal(price)
+    assert market.cost_of(REGION, 't3.medium', VmOptions()) == Decimal('0.048')
+    # types are compared by their cheapest zone
+    assert market.price_of(REGION, 't3.medium', spot=True) == Decimal('0.0151')
 
 
 # -- the cache --------------------------------------------------------------------------------

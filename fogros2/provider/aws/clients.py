@@ -14,13 +14,11 @@ from typing import Any, Optional, TypeVar
 from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.aws.failures import translated
 from fogros2.provider.vm import account as vm
-from fogros2.provider.vm.failures import unless_gone
+from fogros2.provider.vm.failures import SETTLING, unless_gone
 
 T = TypeVar('T')
 
 CONNECT_TIMEOUT, READ_TIMEOUT = 5.0, 30.0
-#: Seconds for which EC2 may not report a new instance.
-SETTLING = 60.0
 
 
 def usual() -> Account:
@@ -46,14 +44,14 @@ class Account(vm.Account):
         super().__init__()
         if session is not None:
             self._known['session'] = session
-        #: Instances that this process has created, and when (``time.monotonic``).
+        #: Instances and groups that this process has created, and when (``time.monotonic``).
         self.made: dict[str, float] = {}
         # boto3 creates clients of one session in one thread only; their use is thread-safe
         self._lock = threading.RLock()
 
-    def just_made(self, instance: str) -> bool:
-        """Return whether EC2 may not report an instance yet that this process has created."""
-        made = self.made.get(instance)
+    def just_made(self, identity: str) -> bool:
+        """Return whether EC2 may not know yet what this process has created."""
+        made = self.made.get(identity)
         return made is not None and time.monotonic() - made < SETTLING
 
     def session(self) -> Any:

@@ -17,7 +17,7 @@ from fogros2.provider.aws.network import Ec2Network
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import Ec2Prices
 from fogros2.provider.vm.cloud import Order, Place, PRICES_AGE, Vm, VmId
-from fogros2.provider.vm.failures import unless_gone
+from fogros2.provider.vm.failures import settled, unless_gone
 from fogros2.provider.vm.regions import read_table, Regions
 
 
@@ -106,9 +106,10 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network, Ec2Disks):
         tags: Mapping[str, str],
     ) -> str:
         words = instances.run_request(place, order, prepared, created[0], tags)
-        answer = self._account.call(
-            'ec2', place.region, 'run_instances',
-            f"creating '{order.spec.name}' ({place.kind})", **words)
+        what = f"creating '{order.spec.name}' ({place.kind})"
+        answer = settled(
+            lambda: self._account.call('ec2', place.region, 'run_instances', what, **words),
+            'InvalidGroup.NotFound', 'InvalidKeyPair.NotFound', cancel=self.cancel, what=what)
         vm = str(answer['Instances'][0]['InstanceId'])
         self._account.made[vm] = time.monotonic()
         return vm

@@ -11,11 +11,11 @@ from typing import Any, Optional
 from fogros2.errors import ConfigurationError, MachineNotFound
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.aws.clients import Account
-from fogros2.provider.aws.instances import tag_list, tags_of
+from fogros2.provider.aws.instances import instances_in, tag_list, tags_of
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import instance_type
 from fogros2.provider.machine_types import MachineType
-from fogros2.provider.vm.cloud import TAG_BAKED, TAG_USER, VmCloud, VmId, when
+from fogros2.provider.vm.cloud import TAG_BAKED, TAG_DRIVER, TAG_USER, VmCloud, VmId, when
 from fogros2.provider.vm.failures import unless_gone
 from fogros2.provider.vm.images import check_baked, Image, image_parts, image_tags
 
@@ -108,7 +108,7 @@ class Ec2Images(VmCloud):
     def _baked(
         self, region: str, kind: MachineType, options: Options, dependencies: str,
     ) -> Optional[Mapping[str, Any]]:
-        """Return the newest image of FogROS2 with the same dependencies, or None."""
+        """Return the newest image of FogROS2 with the same dependencies and driver, or None."""
         images = self._account.call(
             'ec2', region, 'describe_images', 'looking for images baked before', Owners=['self'],
             Filters=[{'Name': f'tag:{TAG_DEPENDENCIES}', 'Values': [dependencies]},
@@ -116,7 +116,8 @@ class Ec2Images(VmCloud):
                      {'Name': 'architecture', 'Values': [kind.arch]},
                      {'Name': 'state', 'Values': ['available']}])['Images']
         fitting = [image for image in images
-                   if tags_of(image).get(TAG_USER, options.user) == options.user]
+                   if tags_of(image).get(TAG_USER, options.user) == options.user
+                   and (TAG_DRIVER in tags_of(image)) is has_nvidia(kind)]
         return max(fitting, key=lambda image: str(image.get('CreationDate', '')), default=None)
 
     def bake(self, machine: VmId, name: str, dependencies: str) -> str:
@@ -124,14 +125,24 @@ class Ec2Images(VmCloud):
         vm = self.get(machine.region, machine.vm)
         if vm is None:
             raise MachineNotFound(f'EC2 does not know {machine.vm} yet', 'try again')
-        listed = tag_list({'Name': name, **image_tags(name, vm.tags, dependencies)})
+        what = f"making the image '{name}'"
+        (kind,) = self.named_types(vm.region, [vm.kind])
+        (entry,) = instances_in(self._account.call(
+            'ec2', vm.region, 'describe_instances', what, InstanceIds=[vm.id])['Reservations'])
+        # an image has all volumes of its machine, unless they are left out
+        others = [str(one['DeviceName']) for one in entry.get('BlockDeviceMappings') or ()
+                  if one['DeviceName'] != entry.get('RootDeviceName')]
+        listed = tag_list({'Name': name, **image_tags(
+            name, vm.tags, dependencies, nvidia=has_nvidia(kind))})
         # names are unique in a region
         stamp = time.strftime('%Y%m%d-%H%M%S', time.gmtime())
         plain = re.sub(r"[^A-Za-z0-9()\[\] ./'@_-]", '-', name)[:80]
         answer = self._account.call(
-            'ec2', vm.region, 'create_image', f"making the image '{name}'",
+            'ec2', vm.region, 'create_image', what,
             InstanceId=vm.id, Name=f'fogros2-{plain}-{stamp}', NoReboot=True,
             Description=f'FogROS2: {plain}',
+            **({'BlockDeviceMappings': [{'DeviceName': device, 'NoDevice': ''}
+                                        for device in others]} if others else {}),
             TagSpecifications=[{'ResourceType': 'image', 'Tags': listed},
                                {'ResourceType': 'snapshot', 'Tags': listed}])
         return f'aws:{vm.region}/{answer["ImageId"]}'

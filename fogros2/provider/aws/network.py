@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+import time
 from typing import Any, Optional
 
 from fogros2.errors import ConfigurationError, ProviderError
@@ -18,7 +19,7 @@ from fogros2.provider.aws import instances
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.failures import AwsError
 from fogros2.provider.vm.cloud import Order, own_name, TAG_ATTEMPT, TAG_SSH_FROM, VmCloud, VmId
-from fogros2.provider.vm.failures import tolerated
+from fogros2.provider.vm.failures import settled, tolerated, wait_through
 from fogros2.provider.vm.options import cidr, FREE_PORTS, SSH
 from fogros2.waiting import wait_until
 
@@ -76,25 +77,31 @@ class Ec2Network(VmCloud):
         """Create a machine's group and return its id; reuse that of an earlier attempt."""
         name, where = order.spec.name, {'VpcId': vpc} if vpc else {}
         with tolerated('InvalidGroup.Duplicate'):
-            return str(self._account.call(
+            group = str(self._account.call(
                 'ec2', region, 'create_security_group', f"making the security group of '{name}'",
                 GroupName=own_name(order.attempt), Description=f'FogROS2 machine {name}', **where,
                 TagSpecifications=[{
                     'ResourceType': 'security-group', 'Tags': instances.tag_list(order.tags)}],
             )['GroupId'])
+            self._account.made[group] = time.monotonic()
+            return group
         return str(self._groups(region, order.attempt)[0]['GroupId'])
 
     def _open_group(self, region: str, group: str, order: Order) -> None:
         """Open the ports of a new group: the VPN's, and SSH for the order's sources."""
         port, (first, last) = order.request.vpn_port, FREE_PORTS
+        what = f"opening the ports of '{order.spec.name}'"
+        rules = [
+            {'IpProtocol': 'udp', 'FromPort': port, 'ToPort': port, **ANYONE},
+            *([rule('tcp', SSH, order.sources)] if order.sources else []),
+            *(rule(protocol, first, order.sources, last)
+              for protocol in (('tcp', 'udp') if order.options.fleet else ()))]
         with tolerated('InvalidPermission.Duplicate'):
-            self._account.call(
-                'ec2', region, 'authorize_security_group_ingress',
-                f"opening the ports of '{order.spec.name}'", GroupId=group, IpPermissions=[
-                    {'IpProtocol': 'udp', 'FromPort': port, 'ToPort': port, **ANYONE},
-                    *([rule('tcp', SSH, order.sources)] if order.sources else []),
-                    *(rule(protocol, first, order.sources, last)
-                      for protocol in (('tcp', 'udp') if order.options.fleet else ()))])
+            settled(
+                lambda: self._account.call(
+                    'ec2', region, 'authorize_security_group_ingress', what, GroupId=group,
+                    IpPermissions=rules),
+                'InvalidGroup.NotFound', cancel=self.cancel, what=what)
             self._account.admitted[order.attempt] = sorted(map(cidr, order.sources))
 
     def undo_begin(
@@ -126,15 +133,24 @@ class Ec2Network(VmCloud):
         for group in ids or [
                 str(entry['GroupId']) for entry in self._groups(region, attempt)]:
             def deleted(group: str = group) -> bool:
-                with tolerated('DependencyViolation', 'InvalidGroup.InUse'):
-                    self._account.remove(region, 'delete_security_group',
-                                         'deleting the security group', GroupId=group)
-                    return True
-                return False
-            wait_until(
-                deleted, timeout=timeout, interval=1.0, longest=5.0,
-                what=f'the security group {group} in {region} to be deleted',
-                hint=f'aws ec2 delete-security-group --region {region} --group-id {group}')
+                try:
+                    self._account.call('ec2', region, 'delete_security_group',
+                                       'deleting the security group', GroupId=group)
+                except AwsError as error:
+                    if error.code in ('DependencyViolation', 'InvalidGroup.InUse'):
+                        return False
+                    if not error.gone:
+                        raise
+                    # EC2 may not know a new group yet, which would stay
+                    return not self._account.just_made(group)
+                return True
+            # a first request without an answer is an error
+            if not deleted():
+                wait_through(
+                    deleted, timeout=timeout, first=1.0, interval=1.5, longest=5.0,
+                    what=f'the security group {group} in {region} to be deleted',
+                    hint=f'aws ec2 delete-security-group --region {region} --group-id {group}')
+            self._account.made.pop(group, None)
 
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
         """Let only ``sources`` reach a TCP port, beside the networks of ``ssh_from=``."""
@@ -197,7 +213,7 @@ class Ec2Network(VmCloud):
         # no look-up is needed for what this process has created
         if (machine.vm in self._account.made or self._there(machine)) \
                 and self._terminate(machine):
-            wait_until(
+            wait_through(
                 lambda: not self._there(machine), timeout=TIMEOUT, first=1.5, interval=3.0,
                 longest=15.0, hint='ros2 fog delete again later',
                 what=f'{machine.vm} in {machine.region} to be terminated')

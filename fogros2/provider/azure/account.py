@@ -8,13 +8,13 @@ import json
 import os
 import threading
 from typing import Any, Optional
+from urllib.parse import urlsplit
 
 from fogros2.errors import FogError, PrerequisiteError, ProviderError
 from fogros2.provider.azure import login
 from fogros2.provider.azure.failures import refusal
-from fogros2.provider.vm.failures import one_line, unless_gone
+from fogros2.provider.vm.failures import one_line, unless_gone, wait_through
 from fogros2.provider.vm.rest import Answer, RestAccount
-from fogros2.waiting import wait_until
 
 #: Names another endpoint than the public cloud's, such as a sovereign cloud's.
 ENDPOINT_VARIABLE, ENDPOINT = 'FOGROS2_AZURE_ENDPOINT', 'https://management.azure.com'
@@ -121,8 +121,8 @@ class Account(RestAccount):
 
         # a group takes longer than what is in it
         first = 0.3 if '/providers/' in path else 1.5
-        return wait_until(look, timeout=OPERATION, cancel=self.cancel, first=first, interval=1.0,
-                          longest=8.0, what=f'{what} to be done')
+        return wait_through(look, timeout=OPERATION, cancel=self.cancel, first=first, interval=1.0,
+                            longest=8.0, what=f'{what} to be done')
 
     def pages(self, path: str, what: str, **query: str) -> Iterator[Mapping[str, Any]]:
         """Yield the entries of a list."""
@@ -168,7 +168,7 @@ class Account(RestAccount):
         query: Optional[Mapping[str, str]] = None,
     ) -> Answer:
         """Make a request below the endpoint, which alone gets the token."""
-        if not url.startswith(f'{endpoint()}/'):
+        if _server(url) != _server(endpoint()):
             raise ProviderError(f'{what} failed: Azure named another server, {url[:100]}')
         return self.ask(method, url, what, body, query=query, repeatable=method != 'POST')
 
@@ -191,6 +191,17 @@ class Account(RestAccount):
         except LibraryError as error:
             raise PrerequisiteError(f'{what} failed: Azure gives no token: {one_line(error)}',
                                     'is there a way to the Internet (a proxy)?') from error
+
+
+def _server(url: str) -> str:
+    """Return scheme, host and port of an address; the scheme's own port is left out."""
+    try:
+        parts = urlsplit(url)
+    except ValueError:
+        return ''
+    port = {'https': ':443', 'http': ':80'}.get(parts.scheme, '')
+    # text is compared: parsers differ about what is the host in 'https://a\\@b'
+    return f'{parts.scheme}://{parts.netloc.lower().removesuffix(port)}'
 
 
 def _state(answer: Any) -> str:

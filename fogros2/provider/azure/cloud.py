@@ -23,10 +23,10 @@ from fogros2.provider import TAG_EXPIRES
 from fogros2.provider.azure import ending, login, machines, prices
 from fogros2.provider.azure.account import Account, endpoint, subscription
 from fogros2.provider.azure.disks import AzureDisks
-from fogros2.provider.azure.failures import refusal
+from fogros2.provider.azure.failures import AzureError, refusal
 from fogros2.provider.azure.images import AzureImages
 from fogros2.provider.azure.machines import Prepared
-from fogros2.provider.azure.options import Options
+from fogros2.provider.azure.options import OLD_UBUNTU, Options
 from fogros2.provider.vm.cloud import (
     Order,
     own_name,
@@ -39,10 +39,9 @@ from fogros2.provider.vm.cloud import (
     Vm,
     VmId,
 )
-from fogros2.provider.vm.failures import unless_gone
+from fogros2.provider.vm.failures import settled, unless_gone, wait_through
 from fogros2.provider.vm.options import ipv4, SSH
 from fogros2.provider.vm.regions import read_table, Regions
-from fogros2.waiting import wait_until
 
 _VMS = 'providers/Microsoft.Compute/virtualMachines'
 _NET = 'providers/Microsoft.Network'
@@ -50,6 +49,8 @@ _NET = 'providers/Microsoft.Network'
 OLD_REGION = 'eastus'
 #: Seconds in which Azure finds room for a machine, or says that there is none.
 ALLOCATION = 300.0
+#: The code of a group that Azure does not know everywhere yet.
+_NEW_GROUP = ('ResourceGroupNotFound',)
 #: One for all providers of this process, so that its sizes are asked for once.
 _USUAL = Account()
 
@@ -142,9 +143,11 @@ class Azure(AzureImages, AzureDisks):
             prepared = {}
             for name, entry in sizes.items():
                 kind, version = prices.machine_type(entry), prices.generation(entry)
-                made = baked.result().get((kind.arch, version), '')
+                image, disk = baked.result().get((kind.arch, version)) or (
+                    options.image,
+                    machines.UBUNTU_DISK if options.image in ('', OLD_UBUNTU) else 0)
                 prepared[name] = Prepared(
-                    machines.image_of(options.image or made, kind.arch, version),
+                    machines.image_of(image, kind.arch, version), disk,
                     kind.gpu.startswith('NVIDIA'),
                     prices.capabilities(entry).get('PremiumIO') == 'True',
                     subnet.result(), guarded.result())
@@ -193,10 +196,12 @@ class Azure(AzureImages, AzureDisks):
         common = {'location': place.region, 'tags': dict(order.tags)}
 
         def put(kind: str, properties: Mapping[str, Any], **more: Any) -> Mapping[str, Any]:
-            resource: Mapping[str, Any] = self._account.call(
-                'PUT', self._account.path(name, f'{_NET}/{kind}/{name}'),
-                f"making the {kind} of '{order.spec.name}'",
-                {**common, **more, 'properties': properties}, wait=True)
+            what = f"making the {kind} of '{order.spec.name}'"
+            resource: Mapping[str, Any] = settled(
+                lambda: self._account.call(
+                    'PUT', self._account.path(name, f'{_NET}/{kind}/{name}'), what,
+                    {**common, **more, 'properties': properties}, wait=True),
+                *_NEW_GROUP, cancel=self.cancel, what=what)
             return resource
 
         with ThreadPoolExecutor(3, 'fog-azure') as pool:
@@ -223,10 +228,18 @@ class Azure(AzureImages, AzureDisks):
             # machines of one network reach each other; its name is long
             tags[machines.TAG_PRIVATE] = f'{private} {"/".join(subnet.split("/")[4:9:2])}'
         what = f"creating '{order.spec.name}' ({place.kind})"
-        self._account.call('PUT', self._account.vm(name), what,
-                           machines.request(place, order, prepared, str(nic['id']), tags))
+        body = machines.request(place, order, prepared, str(nic['id']), tags)
+        made = settled(
+            lambda: self._account.call('PUT', self._account.vm(name), what, body), *_NEW_GROUP,
+            cancel=self.cancel, what=what)
+        guarded = False
+        # at once: the robot may vanish while Azure looks for room
+        with contextlib.suppress(AzureError):
+            self._guard(name, place.region, order, prepared, made)
+            guarded = True
         entry = self._account.seen[name] = self._allocated(name, what)
-        self._guard(name, place.region, order, prepared, entry)
+        if not guarded:
+            self._guard(name, place.region, order, prepared, entry)
         if prepared.nvidia:
             self._install_driver(name, place.region)
 
@@ -241,8 +254,8 @@ class Azure(AzureImages, AzureDisks):
                     raise refusal(400, {**status, 'code': code.split('/')[-1]}, what)
             return entry if any(code.startswith('PowerState/') for code in codes) else None
 
-        return wait_until(look, timeout=ALLOCATION, cancel=self.cancel, first=0.3, interval=1.0,
-                          longest=4.0, what=what)
+        return wait_through(look, timeout=ALLOCATION, cancel=self.cancel, first=0.3,
+                            interval=1.0, longest=4.0, what=what)
 
     def _guard(
         self, name: str, region: str, order: Order, prepared: Prepared, entry: Mapping[str, Any],
@@ -262,7 +275,7 @@ class Azure(AzureImages, AzureDisks):
 
     def _install_driver(self, name: str, region: str) -> None:
         """Install NVIDIA's driver on a machine that runs, without waiting."""
-        wait_until(
+        wait_through(
             lambda: self._entry(name)['properties']['provisioningState'] == 'Succeeded',
             timeout=600.0, cancel=self.cancel, interval=3.0, longest=10.0, what=f'{name} to run')
         self._account.call(

@@ -38,7 +38,7 @@ _FAILURES = {
                      'OverconstrainedZonalAllocationRequest'), Failure(
         'Azure has no free machine of this size here at the moment',
         'try later, or give more sizes and regions: vm_sizes=, regions=', full='zone')),
-    'BadRequestMaxPriceTooLow': Failure(
+    'SpotPriceGreaterThanProvidedMaxPrice': Failure(
         'the spot price is above max_price= at the moment',
         'ros2 fog price --spot shows it; spot=False takes a machine on demand', full='zone'),
     **dict.fromkeys(('QuotaExceeded', 'PublicIPCountLimitReached', 'RegionalCoresQuotaExceeded',

@@ -17,7 +17,7 @@ from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.azure.machines import region_of
 from fogros2.provider.azure.options import Options
 from fogros2.provider.azure.prices import AzurePrices, generation, is_in, machine_type
-from fogros2.provider.vm.cloud import made_at, TAG_BAKED, TAG_MADE, TAG_USER, VmId
+from fogros2.provider.vm.cloud import made_at, TAG_BAKED, TAG_DISK, TAG_MADE, TAG_USER, VmId
 from fogros2.provider.vm.failures import unless_gone
 from fogros2.provider.vm.images import check_baked, Image, image_parts, image_tags
 
@@ -48,18 +48,23 @@ class AzureImages(AzurePrices):
         group = f'fogros2-image-{secrets.token_hex(6)}'
         tags = {**image_tags(name, entry['tags'], dependencies), TAG_MADE: str(int(time.time())),
                 TAG_KIND: f'{kind.arch} {made_for}'}
+        system_disk = entry['properties']['storageProfile']['osDisk']
+        # Azure reports no size of a machine that does not run
+        tags[TAG_DISK] = str(system_disk.get('diskSizeGB') or entry['tags'].get(TAG_DISK, '0'))
         path, version = self._account.path, self._version(group)
         definition, gallery = version.rsplit('/', 2)[0], version.rsplit('/', 4)[0]
         snapshot = path(group, f'{_COMPUTE}/snapshots/machine')
-        disk = entry['properties']['storageProfile']['osDisk']['managedDisk']['id']
         steps: list[tuple[str, dict[str, Any]]] = [
             (path(group), {}),
             (snapshot, {'incremental': True, 'creationData': {
-                'createOption': 'Copy', 'sourceResourceId': disk}}),
+                'createOption': 'Copy', 'sourceResourceId': system_disk['managedDisk']['id']}}),
             (gallery, {}),
             (definition, {
                 'osType': 'Linux', 'osState': 'Generalized', 'hyperVGeneration': made_for,
                 'architecture': 'Arm64' if kind.arch == 'arm64' else 'x64',
+                # without it, sizes whose disks are NVMe alone refuse the image
+                **({'features': [{'name': 'DiskControllerTypes', 'value': 'SCSI, NVMe'}]}
+                   if made_for == 'V2' else {}),
                 'identifier': {'publisher': 'fogros2', 'offer': 'machine', 'sku': group}}),
             (version, {'publishingProfile': {'targetRegions': [{'name': region}]},
                        'storageProfile': {'osDiskImage': {'source': {'id': snapshot}}}})]
@@ -89,9 +94,13 @@ class AzureImages(AzurePrices):
 
     def baked(
         self, region: str, options: Options, dependencies: str,
-    ) -> dict[tuple[str, str], str]:
-        """Return the newest images with the same dependencies, by architecture and generation."""
-        versions: dict[tuple[str, str], str] = {}
+    ) -> dict[tuple[str, str], tuple[str, int]]:
+        """
+        Return the newest images with the same dependencies, by architecture and generation.
+
+        :returns: the path of each and the GB of its disk.
+        """
+        versions: dict[tuple[str, str], tuple[str, int]] = {}
         if options.image or not dependencies:
             return versions
         groups = self._image_groups(
@@ -101,7 +110,9 @@ class AzureImages(AzurePrices):
             if group['tags'].get(TAG_DEPENDENCIES) == dependencies \
                     and group['tags'].get(TAG_USER, options.user) == options.user \
                     and self._state(str(group['name'])) == 'available':
-                versions[arch, made_for] = self._version(str(group['name']))
+                disk = str(group['tags'].get(TAG_DISK, ''))
+                versions[arch, made_for] = (self._version(str(group['name'])),
+                                            int(disk) if disk.isdecimal() else 0)
         return versions
 
     def images(self, region: str) -> Iterator[Image]:

@@ -17,7 +17,7 @@ TAG_ADDRESS, TAG_PRIVATE = 'fogros2-address', 'fogros2-private-ip'
 #: Ubuntu 24.04 of Canonical by architecture and generation; ROS 2 Jazzy is for Ubuntu 24.04.
 UBUNTU = {('x86_64', 'V2'): 'server', ('x86_64', 'V1'): 'server-gen1',
           ('arm64', 'V2'): 'server-arm64'}
-#: GB of the Ubuntu image's disk, the minimum of a machine's.
+#: GB of the Ubuntu image's disk.
 UBUNTU_DISK = 30
 _POWER = {'starting': MachineState.PENDING, 'running': MachineState.RUNNING,
           'stopping': MachineState.STOPPING, 'deallocating': MachineState.STOPPING,
@@ -28,6 +28,8 @@ class Prepared(NamedTuple):
     """What is known of a size before a machine is created."""
 
     image: Mapping[str, str]
+    #: GB of the image's disk, the minimum of a machine's; 0 if it is unknown.
+    disk: int
     nvidia: bool
     premium: bool
     subnet: str
@@ -88,16 +90,19 @@ def request(
     :param nic: resource id of the network interface.
     """
     options: Options = order.options
-    disk = max(options.disk_size, UBUNTU_DISK)
+    # Azure takes the size of an unknown image's disk
+    disk = max(options.disk_size, UBUNTU_DISK, prepared.disk) \
+        if prepared.disk or 'disk_size' in order.spec.options else 0
     spot = {'priority': 'Spot', 'evictionPolicy': 'Delete', 'billingProfile': {
         'maxPrice': -1 if options.max_price is None else float(options.max_price)}}
     return {
-        'location': place.region, 'tags': {**tags, TAG_DISK: str(disk)},
+        'location': place.region, 'tags': {**tags, **({TAG_DISK: str(disk)} if disk else {})},
         **({'identity': {'type': 'SystemAssigned'}} if prepared.guarded else {}),
         'properties': {
             'hardwareProfile': {'vmSize': place.kind},
             'storageProfile': {'imageReference': dict(prepared.image), 'osDisk': {
-                'createOption': 'FromImage', 'deleteOption': 'Delete', 'diskSizeGB': disk,
+                'createOption': 'FromImage', 'deleteOption': 'Delete',
+                **({'diskSizeGB': disk} if disk else {}),
                 'managedDisk': {'storageAccountType':
                                 'Premium_LRS' if prepared.premium else 'StandardSSD_LRS'}}},
             'osProfile': {

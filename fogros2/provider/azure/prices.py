@@ -33,12 +33,17 @@ class AzurePrices(VmCloud):
                          os.environ.get('AZURE_SUBSCRIPTION_ID', '')))
 
     def sizes(self, region: str) -> dict[str, Mapping[str, Any]]:
-        """Return the sizes that the subscription may use in a region; asked once in a process."""
+        """
+        Return the sizes that the subscription may use in a region; asked once in a process.
+
+        Confidential sizes are left out, because they take only requests with a security profile.
+        """
         return self._account.once(f'sizes {region}', lambda: {
             entry['name']: entry for entry in self._account.pages(
                 self._account.path(rest='providers/Microsoft.Compute/skus'),
                 f'asking for the sizes in {region}', **{'$filter': f"location eq '{region}'"})
-            if entry['resourceType'] == 'virtualMachines' and not any(
+            if entry['resourceType'] == 'virtualMachines'
+            and 'ConfidentialComputingType' not in capabilities(entry) and not any(
                 limit.get('type') == 'Location' for limit in entry.get('restrictions') or ())})
 
     def types(self, region: str) -> Iterator[MachineType]:

@@ -8,14 +8,13 @@ import copy
 import functools
 import os
 import threading
-import time
-from typing import Any, cast
+from typing import Any, cast, Optional
 import uuid
 import warnings
 
-from fogros2.errors import DeadlineExceeded, FogError, PrerequisiteError
+from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.gcp import failures, login
-from fogros2.provider.vm.failures import tolerated, unless_gone
+from fogros2.provider.vm.failures import tolerated, unless_gone, wait_through
 from fogros2.provider.vm.rest import RestAccount
 
 #: The API, and gcloud's own variable that names another address.
@@ -161,13 +160,17 @@ class Account(RestAccount):
         scope = path.partition('/')[0] + (
             f'/zones/{operation["zone"].rpartition("/")[2]}' if 'zone' in operation else '/global')
         place = f'{scope}/operations/{operation["name"]}/wait'
-        end = time.monotonic() + OPERATION_TIMEOUT
-        while operation['status'] != 'DONE':
-            if time.monotonic() > end:
-                raise DeadlineExceeded(f'{what} has not ended in {OPERATION_TIMEOUT:g} s',
-                                       'the console of Google Cloud has its operations')
+
+        def done() -> Optional[dict[str, Any]]:
+            answer = self.call('POST', place, what)
+            return answer if answer['status'] == 'DONE' else None
+
+        if operation['status'] != 'DONE':
             try:
-                operation = self.call('POST', place, what)
+                operation = wait_through(
+                    done, timeout=OPERATION_TIMEOUT, cancel=self.cancel, interval=0.5,
+                    longest=5.0, what=f'the end of: {what}',
+                    hint='the console of Google Cloud has its operations')
             except FogError as error:
                 error.refused = False  # the operation continues
                 raise

@@ -31,9 +31,9 @@ from fogros2.provider.vm.cloud import (
     Vm,
     VmId,
 )
-from fogros2.provider.vm.failures import unless_gone
+from fogros2.provider.vm.failures import unless_gone, wait_through
 from fogros2.provider.vm.regions import read_table, Regions
-from fogros2.waiting import cancellable, wait_until
+from fogros2.waiting import cancellable
 
 #: The region of FogROS2's default zone.
 DEFAULT_REGION = 'us-central1'
@@ -264,7 +264,7 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall, GoogleDisks):
     def set_ending(self, machine: VmId, spec: MachineSpec) -> None:
         """Change when Google ends an instance, which it takes for stopped instances only."""
         path, what = path_of(machine.vm), f'writing how {machine.vm} ends'
-        instance = wait_until(
+        instance = wait_through(
             lambda: state if (state := self._account.call('GET', path, what))['status']
             not in ('PENDING_STOP', 'STOPPING') else None,
             timeout=END_TIMEOUT, interval=1.0, longest=5.0, what=f'{machine.vm} to be stopped')

@@ -11,9 +11,9 @@ from typing import Any
 from fogros2.errors import ConfigurationError
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.gcp.account import Account
-from fogros2.provider.gcp.instances import RULES
+from fogros2.provider.gcp.instances import path_of, RULES
 from fogros2.provider.gcp.options import Options
-from fogros2.provider.vm.cloud import TAG_BAKED, TAG_USER, VmCloud, VmId, when
+from fogros2.provider.vm.cloud import TAG_BAKED, TAG_DRIVER, TAG_USER, VmCloud, VmId, when
 from fogros2.provider.vm.failures import unless_gone
 from fogros2.provider.vm.images import check_baked, Image, image_parts, image_tags
 
@@ -48,6 +48,7 @@ class GoogleImages(VmCloud):
             if image['status'] == 'READY'
             and image.get('architecture', 'X86_64').lower() == arch
             and image['labels'].get(TAG_USER) == RULES.encode({'': options.user})['']
+            and (TAG_DRIVER in image['labels']) is gpus
         ] if dependencies else []
         if fitting:
             newest = max(fitting, key=lambda image: when(image['creationTimestamp']) or 0.0)
@@ -76,13 +77,17 @@ class GoogleImages(VmCloud):
         vm = self.get(machine.region, machine.vm)
         assert vm is not None
         project, zone, instance = vm.id.split('/')
+        what = f"making the image '{name}'"
+        gpus = any(kind.gpus for kind in self.named_types(vm.region, [vm.kind])) or bool(
+            self._account.call('GET', path_of(vm.id), what).get('guestAccelerators'))
         stamp = time.strftime('%Y%m%d-%H%M%S', time.gmtime())
         plain = re.sub('[^a-z0-9-]', '-', name.lower())[:36]
         own = f'fogros2-{plain}-{stamp}'
         self._account.call(
-            'POST', f'{project}/global/images', f"making the image '{name}'", forceCreate='true',
+            'POST', f'{project}/global/images', what, forceCreate='true',
             body={'name': own, 'sourceDisk': f'projects/{project}/zones/{zone}/disks/{instance}',
-                  'labels': RULES.encode(image_tags(name, vm.tags, dependencies)),
+                  'labels': RULES.encode(image_tags(
+                      name, vm.tags, dependencies, nvidia=gpus)),
                   'storageLocations': [vm.region]})
         return f'gcp:{vm.region}/{project}/{own}'
 

@@ -26,8 +26,8 @@ _SERVICE = 'v1/services/6F81-5844-456A/skus'
 _FIELDS = 'nextPageToken,skus(description,serviceRegions,' \
     'pricingInfo/pricingExpression/tieredRates)'
 _PART = re.compile(r'(Spot Preemptible )?(?:(?P<family>[A-Z]\d+[A-Z]?) (?:AMD |Arm |Predefined )?'
-                   r'Instance (?P<part>Core|Ram)|(?P<gpu>Nvidia [\w ]+) GPU)(?: attached.*)? '
-                   r'running in .*')
+                   r'Instance (?P<part>Core|Ram)|(?P<gpu>Nvidia [\w ]+) GPU)'
+                   r'(?P<attached> attached to Spot Preemptible VMs)? running in .*')
 #: vCPUs for which Google bills a type that shares its core.
 _SHARED = {'e2-micro': Decimal('0.25'), 'e2-small': Decimal('0.5'), 'e2-medium': Decimal(1)}
 
@@ -85,7 +85,8 @@ def parts(sku: Mapping[str, Any]) -> Rates:
     name = words['family'] or words['gpu'].replace(' ', '-')
     price = sku['pricingInfo'][0]['pricingExpression']['tieredRates'][-1]['unitPrice']
     dollars = int(price.get('units', 0)) + Decimal(int(price.get('nanos', 0))) / 10**9
-    return {(region, name.lower(), words['part'] or 'GPU', bool(words[1])): dollars
+    spot = bool(words[1] or words['attached'])
+    return {(region, name.lower(), words['part'] or 'GPU', spot): dollars
             for region in sku['serviceRegions']}
 
 

@@ -35,8 +35,9 @@ TAG_USER = 'fogros2-user'
 TAG_DISK = 'fogros2-disk-gb'
 TAG_PRICE = 'fogros2-price-per-hour'
 TAG_SSH_FROM = 'fogros2-ssh-from'
-#: Only on images: the image's name.
+#: Only on images: the image's name, and 'nvidia' if it has NVIDIA's driver.
 TAG_BAKED = 'fogros2-baked'
+TAG_DRIVER = 'fogros2-driver'
 #: Only on resources beside the machine: seconds since the epoch of their creation.
 TAG_MADE = 'fogros2-made'
 #: Seconds for which prices are used again; for types and zones: ``VmCloud.types_age``.

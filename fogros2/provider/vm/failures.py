@@ -3,15 +3,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
-from typing import ClassVar, Literal, NamedTuple, Optional
+import threading
+import time
+from typing import Any, ClassVar, Literal, NamedTuple, Optional, TypeVar
 
-from fogros2.errors import FogError, PrerequisiteError, ProviderError
+from fogros2.errors import DeadlineExceeded, FogError, PrerequisiteError, ProviderError
 from fogros2.provider.vm.cloud import CloudError
+from fogros2.waiting import wait_until
+
+T = TypeVar('T')
 
 #: Maximum length of a cloud's own text in a message.
 LENGTH = 300
+#: Seconds for which a cloud may not know everywhere what it has just created.
+SETTLING = 60.0
 
 
 class Failure(NamedTuple):
@@ -110,6 +117,56 @@ class Silent(PrerequisiteError):
     def __init__(self, message: str, hint: str, *, unsent: bool) -> None:
         super().__init__(message, hint)
         self.refused, self.temporary = unsent, not unsent
+
+
+def settled(
+    request: Callable[[], T], *codes: str, cancel: Optional[threading.Event], what: str,
+) -> T:
+    """
+    Make a request about something new, again while the cloud does not know it everywhere.
+
+    :param codes: of the refusals that say so.
+    :param what: see :func:`~fogros2.waiting.wait_until`.
+    :raises CodedError: it still does not know it after ``SETTLING`` seconds.
+    """
+    end = time.monotonic() + SETTLING
+
+    def attempt() -> Optional[tuple[T]]:
+        try:
+            return (request(),)
+        except CodedError as error:
+            if error.code not in codes or time.monotonic() >= end:
+                raise
+            return None
+
+    return wait_until(attempt, timeout=2 * SETTLING, cancel=cancel, interval=0.5, longest=4.0,
+                      what=what)[0]
+
+
+def wait_through(probe: Callable[[], Optional[T]], **options: Any) -> T:
+    """
+    Wait as :func:`~fogros2.waiting.wait_until` does; a request without an answer ends no wait.
+
+    :raises Silent: at the time-out, if the last request got no answer.
+    """
+    silent: Optional[Silent] = None
+
+    def look() -> Optional[T]:
+        nonlocal silent
+        try:
+            value = probe()
+        except Silent as error:
+            silent = error
+            return None
+        silent = None
+        return value
+
+    try:
+        return wait_until(look, **options)
+    except DeadlineExceeded:
+        if silent is not None:
+            raise silent from None
+        raise
 
 
 def one_line(text: object) -> str:

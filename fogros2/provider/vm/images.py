@@ -10,7 +10,7 @@ from typing import Optional
 
 from fogros2.errors import MachineNotFound, ProviderError
 from fogros2.provider import TAG_DEPENDENCIES
-from fogros2.provider.vm.cloud import TAG_BAKED, TAG_USER
+from fogros2.provider.vm.cloud import TAG_BAKED, TAG_DRIVER, TAG_USER
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,9 +33,16 @@ class Image:
     tags: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
-def image_tags(name: str, machine: Mapping[str, str], dependencies: str) -> dict[str, str]:
-    """Return the tags of an image of a machine with the tags ``machine``."""
-    tags = {TAG_BAKED: name, TAG_USER: machine.get(TAG_USER, ''), TAG_DEPENDENCIES: dependencies}
+def image_tags(
+    name: str, machine: Mapping[str, str], dependencies: str, *, nvidia: bool = False,
+) -> dict[str, str]:
+    """
+    Return the tags of an image of a machine with the tags ``machine``.
+
+    :param nvidia: the machine began with NVIDIA's driver.
+    """
+    tags = {TAG_BAKED: name, TAG_USER: machine.get(TAG_USER, ''), TAG_DEPENDENCIES: dependencies,
+            TAG_DRIVER: 'nvidia' * nvidia}
     return {key: value for key, value in tags.items() if value}
 
 

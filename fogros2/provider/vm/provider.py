@@ -49,9 +49,10 @@ from fogros2.provider.vm.cloud import (
     VmId,
 )
 from fogros2.provider.vm.creation import Creation
+from fogros2.provider.vm.failures import wait_through
 from fogros2.provider.vm.options import ipv4, NEAREST, VmOptions
 from fogros2.provider.vm.user_data import AGENT_DIRECTORY, AGENT_PROGRAM
-from fogros2.waiting import cancellable, wait_until
+from fogros2.waiting import cancellable
 
 T = TypeVar('T')
 
@@ -194,7 +195,7 @@ class VmProvider(Provider):
     ) -> Optional[Decimal]:
         with contextlib.suppress(FogError):
             price: Decimal = _market(self.cloud.account(options).until(
-                cancel, hasty=True)).price_of(region, kind, spot=options.spot)
+                cancel, hasty=True)).cost_of(region, kind, options)
             return price
         return None
 
@@ -289,7 +290,7 @@ class VmProvider(Provider):
                 cloud.notes[machine.vm])) if report.endpoint is not None else None
 
         # a cloud needs some ten seconds: few requests, but a fast machine is noticed soon
-        return wait_until(
+        return wait_through(
             look, timeout=timeout, cancel=self.cancel, first=0.5, interval=1.5, longest=5.0,
             what=f"'{name}' ({machine.vm}) to run")
 
@@ -323,8 +324,9 @@ class VmProvider(Provider):
             vm = self.cloud.get(machine.region, machine.vm)
             return vm is None or vm.state is not MachineState.STOPPING
 
-        wait_until(stopped, timeout=END_TIMEOUT, interval=1.0, longest=5.0,
-                   what=f'{machine.vm} in {machine.region} to be stopped')
+        if not stopped():
+            wait_through(stopped, timeout=END_TIMEOUT, first=1.0, interval=1.5, longest=5.0,
+                         what=f'{machine.vm} in {machine.region} to be stopped')
         self.cloud.start(machine)
 
     def tidy(self, dead: Collection[str] = ()) -> list[str]:

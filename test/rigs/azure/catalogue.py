@@ -14,7 +14,12 @@ SIZES: dict[str, tuple[int, float, str, int, bool, str, str]] = {
     'Standard_D8s_v5': (8, 32.0, 'x64', 0, True, '0.384', '0.0768'),
     'Standard_NC4as_T4_v3': (4, 28.0, 'x64', 1, True, '0.526', '0.1052'),
     'Standard_DS2_v2': (2, 7.0, 'x64', 0, False, '0.146', ''),
+    'Standard_DC2as_v5': (2, 8.0, 'x64', 0, True, '0.0076', '0.0019'),
+    'Standard_D2s_v6': (2, 8.0, 'x64', 0, True, '0.101', '0.0202'),
 }
+#: Further capabilities of a size: a confidential one, and one whose disks are NVMe alone.
+CAPABILITIES = {'Standard_DC2as_v5': {'ConfidentialComputingType': 'SNP'},
+                'Standard_D2s_v6': {'DiskControllerTypes': 'NVMe'}}
 #: Marketplace images: what fits to 'publisher:offer:sku', and GB of the disk.
 IMAGES = {
     'Canonical:ubuntu-24_04-lts:server': ('x64', 'V2', 30),
@@ -31,7 +36,8 @@ def skus(region: str, restricted: set[str]) -> list[dict[str, Any]]:
         has = {'vCPUs': str(cpus), 'MemoryGB': f'{memory:g}', 'CpuArchitectureType': arch,
                'vCPUsAvailable': str(cpus), 'vCPUsPerCore': '1' if arch == 'Arm64' else '2',
                'HyperVGenerations': 'V2' if arch == 'Arm64' else 'V1,V2', 'PremiumIO': 'True',
-               'LowPriorityCapable': str(spot), **({'GPUs': str(gpus)} if gpus else {})}
+               'LowPriorityCapable': str(spot), **({'GPUs': str(gpus)} if gpus else {}),
+               **CAPABILITIES.get(name, {})}
         found.append({
             'resourceType': 'virtualMachines', 'name': name, 'tier': 'Standard',
             'size': name.partition('_')[2], 'family': 'standardFamily', 'locations': [region],

@@ -58,7 +58,8 @@ class Box(server.Box):
             with self.cloud.lock:
                 for name in list(self.api.groups):
                     self.api.groups[name]['properties']['provisioningState'] = 'Deleting'
-                    self.api.later(name, lambda name=name: self.api.drop(name))
+                    self.api.later(name, lambda name=name: self.api.drop(name),
+                                   location=True)
         else:
             return super().do(order)
         return None

@@ -23,7 +23,7 @@ import re
 import threading
 import time
 from typing import Any, Optional
-from urllib.parse import parse_qsl, urlsplit
+from urllib.parse import parse_qsl, urlencode, urlsplit
 import uuid
 
 from rigs.azure import catalogue, schema
@@ -47,6 +47,11 @@ _NAMES = {
 #: Kinds whose creation takes an operation; the others answer at once.
 _SLOW = {'networksecuritygroups', 'securityrules', 'publicipaddresses', 'virtualnetworks',
          'virtualmachines', 'extensions', 'snapshots', 'galleries', 'images', 'versions'}
+#: Paths of operations and their results, with the number.
+_OPERATION = re.compile(r'/(\w*operation(s|results))/([0-9a-f-]{36})$', re.IGNORECASE)
+#: Kinds whose operations have another word in their path.
+_OPERATIONS = {'disks': 'diskOperations', 'snapshots': 'diskOperations', **dict.fromkeys(
+    ('galleries', 'images', 'versions'), 'capsOperations')}
 _USERS = {'admin', 'administrator', 'root', 'user', 'test', 'guest', 'sys', 'console'}
 
 
@@ -150,6 +155,8 @@ class Service:
         #: The actions that requests have needed.
         self.actions: set[str] = set()
         self.restricted: set[str] = set()
+        #: The most entries of a list in one answer.
+        self.page = 1000
         self.lock = threading.RLock()
 
     # -- requests -------------------------------------------------------------------------------
@@ -176,6 +183,7 @@ class Service:
                         {'Retry-After': '1'} if fault.status == 429 else {}))
                 found = self._route(method, path, kind, query, body, who, fault)
                 self._check_answer(kind, found[2])
+                found = self._paged(path, query, found)
                 if fault is not None and fault.after:
                     raise Refusal(500, fault.code)
                 code = ''
@@ -201,6 +209,18 @@ class Service:
             *more.items(), ('Content-Type', 'application/json'),
             ('Content-Length', str(len(data)))])
         return [data]
+
+    def _paged(
+        self, path: str, query: Mapping[str, str], answer: tuple[int, dict[str, str], Any],
+    ) -> tuple[int, dict[str, str], Any]:
+        """Return a page of a list, with the link to the next one."""
+        status, headers, found = answer
+        start = int(query.get('$skiptoken', 0))
+        if not isinstance(found, Mapping) or len(found.get('value', ())) <= self.page + start:
+            return status, headers, found if not start else {'value': found['value'][start:]}
+        more = urlencode({**query, '$skiptoken': start + self.page})
+        return status, headers, {'value': found['value'][start:start + self.page],
+                                 'nextLink': f'{self.url}{path}?{more}'}
 
     def _check_answer(self, kind: str, answer: Any) -> None:
         """Compare an answer with the models of the SDK: a defect of this service."""
@@ -245,7 +265,7 @@ class Service:
         return faults.due(self.faults, lambda one: (
             one.method in ('', method) and one.kind.lower() in ('', kind)
             and one.size in ('', size)
-            and '/operations/' not in path))
+            and not _OPERATION.search(path)))
 
     def _route(
         self, method: str, path: str, kind: str, query: Mapping[str, str], body: Any, who: str,
@@ -253,8 +273,8 @@ class Service:
     ) -> tuple[int, dict[str, str], Any]:
         words = path.split('/')
         self._authorize(method, path, kind, who)
-        if '/operations/' in path or '/operationresults/' in path:
-            return self._poll(words[-1], result='/operationresults/' in path)
+        if operation := _OPERATION.search(path):
+            return self._poll(path, operation[3], result=operation[2].lower() == 'results')
         if len(words) == 3:
             return 200, {}, {'subscriptionId': SUBSCRIPTION, 'displayName': 'Robots',
                              'state': 'Enabled', 'id': path}
@@ -288,7 +308,7 @@ class Service:
             role['properties']['permissions'][0] for scope, role in self._roles(who)
             if path.lower().startswith(scope.partition('/providers/')[0])]
         self.actions.add(action)
-        if action and not any(
+        if not any(
                 _matches(action, one['actions']) and not _matches(action, one['notActions'])
                 for one in permissions):
             raise Refusal(403, 'AuthorizationFailed',
@@ -314,12 +334,17 @@ class Service:
         """Begin an operation; return the headers that lead to it."""
         identity = str(uuid.uuid4())
         self.operations[identity] = Operation(time.monotonic() + self.delay, finish)
-        base = f'{self.url}/subscriptions/{SUBSCRIPTION}/providers/Microsoft.Resources/locations'
-        version = 'api-version=2024-03-01'
-        result = f'{base}/any/operationresults/{identity}?{version}'
-        return {'Location': result} if location else {
-            'Azure-AsyncOperation': f'{base}/any/operations/{identity}?{version}',
-            'Location': result, 'Retry-After': '10'}
+        base, version = f'{self.url}/subscriptions/{SUBSCRIPTION}', 'api-version=2024-03-01'
+        if location:
+            return {'Location': f'{base}/operationresults/{identity}?{version}'}
+        provider, kind = path.split('/providers/')[-1].partition('/')[0], kind_of(path)
+        group = self._group_of(path)
+        assert group is not None, path
+        base += f'/providers/{provider}/locations/{group["location"]}'
+        words = _OPERATIONS.get(kind, 'operations')
+        return {
+            'Azure-AsyncOperation': f'{base}/{words}/{identity}?{version}',
+            'Location': f'{base}/operationResults/{identity}?{version}', 'Retry-After': '10'}
 
     def tick(self) -> None:
         """Carry out what is due; a box does so without a request, too."""
@@ -333,7 +358,9 @@ class Service:
                     operation.error = (error.code, error.message)
         self.ghosts = [one for one in self.ghosts if one[0] > time.monotonic()]
 
-    def _poll(self, identity: str, *, result: bool) -> tuple[int, dict[str, str], Any]:
+    def _poll(
+        self, path: str, identity: str, *, result: bool,
+    ) -> tuple[int, dict[str, str], Any]:
         if identity not in self.operations:
             raise Refusal(404, 'NotFound')
         operation = self.operations[identity]
@@ -341,9 +368,7 @@ class Service:
             if operation.error else {}
         if result:
             if operation.status == 'InProgress':
-                return 202, {'Location': f'{self.url}/subscriptions/{SUBSCRIPTION}/providers/'
-                             f'Microsoft.Resources/locations/any/operationresults/{identity}'
-                             '?api-version=2024-03-01'}, None
+                return 202, {'Location': f'{self.url}{path}?api-version=2024-03-01'}, None
             return (409, {}, error) if error else (200, {}, None)
         return 200, {}, {'name': identity, 'status': operation.status, **error}
 
@@ -549,7 +574,9 @@ class Service:
         elif kind == 'versions':
             source = entry['properties']['storageProfile']['osDiskImage']['source']['id']
             disk = self._there(source)['properties']['creationData']['sourceResourceId']
-            self.computers.copy_disk(self._there(self._there(disk)['managedBy']), entry['id'])
+            vm = self._there(self._there(disk)['managedBy'])
+            entry['_disk_gb'] = vm['properties']['storageProfile']['osDisk']['diskSizeGB']
+            self.computers.copy_disk(vm, entry['id'])
 
     def _new_networksecuritygroups(self, entry: dict[str, Any], _: Any) -> None:
         rules = entry['properties'].pop('securityRules', [])
@@ -636,6 +663,10 @@ class Service:
             raise Refusal(400, 'NicInUse')
 
     def _check_image(self, what: dict[str, Any], size: str) -> None:
+        has = catalogue.CAPABILITIES.get(size, {})
+        if 'ConfidentialComputingType' in has:
+            raise Refusal(400, 'BadRequest', f'The VM size {size} is not supported for creation '
+                          'of VMs and Virtual Machine Scale Set with no security type.')
         image, (_, _, arch, *_) = what['storageProfile']['imageReference'], catalogue.SIZES[size]
         if 'id' in image:
             definition = self.resources.get(image['id'].lower().partition('/versions/')[0])
@@ -643,7 +674,14 @@ class Service:
             if definition is None or version is None \
                     or version['properties']['provisioningState'] != 'Succeeded':
                 raise Refusal(404, 'GalleryImageNotFound')
-            found, least = definition['properties']['architecture'], 30
+            found = definition['properties']['architecture']
+            least = version['_disk_gb']
+            features = {one['name']: one['value'] for one in
+                        definition['properties'].get('features', ())}
+            if has.get('DiskControllerTypes') == 'NVMe' \
+                    and 'NVMe' not in features.get('DiskControllerTypes', 'SCSI'):
+                raise Refusal(400, 'InvalidParameter', f'The VM size {size} cannot boot with OS '
+                              'image or disk. Please check that disk controller types match.')
         else:
             name = ':'.join(image[part] for part in ('publisher', 'offer', 'sku'))
             if name not in catalogue.IMAGES or image['version'] != 'latest':
@@ -651,8 +689,11 @@ class Service:
             found, _, least = catalogue.IMAGES[name]
         if found != arch:
             raise Refusal(400, 'BadRequest', f'The size {size} cannot boot this image: {found}.')
-        if what['storageProfile']['osDisk']['diskSizeGB'] < least:
-            raise Refusal(400, 'InvalidParameter', 'diskSizeGB')
+        disk = what['storageProfile']['osDisk'].setdefault('diskSizeGB', least)
+        if disk < least:
+            raise Refusal(409, 'OperationNotAllowed', f'The specified disk size {disk} GB is '
+                          'smaller than the size of the corresponding disk in the VM image: '
+                          f'{least} GB.')
 
     def _create(
         self, path: str, entry: dict[str, Any], fault: Optional[Fault],
@@ -807,13 +848,14 @@ def plain(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def action_of(method: str, path: str, kind: str) -> str:
-    """Return the action that a request needs, '' if it needs none."""
+    """Return the action that a request needs."""
     verb = {'GET': 'read', 'DELETE': 'delete', 'POST': 'action'}.get(method, 'write')
     parts = re.split('/providers/', path, flags=re.IGNORECASE)
-    if '/locations/' in path:
-        return ''
     if len(parts) == 1:
-        return f'Microsoft.Resources/subscriptions/{"resourceGroups/" * ("/" in path[16:])}{verb}'
+        below = path.split('/')[3:4]
+        if below and below[0].lower() == 'resourcegroups':
+            below = ['resourceGroups']
+        return '/'.join(('Microsoft.Resources/subscriptions', *below, verb))
     words = parts[-1].split('/')
     if kind == 'tags':
         return f'Microsoft.Resources/tags/{verb}'

@@ -57,7 +57,7 @@ class Exchange(NamedTuple):
     def specification(self) -> str:
         """Return the pattern of the specification's file; '' for an operation's state."""
         path = self.target.partition('?')[0].lower()
-        return '' if '/operation' in path else next(
+        return '' if 'operation' in path else next(
             (file for word, file in SPECIFICATIONS.items() if word in path), '')
 
     def pair(self, version: str) -> Mapping[str, Any]:
