@@ -210,6 +210,15 @@ def test_an_overloaded_server_is_asked_again(api, server):
     assert api.request('GET', '/x') == {'a': 1}
 
 
+def test_quota_that_two_requests_change_at_once_is_asked_again(api, server):
+    conflict = ('Operation cannot be fulfilled on {} "q": the object has been modified; please '
+                'apply your changes to the latest version and try again')
+    server.answers = [refusal(409, 'Conflict', conflict.format('resourcequotas')), (201, {'a': 1}),
+                      refusal(409, 'Conflict', conflict.format('jobs.batch'))]
+    assert api.request('POST', '/x', {}) == {'a': 1}
+    assert raised(ApiError, lambda: api.request('PATCH', '/x', {})).status == 409
+
+
 def test_a_server_that_does_not_answer_is_given_up(tmp_path, monkeypatch):
     monkeypatch.setenv('KUBECONFIG', str(kubeconfig(tmp_path / 'config', 'http://127.0.0.1:9')))
     api = kubernetes_client.connect()
