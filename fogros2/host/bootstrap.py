@@ -616,6 +616,10 @@ ROS_KEY = 'C1CF6E31E6BADE8868B172B4F42ED6FBAB17C654'
 # ROS's package with the source list and its key is only the carrier of the key: its scripts do
 # not run, and another key is refused.
 _APT_SOURCE = f"""
+# apt refuses to work with a second source of these packages that names another keyring
+! apt-get indextargets --no-release-info --format '$(REPO_URI) $(RELEASE)' \\
+    'Created-By: Packages' |
+    grep -qE '//packages\\.ros\\.org/ros2/ubuntu/? {APT_CODENAME}$' || exit 0
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 base=https://github.com/ros-infrastructure/ros-apt-source/releases
@@ -639,4 +643,5 @@ Suites: {APT_CODENAME}
 Components: main
 Signed-By: /$keyring
 END
+apt-get indextargets >/dev/null || {{ rm /etc/apt/sources.list.d/ros2.sources; exit 1; }}
 """

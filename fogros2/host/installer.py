@@ -30,8 +30,14 @@ from fogros2.model import Bootstrap, Command, Result
 #: Script that installs the Debian packages in some words for sh.
 APT = """\
 export DEBIAN_FRONTEND=noninteractive
-# a machine that has just booted runs apt by itself: wait for its lock
-apt-get -q -o DPkg::Lock::Timeout=300 update
+# a machine that has just booted runs apt by itself: wait for its locks
+tries=0
+until output=$(LC_ALL=C apt-get -q update 2>&1); do
+    case $output in *'Could not get lock'*) ;; *) tries=300 ;; esac
+    # the installation shows whether a source is missed
+    [ $((tries += 1)) -lt 300 ] || {{ printf '%s\\n' "$output" >&2; break; }}
+    sleep 1
+done
 # repair an installation that was killed; apt waits for one that still runs
 dpkg --configure -a </dev/null || :
 apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends {packages}

@@ -121,9 +121,13 @@ class Api:
             raise last[0] from error
 
     def passing(self, error: ApiError) -> bool:
-        """Return whether the cause of an error may be a restart of the API server."""
+        """
+        Return whether the same request may succeed: the API server restarts, or counts several
+        requests against a quota at once, and refuses all but one of them.
+        """
         return error.status in (429, 500, 502, 503, 504) or (
-            error.status == 403 and time.monotonic() - self._lost < DOUBT)
+            error.status == 403 and time.monotonic() - self._lost < DOUBT) or (
+            error.reason == 'Conflict' and 'resourcequotas' in str(error.args[0]))
 
     def doubt(self, error: ApiError, path: str) -> None:
         """

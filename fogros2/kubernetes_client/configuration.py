@@ -53,7 +53,9 @@ def load(context: str) -> tuple[str, str, Any]:
                 "'gcloud container clusters get-credentials', 'az aks get-credentials'")
         config.load_incluster_config()
         namespace = (_IN_CLUSTER / 'namespace').read_text().strip()
-        return '', namespace, kubernetes.client.ApiClient()
+        client = kubernetes.client.ApiClient()
+        _verify_as_kubectl(client)
+        return '', namespace, client
     files = os.environ.get('KUBECONFIG') or str(Path('~/.kube/config').expanduser())
     try:
         contexts, active = config.list_kube_config_contexts(files)
@@ -70,12 +72,40 @@ def load(context: str) -> tuple[str, str, Any]:
         # One connection for each of many machines that start at once.
         settings.connection_pool_maxsize = 64
         client = kubernetes.client.ApiClient(settings)
+        _verify_as_kubectl(client)
         _check_plugin(str(entry['context'].get('user', '')), settings)
     except (config.ConfigException, yaml.YAMLError, OSError, ValueError, TypeError, KeyError,
             AttributeError) as error:
         raise PrerequisiteError(f"the kubeconfig {files} can't be used: {words(error)}",
                                 '`kubectl config view` shows it') from error
     return name, str(entry['context'].get('namespace') or 'default'), client
+
+
+def _verify_as_kubectl(client: Any) -> None:
+    """
+    Let a client accept certificates without key identifiers, such as those of EKS.
+
+    Python 3.13 refuses them by ``VERIFY_X509_STRICT``, and kubectl does not. Everything else is
+    verified as before.
+    """
+    import ssl
+
+    from urllib3.util.ssl_ import create_urllib3_context
+    tls = create_urllib3_context()
+    if not client.configuration.verify_ssl or not tls.verify_flags & ssl.VERIFY_X509_STRICT:
+        return
+    tls.verify_flags &= ~ssl.VERIFY_X509_STRICT
+    # Connections would load the files again, into the context that all of them share.
+    pool = client.rest_client.pool_manager.connection_pool_kw
+    authority, data, certificate, key = (
+        pool.pop(name, None) for name in ('ca_certs', 'ca_cert_data', 'cert_file', 'key_file'))
+    if authority or data:
+        tls.load_verify_locations(authority, cadata=data)
+    else:
+        tls.load_default_certs()
+    if certificate:
+        tls.load_cert_chain(certificate, key)
+    pool['ssl_context'] = tls
 
 
 def _check_plugin(user: str, settings: Any) -> None:

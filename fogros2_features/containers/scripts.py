@@ -54,10 +54,10 @@ if [ -n "$rmw" ]; then
         else
             lacks=
         fi
-        $as_root $engine rm -f "$looking" >/dev/null
+        $as_root $engine rm -f -v "$looking" >/dev/null
         if [ -n "$lacks" ]; then
             adding=fogros2-adding-$$
-            trap '$as_root $engine rm -f $adding >/dev/null 2>&1' EXIT
+            trap '$as_root $engine rm -f -v $adding >/dev/null 2>&1' EXIT
             # dash runs no EXIT trap for a signal, and a signal interrupts 'wait' alone
             trap 'exit 143' HUP INT TERM
             $as_root $engine run --name $adding --user 0:0 --network host --log-driver none \\
@@ -83,7 +83,7 @@ fi
 """
 RUN = ENGINE + """\
 name=$1 gpus=$2; shift 2
-$as_root $engine rm -f "$name" >/dev/null 2>&1 || :
+$as_root $engine rm -f -v "$name" >/dev/null 2>&1 || :
 """ + GPUS + """\
 $as_root $engine run -d --name "$name" "$@" >/dev/null
 """
@@ -113,7 +113,7 @@ while :; do
     since="--since $(date -u +%Y-%m-%dT%H:%M:%S.%NZ)"
     $as_root $engine start "$name" >/dev/null || break
 done
-$as_root $engine rm -f "$name" >/dev/null 2>&1
+$as_root $engine rm -f -v "$name" >/dev/null 2>&1
 # stopped on request, by any signal
 [ -z "$asked" ] || case $status in 130|137|143) status=0 ;; esac
 exit "$status"
@@ -128,13 +128,21 @@ passed_on() {
     asked=1
     state=$($as_root $engine inspect -f '{{.State.Pid}} {{.State.Status}}' "$name" 2>/dev/null)
     first=${state%% *}
-    node=$(cat "/proc/$first/task/$first/children" 2>/dev/null)
+    # its parent, in-container, is the first process or below an init or an entry point
+    parent=$first
+    while :; do
+        node=$(cat "/proc/$parent/task/$parent/children" 2>/dev/null)
+        for child in $node; do
+            ! grep -qsF -e "$inside" "/proc/$child/cmdline" || { parent=$child; continue 2; }
+        done
+        break
+    done
     if [ -n "$node" ]; then $as_root kill -s "$1" $node
     elif [ "$state" = '0 created' ] || [ "$state" = '0 configured' ] \\
             || grep -qs . "/proc/$first/cmdline"; then
         # it is starting: its first process reacts only to SIGKILL
         $as_root $engine kill "$name" >/dev/null 2>&1
-        $as_root $engine rm -f "$name" >/dev/null 2>&1
+        $as_root $engine rm -f -v "$name" >/dev/null 2>&1
     fi
     [ "$1" != TERM ] || [ -n "$late" ] || {
         (sleep "$grace"; $as_root $engine kill "$name") >/dev/null 2>&1 & late=$!; }
@@ -155,7 +163,7 @@ done >"$list"
 [ ! -d "$workspace" ] || set -- -v "$workspace:$workspace:ro" "$@"
 set -- -v "$inside:$inside:ro" "$@"
 """ + GPUS + """\
-$as_root $engine rm -f "$name" >/dev/null 2>&1
+$as_root $engine rm -f -v "$name" >/dev/null 2>&1
 $as_root $engine create --pull never --name "$name" --log-driver none \\
     --user "$(id -u):$(id -g)" --env-file "$list" -e HOME=/tmp "$@" >/dev/null
 status=$?
@@ -167,7 +175,7 @@ if [ -z "$asked" ]; then
     while wait $client; [ -d /proc/$client ]; do :; done
     status=$($as_root $engine inspect -f '{{.State.ExitCode}}' "$name" 2>/dev/null) || status=130
 fi
-$as_root $engine rm -f "$name" >/dev/null 2>&1
+$as_root $engine rm -f -v "$name" >/dev/null 2>&1
 [ -z "$late" ] || kill $late 2>/dev/null
 if [ "$status" -gt 128 ] && [ "$status" -lt 160 ]; then
     # exit like a node that a signal ended
@@ -206,5 +214,5 @@ ids=$($as_root $engine ps -aq --filter "label=$1=$2")
 [ -n "$ids" ] || exit 0
 # running containers had their time to end
 $as_root $engine kill $ids >/dev/null 2>&1 || :
-$as_root $engine rm -f $ids >/dev/null
+$as_root $engine rm -f -v $ids >/dev/null
 """

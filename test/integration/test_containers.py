@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 import dataclasses
+import json
 import os
 from pathlib import Path
 import re
@@ -100,12 +101,13 @@ def limited(image: str, *command: str, restart: str = '') -> Container:
         image, (*container_engine.limits(), '--net', 'none'), command, restart=restart)
 
 
-def node(image: str, launch: str, folder: Path, *command: str, **variables: str,
-         ) -> subprocess.Popen[str]:
+def node(image: str, launch: str, folder: Path, *command: str, options: Sequence[str] = (),
+         **variables: str) -> subprocess.Popen[str]:
     """Start a node in an image as the agent does."""
     made = containers.inside(
         NodeSpec('1', 'n-1', arguments=command, sigkill_timeout=1.5, features={
-            'containers': {'image': image, 'image_options': container_engine.limits()}}),
+            'containers': {'image': image,
+                           'image_options': (*container_engine.limits(), *options)}}),
         image, launch, str(folder), str(settings(folder)), ('COLOUR',))
     for key, text in made.files.items():
         (folder / key).write_text(str(text))
@@ -210,13 +212,18 @@ def test_node_in_an_image_has_variables_files_and_user(image, launch, tmp_path):
     assert not list(tmp_path.glob('variables-*'))
 
 
-@pytest.mark.parametrize(('trapped', 'asked', 'returncode'), [
-    ("trap 'exit 4' INT USR1 TERM", (signal.SIGINT, signal.SIGUSR1, signal.SIGTERM), 4),
-    ("trap '' TERM", (signal.SIGTERM,), -signal.SIGKILL)])
+#: The container's first process runs the node's shell, as an init and some entry points do.
+BELOW = ('--entrypoint', json.dumps(['sh', '-c', '"$@"; exit $?', 'entry']))
+
+
+@pytest.mark.parametrize(('trapped', 'asked', 'returncode', 'options'), [
+    ("trap 'exit 4' INT USR1 TERM", (signal.SIGINT, signal.SIGUSR1, signal.SIGTERM), 4, ()),
+    ("trap 'exit 4' INT USR1 TERM", (signal.SIGINT,), 4, BELOW),
+    ("trap '' TERM", (signal.SIGTERM,), -signal.SIGKILL, ())])
 def test_node_in_an_image_ends_by_its_first_signal(
-        image, launch, tmp_path, trapped, asked, returncode):
+        image, launch, tmp_path, trapped, asked, returncode, options):
     process = node(image, launch, tmp_path, 'sh', '-c',
-                   f'{trapped}; echo up; while :; do busybox sleep 0.01; done')
+                   f'{trapped}; echo up; while :; do busybox sleep 0.01; done', options=options)
     assert process.stdout.readline() == 'up\n'
     for number in asked:
         process.send_signal(number)

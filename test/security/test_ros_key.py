@@ -12,7 +12,8 @@ import pytest
 from fogros2.host import bootstrap
 
 pytestmark = pytest.mark.skipif(
-    not all(map(shutil.which, ('gpg', 'dpkg-deb'))), reason='needs gpg and dpkg-deb')
+    not all(map(shutil.which, ('apt-get', 'gpg', 'dpkg-deb'))),
+    reason='needs apt-get, gpg and dpkg-deb')
 
 
 @pytest.fixture
@@ -43,7 +44,8 @@ def machine(tmp_path: Path) -> tuple[Path, str]:
     programs = tmp_path / 'bin'
     programs.mkdir()
     for name, text in {
-            'apt-get': 'exit 0', 'dpkg': f'touch {tmp_path}/ran',
+            'apt-get': f'exec {shutil.which("apt-get")} -o Dir::Etc={tmp_path}/root/etc/apt "$@"',
+            'dpkg': f'touch {tmp_path}/ran',
             'curl': f'for each; do case $each in */source.deb) cp {tmp_path}/source.deb "$each"; '
                     'exit;; esac; done; echo https://example.org/9'}.items():
         (programs / name).write_text(f'#!/bin/sh\n{text}\n')
@@ -82,3 +84,37 @@ def test_known_key_signs_the_only_source(machine: tuple[Path, str]) -> None:
     text = (folder / 'root/etc/apt/sources.list.d/ros2.sources').read_text()
     assert 'Suites: noble\n' in text
     assert 'Signed-By: /usr/share/keyrings/ros2-archive-keyring.gpg\n' in text
+    # what a second launch finds
+    assert run(folder, bootstrap._APT_SOURCE).returncode == 0
+
+
+ROS = 'http://packages.ros.org/ros2/ubuntu'
+DEB822 = 'Types: deb\nURIs: {}\nSuites: {}\nComponents: main\nSigned-By: /k.gpg\nEnabled: {}\n'
+
+
+@pytest.mark.parametrize(('name', 'text', 'present'), [
+    ('a.list', f'deb [arch=amd64,arm64 signed-by=/k.gpg] {ROS} noble main', True),
+    ('a.list', 'deb [signed-by=/k.gpg] https://packages.ros.org/ros2/ubuntu/ noble main', True),
+    ('ros-latest.sources', DEB822.format(ROS, 'noble', 'yes'), True),
+    ('ros-latest.sources', DEB822.format(ROS, 'noble', 'no'), False),
+    ('a.list', f'# deb {ROS} noble main', False),
+    ('a.list', f'deb {ROS} jammy main', False),
+    ('a.list', 'deb http://packages.ros.org/ros2-testing/ubuntu noble main', False)])
+def test_source_under_another_name_is_kept_alone(
+        machine: tuple[Path, str], name: str, text: str, present: bool) -> None:
+    folder, key = machine
+    (folder / 'root/etc/apt/sources.list.d' / name).write_text(f'{text}\n')
+    done = run(folder, bootstrap._APT_SOURCE.replace(bootstrap.ROS_KEY, key))
+    assert done.returncode == 0, done.stderr
+    assert ('ros2.sources' in files(folder)) is not present
+    said = run(folder, 'apt-get indextargets')
+    assert said.returncode == 0 and said.stderr == ''
+
+
+def test_source_that_apt_refuses_is_removed(machine: tuple[Path, str]) -> None:
+    folder, key = machine
+    (folder / 'root/etc/apt/sources.list.d/a.list').write_text(
+        f'deb-src [signed-by=/k.gpg] {ROS} noble main\n')
+    done = run(folder, bootstrap._APT_SOURCE.replace(bootstrap.ROS_KEY, key))
+    assert done.returncode == 1 and 'Signed-By' in done.stderr
+    assert 'ros2.sources' not in files(folder)

@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import os
 from pathlib import Path
+import signal
 import subprocess
 from types import SimpleNamespace
 from typing import Any
@@ -479,14 +480,14 @@ def test_an_image_without_the_middleware_gets_it_once(engine):
     for has in ('', f'{set_up} {library}'):
         name, told = done(fetch, THERE='ros:rolling', DISTRO='rolling', HAS=has)
         assert name == 'ros:rolling'
-        assert told[-1] == f'{engine} rm -f looking'
+        assert told[-1] == f'{engine} rm -f -v looking'
     name, told = done(fetch, THERE='ros:rolling', DISTRO='rolling', HAS=set_up)
     assert name == made
     (run,) = (line for line in told if ' run ' in line)
     assert ' --user 0:0 ' in run and ' ros-rolling-rmw-cyclonedds-cpp' in told
     assert any(line.startswith('apt-get -qy ') and line.endswith('"$0"') for line in told)
     adding = run.split()[3]
-    assert told[-1] == f'{engine} rm -f {adding}'
+    assert told[-1] == f'{engine} rm -f -v {adding}'
     name, told = done(fetch, THERE=f'ros:rolling {made}', DISTRO='rolling', HAS=set_up)
     assert name == made and not any(' run ' in line for line in told)
 
@@ -497,7 +498,7 @@ def test_container_of_an_abandoned_layer_goes(engine):
         **os.environ, 'THERE': 'ros:rolling', 'DISTRO': 'rolling',
         'HAS': '/opt/ros/rolling/setup.sh', 'ABANDONED': 'yes'})
     assert ended.returncode == 143
-    assert notes()[-1].startswith(f'{engine} rm -f fogros2-adding-')
+    assert notes()[-1].startswith(f'{engine} rm -f -v fogros2-adding-')
 
 
 @pytest.mark.parametrize(('command', 'user', 'kept'), [
@@ -526,7 +527,45 @@ def test_a_node_gets_its_gpus_and_nothing_is_downloaded_for_it(engine, tmp_path)
         assert f' {option}' in create
     assert create.endswith(f' demo:1 sh {tmp_path}/in-container {tmp_path} demo talker ')
     assert f'{engine} start -a fogros2-abc-eyes' in told
-    assert told[-1] == f'{engine} rm -f fogros2-abc-eyes'
+    assert told[-1] == f'{engine} rm -f -v fogros2-abc-eyes'
+
+
+#: An engine whose only container is a process here, below an init or an entry point.
+RUNNING = """#!/bin/sh
+case $1-$3 in
+    create-*) while [ "$1" != demo:1 ]; do shift; done; shift; printf '%s\\n' "$@" >words ;;
+    start-*) IFS='
+'
+        sh -c 'echo $$ >pid; exec "$@"' sh $FIRST $(cat words); echo $? >code ;;
+    inspect-*Pid*) echo "$(cat pid) running" ;;
+    inspect-*) cat code ;;
+esac
+"""
+
+
+@pytest.mark.parametrize('first', ['', 'sh\n-c\n"$@"; exit $?\nentry',
+                                   'sh\n-c\nsh -c "exit 3" other & "$@"; exit $?\nentry'],
+                         ids=['itself', 'below an init', 'beside another process'])
+def test_signal_reaches_the_node_below_an_init_or_entry_point(tmp_path, first):
+    (tmp_path / 'lib/demo').mkdir(parents=True)
+    for name, text in {
+            'podman': RUNNING, 'sudo': '#!/bin/sh\nshift\nexec "$@"\n', 'lib/demo/talker':
+            '#!/bin/sh\ntrap "exit 4" USR1\necho up\nwhile :; do sleep 0.01; done\n'}.items():
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o755)
+    node = NodeSpec('1', 'eyes', 'demo', 'talker', prefix=('env',), features=in_image('demo:1'))
+    made = containers.inside(node, 'demo:1', 'abc', str(tmp_path), '/run/dds.xml')
+    for key, script in made.files.items():
+        (tmp_path / key).write_text(str(script))
+    words = [word if isinstance(word, str) else str(tmp_path / word[0]['file'])
+             for word in made.arguments]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=tmp_path, env={
+        'PATH': f'{tmp_path}:{os.environ["PATH"]}', 'FIRST': first,
+        'AMENT_PREFIX_PATH': str(tmp_path), 'FOGROS2_AGENT_DIRECTORY': str(tmp_path)})
+    assert process.stdout is not None and process.stdout.readline() == 'up\n'
+    process.send_signal(signal.SIGUSR1)
+    process.communicate(timeout=60)
+    assert process.returncode == 4
 
 
 def test_gpu_options_are_those_of_the_engine(engine):

@@ -19,6 +19,7 @@ from fogros2.host import bootstrap, dependencies, installer, workspace
 from fogros2.host.inspection import HostFacts
 from fogros2.host.installer import fill, find_pip, Needs
 from fogros2.model import Command, Result
+from fogros2.provider.vm import user_data
 from rigs.pip_site import package, wheel
 from rigs.rosdep import rosdep_source
 
@@ -232,6 +233,41 @@ def test_image_gets_the_debian_packages_of_keys(tmp_path: Path) -> None:
                  (tmp_path / 'apt-get.called').read_text().splitlines() if ' install ' in line]
     assert installed == ['rsync', 'fogt-hello ros-jazzy-slam-toolbox']
     assert "no rosdep rule for 'fogt_none'" in done.stderr
+
+
+#: What apt-get prints while another process updates its lists.
+LOCKED = ('E: Could not get lock /var/lib/apt/lists/lock. It is held by process 7 (apt-get)\n'
+          'E: Unable to lock directory /var/lib/apt/lists/')
+GONE = "E: The repository 'http://192.0.2.1/ppa noble Release' does not have a Release file."
+
+
+@pytest.mark.parametrize('script', ['a launch', 'the boot of a machine'])
+@pytest.mark.parametrize(('said', 'times', 'updates'), [(LOCKED, 2, 3), (GONE, 1000, 1)],
+                         ids=['locked', 'gone'])
+def test_apt_waits_for_its_lists_and_a_gone_source_is_no_error(
+        tmp_path: Path, script: str, said: str, times: int, updates: int) -> None:
+    calls = tmp_path / 'calls'
+    for name, text in {
+            'apt-get': f'echo "$*" >>{calls}\n'
+                       f'case "$*" in *update) [ "$(grep -c update {calls})" -gt {times} ] || '
+                       f'{{ cat {tmp_path}/said >&2; exit 100; }};; esac',
+            'sleep': ':', 'dpkg': ':'}.items():
+        (tmp_path / name).write_text(f'#!/bin/sh\n{text}\n')
+        (tmp_path / name).chmod(0o755)
+    (tmp_path / 'said').write_text(f'{said}\n')
+    log = tmp_path / 'log'
+    text = installer.APT.format(packages='wireguard-tools rsync nftables')
+    if script != 'a launch':
+        text = user_data._TOOLS.replace('command -v wg', 'false').replace(
+            '/var/log/fogros2-tools.log', str(log)) + 'wait\n'
+    done = subprocess.run(['sh', '-ec', text], text=True, capture_output=True, timeout=60,
+                          env={'PATH': f'{tmp_path}:{os.environ["PATH"]}'})
+    assert done.returncode == 0, done.stderr
+    lines = calls.read_text().splitlines()
+    assert lines[:-1] == ['-q update'] * updates
+    assert lines[-1].endswith(' install --no-install-recommends wireguard-tools rsync nftables')
+    shown = log.read_text() if log.exists() else done.stderr
+    assert (said in shown) is (said == GONE)
 
 
 def test_machine_without_rosdep_says_so() -> None:

@@ -10,6 +10,8 @@ import inspect
 import json
 import os
 from pathlib import Path
+import re
+import ssl
 import subprocess
 import sys
 import threading
@@ -92,6 +94,24 @@ def kubeconfig(path: Path, server: str, **user: Any) -> Path:
     return path
 
 
+def certify(folder: Path, name: str, by: str, *extensions: str) -> None:
+    """Make a key and a certificate, without key identifiers, of the authority ``by``."""
+    (folder / 'openssl.cnf').write_text(
+        f'[req]\ndistinguished_name=n\nprompt=no\n[n]\nCN={name}\n[x]\n'
+        + '\n'.join(('authorityKeyIdentifier=none', 'subjectKeyIdentifier=none', *extensions)))
+    words = ['req', '-config', 'openssl.cnf', '-newkey', 'ec', '-pkeyopt',
+             'ec_paramgen_curve:P-256', '-nodes', '-keyout', f'{name}.key']
+    if by == name:
+        words += ['-x509', '-extensions', 'x', '-out', f'{name}.crt']
+    subprocess.run(['openssl', *words, *([] if by == name else ['-out', 'request'])],
+                   check=True, cwd=folder, capture_output=True)
+    if by != name:
+        subprocess.run([
+            'openssl', 'x509', '-req', '-in', 'request', '-CA', f'{by}.crt', '-CAkey',
+            f'{by}.key', '-CAcreateserial', '-extfile', 'openssl.cnf', '-extensions', 'x',
+            '-out', f'{name}.crt'], check=True, cwd=folder, capture_output=True)
+
+
 @pytest.fixture
 def server():
     with Server() as found:
@@ -168,9 +188,10 @@ def test_invalid_kubeconfig_is_reported(tmp_path, monkeypatch):
 def test_keys_of_a_kubeconfig_stay_in_the_state_folder(tmp_path, end):
     state, elsewhere = tmp_path / 'state', tmp_path / 'tmp'
     elsewhere.mkdir()
+    certify(tmp_path, 'robot', 'robot')
     path = kubeconfig(tmp_path / 'config', 'https://127.0.0.1:9', **{
-        f'client-{each}-data': base64.b64encode(each.encode()).decode()
-        for each in ('certificate', 'key')})
+        f'client-{each}-data': base64.b64encode((tmp_path / file).read_bytes()).decode()
+        for each, file in (('certificate', 'robot.crt'), ('key', 'robot.key'))})
     code = ('import os\nfrom fogros2.kubernetes_client import configuration\n'
             f'print(configuration.load("")[2].configuration.key_file, flush=True)\n{end}')
     done = subprocess.run(
@@ -181,10 +202,66 @@ def test_keys_of_a_kubeconfig_stay_in_the_state_folder(tmp_path, end):
     assert key.parent.parent == state and list(elsewhere.iterdir()) == []
     if end:
         # killed: until `ros2 fog gc`, only the user can read it
-        assert key.read_text() == 'key'
+        assert key.read_text() == (tmp_path / 'robot.key').read_text()
         assert [each.stat().st_mode & 0o77 for each in (key, key.parent)] == [0, 0]
         Store(state).sweep()
     assert list(state.iterdir()) == []
+
+
+@pytest.fixture(scope='module')
+def certificates(tmp_path_factory):
+    """Return a folder with two authorities, and the keys that the first has signed."""
+    folder = tmp_path_factory.mktemp('certificates')
+    root = 'basicConstraints=critical,CA:true', 'keyUsage=critical,keyCertSign'
+    for name, by, *extensions in (
+            ('ca', 'ca', *root), ('other', 'other', *root), ('robot', 'ca'),
+            ('server', 'ca', 'subjectAltName=IP:127.0.0.1')):
+        certify(folder, name, by, *extensions)
+    return folder
+
+
+@pytest.mark.parametrize(('host', 'authority', 'user', 'error'), [
+    ('127.0.0.1', 'ca', 'robot', None),
+    ('localhost', 'ca', 'robot', "doesn't match|mismatch"),
+    ('127.0.0.1', 'other', 'robot', 'CERTIFICATE_VERIFY_FAILED'),
+    ('127.0.0.1', None, 'robot', 'CERTIFICATE_VERIFY_FAILED'),
+    ('127.0.0.1', 'ca', None, '')])
+def test_python_3_13_verifies_servers_as_kubectl_does(
+        server, certificates, tmp_path, monkeypatch, host, authority, user, error):
+    """EKS's certificates have no key identifiers, which Python 3.13 demands by default."""
+    from urllib3.util import ssl_
+    usual = ssl_.create_urllib3_context
+
+    def strict(*given: Any, **options: Any) -> ssl.SSLContext:
+        context = usual(*given, **options)
+        context.verify_flags |= ssl.VERIFY_X509_STRICT
+        return context
+
+    for module in ('urllib3.util.ssl_', 'urllib3.connection'):
+        monkeypatch.setattr(f'{module}.create_urllib3_context', strict)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.verify_mode = ssl.CERT_REQUIRED
+    context.load_verify_locations(certificates / 'ca.crt')
+    context.load_cert_chain(certificates / 'server.crt', certificates / 'server.key')
+    server.socket = context.wrap_socket(server.socket, server_side=True)
+    path = kubeconfig(tmp_path / 'config', f'https://{host}:{server.server_port}', **{
+        'token': 'a-token', **({
+            'client-certificate': str(certificates / 'robot.crt'),
+            'client-key': str(certificates / 'robot.key')} if user else {})})
+    if authority:
+        text = yaml.safe_load(path.read_text())
+        text['clusters'][0]['cluster']['certificate-authority'] = str(
+            certificates / f'{authority}.crt')
+        path.write_text(yaml.safe_dump(text))
+    monkeypatch.setenv('KUBECONFIG', str(path))
+    server.answers = [(200, {'a': 1})]
+    api = kubernetes_client.connect()
+    if error is None:
+        assert api.request('GET', '/x', timeout=5.0) == {'a': 1}
+    else:
+        told = str(raised(Unreachable, lambda: api.request('GET', '/x', timeout=0.3)))
+        assert re.search(error, told), told
+        assert server.asked == []
 
 
 def test_failing_credential_plugin_is_reported(tmp_path, monkeypatch):
@@ -208,6 +285,15 @@ def test_an_overloaded_server_is_asked_again(api, server):
     server.answers = [refusal(429, 'TooManyRequests', 'later'), (503, 'no JSON object'),
                       (200, {'a': 1})]
     assert api.request('GET', '/x') == {'a': 1}
+
+
+def test_quota_that_two_requests_change_at_once_is_asked_again(api, server):
+    conflict = ('Operation cannot be fulfilled on {} "q": the object has been modified; please '
+                'apply your changes to the latest version and try again')
+    server.answers = [refusal(409, 'Conflict', conflict.format('resourcequotas')), (201, {'a': 1}),
+                      refusal(409, 'Conflict', conflict.format('jobs.batch'))]
+    assert api.request('POST', '/x', {}) == {'a': 1}
+    assert raised(ApiError, lambda: api.request('PATCH', '/x', {})).status == 409
 
 
 def test_a_server_that_does_not_answer_is_given_up(tmp_path, monkeypatch):

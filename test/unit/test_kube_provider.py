@@ -9,6 +9,7 @@ from pathlib import Path
 import socket
 import subprocess
 import threading
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -35,6 +36,7 @@ from fogros2.provider.kubernetes import (
     manifests,
     names,
     pods,
+    start,
 )
 from fogros2.provider.kubernetes.exposure import Exposure
 from fogros2.provider.kubernetes.names import MachineId
@@ -132,6 +134,11 @@ def test_a_job_guards_itself():
     assert job['spec']['backoffLimit'] == 0
     assert pod['restartPolicy'] == 'Never'
     assert 'resources' not in pod['containers'][0], 'limits that nobody asked for'
+    # what a mesh adds would run on when the machine has ended
+    meta = job['spec']['template']['metadata']
+    assert meta['labels']['sidecar.istio.io/inject'] == 'false'
+    assert meta['annotations']['sidecar.istio.io/inject'] == 'false'
+    assert meta['annotations']['linkerd.io/inject'] == 'disabled'
 
 
 def test_a_pod_has_net_admin_and_no_other_right():
@@ -358,7 +365,8 @@ def job_of(**status: Any) -> dict[str, Any]:
 
 def pod_of(phase: str = 'Running', name: str = 'p', created: str = '2026-01-01T00:00:00Z',
            state: Any = None, **status: Any) -> dict[str, Any]:
-    container = {'image': 'x/y:z', 'state': state if state is not None else {'running': {}}}
+    container = {'name': 'machine', 'image': 'x/y:z',
+                 'state': state if state is not None else {'running': {}}}
     return {'metadata': {'uid': name, 'name': name, 'creationTimestamp': created,
                          'ownerReferences': [{'uid': 'j'}]},
             'spec': {}, 'status': {'phase': phase, 'containerStatuses': [container], **status}}
@@ -382,11 +390,12 @@ def test_state_of_a_machine_follows_job_and_pod():
     assert pods.state_of(deleted, pod_of()) is MachineState.STOPPING
 
 
-def test_web_application_neither_holds_up_nor_keeps_a_machine():
+@pytest.mark.parametrize('name', ['application', 'linkerd-proxy'])
+def test_other_container_neither_holds_up_nor_keeps_a_machine(name):
     def beside(machine: Any, application: Any, phase: str) -> dict[str, Any]:
         pod = pod_of(phase, state=machine)
         pod['status']['containerStatuses'].insert(
-            0, {'name': 'application', 'image': 'x/app:1', 'state': application})
+            0, {'name': name, 'image': 'x/app:1', 'state': application})
         return pod
 
     running: dict[str, Any] = {'running': {}}
@@ -475,7 +484,54 @@ def test_trouble_is_found_in_events():
     assert none is not None and none.final
     quota = pods.trouble_in([event('FailedCreate', 'exceeded quota: q')])
     assert quota is not None and not quota.final and 'quota' in quota.hint
-    assert pods.scales_up([event('TriggeredScaleUp', '')])
+
+
+def at(second: int, reason: str, message: str = '') -> dict[str, Any]:
+    return {'reason': reason, 'message': message, 'metadata': {'namespace': 'robots'},
+            'lastTimestamp': f'2026-01-01T00:00:{second:02}Z'}
+
+
+UNSCHEDULED = {'state': {}, 'conditions': [{
+    'type': 'PodScheduled', 'status': 'False',
+    'message': '0/1 nodes are available: pod has unbound immediate PersistentVolumeClaims.'}]}
+CREATING = {'state': {'waiting': {'reason': 'ContainerCreating'}}}
+NO_SANDBOX = at(1, 'FailedCreatePodSandBox', 'no address yet')
+
+
+@pytest.mark.parametrize(('pod', 'before', 'events', 'ends'), [
+    (UNSCHEDULED, [], [], 60),
+    (UNSCHEDULED, [at(1, 'FailedScheduling')], [at(1, 'FailedScheduling'), at(9, 'Nominated')], 0),
+    (UNSCHEDULED, [], [at(9, 'NotTriggerScaleUp', 'no node')], 15),
+    (UNSCHEDULED, [], [at(9, 'NotTriggerScaleUp', 'no node'), at(2, 'TriggeredScaleUp')], 0),
+    (UNSCHEDULED, [], [at(2, 'NotTriggerScaleUp'), at(9, 'TriggeredScaleUp')], 0),
+    (CREATING, [NO_SANDBOX], [NO_SANDBOX], 20),
+    (CREATING, [NO_SANDBOX], [NO_SANDBOX, at(3, 'Pulling')], 0),
+    (CREATING, [at(5, 'FailedMount'), at(3, 'Pulled')], [at(5, 'FailedMount')], 20),
+    (CREATING, [], [{**NO_SANDBOX, 'lastTimestamp': None, 'eventTime': '2026-01-01T00:00:01.5Z'},
+                    at(2, 'Created')], 0)])
+def test_pod_is_given_up_only_for_what_lasts(monkeypatch, pod, before, events, ends):
+    """The events are ``before`` in the first ten seconds; ``ends`` is 0 for a pod that runs."""
+    now = 0.0
+
+    class Cluster:
+        def request(self, method, target, **query):
+            return {'items': before if now < 10 else events}
+
+        def follow(self, target, look, *, tick, **more):
+            nonlocal now
+            assert look('ADDED', pod_of('Pending', **pod)) is None
+            while now < 200:
+                now += 0.5
+                tick()
+            return look('MODIFIED', pod_of())
+
+    monkeypatch.setattr(start, 'time', SimpleNamespace(monotonic=lambda: now))
+    waiting = start.Start(Cluster(), OWNER, job_of(), name='planner', cancel=threading.Event())
+    if ends:
+        raised(ProviderError, lambda: waiting.wait(300.0))
+        assert ends <= now < ends + 1
+    else:
+        assert waiting.wait(300.0)['metadata']['name'] == 'p'
 
 
 @pytest.mark.parametrize('message, final', [

@@ -461,6 +461,56 @@ def test_docker_machine_gets_its_packet_filter_at_once(monkeypatch):
     assert json.loads(commands[-1].input) == {'pid': 77}
 
 
+@pytest.mark.parametrize('group', [True, False])
+def test_end_of_docker_machine_removes_its_filter_as_root(monkeypatch, group):
+    commands = []
+
+    def run(command, **more):
+        commands.append(command)
+        return Result(0, '', '')
+
+    monkeypatch.setattr(container_engine.process, 'run', run)
+    monkeypatch.setattr(container_engine, '_WORKED', {'docker': Engine('docker', sudo=not group)})
+    container.ContainerProvider().destroy('docker:0123456789ab:0123-token')
+    assert [command.sudo for command in commands if 'docker' in command.argv] == [not group]
+    assert [command.sudo for command in commands
+            if any('delete table' in word for word in command.argv)] == [True]
+
+
+def test_filter_that_stays_is_reported(monkeypatch):
+    def run(command, **more):
+        result = Result(int(command.sudo), '', 'sudo: a password is required' * command.sudo)
+        if result.returncode and more.get('check', True):
+            raise CommandError(command, result, 'here')
+        return result
+
+    monkeypatch.setattr(container_engine.process, 'run', run)
+    monkeypatch.setattr(container_engine, '_WORKED', {'docker': Engine('docker', sudo=False)})
+    with pytest.raises(ProviderError, match='removing the packet filter .*sudo -v'):
+        container.ContainerProvider().destroy('docker:0123456789ab:0123-token')
+
+
+@pytest.mark.parametrize(('said', 'stopped'), [
+    ('Cannot connect to the Docker daemon at unix:///var/run/docker.sock. Is the docker daemon '
+     'running?', True),
+    ('failed to connect to the docker API at unix:///var/run/docker.sock; check if the path is '
+     'correct and if the daemon is running: dial unix /var/run/docker.sock: connect: connection '
+     'refused', True),
+    ('permission denied while trying to connect to the Docker daemon socket at '
+     'unix:///var/run/docker.sock', False),
+    ('permission denied while trying to connect to the docker API at '
+     'unix:///var/run/docker.sock', False)])
+def test_docker_whose_service_is_stopped_has_no_machines(monkeypatch, said, stopped):
+    monkeypatch.setattr(container_engine, 'installed', lambda: [Engine('docker')])
+    monkeypatch.setattr(container_engine.process, 'run', lambda *_, **more: Result(1, '', said))
+    provider = container.ContainerProvider()
+    if stopped:
+        assert list(provider.find({})) == []
+    else:
+        with pytest.raises(ProviderError, match='permission denied'):
+            list(provider.find({}))
+
+
 def test_isolated_machine_sees_nothing_of_this_computers_system(tmp_path):
     for name in ('usr/bin', 'etc/pam.d', 'var/lib/dpkg'):
         (tmp_path / name).mkdir(parents=True)

@@ -349,7 +349,7 @@ class ContainerProvider(Provider):
                                     'sudo apt-get install podman')
         for engine in engines:
             result = engine.call('ps', '-aq', *filters, what='listing containers', check=False)
-            if result.returncode != 0 and 'docker daemon' not in result.stderr.lower():
+            if result.returncode != 0 and not container_engine.stopped(result.stderr):
                 raise ProviderError(
                     f'{engine.name} lists no containers: '
                     f'{process.last_error(result.stderr)}',
@@ -388,12 +388,21 @@ class ContainerProvider(Provider):
     def destroy(self, machine_id: str) -> None:
         """Remove a container and its root; return when both are removed."""
         engine, identity, token = container_machine.parse_id(machine_id)
+        cleaning = clean(container_machine.directory(token))
         result = process.run(
-            Command(('sh', '-c', _DESTROY, 'sh', identity,
-                     clean(container_machine.directory(token)), *engine.argv()),
+            Command(('sh', '-c', _DESTROY, 'sh', identity, cleaning if engine.sudo else '',
+                     *engine.argv()),
                     sudo=engine.sudo, what=f'removing container {identity}'),
             timeout=60.0, check=False)
         self._host_keys.pop(identity, None)
+        if not engine.sudo:
+            # a user in docker's group may remove the container, but not the rest
+            try:
+                process.run(Command(('sh', '-c', cleaning), sudo=True,
+                                    what=f'removing the packet filter of container {identity}'),
+                            timeout=60.0)
+            except CommandError as error:
+                raise container_engine.translate(error) from error
         if result.returncode == 0:
             return
         if sudo := container_engine.sudo_hint(result.stderr):

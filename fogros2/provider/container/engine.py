@@ -93,6 +93,12 @@ def gone(text: str) -> bool:
     return 'no such container' in text.lower() or 'no such object' in text.lower()
 
 
+def stopped(text: str) -> bool:
+    """Return whether docker's program says that its service does not run."""
+    return bool(re.search('docker daemon|docker api', text.lower())) \
+        and 'permission denied' not in text.lower()
+
+
 def sudo_hint(text: str) -> str:
     """Return the remedy if sudo refused, or ''."""
     if 'password is required' in text or 'a terminal is required' in text:

@@ -38,7 +38,7 @@ if [ -n "$missing" ]; then
     # the package manager installs what the image lacks, once
     command -v apt-get >/dev/null || fail "the image lacks$missing, and has no apt-get"
     export DEBIAN_FRONTEND=noninteractive
-    apt-get update -q >&2 && apt-get install -q -y --no-install-recommends \\
+    apt-get update -q >&2; apt-get install -q -y --no-install-recommends \\
         openssh-server sudo rsync python3 iproute2 >&2 \\
         || fail "the image lacks$missing, and apt-get could not install them"
 fi

@@ -23,6 +23,8 @@ LISTEN = 180.0
 APPLICATION_PORT = 8080
 #: Limits of the application, a file server, if the machine's container has limits of that kind.
 _APPLICATION_LIMITS = {'cpu': '100m', 'memory': '128Mi'}
+#: A mesh adds no container, which would outlive the machine; Istio's label, before an annotation.
+_NO_MESH = {'sidecar.istio.io/inject': 'false'}
 
 
 def job(spec: MachineSpec, request: CreateRequest, options: Options) -> dict[str, Any]:
@@ -52,9 +54,10 @@ def job(spec: MachineSpec, request: CreateRequest, options: Options) -> dict[str
 def metadata(spec: MachineSpec, request: CreateRequest) -> dict[str, Any]:
     """Return the labels and annotations of a pod."""
     return {
-        'labels': names.labels(spec.name, request.tags),
+        'labels': {**names.labels(spec.name, request.tags), **_NO_MESH},
         # An autoscaler must not move the pod to free its node.
-        'annotations': {'cluster-autoscaler.kubernetes.io/safe-to-evict': 'false'}}
+        'annotations': {'cluster-autoscaler.kubernetes.io/safe-to-evict': 'false',
+                        'linkerd.io/inject': 'disabled', **_NO_MESH}}
 
 
 def pod(spec: MachineSpec, request: CreateRequest, options: Options) -> dict[str, Any]:

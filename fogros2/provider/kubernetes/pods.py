@@ -22,6 +22,11 @@ _FINAL = re.compile(r'not ?found|manifest unknown|unauthorized|denied|forbidden|
 #: The API server's decisions about a pod. Any other failure to create one (a server that restarts,
 #: a webhook that does not answer) ends, and the cluster tries again.
 _REFUSED = re.compile(r'\b(forbidden|invalid|denied)\b')
+#: Reasons of events: the Cluster Autoscaler and Karpenter add a node for the pod.
+_SCALES_UP = ('TriggeredScaleUp', 'Nominated')
+#: The node cannot begin the pod, and has begun it.
+_HELD_UP = ('FailedCreatePodSandBox', 'FailedMount')
+_BEGUN = ('Pulling', 'Pulled', 'Created')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +44,11 @@ class Trouble:
     def less_than(self, before: Trouble) -> bool:
         """Return whether this only repeats an earlier problem, with less detail."""
         return self.what.startswith('ImagePullBackOff') and before.what.startswith('ErrImagePull')
+
+    @property
+    def unscheduled(self) -> bool:
+        """Whether no node takes the pod: one may be coming, or the disk of a claim."""
+        return self.what.startswith('FailedScheduling')
 
 
 def timestamp(text: str) -> float:
@@ -92,9 +102,9 @@ def _machine_has(pod: Mapping[str, Any], state: str) -> bool:
 
 
 def _machine(pod: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the statuses of a pod's containers, without the application's."""
+    """Return the status of the machine's container; others are the application's or a mesh's."""
     return [each for each in (pod.get('status') or {}).get('containerStatuses') or ()
-            if each.get('name') != names.APPLICATION]
+            if each.get('name') == names.CONTAINER]
 
 
 def end_of(job: Mapping[str, Any], pod: Optional[Mapping[str, Any]]) -> str:
@@ -141,20 +151,28 @@ def trouble_in(events: Sequence[Mapping[str, Any]]) -> Optional[Trouble]:
 
     :param events: events of the Job and its pod, in any order.
     """
-    for event in events:
+    begun = max((_last(event) for event in events if event.get('reason') in _BEGUN), default=-1.0)
+    for event in sorted(events, key=_last, reverse=True):
         reason, message = str(event.get('reason', '')), str(event.get('message', ''))
-        if reason == 'NotTriggerScaleUp':
+        if reason == 'NotTriggerScaleUp' and not scales_up(events):
             return Trouble(f'{reason}: {message}', 'the autoscaler has no node that would fit',
                            final=True)
         if reason == 'FailedCreate':
             namespace = str(event['metadata'].get('namespace', ''))
             return Trouble(f'FailedCreate: {message}', hints.of_refusal(message, namespace),
                            final='quota' not in message and bool(_REFUSED.search(message)))
-        if reason in ('FailedCreatePodSandBox', 'FailedMount'):
+        if reason in _HELD_UP and _last(event) > begun:
             return Trouble(f'{reason}: {message}', 'the node can not begin the pod')
     return None
 
 
 def scales_up(events: Sequence[Mapping[str, Any]]) -> bool:
     """Return whether the cluster is adding a node for the pod."""
-    return any(event.get('reason') == 'TriggeredScaleUp' for event in events)
+    return any(event.get('reason') in _SCALES_UP for event in events)
+
+
+def _last(event: Mapping[str, Any]) -> float:
+    """Return when an event was last seen, in seconds since the epoch; 0 if it has no time."""
+    time = event.get('lastTimestamp') or event.get('eventTime') \
+        or event['metadata'].get('creationTimestamp')
+    return timestamp(str(time)) if time else 0.0

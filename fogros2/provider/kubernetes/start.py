@@ -18,6 +18,8 @@ from fogros2.provider.kubernetes.pods import Trouble
 #: Seconds to wait for the end of a problem that may be temporary: a node that is being freed, a
 #: registry that does not answer at first.
 TIMEOUT = 15.0
+#: Seconds to wait for a node or a disk, whose coming no event may report.
+SCHEDULING = 60.0
 #: Seconds after which the events are read, if there is no pod or the pod does not start.
 QUIET = 5.0
 
@@ -39,6 +41,7 @@ class Start:
         self._name = name
         self._pod: Optional[dict[str, Any]] = None
         self._trouble: Optional[Trouble] = None
+        self._event_trouble: Optional[Trouble] = None
         self._since = 0.0
         self._scales_up = False
         self._next_events = time.monotonic() + QUIET
@@ -97,13 +100,23 @@ class Start:
 
     def _tick(self) -> None:
         now = time.monotonic()
-        late = self._trouble is not None and now - self._since >= TIMEOUT
-        if now >= self._next_events and (late or self._trouble is None):
+        over = self._lasting(now) is not None and not self._scales_up
+        if over or now >= self._next_events and (
+                self._trouble is None or now - self._since >= TIMEOUT):
             # Polled rarely, because a watch would report the events of all pods.
             self._next_events = now + 4 * QUIET
             self._events()
-        if late and self._trouble is not None and not self._scales_up:
-            raise self._error(self._trouble)
+        trouble = self._lasting(now)
+        if trouble is not None and not self._scales_up:
+            raise self._error(trouble)
+
+    def _lasting(self, now: float) -> Optional[Trouble]:
+        """Return the problem if it has had its time to end."""
+        trouble = self._trouble
+        if trouble is None:
+            return None
+        return trouble if now - self._since >= (
+            SCHEDULING if trouble.unscheduled else TIMEOUT) else None
 
     def _events(self) -> None:
         if self._pod is None:
@@ -114,5 +127,6 @@ class Start:
             fieldSelector=f"involvedObject.uid={meta['uid']}", cancel=self._cancel))
         self._scales_up = pods.scales_up(events)
         trouble = pods.trouble_in(events)
-        if trouble is not None and (trouble.final or self._trouble is None):
+        if self._trouble in (None, self._event_trouble) or (trouble is not None and trouble.final):
             self._note(trouble)
+        self._event_trouble = trouble

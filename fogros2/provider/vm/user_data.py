@@ -83,11 +83,17 @@ systemd-run --no-block --unit=fogros2-agent --property=DefaultDependencies=no \\
     || setsid /bin/sh {folder}/watchdog.sh &
 """
 
-# the launch installs these too: apt's lock makes one wait for the other
+# the launch installs these too: one waits for apt's locks of the other
 _TOOLS = """\
 command -v wg && command -v rsync && command -v nft && exit 0
 export DEBIAN_FRONTEND=noninteractive
-{ apt-get -q -o DPkg::Lock::Timeout=300 update
+{ tries=0
+until output=$(LC_ALL=C apt-get -q update 2>&1); do
+    case $output in *'Could not get lock'*) ;; *) tries=300 ;; esac
+    [ $((tries += 1)) -lt 300 ] || break
+    sleep 1
+done
+echo "$output"
 apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends \\
     wireguard-tools rsync nftables
 } >/var/log/fogros2-tools.log 2>&1 </dev/null &

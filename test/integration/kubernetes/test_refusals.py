@@ -49,7 +49,8 @@ def refused(timeout: float, *machines: dict[str, object]) -> list[str]:
 
 def test_reason_why_a_pod_does_not_run_is_reported(namespace, monkeypatch):
     # what time might mend is given less of it than usual
-    monkeypatch.setattr('fogros2.provider.kubernetes.start.TIMEOUT', 4.0)
+    for limit in ('TIMEOUT', 'SCHEDULING'):
+        monkeypatch.setattr(f'fogros2.provider.kubernetes.start.{limit}', 4.0)
     gpu, labels, image = refused(
         40.0, {'gpus': 1}, {'node_selector': {'kind': 'moon'}},
         {'container_image': 'fogros2.test/nothing:1'})
