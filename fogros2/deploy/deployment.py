@@ -102,6 +102,7 @@ def _run(context: Context, job: RunningMachine) -> None:
     # a second time, so that the nodes stop first on the way down
     job.push(NODES)
     dds.start_router(context, job)
+    job.restoring = (arming.watch_notice,)
     connection.enter_vpn()
     job.undo.callback(ClockComparison(job.name, job.heartbeat, context.report).close)
     job.undo.callback(job.ending.set)

@@ -19,10 +19,19 @@ from fogros2.deploy.steps.installing import Modules
 from fogros2.deploy.steps.watching import POLL_INTERVAL, Watch
 from fogros2.deploy.undo import OPEN_PORT
 from fogros2.errors import AgentError, DeadlineExceeded, FogError
-from fogros2.events import Event
+from fogros2.events import Event, NodeStatus
 from fogros2.model import Machine, MachineSpec, NodeSpec
 from fogros2.report import Warned
 from fogros2.waiting import wait_until
+
+
+@dataclasses.dataclass(frozen=True)
+class _Watched:
+    """A program that the agent runs until it exits with 0."""
+
+    argv: Sequence[str]
+    interval: float
+    then: Callable[[str], None]
 
 
 class RunningMachine(MachineJob):
@@ -39,7 +48,9 @@ class RunningMachine(MachineJob):
         self._shortening = threading.Lock()
         self._callback: Optional[EventCallback] = None
         self._published: dict[int, tuple[str, int]] = {}
-        self._watches: dict[str, Callable[[str], None]] = {}
+        self._watches: dict[str, _Watched] = {}
+        #: Steps of the deployment that an agent needs which was started again.
+        self.restoring: Sequence[Callable[[], None]] = ()
 
     def begin(self, found: Callable[[Machine], None] = lambda machine: None) -> None:
         """
@@ -78,8 +89,23 @@ class RunningMachine(MachineJob):
         self, name: str, argv: Sequence[str], interval: float, then: Callable[[str], None],
     ) -> None:
         """Run a program until it exits with 0; see :class:`fogros2.feature.RunningMachine`."""
-        self._watches[name] = then
-        self.agent.request('watch', what=name, interval=interval, argv=list(argv))
+        watched = self._watches[name] = _Watched(argv, interval, then)
+        self._send_watch(name, watched)
+
+    def _send_watch(self, name: str, watched: _Watched) -> None:
+        self.agent.request(
+            'watch', what=name, interval=watched.interval, argv=list(watched.argv))
+
+    def restore(self) -> None:
+        """
+        Give an agent that was started again what it needs, before nodes start.
+
+        :raises FogError: the agent does not take it.
+        """
+        for restore in self.restoring:
+            restore()
+        for name, watched in list(self._watches.items()):
+            self._send_watch(name, watched)
 
     def stop(self, ids: Optional[Sequence[str]] = None) -> None:
         """Stop nodes by SIGINT, SIGTERM, SIGKILL in turn; all nodes if ``ids`` is None."""
@@ -89,13 +115,21 @@ class RunningMachine(MachineJob):
         """Send a node a signal, given by its name (``SIGUSR1``)."""
         self._request('signal', node=node, signal=name)
 
-    def _request(self, command: str, **arguments: Any) -> None:
+    def node_states(self) -> Sequence[NodeStatus]:
+        """
+        Return the states of the nodes that were started.
+
+        :raises FogError: the agent does not answer.
+        """
+        states: Sequence[NodeStatus] = self._request('status')['nodes']
+        return states
+
+    def _request(self, command: str, **arguments: Any) -> Mapping[str, Any]:
         """Send the agent a request, with a shorter time-out while the launch ends."""
         if self._context.cancel.is_set():
-            self.agent.request(command, timeout=self.timeout(30.0),
-                               silent=SILENCE_TIMEOUT, **arguments)
-        else:
-            self.agent.request(command, timeout=30.0, **arguments)
+            return self.agent.request(command, timeout=self.timeout(30.0),
+                                      silent=SILENCE_TIMEOUT, **arguments)
+        return self.agent.request(command, timeout=30.0, **arguments)
 
     def note(self, name: str, text: str) -> None:
         """Let ``ros2 fog`` show a note; see :class:`fogros2.feature.RunningMachine`."""
@@ -127,8 +161,8 @@ class RunningMachine(MachineJob):
                 return
             if event['event'] != 'watched':
                 callback(event)
-            elif then := self._watches.pop(event['what'], None):
-                then(event['reason'])
+            elif watched := self._watches.pop(event['what'], None):
+                watched.then(event['reason'])
 
         with self._lock:
             self._callback, life = callback, self.life

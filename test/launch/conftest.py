@@ -38,18 +38,27 @@ class FakeMachine:
         #: Whether the provider confirms a notice: its answers, of which the last stays.
         self.confirms = [True]
         self.pids = iter(range(4001, 5000))
+        #: The states of nodes in the agent's status.
+        self.statuses = []
 
     def start(self, nodes):
+        self.launch.on_request(nodes)
         if self.launch.start_error is not None:
             raise self.launch.start_error
         for node in nodes:
             self.launch.note('start', self.spec.name, node.name)
             self.all.append(node)
             self.nodes[node.executable or node.arguments[0]] = node
-            self.say('started', node, pid=next(self.pids), cmd=['/there/program'])
+            if len(self.all) - 1 not in self.launch.silent:
+                self.say('started', node, pid=next(self.pids), cmd=['/there/program'])
             on_start = self.launch.on_start
             if on_start is not None:
                 on_start(self, node)
+
+    def restore(self):
+        self.launch.note('restore', self.spec.name)
+        if self.launch.restore_error is not None:
+            raise self.launch.restore_error
 
     def stop(self, ids=None):
         self.stops.append(list(ids))
@@ -68,6 +77,9 @@ class FakeMachine:
 
     def signal(self, node, name):
         self.signals.append((node, name))
+
+    def node_states(self):
+        return self.statuses
 
     def subscribe(self, callback):
         self.callback = callback
@@ -105,8 +117,13 @@ class FakeLaunch:
         #: Errors of the next calls of ``retire``, one for each call.
         self.retire_errors = []
         self.here_error = None
+        #: Called with the nodes of each request, and the numbers of nodes whose start gets lost.
+        self.on_request = lambda nodes: None
+        self.silent = set()
         #: What machines refuse nodes with.
         self.start_error = None
+        #: Why machines do not restore an agent.
+        self.restore_error = None
         self.prepare_error = None
         self.down_errors = []
         self.spent = []

@@ -569,6 +569,22 @@ def test_everybody_knows_of_a_new_machine_when_it_is_up(members, monkeypatch):
         [('m3', ['m2', 'm4', 'robot']), ('m2', ['m3', 'm4', 'robot'])])
 
 
+def test_agent_that_was_started_again_watches_for_the_notice(launch, provider, monkeypatch):
+    context, mine = begun(launch)
+    requests = []
+    mine.agent = SimpleNamespace(
+        request=lambda command, **words: requests.append((command, words)))
+    monkeypatch.setattr(provider, 'capabilities_of', lambda machine: dataclasses.replace(
+        provider.capabilities, preemption_notice=('look',)))
+    mine.machine = Machine('i-1', 'planner', 'fake', MachineState.RUNNING)
+    mine.expires = time.monotonic() + 100.0
+    Arming(context, mine).watch_notice()
+    ((command, words),) = requests
+    assert command == 'configure' and words['again'] and words['notice'] == ['look']
+    # its lifetime goes on
+    assert 90.0 < words['lifetime'] <= 100.0
+
+
 def test_robot_alone_uses_a_relay(members, monkeypatch):
     dialled = []
     peers = FakeVpn.peers
