@@ -122,7 +122,7 @@ class ConnectionChanged(TypedDict, total=False):
 
 
 class Gap(TypedDict):
-    """So many events were dropped from the agent's journal before the robot got them."""
+    """So many events are not in the agent's journal (any more), and the robot lacks them."""
 
     event: Literal['gap']
     count: int

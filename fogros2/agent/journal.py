@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import time
 
@@ -34,6 +35,18 @@ class Generation:
     def __del__(self) -> None:
         with contextlib.suppress(AttributeError, OSError):
             os.close(self.fd)
+
+    def write(self, line: bytes) -> None:
+        """
+        Append a line, or nothing.
+
+        :raises OSError: such as a full disk.
+        """
+        written = os.write(self.fd, line)
+        if written < len(line):
+            os.ftruncate(self.fd, self.size)
+            raise OSError(errno.ENOSPC, 'disk full')
+        self.size += written
 
     def read(self, offset: int) -> bytes:
         """Return whole lines from ``offset`` on, at least one if there is one."""
@@ -88,13 +101,14 @@ class Journal:
 
     Positions count the bytes of all generations.
 
-    :param limit: size of a generation in bytes.
+    :param limit: size of a generation in bytes; less on a small disk, which may be memory.
     """
 
     def __init__(self, directory: str, limit: int) -> None:
         self.path = os.path.join(directory, 'events.jsonl')
         self.old = os.path.join(directory, 'events.1.jsonl')
-        self.limit = limit
+        disk = os.statvfs(directory)
+        self.limit = min(limit, disk.f_blocks * disk.f_frsize // 8 or limit)
         self.full = False
         self.files = [Generation(self.old, 0, 0)] if os.path.exists(self.old) else []
         current = Generation(self.path, os.O_CREAT, sum(file.size for file in self.files))
@@ -118,11 +132,13 @@ class Journal:
             file = self.files[-1]
             if file.size and file.size + len(data) > self.limit:
                 file = self.rotate(number)
-            written = os.write(file.fd, data)
-            if written < len(data):
-                os.ftruncate(file.fd, file.size)
-                raise OSError(28, 'disk full')
-            file.size += written
+            try:
+                file.write(data)
+            except OSError as error:
+                if error.errno != errno.ENOSPC or not any(each.size for each in self.files):
+                    raise
+                # the older generation's room
+                self.rotate(number).write(data)
             self.full = False
         except OSError as error:
             # the agent works without a journal too; the missing seqs show the gap

@@ -9,6 +9,7 @@ import contextlib
 import functools
 import os
 import re
+import resource
 import selectors
 import shlex
 import signal
@@ -159,7 +160,11 @@ class Nodes:
         if not setup or self.settings == (setup, variables):
             then(None)
             return
-        output = os.memfd_create('variables', os.MFD_CLOEXEC)
+        try:
+            output = os.memfd_create('variables', os.MFD_CLOEXEC)
+        except OSError as error:
+            then(Refused(f"the setup files can't be sourced: {error}"))
+            return
 
         def ran(status: int) -> None:
             printed = os.pread(output, VARIABLES, 0).decode(errors='surrogateescape')
@@ -280,13 +285,17 @@ class Nodes:
         prctl = ctypes.CDLL(None).prctl
         outputs: list[Output] = []
         command = node.command
+
+        def prepare() -> None:
+            # the nodes must not outlive an agent that nothing starts again
+            prctl(PR_SET_PDEATHSIG, signal.SIGINT)
+            resource.setrlimit(resource.RLIMIT_NOFILE, self.processes.descriptors)
+
         if node.spec.get('shell'):
             command = ['/bin/sh', '-c', ' '.join(command)]
         pid = self.processes.start(
             command, lambda status: self._exited(node, outputs, status), stdin=self.stdin,
-            stdout=theirs[0], stderr=theirs[1], **node.options,
-            # the nodes must not outlive an agent that nothing starts again
-            preexec_fn=lambda: prctl(PR_SET_PDEATHSIG, signal.SIGINT))
+            stdout=theirs[0], stderr=theirs[1], **node.options, preexec_fn=prepare)
         for stream, fd in zip(('stdout', 'stderr'), ours):
             outputs.append(Output(self.loop, fd, functools.partial(
                 self._report, node, 'output', stream=stream)))
@@ -370,7 +379,10 @@ class Nodes:
         pid = node.status['pid']
         if pid is None:
             if node.status['state'] == 'starting':
+                # it would have respawned
                 node.status['state'] = 'exited'
+                self._report(node, 'exited', returncode=node.status['returncode'],
+                             respawns=False)
             return
         kill = functools.partial(self.processes.kill, pid)
         kill(signal.SIGINT)

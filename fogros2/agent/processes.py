@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 import contextlib
 import os
 import pwd
+import resource
 import signal
 import subprocess
 import sys
@@ -92,8 +93,12 @@ def search_path() -> str:
 def marked(mark: str) -> list[int]:
     """Return the nodes' processes and their descendants, found by their environment."""
     variable = f'{MARK}={mark}'.encode()
-    pids = []
-    for name in os.listdir('/proc'):
+    pids: list[int] = []
+    try:
+        names = os.listdir('/proc')
+    except OSError:
+        return pids  # no descriptor is left
+    for name in names:
         if name.isdigit() and int(name) != os.getpid():
             with contextlib.suppress(OSError), open(f'/proc/{name}/environ', 'rb') as stream:
                 if variable in stream.read().split(b'\0'):
@@ -113,6 +118,8 @@ class Processes:
     def __init__(self, loop: Loop, identity: Identity) -> None:
         self.loop = loop
         self.identity = identity
+        #: The limits of descriptors that this process was started with.
+        self.descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)
         #: Called with the exit status of a child process.
         self.children: dict[int, Callable[[int], None]] = {}
 
@@ -243,6 +250,9 @@ class Watches:
         self.loop = processes.loop
         self.emit = emit
         self.known: dict[str, Watch] = {}
+        #: The number of ``take_down`` calls whose commands run, and what follows all of them.
+        self.ending = 0
+        self._ended: list[Callable[[], None]] = []
 
     def start(self, watch: Watch) -> None:
         """Start a watch, or replace the one with the same ``what``."""
@@ -251,7 +261,12 @@ class Watches:
 
     def _look(self, watch: Watch) -> None:
         if self.known.get(watch.what) is watch:
-            output = os.memfd_create('watch', os.MFD_CLOEXEC)
+            try:
+                output = os.memfd_create('watch', os.MFD_CLOEXEC)
+            except OSError as error:
+                say(f'{watch.what}: {error}')
+                self._look_later(watch)
+                return
             self.processes.spawn(
                 watch.argv, lambda status: self._looked(watch, status, output),
                 timeout=CHECK_TIMEOUT, output=output)
@@ -299,4 +314,13 @@ class Watches:
         """End all watches, run their ``down`` commands, then call ``then``."""
         commands = [argv for watch in self.known.values() for argv in watch.down]
         self.known.clear()
-        self.processes.spawn_all(commands, lambda good: then())
+        self.ending += 1
+        self._ended.append(then)
+
+        def ended(good: bool) -> None:
+            self.ending -= 1
+            if not self.ending:
+                calls, self._ended = self._ended, []
+                for call in calls:
+                    call()
+        self.processes.spawn_all(commands, ended)

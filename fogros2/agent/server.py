@@ -13,6 +13,7 @@ import contextlib
 import fcntl
 import json
 import os
+import resource
 import selectors
 import signal
 import socket
@@ -48,6 +49,10 @@ CLIENTS = 64
 RETRY_END = 30.0
 #: Shortest and longest pause in seconds before an agent that died starts again.
 FIRST_RESTART, LAST_RESTART = 0.1, 30.0
+#: Seconds without new connections after all descriptors were used up.
+ACCEPT_PAUSE = 1.0
+#: Bytes of the file of the deadlines.
+DEADLINES = 256
 #: Settings that a restarted agent takes over from its predecessor.
 RESUMED = (
     'launch', 'on_exit', 'lifetime', 'robot_timeout', 'heartbeat', 'environment', 'setup')
@@ -268,14 +273,15 @@ class Agent:
             # the user could have written the file: take nothing that root would execute
             self.config.update({key: saved[key] for key in RESUMED if key in saved})
             self._restart_watchdog()
-            if not self.config['launch'] and self.config['on_exit'] == 'keep':
-                self._expect_no_launch()
+            kept = not self.config['launch'] and self.config['on_exit'] == 'keep'
             with contextlib.suppress(
                     OSError, OverflowError, RecursionError, TypeError, ValueError), \
                     open(self.path('watchdog.json')) as stream:
                 self.nodes.mark, *state = json.load(stream)
-                if self.config['launch']:
+                if self.config['launch'] or kept:
                     self.watchdog.resume(state, self.loop.clock())
+            if kept:
+                self._expect_no_launch()
 
     def _expect_no_launch(self) -> None:
         """Only the lifetime ends this machine, which a launch has kept."""
@@ -289,6 +295,7 @@ class Agent:
         with self.identity.root(), contextlib.suppress(OSError, ValueError), \
                 open(self.config['kept_until']) as stream:
             self.config.update(on_exit='keep', lifetime=float(stream.read()) - time.time())
+            self.watchdog.lifetime_from = self.loop.clock()
             self._expect_no_launch()
 
     def _note_kept(self) -> None:
@@ -316,8 +323,15 @@ class Agent:
 
     def save_deadlines(self) -> None:
         """Write the watchdog's state, and the mark of the nodes, for a restarted agent."""
+        data = json.dumps([self.nodes.mark, *self.watchdog.state]).ljust(DEADLINES).encode()
+        # in place, for which a full disk has room
         with contextlib.suppress(OSError):
-            self._write('watchdog.json', [self.nodes.mark, *self.watchdog.state])
+            fd = os.open(self.path('watchdog.json'),
+                         os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+            try:
+                os.pwrite(fd, data, 0)
+            finally:
+                os.close(fd)
 
     def _write(self, name: str, data: Any) -> None:
         aside = self.path(f'{name}.new')
@@ -342,7 +356,10 @@ class Agent:
 
     def run(self) -> None:
         """Serve until the agent ends."""
-        self.loop.select(self.listener, selectors.EVENT_READ, self._accept)
+        # each node takes two descriptors
+        most = self.processes.descriptors[1]
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+        self._await_clients()
         try:
             self.heartbeats.open()
         except Refused as error:
@@ -380,10 +397,19 @@ class Agent:
             if client.position is not None and not client.out:
                 client.send()
 
+    def _await_clients(self) -> None:
+        self.loop.select(self.listener, selectors.EVENT_READ, self._accept)
+
     def _accept(self, mask: int) -> None:
         try:
             connection, _ = self.listener.accept()
-        except OSError:
+        except (BlockingIOError, ConnectionError):
+            return
+        except OSError as error:
+            # the client waits, and would wake the selector forever
+            say(f'no connection accepted: {error}')
+            self.loop.select(self.listener, 0, self._accept)
+            self.loop.at(ACCEPT_PAUSE, self._await_clients)
             return
         if len(self.clients) >= CLIENTS:
             # connections whose network is gone accumulate here
@@ -436,7 +462,8 @@ class Agent:
                 f"this machine belongs to launch '{owner}', whose last sign of life is "
                 f'{self.loop.clock() - heard_at:.0f} s old',
                 'end that launch, or choose another name', 'busy')
-        occupied = taken_over and (self.nodes.known or self.watches.known)
+        occupied = taken_over and (
+            self.nodes.known or self.watches.known or self.watches.ending)
         if not (self.nodes.stopping or occupied):
             return self._configure(new, taken_over)
         if taken_over:
@@ -445,9 +472,11 @@ class Agent:
 
         def stopped() -> None:
             try:
-                if taken_over and self.claimed != new['launch']:
+                # a request that was sent twice takes over once
+                claims = taken_over and self.config['launch'] != new['launch']
+                if claims and self.claimed != new['launch']:
                     raise Refused('the machine was released meanwhile', kind='released')
-                reply(self._configure(new, taken_over))
+                reply(self._configure(new, claims))
             except Refused as error:
                 reply(error.answer)
 
@@ -466,9 +495,8 @@ class Agent:
         self.released = self.released and not new.get('launch')
         if new.get('heartbeat', self.config['heartbeat']) != self.config['heartbeat']:
             self.watchdog.number = 0  # of another key
-        fixed = self.config['notice'] is not None
         self.config.update(new)
-        if not fixed:
+        if 'notice' in new and NOTICE not in self.watches.known:
             self._watch_notice()
         if taken_over:
             self.watchdog.disarm()
@@ -520,6 +548,10 @@ class Agent:
                 if failure is not None:
                     raise failure
                 self._check_held()
+                if self.config['heartbeat'] and self.watchdog.beat_at is None:
+                    # the robot was gone, and the machine stayed
+                    self.watchdog.beat_at = self.loop.clock()
+                    self.save_deadlines()
                 reply({'known': self.nodes.start(nodes)})
             except Refused as error:
                 reply(error.answer)

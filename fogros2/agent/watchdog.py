@@ -121,19 +121,22 @@ class Heartbeats:
         where = self.config['heartbeat']
         if not where:
             return
-        link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        link = None
         try:
+            link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
             # the VPN's address may appear later, and disappear for a time
             link.setsockopt(socket.IPPROTO_IP, IP_FREEBIND, 1)
             link.bind((where['bind'], where['port']))
         except (OSError, OverflowError) as error:
-            link.close()
+            if link is not None:
+                link.close()
             raise Refused(f"no heartbeats at {where['bind']}:{where['port']}: {error}") from error
         self.socket = link
         self.loop.select(link, selectors.EVENT_READ, self._receive)
 
     def _receive(self, mask: int) -> None:
-        assert self.socket is not None
+        if self.socket is None:
+            return  # closed by a release that was ready at the same time
         try:
             datagram, peer = self.socket.recvfrom(DATAGRAM)
             where = self.config['heartbeat']

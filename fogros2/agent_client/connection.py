@@ -27,8 +27,10 @@ from fogros2.waiting import Periodic, wait_until
 #: Seconds without data, although a ping was sent, after which a connection counts as lost. TCP
 #: would need 15 minutes after the robot has changed networks.
 SILENCE = 20.0
-#: Seconds that an agent may need to restart.
-RESTART = 5.0
+#: Seconds that an agent may need to restart: its longest pause, and its start.
+RESTART = 35.0
+#: Seconds after which nobody waits for it on the way down, or for a program without an answer.
+PATIENCE = 5.0
 
 #: A request without a waiting caller; its reply shows that the agent is there.
 _PING = b'{"id":0,"command":"ping"}\n'
@@ -78,6 +80,8 @@ class AgentClient:
         #: Whether an agent has answered, and whether the connection to it is lost.
         self._agent: Literal['awaited', 'here', 'lost'] = 'awaited'
         self._absent: Optional[str] = None
+        #: When an agent that had answered was first absent; None while it is there.
+        self._absent_since: Optional[float] = None
         self._next: Optional[int] = None
         #: The id of the request whose reply says where the log begins; 0 is a ping's.
         self._log_request = -1
@@ -119,7 +123,8 @@ class AgentClient:
 
         :param timeout: seconds, including the time of lost connections.
         :param silent: seconds without any data after which the request fails earlier; must be more
-            than half of ``SILENCE``, because a busy agent still answers pings.
+            than half of ``SILENCE``, because a busy agent still answers pings. An absent agent
+            then gets ``PATIENCE`` seconds instead of ``RESTART``.
         :raises AgentError: refused, with the agent's hint; or no agent is there (any more).
         :raises DeadlineExceeded: no reply in time.
         """
@@ -147,6 +152,10 @@ class AgentClient:
                         self.silent_for, time.monotonic() - begin) > silent:
                     raise DeadlineExceeded(
                         f"the agent sent nothing for {silent:g} s and didn't answer '{command}'")
+                absent_since = self._absent_since
+                if silent is not None and absent_since is not None \
+                        and time.monotonic() - absent_since > PATIENCE:
+                    raise AgentAbsent('the agent has ended')
         finally:
             with self._lock:
                 self._pending.pop(number, None)
@@ -189,13 +198,13 @@ class AgentClient:
     # -- the reader's thread --------------------------------------------------------------
 
     def _read_all(self) -> None:
-        pause, quiet_since = 0.0, time.monotonic()
+        pause, begin = 0.0, time.monotonic()
         try:
             while not self._closed.is_set():
                 if self._read_stream():
-                    pause, quiet_since = 0.0, time.monotonic()
+                    pause = 0.0
                 else:
-                    self._judge(time.monotonic() - quiet_since)
+                    self._judge(begin)
                 if self._error is not None:
                     break
                 if self._agent == 'here' and not self._closed.is_set():
@@ -218,12 +227,19 @@ class AgentClient:
         if self._error is not None and not self._closed.is_set():
             self._tell({'event': 'connection', 'state': 'absent', 'error': str(self._error)})
 
-    def _judge(self, seconds: float) -> None:
-        """Give up an agent that was silent for so many seconds, if it will not come back."""
-        awaited = self._agent == 'awaited'
-        if self._absent is not None and (awaited or seconds > RESTART):
-            self._error = AgentAbsent(self._absent, 'its machine may have ended')
-        elif awaited and seconds > RESTART:
+    def _judge(self, begin: float) -> None:
+        """
+        Give up an agent that did not answer, if it will not come back.
+
+        :param begin: when the client first connected.
+        """
+        awaited, now = self._agent == 'awaited', time.monotonic()
+        if self._absent is not None:
+            if self._absent_since is None:
+                self._absent_since = now
+            if awaited or now - self._absent_since > RESTART:
+                self._error = AgentAbsent(self._absent, 'its machine may have ended')
+        elif awaited and now - begin > PATIENCE:
             self._error = AgentError(
                 'the program that connects to the agent ended without an answer',
                 'is python3 on the machine, and agent.py with it?')
@@ -246,7 +262,7 @@ class AgentClient:
                 if message.get('kind') == 'absent' and 'ok' not in message:
                     self._absent = str(message.get('error'))
                 else:
-                    spoke = True
+                    spoke, self._absent_since = True, None
                     before, self._agent = self._agent, 'here'
                     if before == 'lost':
                         self._tell({'event': 'connection', 'state': 'back'})
@@ -266,6 +282,9 @@ class AgentClient:
     def _deliver(self, message: dict[str, Any]) -> None:
         event, seq = events.event(message), message.get('seq')
         if seq is not None and self._next is not None and seq >= self._next:
+            if seq > self._next:
+                # so many were lost on the way to the log, or before a slow connection took them
+                self._tell({'event': 'gap', 'count': seq - self._next})
             self._next = seq + 1
             if event is not None:
                 self._tell(event)
@@ -291,6 +310,7 @@ class AgentClient:
                 self._follow_on(stream)
         elif log['lost'] > 0:
             self._tell({'event': 'gap', 'count': log['lost']})
+            self._next = max(self._next or 1, log['first'])
 
     def _tell(self, event: events.Event) -> None:
         if self._callback is not None:

@@ -19,7 +19,7 @@ from fogros2.deploy.steps.installing import Modules
 from fogros2.deploy.steps.watching import POLL_INTERVAL, Watch
 from fogros2.deploy.undo import OPEN_PORT
 from fogros2.errors import AgentError, DeadlineExceeded, FogError
-from fogros2.events import Event
+from fogros2.events import Event, NodeStatus
 from fogros2.model import Machine, MachineSpec, NodeSpec
 from fogros2.report import Warned
 from fogros2.waiting import wait_until
@@ -115,13 +115,21 @@ class RunningMachine(MachineJob):
         """Send a node a signal, given by its name (``SIGUSR1``)."""
         self._request('signal', node=node, signal=name)
 
-    def _request(self, command: str, **arguments: Any) -> None:
+    def node_states(self) -> Sequence[NodeStatus]:
+        """
+        Return the states of the nodes that were started.
+
+        :raises FogError: the agent does not answer.
+        """
+        states: Sequence[NodeStatus] = self._request('status')['nodes']
+        return states
+
+    def _request(self, command: str, **arguments: Any) -> Mapping[str, Any]:
         """Send the agent a request, with a shorter time-out while the launch ends."""
         if self._context.cancel.is_set():
-            self.agent.request(command, timeout=self.timeout(30.0),
-                               silent=SILENCE_TIMEOUT, **arguments)
-        else:
-            self.agent.request(command, timeout=30.0, **arguments)
+            return self.agent.request(command, timeout=self.timeout(30.0),
+                                      silent=SILENCE_TIMEOUT, **arguments)
+        return self.agent.request(command, timeout=30.0, **arguments)
 
     def note(self, name: str, text: str) -> None:
         """Let ``ros2 fog`` show a note; see :class:`fogros2.feature.RunningMachine`."""

@@ -176,7 +176,10 @@ class RemoteRun:
                 self._print(event)
         elif event['event'] == 'exited':
             self.on('respawns' if event['respawns'] else 'exited', event)
-        elif event['event'] == 'started' or event['event'] == 'refused':
+        elif event['event'] == 'refused' or event['event'] == 'started' and not (
+                # known from the agent's status already
+                self.state.phase in ('running', 'leaving')
+                and event['pid'] == self._details.get('pid')):
             self.on(event['event'], event)
 
     def _report(self, said: Optional[Event]) -> None:

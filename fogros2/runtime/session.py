@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
+import contextlib
 import dataclasses
 import functools
 import logging
@@ -20,7 +21,7 @@ from fogros2.errors import (
     FogError,
     ProviderError,
 )
-from fogros2.events import Event
+from fogros2.events import Event, NodeStatus
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2.ros_names import remapped
 from fogros2.runtime.backlog import Backlog
@@ -41,7 +42,7 @@ _NOTICES = {
     'end_failed': (logging.ERROR, 'the machine would not end: exit status {returncode}'),
     'vpn_repaired': (logging.WARNING, 'the VPN was down for {seconds:.1f} s and is up again'),
     'restarted': (logging.ERROR, 'its agent died and was started again; the nodes have ended'),
-    'gap': (logging.WARNING, '{count} events of the agent came too late for its log'),
+    'gap': (logging.WARNING, '{count} events of its agent, such as output, were lost'),
     'connection lost': (logging.WARNING, 'the connection to its agent is lost; trying again'),
     'connection back': (logging.INFO, 'the connection is back'),
     'connection absent': (logging.ERROR, 'the agent is gone: {error}'),
@@ -55,6 +56,20 @@ _Event = Literal['up', 'gone', 'given_up']
 #: The next phase by phase and event; another event is too late.
 _NEXT: Mapping[tuple[str, _Event], str] = {
     ('awaited', 'up'): 'up', ('up', 'gone'): 'gone', ('up', 'given_up'): 'over'}
+
+
+def _last_event(node: NodeStatus) -> Optional[Event]:
+    """Return the event after which a node is in its state; None if another event follows."""
+    number, name, pid, returncode = node['id'], node['name'], node['pid'], node['returncode']
+    if node['state'] == 'running' and pid is not None:
+        return {'event': 'started', 'node': number, 'name': name, 'pid': pid, 'cmd': []}
+    if node['state'] == 'exited':
+        return {'event': 'exited', 'node': number, 'name': name, 'respawns': False,
+                'returncode': _UNREPORTED if returncode is None else returncode}
+    if node['state'] == 'refused':
+        return {'event': 'refused', 'node': number, 'name': name, 'hint': '',
+                'error': node.get('error', '')}
+    return None
 
 
 class Robot(Protocol):
@@ -127,6 +142,10 @@ class Session:
         self._backlog = Backlog(loop, self._on_event, busy, self._dropped)
         self._runs: dict[str, RemoteRun] = {}
         self._to_stop: list[RemoteRun] = []
+        #: Processes whose end nobody reported; the machine may yet start them.
+        self._unreported: set[str] = set()
+        #: Whether a comparison with the agent's state waits.
+        self._comparing = False
         #: Paths of the robot that its nodes get, and of which the user knows.
         self._paths: set[str] = set()
         #: Requests to the agent that are not answered yet.
@@ -242,6 +261,8 @@ class Session:
     def forget(self, run: RemoteRun) -> None:
         """Remove a process that has ended."""
         self._runs.pop(run.node.id, None)
+        if run.get_returncode() is None:
+            self._unreported.add(run.node.id)
         self._changed()
 
     def halted(self, run: RemoteRun) -> bool:
@@ -342,6 +363,30 @@ class Session:
         except FogError as error:
             self._logger.error(f'{self.spec.name}: {name} not sent to {run.node.name}: {error}')
 
+    async def _stop_late(self, node: str, name: str) -> None:
+        """Stop a process that has started although the launch counts it as ended."""
+        assert self.running is not None
+        with contextlib.suppress(FogError):
+            async with self._order:
+                await self._in_thread(self.running.stop, [node])
+            self._logger.warning(f'{self.spec.name}: {name} started too late, and was stopped')
+
+    async def _compare(self) -> None:
+        """Catch up on events that were lost: compare with the agent's state."""
+        assert self.running is not None
+        try:
+            async with self._order:
+                self._comparing = False
+                await self._in_thread(self.running.restore)
+                nodes = await self._in_thread(self.running.node_states)
+        except FogError as error:
+            self._logger.warning(f'{self.spec.name}: lost events are not made up for: {error}')
+            return
+        for node in nodes:
+            run, event = self._runs.get(node['id']), _last_event(node)
+            if run is not None and event is not None:
+                self._on_process_event(run, event)
+
     # -- events of the agent --------------------------------------------------------------------
 
     def _dropped(self, count: int) -> None:
@@ -355,6 +400,10 @@ class Session:
         if run is not None:
             self._on_process_event(run, event)
             return
+        if event['event'] == 'started' and event['node'] in self._unreported:
+            self._unreported.remove(event['node'])
+            self.request(functools.partial(self._stop_late, event['node'], event['name']))
+            return
         if event['event'] == 'given_up':
             self.request(functools.partial(self._give_up, event['reason']))
             return
@@ -367,6 +416,9 @@ class Session:
         if kind in _NOTICES:
             level, text = _NOTICES[kind]
             self._logger.log(level, f'{self.spec.name}: {text.format_map(event)}')
+        if kind == 'gap' and not self._comparing:
+            self._comparing = True
+            self.request(self._compare)
         if kind == 'restarted':
             self._restarted()
         elif kind == 'connection absent':

@@ -265,6 +265,61 @@ def test_output_and_clients_fill_neither_memory_nor_disk(rig):
     silent.close()
 
 
+def test_slow_connection_loses_events_and_counts_them(rig):
+    client = rig.started(log_bytes=64 << 10)
+    first = rig.node('first', 'import sys\nprint("up")\nfor line in sys.stdin: pass\n')
+    rig.run(first)
+    rig.shell.pause()
+    other = rig.client(follow=False)
+    flood = 'for _ in range(5000):\n    print("x" * 200)\n'
+    for name, code in (('before', flood), ('between', 'raise SystemExit(7)\n'),
+                       ('after', flood)):
+        other.request('start', nodes=[rig.node(name, code)])
+        wait_until(lambda name=name: states(other)[name] == 'exited', timeout=60, what=name)
+    rig.shell.streams[0]._channel.child.send_signal(signal.SIGCONT)
+    rig.wait('exited', node='after')
+    assert not [e for e in rig.events if e.get('node') == 'between'], 'nothing was lost'
+    rig.wait('gap')
+    assert sum(e['count'] for e in rig.events if e['event'] == 'gap') == (
+        rig.events[-1]['seq'] - sum('seq' in e for e in rig.events))
+    status, = (node for node in client.status()['nodes'] if node['id'] == 'between')
+    assert (status['state'], status['returncode']) == ('exited', 7)
+
+
+def test_nodes_beyond_the_descriptors_are_refused(rig):
+    rig.prefix = ('sh', '-c', 'ulimit -n 40 && exec "$@"', 'sh')
+    client = rig.started()
+    mark = rig.folder / 'looked'
+    client.request('watch', what='vpn', interval=0.05, argv=['touch', str(mark)], repair=[])
+    nodes = [rig.node(str(number), SLEEP) for number in range(30)]
+    client.request('start', nodes=nodes)
+    found = states(client)
+    assert {'running', 'refused'} == set(found.values()) and found['0'] == 'running'
+    crowd = [Raw(rig.directory) for _ in range(10)]  # which take the rest
+    running = [name for name, state in found.items() if state == 'running']
+    client.request('ping')
+    os.utime(rig.folder)
+    client.request('stop', nodes=running[1:])
+    for name in running[1:]:
+        rig.wait('exited', node=name)
+    mark.unlink(missing_ok=True)
+    wait_until(mark.exists, timeout=60, what='the watch to go on')
+    assert all(raw.ask(b'{"id": 1, "command": "ping"}\n')['ok'] for raw in crowd)
+    assert states(client)['0'] == 'running' and rig.agents[0].poll() is None
+    for raw in crowd:
+        raw.close()
+
+
+def test_agent_may_have_more_descriptors_than_its_nodes(rig):
+    rig.prefix = ('sh', '-c', 'ulimit -Sn 40 && exec "$@"', 'sh')
+    rig.started()
+    rig.run(*(rig.node(str(number), (
+        'import resource, time\n'
+        'print(resource.getrlimit(resource.RLIMIT_NOFILE)[0])\n'
+        'time.sleep(600)\n')) for number in range(20)))
+    assert {rig.text(str(number)) for number in range(20)} == {'40\n'}
+
+
 def test_requests_are_answered_after_the_end_of_input(shared, tmp_path):
     def connect(directory: Path) -> subprocess.CompletedProcess[bytes]:
         return subprocess.run(
@@ -391,6 +446,23 @@ def test_kept_machine_stops_nodes_and_stays_for_its_lifetime(rig, heartbeat):
     wait_until((rig.folder / 'ended').exists, timeout=60, what='the end of the machine')
 
 
+def test_nodes_that_start_after_a_long_cut_are_guarded(rig, heartbeat):
+    client = rig.started(robot_timeout=0.5, on_exit='keep', end_command=ends(rig))
+    client.request('start', nodes=[rig.node(
+        'again', 'raise SystemExit(3)\n', respawn=True, respawn_delay=600.0)])
+    rig.wait('exited', node='again', respawns=True)
+    client.request('configure', heartbeat=heartbeat)
+    rig.wait('watchdog', reason='robot gone')
+    assert rig.wait('exited', node='again', respawns=False)['returncode'] == 3
+    # the launch reaches it again, and one of its event handlers starts a node
+    with contextlib.closing(Heartbeat('127.0.0.1', heartbeat['port'], KEY, interval=0.05)):
+        client.request('start', nodes=[rig.node('late', SLEEP)])
+        assert client.request('status')['heartbeat_age'] is not None
+    rig.wait('exited', node='late')
+    assert sum(event.get('reason') == 'robot gone' for event in rig.events) == 2
+    assert not (rig.folder / 'ended').exists()
+
+
 def test_computer_without_end_command_is_cleaned_up(rig):
     mark = rig.folder / 'down'
     agent = rig.serve()
@@ -406,10 +478,17 @@ def test_computer_without_end_command_is_cleaned_up(rig):
 
 
 def test_kept_machine_without_launch_outlives_its_agent(rig):
-    rig.started(on_exit='keep', lifetime=2.0, end_command=ends(rig)).request(
-        'release', on_exit='keep')
+    client = rig.started(on_exit='keep', lifetime=3.0, end_command=ends(rig))
+    client.request('release', on_exit='keep')
+
+    def left() -> float:
+        seconds: float = rig.ask('status')['lifetime_left']
+        return seconds
+
+    wait_until(lambda: left() < 1.5, timeout=60, what='half of the lifetime')
     rig.kill()
-    rig.serve(on_exit='keep', boot_timeout=0.3, lifetime=2.0, end_command=ends(rig))
+    rig.serve(on_exit='keep', boot_timeout=0.3, lifetime=3.0, end_command=ends(rig))
+    assert left() < 1.5
     assert rig.wait('watchdog')['reason'] == 'lifetime'
 
 
@@ -486,6 +565,38 @@ def test_release_during_a_takeover_leaves_the_machine_free(rig):
     taking.join(60)
     assert 'was released meanwhile' in str(refused[0])
     assert client.request('status')['launch'] == ''
+
+
+@pytest.mark.parametrize('busy', ['nodes', 'commands'])
+def test_takeover_goes_on_after_a_lost_connection(rig, busy):
+    """While the former launch's nodes, or the commands of its watches, end."""
+    client = rig.started(launch='first', on_exit='keep')
+    go, done, again = (rig.folder / name for name in ('go', 'done', 'again'))
+    wait = f'until [ -e {go} ]; do sleep 0.02; done; touch {done}'
+    if busy == 'nodes':
+        rig.run(NodeSpec('n', 'n-1', arguments=(
+            'sh', '-c', f'trap "" TERM; trap "{wait}; exit" INT; echo up; '
+            'while true; do sleep 0.02; done')))
+    else:
+        client.request('watch', what='vpn', argv=['true'], repair=[],
+                       down=[['sh', '-c', f'touch {again}; {wait}']])
+    answers: list[Any] = []
+
+    def take() -> None:
+        answers.append(client.request('configure', launch='second', force='first'))
+        answers.append(done.exists())
+
+    taking = threading.Thread(target=take)
+    taking.start()
+    if busy == 'commands':
+        wait_until(again.exists, timeout=60, what='the command')
+    rig.shell.cut()
+    rig.wait('connection', state='back')
+    client.request('ping')
+    go.touch()
+    taking.join(60)
+    assert answers[0]['ok'] and answers[1]
+    assert client.request('status')['launch'] == 'second'
 
 
 def test_health_check_repairs_until_its_launch_ends(rig):
@@ -619,6 +730,39 @@ def test_restarted_agent_ends_nodes_and_keeps_its_watchdog(rig, heartbeat):
     seqs = [e['seq'] for e in rig.events if 'seq' in e]
     assert seqs == list(range(1, len(seqs) + 1))
     assert rig.wait('watchdog')['reason'] == 'robot gone'
+
+
+def test_restarted_agent_gets_its_watches_again(rig):
+    notice = ['cat', str(rig.folder / 'notice')]
+    client = rig.started(notice=notice)
+    rig.run(rig.node('n', 'print("up")\n'))
+    rig.kill()
+    # a machine's boot knows of no notice, and the folder is the user's
+    rig.serve()
+    rig.wait('restarted')
+    (rig.folder / 'notice').write_text('soon')
+    for _ in range(2):
+        rig.events.clear()
+        client.request('configure', launch='abc123', again=True, notice=notice)
+        assert rig.wait('notice')['reason'] == 'soon'
+    with pytest.raises(AgentError, match='is fixed'):
+        client.request('configure', launch='abc123', again=True, notice=['true'])
+
+
+def test_deadlines_are_kept_on_a_full_disk(tmp_path):
+    agent = Agent({'machine': 'planner', 'launch': 'abc123', 'directory': str(tmp_path / 'agent')})
+    agent.open()
+    path = tmp_path / 'agent' / 'watchdog.json'
+    before = path.stat()
+    agent.watchdog.configured(123456.789012345, heartbeat=True)
+    agent.watchdog.beat((1 << 64) - 1, 123456.789012345)
+    agent.save_deadlines()
+    # no new block is needed
+    after = path.stat()
+    assert (after.st_ino, after.st_size) == (before.st_ino, before.st_size)
+    assert json.loads(path.read_text())[1:] == agent.watchdog.state
+    agent.listener.close()
+    os.close(agent.lock)
 
 
 @pytest.fixture

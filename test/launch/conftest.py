@@ -40,19 +40,23 @@ class FakeMachine:
         #: Whether the provider confirms a notice: its answers, of which the last stays.
         self.confirms = [True]
         self.pids = iter(range(4001, 5000))
+        #: The states of nodes in the agent's status.
+        self.statuses = []
 
     def start(self, nodes):
         if self.lost:
             raise AgentError('the connection to the agent was closed')
         if self.launch.start_errors:
             raise self.launch.start_errors.pop(0)
+        self.launch.on_request(nodes)
         if self.launch.start_error is not None:
             raise self.launch.start_error
         for node in nodes:
             self.launch.note('start', self.spec.name, node.name)
             self.all.append(node)
             self.nodes[node.executable or node.arguments[0]] = node
-            self.say('started', node, pid=next(self.pids), cmd=['/there/program'])
+            if len(self.all) - 1 not in self.launch.silent:
+                self.say('started', node, pid=next(self.pids), cmd=['/there/program'])
             on_start = self.launch.on_start
             if on_start is not None:
                 on_start(self, node)
@@ -79,6 +83,9 @@ class FakeMachine:
 
     def signal(self, node, name):
         self.signals.append((node, name))
+
+    def node_states(self):
+        return self.statuses
 
     def subscribe(self, callback):
         self.callback = callback
@@ -118,6 +125,9 @@ class FakeLaunch:
         #: Errors of the next calls of ``retire``, one for each call.
         self.retire_errors = []
         self.here_error = None
+        #: Called with the nodes of each request, and the numbers of nodes whose start gets lost.
+        self.on_request = lambda nodes: None
+        self.silent = set()
         #: What machines refuse nodes with.
         self.start_error = None
         #: Why machines do not restore an agent.

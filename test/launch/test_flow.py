@@ -36,6 +36,7 @@ from fogros2.errors import (
     ProviderError,
     VpnError,
 )
+from fogros2.model import NodeSpec
 from fogros2.runtime import remote_run, session
 from rigs.launching import ends
 from ros2fog_cli.api.preview import Preview
@@ -401,6 +402,75 @@ def test_agent_that_starts_no_node_ends_no_launch(run, fake, planner, capfd, err
     fake.start_error = error
     assert run(LaunchDescription([talker(planner)])) == status
     assert (f"process can't be started: {error}" in capfd.readouterr().out) == (not status)
+
+
+@pytest.mark.parametrize('restored', [True, False])
+def test_launch_makes_up_for_lost_events(run, fake, planner, capfd, restored):
+    def status(node, state, **changes):
+        return {'id': node.id, 'name': node.name, 'state': state, 'pid': None,
+                'returncode': None, 'restarts': 0, **changes}
+
+    def flood(machine, node):
+        """Lose the end of the first node, and the start of the second."""
+        if node is sent[-1]:
+            machine.statuses = [
+                status(sent[0], 'exited', returncode=7), status(sent[1], 'running', pid=4711),
+                status(sent[2], 'refused', error='no room'), status(node, 'exited', id='unknown')]
+            machine.say('gap', count=3)
+
+    sent: list[NodeSpec] = []
+    fake.on_request = sent.extend
+    fake.silent = {1, 2}
+    fake.on_start = flood
+    fake.restore_error = None if restored else AgentError('gone')
+    ended, started = [], []
+    first, late, refused = (talker(planner, exec_name=f'n{number}') for number in range(3))
+
+    def on_start(event, context):
+        started.append(event.pid)
+        machine = fake.machines['planner']
+        # what the agent has said of it before comes late
+        machine.say('started', sent[1], pid=4711, cmd=['/there/program'])
+        machine.say('exited', sent[1], returncode=0, respawns=False)
+
+    run(LaunchDescription([
+        first, late, refused,
+        RegisterEventHandler(OnProcessExit(
+            target_action=first, on_exit=lambda event, context: ended.append(event.returncode))),
+        RegisterEventHandler(OnProcessStart(target_action=late, on_start=on_start)),
+        *([] if restored else [TimerAction(period=0.5, actions=[Shutdown()])])]))
+    output = capfd.readouterr().out
+    assert 'planner: 3 events of its agent, such as output, were lost' in output
+    if restored:
+        assert (ended, started) == ([7], [4711]) and 'no room' in output
+    else:
+        assert 'planner: lost events are not made up for: gone' in output
+
+
+def test_node_that_starts_after_its_refusal_is_stopped(run, fake, planner, capfd):
+    fake.start_error = DeadlineExceeded("the agent didn't answer 'start'")
+    fake.on_request = lambda nodes: threading.Timer(0.1, lambda: [
+        machine.say('started', node, pid=4711, cmd=[])
+        for machine in fake.machines.values() for node in nodes for _ in range(2)]).start()
+    node, other = talker(planner), robot(fake, 'sleep', '2')
+    assert run(LaunchDescription([node, *other])) == 0
+    (_, stopped), = fake.noted('stop')
+    assert 'talker' in stopped and 'started too late, and was stopped' in capfd.readouterr().out
+
+
+def test_node_that_has_started_needs_no_answer(run, fake, planner, capfd):
+    def started(nodes):
+        machine = fake.machines['planner']
+        machine.say('started', nodes[0], pid=4711, cmd=[])
+        threading.Timer(0.3, machine.say, ('exited', nodes[0]), {
+            'returncode': 3, 'respawns': False}).start()
+
+    fake.start_error = DeadlineExceeded("the agent didn't answer 'start'")
+    fake.on_request = started
+    node = talker(planner)
+    assert run(LaunchDescription([node])) == 0
+    assert node.return_code == 3 and not fake.noted('stop')
+    assert "can't be started" not in capfd.readouterr().out
 
 
 def test_nodes_respawn_at_most_as_often_as_they_may(run, fake, planner, monkeypatch, capfd):

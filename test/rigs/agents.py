@@ -40,6 +40,10 @@ class CutShell(LocalShell):
     def cut(self) -> None:
         self.streams[-1]._channel.child.kill()
 
+    def pause(self, *, until: bool = False) -> None:
+        """Let the connection carry nothing, ``until`` it does again."""
+        self.streams[-1]._channel.child.send_signal(signal.SIGCONT if until else signal.SIGSTOP)
+
 
 class Raw:
     """A connection without manners."""
@@ -75,6 +79,8 @@ class Rig:
         self.directory = folder / 'agent'
         self.shell = CutShell()
         self.events: list[Any] = []
+        #: The command line of a program that executes the agent.
+        self.prefix: tuple[str, ...] = ()
         self.agents: list[subprocess.Popen[bytes]] = []
         self.clients: list[AgentClient] = []
 
@@ -87,7 +93,7 @@ class Rig:
         return [sys.executable, '-IS', str(self.program), 'serve', *options, '--config', str(path)]
 
     def serve(self, **config: Any) -> subprocess.Popen[bytes]:
-        agent = subprocess.Popen(self.words(**config), stderr=subprocess.PIPE)
+        agent = subprocess.Popen([*self.prefix, *self.words(**config)], stderr=subprocess.PIPE)
         self.agents.append(agent)
         wait_until(lambda: self.ask('ping') or agent.poll() is not None, timeout=60,
                    what='the agent')

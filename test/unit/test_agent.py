@@ -3,15 +3,20 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import selectors
+import socket
+from types import SimpleNamespace
 
 import pytest
 
 from fogros2.agent import journal
 from fogros2.agent.journal import Journal
+from fogros2.agent.loop import Loop
 from fogros2.agent.protocol import checked, CONFIG, Refused
-from fogros2.agent.watchdog import Watchdog
+from fogros2.agent.watchdog import Heartbeats, Watchdog
 
 HEARTBEAT = {'bind': '10.0.0.1', 'peer': '10.0.0.2', 'port': 7, 'key': 'ab' * 16}
 
@@ -124,6 +129,52 @@ def test_full_disk_loses_only_events(tmp_path, capsys):
     assert log.next == 3
 
 
+def test_small_disk_gets_a_small_journal(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, 'statvfs', lambda path: SimpleNamespace(f_blocks=8, f_frsize=4096))
+    log = Journal(str(tmp_path), 1 << 20)
+    for number in range(300):
+        log.append(event(str(number)))
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 2 * 4096
+
+
+@pytest.mark.parametrize('room', [3000, 6000])
+def test_full_disk_keeps_the_newest_events(tmp_path, monkeypatch, room):
+    """Which something else has filled up, to less than the journal's two generations."""
+    write = os.write
+
+    def full(fd, data):
+        taken = sum(path.stat().st_size for path in tmp_path.iterdir())
+        if taken >= room:
+            raise OSError(errno.ENOSPC, 'No space left on device')
+        return write(fd, data[:room - taken])
+
+    monkeypatch.setattr(os, 'write', full)
+    log = Journal(str(tmp_path), 4096)
+    live = 0
+    for number in range(1000):
+        position = log.find(log.next)
+        log.append(event(str(number)))
+        live += bool(log.read(position)[0])
+    assert read(log)[-1]['seq'] == log.next - 1 == 1000
+    # a follower misses few
+    assert live > 950
+
+
+def test_large_event_is_kept_on_a_full_disk(tmp_path, monkeypatch):
+    write = os.write
+
+    def full(fd, data):
+        if sum(path.stat().st_size for path in tmp_path.iterdir()) + len(data) > 3000:
+            raise OSError(errno.ENOSPC, 'No space left on device')
+        return write(fd, data)
+
+    monkeypatch.setattr(os, 'write', full)
+    log = Journal(str(tmp_path), 4096)
+    for size in (2500, 2500, 2500, 10):
+        log.append(event('x' * size))
+    assert read(log)[-1]['seq'] == 4
+
+
 def config(**more):
     return {**{key: default for key, (_, default) in CONFIG.items()},
             'lifetime': 1000.0, 'robot_timeout': 10.0, 'boot_timeout': 100.0, **more}
@@ -171,6 +222,24 @@ def test_late_heartbeat_does_not_rearm_the_watchdog():
     dog.beat(1, 1.0)
     assert dog.beat_at is None
     assert dog.deadlines() == [(1000.0, 'lifetime')]
+
+
+def test_heartbeat_behind_a_release_is_dropped(free_udp_port):
+    loop, settings = Loop(), config(heartbeat={
+        **HEARTBEAT, 'bind': '127.0.0.1', 'port': free_udp_port})
+    beats = Heartbeats(loop, settings, Watchdog(settings, 0.0), lambda: None)
+    beats.open()
+    robot, machine = socket.socketpair()
+    with robot, machine, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        def release(mask):
+            settings['heartbeat'] = None
+            beats.open()
+
+        loop.select(machine, selectors.EVENT_READ, release)
+        robot.send(b'release')
+        other.sendto(b'beat', ('127.0.0.1', free_udp_port))
+        loop.turn(loop.clock())
+        assert beats.socket is None
 
 
 def test_configuring_without_heartbeat_keeps_the_deadline():

@@ -15,6 +15,7 @@ import pytest
 from fogros2.agent.protocol import ANSWER, BEAT, sign, verify
 from fogros2.agent_client import AgentClient, connection, Heartbeat, interval_for
 from fogros2.errors import (
+    AgentAbsent,
     AgentError,
     AuthenticationError,
     ConnectError,
@@ -48,9 +49,11 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., AgentClient]
 
     def build(
         *streams: Any, silence: float = connection.SILENCE, restart: float = connection.RESTART,
+        patience: float = connection.PATIENCE,
     ) -> AgentClient:
         monkeypatch.setattr(connection, 'SILENCE', silence)
         monkeypatch.setattr(connection, 'RESTART', restart)
+        monkeypatch.setattr(connection, 'PATIENCE', patience)
         shell: Any = ScriptedShell(*streams)
         clients.append(AgentClient(shell, '/run/x', agent_path='/run/x/agent.py'))
         return clients[-1]
@@ -128,6 +131,30 @@ def test_events_arrive_once_and_in_order_over_connections(make):
     assert [e.get('seq', e.get('state')) for e in seen] == [1, 2, 3, 'lost', 'back', 4, 5]
 
 
+def gaps(seen: list[dict[str, Any]]) -> list[int]:
+    return [event['count'] for event in seen if event['event'] == 'gap']
+
+
+def test_events_that_are_missing_between_others_are_counted(make):
+    stream = agent()
+    client = make(stream)
+    seen = followed(client)
+    for seq in (1, 2, 9, 10):
+        stream.say(ending(seq))
+    until(lambda: len(seen) == 5)
+    assert [event.get('seq') for event in seen] == [1, 2, None, 9, 10] and gaps(seen) == [6]
+
+
+def test_events_that_the_log_has_lost_are_counted_once(make):
+    stream = agent(next_seq=9, first=6, lost=5)
+    client = make(stream)
+    seen = followed(client)
+    for seq in (6, 7):
+        stream.say(ending(seq))
+    until(lambda: len(seen) == 3)
+    assert [event.get('seq') for event in seen] == [None, 6, 7] and gaps(seen) == [5]
+
+
 def test_new_log_of_an_agent_is_read_from_its_beginning(make):
     first, second = agent(next_seq=60), agent(next_seq=3)
     client = make(first, second)
@@ -162,12 +189,35 @@ def test_machine_without_agent_is_given_up(make):
         client.request('status')
 
 
+def absent() -> ScriptedStream:
+    stream = ScriptedStream(lambda request: [])
+    stream.say({'error': 'no agent serves /run/x', 'kind': 'absent'})
+    stream.say(None)
+    return stream
+
+
+def test_agent_that_pauses_before_its_restart_is_awaited(make):
+    first = ScriptedStream(lambda request: [done(request)])
+    client = make(first, *(absent() for _ in range(4)), agent(), patience=0.2)
+    client.request('status')
+    first.answer = lambda request: [None]
+    # the launch goes on; its way down does not wait for as long
+    waiting = request(client, 'status')
+    with pytest.raises(AgentAbsent, match='the agent has ended'):
+        client.request('release', silent=60.0)
+    assert waiting.result(60)['ok'] is True
+
+
+def test_time_without_a_network_is_no_time_without_an_agent(make):
+    first = agent()
+    client = make(first, *(ConnectError('down') for _ in range(4)), absent(), agent(), restart=0.3)
+    seen = followed(client)
+    first.say(None)
+    until(lambda: len(seen) == 2)
+    assert [e['state'] for e in seen] == ['lost', 'back']
+
+
 def test_agent_that_does_not_come_back_is_given_up(make):
-    def absent() -> ScriptedStream:
-        stream = ScriptedStream(lambda request: [])
-        stream.say({'error': 'no agent serves /run/x', 'kind': 'absent'})
-        stream.say(None)
-        return stream
     # it may take a moment to restart
     first, second = agent(), agent()
     client = make(first, absent(), absent(), second, *(absent() for _ in range(50)), restart=0.5)
@@ -185,7 +235,7 @@ def test_program_that_ends_without_output_is_given_up(make):
     for stream in streams:
         stream.say(b'python3: can not open file\n')
         stream.say(None)
-    client = make(*streams, restart=0.3)
+    client = make(*streams, patience=0.3)
     with pytest.raises(AgentError, match='without an answer'):
         client.request('status')
     assert len(client._shell.opened) < 6

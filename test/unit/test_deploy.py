@@ -613,6 +613,22 @@ def test_agent_that_was_started_again_gets_router_and_watches(launch, provider):
     assert requests[2:] == before
 
 
+def test_agent_that_was_started_again_watches_for_the_notice(launch, provider, monkeypatch):
+    context, mine = begun(launch)
+    requests = []
+    mine.agent = SimpleNamespace(
+        request=lambda command, **words: requests.append((command, words)))
+    monkeypatch.setattr(provider, 'capabilities_of', lambda machine: dataclasses.replace(
+        provider.capabilities, preemption_notice=('look',)))
+    mine.machine = Machine('i-1', 'planner', 'fake', MachineState.RUNNING)
+    mine.expires = time.monotonic() + 100.0
+    Arming(context, mine).watch_notice()
+    ((command, words),) = requests
+    assert command == 'configure' and words['again'] and words['notice'] == ['look']
+    # its lifetime goes on
+    assert 90.0 < words['lifetime'] <= 100.0
+
+
 def test_robot_alone_uses_a_relay(members, monkeypatch):
     dialled = []
     peers = FakeVpn.peers

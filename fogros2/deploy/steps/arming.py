@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import contextlib
 import secrets
+import time
 from typing import Any, Optional
 
 from fogros2 import model, plan
@@ -67,13 +68,12 @@ class Arming(Step):
         """
         context, job, program = self._context, self._job, self._job.capabilities.agent_program
         endpoint = job.machine.endpoint
-        notice = context.provider.capabilities_of(job.machine).preemption_notice
         config = {
             **plan.agent_config(
                 job.spec, context.launch_id, job.directory, job.machine.end_command),
             'user': endpoint.user if endpoint else '',
             # fixed before any node starts, even if there is none
-            'notice': list(notice),
+            'notice': self._notice,
             # the launch keeps in touch from now on: by re-arming the agent, then by heartbeats
             'boot_timeout': job.spec.robot_timeout}
         with job.step('watchdog'):
@@ -106,6 +106,20 @@ class Arming(Step):
             job.push(NODES)
             job.rearming = Periodic('fog-rearm', job.spec.robot_timeout / 4, self._rearm)
             job.undo.callback(job.rearming.close)
+
+    @property
+    def _notice(self) -> list[str]:
+        return list(
+            self._context.provider.capabilities_of(self._job.machine).preemption_notice)
+
+    def watch_notice(self) -> None:
+        """Let an agent that was started again watch for the preemption notice."""
+        job = self._job
+        job.agent.request(
+            'configure', timeout=self._context.timeouts.agent, launch=self._context.launch_id,
+            again=True, notice=self._notice,
+            # which this restarts
+            lifetime=max(1.0, job.expires - time.monotonic()))
 
     def _rearm(self) -> None:
         # a later call may get through; the current step reports a lasting failure
