@@ -637,3 +637,16 @@ def test_bridge_ends_while_a_call_waits(robot, bench):
     bench.bridge.send_signal(signal.SIGINT)
     assert bench.bridge.wait(20) == 0
     silent.destroy_node()
+def test_renamed_topic_is_recorded_and_missing_one_is_named(bench, tmp_path):
+    bench.node.create_publisher(String, '/fogros2/m/plan', LATCHED).publish(String(data='new'))
+    recorder = bench.run('-c', RECORD.format('recorder.PATIENCE = 1.0; '), str(tmp_path), '/plan',
+                         '/none', '--ros-args', '-r', '/plan:=/fogros2/m/plan')
+    bench.until(lambda: re.search('no topic of the names .*/none yet', ''.join(bench.lines)),
+                'the warning')
+    bench.listeners('/fogros2/m/plan', 1)
+    recorder.send_signal(signal.SIGINT)
+    assert recorder.wait(60) == 0
+    bench.processes.remove(recorder)
+    assert recorded(tmp_path) == {'/plan': ['new']}
+
+
