@@ -7,8 +7,9 @@ decoding them. A slow viewer loses its oldest messages, without effect on other 
 stream of ``image_transport_h264`` is sent as ``foxglove.CompressedVideo``.
 
 Parameters: ``address``, ``port`` (0: any free port; the log has the port), ``topics`` (patterns of
-the names of topics, services and parameters to show) and ``client_publish`` (whether viewers may
-publish, call services and set parameters).
+the names of topics, services and parameters to show), ``client_publish`` (whether viewers may
+publish, call services and set parameters) and ``gate`` (a file descriptor that ends with the gate,
+without which nobody reaches the bridge; then the bridge fails).
 
 Protocol: https://github.com/foxglove/ws-protocol, implemented by ``foxglove-sdk``.
 """
@@ -25,6 +26,7 @@ import foxglove
 from foxglove import MessageSchema, Parameter, Schema, Service, ServiceSchema
 from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, ServerListener
 from rcl_interfaces.msg import ParameterEvent
+import rclpy
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.publisher import Publisher
@@ -71,10 +73,14 @@ class BridgeNode(GraphNode, ServerListener):
             supported_encodings=['cdr'], asset_handler=assets.read, context=self.viewers,
             message_backlog_size=BACKLOG)
         self._look()
+        self.failed = False
+        gate = int(self.declare_parameter('gate', -1).value)
         self.create_subscription(ParameterEvent, '/parameter_events', self._tell_change, 1000)
         self.create_timer(LOOK, self._look)
         self.get_logger().info(f'serving ws://{address}:{self._server.port}')
 
+        if gate >= 0:
+            threading.Thread(target=self._follow, args=(gate,), name='gate', daemon=True).start()
     def destroy_node(self) -> None:
         """Disconnect the viewers, then destroy the node."""
         self._service_calls.close()
@@ -209,6 +215,13 @@ class BridgeNode(GraphNode, ServerListener):
         """Report to the log and to all viewers."""
         why = clean(why[:1000])
         self.get_logger().warning(why)
+    def _follow(self, gate: int) -> None:
+        os.read(gate, 1)
+        if rclpy.ok():
+            self.failed = True
+            self.get_logger().error('the gate has ended, so nobody reaches this bridge')
+            rclpy.try_shutdown()
+
         self._server.publish_status(why, foxglove.StatusLevel.Warning)
 
 
@@ -216,7 +229,9 @@ def main() -> None:
     """Run the bridge until a signal."""
     os.environ['TOKIO_WORKER_THREADS'] = str(2 * WAITING)  # read by the SDK
     # an error may be another type of a topic with Fast DDS
-    ending.run(BridgeNode, BridgeNode.refuse)
+    bridge = ending.run(BridgeNode, BridgeNode.refuse)
+    if bridge is not None and bridge.failed:
+        raise SystemExit(1)
 
 
 if __name__ == '__main__':
