@@ -32,6 +32,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.publisher import Publisher
 
 from fogros2 import ros_types
+from fogros2.ros_names import absolute
 from fogros2.untrusted import clean
 from fogros2_monitor import assets
 from fogros2_monitor.definitions import definition
@@ -72,15 +73,15 @@ class BridgeNode(GraphNode, ServerListener):
                 [Capability.ClientPublish, Capability.Services] if self._publish else [])],
             supported_encodings=['cdr'], asset_handler=assets.read, context=self.viewers,
             message_backlog_size=BACKLOG)
-        self._look()
         self.failed = False
         gate = int(self.declare_parameter('gate', -1).value)
+        self._look()
         self.create_subscription(ParameterEvent, '/parameter_events', self._tell_change, 1000)
         self.create_timer(LOOK, self._look)
         self.get_logger().info(f'serving ws://{address}:{self._server.port}')
-
         if gate >= 0:
             threading.Thread(target=self._follow, args=(gate,), name='gate', daemon=True).start()
+
     def destroy_node(self) -> None:
         """Disconnect the viewers, then destroy the node."""
         self._service_calls.close()
@@ -206,15 +207,14 @@ class BridgeNode(GraphNode, ServerListener):
         if encoding != 'cdr':
             self.refuse(f"{topic}: publishes '{encoding}', this bridge takes cdr")
             return
+        if not self._shows(absolute(topic, '/')):
+            self.refuse(f'{topic}: not among the topics of this bridge')
+            return
         try:
             self._published[key] = self.create_publisher(ros_types.message(kind), topic, 10)
         except (LookupError, NameValidationException) as error:
             self.refuse(f'{topic}: {error}')
 
-    def refuse(self, why: str) -> None:
-        """Report to the log and to all viewers."""
-        why = clean(why[:1000])
-        self.get_logger().warning(why)
     def _follow(self, gate: int) -> None:
         os.read(gate, 1)
         if rclpy.ok():
@@ -222,6 +222,10 @@ class BridgeNode(GraphNode, ServerListener):
             self.get_logger().error('the gate has ended, so nobody reaches this bridge')
             rclpy.try_shutdown()
 
+    def refuse(self, why: str) -> None:
+        """Report to the log and to all viewers."""
+        why = clean(why[:1000])
+        self.get_logger().warning(why)
         self._server.publish_status(why, foxglove.StatusLevel.Warning)
 
 
