@@ -59,7 +59,7 @@ class H264(Raw):
 
 class Compressed(Raw):
     """
-    Send ``/camera`` as ``/camera/compressed``, like ROS's own transport of that name.
+    Send ``/camera`` as ``/camera/fogros2/compressed``, in the format of ROS's own transport.
 
     The options are ``format`` (jpeg or png), and ``jpeg_quality`` (default 80).
     """

@@ -6,7 +6,9 @@ On the robot a topic keeps its name, so that drivers and viewers outside the lau
 On a machine, image and camera info get a name that contains the machine (``/camera`` becomes
 ``/fogros2/planner/camera``). With one name on both sides, DDS would connect them, and raw images
 would cross the VPN. The stream's name extends that of its source (``/camera/h264``,
-``/fogros2/planner/annotated/h264``), so several hosts may publish the same topic.
+``/fogros2/planner/annotated/h264``), so several hosts may publish the same topic. Names of plugins
+of ``image_transport`` get an addition (``/camera/fogros2/compressed``): a driver may publish
+``/camera/compressed``, and both would cross.
 """
 
 from __future__ import annotations
@@ -26,6 +28,8 @@ from fogros2_features.streams.transport import Stream
 DECODER_PARAMETERS = ('encoding',)
 #: Options of all streams that use this project's nodes.
 OPTIONS = frozenset({'camera_info', 'priority', *DECODER_PARAMETERS})
+#: Last parts of streams' names that no plugin uses.
+_OWN = ('h264', 'pointcloud', 'raw')
 
 
 def check(stream: Stream) -> None:
@@ -74,7 +78,8 @@ def names_of(stream: Stream, role: str, name: str) -> tuple[str, str, str]:
     if role == 'decoder' and stream.source is not None:
         label += f'_from_{identifier(stream.source)}'
     full = label if machine is None else f'{label}_on_{identifier(machine)}'
-    return label, full, f'{local_topic(stream.topic, stream.source)}/{name}'
+    between = name if name in _OWN else f'fogros2/{name}'
+    return label, full, f'{local_topic(stream.topic, stream.source)}/{between}'
 
 
 def check_modules(package: str = 'image_transport_h264', what: str = 'images') -> None:
