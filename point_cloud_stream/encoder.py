@@ -54,7 +54,7 @@ class EncoderNode(LazyNode):
     # --- in the executor's thread
 
     def _matched(self) -> None:
-        self._clouds.want(self.subscribers(self._publisher) > 0)
+        self._clouds.want(self.subscribers(self._publisher))
 
     def _take(self, cloud: bytes) -> None:
         if self._control.arrived(time.monotonic()):
