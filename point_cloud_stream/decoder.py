@@ -29,7 +29,8 @@ class DecoderNode(LazyNode):
         topic = self.resolve_topic_name('points')
         stream = str(self.declare_parameter('stream', '').value) or f'{topic}/{FORMAT}'
         self._max_bytes = int(self.declare_parameter('max_bytes', MAX_BYTES, ParameterDescriptor(
-            description='larger clouds are not decoded', read_only=True)).value)
+            description='larger clouds are not decoded', read_only=True,
+            dynamic_typing=True)).value)
         self._announcement = Announcement(self, stream)
         put = self.start_worker('decode', self._decode).put
         self._taps = [Tap(self, CompressedImage, stream, IMAGE_QOS, put),

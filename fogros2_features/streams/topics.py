@@ -22,7 +22,7 @@ from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.host import modules
 from fogros2.model import NodeSpec
 from fogros2.ros_names import check_name, identifier, local_topic
-from fogros2_features.streams.transport import Stream
+from fogros2_features.streams.transport import ImageTransport, Stream
 
 #: Options of a Stream that are parameters of the decoder, not of the encoder.
 DECODER_PARAMETERS = ('encoding',)
@@ -36,18 +36,32 @@ def check(stream: Stream) -> None:
     """
     Check that a stream is possible.
 
-    :raises ConfigurationError: not a full topic name, both ends on one host, or an invalid
-        priority.
+    :raises ConfigurationError: not a full topic name, or both ends on one host.
     """
-    priority = stream.options.get('priority', 1)
-    if not isinstance(priority, (int, float)) or not 0.01 <= priority <= 100:
-        raise ConfigurationError(f'{stream.topic}: priority={priority!r} is invalid',
-                                 'give a number from 0.01 to 100; the default is 1')
     check_name(stream.topic)
     if stream.source == stream.target:
         where = stream.source or 'the robot'
         raise ConfigurationError(f'{stream.topic} would be streamed from {where} to itself',
                                  'source= names another machine; leave it out for the robot')
+
+
+def check_option(topic: str, name: str, value: Any, transport: ImageTransport) -> None:
+    """
+    Check the value of a stream's option, unless it is a substitution.
+
+    :raises ConfigurationError: the transport's nodes would refuse it.
+    """
+    if not isinstance(value, (bool, int, float, str)):
+        return
+    hint = ''
+    if name in transport.numbers:
+        least, largest = transport.numbers[name]
+        if isinstance(value, (bool, str)) or not least <= value <= largest:
+            hint = f'give a number from {least:.10g} to {largest:.10g}'
+    elif value not in transport.choices.get(name, (value,)):
+        hint = f"there are {', '.join(map(json.dumps, transport.choices[name]))}"
+    if hint:
+        raise ConfigurationError(f'{topic}: {name}={value!r} is invalid', hint)
 
 
 def camera_info_topic(topic: str) -> str:
