@@ -29,13 +29,14 @@ if TYPE_CHECKING:
 TARGET, LIMIT = '~/fogros2', 10e9
 #: Seconds for one attempt to copy a folder, and the number of attempts on broken connections.
 TIMEOUT, ATTEMPTS = 3600.0, 3
-#: Bytes that a folder may take on the disk beyond twice its size: each small file has a block.
+#: Bytes that a folder may take on the disk beyond its limit: each small file has a block.
 SLACK = 100e6
 #: Where a machine, by its name, keeps recordings until they come home, and the name of the folder.
 RECORDINGS, RECORDED = '~/fogros2-{}', 'recordings'
 _UNITS = {'': 1.0, 'k': 1e3, 'M': 1e6, 'G': 1e9, 'T': 1e12}
 # Print the bytes in the folder {0}, or in the one that it links to; nothing without the folder.
-_SIZE = '[ ! -d {0} ] || du -sb -- {0}/. | cut -f 1'
+# Hard links count each, because each becomes a file here.
+_SIZE = '[ ! -d {0} ] || du -sbl -- {0}/. | cut -f 1'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +140,8 @@ def _bring(running: RunningMachine, own: Wanted) -> str:
         done.append(f'{total / 1e6:.3g} MB to {home}')
     for folder, target in _targets(home, sizes).items():
         try:
-            _copy(running, folder, target, sizes[folder])
+            # the machine may send more than it said, but no more than the user allows
+            _copy(running, folder, target, int(max(2 * sizes[folder], own.limit) + SLACK))
         except FogError as error:
             failures.append(error)
             if isinstance(error, ConnectError):
@@ -160,13 +162,11 @@ def _make(folder: Path, *, new: bool = False) -> None:
                          'fetch_to= names another folder') from error
 
 
-def _copy(running: RunningMachine, folder: str, target: Path, size: int) -> None:
+def _copy(running: RunningMachine, folder: str, target: Path, limit: int) -> None:
     _make(target)
     for attempt in range(1, ATTEMPTS + 1):
         try:
-            # the machine may send more than it said
-            running.shell.fetch(folder, target, known=None, limit=int(2 * size + SLACK),
-                                timeout=TIMEOUT)
+            running.shell.fetch(folder, target, known=None, limit=limit, timeout=TIMEOUT)
             return
         except ConnectError:
             if attempt == ATTEMPTS:

@@ -6,14 +6,17 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Sequence
 import contextlib
+import functools
 import logging
 import os
 import shutil
 from typing import Any, Optional, TYPE_CHECKING, Union
+from weakref import WeakKeyDictionary
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
-from launch.actions import OpaqueFunction, RegisterEventHandler
+from launch.actions import EmitEvent, ExecuteLocal, OpaqueFunction, RegisterEventHandler
 from launch.event_handlers import OnProcessStart, OnShutdown
+from launch.events.process import ShutdownProcess
 import launch.logging
 
 from fogros2 import feature
@@ -36,6 +39,10 @@ if TYPE_CHECKING:
 _RESPAWN = 2.0
 #: The agent's folder, as a process on the machine sees it.
 _AGENT = '$FOGROS2_AGENT_DIRECTORY'
+#: Ids of bridges.
+_DEFAULT, _OTHER = 'foxglove-default-{}-{}', 'foxglove-{}-{}'
+#: Machine and port of the bridges in a launch, but for the default ones.
+_BRIDGES: WeakKeyDictionary[LaunchContext, set[tuple[str, int]]] = WeakKeyDictionary()
 
 
 class Foxglove(Action):
@@ -56,6 +63,8 @@ class Foxglove(Action):
         machine can run containers; '' for none.
     :raises ConfigurationError: an invalid port, pattern or network.
     """
+
+    _default = False
 
     def __init__(
         self, machine: SomeMachine, topics: Sequence[SomeSubstitutionsType] = ('*',),
@@ -86,10 +95,42 @@ class Foxglove(Action):
         if coordinator.on_robot(machine):
             return _on_robot(machine if isinstance(machine, str) else machine.name, port, topics)
         session = coordinator.session(machine)
-        bridge = AddedProcess(_bridge(session.spec.name, port, topics, _options(
-            coordinator, session, port, allow, values.resolve(context, self._image))))
-        send(bridge, session.spec.name)
-        return [bridge, _once_started(bridge, lambda: _report(session, port, allow))]
+        name, known = session.spec.name, _BRIDGES.setdefault(context, set())
+        replaced: list[LaunchDescriptionEntity] = []
+        if not self._default:
+            if (name, port) in known:
+                raise ConfigurationError(f"'{name}' has two bridges at port {port}",
+                                         'give one of them another port=')
+            known.add((name, port))
+        elif (name, port) in known:
+            return []
+        if port == addresses.PORT and not self._default:
+            replaced.append(EmitEvent(event=ShutdownProcess(
+                process_matcher=functools.partial(_is_default, name))))
+            allow = allow or _networks(session) or ()
+        bridge = AddedProcess(_bridge(name, port, topics, _options(
+            coordinator, session, port, allow, values.resolve(context, self._image)),
+            _DEFAULT if self._default else _OTHER))
+        send(bridge, name)
+        return [*replaced, bridge, _once_started(bridge, lambda: _report(session, port, allow))]
+
+
+class DefaultFoxglove(Foxglove):
+    """The bridge of ``launch_foxglove=True``; another one at its port takes its place."""
+
+    _default = True
+
+
+def _is_default(machine: str, process: ExecuteLocal) -> bool:
+    return isinstance(process, AddedProcess) and process.node == _DEFAULT.format(
+        machine, addresses.PORT)
+
+
+def _networks(session: Session) -> Optional[Sequence[str]]:
+    """Return the networks that the machine itself admits; None if it has no default bridge."""
+    networks: Optional[Sequence[str]] = feature.options(
+        'monitor', session.spec.features.get('monitor', {}))
+    return networks
 
 
 def _port(value: Union[int, str]) -> int:
@@ -112,7 +153,7 @@ def _options(
     spec = session.spec
     provider = coordinator.launch.provider(spec.provider)
     beside = provider.capabilities.application_port
-    if beside and feature.options('monitor', spec.features.get('monitor', {})) is not None:
+    if beside and _networks(session) is not None:
         options += ['--application', f'127.0.0.1:{beside}']
     with contextlib.suppress(Unsupported):
         provider.check_containers(spec)
@@ -135,9 +176,11 @@ def _on_robot(name: str, port: int, topics: Sequence[str]) -> list[LaunchDescrip
             folder, ignore_errors=True)))]
 
 
-def _bridge(where: str, port: int, topics: Sequence[str], options: Sequence[str]) -> NodeSpec:
+def _bridge(
+    where: str, port: int, topics: Sequence[str], options: Sequence[str], identity: str = '',
+) -> NodeSpec:
     return NodeSpec(
-        id=f'foxglove-{where}-{port}', name='foxglove_bridge', package='fogros2',
+        id=(identity or _OTHER).format(where, port), name='foxglove_bridge', package='fogros2',
         executable='bridge', respawn=True, respawn_delay=_RESPAWN,
         # with ROS arguments the bridge gets the renamed topics of streams, as the machine's nodes
         # do; otherwise its images would cross the VPN from the robot uncompressed

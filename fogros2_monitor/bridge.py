@@ -7,8 +7,9 @@ decoding them. A slow viewer loses its oldest messages, without effect on other 
 stream of ``image_transport_h264`` is sent as ``foxglove.CompressedVideo``.
 
 Parameters: ``address``, ``port`` (0: any free port; the log has the port), ``topics`` (patterns of
-the names of topics, services and parameters to show) and ``client_publish`` (whether viewers may
-publish, call services and set parameters).
+the names of topics, services and parameters to show), ``client_publish`` (whether viewers may
+publish, call services and set parameters) and ``gate`` (a file descriptor that ends with the gate,
+without which nobody reaches the bridge; then the bridge fails).
 
 Protocol: https://github.com/foxglove/ws-protocol, implemented by ``foxglove-sdk``.
 """
@@ -25,11 +26,13 @@ import foxglove
 from foxglove import MessageSchema, Parameter, Schema, Service, ServiceSchema
 from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, ServerListener
 from rcl_interfaces.msg import ParameterEvent
+import rclpy
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.publisher import Publisher
 
 from fogros2 import ros_types
+from fogros2.ros_names import absolute
 from fogros2.untrusted import clean
 from fogros2_monitor import assets
 from fogros2_monitor.definitions import definition
@@ -70,10 +73,14 @@ class BridgeNode(GraphNode, ServerListener):
                 [Capability.ClientPublish, Capability.Services] if self._publish else [])],
             supported_encodings=['cdr'], asset_handler=assets.read, context=self.viewers,
             message_backlog_size=BACKLOG)
+        self.failed = False
+        gate = int(self.declare_parameter('gate', -1).value)
         self._look()
         self.create_subscription(ParameterEvent, '/parameter_events', self._tell_change, 1000)
         self.create_timer(LOOK, self._look)
         self.get_logger().info(f'serving ws://{address}:{self._server.port}')
+        if gate >= 0:
+            threading.Thread(target=self._follow, args=(gate,), name='gate', daemon=True).start()
 
     def destroy_node(self) -> None:
         """Disconnect the viewers, then destroy the node."""
@@ -200,10 +207,20 @@ class BridgeNode(GraphNode, ServerListener):
         if encoding != 'cdr':
             self.refuse(f"{topic}: publishes '{encoding}', this bridge takes cdr")
             return
+        if not self._shows(absolute(topic, '/')):
+            self.refuse(f'{topic}: not among the topics of this bridge')
+            return
         try:
             self._published[key] = self.create_publisher(ros_types.message(kind), topic, 10)
         except (LookupError, NameValidationException) as error:
             self.refuse(f'{topic}: {error}')
+
+    def _follow(self, gate: int) -> None:
+        os.read(gate, 1)
+        if rclpy.ok():
+            self.failed = True
+            self.get_logger().error('the gate has ended, so nobody reaches this bridge')
+            rclpy.try_shutdown()
 
     def refuse(self, why: str) -> None:
         """Report to the log and to all viewers."""
@@ -216,7 +233,9 @@ def main() -> None:
     """Run the bridge until a signal."""
     os.environ['TOKIO_WORKER_THREADS'] = str(2 * WAITING)  # read by the SDK
     # an error may be another type of a topic with Fast DDS
-    ending.run(BridgeNode, BridgeNode.refuse)
+    bridge = ending.run(BridgeNode, BridgeNode.refuse)
+    if bridge is not None and bridge.failed:
+        raise SystemExit(1)
 
 
 if __name__ == '__main__':

@@ -58,5 +58,5 @@ class Monitor(Feature):
 
     def beside(self, spec: MachineSpec, own: Optional[Sequence[str]]) -> Sequence[Any]:
         """Return the action that starts the bridge."""
-        from fogros2_monitor.action import Foxglove
-        return [] if own is None else [Foxglove(spec.name, monitor_allow=own)]
+        from fogros2_monitor.action import DefaultFoxglove
+        return [] if own is None else [DefaultFoxglove(spec.name, monitor_allow=own)]

@@ -251,24 +251,38 @@ def endpoint(text: str) -> tuple[str, int]:
 
 
 def _listen(address: tuple[str, int]) -> socket.socket:
+    """
+    Listen at an address; '' is every address of the machine.
+
+    :raises SystemExit: another program has the port, or the machine lacks the address.
+    """
     host, port = address
-    if host == '':  # all addresses of the machine
-        both = socket.has_dualstack_ipv6()
-        listener = socket.create_server(
-            ('', port), family=socket.AF_INET6 if both else socket.AF_INET, dualstack_ipv6=both)
-    else:
-        listener = socket.create_server(
-            address, family=socket.AF_INET6 if ':' in host else socket.AF_INET)
+    try:
+        listener = _server(host, port)
+    except OSError as error:
+        raise SystemExit(
+            f'gate: nobody can listen at {host}:{port}: {os.strerror(error.errno or 0)}\n'
+            'Foxglove(port=) chooses another port') from error
     listener.setblocking(False)
     print('listening on {}:{}'.format(*listener.getsockname()), flush=True)
     return listener
+
+
+def _server(host: str, port: int) -> socket.socket:
+    if host == '':  # all addresses of the machine
+        both = socket.has_dualstack_ipv6()
+        return socket.create_server(
+            ('', port), family=socket.AF_INET6 if both else socket.AF_INET, dualstack_ipv6=both)
+    return socket.create_server(
+        (host, port), family=socket.AF_INET6 if ':' in host else socket.AF_INET)
 
 
 async def _run(options: argparse.Namespace) -> None:
     ended = asyncio.ensure_future(asyncio.Event().wait())
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, ended.cancel)
+        # the bridge, which gets the signal too, fails if its gate ends first
+        loop.add_signal_handler(number, int if options.until_eof else ended.cancel)
     if options.until_eof:
         loop.add_reader(0, ended.cancel)  # the parent never writes: readable means closed
     gate = Gate(options.to, _token(options.token_file), options.application, options.name)

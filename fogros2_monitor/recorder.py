@@ -8,7 +8,7 @@ The format: https://mcap.dev, written by ``foxglove-sdk``.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import os
 from pathlib import Path
 import shutil
@@ -25,6 +25,8 @@ from image_transport_h264 import ending
 
 #: Bytes of the disk that stay free.
 FREE = 1_000_000_000
+#: Seconds until the node reports topics that are not there.
+PATIENCE = 60.0
 
 
 class DiskFull(Exception):
@@ -42,17 +44,28 @@ class RecorderNode(GraphNode):
     def __init__(self, path: Path, names: Sequence[str]) -> None:
         super().__init__('fogros2_recorder')
         self._path = path
-        self._patterns = names
+        self._names = names
         self._writer = foxglove.open_mcap(
             path, context=self.viewers, writer_options=MCAPWriteOptions(profile='ros2'))
         self._look()
         self.create_timer(LOOK, self._tick)
+        self._missing = self.create_timer(PATIENCE, self._report_missing)
         self.get_logger().info(f'recording {", ".join(names)} to {path}')
 
     def destroy_node(self) -> None:
         """Complete the file, then destroy the node."""
         self._writer.close()
         super().destroy_node()
+
+    def _chosen(self, everything: Iterable[str]) -> dict[str, str]:
+        # of a denied topic, or a stream between machines, the graph has only the new name
+        names = {name: self.resolve_topic_name(name) for name in self._names}
+        return {name: full for name, full in names.items() if full in everything}
+
+    def _report_missing(self) -> None:
+        self._missing.cancel()
+        if missing := [name for name in self._names if name not in self._topics]:
+            self.get_logger().warning(f'no topic of the names {", ".join(missing)} yet')
 
     def _added(self, topic: Topic) -> Topic:
         topic.look(0)

@@ -11,7 +11,8 @@ Start the bridge on a machine, with its gate and the web application.
 
 The bridge (:mod:`~fogros2_monitor.bridge`) needs no token, so it listens on a random address and
 port of 127.0.0.0/8 that no web page can guess. Viewers connect to the gate's ports. Gate and
-application end when this process ends, even if it is killed.
+application end when this process ends, even if it is killed. This process ends when its gate ends,
+so that the launch starts both again.
 """
 
 from __future__ import annotations
@@ -85,6 +86,7 @@ def main() -> None:
         gate += public_port(ours.public, folder, ours.name)
     address, port = hidden_place()
     end, kept = os.pipe()
+    ended, alive = os.pipe()  # the gate keeps the second end open, and the bridge reads
     os.set_inheritable(kept, True)  # the bridge keeps this end open; at its end the others exit
     if ours.image and ours.vpn is not None:
         inside = application_port(ours.vpn)
@@ -95,11 +97,13 @@ def main() -> None:
              '--name', ours.name], stdin=end)
     subprocess.Popen(
         [sys.executable, '-m', 'fogros2_monitor.gate', '--to', f'{address}:{port}',
-         '--until-eof', *gate], stdin=end)
+         '--until-eof', *gate], stdin=end, pass_fds=[alive])
     os.close(end)
+    os.close(alive)
+    os.set_inheritable(ended, True)
     os.execv(sys.executable, [
         sys.executable, '-m', 'fogros2_monitor.bridge', '--ros-args', *words[at + 1:],
-        '-p', f'address:={address}', '-p', f'port:={port}',
+        '-p', f'address:={address}', '-p', f'port:={port}', '-p', f'gate:={ended}',
         '-p', f'topics:={json.dumps(ours.topic or ["*"])}'])
 
 

@@ -7,7 +7,7 @@ An H.264 stream of ``image_transport_h264`` is passed on as ``foxglove.Compresse
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import fnmatch
 from typing import Any, Optional
 
@@ -115,7 +115,7 @@ class Topic:
 
 class GraphNode(Node):
     """
-    A node that has the topics of the graph whose names match patterns.
+    A node that has topics of the graph, by default those whose names match patterns.
 
     :ivar viewers: where the topics' messages go.
     """
@@ -130,12 +130,13 @@ class GraphNode(Node):
     def _look(self) -> None:
         """Add new topics and remove topics that are gone."""
         everything = ros_types.topics(self)
-        kinds = {name: kind for name, kind in everything.items() if self._shows(name)}
+        names = self._chosen(everything)
+        kinds = {name: everything[full] for name, full in names.items()}
         for name in self._topics.keys() - kinds.keys():
             self._topics.pop(name).close()
         for name, kind in kinds.items():
             topic = self._topics.get(name)
-            video = kind == _COMPRESSED and f'{name}{_KEYFRAME}' in everything
+            video = kind == _COMPRESSED and f'{names[name]}{_KEYFRAME}' in everything
             if topic is not None and (topic.kind, topic.video) == (kind, video):
                 topic.refit()
                 continue
@@ -148,6 +149,10 @@ class GraphNode(Node):
             except LookupError as error:
                 self._unknown.add(kind)
                 self.get_logger().warning(f'{name} is not shown: {error}')
+
+    def _chosen(self, everything: Iterable[str]) -> dict[str, str]:
+        """Return the names of topics to show, with the names that the graph has for them."""
+        return {name: name for name in everything if self._shows(name)}
 
     def _shows(self, name: str) -> bool:
         return '/_' not in name and any(  # hidden by ROS 2's naming convention

@@ -99,12 +99,19 @@ class Leaving(Way):
         super().__init__(node, source, target)
         #: What came from the other end, and is heard here.
         self.echoes = Echoes()
-        #: Contents that the other direction's publisher gives to later subscribers.
+        #: Hashes of the messages that the other direction's publisher gives to later subscribers.
         self.latched: list[int] = []
         #: What the next message has: transforms by child frame, or one serialized message.
         self._newest: dict[str, Any] = {}
         self._timer = node.create_timer(
             period, self._send, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False)
+
+    def look(self) -> None:
+        """Follow the publishers, and expect the other direction's latched messages anew."""
+        before = self.subscription
+        super().look()
+        if self.form is not None and self.subscription is not before:
+            self.echoes.restart(time.monotonic(), self.latched if self.form.kept else ())
 
     def unsubscribe(self) -> None:
         """End the subscription, and forget its messages."""
@@ -113,7 +120,7 @@ class Leaving(Way):
 
     def heard(self, data: bytes) -> None:
         """Keep a message for the end of the period; send it at once if none was sent lately."""
-        if self.echoes.heard(time.monotonic(), data) or hash(data) in self.latched:
+        if self.echoes.heard(time.monotonic(), data):
             return
         if self.form is not None and self.form.kind == TRANSFORMS:
             with contextlib.suppress(RuntimeError):  # the bytes are no transforms
@@ -146,6 +153,11 @@ class Coming(Way):
     def __init__(self, node: Node, source: str, target: str, leaving: Leaving) -> None:
         super().__init__(node, source, target)
         self._leaving = leaving
+
+    def unpublish(self) -> None:
+        """End the publisher, and with it the latched messages."""
+        super().unpublish()
+        self._leaving.latched.clear()
 
     def heard(self, data: bytes) -> None:
         """Publish a message, which the other direction then does not send back."""

@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 import contextlib
 import fcntl
+import itertools
 import json
 import os
 from pathlib import Path
@@ -61,7 +62,7 @@ class Shared:
         #: What later machines get.
         self.kept: deque[tuple[bytes, bytes]] = deque(maxlen=0)
         self.echoes = Echoes()
-        #: Contents that the publishers for other machines still give to later subscribers.
+        #: Hashes of the messages that publishers for other machines give to later subscribers.
         self.theirs: dict[Path, deque[int]] = {}
 
 
@@ -224,19 +225,21 @@ class Relay(Node):
             self.destroy_subscription(shared.subscription)
         with self._lock:
             shared.form, shared.kept = form, deque(shared.kept, form.kept if form else 0)
-        try:
-            shared.subscription = form and self.create_subscription(
-                self._imported(form.kind), name,
-                lambda data: self._heard(name, shared, form, data), profile(form, DEPTH), raw=True)
-        except RuntimeError as error:  # with Fast DDS, a process has one type of a topic
-            shared.subscription = None
-            self._complain(f'{name} is {shared.kind} here and another type on another robot, so '
-                           f'it is not shared: {error}')
+            latched = itertools.chain(*shared.theirs.values()) if form and form.kept else ()
+            shared.echoes.restart(time.monotonic(), latched)
+            try:
+                shared.subscription = form and self.create_subscription(
+                    self._imported(form.kind), name,
+                    lambda data: self._heard(name, shared, form, data), profile(form, DEPTH),
+                    raw=True)
+            except RuntimeError as error:  # with Fast DDS, a process has one type of a topic
+                shared.subscription = None
+                self._complain(f'{name} is {shared.kind} here and another type on another robot, '
+                               f'so it is not shared: {error}')
 
     def _heard(self, name: str, shared: Shared, form: Form, data: bytes) -> None:
         with self._lock:
-            if shared.echoes.heard(time.monotonic(), data) or any(
-                    hash(data) in kept for kept in shared.theirs.values() if kept):
+            if shared.echoes.heard(time.monotonic(), data):
                 return
             if len(data) > LARGEST:
                 return self._complain(f'{name}: {len(data)} bytes are too large to be shared')

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 import re
 from typing import NamedTuple
 
@@ -62,6 +63,15 @@ class Echoes:
     def add(self, now: float, data: bytes) -> None:
         """Record a message that is about to be published."""
         self._published.append((now, hash(data)))
+
+    def restart(self, now: float, latched: Iterable[int]) -> None:
+        """
+        Forget all messages but latched ones, which a new subscription hears once more.
+
+        :param latched: hashes of their contents.
+        """
+        self._published.clear()
+        self._published.extend((now, content) for content in latched)
 
     def heard(self, now: float, data: bytes) -> bool:
         """Return whether a message that was heard is one that the relay has published."""

@@ -8,8 +8,8 @@ import dataclasses
 import math
 from typing import Optional
 
-from image_transport_h264.codec import Settings
 from image_transport_h264.rate import Governor, LEAST_BITRATE, LEAST_BITS, MOST_RECEIVERS
+from image_transport_h264.settings import MAX_RATE, Settings
 
 #: Seconds after which a silent receiver no longer limits the others.
 SILENT = 3.0
@@ -32,10 +32,10 @@ class Control:
     """
 
     def __init__(self, asked: Settings, max_rate: float = 0.0, adapt: bool = True) -> None:
-        self.asked, self.max_rate, self.adapt = asked, max_rate, adapt
         #: The stream's share of its links in bits per second.
         self.share = math.inf
         self._governors: dict[int, Governor] = {}
+        self.ask(asked, max_rate, adapt)
         self._sent: deque[tuple[float, int]] = deque()
         self._interval = 1 / 30
         self._arrived: Optional[float] = None
@@ -52,8 +52,12 @@ class Control:
         return max((governor.latency for governor in self._governors.values()), default=0.0)
 
     def ask(self, asked: Settings, max_rate: float, adapt: bool) -> None:
-        """Set the user's settings from now on."""
-        if not 0 <= max_rate <= 1000:
+        """
+        Set the user's settings from now on.
+
+        :raises ValueError: ``max_rate`` is too large or negative.
+        """
+        if not MAX_RATE[0] <= max_rate <= MAX_RATE[1]:
             raise ValueError(f'max_rate {max_rate} is not between 0 and 1000')
         self.asked, self.max_rate, self.adapt = asked, max_rate, adapt
         for governor in self._governors.values():
@@ -104,7 +108,8 @@ class Control:
         wanted = self.asked.bitrate
         if self.adapt:
             wanted = min([wanted, *(g.bitrate for g in self._governors.values())])
-        wanted = int(max(LEAST_BITRATE, min(wanted, self.share)))
+        least = min(LEAST_BITRATE, self.asked.bitrate)
+        wanted = int(max(least, min(wanted, self.share)))
         same = dataclasses.replace(
             self.asked, bitrate=current.bitrate, rate=current.rate) == current
         if same and wanted >= current.bitrate:

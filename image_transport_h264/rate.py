@@ -166,7 +166,10 @@ class Governor:
         if rate:
             self._rate = rate
         lower = YIELD * min(self.bitrate, rate or self.bitrate)
-        self.bitrate = max(LEAST_BITRATE, int(lower))
+        self._lower(int(lower))
+
+    def _lower(self, bitrate: int) -> None:
+        self.bitrate = max(min(LEAST_BITRATE, self.ceiling), bitrate)
 
     def _arrival_rate(self, now: float) -> float:
         if len(self._arrivals) < 2:
@@ -180,6 +183,6 @@ class Governor:
         """Forget lost packets; halve the bitrate if all packets were lost."""
         if self._sent and now - self._sent[0].when > LOST:
             if self._sent[-1].when < now - LOST / 2 or (self.heard or 0) < now - LOST:
-                self.bitrate = max(LEAST_BITRATE, self.bitrate // 2)
+                self._lower(self.bitrate // 2)
             self._sent.clear()
             self._trips.clear()

@@ -20,7 +20,7 @@ from std_msgs.msg import Empty, UInt8MultiArray, UInt64MultiArray
 from image_transport_h264 import message, stills
 from image_transport_h264.budget import Budget
 from image_transport_h264.cdr import CdrError
-from image_transport_h264.codec import CodecError, Encoder, Settings
+from image_transport_h264.codec import CodecError, Encoder
 from image_transport_h264.control import Control
 from image_transport_h264.lazy import (
     FEEDBACK_QOS,
@@ -33,6 +33,7 @@ from image_transport_h264.message import FEEDBACK, KEY_REQUEST, PIECES
 from image_transport_h264.pacing import MOST, Pace, Sent
 from image_transport_h264.rate import LEAST_BITS
 from image_transport_h264.repair import pieces
+from image_transport_h264.settings import Settings
 from image_transport_h264.slices import SliceSender
 
 CODECS = ('h264', 'jpeg', 'png', 'raw')
@@ -169,10 +170,10 @@ class VideoSender(Sender):
         self._node = node
         self._lock = threading.Lock()
         values = {name: node.declare_parameter(
-            name, default, ParameterDescriptor(description=what)).value
+            name, default, ParameterDescriptor(description=what, dynamic_typing=True)).value
             for name, default, what in PARAMETERS}
         self._control = Control(
-            _settings(values), float(values['max_rate']), bool(values['adapt']))
+            _settings(values), float(values['max_rate']), _flag(values, 'adapt'))
         node.add_on_set_parameters_callback(self._set)
         self._encoder = Encoder(self._control.asked)
         self._key_wanted = False
@@ -229,8 +230,8 @@ class VideoSender(Sender):
             values = {**dataclasses.asdict(control.asked), 'max_rate': control.max_rate,
                       'adapt': control.adapt, **changed}
             try:
-                control.ask(_settings(values), float(values['max_rate']), bool(values['adapt']))
-            except (TypeError, ValueError) as error:
+                control.ask(_settings(values), float(values['max_rate']), _flag(values, 'adapt'))
+            except (OverflowError, TypeError, ValueError) as error:
                 return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
@@ -293,4 +294,11 @@ def _settings(values: dict[str, Any]) -> Settings:
     return Settings(
         bitrate=int(values['bitrate']), quality=float(values['quality']),
         preset=str(values['preset']), gop=int(values['gop']), encoder=str(values['encoder']),
-        lossless=bool(values['lossless']))
+        lossless=_flag(values, 'lossless'))
+
+
+def _flag(values: dict[str, Any], name: str) -> bool:
+    value = values[name]
+    if value not in (True, False):
+        raise TypeError(f'{name} {value!r} is neither true nor false')
+    return bool(value)

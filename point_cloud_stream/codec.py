@@ -56,15 +56,17 @@ class Coded:
 
 def encode(
     layout: Layout, data: Any, resolution: float, drop: frozenset[str] = frozenset(),
+    max_bytes: int = MAX_BYTES,
 ) -> Coded:
     """
     Encode a cloud.
 
     :param resolution: twice the largest error of a coordinate in metres; 0 for none.
     :param drop: names of fields to leave out; their bytes become zero.
-    :raises CloudError: the cloud contradicts itself, or has no x, y, z as float32.
+    :raises CloudError: the cloud contradicts itself, has no x, y, z as float32, or has more than
+        ``max_bytes``.
     """
-    layout.check()
+    layout.check(max_bytes)
     points, padding = cloud.rows(layout, data)
     dropped_fields = [each for each in layout.fields if each.name in drop - {*COORDINATES}]
     if dropped_fields:

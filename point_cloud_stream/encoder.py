@@ -21,12 +21,12 @@ from image_transport_h264.lazy import IMAGE_QOS, LazyNode, run, STREAM_QOS, Tap
 from image_transport_h264.message import compressed
 from image_transport_h264.slices import SliceSender
 from point_cloud_stream import message
-from point_cloud_stream.cloud import CloudError
+from point_cloud_stream.cloud import CloudError, MAX_BYTES
 from point_cloud_stream.codec import Coded, encode, FORMAT
 from point_cloud_stream.control import Control
 
 PARAMETERS: dict[str, Any] = {'stream': '', 'topic': '', 'resolution': 0.001, 'lossless': False,
-                              'max_rate': 0.0, 'drop_fields': ''}
+                              'max_rate': 0.0, 'drop_fields': '', 'max_bytes': MAX_BYTES}
 
 
 class EncoderNode(LazyNode):
@@ -43,6 +43,7 @@ class EncoderNode(LazyNode):
         self._drop = frozenset(filter(None, str(values['drop_fields']).split(',')))
         self._control = Control(0.0 if values['lossless'] else float(values['resolution']),
                                 float(values['max_rate']))
+        self._max_bytes = int(values['max_bytes'])
         self._worker = self.start_worker('encode', self._send)
         self._clouds = Tap(self, PointCloud2, topic, IMAGE_QOS, self._take)
         self._publisher = self.offer(CompressedImage, stream, STREAM_QOS, self._matched)
@@ -54,7 +55,7 @@ class EncoderNode(LazyNode):
     # --- in the executor's thread
 
     def _matched(self) -> None:
-        self._clouds.want(self.subscribers(self._publisher) > 0)
+        self._clouds.want(self.subscribers(self._publisher))
 
     def _take(self, cloud: bytes) -> None:
         if self._control.arrived(time.monotonic()):
@@ -66,7 +67,8 @@ class EncoderNode(LazyNode):
         """Encode and publish a cloud, slice by slice as share and link take them."""
         try:
             header, layout, points = message.cloud(cloud)
-            coded = encode(layout, points, self._control.resolution, self._drop)
+            coded = encode(
+                layout, points, self._control.resolution, self._drop, self._max_bytes)
         except (CdrError, CloudError) as error:
             self.complain(str(error), f'cloud of {self._named} not sent: {error}')
             return

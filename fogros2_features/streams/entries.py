@@ -12,7 +12,7 @@ from fogros2.describe import values
 from fogros2.errors import ConfigurationError, did_you_mean
 from fogros2.model import NodeSpec
 from fogros2.ros_names import local_topic
-from fogros2_features.streams.topics import camera_info_topic, carries_info, check
+from fogros2_features.streams.topics import camera_info_topic, carries_info, check, check_option
 from fogros2_features.streams.transport import GROUP, ImageTransport, Stream
 
 Direction = Literal['to_cloud', 'to_robot']
@@ -89,7 +89,7 @@ def stream(entry: Entry, machine: str) -> Stream:
 
     :param entry: with its source, if any, as a name.
     :raises ConfigurationError: no valid entry; an unknown transport (the hint lists all),
-        direction or parameter; a topic that cannot be streamed.
+        direction or parameter, or its value; a topic that cannot be streamed.
     :raises PrerequisiteError: the robot lacks what its end of the stream needs.
     """
     entry = topic_of(entry)
@@ -108,14 +108,15 @@ def stream(entry: Entry, machine: str) -> Stream:
     made = Stream(entry.topic, entry.transport, source=entry.source if to_cloud else machine,
                   target=machine if to_cloud else None, options=dict(entry.parameters))
     check(made)
-    options = _transport(made).options
-    for name in entry.parameters:
-        if options is not None and name not in options:
+    transport = _transport(made)
+    for name, value in entry.parameters.items():
+        if transport.options is not None and name not in transport.options:
             raise ConfigurationError(
                 f"{entry.topic}: streams by {entry.transport} have no '{name}'",
-                did_you_mean(name, sorted(options)))
+                did_you_mean(name, sorted(transport.options)))
+        check_option(entry.topic, name, value, transport)
     if None in (made.source, made.target):
-        _transport(made).check()
+        transport.check()
     return made
 
 

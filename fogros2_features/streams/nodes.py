@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar
 
-from fogros2.errors import ConfigurationError
 from fogros2.model import NodeSpec
 from fogros2_features.streams.topics import (
     carries_info,
@@ -20,6 +19,11 @@ from fogros2_features.streams.topics import (
     OPTIONS,
 )
 from fogros2_features.streams.transport import ImageTransport, Stream
+from image_transport_h264.settings import BITRATE, ENCODERS, MAX_RATE, PRESETS, QUALITY
+
+PRIORITY, BOOLEAN = (0.01, 100), (True, False)
+#: Bytes of the largest message that ``image_transport_h264`` sends in slices.
+LARGEST = 1 << 28
 
 
 class Raw(ImageTransport):
@@ -27,6 +31,8 @@ class Raw(ImageTransport):
 
     camera_info = True
     options = OPTIONS
+    numbers = {'priority': PRIORITY}
+    choices = {'camera_info': BOOLEAN}
     #: The value of the nodes' parameter ``codec``, and the last part of the stream's topic.
     codec: ClassVar[str] = 'raw'
 
@@ -55,24 +61,29 @@ class H264(Raw):
     codec = 'h264'
     options = OPTIONS | {'adapt', 'bitrate', 'encoder', 'gop', 'lossless', 'max_rate', 'preset',
                          'quality'}
+    numbers = {'priority': PRIORITY, 'bitrate': BITRATE, 'gop': (1, 2 ** 31 - 1),
+               'max_rate': MAX_RATE, 'quality': QUALITY}
+    choices = {'camera_info': BOOLEAN, 'adapt': BOOLEAN, 'encoder': ENCODERS,
+               'lossless': BOOLEAN, 'preset': PRESETS}
 
 
 class Compressed(Raw):
     """
-    Send ``/camera`` as ``/camera/compressed``, like ROS's own transport of that name.
+    Send ``/camera`` as ``/camera/fogros2/compressed``, in the format of ROS's own transport.
 
     The options are ``format`` (jpeg or png), and ``jpeg_quality`` (default 80).
     """
 
     codec = 'compressed'
     options = OPTIONS | {'format', 'jpeg_quality'}
+    numbers = {'priority': PRIORITY, 'jpeg_quality': (1, 100)}
+    choices = {'camera_info': BOOLEAN, 'format': ('jpeg', 'png')}
 
     def _node(self, stream: Stream, role: str, codec: str = '') -> NodeSpec:
         options = dict(stream.options)
         codec = options.pop('format', 'jpeg')
-        if codec not in ('jpeg', 'png'):
-            raise ConfigurationError(f"format '{codec}' of {stream.topic} is unknown",
-                                     'there are jpeg and png')
+        if 'jpeg_quality' in options:
+            options['jpeg_quality'] = int(options['jpeg_quality'])
         return super()._node(dataclasses.replace(stream, options=options), role, codec)
 
 
@@ -82,6 +93,9 @@ class PointCloud(Raw):
     camera_info = False
     options = frozenset(
         'drop_fields lossless max_bytes max_rate priority resolution'.split())
+    numbers = {'priority': PRIORITY, 'max_bytes': (1, LARGEST), 'max_rate': MAX_RATE,
+               'resolution': (0, 1000)}
+    choices = {'lossless': BOOLEAN}
 
     def check(self) -> None:
         """Check for NumPy and zstandard."""
@@ -90,4 +104,5 @@ class PointCloud(Raw):
     def _node(self, stream: Stream, role: str, codec: str = '') -> NodeSpec:
         return node(
             stream, role=role, name='pointcloud', package='point_cloud_stream', topic='points',
-            options=('max_bytes',), parameters={})
+            options=('max_bytes',), parameters={
+                name: value for name, value in stream.options.items() if name == 'max_bytes'})

@@ -6,7 +6,9 @@ On the robot a topic keeps its name, so that drivers and viewers outside the lau
 On a machine, image and camera info get a name that contains the machine (``/camera`` becomes
 ``/fogros2/planner/camera``). With one name on both sides, DDS would connect them, and raw images
 would cross the VPN. The stream's name extends that of its source (``/camera/h264``,
-``/fogros2/planner/annotated/h264``), so several hosts may publish the same topic.
+``/fogros2/planner/annotated/h264``), so several hosts may publish the same topic. Names of plugins
+of ``image_transport`` get an addition (``/camera/fogros2/compressed``): a driver may publish
+``/camera/compressed``, and both would cross.
 """
 
 from __future__ import annotations
@@ -20,30 +22,46 @@ from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.host import modules
 from fogros2.model import NodeSpec
 from fogros2.ros_names import check_name, identifier, local_topic
-from fogros2_features.streams.transport import Stream
+from fogros2_features.streams.transport import ImageTransport, Stream
 
 #: Options of a Stream that are parameters of the decoder, not of the encoder.
 DECODER_PARAMETERS = ('encoding',)
 #: Options of all streams that use this project's nodes.
 OPTIONS = frozenset({'camera_info', 'priority', *DECODER_PARAMETERS})
+#: Last parts of streams' names that no plugin uses.
+_OWN = ('h264', 'pointcloud', 'raw')
 
 
 def check(stream: Stream) -> None:
     """
     Check that a stream is possible.
 
-    :raises ConfigurationError: not a full topic name, both ends on one host, or an invalid
-        priority.
+    :raises ConfigurationError: not a full topic name, or both ends on one host.
     """
-    priority = stream.options.get('priority', 1)
-    if not isinstance(priority, (int, float)) or not 0.01 <= priority <= 100:
-        raise ConfigurationError(f'{stream.topic}: priority={priority!r} is invalid',
-                                 'give a number from 0.01 to 100; the default is 1')
     check_name(stream.topic)
     if stream.source == stream.target:
         where = stream.source or 'the robot'
         raise ConfigurationError(f'{stream.topic} would be streamed from {where} to itself',
                                  'source= names another machine; leave it out for the robot')
+
+
+def check_option(topic: str, name: str, value: Any, transport: ImageTransport) -> None:
+    """
+    Check the value of a stream's option, unless it is a substitution.
+
+    :raises ConfigurationError: the transport's nodes would refuse it.
+    """
+    if not isinstance(value, (bool, int, float, str)):
+        return
+    hint = ''
+    if name in transport.numbers:
+        least, largest = transport.numbers[name]
+        if isinstance(value, (bool, str)) or not least <= value <= largest:
+            hint = f'give a number from {least:.10g} to {largest:.10g}'
+    elif value not in transport.choices.get(name, (value,)):
+        hint = f"there are {', '.join(map(json.dumps, transport.choices[name]))}"
+    if hint:
+        raise ConfigurationError(f'{topic}: {name}={value!r} is invalid', hint)
 
 
 def camera_info_topic(topic: str) -> str:
@@ -74,7 +92,8 @@ def names_of(stream: Stream, role: str, name: str) -> tuple[str, str, str]:
     if role == 'decoder' and stream.source is not None:
         label += f'_from_{identifier(stream.source)}'
     full = label if machine is None else f'{label}_on_{identifier(machine)}'
-    return label, full, f'{local_topic(stream.topic, stream.source)}/{name}'
+    between = name if name in _OWN else f'fogros2/{name}'
+    return label, full, f'{local_topic(stream.topic, stream.source)}/{between}'
 
 
 def check_modules(package: str = 'image_transport_h264', what: str = 'images') -> None:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import dataclasses
 from typing import Any, ClassVar, Optional
 
@@ -43,6 +43,9 @@ class ImageTransport(abc.ABC):
     camera_info: ClassVar[bool] = False
     #: The valid options of a stream, None for any.
     options: ClassVar[Optional[frozenset[str]]] = None
+    #: The least and the largest value of options that are numbers, and all values of others.
+    numbers: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    choices: ClassVar[Mapping[str, Sequence[object]]] = {}
 
     def check(self) -> None:
         """

@@ -533,6 +533,26 @@ def test_bytes_that_are_no_request_are_refused(robot, bench):
     assert robot.enabled == []
 
 
+def test_viewer_publishes_only_topics_of_the_bridge(bench):
+    bench.run('-m', 'fogros2_monitor.bridge', '--ros-args', '-p', 'port:=0',
+              '-p', 'topics:=["/words"]', '-r', '__node:=looker')
+    viewer = bench.viewer(bench.serving())
+    for topic in ('/cmd_vel', 'cmd_vel', '/words/deep'):
+        viewer.wish(publish=topic, schemaName='std_msgs/msg/String', definition='string data',
+                    message={'data': 'go'})
+        assert 'not among the topics' in viewer.until('status')['status']
+        assert not bench.node.count_publishers(topic)
+    heard: list[Any] = []
+    bench.node.create_subscription(String, '/words', heard.append, 10)
+
+    def publish() -> bool:
+        viewer.wish(publish='words', schemaName='std_msgs/msg/String', definition='string data',
+                    message={'data': 'said'})
+        return bool(heard)
+
+    bench.until(publish, 'what a viewer published')
+
+
 def test_bridge_that_takes_no_messages_changes_nothing(robot, bench):
     bench.run('-m', 'fogros2_monitor.bridge', '--ros-args', '-p', 'port:=0',
               '-p', 'client_publish:=false', '-p', 'topics:=["/bench.*", "/words"]',
@@ -618,6 +638,19 @@ def test_recording_and_viewer_have_streams_as_they_came(bench, tmp_path):
         with contextlib.suppress(av.error.InvalidDataError):  # one before the picture
             frames += decoder.decode(av.Packet(fields[3]))
     assert (frames[0].width, frames[0].height) == (64, 48)
+
+
+def test_renamed_topic_is_recorded_and_missing_one_is_named(bench, tmp_path):
+    bench.node.create_publisher(String, '/fogros2/m/plan', LATCHED).publish(String(data='new'))
+    recorder = bench.run('-c', RECORD.format('recorder.PATIENCE = 1.0; '), str(tmp_path), '/plan',
+                         '/none', '--ros-args', '-r', '/plan:=/fogros2/m/plan')
+    bench.until(lambda: re.search('no topic of the names .*/none yet', ''.join(bench.lines)),
+                'the warning')
+    bench.listeners('/fogros2/m/plan', 1)
+    recorder.send_signal(signal.SIGINT)
+    assert recorder.wait(60) == 0
+    bench.processes.remove(recorder)
+    assert recorded(tmp_path) == {'/plan': ['new']}
 
 
 def test_recording_ends_before_the_disk_is_full(bench, tmp_path):

@@ -88,6 +88,23 @@ def test_robot_that_comes_later_gets_the_map(robot: Callable[[str], Robot]) -> N
     assert two.relay is not None and two.relay.poll() is None, two.lines
 
 
+def test_latched_value_of_another_robot_may_be_repeated(
+        robot: Callable[[str], Robot]) -> None:
+    """Otherwise robots would disagree for ever, such as on an emergency stop."""
+    one, two = robot('one'), robot('two')
+    for each in (one, two):
+        each.start('/stop')
+    heard, seen = (each.heard(Int32, '/stop', LATCHED) for each in (one, two))
+    one.publisher(Int32, '/stop', LATCHED).publish(Int32(data=0))
+    wait_until(lambda: [message.data for message in seen] == [0], timeout=60, what='the value')
+    publisher = two.publisher(Int32, '/stop', LATCHED)
+    for count, value in enumerate((1, 0, 1, 0)):
+        publisher.publish(Int32(data=value))
+        wait_until(lambda count=count: len(heard) == count + 2, timeout=60, what='the next value')
+    assert [message.data for message in heard] == [0, 1, 0, 1, 0]
+    assert [message.data for message in seen] == [0, 1, 0, 1, 0]
+
+
 def test_qos_and_type_of_publishers_are_kept(robot: Callable[[str], Robot]) -> None:
     one, two = robot('one'), robot('two')
     topics = '/fast', '/count', '/late'

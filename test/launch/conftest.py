@@ -81,6 +81,13 @@ class FakeMachine:
     def end(self, reason):
         self.launch.note('end', self.spec.name, reason)
 
+    def note(self, key, value):
+        self.launch.note('note', key, value)
+
+    def open_port(self, port, allowed):
+        self.launch.note('open', port, *allowed)
+        return '192.0.2.7', port
+
     def signal(self, node, name):
         self.signals.append((node, name))
 
@@ -158,6 +165,7 @@ class FakeLaunch:
     def provider(self, name):
         return SimpleNamespace(has_own_packages=lambda spec: 'image' in spec.options,
                                shared_folders=lambda spec: ['/shared'],
+                               check_containers=lambda spec: None,
                                capabilities=Capabilities())
 
     def expect(self, names):

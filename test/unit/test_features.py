@@ -266,6 +266,25 @@ def test_too_large_folders_do_not_come_home(home: Path) -> None:
     assert not (home / 'fogros2').exists()
 
 
+def test_many_small_files_come_home(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each takes a block of the disk, so together they take more than twice their size."""
+    monkeypatch.setattr(results, 'SLACK', 0)
+    (home / 'bags').mkdir()
+    for number in range(100):
+        (home / f'bags/{number}').write_text('1')
+    assert len(brought(FakeRunning(), fetch=['~/bags'], fetch_limit='1MB')) == 100
+
+
+def test_hard_links_count_as_the_files_that_they_become(home: Path) -> None:
+    (home / 'bags').mkdir()
+    (home / 'bags/1').write_text(100_000 * '1')
+    for number in range(2, 5):
+        (home / f'bags/{number}').hardlink_to(home / 'bags/1')
+    with pytest.raises(ShellError, match=r'~/bags of .a. have 0.0004\d* GB, more than'):
+        brought(FakeRunning(), fetch=['~/bags'], fetch_limit='300kB')
+    assert len(brought(FakeRunning(), fetch=['~/bags'], fetch_limit='500kB')) == 4
+
+
 def test_broken_connection_is_tried_again(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (home / 'bags').mkdir()
     (home / 'bags/one').write_text('1')

@@ -192,6 +192,13 @@ def test_the_slowest_receiver_decides_until_it_is_gone() -> None:
     assert control.settings(settings, now).bitrate >= lowest
 
 
+def test_low_bitrate_of_the_user_is_kept_on_every_link() -> None:
+    control = Control(Settings(bitrate=20_000))
+    for rate in (50e6, 8e3):
+        records = stream(lambda now, rate=rate: rate, 6, control=control)
+        assert max(record.bitrate for record in records) == 20_000
+
+
 def test_bitrate_of_the_user_is_the_ceiling() -> None:
     control = Control(Settings(bitrate=8_000_000))
     control.heard(1, 0, 0, 0.0)

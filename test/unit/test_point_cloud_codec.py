@@ -223,6 +223,8 @@ def test_larger_clouds_than_allowed_are_refused() -> None:
     with pytest.raises(CloudError, match='more points'):
         decode(coded.data, max_bytes=SCAN.nbytes - 1)
     assert decode(coded.data, max_bytes=SCAN.nbytes)[0] == layout(SCAN)
+    with pytest.raises(CloudError, match='more points'):
+        encode(layout(SCAN), SCAN.tobytes(), 0.01, max_bytes=SCAN.nbytes - 1)
 
 
 def test_layouts_are_read_as_they_were_written() -> None:

@@ -28,7 +28,10 @@ class Bench:
             way.publisher = SimpleNamespace(publish=self.sent.append)
 
     def _ways(self) -> tuple[limits.Leaving, limits.Coming]:
-        node: Any = SimpleNamespace(create_timer=self._timer)
+        node: Any = SimpleNamespace(
+            create_timer=self._timer, create_subscription=lambda *_, **__: object(),
+            destroy_subscription=lambda _: None, get_publishers_info_by_topic=lambda _: (),
+            get_subscriptions_info_by_topic=lambda _: ())
         leaving = limits.Leaving(node, '/tf', '/there', 0.05)
         return leaving, limits.Coming(node, '/back', '/tf', leaving)
 
@@ -39,17 +42,27 @@ class Bench:
             cancel=lambda: setattr(self, 'running', False))
 
 
-def test_message_does_not_return() -> None:
+def test_message_does_not_return(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench('std_msgs/msg/String')
-    bench.leaving.subscription = object()
+    monkeypatch.setattr(limits, 'form_of', lambda _: bench.leaving.form)
+    monkeypatch.setattr(limits, 'others', lambda *_: ['a node'])
+    bench.leaving.look()
     bench.coming.heard(b'theirs')
     bench.leaving.heard(b'theirs')
     assert bench.sent == [b'theirs']
     # a latched one is heard again by a later subscription
+    bench.leaving.unsubscribe()
+    bench.leaving.look()
     bench.leaving.heard(b'theirs')
     assert bench.sent == [b'theirs']
     bench.leaving.heard(b'ours')
     assert bench.sent == [b'theirs', b'ours']
+    # a node here may say later what the other side has said last
+    bench.expire()
+    bench.expire()
+    bench.leaving.look()
+    bench.leaving.heard(b'theirs')
+    assert bench.sent == [b'theirs', b'ours', b'theirs']
 
 
 def test_wrong_transforms_end_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

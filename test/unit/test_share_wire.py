@@ -54,6 +54,15 @@ def test_own_message_is_heard_once() -> None:
     assert [echoes.heard(0.2, b'a') for _ in range(3)] == [True, True, False]
 
 
+def test_new_subscription_hears_latched_messages_once_more() -> None:
+    echoes = Echoes()
+    echoes.add(0.0, b'a')
+    echoes.add(0.0, b'lost with the old subscription')
+    echoes.restart(0.1, [hash(b'a')])
+    assert [echoes.heard(0.2, b'a') for _ in range(2)] == [True, False]
+    assert not echoes.heard(0.2, b'lost with the old subscription')
+
+
 def test_message_of_long_ago_is_no_echo() -> None:
     echoes = Echoes()
     echoes.add(0.0, b'a')

@@ -3,9 +3,14 @@
 
 from __future__ import annotations
 
+import os
+import socket
+import subprocess
 import sys
 
 import pytest
+
+from rigs.domains import taken
 
 serve = pytest.importorskip(
     'fogros2_monitor.serve', reason='rclpy is not installed')
@@ -16,3 +21,18 @@ def test_unwritable_token_folder_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, 'argv', ['bridge', '--secrets', f'{tmp_path}/file/secrets'])
     with pytest.raises(SystemExit, match='its token to .*\n--secrets names another folder'):
         serve.main()
+
+
+def test_taken_port_is_named_and_ends_the_bridge(tmp_path):
+    """So it starts again, when the port may be free."""
+    pytest.importorskip('foxglove', reason='the extra "monitor" is not installed')
+    with socket.create_server(('127.0.0.1', 0)) as other, taken() as domain:
+        port = other.getsockname()[1]
+        done = subprocess.run(
+            [sys.executable, '-m', 'fogros2_monitor.serve', '--listen', f'127.0.0.1:{port}',
+             '--secrets', str(tmp_path)], capture_output=True, text=True, timeout=60,
+            env={**os.environ, 'ROS_DOMAIN_ID': domain,
+                 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'})
+    assert done.returncode == 1
+    assert f'nobody can listen at 127.0.0.1:{port}: Address already in use\n' in done.stderr
+    assert 'the gate has ended' in done.stderr and 'Traceback' not in done.stderr

@@ -35,8 +35,8 @@ def test_nodes_are_handed_out_once() -> None:
     (StreamTopic('/a', source='two'), StreamTopic('/a', source='one'), 'two',
      "from 'one' and to it"),
     (('/a', 'h264'), ('/a', 'compressed'), 'one', "to 'one' twice"),
-    (('/a', 'h264'), StreamTopic('/a', 'h264', bitrate=1), 'one', "to 'one' twice"),
-    (('/a', 'h264'), StreamTopic('/a', 'h264', bitrate=1), 'two', 'different parameters')])
+    (('/a', 'h264'), StreamTopic('/a', 'h264', bitrate=10_000), 'one', "to 'one' twice"),
+    (('/a', 'h264'), StreamTopic('/a', 'h264', bitrate=10_000), 'two', 'different parameters')])
 def test_streams_that_contradict_each_other(
     first: Any, second: Any, machine: str, said: str,
 ) -> None:

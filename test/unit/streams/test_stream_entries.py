@@ -110,7 +110,9 @@ def test_an_unknown_parameter_gets_the_nearest_name(entry, said):
 
 def test_parameters_are_those_that_the_nodes_declare():
     pytest.importorskip('rclpy', reason='rclpy is not installed')
-    from fogros2_features.streams.nodes import H264
+    from fogros2_features.streams.nodes import H264, LARGEST
     from fogros2_features.streams.topics import OPTIONS
+    from image_transport_h264 import slices
     from image_transport_h264.senders import PARAMETERS
     assert H264.options == OPTIONS | {name for name, _, _ in PARAMETERS}
+    assert LARGEST == slices.LARGEST
