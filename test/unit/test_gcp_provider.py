@@ -89,6 +89,15 @@ def test_price_is_the_sum_of_a_types_parts(name, gpus, spot, price):
         assert cost == (None if price is None else Decimal(price))
 
 
+def test_gpu_has_a_price_although_the_catalogue_names_it_otherwise():
+    sku = {**catalogue.skus()[0], 'description': 'Nvidia Tesla A100 80GB GPU running in Frankfurt'}
+    table = prices.parts(sku)
+    entry = {'name': 'a2-x', 'guestCpus': 0, 'memoryMb': 0}
+    rates = {**table, **{('europe-west3', 'a2', part, False): 0 for part in ('Core', 'Ram')}}
+    (cost,) = table.values()
+    assert prices.price(rates, 'europe-west3', entry, {'nvidia-a100-80gb': 2}, False) == 2 * cost
+
+
 def test_regions_share_one_answer_of_the_catalogue(gce, monkeypatch):
     prices._asked.cache_clear()
     spec = MachineSpec('planner', 'gcp', {'region': 'europe-west3', 'machine_type': 'cheapest'})

@@ -82,12 +82,17 @@ def parts(sku: Mapping[str, Any]) -> Rates:
     words = _PART.fullmatch(sku['description'])
     if words is None:
         return {}
-    name = words['family'] or words['gpu'].replace(' ', '-')
+    name = words['family'] or _gpu(words['gpu'].replace(' ', '-'))
     price = sku['pricingInfo'][0]['pricingExpression']['tieredRates'][-1]['unitPrice']
     dollars = int(price.get('units', 0)) + Decimal(int(price.get('nanos', 0))) / 10**9
     spot = bool(words[1] or words['attached'])
     return {(region, name.lower(), words['part'] or 'GPU', spot): dollars
             for region in sku['serviceRegions']}
+
+
+def _gpu(name: str) -> str:
+    """Return the name of a GPU without 'tesla', which catalogue and types use differently."""
+    return name.lower().replace('-tesla-', '-')
 
 
 def price(
@@ -104,7 +109,7 @@ def price(
            for gpu in entry.get('accelerators') or ()}
     wanted = [(family, 'Core', _SHARED.get(entry['name'], Decimal(entry['guestCpus']))),
               (family, 'Ram', Decimal(entry['memoryMb']) / 1024),
-              *((gpu, 'GPU', Decimal(count)) for gpu, count in {**own, **gpus}.items())]
+              *((_gpu(gpu), 'GPU', Decimal(count)) for gpu, count in {**own, **gpus}.items())]
     costs = [(table.get((region, name, part, spot)), count) for name, part, count in wanted]
     if any(cost is None for cost, _ in costs):
         return None
