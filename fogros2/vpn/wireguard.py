@@ -366,7 +366,8 @@ confine() {{
   [ "$kept" = "$top$group" ] || {{
     printf "%s\\n" "$top$group" >{record}
     mkdir -p "$top$group" || return
-    for each in $parent "$pid"; do echo "$each" >"$top$group/cgroup.procs"; done || return
+    [ -z "$parent" ] || echo "$parent" >"$top$group/cgroup.procs" || return
+    echo "$pid" >"$top$group/cgroup.procs" || return
   }}
   path=${{top#/sys/fs/cgroup}}$group
   printf {text} "$(($(printf %s "$group" | tr -cd / | wc -c)))" "${{path#/}}" | nft -f -

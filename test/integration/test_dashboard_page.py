@@ -198,8 +198,8 @@ def test_deletion_asks_and_shows_its_result(story: Story, page: Browser) -> None
     assert story.deleted == [('planner', False)]
     assert 'end that launch' in page.text()
     # under a launch that runs the question says so, and the answer means it
-    story.tell(machines=[machine('planner')])
-    page.until('!document.getElementById("notices").textContent')
+    story.tell(machines=[machine('planner', kind='t3.small')])
+    page.until('document.querySelector("article").innerText.includes("t3.small")')
     page.ask('document.querySelector("button.delete").click()')
     page.until('document.getElementById("ask").open')
     asked = page.ask('document.getElementById("ask").innerText')
