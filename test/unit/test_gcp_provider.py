@@ -89,7 +89,7 @@ def test_price_is_the_sum_of_a_types_parts(name, gpus, spot, price):
         assert cost == (None if price is None else Decimal(price))
 
 
-def test_gpu_has_a_price_although_the_catalogue_names_it_otherwise():
+def test_gpu_has_a_price_under_either_of_its_names():
     sku = {**catalogue.skus()[0], 'description': 'Nvidia Tesla A100 80GB GPU running in Frankfurt'}
     table = prices.parts(sku)
     entry = {'name': 'a2-x', 'guestCpus': 0, 'memoryMb': 0}
