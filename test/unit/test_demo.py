@@ -20,8 +20,10 @@ def test_command_line_may_be_no_text(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, 'demo', demo)  # its dataclass looks there
     spec.loader.exec_module(demo)
     monkeypatch.setattr(demo, 'output', lambda *words, root=False: '')
-    with subprocess.Popen([sys.executable, '-c', 'input()', b'caf\xe9'],
-                          stdin=subprocess.PIPE) as child:
+    with subprocess.Popen(['sh', '-c', 'echo; read line', b'caf\xe9'], stdin=subprocess.PIPE,
+                          stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        child.stdout.readline()
         traces = [*demo.traces()]
         child.communicate(b'\n')
-    assert f'process {child.pid} {sys.executable} -c input() caf\ufffd' in traces
+    assert f'process {child.pid} sh -c echo; read line caf\ufffd' in traces
