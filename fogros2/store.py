@@ -25,7 +25,7 @@ import time
 from typing import Any, Optional
 
 from fogros2 import model, process
-from fogros2.errors import ConfigurationError, did_you_mean, NameTaken, StoreError
+from fogros2.errors import ConfigurationError, did_you_mean, FogError, NameTaken, StoreError
 from fogros2.model import Command, Endpoint, MachineSpec, OtherVpn, Peer, VpnInterface
 
 #: Name of a file or folder that only one process uses, with that process.
@@ -479,9 +479,11 @@ def delete_folder(path: Path) -> None:
     with contextlib.suppress(RecursionError):  # before Python 3.12.4
         shutil.rmtree(path, ignore_errors=True)
     if path.is_dir():
-        for words in (('find', str(path), '-type', 'd', '-exec', 'chmod', 'u+rwx', '{}', ';'),
+        for words in (('find', str(path), '-type', 'd', '!', '-perm', '-700',
+                       '-exec', 'chmod', 'u+rwx', '{}', ';'),
                       ('rm', '-rf', '--', str(path))):
-            process.run(Command(words), timeout=_DELETION, check=False, kept=1e4)
+            with contextlib.suppress(FogError):  # it takes too long
+                process.run(Command(words), timeout=_DELETION, check=False, kept=1e4)
 
 
 def entries(folder: Path, *, without: str = '') -> Iterator[os.DirEntry[str]]:

@@ -140,7 +140,7 @@ def _bring(running: RunningMachine, own: Wanted) -> str:
         done.append(f'{total / 1e6:.3g} MB to {home}')
     for folder, target in _targets(home, sizes).items():
         try:
-            # the machine may send more than it said, but no more than the user allows
+            # a folder may grow meanwhile, and many small files take more than their sizes
             _copy(running, folder, target, int(max(2 * sizes[folder], own.limit) + SLACK))
         except FogError as error:
             failures.append(error)

@@ -80,6 +80,7 @@ class Foxglove(Action):
         self._topics = list(topics)
         self._port = port
         self._allow = features.own({'monitor_allow': monitor_allow})
+        self._asked = monitor_allow is not None
         self._image = image
         if isinstance(port, (int, str)):
             _port(port)
@@ -107,7 +108,7 @@ class Foxglove(Action):
         if port == addresses.PORT and not self._default:
             replaced.append(EmitEvent(event=ShutdownProcess(
                 process_matcher=functools.partial(_is_default, name))))
-            allow = allow or _networks(session) or ()
+            allow = allow if self._asked else _networks(session) or ()
         bridge = AddedProcess(_bridge(name, port, topics, _options(
             coordinator, session, port, allow, values.resolve(context, self._image)),
             _DEFAULT if self._default else _OTHER))

@@ -14,7 +14,7 @@ from typing import Optional
 from sensor_msgs.msg import CameraInfo, Image
 
 from image_transport_h264.budget import Announcement
-from image_transport_h264.lazy import LazyNode, OUTPUT_QOS, Relay, run
+from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Relay, run
 from image_transport_h264.message import CAMERA_INFO, camera_info_topic
 from image_transport_h264.receivers import make_receiver
 
@@ -27,14 +27,14 @@ class DecoderNode(LazyNode):
         topic = self.resolve_topic_name('image')
         codec = str(self.declare_parameter('codec', 'h264').value)
         stream = str(self.declare_parameter('stream', '').value) or f'{topic}/{codec}'
-        self._images = self.offer(Image, topic, OUTPUT_QOS, self._listeners_changed)
+        self._images = self.offer(Image, topic, IMAGE_QOS, self._listeners_changed)
         self._announcement = Announcement(self, stream)
         self._receiver = make_receiver(
             self, codec, stream, functools.partial(self.put_out, self._images))
         self._infos: Optional[Relay] = None
         if self.declare_parameter('camera_info', True).value:
             self._infos = Relay(self, CameraInfo, f'{stream}/{CAMERA_INFO}',
-                                camera_info_topic(topic), OUTPUT_QOS)
+                                camera_info_topic(topic), IMAGE_QOS)
         self._listeners_changed()
         self.get_logger().info(f'{stream} ({codec}) comes in as {topic}')
 

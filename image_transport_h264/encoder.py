@@ -57,7 +57,7 @@ class EncoderNode(LazyNode):
         self.get_logger().warning(f'no images on {named}{guess}')
 
     def _listeners_changed(self) -> None:
-        self._images.want(self._sender.listeners())
+        self._images.want(self._sender.listeners() > 0)
 
 
 def main() -> None:

@@ -21,19 +21,17 @@ from image_transport_h264.worker import Worker
 
 def _qos(
     depth: int, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
-    durability: DurabilityPolicy = DurabilityPolicy.VOLATILE,
 ) -> QoSProfile:
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability,
-                      durability=durability)
+                      durability=DurabilityPolicy.VOLATILE)
 
 
 #: Packets of a stream; reliable for recorders and other subscribers that ask for it.
 STREAM_QOS = _qos(8)
 #: Slices of images, and their acknowledgements; there are fewer at once, see ``slices.py``.
 SLICES_QOS = _qos(64)
-#: Images: the newest ones, and those of a decoder, whose source may have latched them.
+#: Images: the newest ones.
 IMAGE_QOS = _qos(2)
-OUTPUT_QOS = _qos(2, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 #: Messages that are useless if they are late: acknowledgements, and pieces of packets.
 FEEDBACK_QOS = _qos(8, ReliabilityPolicy.BEST_EFFORT)
 PIECES_QOS = _qos(128, ReliabilityPolicy.BEST_EFFORT)
@@ -148,23 +146,18 @@ class LazyNode(Node):
 
 
 def fitting(node: Node, topic: str, qos: QoSProfile) -> QoSProfile:
-    """
-    Return the profile that fits all publishers of the topic.
-
-    It is best effort unless all of them are reliable, and receives latched messages if all latch.
-    """
-    offered = [info.qos_profile for info in node.get_publishers_info_by_topic(topic)]
-    if not offered or any(one.reliability != ReliabilityPolicy.RELIABLE for one in offered):
-        return best_effort(qos)
-    latched = all(one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offered)
-    return _qos(qos.depth, durability=offered[0].durability) if latched else qos
+    """Return the profile, with best effort unless all publishers of the topic are reliable."""
+    kinds = [info.qos_profile.reliability for info in node.get_publishers_info_by_topic(topic)]
+    if kinds and all(kind == ReliabilityPolicy.RELIABLE for kind in kinds):
+        return qos
+    return best_effort(qos)
 
 
 class Tap:
     """
     A subscription to serialized messages that exists only on request.
 
-    The tap subscribes again if a new publisher needs another reliability or durability.
+    The tap subscribes again if a new publisher needs another reliability.
     """
 
     def __init__(
@@ -174,22 +167,15 @@ class Tap:
         self._node, self._kind, self._topic = node, kind, topic
         self._qos, self._heard, self._adapt = qos, heard, adapt
         self._subscription: Optional[Subscription] = None
-        self._fitting = qos
-        self._listeners = 0
+        self._reliability: Optional[ReliabilityPolicy] = None
 
-    def want(self, listeners: int) -> None:
-        """
-        Subscribe while somebody listens; call this in the executor's thread.
-
-        Only a new subscription receives latched messages again, so a new listener causes one.
-        """
-        more, self._listeners = listeners > self._listeners, listeners
-        latched = self._fitting.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        if self._subscription is not None and (not listeners or more and latched):
+    def want(self, wanted: bool) -> None:
+        """Subscribe or unsubscribe; call this in the executor's thread."""
+        if wanted and self._subscription is None:
+            self._subscribe()
+        elif not wanted and self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
-        if listeners and self._subscription is None:
-            self._subscribe()
 
     def ask_for(self, qos: QoSProfile) -> None:
         """Change the profile of the subscription; call this in the executor's thread."""
@@ -201,32 +187,28 @@ class Tap:
         self._node.destroy_subscription(old)
 
     def _subscribe(self) -> None:
-        changed = self._changed if self._adapt else None
-        self._fitting = fitting(self._node, self._topic, self._qos) if self._adapt else self._qos
+        qos = fitting(self._node, self._topic, self._qos) if self._adapt else self._qos
+        self._reliability = qos.reliability
+        events = SubscriptionEventCallbacks(matched=self._matched if self._adapt else None)
         self._subscription = self._node.create_subscription(
-            self._kind, self._topic, self._heard, self._fitting, raw=True,
-            event_callbacks=SubscriptionEventCallbacks(matched=changed, incompatible_qos=changed))
+            self._kind, self._topic, self._heard, qos, event_callbacks=events, raw=True)
 
-    def _changed(self, _: Any) -> None:
-        if self._subscription is not None and self._fitting != fitting(
-                self._node, self._topic, self._qos):
-            self._node.destroy_subscription(self._subscription)
+    def _matched(self, _: Any) -> None:
+        reliability = fitting(self._node, self._topic, self._qos).reliability
+        if self._subscription is not None and reliability != self._reliability:
+            self.want(False)
             self._subscribe()
 
 
 class Relay:
-    """
-    Forward messages from a topic to another while the other one has subscribers.
-
-    :param qos: profile of the other topic.
-    """
+    """Forward messages from a topic to another while the other one has subscribers."""
 
     def __init__(
         self, node: LazyNode, kind: Any, source: str, target: str, qos: QoSProfile,
     ) -> None:
         self._node = node
         self._publisher = node.offer(kind, target, qos, self._changed)
-        self._tap = Tap(node, kind, source, IMAGE_QOS, self._publisher.publish)
+        self._tap = Tap(node, kind, source, qos, self._publisher.publish)
 
     def _changed(self) -> None:
-        self._tap.want(self._node.subscribers(self._publisher))
+        self._tap.want(self._node.subscribers(self._publisher) > 0)

@@ -13,7 +13,7 @@ from sensor_msgs.msg import CompressedImage, PointCloud2
 
 from image_transport_h264.budget import Announcement
 from image_transport_h264.cdr import CdrError
-from image_transport_h264.lazy import IMAGE_QOS, LazyNode, OUTPUT_QOS, run, Tap
+from image_transport_h264.lazy import IMAGE_QOS, LazyNode, run, Tap
 from image_transport_h264.message import coded
 from image_transport_h264.slices import SliceReceiver
 from point_cloud_stream import message
@@ -35,7 +35,7 @@ class DecoderNode(LazyNode):
         put = self.start_worker('decode', self._decode).put
         self._taps = [Tap(self, CompressedImage, stream, IMAGE_QOS, put),
                       SliceReceiver(self, stream, put, self._max_bytes).tap]
-        self._points = self.offer(PointCloud2, topic, OUTPUT_QOS, self._matched)
+        self._points = self.offer(PointCloud2, topic, IMAGE_QOS, self._matched)
         self._matched()
         self.get_logger().info(f'{stream} comes in as {topic}')
 

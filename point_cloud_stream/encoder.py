@@ -55,7 +55,7 @@ class EncoderNode(LazyNode):
     # --- in the executor's thread
 
     def _matched(self) -> None:
-        self._clouds.want(self.subscribers(self._publisher))
+        self._clouds.want(self.subscribers(self._publisher) > 0)
 
     def _take(self, cloud: bytes) -> None:
         if self._control.arrived(time.monotonic()):

@@ -58,7 +58,7 @@ END
 make_ros2() {
     { cat - tools/ros2.py <<'END'
 #!/bin/sh
-'''exec' "$(dirname "$0")/python" "$0" "$@"
+'''exec' "$(dirname "$(readlink -f "$0")")/python" "$0" "$@"
 ' '''
 END
     } >"$1/bin/ros2"

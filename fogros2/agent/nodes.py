@@ -289,7 +289,8 @@ class Nodes:
         def prepare() -> None:
             # the nodes must not outlive an agent that nothing starts again
             prctl(PR_SET_PDEATHSIG, signal.SIGINT)
-            resource.setrlimit(resource.RLIMIT_NOFILE, self.processes.descriptors)
+            with contextlib.suppress(OSError, ValueError):
+                resource.setrlimit(resource.RLIMIT_NOFILE, self.processes.descriptors)
 
         if node.spec.get('shell'):
             command = ['/bin/sh', '-c', ' '.join(command)]

@@ -358,7 +358,8 @@ class Agent:
         """Serve until the agent ends."""
         # each node takes two descriptors
         most = self.processes.descriptors[1]
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+        with contextlib.suppress(OSError, ValueError):  # more than fs.nr_open
+            resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
         self._await_clients()
         try:
             self.heartbeats.open()

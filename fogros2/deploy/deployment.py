@@ -104,7 +104,7 @@ def _run(context: Context, job: RunningMachine) -> None:
     job.push(NODES)
     start_router = functools.partial(dds.start_router, context, job)
     start_router()
-    job.restoring = (arming.watch_notice, joining.restore, start_router)
+    job.restoring = (joining.restore, start_router, arming.watch_notice)
     connection.enter_vpn()
     job.undo.callback(ClockComparison(job.name, job.heartbeat, context.report).close)
     job.undo.callback(job.ending.set)

@@ -102,8 +102,9 @@ class RunningMachine(MachineJob):
 
         :raises FogError: the agent does not take it.
         """
-        for restore in self.restoring:
-            restore()
+        with self._shortening:  # a step sends the lifetime
+            for restore in self.restoring:
+                restore()
         for name, watched in list(self._watches.items()):
             self._send_watch(name, watched)
 

@@ -34,13 +34,17 @@ export DEBIAN_FRONTEND=noninteractive
 tries=0
 until output=$(LC_ALL=C apt-get -q update 2>&1); do
     case $output in *'Could not get lock'*) ;; *) tries=300 ;; esac
-    # the installation shows whether a source is missed
-    [ $((tries += 1)) -lt 300 ] || {{ printf '%s\\n' "$output" >&2; break; }}
+    [ $((tries += 1)) -lt 300 ] || break
     sleep 1
 done
 # repair an installation that was killed; apt waits for one that still runs
 dpkg --configure -a </dev/null || :
-apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends {packages}
+# the installation shows whether a source is missed, whose error is then the reason
+apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends {packages} || {{
+    status=$?
+    printf '%s\\n' "$output" | grep '^[EW]: ' | tail -n 2 >&2
+    exit $status
+}}
 """
 #: Prints the Debian packages that are not installed.
 _MISSING = """\

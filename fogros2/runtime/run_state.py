@@ -114,10 +114,10 @@ def _decide_report(state: RunState, event: Event) -> tuple[RunState, tuple[Comma
         # it may have been told to end it before it knew it
         return dataclasses.replace(state, phase='leaving' if leaving else 'running'), (
             ('report', 'ask') if state.stopping else ('report',))
-    if event == 'refused' and state.phase == 'running':
-        return state, ()  # the request got no answer, and the machine has started it
     if leaving and not state.stopping:
         return dataclasses.replace(state, phase='away'), ('leave',)
     if event == 'respawns' and not state.stopping:
         return dataclasses.replace(state, phase='respawning'), ('report',)
-    return dataclasses.replace(state, phase='ended'), ('report', 'end')
+    # a process that would have respawned has reported its exit
+    reported = event == 'exited' and state.phase == 'respawning'
+    return dataclasses.replace(state, phase='ended'), ('end',) if reported else ('report', 'end')

@@ -341,8 +341,9 @@ class Session:
                 run.on('over')
             raise error
         for run in runs:
-            run.on_event({'event': 'refused', 'node': run.node.id, 'name': run.node.name,
-                          'error': str(error.args[0]), 'hint': error.hint})
+            if run.state.phase != 'running':  # the machine may have started it and not answered
+                run.on_event({'event': 'refused', 'node': run.node.id, 'name': run.node.name,
+                              'error': str(error.args[0]), 'hint': error.hint})
 
     async def _stop_collected(self) -> None:
         runs, self._to_stop = self._to_stop, []
@@ -382,10 +383,13 @@ class Session:
         except FogError as error:
             self._logger.warning(f'{self.spec.name}: lost events are not made up for: {error}')
             return
+        known = {node['id'] for node in nodes}
+        if any(run.state.started and id not in known for id, run in self._runs.items()):
+            self._restarted()  # this event was lost, too
+            return
         for node in nodes:
-            run, event = self._runs.get(node['id']), _last_event(node)
-            if run is not None and event is not None:
-                self._on_process_event(run, event)
+            if (event := _last_event(node)) is not None:
+                self._backlog.put(event)
 
     # -- events of the agent --------------------------------------------------------------------
 

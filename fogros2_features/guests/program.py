@@ -280,7 +280,9 @@ def runs(uid: int) -> bool:
         with contextlib.suppress(OSError):  # it has ended
             fields = dict(line.split(':\t', 1) for line in path.read_bytes().decode(
                 errors='replace').splitlines() if ':\t' in line)
-            if str(uid) in fields['Uid'].split() and fields['State'][0] not in 'ZX':
+            # with several threads, the first may have ended before the others
+            if str(uid) in fields['Uid'].split() and (
+                    fields['State'][0] not in 'ZX' or int(fields['Threads']) > 1):
                 return True
     return False
 

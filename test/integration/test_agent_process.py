@@ -24,7 +24,7 @@ import pytest
 from fogros2.agent.processes import SWEEP
 from fogros2.agent.protocol import Refused
 from fogros2.agent.server import Agent
-from fogros2.agent_client import AgentClient, Heartbeat
+from fogros2.agent_client import AgentClient, connection, Heartbeat
 from fogros2.errors import AgentError
 from fogros2.model import NodeSpec
 from fogros2.waiting import wait_until
@@ -265,7 +265,8 @@ def test_output_and_clients_fill_neither_memory_nor_disk(rig):
     silent.close()
 
 
-def test_slow_connection_loses_events_and_counts_them(rig):
+def test_slow_connection_loses_events_and_counts_them(rig, monkeypatch):
+    monkeypatch.setattr(connection, 'SILENCE', 600.0)
     client = rig.started(log_bytes=64 << 10)
     first = rig.node('first', 'import sys\nprint("up")\nfor line in sys.stdin: pass\n')
     rig.run(first)
@@ -298,7 +299,6 @@ def test_nodes_beyond_the_descriptors_are_refused(rig):
     crowd = [Raw(rig.directory) for _ in range(10)]  # which take the rest
     running = [name for name, state in found.items() if state == 'running']
     client.request('ping')
-    os.utime(rig.folder)
     client.request('stop', nodes=running[1:])
     for name in running[1:]:
         rig.wait('exited', node=name)
@@ -447,7 +447,7 @@ def test_kept_machine_stops_nodes_and_stays_for_its_lifetime(rig, heartbeat):
 
 
 def test_nodes_that_start_after_a_long_cut_are_guarded(rig, heartbeat):
-    client = rig.started(robot_timeout=0.5, on_exit='keep', end_command=ends(rig))
+    client = rig.started(robot_timeout=3.0, on_exit='keep', end_command=ends(rig))
     client.request('start', nodes=[rig.node(
         'again', 'raise SystemExit(3)\n', respawn=True, respawn_delay=600.0)])
     rig.wait('exited', node='again', respawns=True)
@@ -576,7 +576,7 @@ def test_takeover_goes_on_after_a_lost_connection(rig, busy):
     if busy == 'nodes':
         rig.run(NodeSpec('n', 'n-1', arguments=(
             'sh', '-c', f'trap "" TERM; trap "{wait}; exit" INT; echo up; '
-            'while true; do sleep 0.02; done')))
+            'while true; do sleep 0.02; done'), sigterm_timeout=60.0))
     else:
         client.request('watch', what='vpn', argv=['true'], repair=[],
                        down=[['sh', '-c', f'touch {again}; {wait}']])

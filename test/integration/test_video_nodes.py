@@ -28,7 +28,7 @@ from std_msgs.msg import Empty, UInt8MultiArray, UInt64MultiArray
 from image_transport_h264 import annexb, message
 from image_transport_h264.acknowledgement import wait_for_all_acked
 from image_transport_h264.codec import Encoder, peek, Settings
-from rigs.bench import Bench, BEST_EFFORT, LATCHED, made, RELIABLE
+from rigs.bench import Bench, BEST_EFFORT, made, RELIABLE
 
 ROOT = Path(__file__).parents[2]
 WIDTH, HEIGHT = 96, 64
@@ -88,23 +88,6 @@ def test_what_goes_in_comes_out(pair: Bench) -> None:
             sent.height, sent.width, sent.step, sent.is_bigendian)
         a, b = (numpy.frombuffer(m.data, numpy.uint8).astype(int) for m in (got, sent))
         assert numpy.abs(a - b).mean() < (0.01 if got.encoding == '32FC1' else 4)
-
-
-@pytest.mark.parametrize('codec', ['h264', 'raw'])
-def test_latched_image_reaches_all_later_subscribers(bench: Bench, codec: str) -> None:
-    bench.node.create_publisher(Image, '/camera', LATCHED).publish(image(1))
-    bench.node.create_publisher(CameraInfo, '/camera_info', LATCHED).publish(
-        CameraInfo(width=WIDTH))
-    bench.pair(codec=codec)
-    bench.start('decoder', '-r', 'image:=/late/camera', '-p', f'codec:={codec}',
-                '-p', f'stream:=/camera/{codec}')
-    for place in ('/seen', '/seen', '/late', '/late'):
-        seen = bench.heard(Image, f'{place}/camera', LATCHED)
-        infos = bench.heard(CameraInfo, f'{place}/camera_info', LATCHED)
-        bench.until(lambda seen=seen, infos=infos: seen and infos, f'the image at {place}')
-        assert (seen[0].header, infos[0].width) == (image(1).header, WIDTH)
-    # a camera that latches nothing is heard beside it
-    bench.until(lambda: len(seen) > 5, 'further images', meanwhile=source(bench))
 
 
 def test_numbers_of_either_type_are_accepted(bench: Bench) -> None:

@@ -36,8 +36,10 @@ from fogros2.errors import (
     ProviderError,
     VpnError,
 )
+from fogros2.launch_internals import private
 from fogros2.model import NodeSpec
 from fogros2.runtime import remote_run, session
+from fogros2.waiting import wait_until
 from rigs.launching import ends
 from ros2fog_cli.api.preview import Preview
 
@@ -404,8 +406,24 @@ def test_agent_that_starts_no_node_ends_no_launch(run, fake, planner, capfd, err
     assert (f"process can't be started: {error}" in capfd.readouterr().out) == (not status)
 
 
+@pytest.fixture()
+def until_noted(fake, tmp_path, monkeypatch):
+    """Return a function that makes a process of the robot's, which ends at a note."""
+    def process(word):
+        def note(*words):
+            before(*words)
+            if words[0] == word:
+                noted.touch()
+
+        before, noted = fake.note, tmp_path / word
+        monkeypatch.setattr(fake, 'note', note)
+        return ExecuteProcess(cmd=[
+            'sh', '-c', f'until [ -e {noted} ]; do sleep 0.05; done'], on_exit=Shutdown())
+    return process
+
+
 @pytest.mark.parametrize('restored', [True, False])
-def test_launch_makes_up_for_lost_events(run, fake, planner, capfd, restored):
+def test_launch_makes_up_for_lost_events(run, fake, planner, capfd, restored, until_noted):
     def status(node, state, **changes):
         return {'id': node.id, 'name': node.name, 'state': state, 'pid': None,
                 'returncode': None, 'restarts': 0, **changes}
@@ -438,7 +456,7 @@ def test_launch_makes_up_for_lost_events(run, fake, planner, capfd, restored):
         RegisterEventHandler(OnProcessExit(
             target_action=first, on_exit=lambda event, context: ended.append(event.returncode))),
         RegisterEventHandler(OnProcessStart(target_action=late, on_start=on_start)),
-        *([] if restored else [TimerAction(period=0.5, actions=[Shutdown()])])]))
+        *([] if restored else [until_noted('restore')])]))
     output = capfd.readouterr().out
     assert 'planner: 3 events of its agent, such as output, were lost' in output
     if restored:
@@ -447,13 +465,29 @@ def test_launch_makes_up_for_lost_events(run, fake, planner, capfd, restored):
         assert 'planner: lost events are not made up for: gone' in output
 
 
-def test_node_that_starts_after_its_refusal_is_stopped(run, fake, planner, capfd):
+def test_lost_restart_of_the_agent_is_made_up_for(run, fake, planner, monkeypatch):
+    def lose(machine, node):
+        if len(machine.all) == 1:
+            machine.say('gap', count=1)  # its status has no nodes
+        else:
+            ends(machine, node)
+
+    monkeypatch.setattr(session, '_RESPAWN_DELAY', 0.01)
+    fake.on_start = lose
+    assert run(LaunchDescription([talker(planner, respawn=True)])) == 0
+    assert len(fake.noted('start')) == 2
+
+
+def test_node_that_starts_after_its_refusal_is_stopped(run, fake, planner, capfd, until_noted):
+    def start(nodes):
+        wait_until(lambda: private.completed(node).done(), timeout=60.0, what='the refusal')
+        for _ in range(2):
+            fake.machines['planner'].say('started', nodes[0], pid=4711, cmd=[])
+
     fake.start_error = DeadlineExceeded("the agent didn't answer 'start'")
-    fake.on_request = lambda nodes: threading.Timer(0.1, lambda: [
-        machine.say('started', node, pid=4711, cmd=[])
-        for machine in fake.machines.values() for node in nodes for _ in range(2)]).start()
-    node, other = talker(planner), robot(fake, 'sleep', '2')
-    assert run(LaunchDescription([node, *other])) == 0
+    fake.on_request = lambda nodes: threading.Thread(target=start, args=(nodes,)).start()
+    node = talker(planner)
+    assert run(LaunchDescription([node, until_noted('stop')])) == 0
     (_, stopped), = fake.noted('stop')
     assert 'talker' in stopped and 'started too late, and was stopped' in capfd.readouterr().out
 

@@ -40,9 +40,9 @@ class CutShell(LocalShell):
     def cut(self) -> None:
         self.streams[-1]._channel.child.kill()
 
-    def pause(self, *, until: bool = False) -> None:
-        """Let the connection carry nothing, ``until`` it does again."""
-        self.streams[-1]._channel.child.send_signal(signal.SIGCONT if until else signal.SIGSTOP)
+    def pause(self) -> None:
+        """Let the connection carry nothing more, until its process gets SIGCONT."""
+        self.streams[-1]._channel.child.send_signal(signal.SIGSTOP)
 
 
 class Raw:

@@ -507,7 +507,8 @@ NO_SANDBOX = at(1, 'FailedCreatePodSandBox', 'no address yet')
     (CREATING, [NO_SANDBOX], [NO_SANDBOX], 20),
     (CREATING, [NO_SANDBOX], [NO_SANDBOX, at(3, 'Pulling')], 0),
     (CREATING, [at(5, 'FailedMount'), at(3, 'Pulled')], [at(5, 'FailedMount')], 20),
-    (CREATING, [], [{**NO_SANDBOX, 'lastTimestamp': None, 'eventTime': '2026-01-01T00:00:01.5Z'},
+    (CREATING, [], [{**NO_SANDBOX, 'lastTimestamp': None,
+                     'eventTime': '2026-01-01T00:00:01.500000Z'},
                     at(2, 'Created')], 0)])
 def test_pod_is_given_up_only_for_what_lasts(monkeypatch, pod, before, events, ends):
     """The events are ``before`` in the first ten seconds; ``ends`` is 0 for a pod that runs."""

@@ -34,8 +34,8 @@ def after(*events: Event, movable: bool = True) -> tuple[RunState, list[Command]
     ('started overdue', 'running', 'report'),
     ('stop', 'ended', 'end'),
     ('sent stop absent', 'ended', 'ask expect end'),
-    # the request to start it got no answer
-    ('sent started refused', 'running', 'report'),
+    # the agent could not start it again
+    ('sent started refused', 'ended', 'report report end'),
     # its machine gets to know it after the request to end it
     ('sent stop started', 'running', 'ask expect report ask'),
     ('started respawns stop', 'ended', 'report report ask end'),

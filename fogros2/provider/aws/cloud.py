@@ -109,7 +109,7 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network, Ec2Disks):
         what = f"creating '{order.spec.name}' ({place.kind})"
         answer = settled(
             lambda: self._account.call('ec2', place.region, 'run_instances', what, **words),
-            'InvalidGroup.NotFound', 'InvalidKeyPair.NotFound', cancel=self.cancel, what=what)
+            'InvalidGroup.NotFound', 'InvalidKeyPair.NotFound', what=what)
         vm = str(answer['Instances'][0]['InstanceId'])
         self._account.made[vm] = time.monotonic()
         return vm

@@ -101,7 +101,7 @@ class Ec2Network(VmCloud):
                 lambda: self._account.call(
                     'ec2', region, 'authorize_security_group_ingress', what, GroupId=group,
                     IpPermissions=rules),
-                'InvalidGroup.NotFound', cancel=self.cancel, what=what)
+                'InvalidGroup.NotFound', what=what)
             self._account.admitted[order.attempt] = sorted(map(cidr, order.sources))
 
     def undo_begin(

@@ -139,7 +139,8 @@ class Azure(AzureImages, AzureDisks):
             if not sizes:
                 raise ConfigurationError(
                     f'Azure has no {" or ".join(types)} in {region} for this subscription',
-                    'ros2 fog price --region shows what it has')
+                    'ros2 fog price --region shows what it has; confidential sizes need settings '
+                    'that FogROS2 does not make')
             prepared = {}
             for name, entry in sizes.items():
                 kind, version = prices.machine_type(entry), prices.generation(entry)
@@ -201,7 +202,7 @@ class Azure(AzureImages, AzureDisks):
                 lambda: self._account.call(
                     'PUT', self._account.path(name, f'{_NET}/{kind}/{name}'), what,
                     {**common, **more, 'properties': properties}, wait=True),
-                *_NEW_GROUP, cancel=self.cancel, what=what)
+                *_NEW_GROUP, what=what)
             return resource
 
         with ThreadPoolExecutor(3, 'fog-azure') as pool:
@@ -231,12 +232,13 @@ class Azure(AzureImages, AzureDisks):
         body = machines.request(place, order, prepared, str(nic['id']), tags)
         made = settled(
             lambda: self._account.call('PUT', self._account.vm(name), what, body), *_NEW_GROUP,
-            cancel=self.cancel, what=what)
+            what=what)
         guarded = False
         # at once: the robot may vanish while Azure looks for room
-        with contextlib.suppress(AzureError):
-            self._guard(name, place.region, order, prepared, made)
-            guarded = True
+        if made.get('identity') or not prepared.guarded:
+            with contextlib.suppress(AzureError):
+                self._guard(name, place.region, order, prepared, made)
+                guarded = True
         entry = self._account.seen[name] = self._allocated(name, what)
         if not guarded:
             self._guard(name, place.region, order, prepared, entry)

@@ -82,7 +82,8 @@ class Start:
     def _note(self, trouble: Optional[Trouble]) -> None:
         if trouble is not None and trouble.final:
             raise self._error(trouble)
-        if trouble is None or self._trouble is None:
+        if trouble is None or self._trouble is None \
+                or trouble.unscheduled != self._trouble.unscheduled:
             self._since = time.monotonic()
         elif trouble.less_than(self._trouble):
             return

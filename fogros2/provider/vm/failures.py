@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
-import threading
 import time
 from typing import Any, ClassVar, Literal, NamedTuple, Optional, TypeVar
 
@@ -119,12 +118,11 @@ class Silent(PrerequisiteError):
         self.refused, self.temporary = unsent, not unsent
 
 
-def settled(
-    request: Callable[[], T], *codes: str, cancel: Optional[threading.Event], what: str,
-) -> T:
+def settled(request: Callable[[], T], *codes: str, what: str) -> T:
     """
     Make a request about something new, again while the cloud does not know it everywhere.
 
+    :param request: raises Cancelled itself: it alone knows whether something was sent.
     :param codes: of the refusals that say so.
     :param what: see :func:`~fogros2.waiting.wait_until`.
     :raises CodedError: it still does not know it after ``SETTLING`` seconds.
@@ -139,8 +137,8 @@ def settled(
                 raise
             return None
 
-    return wait_until(attempt, timeout=2 * SETTLING, cancel=cancel, interval=0.5, longest=4.0,
-                      what=what)[0]
+    return wait_until(
+        attempt, timeout=2 * SETTLING, interval=0.5, longest=4.0, what=what)[0]
 
 
 def wait_through(probe: Callable[[], Optional[T]], **options: Any) -> T:
