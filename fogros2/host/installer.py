@@ -37,14 +37,11 @@ until output=$(LC_ALL=C apt-get -q update 2>&1); do
     [ $((tries += 1)) -lt 300 ] || break
     sleep 1
 done
+# the installation shows whether a source is missed
+printf '%s\\n' "$output" >&2
 # repair an installation that was killed; apt waits for one that still runs
 dpkg --configure -a </dev/null || :
-# the installation shows whether a source is missed, whose error is then the reason
-apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends {packages} || {{
-    status=$?
-    printf '%s\\n' "$output" | grep '^[EW]: ' | tail -n 2 >&2
-    exit $status
-}}
+apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends {packages}
 """
 #: Prints the Debian packages that are not installed.
 _MISSING = """\
