@@ -11,8 +11,8 @@ from typing import Any, Optional
 from fogros2.errors import ConfigurationError, FogError, ProviderError
 from fogros2.model import Command, MachineState
 from fogros2.provider import TAG_DEPENDENCIES
+from fogros2.provider.vm.failures import wait_through
 from fogros2.provider.vm.images import Image
-from fogros2.waiting import wait_until
 from fogros2_features.images.keepers import image_keeper
 from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry, Warn
@@ -80,9 +80,9 @@ def wait(baking: Image, *, timeout: float = TIMEOUT) -> Image:
                                 f'ros2 fog image delete {image.id}, and try again')
         return image if image.state == READY else None
 
-    return wait_until(probe, timeout=timeout, interval=0.5, longest=LOOK,
-                      what=f"the image '{baking.name}'",
-                      hint='it goes on: ros2 fog image list shows it')
+    return wait_through(probe, timeout=timeout, interval=0.5, longest=LOOK,
+                        what=f"the image '{baking.name}'",
+                        hint='it goes on: ros2 fog image list shows it')
 
 
 def survey(warn: Warn, *, regions: Optional[Sequence[str]] = None) -> list[Image]:

@@ -36,8 +36,8 @@ class Moving(Nodes, Protocol):
     async def move_halted(self) -> None:
         """Let processes start on the robot: the machine no longer runs them."""
 
-    def homeless(self) -> list[str]:
-        """Return the names of processes that cannot run on the robot."""
+    async def homeless(self) -> list[str]:
+        """Return, after moves under way, the names of processes that cannot run on the robot."""
 
     def replace(self, running: RunningMachine) -> None:
         """Use another machine from now on."""
@@ -51,14 +51,13 @@ class Replacer:
     The replacements of one machine, on launch's event loop.
 
     :param in_thread: runs a blocking function in a thread.
-    :param fail: ends the launch because of an error.
     :param is_over: returns whether the launch is shutting down.
     """
 
     def __init__(
         self, session: Moving, launch: Launch, loop: asyncio.AbstractEventLoop, *,
-        in_thread: Callable[..., asyncio.Future[Any]], fail: Callable[[BaseException], None],
-        is_over: Callable[[], bool], logger: logging.Logger,
+        in_thread: Callable[..., asyncio.Future[Any]], is_over: Callable[[], bool],
+        logger: logging.Logger,
     ) -> None:
         self.state = Replacement(
             session.own.max_replacements, GRACE, session.spec.robot_timeout + GRACE)
@@ -66,7 +65,6 @@ class Replacer:
         self._launch = launch
         self._loop = loop
         self._in_thread = in_thread
-        self._fail = fail
         self._is_over = is_over
         self._logger = logger
 
@@ -131,12 +129,14 @@ class Replacer:
     def _give_up(self) -> None:
         name, count = self._session.spec.name, self.state.limit
         what = f"the machine '{name}' is not replaced again: max_replacements={count} is reached"
-        if homeless := self._session.homeless():
-            self._fail(ProviderError(
-                f"{what}, and {', '.join(homeless)} can't run on the robot",
-                'raise max_replacements, or install the programs on the robot'))
-        else:
+
+        async def give_up() -> None:
+            if homeless := await self._session.homeless():
+                raise ProviderError(
+                    f"{what}, and {', '.join(homeless)} can't run on the robot",
+                    'raise max_replacements, or install the programs on the robot')
             self._logger.error(f'{what}; its nodes stay on the robot')
+        self._session.request(give_up)
 
     def _warn(self, what: str, error: FogError) -> None:
         if not isinstance(error, Cancelled) and not self._is_over():

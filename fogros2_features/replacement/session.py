@@ -63,7 +63,7 @@ class Interruptible(Session):
             if own.checkpoint:
                 self._check_alone(own.checkpoint)
             self.replacer = Replacer(
-                self, launch, self._loop, in_thread=self._in_thread, fail=self._fail,
+                self, launch, self._loop, in_thread=self._in_thread,
                 is_over=lambda: context.is_shutdown, logger=self._logger)
             self.checkpoints = Checkpoints(
                 self, context,
@@ -322,9 +322,10 @@ class Interruptible(Session):
             for run in [*self._away, *self._runs.values()]:
                 run.on('left')
 
-    def homeless(self) -> list[str]:
-        """Return the names of processes that cannot run on the robot."""
-        return [run.node.name for run in self._away if run.state.phase == 'away']
+    async def homeless(self) -> list[str]:
+        """Return, after moves under way, the names of processes that cannot run on the robot."""
+        async with self._moves:
+            return [run.node.name for run in self._away if run.state.phase == 'away']
 
     def replace(self, running: RunningMachine) -> None:
         """Use another machine from now on."""
@@ -337,7 +338,7 @@ class Interruptible(Session):
         """Move all processes to the new machine."""
         back: dict[RemoteRun, bool] = {}
         async with self._moves:
-            was_here = len(self.homeless()) < len(self._away)
+            was_here = any(run.state.phase != 'away' for run in self._away)
             # processes that execute meanwhile join
             while new := [run for run in self._away if run not in back]:
                 back.update(zip(new, await asyncio.gather(*(run.come_back() for run in new))))

@@ -100,6 +100,29 @@ def test_creations_that_fail_end_a_launch_whose_nodes_wait(
     assert 'max_replacements=3 is reached' in said.out + said.err
 
 
+@pytest.mark.parametrize('elsewhere', [True, False])
+def test_nodes_of_the_last_lost_machine(run, fake, package, talker, watch, capfd, elsewhere):
+    """They stay on the robot, or end a launch that can run them nowhere."""
+    planner = ContainerInstance(
+        name='planner', ros_workspace='', on_interrupt='replace', max_replacements=1)
+    lost = says(fake, 'lost', reason='deleted')
+    if elsewhere:
+        first, free = held(fake, lost)
+        watch.at_start = {1: first, 3: lost, 4: end}
+        actions = [free, talker(machine=planner)]
+    else:
+        planner._options['image'] = 'mine'
+        watch.at_start = {1: lost, 2: lost}
+        actions = [CloudNode(machine=planner, package='absent', executable='says')]
+    assert run(LaunchDescription([*watch(), *actions])) == (0 if elsewhere else 1)
+    here = [str(package / 'lib/demo/says')] * elsewhere
+    assert [cmd for _, cmd in watch.starts] == [THERE, *here] * 2
+    said = capfd.readouterr()
+    rest = 'its nodes stay on the robot' if elsewhere else "can't run on the robot"
+    assert 'max_replacements=1 is reached' in said.out + said.err
+    assert rest in said.out + said.err
+
+
 def test_node_that_ended_on_the_robot_stays_ended(run, fake, package, planner, talker, watch):
     program = package / 'lib/demo/says'
     notice, free = held(fake, says(fake, 'notice', reason='at 12:00'), OnProcessExit)

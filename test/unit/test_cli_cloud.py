@@ -46,6 +46,7 @@ from fogros2.provider import (
     TAG_ROBOT,
 )
 from fogros2.provider.machine_types import Region
+from fogros2.provider.vm.failures import Silent
 from fogros2.provider.vm.images import Image
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2.waiting import wait_until
@@ -106,7 +107,10 @@ class Cloud(FakeProvider):
 
     def images(self) -> Iterable[Image]:
         if self.states:
-            self.baked[-1] = dataclasses.replace(self.baked[-1], state=self.states.pop(0))
+            state = self.states.pop(0)
+            if state == 'no answer':
+                raise Silent('no answer', 'is there a network?', unsent=False)
+            self.baked[-1] = dataclasses.replace(self.baked[-1], state=state)
         return list(self.baked)
 
     def delete_image(self, image_id: str) -> None:
@@ -509,7 +513,8 @@ def test_image_is_created_and_awaited(
     quick: None, disk: FakeShell, capsys: pytest.CaptureFixture[str],
 ) -> None:
     machine('slam')
-    Cloud.states = ['pending', 'pending', 'available']
+    # a request without an answer does not end the wait
+    Cloud.states = ['pending', 'no answer', 'pending', 'available']
     assert run('image', 'slam', '--dry-run') == 0
     assert 'would make an image of slam: cloud id-slam, running' in capsys.readouterr().err
     assert not Cloud.baked and not disk.commands
