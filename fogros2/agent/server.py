@@ -191,6 +191,8 @@ class Agent:
         self.claimed = ''
         #: Whether no launch has the machine; late requests of the former launch start nothing.
         self.released = False
+        #: Whether an agent of a launch died here.
+        self.succeeds = False
         self.since = time.time()
 
     # -- the directory ------------------------------------------------------------------------
@@ -273,6 +275,7 @@ class Agent:
             # the user could have written the file: take nothing that root would execute
             self.config.update({key: saved[key] for key in RESUMED if key in saved})
             self._restart_watchdog()
+            self.succeeds = bool(self.config['launch'])
             kept = not self.config['launch'] and self.config['on_exit'] == 'keep'
             with contextlib.suppress(
                     OSError, OverflowError, RecursionError, TypeError, ValueError), \
@@ -366,7 +369,7 @@ class Agent:
         except Refused as error:
             say(str(error))
         self._watch_notice()
-        if self.journal.next > 1:
+        if self.succeeds or self.journal.next > 1:
             # the nodes end with the agent that died here, and nothing has reported it
             self.nodes.sweep_former()
         while not self.done:

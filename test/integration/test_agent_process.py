@@ -732,10 +732,15 @@ def test_restarted_agent_ends_nodes_and_keeps_its_watchdog(rig, heartbeat):
     assert rig.wait('watchdog')['reason'] == 'robot gone'
 
 
-def test_restarted_agent_gets_its_watches_again(rig):
+@pytest.mark.parametrize('early', [False, True])
+def test_restarted_agent_gets_its_watches_again(rig, early):
+    """Also one whose predecessor had no event yet."""
     notice = ['cat', str(rig.folder / 'notice')]
     client = rig.started(notice=notice)
-    rig.run(rig.node('n', 'print("up")\n'))
+    if early:
+        client.status()
+    else:
+        rig.run(rig.node('n', 'print("up")\n'))
     rig.kill()
     # a machine's boot knows of no notice, and the folder is the user's
     rig.serve()
