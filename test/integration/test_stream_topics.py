@@ -162,10 +162,11 @@ def test_streams_go_on_when_the_machine_between_goes(
     with launching() as launch:
         run = launch(str(path))
         run.wait_for('[last]:')
-        status = ros2('fog', 'status', f'{NAME}-b')
-        rate = re.search(rf'^/between \(h264\) +\S+ +{NAME}-b +([0-9.]+) ', status.stdout,
-                         re.MULTILINE)
-        assert rate is not None and float(rate[1]) > 1, status.stdout + status.stderr
+        wait_until(
+            lambda: any(float(rate) > 1 for rate in re.findall(
+                rf'^/between \(h264\) +\S+ +{NAME}-b +([0-9.]+) ',
+                ros2('fog', 'status', f'{NAME}-b').stdout, re.MULTILINE)),
+            timeout=60.0, what='a rate of the stream')
         process.run(Command((engine, 'rm', '-f', '-t', '0', f'fogros2-{NAME}-a'), sudo=True),
                     timeout=60.0)
         run.wait_for(f"the machine '{NAME}-a' is gone")
