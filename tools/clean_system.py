@@ -198,8 +198,15 @@ class System:
         return terminal.wait()
 
     def received(self) -> int:
-        """Return how many bytes came by the network."""
-        return int(Path(self.files, 'sys/class/net/tap0/statistics/rx_bytes').read_text())
+        """
+        Return how many bytes came by the network.
+
+        :raises CleanSystemError: the system has none any more.
+        """
+        try:
+            return int(Path(self.files, 'sys/class/net/tap0/statistics/rx_bytes').read_text())
+        except FileNotFoundError:
+            raise CleanSystemError('the system has lost its network, tap0') from None
 
     def saved(self, packages: Iterable[str]) -> int:
         """Return how many bytes of these package files an earlier run had downloaded."""
@@ -480,13 +487,14 @@ def _network(process: int) -> Iterator[None]:
     ready, told = os.pipe()
     # slirp4netns ends when the other end is closed, by us or because we are gone
     watched, held = os.pipe()
+    words = tempfile.TemporaryFile()
     try:
         slirp = subprocess.Popen(
             ['slirp4netns', '--configure', '--mtu=1500', '--disable-host-loopback',
              f'--ready-fd={told}', f'--exit-fd={watched}', '--netns-type=path',
              f'/proc/{process}/ns/net', 'tap0'],
             pass_fds=(told, watched), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL, start_new_session=True)
+            stderr=words, start_new_session=True)
         os.close(told)
         told = -1
         if os.read(ready, 1) != b'1':
@@ -494,8 +502,13 @@ def _network(process: int) -> Iterator[None]:
         try:
             yield
         finally:
+            if slirp.poll() is not None:
+                words.seek(0)
+                say(f'slirp4netns ended with status {slirp.returncode}: '
+                    f'{words.read().decode(errors="replace")[-2000:]}')
             _end(slirp)
     finally:
+        words.close()
         for number in (ready, told, watched, held):
             if number >= 0:
                 os.close(number)
