@@ -13,7 +13,7 @@ _TEXTS = {
     'refused': 'could not be started: {error}',
     'watchdog': 'watchdog: {reason}, {action}',
     'notice': 'the provider takes the machine away: {reason}',
-    'gap': '{count} older events are not kept any more',
+    'gap': '{count} events, such as output, are missing here',
 }
 #: Characters of output without a line's end that are kept for its rest.
 _KEPT = 65_536
