@@ -8,7 +8,8 @@ at once, and each one's leftovers are its own. slirp4netns connects it to the pa
 Debian's podman brings it, its addresses do not depend on this computer's, and it lets no
 connection in (pasta would open this computer's ports inside).
 
-The mirror, apt's and pip's connection settings and additional certificates are this computer's.
+The mirror, the connection settings of apt and pip, and additional certificates are this
+computer's.
 Root there is root of this computer's kernel: run nothing that you would not run here as root.
 """
 
@@ -355,6 +356,8 @@ def _configure(root: Path, suite: Suite, password: bool) -> None:
         f'{name} = {value}\n' for name, value in pip_settings().items()))
     if not password:
         write(f'etc/sudoers.d/{USER}', f'{USER} ALL=(ALL) NOPASSWD: ALL\n', 0o440)
+    # Node has certificates of its own, without this computer's
+    write('etc/skel/.npmrc', 'cafile = /etc/ssl/certs/ca-certificates.crt\n')
     for path in _own_certificates():
         write(str(path).lstrip('/'), path.read_text())
 
