@@ -65,7 +65,9 @@ missing_packages() {
     [ -e /etc/ssl/certs/ca-certificates.crt ] || echo ca-certificates
     case $target in interfaces|test)
         for program in cmake g++ make; do have "$program" || echo "$program"; done
-        if [ -n "$python" ] && ! "$python" -c "import os, sys, sysconfig
+        if [ -z "$python" ]; then
+            echo python3-dev
+        elif ! "$python" -c "import os, sys, sysconfig
 sys.exit(not os.path.exists(sysconfig.get_path('include') + '/Python.h'))"; then
             python_package dev
         fi
