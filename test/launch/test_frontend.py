@@ -25,6 +25,7 @@ from fogros2 import (
     SSHInstance,
     StreamTopic,
 )
+from fogros2.actions.frontend.entity import complete
 from fogros2.describe import keywords, values
 from fogros2.errors import ConfigurationError
 from fogros2.runtime.coordinator import Coordinator
@@ -433,3 +434,11 @@ def test_the_documentation_names_every_element():
     assert {name for name, parse in action_parse_methods.items()
             if parse.__module__.startswith('fogros2')} == set(
                 re.findall(r'^\| `(\w+)` \| `', DOCUMENT, re.MULTILINE))
+
+
+def test_attribute_that_an_older_launch_ros_does_not_read_is_not_its_own_remedy():
+    element, _ = Parser.load(io.StringIO('<node name="a" exec_nmae="b"/>'))
+    element.get_attr('name')
+    with pytest.raises(ConfigurationError) as caught:
+        complete(element, ['exec_nmae', 'exec_name', 'name'])
+    assert str(caught.value) == "node has no 'exec_nmae' (did you mean 'exec_name'?)"

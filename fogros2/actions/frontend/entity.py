@@ -166,4 +166,6 @@ def complete(entity: Entity, known: Iterable[str], what: str = '') -> None:
         names = sorted(ast.literal_eval(match[1])) if match is not None else []
         if not names:
             raise ConfigurationError(str(error), 'take it out') from error
-        raise kinds.unknown(what or entity.type_name, names[0], known) from error
+        # an older launch_ros does not read all that is known
+        raise kinds.unknown(
+            what or entity.type_name, names[0], {*known} - {names[0]}) from error
