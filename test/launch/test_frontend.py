@@ -436,7 +436,7 @@ def test_the_documentation_names_every_element():
                 re.findall(r'^\| `(\w+)` \| `', DOCUMENT, re.MULTILINE))
 
 
-def test_attribute_that_an_older_launch_ros_does_not_read_is_not_its_own_remedy():
+def test_name_that_an_older_launch_ros_does_not_read():
     element, _ = Parser.load(io.StringIO('<node name="a" exec_nmae="b"/>'))
     element.get_attr('name')
     with pytest.raises(ConfigurationError) as caught:
