@@ -64,8 +64,9 @@ failed() {
     # it writes into the folder, and a hook of the engine waits for its result
     [ -n "$search" ] && kill "$search" 2>/dev/null && wait "$search" || :
     rm -f "$top/shown"
-    [ -s "$top/cid" ] && "$engine" rm -f -v "$(cat "$top/cid")" >/dev/null 2>&1
-    sh -c "$clean"
+    # a launch that ends kills this group soon, and a busy engine takes longer
+    setsid sh -c '[ -s "$1/cid" ] && "$2" rm -f -v "$(cat "$1/cid")" >/dev/null 2>&1; eval "$3"' \
+        sh "$top" "$engine" "$clean"
     exit $code
 }
 tries=0
