@@ -57,16 +57,23 @@ _CREATE = """\
 top=$1 begin=$2 inside=$3 end=$4 look=$5 clean=$6 shown=$7
 shift 7
 umask 022
-search=
+search= creating=
 failed() {
     code=$?
     [ $code -eq 0 ] && return
     # it writes into the folder, and a hook of the engine waits for its result
     [ -n "$search" ] && kill "$search" 2>/dev/null && wait "$search" || :
     rm -f "$top/shown"
-    # a launch that ends kills this group soon, and a busy engine takes longer
-    setsid sh -c '[ -s "$1/cid" ] && "$2" rm -f -v "$(cat "$1/cid")" >/dev/null 2>&1; eval "$3"' \
-        sh "$top" "$engine" "$clean"
+    # A launch that ends kills this group soon. A busy engine takes longer, and one that is killed
+    # while it creates leaves a network.
+    setsid sh -c 'tries=0
+        while kill -0 "$4" 2>/dev/null && [ $tries -lt 600 ]; do
+            sleep 0.1
+            tries=$((tries + 1))
+        done
+        [ -s "$1/cid" ] && "$2" rm -f -v "$(cat "$1/cid")" >/dev/null 2>&1
+        eval "$3"' sh "$top" "$engine" "$clean" "$creating" &
+    wait
     exit $code
 }
 tries=0
@@ -92,8 +99,9 @@ printf '%s' "$shown" >"$top/shown"
 python3 -IS -c "$look" "$top" </dev/null >/dev/null 2>&1 &
 search=$!
 tar -xpf - --numeric-owner -C "$top/root"
-"$@" &
-wait $!
+setsid "$@" &
+creating=$!
+wait $creating
 """
 
 # Podman forgets the folder of a container's hooks when the container has started.
@@ -108,7 +116,7 @@ rm -f "$top/hidden"
 if [ -e "$top/shown" ]; then python3 -IS -c "$5" "$top" </dev/null >/dev/null 2>&1 & fi
 search=$!
 shift 5
-"$@" || { code=$?; kill "$search" 2>/dev/null; exit $code; }
+setsid "$@" || { code=$?; kill "$search" 2>/dev/null; exit $code; }
 """
 
 # The machine's login user has any number; the first process gives it the folder 'own'. The names
