@@ -31,6 +31,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from typing import IO, Optional
 
@@ -199,15 +200,8 @@ class System:
         return terminal.wait()
 
     def received(self) -> int:
-        """
-        Return how many bytes came by the network.
-
-        :raises CleanSystemError: the system has none any more.
-        """
-        try:
-            return int(Path(self.files, 'sys/class/net/tap0/statistics/rx_bytes').read_text())
-        except FileNotFoundError:
-            raise CleanSystemError('the system has lost its network, tap0') from None
+        """Return how many bytes came by the network."""
+        return int(Path(self.files, 'sys/class/net/tap0/statistics/rx_bytes').read_text())
 
     def saved(self, packages: Iterable[str]) -> int:
         """Return how many bytes of these package files an earlier run had downloaded."""
@@ -486,35 +480,63 @@ def _remove_group(path: Path) -> None:
 
 @contextlib.contextmanager
 def _network(process: int) -> Iterator[None]:
-    """Connect the network namespace of a process to the outside."""
-    ready, told = os.pipe()
+    """Connect the network namespace of a process to the outside, again when slirp4netns dies."""
+    namespace = f'/proc/{process}/ns/net'
+    # made by slirp4netns it would go with it, and so would the count of bytes
+    for words in ('tuntap add tap0 mode tap', 'address add 10.0.2.100/24 dev tap0',
+                  'link set tap0 mtu 1500 up', 'route add default via 10.0.2.2'):
+        _run(['nsenter', f'--net={namespace}', 'ip', *words.split()])
     # slirp4netns ends when the other end is closed, by us or because we are gone
     watched, held = os.pipe()
-    words = tempfile.TemporaryFile()
+    ended = threading.Event()
+
+    def keep(slirp: subprocess.Popen[bytes]) -> None:
+        while True:
+            slirp.wait()
+            if ended.is_set():
+                return
+            # libslirp 4.7.0, Debian 12's, segfaults now and then
+            say(f'slirp4netns ended with status {slirp.returncode}; it is started again')
+            try:
+                slirp = _slirp4netns(namespace, watched)
+            except CleanSystemError as error:
+                say(str(error))
+                return
+
+    keeper = threading.Thread(target=keep, args=[_slirp4netns(namespace, watched)])
+    keeper.start()
     try:
-        slirp = subprocess.Popen(
-            ['slirp4netns', '--configure', '--mtu=1500', '--disable-host-loopback',
-             f'--ready-fd={told}', f'--exit-fd={watched}', '--netns-type=path',
-             f'/proc/{process}/ns/net', 'tap0'],
-            pass_fds=(told, watched), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-            stderr=words, start_new_session=True)
-        os.close(told)
-        told = -1
-        if os.read(ready, 1) != b'1':
-            raise CleanSystemError(f'slirp4netns ended with status {slirp.wait()}')
-        try:
-            yield
-        finally:
-            if slirp.poll() is not None:
-                words.seek(0)
-                say(f'slirp4netns ended with status {slirp.returncode}: '
-                    f'{words.read().decode(errors="replace")[-2000:]}')
-            _end(slirp)
+        yield
     finally:
-        words.close()
-        for number in (ready, told, watched, held):
-            if number >= 0:
-                os.close(number)
+        ended.set()
+        os.close(held)
+        keeper.join()
+        os.close(watched)
+
+
+def _slirp4netns(namespace: str, watched: int) -> subprocess.Popen[bytes]:
+    """
+    Return slirp4netns when it serves tap0 of a network namespace.
+
+    :param watched: the end of a pipe; slirp4netns ends with the other end.
+    :raises CleanSystemError: it ended.
+    """
+    ready, told = os.pipe()
+    with open(ready, 'rb') as line, tempfile.TemporaryFile() as words:
+        try:
+            slirp = subprocess.Popen(
+                ['slirp4netns', '--mtu=1500', '--disable-host-loopback', f'--ready-fd={told}',
+                 f'--exit-fd={watched}', '--netns-type=path', namespace, 'tap0'],
+                pass_fds=(told, watched), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                stderr=words, start_new_session=True)
+        finally:
+            os.close(told)
+        if line.read(1) != b'1':
+            status = slirp.wait()
+            words.seek(0)
+            raise CleanSystemError(f'slirp4netns ended with status {status}: '
+                                   f'{words.read().decode(errors="replace")[-2000:].strip()}')
+    return slirp
 
 
 def _joined(groups: Sequence[Path], words: Sequence[str]) -> list[str]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib
 import os
 from pathlib import Path
+import signal
 import subprocess
 import sys
 
@@ -119,3 +120,36 @@ def test_sudo_ticket_is_kept_while_a_script_runs(tmp_path):
     ('file /home/robot/.ros/log/x', False), ('file /home/robot/.local/share/fogros2/x', True)])
 def test_only_what_is_ours_counts_as_left_behind(tools, line, counted):
     assert (tools['leftovers']._OTHERS.fullmatch(line) is None) == counted
+
+
+SLIRP4NETNS = """
+import os, sys
+ready, watched = (int(word.partition('=')[2]) for word in sys.argv if '-fd=' in word)
+with open(os.environ['STARTED'], 'a') as file:
+    file.write(f'{os.getpid()}\\n')
+os.write(ready, b'1')
+os.close(ready)
+os.read(watched, 1)
+"""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='network namespaces need root')
+def test_network_returns_when_its_program_dies(tools, tmp_path, monkeypatch):
+    program, started = tmp_path / 'slirp4netns', tmp_path / 'started'
+    program.write_text(f'#!{sys.executable}\n{SLIRP4NETNS}')
+    program.chmod(0o755)
+    monkeypatch.setenv('PATH', f'{tmp_path}:{os.environ["PATH"]}')
+    monkeypatch.setenv('STARTED', str(started))
+    with subprocess.Popen(['unshare', '--net', 'sh', '-c', 'echo ready; exec sleep 60'],
+                          stdout=subprocess.PIPE) as first:
+        assert first.stdout.readline() == b'ready\n'
+        with tools['clean_system']._network(first.pid):
+            os.kill(int(started.read_text()), signal.SIGSEGV)
+            wait_until(lambda: len(started.read_text().splitlines()) == 2, timeout=20.0,
+                       what='slirp4netns runs again')
+            for device in ('tap0', 'default via 10.0.2.2'):
+                assert device in subprocess.run(
+                    ['nsenter', f'--net=/proc/{first.pid}/ns/net', 'sh', '-c',
+                     'ip address; ip route'], stdout=subprocess.PIPE, text=True, check=True).stdout
+        first.kill()
+    assert not any(Path('/proc', pid).exists() for pid in started.read_text().split())
