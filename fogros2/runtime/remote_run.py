@@ -18,6 +18,7 @@ from fogros2.events import Event, NodeExited, NodeOutput, NodeStarted
 from fogros2.launch_internals import private
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2.runtime import run_state
+from fogros2.runtime.added_process import AddedProcess
 from fogros2.runtime.run_state import RunState
 
 #: Texts of a process that a signal interrupted while it started: NumPy, for one, turns Python's
@@ -72,6 +73,8 @@ class RemoteRun:
         completed = private.completed(action)
         assert completed is not None
         self.node = node
+        #: Whether FogROS2 added the process to the launch.
+        self.added = isinstance(action, AddedProcess)
         self.complete = completed
         self._action = action
         self._come_here = come_here

@@ -29,6 +29,8 @@ class Moving(Nodes, Protocol):
     """The nodes of one machine, which move to the robot and to a new machine."""
 
     checkpoints: Optional[Checkpoints]
+    #: The name of what goes on without the machine, '' if nothing does.
+    others: str
 
     async def halt_all(self) -> None:
         """Let the machine end all of its processes; ``drained`` follows."""
@@ -36,8 +38,8 @@ class Moving(Nodes, Protocol):
     async def move_halted(self) -> None:
         """Let processes start on the robot: the machine no longer runs them."""
 
-    async def homeless(self) -> list[str]:
-        """Return, after moves under way, the names of processes that cannot run on the robot."""
+    async def stay(self) -> list[str]:
+        """End, after moves under way, what the robot cannot run; return the nodes' names."""
 
     def replace(self, running: RunningMachine) -> None:
         """Use another machine from now on."""
@@ -131,11 +133,13 @@ class Replacer:
         what = f"the machine '{name}' is not replaced again: max_replacements={count} is reached"
 
         async def give_up() -> None:
-            if homeless := await self._session.homeless():
+            homeless, others = await self._session.stay(), self._session.others
+            if homeless and not others:
                 raise ProviderError(
                     f"{what}, and {', '.join(homeless)} can't run on the robot",
                     'raise max_replacements, or install the programs on the robot')
-            self._logger.error(f'{what}; its nodes stay on the robot')
+            self._logger.error(
+                f'{what}; {others} go on' if others else f'{what}; its nodes stay on the robot')
         self._session.request(give_up)
 
     def _warn(self, what: str, error: FogError) -> None:

@@ -7,6 +7,7 @@ import asyncio
 from collections.abc import Callable, Mapping
 import functools
 import os
+import time
 from typing import Any, Optional, TYPE_CHECKING
 
 from fogros2 import plan
@@ -34,6 +35,8 @@ _LAST_EVENTS = ('watchdog', 'ending')
 _HOLD = 60.0
 #: Seconds in which the provider may confirm a notice; EC2 gives two minutes' notice.
 _CONFIRM = 150.0
+#: Seconds before the end of its lifetime from which a machine that is lost is not replaced.
+_LAST = 60.0
 #: Seconds until processes are started again that a machine did not start.
 _AGAIN = 1.0
 
@@ -269,6 +272,10 @@ class Interruptible(Session):
     def go_on(self, event: MachineInterrupted, remedy: str = '') -> list[Action]:
         """Apply ``on_interrupt``; return what this needs; see the base class."""
         if self.replacer is not None:
+            if event.lost and self.running is not None and (
+                    time.monotonic() > self.running.expires - _LAST):
+                return super().go_on(event, 'its time was over: raise lifetime=, or the budget '
+                                     'that shortens it')
             self._logger.warning(f'{event}; a new machine will continue its nodes')
             self.replacer.on('lost' if event.lost else 'notice')
             return []
@@ -322,10 +329,13 @@ class Interruptible(Session):
             for run in [*self._away, *self._runs.values()]:
                 run.on('left')
 
-    async def homeless(self) -> list[str]:
-        """Return, after moves under way, the names of processes that cannot run on the robot."""
+    async def stay(self) -> list[str]:
+        """End, after moves under way, what the robot cannot run; return the nodes' names."""
         async with self._moves:
-            return [run.node.name for run in self._away if run.state.phase == 'away']
+            homeless = [run for run in self._away if run.state.phase == 'away']
+        for run in homeless:
+            run.on('over')
+        return [run.node.name for run in homeless if not run.added]
 
     def replace(self, running: RunningMachine) -> None:
         """Use another machine from now on."""

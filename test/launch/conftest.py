@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import stat
 import tempfile
@@ -37,6 +38,7 @@ class FakeMachine:
         self.exits_on_stop = True
         #: Why the machine is gone, '' while it is there.
         self.lost = ''
+        self.expires = math.inf
         #: Whether the provider confirms a notice: its answers, of which the last stays.
         self.confirms = [True]
         self.pids = iter(range(4001, 5000))

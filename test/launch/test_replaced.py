@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+import time
 
 from launch import LaunchDescription
 from launch.actions import ExecuteProcess, OpaqueFunction, RegisterEventHandler
@@ -14,8 +15,10 @@ import pytest
 
 from fogros2 import CloudNode, ContainerInstance
 from fogros2.errors import ConfigurationError, ConnectError, DeadlineExceeded, ProviderError
-from fogros2.model import Endpoint, MachineSpec
+from fogros2.model import Endpoint, MachineSpec, NodeSpec
 from fogros2.process import which
+from fogros2.runtime.coordinator import Coordinator
+from fogros2.runtime.remote_process import process_on
 from fogros2.shell.local import LocalShell
 from fogros2.store import Store
 from fogros2.waiting import wait_until
@@ -121,6 +124,53 @@ def test_nodes_of_the_last_lost_machine(run, fake, package, talker, watch, capfd
     rest = 'its nodes stay on the robot' if elsewhere else "can't run on the robot"
     assert 'max_replacements=1 is reached' in said.out + said.err
     assert rest in said.out + said.err
+
+
+def test_machine_at_the_end_of_its_lifetime_is_not_replaced(run, fake, planner, watch, capfd):
+    node = CloudNode(machine=planner, package='absent', executable='says')
+    planner._options['image'] = 'mine'
+
+    def ended(event):
+        fake.machines['planner'].expires = time.monotonic() - 1.0
+        return says(fake, 'lost', reason='deleted')(event)
+
+    watch.at_start = {1: ended}
+    assert run(LaunchDescription([*watch(), node])) == 1
+    assert len(fake.noted('up')) == 1
+    said = capfd.readouterr()
+    assert 'raise lifetime=' in said.out + said.err
+
+
+def test_replica_that_is_not_replaced_again_leaves_the_others(run, fake, watch, capfd):
+    planner = ContainerInstance(
+        name='planner', ros_workspace='', on_interrupt='replace', max_replacements=1)
+    planner._options['image'] = 'mine'
+    lost = says(fake, 'lost', reason='deleted')
+    watch.at_start = {1: lost, 2: lost}
+
+    def replicate(context):
+        Coordinator.of(context).session('planner').rename({}, 'the other replicas')
+
+    assert run(LaunchDescription([
+        *watch(), CloudNode(machine=planner, package='absent', executable='says'),
+        OpaqueFunction(function=replicate)])) == 0
+    said = capfd.readouterr()
+    assert 'max_replacements=1 is reached; the other replicas go on' in said.out + said.err
+
+
+def test_program_of_a_feature_keeps_no_node_from_staying(
+        run, fake, package, talker, watch, capfd):
+    planner = ContainerInstance(
+        name='planner', ros_workspace='', on_interrupt='replace', max_replacements=1)
+    lost = says(fake, 'lost', reason='deleted')
+    first, free = held(fake, lost)
+    (package / 'lib/demo/says').write_text('#!/bin/sh\necho here; exec sleep 60\n')
+    added = process_on(NodeSpec(id='', name='record', arguments=('record',)), 'planner')
+
+    watch.at_start = {2: first, 5: lost, 6: end}
+    assert run(LaunchDescription([*watch(), free, talker(machine=planner), added])) == 0
+    said = capfd.readouterr()
+    assert 'its nodes stay on the robot' in said.out + said.err
 
 
 def test_node_that_ended_on_the_robot_stays_ended(run, fake, package, planner, talker, watch):
@@ -388,6 +438,16 @@ def test_checkpoint_of_a_node_needs_a_replacement(run, fake, package, capfd):
         machine=machine, package='demo', executable='talker', checkpoint='$HOME/map')])) == 1
     assert fake.noted('up') == []
     assert "a node of 'planner' has a checkpoint, and nothing" in capfd.readouterr().out
+
+
+def test_node_in_an_image_has_no_checkpoint_of_its_own(run, fake, capfd):
+    machine = ContainerInstance(
+        name='planner', ros_workspace='', on_interrupt='replace', containers=True)
+    assert run(LaunchDescription([CloudNode(
+        machine=machine, package='demo', executable='talker', image='ros:jazzy',
+        checkpoint='$HOME/map')])) == 1
+    assert fake.noted('up') == []
+    assert "the checkpoint ~/map of a node on 'planner'" in capfd.readouterr().out
 
 
 @pytest.mark.parametrize('words, message', [
