@@ -187,8 +187,9 @@ class VideoSender(Sender):
         self._ffmpeg: Optional[Publisher] = None
         self._ffmpeg_packet = message.installed('ffmpeg_image_transport_msgs', 'FFMPEGPacket')
         if self._ffmpeg_packet is not None:
-            self._ffmpeg = node.offer(self._ffmpeg_packet, f"{stream.rpartition('/')[0]}/ffmpeg",
-                                      STREAM_QOS, self._matched)
+            # a driver with image_transport's plugin publishes <image>/ffmpeg
+            self._ffmpeg = node.offer(
+                self._ffmpeg_packet, f'{stream}/ffmpeg', STREAM_QOS, self._matched)
             self.publishers.append(self._ffmpeg)
         self._slices = SliceSender(node, stream, self._matched)
         self._pieces = node.create_publisher(

@@ -45,6 +45,8 @@ class RemoteProcess:
     features: Mapping[str, Mapping[str, Any]] = {}
     #: Of the action's machine; set by ``prepare`` unless the process runs on the robot.
     session: Optional[Session] = None
+    #: Whether the launch does not go on without the process.
+    needed = True
     #: Whether the process runs on the robot.
     here = False
     _node: NodeSpec
@@ -96,6 +98,8 @@ class RemoteProcess:
             bool(contained), provider.has_own_packages(session.spec),
             provider.capabilities.account), features=self.features)
         if not isinstance(action, AddedProcess):
+            if self.needed:
+                session.need(self._node.name)
             paths = node_spec.robot_paths(
                 self._node, [context.environment.get('HOME', ''), *(plan.ament_prefixes(
                     coordinator.base_environment) if contained else ())],
@@ -224,6 +228,6 @@ def send_components(
     coordinator = Coordinator.of(context)
     session = None if coordinator.on_robot(machine) else coordinator.session(machine)
     components.rename_topics(
-        entity, dict if session is None else functools.partial(
-            coordinator.parts.names, session.spec.name),
+        entity, lambda: {} if session is None or session.interrupted else coordinator.parts.names(
+            session.spec.name),
         lambda: coordinator.beside(own, session, process_on))

@@ -16,6 +16,7 @@ import launch.logging
 from fogros2.describe import values
 from fogros2.errors import (
     AgentError,
+    ConfigurationError,
     ConnectError,
     DeadlineExceeded,
     FogError,
@@ -127,6 +128,8 @@ class Session:
         #: New names of topics and services of its nodes, and what goes on without these nodes.
         self.renamed: dict[str, str] = {}
         self.others = ''
+        #: A node without which the launch does not go on, '' without one.
+        self._needed = ''
         self._loop = loop
         self._in_thread = in_thread
         self._fail = fail
@@ -194,10 +197,27 @@ class Session:
         Rename topics and services of nodes without which the launch goes on.
 
         :param others: what goes on, for messages.
-        :raises ConfigurationError: the nodes may move to the robot.
+        :raises ConfigurationError: the nodes may move to the robot, or others run on the machine.
         """
         self.renamed.update(names)
         self.others = others
+        self._check_needed()
+
+    def need(self, node: str) -> None:
+        """
+        Note a node without which the launch does not go on.
+
+        :raises ConfigurationError: the machine runs nodes without which it does.
+        """
+        self._needed = node
+        self._check_needed()
+
+    def _check_needed(self) -> None:
+        if self.others and self._needed:
+            raise ConfigurationError(
+                f"'{self._needed}' can't run on '{self.spec.name}': topics are renamed there, and "
+                f'if that machine is lost, {self.others} go on',
+                'give it another machine, or put it into their group')
 
     def warn_of_paths(self, node: NodeSpec, paths: Sequence[str]) -> None:
         """Warn once of each path of the robot that a node gets."""

@@ -144,6 +144,8 @@ class _Replica(CloudGroup):
     def _send(self, entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
         _check(entity)
         super()._send(entity, context)
+        if (remote := remote_of(entity)) is not None:
+            remote.needed = False
 
 
 class _Last(GroupAction):

@@ -108,6 +108,8 @@ def streams(topics: Iterable[Topic], nodes: Iterable[str], hosts: Hosts) -> list
             name, _, last = topic.name.rpartition('/')
             if encoder['host']:
                 name = name.removeprefix(f"/fogros2/{encoder['host']}")
+            # in the names of plugins' streams
+            name = name.removesuffix('/fogros2')
             if node not in topic.publishers or last != encoder['transport'] \
                     or identifier(name) != encoder['topic']:
                 continue

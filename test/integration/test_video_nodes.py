@@ -189,7 +189,7 @@ def test_ffmpeg_image_transport_decodes_our_packets(bench: Bench) -> None:
     bench.start('encoder', '-r', 'image:=/camera')
     bench.run(f'{prefix}/lib/image_transport/republish', '--ros-args',
               '-p', 'in_transport:=ffmpeg', '-p', 'out_transport:=raw',
-              '-r', 'in/ffmpeg:=/camera/ffmpeg', '-r', 'out:=/shown')
+              '-r', 'in/ffmpeg:=/camera/h264/ffmpeg', '-r', 'out:=/shown')
     shown = bench.heard(Image, '/shown')
     bench.until(lambda: len(shown) >= 5, 'an image', meanwhile=source(bench, encoding='rgb8'))
     for got in shown:

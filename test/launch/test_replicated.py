@@ -247,6 +247,19 @@ def test_two_groups_with_the_same_name_are_refused(run, caplog):
     assert "two groups of replicas have '/plan'" in caplog.text
 
 
+@pytest.mark.parametrize('order', [1, -1])
+def test_other_node_on_a_machine_of_replicas_is_refused(run, fake, caplog, order):
+    """Its topics would be renamed, and nobody would miss it."""
+    ends_when_started(fake, 3)
+    both = machines('one', 'two')
+    assert run(LaunchDescription([
+        CloudNode(both[0], package='demo', executable='talker', exec_name='own'),
+        Replicated(both, [talker()], services=['/plan'])][::order])) == 1
+    assert "can't run on 'one': topics are renamed there, and if that machine is lost, " in (
+        caplog.text)
+    assert fake.noted('up') == []
+
+
 XML = """
 <launch>
   <arg name="second" default="two"/>

@@ -55,13 +55,13 @@ def test_streams_are_found_by_node_names() -> None:
               f'camera_image_raw_h264_decoder_on_slam_1 {OWN}', PACKET),
         topic('/fogros2/slam_1/annotated/h264', 'annotated_h264_encoder_on_slam_1', OWN, PACKET),
         topic('/annotated', 'annotated_h264_decoder_from_slam_1', OWN, IMAGE),
-        topic('/fogros2/far_away/map/compressed', 'map_compressed_encoder_on_far_away',
+        topic('/fogros2/far_away/map/fogros2/compressed', 'map_compressed_encoder_on_far_away',
               'map_compressed_decoder_from_far_away_on_slam_1', PACKET)]
     found = streams(graph, names, hosts)
     assert found == [
         Stream('/camera/image_raw', 'h264', '/camera/image_raw/h264', PACKET, '', 'slam-1', True),
-        Stream('/map', 'compressed', '/fogros2/far_away/map/compressed', PACKET, 'far-away',
-               'slam-1', True),
+        Stream('/map', 'compressed', '/fogros2/far_away/map/fogros2/compressed', PACKET,
+               'far-away', 'slam-1', True),
         Stream('/annotated', 'h264', '/fogros2/slam_1/annotated/h264', PACKET, 'slam-1', '',
                False)]
     assert [decoded(one) for one in graph] == [False, False, False, True, False]
