@@ -24,6 +24,7 @@ from fogros2.model import (
     Machine,
     MachineSpec,
     NodeSpec,
+    OtherVpn,
     VpnInterface,
 )
 from fogros2.shell import Shell
@@ -259,6 +260,9 @@ class RunningLaunch(Protocol):
         :raises ConfigurationError: there is none of this name.
         """
 
+    def other_vpn(self, name: str) -> Optional[OtherVpn]:
+        """Return the VPN of another robot in which a machine is, None for the launch's."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Program:
@@ -350,6 +354,9 @@ class Feature:
     node_options: ClassVar[Callable[..., Any]] = staticmethod(lambda: None)
     #: Whether each machine uses the feature, even without its keywords.
     always: ClassVar[bool] = False
+    #: Whether its context surrounds those of other features, because it makes folders that these
+    #: may use.
+    outermost: ClassVar[bool] = False
     #: A keyword of machines that takes a list, and the element of XML and YAML that is one item.
     #: Machines have a method ``add_ELEMENT``, which adds what ``item`` returns for its arguments.
     machine_list: ClassVar[tuple[str, str]] = ('', '')
@@ -370,6 +377,14 @@ class Feature:
         Check a machine that uses the feature before anything is created.
 
         :raises FogError: the feature can't work there.
+        """
+
+    def check_beside(self, spec: MachineSpec, others: Sequence[MachineSpec], own: Any) -> None:
+        """
+        Check a machine against the launch's other machines before it is created.
+
+        :param spec: with its choices made, as ``others``, which run or will be created.
+        :raises FogError: the feature can't work on all of them.
         """
 
     def lifetime(
@@ -559,9 +574,10 @@ def used(spec: MachineSpec) -> Iterator[tuple[Feature, Any]]:
 
 def names(spec: MachineSpec) -> Sequence[str]:
     """
-    Return the names of the features that a machine uses.
+    Return the names of the features that a machine uses, the outermost first.
 
     :raises ConfigurationError: one is not installed.
     """
-    return list(dict.fromkeys([*spec.features, *(
-        name for name, each in installed().items() if each.always)]))
+    return sorted(dict.fromkeys([*spec.features, *(
+        name for name, each in installed().items() if each.always)]),
+        key=lambda name: not load(name).outermost)

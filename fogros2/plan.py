@@ -105,6 +105,21 @@ def check_rmw(rmw: str, prefixes: Sequence[str], specs: Iterable[MachineSpec]) -
                 "use bootstrap='apt' (Ubuntu 24.04), or unset RMW_IMPLEMENTATION")
 
 
+def check_domain(domain: int, specs: Iterable[MachineSpec]) -> None:
+    """
+    Check that the nodes of machines are in the launch's ROS domain.
+
+    :raises DdsError: they and the robot's nodes would not hear each other.
+    """
+    for spec in specs:
+        own = spec.environment.get('ROS_DOMAIN_ID', str(domain)) or '0'
+        if own != str(domain):
+            raise DdsError(
+                f"the nodes of machine '{spec.name}' would have ROS_DOMAIN_ID={own}, those here "
+                f'{domain}: they would not hear each other',
+                'set ROS_DOMAIN_ID for the whole launch, before it')
+
+
 def has_wheels(prefix: str) -> bool:
     """Return whether a prefix has ROS 2 from the wheels of the package index."""
     return next(Path(prefix).glob('lib/python3*/site-packages/ros_rclpy-*.dist-info'),

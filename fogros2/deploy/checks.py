@@ -79,6 +79,17 @@ def check(
             report(warned)
 
 
+def check_together(specs: Sequence[MachineSpec]) -> None:
+    """
+    Check the machines of a launch, with all choices made, against each other.
+
+    :raises FogError: a feature can't work on all of them.
+    """
+    for spec in specs:
+        for each, own in feature.used(spec):
+            each.check_beside(spec, [other for other in specs if other is not spec], own)
+
+
 def check_architecture(spec: MachineSpec, provider: Provider) -> None:
     """
     Check that wheels and workspace fit the processor of a machine with all choices made.

@@ -60,13 +60,11 @@ class Choices:
         """
         Return the specs to try while there is no capacity, one after the other.
 
-        A provider that stands for others is asked for them once for each launch.
+        Their provider, which stands for others, is asked once, and again after ``forget``.
 
         :raises FogError: nothing fits.
         """
         provider = self._provider(spec.provider)
-        if not provider.capabilities.places:
-            return [spec]
         if spec.name not in self._places:
             with step(self._report, spec.name, 'offers') as detail:
                 places = provider.places(spec)
@@ -74,6 +72,10 @@ class Choices:
                 detail += [f'{len(places) - 2} more'] * (len(places) > 2)
             self._places[spec.name] = [place for _, place in places]
         return self._places[spec.name]
+
+    def forget(self, name: str) -> None:
+        """Let ``places`` ask anew for the offers of a machine."""
+        self._places.pop(name, None)
 
     def price(self, spec: MachineSpec) -> Optional[Decimal]:
         """Return the price of a machine in US dollars per hour, None if unknown."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent import futures
 from concurrent.futures import Future, ThreadPoolExecutor
+import contextlib
 import dataclasses
 import functools
 import os
@@ -16,7 +17,13 @@ from typing import Optional
 from fogros2 import model, plan, plugin_system
 from fogros2.dds import addresses_of, DdsVendor
 from fogros2.deploy import robot_router
-from fogros2.deploy.checks import check, check_architecture, check_here, check_names
+from fogros2.deploy.checks import (
+    check,
+    check_architecture,
+    check_here,
+    check_names,
+    check_together,
+)
 from fogros2.deploy.choosing import Choices
 from fogros2.deploy.context import Context, programs_of
 from fogros2.deploy.deployment import bring_up
@@ -24,14 +31,21 @@ from fogros2.deploy.robot import check_robot, clear, provider, run
 from fogros2.deploy.robot_vpn import choose_interface, RobotVpn
 from fogros2.deploy.running import RunningMachine
 from fogros2.deploy.undo import UndoStack
-from fogros2.errors import Cancelled, ConfigurationError, DdsError, FogError, StoreError
+from fogros2.errors import (
+    Cancelled,
+    ConfigurationError,
+    DdsError,
+    FogError,
+    MachineNotFound,
+    StoreError,
+)
 from fogros2.feature import Cost
 from fogros2.journal import Journal
-from fogros2.model import DdsInterface, MachineSpec, NodeSpec, OtherVpn
+from fogros2.model import DdsInterface, MachineSpec, MachineState, NodeSpec, OtherVpn
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent, step, StepFailed, Warned
 from fogros2.store import delete_folder, Record, Store, this_process, write_private
-from fogros2.vpn import addresses
+from fogros2.vpn import addresses, Vpn
 from fogros2.waiting import in_thread, Timeouts
 
 #: Seconds for the checks that come before the robot's VPN interface.
@@ -72,8 +86,8 @@ class Launch:
         self._rmw = ''
         self._interfaces: list[DdsInterface] = []
         self._robot_environment: Optional[dict[str, str]] = None
-        #: Networks of the VPNs that this launch will join.
-        self._others: list[str] = []
+        #: The VPNs of other robots to whose machines the robot's filter lets DDS pass.
+        self._others: list[OtherVpn] = []
         #: The VPNs of other robots that this launch has joined, by the names of machines here.
         self._joined: dict[str, OtherVpn] = {}
 
@@ -97,7 +111,7 @@ class Launch:
             if answer in done:
                 answer.result()
         self._others = [
-            other.interface.network for spec in specs
+            other for spec in specs
             if (other := self.provider(spec.provider).other_vpn(spec)) is not None]
 
     def prepare(
@@ -115,21 +129,33 @@ class Launch:
         self._nodes.update(nodes)
         check_names(specs)
         plan.check_rmw(rmw, plan.ament_prefixes(self.user_environment), specs)
+        plan.check_domain(self.domain, specs)
+        self._check_router(specs)
         for spec in specs:
             check(spec, self.provider(spec.provider), environment=self.user_environment,
                   programs=programs_of(nodes.get(spec.name, ())), report=self.report)
         with ThreadPoolExecutor(max(1, len(specs)), 'fog-choose') as pool:
             choices = [pool.submit(self._choose, spec) for spec in specs]
             chosen = [choice.result() for choice in choices]
+        check_together([cost.spec for cost in self.costs() if not cost.ended])
         # each counts what all cost
         for spec in filter(None, chosen):
             self._choices.limited(spec)
+
+    def _check_router(self, specs: Sequence[MachineSpec]) -> None:
+        """Check that the robot's router, where the middleware has one, can have all machines."""
+        names = {*self._indices, *(spec.name for spec in specs)}
+        if len(names) > robot_router.MACHINES and self.dds().router('', (), None) is not None:
+            raise DdsError(
+                f"the launch has {len(names)} machines, and the robot's router can have "
+                f'{robot_router.MACHINES}',
+                'use several launches, or another RMW_IMPLEMENTATION')
 
     def _choose(self, spec: MachineSpec) -> Optional[MachineSpec]:
         """Make the open choices of a spec; return it unless a kept machine may fit."""
         place = self._places(spec)[0]
         before = self._before(spec)
-        if before is None or before.provider != place.provider:
+        if before is None or before.provider != place.provider or not self._exists(before):
             return self._check_choices(place)
         kept = dataclasses.replace(place, options=before.spec.options)
         self._choices.expect(kept, self._choices.price(kept))
@@ -144,9 +170,12 @@ class Launch:
 
     def _places(self, spec: MachineSpec) -> list[MachineSpec]:
         """Return the specs to try; a kept machine with the same requirements stays where it is."""
+        if not self.provider(spec.provider).capabilities.places:
+            return [spec]
         before = self._before(spec)
         if before is not None and before.spec.wanted is not None and (
-                model.to_json(before.spec.wanted) == model.to_json(spec.options)):
+                model.to_json(before.spec.wanted) == model.to_json(spec.options)
+                ) and self._exists(before):
             return [dataclasses.replace(
                 spec, provider=before.provider, options=before.asked,
                 wanted=spec.options)]
@@ -159,6 +188,14 @@ class Launch:
         except StoreError:
             return None
         return before if before is not None and before.machine_id is not None else None
+
+    def _exists(self, before: Record) -> bool:
+        """Return whether the machine of a record with its id has not expired meanwhile."""
+        assert before.machine_id is not None
+        with contextlib.suppress(MachineNotFound):
+            return self.provider(before.provider).describe(
+                before.machine_id).state is not MachineState.DELETED
+        return False
 
     def provider(self, name: str) -> Provider:
         """
@@ -220,6 +257,11 @@ class Launch:
         except ValueError:
             raise ConfigurationError(f'ROS_DOMAIN_ID={text} is no number',
                                      'use 0 to 101') from None
+
+    def drops(self, environment: Mapping[str, str]) -> bool:
+        """Return whether the robot's filter drops the DDS of a node with these variables."""
+        own = environment.get('ROS_DOMAIN_ID') or '0'
+        return own != str(self.domain) and bool(self.dds().ports)
 
     # -- the robot ------------------------------------------------------------------------------
 
@@ -291,6 +333,10 @@ class Launch:
                 self.undo.enter_context(provider.join(
                     spec, self.dds().rmw, self.domain, self.user_environment))
                 self._joined[spec.name] = other
+                if other not in self._others:
+                    self._others.append(other)
+                    if self._vpn is not None:
+                        self._vpn.use(self._make_vpn())
                 if self._robot_environment is not None:
                     self._write_interfaces()
             return self._joined.get(spec.name)
@@ -304,17 +350,23 @@ class Launch:
                 # `ros2 fog gc` reads this to recognise the folder of a killed launch
                 write_private(
                     folder / 'process.json', model.to_json(this_process()).encode())
-                vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
-                    ports=self.dds().ports,
-                    asked=addresses_of(self.dds().asked(self.user_environment)))
                 self._vpn = RobotVpn(
                     choose_interface(
                         self.id, folder, self.user_environment, self.timeouts.vpn,
-                        self._others), vpn,
+                        [other.interface.network for other in self._others]), self._make_vpn(),
                     report=self.report, timeout=self.timeouts.vpn,
                     cancel=self.cancel, ending=self._ending,
                     choose_port=functools.partial(addresses.choose_port, self.user_environment))
             return self._vpn
+
+    def _make_vpn(self) -> Vpn:
+        """Return the VPN with what the robot's filter admits now."""
+        machines = [other.interface.address for other in self._others]
+        vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
+            ports=self.dds().ports, asked=[*dict.fromkeys([
+                *addresses_of(self.dds().asked(self.user_environment)), *machines,
+                *map(addresses.multicast_group, machines)])])
+        return vpn
 
     def _clear(self) -> None:
         """Remove what the launch has made on the robot, as for a launch that died."""
@@ -409,6 +461,8 @@ class Launch:
             up = self._ups.get(name)
         if up is not None and up.exception() is None:
             up.result().retire()
+        # the next machine costs what offers cost then
+        self._choices.forget(name)
         with self._lock:
             self._ups.pop(name, None)
 

@@ -104,6 +104,13 @@ class RobotVpn:
                 Periodic('fog-vpn', POLL_INTERVAL, self.check_health, stop=self._stop)
             return self._peer
 
+    def use(self, vpn: Vpn) -> None:
+        """Use commands with another filter; bring an interface that is up to that state."""
+        with self._lock:
+            self.vpn = vpn
+            if self._peer is not None:
+                self._run(vpn.up(self.interface, self._peers()))
+
     def _run(self, commands: Iterable[Command], *, cancel: bool = True) -> str:
         return run(commands, timeout=self._timeout, cancel=self._cancel if cancel else None)
 

@@ -221,6 +221,7 @@ def end_machine(
         provider.destroy(record.machine_id)
         return True
     machines: list[Machine] = []
+    provider.search_for([record.spec])
     with contextlib.suppress(Unsupported):
         machines += provider.find({TAG_NAME: record.name, TAG_LAUNCH: record.last})
     for machine in machines:

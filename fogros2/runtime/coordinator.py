@@ -28,8 +28,8 @@ from launch.actions import (
     PushEnvironment,
     ResetEnvironment,
 )
-from launch.event_handlers import OnShutdown
-from launch.events.process import ShutdownProcess
+from launch.event_handlers import OnProcessStart, OnShutdown
+from launch.events.process import ProcessStarted, ShutdownProcess
 import launch.logging
 from launch.substitutions import SubstitutionFailure
 
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from fogros2.describe.machines import SomeMachine
     from fogros2.describe.overrides import Overrides
     from fogros2.feature import Program
-    from fogros2.model import MachineSpec
+    from fogros2.model import MachineSpec, OtherVpn
 
 #: Returns the process of a node on a machine, by the machine's name.
 OnMachine = Callable[[NodeSpec, str], ExecuteLocal]
@@ -132,6 +132,7 @@ class Coordinator:
             context.register_event_handler(EventHandler(
                 matcher=functools.partial(_is, kind),
                 entities=OpaqueFunction(function=function)))
+        context.register_event_handler(OnProcessStart(on_start=self._on_process_start))
         context.register_event_handler(OnShutdown(on_shutdown=self._on_shutdown))
 
     @classmethod
@@ -366,6 +367,11 @@ class Coordinator:
         """Return a machine as the launch file requests it."""
         return self._spec(self._by_name(name))
 
+    def other_vpn(self, name: str) -> Optional[OtherVpn]:
+        """Return the VPN of another robot in which a machine is, None for the launch's."""
+        spec = self.spec(name)
+        return self.launch.provider(spec.provider).other_vpn(spec)
+
     def beside(
         self, own: Lists, session: Optional[Session], on_machine: OnMachine,
     ) -> list[ExecuteLocal]:
@@ -435,6 +441,12 @@ class Coordinator:
                 self._logger.warning(
                     f"{details['name']} runs already and so without the cloud's DDS settings: it "
                     'may not see the cloud; use a FogROSLaunchDescription')
+
+    def _on_process_start(self, event: ProcessStarted, context: LaunchContext) -> None:
+        if self._launch is not None and self._launch.drops(event.env or {}):
+            self._logger.warning(
+                f"{event.process_name} has another ROS_DOMAIN_ID than the launch: the launch's "
+                'DDS filter drops messages of other domains; start it outside of the launch')
 
     def _on_begin(self, context: LaunchContext) -> None:
         self._begun = True

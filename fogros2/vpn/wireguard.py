@@ -69,7 +69,8 @@ class WireGuard(Vpn):
     Commands for a WireGuard interface; they need root and the programs of ``PACKAGES``.
 
     :param ports: ranges of UDP ports that an interface with a firewall admits, as (first, last).
-    :param asked: IPv4 addresses that the user configured for the robot's nodes to ask.
+    :param asked: IPv4 addresses outside the VPN to which the robot's nodes may send: those that
+        the user configured, and those of joined machines.
     """
 
     def __init__(self, ports: Sequence[tuple[int, int]] = (), asked: Sequence[str] = ()) -> None:
@@ -230,9 +231,10 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
     only DDS and ping from a machine, which may be hijacked. A machine of a launch accepts DDS from
     the VPN and from itself only.
 
-    It uses one table, so that one delete is its undo. One transaction replaces the whole table,
-    so there is no moment without it. An accept in another table does not override a drop here,
-    nor an accept here a drop there (the user's own firewall has to admit the VPN).
+    It uses one table, so that one delete is its undo. One transaction replaces all rules, so there
+    is no moment without them; known addresses of the LAN stay. An accept in another table does not
+    override a drop here, nor an accept here a drop there (the user's own firewall has to admit the
+    VPN).
     """
     name = _name(interface)
     outside = _outside(interface)
@@ -240,7 +242,7 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
     destinations = f'{{ {interface.address}, {DISCOVERY_GROUP}, {group} }}'
     rules = [
         f'table inet {name}',
-        f'delete table inet {name}',
+        f'flush table inet {name}',
         f'table inet {name} {{',
         f'  set lan {{ type ipv4_addr; size 4096; flags dynamic; timeout {LAN_TIMEOUT}; }}'
         if interface.firewall else '',
@@ -275,11 +277,12 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
         rules.append(f'    {outside} {RTPS} drop')
     rules += ['  }', '}']
     # the first line creates the table if missing, so that the second cannot fail
+    undo = [rules[0], f'delete table inet {name}']
     return _Step(
         f'{_print(rules)} | nft -f - || '
         '{ echo "nft: the packet filter takes no rules" >&2; exit 1; }',
         f'! command -v nft >/dev/null || '
-        f'{_print(rules[:2])} | nft -f -')
+        f'{_print(undo)} | nft -f -')
 
 
 def _confine(
@@ -289,10 +292,11 @@ def _confine(
     Return the step that filters the DDS of one process and its children, in a control group.
 
     A hijacked machine may announce any address and port as its own. The robot's processes send
-    only to the VPN, and to DDS's ports of this computer and of the computers of the LAN that sent
-    DDS themselves, or that the user configured. The processes of a machine accept DDS from the VPN
-    and from the machine only. Multicast is an exception there: one packet is for all processes of
-    the host, the user's own included.
+    only to the VPN, and to DDS's ports of this computer, of joined machines, and of the computers
+    of the LAN that sent DDS themselves, or that the user configured. The loopback has other
+    services by UDP, such as MAVLink's, so only the domain's ports pass there. The processes of a
+    machine accept DDS from the VPN and from the machine only. Multicast is an exception there: one
+    packet is for all processes of the host, the user's own included.
 
     The parent of an agent, which has the same command line, is in the group, too: it starts
     another agent when that one dies.

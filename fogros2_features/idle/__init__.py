@@ -8,6 +8,7 @@ from pathlib import Path
 import secrets
 from typing import Optional, TYPE_CHECKING
 
+from fogros2 import plugin_system
 from fogros2.describe.values import parse_duration
 from fogros2.errors import ConfigurationError
 from fogros2.feature import contained, Feature, RunningMachine
@@ -33,6 +34,10 @@ class IdleTimeout(Feature):
 
     def check(self, spec: MachineSpec, own: float) -> None:
         """Check that what uses the machine can be measured, and that nobody needs it later."""
+        if plugin_system.load('fogros2.provider', spec.provider).capabilities.account:
+            raise ConfigurationError(
+                f"'{spec.name}' is a machine of another robot, whose launch ends it",
+                'leave idle_timeout= out')
         if contained(spec.features):
             raise _not_measured(spec)
         if spec.options.get('fleet'):

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Decide when nobody uses a machine: its nodes compute nothing, and its VPN carries no data.
+Decide when nobody uses a machine: nodes and guests compute nothing, the VPN carries no data.
 
 Runs on the machine as root, as python3 -c SOURCE INTERFACE FOLDER TIMEOUT TOKEN, for each sample
 anew. INTERFACE is the VPN's, FOLDER the agent's; a new TOKEN starts the time anew. Prints a reason
@@ -32,6 +32,9 @@ DISCOVERY = 4200.0
 #: Share of the time that a thread is ready to run from which on it is in use, although it may get
 #: less than ``CPU``: others use the processor.
 READY = 0.5
+#: Homes of the accounts of invited computers, see ``fogros2_features.guests.program``. An account
+#: has the name of its interface, 'g' and a number.
+GUESTS = Path('/var/lib/fogros2-guests')
 #: Linux: the major numbers of terminals of remote logins.
 PSEUDO_TERMINALS = range(136, 144)
 #: The variable by which the agent marks the nodes' processes, see ``fogros2.agent.processes``.
@@ -99,6 +102,19 @@ def marked(mark: str) -> list[str]:
     for pid in _processes():
         with contextlib.suppress(OSError):
             if f'{MARK}={mark}'.encode() in Path(f'/proc/{pid}/environ').read_bytes().split(b'\0'):
+                pids.append(pid)
+    return pids
+
+
+def invited(interface: str) -> list[str]:
+    """Return the processes of the computers that were invited to an interface."""
+    users, pids = set(), []
+    for home in GUESTS.glob(f'{interface}g*'):
+        with contextlib.suppress(OSError):  # the computer has left
+            users.add(home.stat().st_uid)
+    for pid in _processes() if users else ():
+        with contextlib.suppress(OSError):
+            if os.stat(f'/proc/{pid}').st_uid in users:
                 pids.append(pid)
     return pids
 
@@ -176,7 +192,8 @@ def main(interface: str, folder: str, timeout: float, token: str, run: str = '/r
             nodes = marked(str(json.loads(Path(folder, 'watchdog.json').read_text())[0]))
     except (OSError, ValueError, LookupError, TypeError):
         return False  # the agent is being started again
-    cpu, threads, connected = computed(nodes), ready(nodes), has_terminal(user)
+    users = [*nodes, *invited(interface)]
+    cpu, threads, connected = computed(users), ready(users), has_terminal(user)
     traffic = carried(interface)
     if traffic is None:
         return False  # the VPN is being repaired, or the launch has ended

@@ -13,12 +13,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 import contextlib
 import functools
+import re
 from typing import Optional, TYPE_CHECKING
 
-from fogros2 import plugin_system
+from fogros2 import plan, plugin_system
 from fogros2.errors import ConfigurationError
-from fogros2.feature import Feature, RunningMachine
-from fogros2.model import MachineSpec, NodeSpec
+from fogros2.feature import contained, Feature, RunningMachine, used
+from fogros2.model import CreateRequest, MachineSpec, NodeSpec
 from fogros2_features.replacement.options import folder_of, Options, read, read_folder
 
 if TYPE_CHECKING:
@@ -85,13 +86,21 @@ class Replacement(Feature):
             raise ConfigurationError(
                 f"'{spec.name}' is a computer that exists already: no launch can replace it",
                 "use on_interrupt='robot' or 'shutdown'")
+        _check_folder(spec, own.checkpoint)
 
     def check_node(self, spec: MachineSpec, node: NodeSpec, own: Options) -> None:
-        """Check that something restores the node's folder."""
-        if folder_of(node) and not own.replaces:
+        """Check that something copies and restores the node's folder."""
+        folder = folder_of(node)
+        if folder and not own.replaces:
             raise ConfigurationError(
                 f"a node of '{spec.name}' has a checkpoint, and nothing would restore it",
                 "add on_interrupt='replace' to the machine, or leave checkpoint= out")
+        if folder and contained(node.features):
+            raise ConfigurationError(
+                f"the checkpoint {folder} of a node on '{spec.name}' would be the machine's "
+                "folder, and the node's image has its own",
+                'give the machine the checkpoint, and mount the folder with image_options=')
+        _check_folder(spec, folder)
 
     @contextlib.contextmanager
     def machine(self, running: RunningMachine, own: Options) -> Iterator[None]:
@@ -105,3 +114,26 @@ class Replacement(Feature):
         from fogros2_features.replacement.session import Interruptible
         return functools.partial(Interruptible, own)
 
+
+def _check_folder(spec: MachineSpec, folder: str) -> None:
+    """
+    Check that a volume has no files of a checkpoint, because the volume's are newer.
+
+    :raises ConfigurationError: one has.
+    """
+    request = CreateRequest('', '', {}, 0)
+    for each, own in used(spec) if folder else ():
+        request = each.request(request, own)
+    here = _of_home(folder)
+    for name, (path, _) in request.with_volumes.items():
+        there = _of_home(path)
+        if plan.below(here, [there]) or plan.below(there, [here]):
+            raise ConfigurationError(
+                f"a replacement of '{spec.name}' gets the volume '{name}' at {path}, and the "
+                f'checkpoint {folder} would write an older copy over it',
+                'leave checkpoint= out, or use a folder beside the volume')
+
+
+def _of_home(path: str) -> str:
+    """Return a path as ``check_folder`` writes a path in a home."""
+    return re.sub('^(/home/[^/]+|/root)(?=/|$)', '~', path)

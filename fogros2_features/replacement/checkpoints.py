@@ -15,7 +15,7 @@ import zlib
 
 from launch import LaunchContext
 
-from fogros2.errors import FogError
+from fogros2.errors import FogError, ShellError
 from fogros2.model import Endpoint, MachineSpec, NodeSpec
 from fogros2.runtime.node_spec import full_name
 from fogros2.shell import connect, Shell
@@ -149,9 +149,16 @@ class Checkpoints:
         await self._each(lambda folder: folder.save(shell, still=still), 'has no new checkpoint')
 
     async def restore(self, shell: Shell) -> None:
-        """Write the newest snapshots to a machine, or to the robot."""
-        aside = self._suffix if shell is self.robot else ''
-        await self._each(lambda folder: folder.restore(shell, aside), 'is not restored')
+        """Write the newest snapshots to a machine, or to the robot; warn if there is none."""
+        robot = shell is self.robot
+
+        def act(folder: Checkpoint) -> None:
+            # said once: nodes leave a machine by way of the robot
+            if not folder.restore(shell, self._suffix if robot else '') and robot:
+                raise ShellError('the launch has no copy of it',
+                                 'do the nodes write there, and not to a folder of a container?')
+
+        await self._each(act, 'is not restored')
 
     async def _each(self, act: Callable[[Checkpoint], object], failed: str) -> None:
         async with self._order:

@@ -84,14 +84,31 @@ class Part(LaunchPart):
         ends = {machine, *(entry.source for entry in streams if entry.source is not None)}
         for name in ends:
             self._streams.bandwidths[name] = self._policy(name).bandwidth
-        new = self._streams.add([collection.from_robot(entry, away) for entry in streams], machine)
+        moved = [collection.from_robot(entry, away) for entry in streams]
+        for entry in moved:
+            self._refuse_apart(entry, machine)
+        new = self._streams.add(moved, machine)
         for name in ends:
-            _refuse(self._streams.remappings(name), self._policy(name).limits,
+            names = self._streams.remappings(name)
+            _refuse(names, self._policy(name).limits,
                     f"limit_topics of '{name}'", 'a stream already carries it')
+            _refuse(names, self._launch.spec(name).features.get('share', {}).get('share', ()),
+                    f"share= of '{name}'", 'a stream gives it another name there')
         # another machine may be the source
         for name in machines:
             self._warn_of_early(name, before[name])
         return [Program(spec, host, machine) for host, spec in new]
+
+    def _refuse_apart(self, entry: StreamTopic, machine: str) -> None:
+        """Refuse a stream between machines that no VPN connects."""
+        if entry.source is None:
+            return
+        ends = [self._launch.other_vpn(name) for name in (entry.source, machine)]
+        if len({other and other.interface.network for other in ends}) > 1:
+            raise ConfigurationError(
+                f"{entry.topic} can't be streamed from '{entry.source}' to '{machine}': machines "
+                'of different robots do not reach each other',
+                'stream it to the robot, and from there by another name')
 
     def _warn_of_early(self, machine: str, before: Mapping[str, str]) -> None:
         names = self._streams.remappings(machine)

@@ -16,7 +16,7 @@ import contextlib
 import dataclasses
 import itertools
 import re
-from typing import Optional, TYPE_CHECKING
+from typing import ClassVar, Optional, TYPE_CHECKING
 
 from fogros2 import plugin_system
 from fogros2.errors import ConfigurationError, Unsupported
@@ -34,6 +34,9 @@ SIZE, LARGEST = 50, 16000
 #: Volumes of a machine: EC2 recommends 11 names of devices.
 MOST = 10
 _NAME = re.compile(r'[a-z]([a-z0-9-]{0,38}[a-z0-9])?')
+#: Options of machines that name the place of their volumes.
+_PLACE = ('region', 'zone', 'project_id', 'context', 'namespace', 'on', 'engine', 'host', 'port',
+          'user')
 _VALUE = re.compile(r'(/[A-Za-z0-9._/-]*?)/?(?::(\d{1,5}) ?GB)?')
 #: Folders that belong to the system, with all below them; and those that hold others.
 _SYSTEM = ('bin', 'boot', 'dev', 'etc', 'lib', 'lib32', 'lib64', 'libx32', 'proc', 'run', 'sbin',
@@ -113,6 +116,9 @@ rm -f -- "/run/$3.volume-$1"
 class Volumes(Feature):
     """``volumes={'models': '/data'}``: a disk that comes back with the next machine."""
 
+    # results are fetched from volumes, and containers mount their folders
+    outermost: ClassVar[bool] = True
+
     @staticmethod
     def options(
         volumes: Optional[Mapping[str, SomeSubstitutionsType]] = None,
@@ -146,6 +152,19 @@ class Volumes(Feature):
                 raise ConfigurationError(f"the volume '{name}' at {path} would hide the workspace",
                                          'choose another folder')
 
+    def check_beside(
+        self, spec: MachineSpec, others: Sequence[MachineSpec],
+        own: Mapping[str, tuple[str, int]],
+    ) -> None:
+        """Check that no other machine of the launch has one of the volumes."""
+        for other in others:
+            theirs = Volumes.options(**other.features.get('volumes', {}))
+            shared = sorted({*own} & {*theirs})
+            if shared and _place(spec) == _place(other):
+                raise ConfigurationError(
+                    f"'{spec.name}' and '{other.name}' have one volume '{shared[0]}', and one "
+                    'machine has it at a time', 'give each machine a volume of its own')
+
     def request(
         self, request: CreateRequest, own: Mapping[str, tuple[str, int]],
     ) -> CreateRequest:
@@ -172,6 +191,10 @@ class Volumes(Feature):
                         sudo=True, what=f"mount the volume '{name}'"), timeout=900.0)
                     detail.append(f'{name} at {path}{", new" if "new" in output else ""}')
             yield
+
+
+def _place(spec: MachineSpec) -> Sequence[object]:
+    return [spec.provider, *(spec.options.get(option) or '' for option in _PLACE)]
 
 
 def _keeper(provider: Provider) -> VolumeKeeper:

@@ -114,7 +114,7 @@ def join(
             path = tmp_path / 'second.launch.py'
             path.write_text(SECOND.format(text=text, workspace=workspace))
             return start(str(path), environment=second.environment,
-                         prefix=('ip', 'netns', 'exec', second.spaces[1]))
+                         prefix=second.enter)
         yield launch
 
 

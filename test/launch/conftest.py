@@ -126,6 +126,8 @@ class FakeLaunch:
         self.cancel = None
         self.store = Store()
         self.environment = {}
+        #: The VPNs of other robots, by the names of their machines.
+        self.other_vpns = {}
         #: Called with the machine and the node when a node was started.
         self.on_start = None
         #: Names of machines whose ``up`` waits until the event is set, or the launch ends.
@@ -168,10 +170,15 @@ class FakeLaunch:
         return SimpleNamespace(has_own_packages=lambda spec: 'image' in spec.options,
                                shared_folders=lambda spec: ['/shared'],
                                check_containers=lambda spec: None,
+                               other_vpn=lambda spec: self.other_vpns.get(spec.name),
                                capabilities=Capabilities())
 
     def expect(self, names):
         self.note('expect', *names)
+
+    def drops(self, environment):
+        """Take 101 as the only other domain."""
+        return environment.get('ROS_DOMAIN_ID') == '101'
 
     def join(self, spec):
         """Join nothing: all machines are the launch's own."""

@@ -156,6 +156,16 @@ def test_components_of_a_container_know_the_streams(
     assert ('planner', 'box') in started(fake)
 
 
+@pytest.mark.parametrize(('domain', 'warned'), [('100', 0), ('101', 1)])
+def test_node_whose_dds_the_filter_drops_is_reported(
+        run, fake, planner, caplog, domain, warned):
+    fake.on_start = ends
+    local = launch_ros.actions.Node(
+        package='demo', executable='talker', additional_env={'ROS_DOMAIN_ID': domain})
+    assert run(LaunchDescription([node(machine=planner), stops(local), local])) == 0
+    assert caplog.text.count('has another ROS_DOMAIN_ID than the launch') == warned
+
+
 def test_a_machine_of_another_type_is_refused():
     for cls in (Node, CloudNode):
         with pytest.raises(ConfigurationError, match='machine=7 is no machine'):

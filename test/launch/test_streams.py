@@ -40,8 +40,9 @@ from fogros2 import (
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
 from fogros2.errors import ConfigurationError
+from fogros2.model import OtherVpn, Peer, VpnInterface
 from fogros2_testing.plugins import instead
-from rigs.launching import Harmless
+from rigs.launching import end, Harmless, says
 
 BACK = StreamTopic('/seen', 'h264', 'to_robot', bitrate=500_000)
 
@@ -351,6 +352,17 @@ def test_components_on_the_robot_have_streams_from_machines(run, fake, mapper):
     assert Loading.told == ([],)
 
 
+@pytest.mark.parametrize('how', ['robot', 'replace'])
+def test_components_that_move_have_the_robots_names(run, fake, box, watch, how):
+    machine = ContainerInstance(
+        name='planner', ros_workspace='', on_interrupt=how, deny_topics=['/costmap'])
+    load = Loading(ComposableNode(package='demo', plugin='demo::View'))
+    watch.at_start = {1: says(fake, 'lost', reason='evicted'), 2: end}
+    assert run(LaunchDescription([*watch(), CloudGroup(machine, [box, RegisterEventHandler(
+        OnProcessStart(target_action=box, on_start=[load]))])])) == 0
+    assert Loading.told == ([('/costmap', '/fogros2/planner/costmap')], [])
+
+
 @pytest.mark.parametrize('condition', ['true', 'false'])
 def test_components_loaded_before_a_stream_are_named(
         run, fake, planner, caplog, box, condition):
@@ -400,17 +412,37 @@ def test_denied_and_limited_topics_are_renamed_on_their_machine(
     assert 'takes no ROS arguments' not in caplog.text
 
 
+@pytest.mark.parametrize(('keyword', 'value'), [
+    ('limit_topics', lambda topic: {topic: 5}), ('share', lambda topic: [topic])])
 @pytest.mark.parametrize(('topic', 'streams'), [
     ('/seen', lambda planner: [StreamTopic('/seen', 'h264', source=planner)]),
     ('/camera_info', lambda planner: [StreamTopic('/camera', 'h264', camera_info=True)])])
-def test_topic_of_a_stream_is_not_limited(run, fake, capfd, topic, streams):
-    """What a decoder publishes would be sent back."""
-    limited = ContainerInstance(name='planner', ros_workspace='', limit_topics={topic: 5})
-    machine = ContainerInstance(name='mapper', ros_workspace='') if topic == '/seen' else limited
+def test_topic_of_a_stream_is_neither_limited_nor_shared(
+        run, fake, capfd, keyword, value, topic, streams):
+    """What a decoder publishes would be sent back; a relay would get the topic unencoded."""
+    fake.on_start = own_ends
+    own = ContainerInstance(name='planner', ros_workspace='', **{keyword: value(topic)})
+    machine = ContainerInstance(name='mapper', ros_workspace='') if topic == '/seen' else own
     assert run(FogROSLaunchDescription([
-        talker(limited), talker(machine, stream_topics=streams(limited))])) == 1
-    assert f"{topic} can't be in limit_topics of 'planner'" in capfd.readouterr().out
+        talker(own), talker(machine, stream_topics=streams(own))])) == 1
+    place = 'share=' if keyword == 'share' else keyword
+    assert f"{topic} can't be in {place} of 'planner'" in capfd.readouterr().out
     assert fake.noted('up') == []
+
+
+@pytest.mark.parametrize('networks', [('', 'a'), ('a', ''), ('a', 'b'), ('a', 'a')])
+def test_streams_between_machines_of_two_robots_are_refused(
+        run, fake, planner, mapper, capfd, networks):
+    fake.other_vpns = {name: OtherVpn(
+        Peer(name, '', ''), VpnInterface('', '', network, 0, ''), VpnInterface('', '', '', 0, ''),
+        0) for name, network in zip(('planner', 'mapper'), networks) if network}
+    ends_when_all_started(fake, 4)
+    refused = networks != ('a', 'a')
+    assert run(watched(fake, FogROSLaunchDescription, talker(mapper), talker(
+        planner, stream_topics=[StreamTopic('/map', source=mapper)]))) == refused
+    words = "/map can't be streamed from 'mapper' to 'planner': machines of different robots"
+    assert (words in capfd.readouterr().out) == refused
+    assert bool(fake.noted('up')) != refused
 
 
 def test_topic_of_replicas_is_neither_denied_nor_limited(run, fake, mapper, capfd):

@@ -49,6 +49,10 @@ class SecondRobot:
         self.host, self.nat_address = (f'203.0.113.{192 + 4 * number + end}' for end in (1, 2))
         mark = f'fogs{os.getpid() % 10000}{number:02}'
         self.spaces = [f'{mark}n', f'{mark}r']
+        #: Words before those of a program there. `ip netns exec` hides the control groups of this
+        #: computer, and without them a launch does not filter its DDS.
+        self.enter = ('ip', 'netns', 'exec', self.spaces[1], 'sh', '-c',
+                      'mount -t cgroup2 cgroup2 /sys/fs/cgroup; exec "$@"', 'sh')
         self.environment = {
             **os.environ, 'FOGROS2_STATE_HOME': str(state), 'XDG_CONFIG_HOME': f'{state}/config',
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
@@ -100,7 +104,7 @@ class SecondRobot:
     def start(self, *words: str) -> subprocess.Popen[str]:
         """Start a program there; its output is read by the caller."""
         return subprocess.Popen(
-            argv(Command(('ip', 'netns', 'exec', self.spaces[1], *words), sudo=True)),
+            argv(Command((*self.enter, *words), sudo=True)),
             env=self.environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, text=True)
 

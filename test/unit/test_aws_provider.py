@@ -490,6 +490,21 @@ def test_keys_that_an_image_brings_along_are_taken_away_once(booted, tmp_path):
     assert keys.read_text() == 'ours'
 
 
+def test_recordings_that_an_image_brings_along_are_deleted_once(booted, tmp_path):
+    recorded = tmp_path / 'home/fogros2-planner/recordings/run.mcap'
+    users = [tmp_path / 'home' / name for name in ('fogros2-planner/notes', 'recordings/mine')]
+    for path in (recorded, *users):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    told = config(machine='planner', directory='/run/fogros2')
+    booted(told)
+    assert not recorded.parent.exists() and all(path.exists() for path in users)
+    recorded.parent.mkdir()
+    recorded.touch()
+    booted(told)
+    assert recorded.exists()
+
+
 def test_a_machine_that_boots_again_is_not_its_first_launchs(booted):
     """That one is over; later ones of the same robot came and went, by other ids."""
     told = config(machine='planner', launch='l1', directory='/run/fogros2')

@@ -75,6 +75,27 @@ def test_program_without_a_ros_name_offers_no_service(
         NodeSpec('6', name='a' * 300)]) is None
 
 
+def test_nodes_without_a_copy_of_their_folder_are_reported(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture,
+) -> None:
+    session: Any = SimpleNamespace(
+        spec=MachineSpec('planner', 'container'), own=Options(checkpoint='/nowhere/map'))
+
+    async def move() -> None:
+        context = LaunchContext()
+        context._set_asyncio_loop(asyncio.get_running_loop())
+        kept = Checkpoints(session, context, tmp_path, '', None, in_thread=asyncio.to_thread,
+                           logger=logging.getLogger())
+        await kept.restore(kept.robot)
+        machine: Any = None
+        await kept.restore(machine)
+
+    loops.run(move())
+    assert [each.getMessage() for each in caplog.records if each.levelname == 'WARNING'] == [
+        'planner: /nowhere/map is not restored: the launch has no copy of it '
+        '(do the nodes write there, and not to a folder of a container?)']
+
+
 @pytest.mark.parametrize('node', [Destroyed(), Silent()])
 def test_ending_launch_and_silence_count_as_no_consent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, node: Any,

@@ -9,22 +9,24 @@ from decimal import Decimal
 import json
 from pathlib import Path
 import threading
-from typing import Any
+from typing import Any, Optional
 
 import pytest
 from ros2cli.cli import main
 
 from fogros2.deploy import Launch
 from fogros2.deploy import launch as launches
-from fogros2.errors import ConfigurationError, FogError, ProviderError
-from fogros2.model import MachineSpec
+from fogros2.deploy.running import RunningMachine
+from fogros2.deploy.steps.creating import Creation
+from fogros2.errors import ConfigurationError, FogError, NameTaken, ProviderError
+from fogros2.model import Machine, MachineSpec, MachineState
 from fogros2.provider.azure.provider import AzureProvider
 from fogros2.provider.gcp import prices
 from fogros2.provider.gcp.provider import GCPProvider
 from fogros2.provider.machine_types import MachineType, Region
 from fogros2.provider.vm import regions
 from fogros2.report import Warned
-from fogros2.store import Store
+from fogros2.store import Record, Store
 from fogros2_features.prices import clouds
 from fogros2_features.prices.market import seller
 from fogros2_features.prices.offers import Offer, Offers, ranked, Wants, wants
@@ -316,14 +318,62 @@ def test_only_a_lack_of_capacity_tries_the_next_cloud(
     assert fakes['north'].calls.count('offers') == 1
 
 
-def test_kept_machine_stays_in_its_cloud(
-    fakes: dict[str, Fake], launch: Any, tmp_path: Path,
-) -> None:
-    from fogros2.store import Record
+@pytest.fixture
+def kept(fakes: dict[str, Fake], tmp_path: Path) -> MachineSpec:
+    """Keep a machine in the dearer cloud; return its spec."""
     place = dataclasses.replace(
         SPEC, provider='south', options={'size': 'south'}, wanted=SPEC.options)
     Store(tmp_path).save(Record('planner', 'south', place, machine_id='m', asked=place.options))
+    fakes['south'].machines['m'] = Machine('m', 'planner', 'south', MachineState.RUNNING)
+    return place
+
+
+def test_kept_machine_stays_in_its_cloud(
+    fakes: dict[str, Fake], launch: Any, kept: MachineSpec,
+) -> None:
     mine = launch([])
-    assert mine._places(SPEC) == [place] and fakes['north'].calls == []
+    assert mine._places(SPEC) == [kept] and fakes['north'].calls == []
     other = dataclasses.replace(SPEC, options={'min_cpu': 4})
     assert mine._places(other)[0].provider == 'north'
+
+
+def create(launch: Launch, place: MachineSpec) -> RunningMachine:
+    context = launch.context(place)
+    machine = RunningMachine(context, place)
+    Creation(context, machine).run()
+    return machine
+
+
+@pytest.mark.parametrize('expired', [None, MachineState.DELETED])
+def test_expired_machine_leaves_its_name_to_the_cheapest(
+    fakes: dict[str, Fake], launch: Any, kept: MachineSpec, expired: Optional[MachineState],
+) -> None:
+    if expired is None:
+        del fakes['south'].machines['m']
+    else:
+        fakes['south'].machines['m'] = Machine('m', 'planner', 'south', expired)
+    mine = launch([])
+    mine.prepare([SPEC])
+    assert [cost.spec.provider for cost in mine.costs()] == ['north']
+    machine = create(mine, mine._places(SPEC)[0])
+    assert mine.store.load('planner').provider == 'north'
+    assert [*fakes['north'].machines] == [machine.machine_id] and not fakes['south'].machines
+
+
+def test_machine_of_another_cloud_keeps_its_name(
+    fakes: dict[str, Fake], launch: Any, kept: MachineSpec,
+) -> None:
+    with pytest.raises(NameTaken, match="'planner' is a machine of the provider 'south'"):
+        create(launch([]), dataclasses.replace(kept, provider='north', wanted=None))
+    assert fakes['north'].machines == {} and [*fakes['south'].machines] == ['m']
+
+
+def test_replacement_takes_the_offer_that_is_cheapest_then(
+    fakes: dict[str, Fake], launch: Any,
+) -> None:
+    mine = launch([])
+    mine.prepare([SPEC])
+    fakes['north'].price = Decimal(9)
+    assert mine._places(SPEC)[0].provider == 'north'
+    mine.retire('planner')
+    assert mine._places(SPEC)[0].provider == 'south'

@@ -35,6 +35,7 @@ from fogros2.errors import (
     CommandError,
     ConfigurationError,
     ConnectError,
+    DdsError,
     DeadlineExceeded,
     FogError,
     HostKeyError,
@@ -63,6 +64,7 @@ from fogros2.store import Made, process_start, Store
 from fogros2.vpn import addresses, STAYS
 from fogros2.waiting import Periodic, Timeouts, wait_until
 from fogros2_features.guests import invitation
+from fogros2_features.guests.provider import JoinedProvider
 from fogros2_features.replacement import Replacement
 from fogros2_testing.fakes import (
     FAKE_ENDPOINT,
@@ -129,6 +131,31 @@ def test_domain_that_is_no_number_is_refused(launch):
         launch.dds()
 
 
+@pytest.mark.parametrize(('changes', 'count', 'words'), [
+    ({'environment': {'ROS_DOMAIN_ID': '5'}}, 1, 'ROS_DOMAIN_ID=5, those here 0'),
+    ({}, 33, 'has 33 machines, and the robot.s router can have 32')])
+def test_machines_that_no_node_would_hear_are_not_created(
+        launch, checked, monkeypatch, changes, count, words):
+    monkeypatch.setattr(deployed, 'check_robot', lambda: None)
+    monkeypatch.setattr(plan, 'check_rmw', lambda *_: None)
+    launch.use_dds('zenoh')
+    specs = [dataclasses.replace(SPEC, name=f'm{n}', **changes) for n in range(count)]
+    with pytest.raises(DdsError, match=words):
+        launch.prepare(specs)
+    assert checked.calls == []
+    launch.prepare([dataclasses.replace(SPEC, name=f'm{n}') for n in range(32)])
+
+
+@pytest.mark.parametrize(('dds', 'environment', 'drops'), [
+    ('fastdds', {}, True), ('fastdds', {'ROS_DOMAIN_ID': '5'}, True),
+    ('fastdds', {'ROS_DOMAIN_ID': '3'}, False), ('zenoh', {'ROS_DOMAIN_ID': '5'}, False)])
+def test_filter_drops_dds_of_other_domains(launch, monkeypatch, dds, environment, drops):
+    monkeypatch.setattr(plan, 'check_rmw', lambda *_: None)
+    launch.user_environment['ROS_DOMAIN_ID'] = '3'
+    launch.use_dds(dds)
+    assert launch.drops(environment) == drops
+
+
 def test_computer_of_the_user_cannot_be_stopped(launch, checked, monkeypatch):
     monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(owned=False))
     monkeypatch.setattr(deployed, 'check_robot', lambda: None)
@@ -169,17 +196,48 @@ def test_machine_is_deleted_if_its_id_cannot_be_stored(
     assert list(provider.find({})) == []
 
 
-def test_launch_s_network_differs_from_one_that_it_joins(launch, monkeypatch):
+def joined(launch, monkeypatch, name, network):
+    """Return a machine of another robot, in the VPN with a network."""
     monkeypatch.setenv('FOGROS2_STATE_HOME', str(launch.store.root))
-    own = addresses.choose_subnet([], launch_id=launch.id)
-    text = invitation.seal(invitation.Invitation(
-        'planner', 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw=', own.replace('.0/24', '.2'),
-        '203.0.113.9:50000', own.replace('.0/24', '.224'), own, 'rmw_fastrtps_cpp', 3,
+    return MachineSpec(name, 'joined', {'invitation': invitation.seal(invitation.Invitation(
+        'planner', 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw=', network.replace('.0/24', '.2'),
+        '203.0.113.9:50000', network.replace('.0/24', '.224'), network, 'rmw_fastrtps_cpp', 3,
         time.time() + 600, 'foga1b2c3m0', '5a' * 32),
-        invitation.public_text(invitation.own_key(launch.store)))
+        invitation.public_text(invitation.own_key(launch.store)))})
+
+
+def test_launch_s_network_differs_from_one_that_it_joins(launch, monkeypatch):
+    own = addresses.choose_subnet([], launch_id=launch.id)
     monkeypatch.setattr(addresses, 'parse_used', lambda output: [])
-    launch.check_here([MachineSpec('planner', 'joined', {'invitation': text})])
+    launch.check_here([joined(launch, monkeypatch, 'planner', own)])
     assert launch.robot_vpn().interface.network != own
+
+
+def test_robot_s_nodes_may_send_to_machines_that_it_joins(launch, monkeypatch):
+    """Its filter would drop what they send to a machine that has not sent to them before."""
+    filters = []
+
+    class Filtered(FakeVpn):
+        def __init__(self, ports=(), asked=()):
+            self.asked = asked
+
+        def up(self, interface, peers):
+            filters.append(self.asked)
+            return super().up(interface, peers)
+
+    instead(monkeypatch, 'fogros2.vpn', {'wireguard': Filtered})
+    monkeypatch.setattr(JoinedProvider, 'join', lambda *_: contextlib.nullcontext())
+    launch.user_environment['ROS_STATIC_PEERS'] = '192.0.2.7'
+    early, late = (joined(launch, monkeypatch, name, f'198.18.{number}.0/24')
+                   for name, number in (('early', 9), ('late', 8)))
+    launch.check_here([early])
+    launch.robot_vpn().ensure()
+    known = ['192.0.2.7', '198.18.9.2', '239.18.9.2']
+    assert filters == [known]
+    for spec in (early, late, late):
+        launch.join(spec)
+    assert filters == [known, ['192.0.2.7', '198.18.9.2', '198.18.8.2', '239.18.9.2',
+                               '239.18.8.2']]
 
 
 def test_robot_asks_machines_and_names_its_middleware(launch, events, monkeypatch):

@@ -98,6 +98,21 @@ def test_machines_of_a_launch_end_when_all_have_spent_its_budget(launch, provide
     assert provider.calls.count('create') == 2
 
 
+def test_machines_with_one_volume_are_refused_before_creation(launch, monkeypatch):
+    class Keeping(FakeProvider):
+        capabilities = FakeProvider.can(keeps_volumes=True)
+
+    instead(monkeypatch, 'fogros2.provider', {'fake': Keeping})
+    first, second = (MachineSpec(name, 'fake', features={
+        'volumes': {'volumes': {'maps': '/data'}}}) for name in ('a', 'b'))
+    launch.prepare([first])
+    with pytest.raises(ConfigurationError, match="'a' and 'b' have one volume 'maps'"):
+        launch.prepare([second])
+    assert 'create' not in launch.provider('fake').calls
+    launch._choices.end('a')
+    launch.prepare([second])
+
+
 def test_machine_that_runs_gets_less_time_when_another_costs(launch, provider):
     spec = dataclasses.replace(SPEC, lifetime=1e6, features={'budget': {'launch_budget': '1'}})
     first = create(launch, spec)
@@ -221,6 +236,16 @@ def test_kept_machine_fits_though_today_differs(
     assert list(provider.find({})) == []
 
 
+def test_expired_machine_is_chosen_anew_before_creation(launch, provider, tmp_path):
+    keep(launch, SPEC)
+    provider.machines.clear()
+    provider.prices['tiny'] = Decimal('0.1')
+    again = Launch(store=Store(tmp_path), environment={})
+    again.prepare([SPEC])
+    assert [(one.spec.options, one.price) for one in again.costs()] == [
+        ({'size': 'tiny'}, Decimal('0.1'))]
+
+
 def test_kept_machine_gets_its_owner_before_it_starts(
         launch, provider, tmp_path, monkeypatch):
     keep(launch, SPEC)
@@ -261,5 +286,17 @@ def test_provider_knows_what_will_be_installed(launch, provider, monkeypatch):
     monkeypatch.setattr(
         'fogros2.host.bootstrap.dependencies', lambda spec, under, packages: 'a' * 16)
     monkeypatch.setattr(Context, 'underlay', lambda self, workspaces: None)
-    create(launch)
+    keep(launch, SPEC)
     assert requests[0].dependencies == requests[0].tags['fogros2-dependencies'] == 'a' * 16
+
+
+def test_image_of_a_kept_machine_has_what_was_added(launch, provider, tmp_path, monkeypatch):
+    monkeypatch.setattr(Context, 'underlay', lambda self, workspaces: None)
+    monkeypatch.setattr(
+        'fogros2.host.bootstrap.dependencies', lambda spec, under, packages: ' '.join(spec.apt))
+    adopted = []
+    monkeypatch.setattr(provider, 'adopt', lambda machine_id, spec, tags: adopted.append(tags))
+    keep(launch, SPEC)
+    create(Launch(store=Store(tmp_path), environment={}),
+           dataclasses.replace(SPEC, apt=('libzbar0',)))
+    assert [tags['fogros2-dependencies'] for tags in adopted] == ['libzbar0']

@@ -23,6 +23,7 @@ from fogros2.agent import processes
 from fogros2.errors import ConfigurationError
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2.waiting import wait_until
+from fogros2_features.guests import program as guests
 from fogros2_features.idle import IdleTimeout, program
 from fogros2_features.idle.program import (
     carried,
@@ -236,6 +237,21 @@ def test_sample_without_the_vpn_decides_and_leaves_nothing(machine, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ['watchdog.json']
 
 
+def test_what_guests_compute_is_use(tmp_path, monkeypatch):
+    (tmp_path / 'watchdog.json').write_text('["no-such-mark", 1]')
+    assert program.GUESTS == guests.HOMES
+    monkeypatch.setattr(program, 'GUESTS', tmp_path / 'guests')
+    counted = {'computed': [], 'ready': []}
+    monkeypatch.setattr(program, 'computed', lambda pids: counted['computed'].append(pids) or 0.0)
+    monkeypatch.setattr(program, 'ready', lambda pids: counted['ready'].append(pids) or {})
+    for name in ('other', 'lo'):
+        # whose account is this one
+        (tmp_path / 'guests' / guests.account(name, '198.18.7.224')).mkdir(parents=True)
+        program.main('lo', str(tmp_path), 60.0, 'a', str(tmp_path))
+    for pids in counted.values():
+        assert [str(os.getpid()) in each for each in pids] == [False, True]
+
+
 @pytest.mark.parametrize('content', ['', '{}', '[]', '5', None])
 def test_machine_whose_nodes_are_unknown_is_not_idle(machine, tmp_path, content):
     path = tmp_path / 'watchdog.json'
@@ -279,6 +295,11 @@ def test_each_start_of_nodes_lets_the_time_begin_anew():
 def test_machine_whose_use_is_unknown_has_no_idle_timeout(how):
     with pytest.raises(ConfigurationError, match='computes|use the machine after'):
         IdleTimeout().check(MachineSpec('a', 'container', **how), 60.0)
+
+
+def test_machine_of_another_robot_has_no_idle_timeout():
+    with pytest.raises(ConfigurationError, match="'a' is a machine of another robot"):
+        IdleTimeout().check(MachineSpec('a', 'joined'), 60.0)
 
 
 @pytest.mark.parametrize('written', [90, '90', '1m30s'])

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tests of fogros2.plan: values in, values out."""
 
+import contextlib
 import dataclasses
 from decimal import Decimal
 from pathlib import Path
@@ -206,6 +207,16 @@ def test_a_middleware_has_to_be_there_and_to_be_one_for_all(tmp_path: Path) -> N
         with pytest.raises(DdsError, match=words) as caught:
             plan.check_rmw(rmw, prefixes, [spec])
         assert caught.value.hint
+
+
+@pytest.mark.parametrize(('environment', 'own'), [
+    ({}, ''), ({'ROS_DOMAIN_ID': '3'}, ''), ({'ROS_DOMAIN_ID': '5'}, '5'),
+    ({'ROS_DOMAIN_ID': ''}, '0')])
+def test_machine_has_the_domain_of_the_launch(environment: dict[str, str], own: str) -> None:
+    specs = [MachineSpec('n', 'ssh'), MachineSpec('m', 'ssh', environment=environment)]
+    refused = pytest.raises(DdsError, match=f"'m' would have ROS_DOMAIN_ID={own}, those here 3")
+    with refused if own else contextlib.nullcontext():
+        plan.check_domain(3, specs)
 
 
 @pytest.mark.parametrize('name', ['fastdds', 'fastrtps', 'rmw_fastrtps_cpp'])

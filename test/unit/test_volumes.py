@@ -12,11 +12,14 @@ from typing import Any
 
 import pytest
 
+from fogros2 import feature
+from fogros2.deploy import checks
 from fogros2.errors import Cancelled, ConfigurationError, FogError, NameTaken
-from fogros2.model import MachineSpec, Volume
+from fogros2.model import MachineSpec, NodeSpec, Volume
 from fogros2.provider import container, ssh, TAG_ROBOT
 from fogros2.provider.container import machine as container_machine
 from fogros2.provider.kubernetes import claims, names
+from fogros2_features.replacement import Replacement
 from fogros2_features.volumes import Volumes
 from fogros2_features.volumes.verbs import _named
 from fogros2_testing.fakes import FakeRunning
@@ -63,6 +66,50 @@ def test_machines_that_cannot_have_a_volume(
 ) -> None:
     with pytest.raises(FogError, match=error):
         Volumes().check(MachineSpec('a', provider, **more), Volumes.options({'m': '/data'}))
+
+
+@pytest.mark.parametrize(('provider', 'first', 'second', 'name', 'error'), [
+    ('aws', {'region': 'us-west-1'}, {'region': 'us-west-1', 'spot': True}, 'm',
+     "'a' and 'b' have one volume 'm'.*give each machine a volume of its own"),
+    ('container', {}, {'image': 'mine'}, 'm', "'a' and 'b' have one volume 'm'"),
+    ('aws', {'region': 'us-west-1'}, {'region': 'us-west-1'}, 'n', ''),
+    ('aws', {'region': 'us-west-1'}, {'region': 'us-west-2'}, 'm', ''),
+    ('gcp', {'zone': 'us-west1-a'}, {'zone': 'us-east1-b'}, 'm', ''),
+    ('hosted', {'on': 'lab'}, {'on': 'attic'}, 'm', ''),
+    ('ssh', {'host': 'lab'}, {'host': 'lab', 'user': 'other'}, 'm', '')])
+def test_two_machines_of_one_place_need_two_volumes(
+    provider: str, first: dict[str, Any], second: dict[str, Any], name: str, error: str,
+) -> None:
+    specs = [MachineSpec('a', provider, first, features={'volumes': {'volumes': {'m': '/data'}}}),
+             MachineSpec('b', provider, second, features={'volumes': {'volumes': {name: '/x'}}})]
+    with pytest.raises(ConfigurationError, match=error) if error else contextlib.nullcontext():
+        checks.check_together([*specs, MachineSpec('c', provider, first)])
+
+
+def test_volumes_are_mounted_as_long_as_others_use_them() -> None:
+    """Results are fetched after the nodes have ended; containers mount folders of volumes."""
+    spec = MachineSpec('a', 'aws', features={
+        'containers': {'docker_containers': ['docker run -v /data:/data db']},
+        'results': {'fetch': ['/data']}, 'volumes': {'volumes': {'m': '/data'}}})
+    assert feature.names(spec)[:3] == ['volumes', 'containers', 'results']
+    assert isinstance(next(feature.used(spec))[0], Volumes)
+
+
+@pytest.mark.parametrize(('folder', 'error'), [
+    ('/data', "gets the volume 'm' at /data, and the checkpoint /data would write an older copy"),
+    ('/data/map', 'the checkpoint /data/map would'),
+    ('/home/ubuntu', "the volume 'n' at /home/ubuntu/maps, and the checkpoint /home/ubuntu"),
+    ('$HOME/maps/a', "the volume 'n' at /home/ubuntu/maps, and the checkpoint ~/maps/a"),
+    ('$HOME/data', ''), ('/data2', '')])
+def test_checkpoint_is_not_written_over_a_volume(folder: str, error: str) -> None:
+    volumes = {'volumes': {'volumes': {'m': '/data', 'n': '/home/ubuntu/maps'}}}
+    alone = Replacement.options(on_interrupt='replace')
+    node = NodeSpec('a/1', 'slam', features={'replacement': {'checkpoint': folder}})
+    with pytest.raises(ConfigurationError, match=error) if error else contextlib.nullcontext():
+        Replacement().check(MachineSpec('a', 'aws', features=volumes), Replacement.options(
+            on_interrupt='replace', checkpoint=folder))
+    with pytest.raises(ConfigurationError, match=error) if error else contextlib.nullcontext():
+        Replacement().check_node(MachineSpec('a', 'aws', features=volumes), node, alone)
 
 
 def test_a_name_of_several_volumes_deletes_none() -> None:

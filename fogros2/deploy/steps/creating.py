@@ -11,6 +11,7 @@ from typing import Any, Literal, Optional
 import uuid
 
 from fogros2 import feature, model, plan, process
+from fogros2.deploy import robot
 from fogros2.deploy.machine_job import Step
 from fogros2.deploy.undo import close_ports, end_machine, late
 from fogros2.errors import (
@@ -88,20 +89,22 @@ class Creation(Step):
             raise NameTaken(
                 f"the launch with process {before.pid} has the machine '{job.name}'",
                 'give the machine another name=, or end that launch')
-        if before.provider != job.spec.provider:
-            raise NameTaken(
-                f"'{job.name}' is a machine of the provider '{before.provider}'",
-                f'give the machine another name=, or: ros2 fog delete {job.name}')
+        other = before.provider != job.spec.provider
+        provider = robot.provider(before.provider) if other else context.provider
         machine: Optional[Machine] = None
         # a launch that was killed did not save the id of its machine, if it has one
         if before.machine_id is not None:
             with contextlib.suppress(MachineNotFound):
-                machine = context.provider.describe(before.machine_id)
+                machine = provider.describe(before.machine_id)
         if machine is None or machine.state is MachineState.DELETED:
             # what was made for it may still be there
-            if not end_machine(context.provider, before):
+            if not end_machine(provider, before):
                 context.store.set_aside(before)
             return None
+        if other:
+            raise NameTaken(
+                f"'{job.name}' is a machine of the provider '{before.provider}'",
+                f'give the machine another name=, or: ros2 fog delete {job.name}')
         self._check_alike(before.asked, machine)
         # the earlier choices still hold; everything else comes from this launch
         job.spec = dataclasses.replace(job.spec, options=before.spec.options)
@@ -157,15 +160,12 @@ class Creation(Step):
             **plan.agent_config(job.spec, context.launch_id, job.directory, ()),
             'boot_timeout': context.timeouts.boot + context.timeouts.ssh,
         } if context.capabilities.agent_directory else {}
-        dependencies = self._dependencies()
-        tags = {
-            TAG_NAME: job.name, TAG_ROBOT: robot_id(), **self._tags(),
-            **({TAG_DEPENDENCIES: dependencies} if dependencies else {}),
-        }
+        tags = {TAG_NAME: job.name, TAG_ROBOT: robot_id(), **self._tags()}
         can = context.capabilities
         key = self._login_key() if can.owned and can.shell_kind == 'ssh' else ''
         request = CreateRequest(
-            token=token, authorized_key=key, tags=tags, dependencies=dependencies,
+            token=token, authorized_key=key, tags=tags,
+            dependencies=tags.get(TAG_DEPENDENCIES, ''),
             vpn_port=plan.machine_port(context.launch_id), agent_config=config)
         for each, own in feature.used(job.spec):
             request = each.request(request, own)
@@ -184,9 +184,10 @@ class Creation(Step):
 
     def _tags(self) -> dict[str, str]:
         """Return the tags that change with the launch that uses the machine."""
-        spec = self._job.spec
+        spec, dependencies = self._job.spec, self._dependencies()
         return {TAG_LAUNCH: self._context.launch_id, TAG_ON_EXIT: spec.on_exit,
-                TAG_EXPIRES: str(int(time.time() + spec.lifetime))}
+                TAG_EXPIRES: str(int(time.time() + spec.lifetime)),
+                **({TAG_DEPENDENCIES: dependencies} if dependencies else {})}
 
     def _dependencies(self) -> str:
         """Return the hash of the machine's dependencies, by which the provider finds an image."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 
 from fogros2.deploy.context import Context
 from fogros2.deploy.machine_job import MachineJob
-from fogros2.deploy.robot_router import MACHINES, PAUSE
-from fogros2.errors import DdsError
+from fogros2.deploy.robot_router import PAUSE
 from fogros2.model import NodeSpec
 
 
@@ -26,10 +25,6 @@ def start_router(context: Context, job: MachineJob) -> None:
     router = context.dds.router(job.interface.address, context.others(), None)
     if router is None:
         return
-    if context.index >= MACHINES:
-        raise DdsError(
-            f"'{job.name}' is one machine too many: the robot's router can have {MACHINES}",
-            'use several launches, or another RMW_IMPLEMENTATION')
     node = NodeSpec(
         id=f'{job.name}/router', name='router', package=router.package,
         executable=router.executable, files={'router.json5': router.config},

@@ -59,11 +59,11 @@ until {end}; do sleep 30; done
 _BOOT = """\
 umask 022
 mkdir -p {folder}
-# an image of another machine contains the keys that could log in there
+# an image of another machine contains the keys that could log in there, and its recordings
 owned=yes
 if [ "$(cat {folder}/instance 2>/dev/null)" != "$INSTANCE_ID" ]; then
     home=$(getent passwd {user} | cut -d: -f6)
-    [ -z "$home" ] || rm -f "$home/.ssh/authorized_keys"
+    [ -z "$home" ] || rm -rf "$home/.ssh/authorized_keys" "$home"/fogros2-*/recordings
     rm -f /root/.ssh/authorized_keys
     rm -f {folder}/kept_until {program}
     echo "$INSTANCE_ID" >{folder}/instance

@@ -134,6 +134,17 @@ def test_up_again_changes_nothing_and_keeps_the_session(shared: Lab) -> None:
         'chain ') == 5
 
 
+def test_up_with_another_filter_keeps_the_known_lan(shared: Lab) -> None:
+    interface, ports = shared.interfaces['robot'], shared.dds.ports
+    shared.shell('robot', f'nft add element inet {interface.name} lan "{{ 192.168.77.2 }}"')
+    shared.do('robot', WireGuard(ports, ['198.18.8.2']).up(interface, shared.peers()['robot']))
+    rules = shared.shell('robot', f'nft list table inet {interface.name}')
+    assert '192.168.77.2' in rules and '198.18.8.2' in rules
+    shared.do('robot', shared.vpn.up(interface, shared.peers()['robot']))
+    rules = shared.shell('robot', f'nft list table inet {interface.name}')
+    assert '192.168.77.2' in rules and '198.18.8.2' not in rules
+
+
 def test_up_takes_over_what_failed_and_killed_launches_left(lab: Lab) -> None:
     interface = lab.interfaces['machine']
     command = lab.vpn.keys(interface)
