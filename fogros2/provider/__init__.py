@@ -317,6 +317,9 @@ class Provider(abc.ABC):
         :raises Unsupported: the provider keeps no tags.
         """
 
+    def search_for(self, specs: Iterable[MachineSpec]) -> None:
+        """Let ``find`` also search where machines with these specs are, if specs name places."""
+
     @abc.abstractmethod
     def destroy(self, machine_id: str) -> None:
         """

@@ -74,11 +74,18 @@ if [ -n "$rmw" ]; then
 fi
 echo "$image"
 """
-# Docker names GPUs by number, podman by the vendor's description (CDI).
+# Docker takes a number of GPUs, podman the name of each by the vendor's description (CDI).
 GPUS = """\
 if [ -n "$gpus" ]; then
     if [ $engine = docker ]; then set -- --gpus "$gpus" "$@"
-    else set -- --device "nvidia.com/gpu=$gpus" "$@"; fi
+    else
+        case $gpus in
+            *[!0-9]*) set -- --device "nvidia.com/gpu=$gpus" "$@" ;;
+            *) while [ "$gpus" -gt 0 ]; do
+                   gpus=$((gpus - 1)); set -- --device "nvidia.com/gpu=$gpus" "$@"
+               done ;;
+        esac
+    fi
 fi
 """
 RUN = ENGINE + """\

@@ -332,7 +332,7 @@ def _ask(
     """
     if not any(record.provider == name for record in records) and not wanted(name, regions):
         return Answer([])
-    provider = load(name, regions)
+    provider = load(name, regions, records)
     provider.cancel = cancel
     matches: list[Machine] = []
     silent = []
@@ -363,16 +363,20 @@ def _ask(
     return Answer(matches, silent)
 
 
-def load(name: str, regions: Optional[Sequence[str]] = None) -> Provider:
+def load(
+    name: str, regions: Optional[Sequence[str]] = None, records: Iterable[Record] = (),
+) -> Provider:
     """
     Load a provider.
 
     :param regions: regions to search if the provider has regions; ``['all']`` or ``['*']``: all.
+    :param records: of machines to search for; those of other providers are ignored.
     :raises FogError: no provider has that name, or a library of the provider is not installed.
     """
     provider: Provider = plugin_system.load('fogros2.provider', name)()
     if regions:
         provider.search_in(['all'] if {'all', '*'} & set(regions) else list(regions))
+    provider.search_for(record.spec for record in records if record.provider == name)
     return provider
 
 

@@ -122,7 +122,7 @@ class Bench:
         self.executor.shutdown()
         self.node.destroy_node()
         self.context.try_shutdown()
-        assert set(codes) <= {0}, [''.join(lines) for _, lines, _ in self.processes]
+        assert set(codes) <= {0}, (codes, [''.join(lines) for _, lines, _ in self.processes])
 
 
 @contextlib.contextmanager

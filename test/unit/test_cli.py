@@ -257,6 +257,34 @@ def test_gc_deletes_machine_whose_id_was_not_saved(capsys: pytest.CaptureFixture
     assert [*Memory.machines] == ['id-of-a-neighbour']
 
 
+@pytest.mark.parametrize('machine_id', ['id-a', None])
+def test_machine_is_searched_where_its_record_names_it(
+    monkeypatch: pytest.MonkeyPatch, machine_id: Optional[str],
+) -> None:
+    """Such as a pod of a namespace, with no right to list pods in another one."""
+    def search_for(self: Memory, specs: Iterable[MachineSpec]) -> None:
+        self.places = [spec.options['namespace'] for spec in specs]
+
+    def find(self: Memory, tags: Any) -> list[Machine]:
+        if self.places != ['robots']:
+            raise ProviderError('the cluster refused listing jobs')
+        return [*Memory.machines.values()]
+
+    monkeypatch.setattr(Memory, 'places', [], raising=False)
+    monkeypatch.setattr(Memory, 'search_for', search_for)
+    monkeypatch.setattr(Memory, 'find', find)
+    machine('a')
+    ours = record('a', machine_id, **dead(), spec=MachineSpec(
+        'a', 'memory', {'namespace': 'robots'}))
+    (entry,) = machines.survey(lambda text: None)
+    assert entry.state == 'running (launch gone)'
+    if machine_id is None:
+        endings.end_request(ours, 0.0, Store())
+    else:
+        assert run('delete', 'a', '--yes') == 0
+    assert not Memory.machines
+
+
 @pytest.mark.parametrize('words', [
     'gc --keep-stopped=-1', 'gc --keep-stopped=nan', 'price --limit=-1', 'wait a --timeout=inf'])
 def test_wrong_number_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:

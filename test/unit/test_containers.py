@@ -512,7 +512,7 @@ def test_layer_keeps_command_and_user_of_image(engine, command, user, kept):
 
 
 def test_a_node_gets_its_gpus_and_nothing_is_downloaded_for_it(engine, tmp_path):
-    node = NodeSpec('1', 'eyes', 'demo', 'talker', features=in_image('demo:1', '--gpus=1'))
+    node = NodeSpec('1', 'eyes', 'demo', 'talker', features=in_image('demo:1', '--gpus=all'))
     made = containers.inside(node, 'demo:1', 'abc', str(tmp_path), '/run/dds.xml')
     for key, script in made.files.items():
         (tmp_path / key).write_text(str(script))
@@ -520,7 +520,7 @@ def test_a_node_gets_its_gpus_and_nothing_is_downloaded_for_it(engine, tmp_path)
              for word in made.arguments]
     told = done(Command(tuple(words)), FOGROS2_AGENT_DIRECTORY=str(tmp_path),
                 ROS_DOMAIN_ID='7')[1]
-    gpus = '--gpus 1' if engine == 'docker' else '--device nvidia.com/gpu=1'
+    gpus = '--gpus all' if engine == 'docker' else '--device nvidia.com/gpu=all'
     (create,) = (line for line in told if ' create ' in line)
     assert f' {gpus} ' in create and f' -v {tmp_path}:{tmp_path}:ro ' in create
     for option in ('--pull never', '--network host', '--ipc host', f'--user {os.getuid()}:'):
@@ -568,10 +568,12 @@ def test_signal_reaches_the_node_below_an_init_or_entry_point(tmp_path, first):
     assert process.returncode == 4
 
 
-def test_gpu_options_are_those_of_the_engine(engine):
-    container = parse('docker run --gpus 1 -p 80:80 image run')
+@pytest.mark.parametrize(('number', 'names'), [(1, ['0']), (2, ['0', '1'])])
+def test_gpu_options_are_those_of_the_engine(engine, number, names):
+    container = parse(f'docker run --gpus {number} -p 80:80 image run')
     told = done(containers.run(container, 0, 'abc', 'image', '/run/dds.xml', '/run/variables'))[1]
-    gpus = '--gpus 1' if engine == 'docker' else '--device nvidia.com/gpu=1'
+    gpus = f'--gpus {number}' if engine == 'docker' else ' '.join(
+        f'--device nvidia.com/gpu={name}' for name in names)
     assert told[-1] == (f'{engine} run -d --name fogros2-abc-0-image {gpus} '
                         '--label fogros2-launch=abc -p 80:80 image run')
 

@@ -319,6 +319,53 @@ def test_architecture_is_that_of_the_matching_nodes(monkeypatch, options, nodes,
     assert KubernetesProvider().architecture(spec) == architecture
 
 
+class Limited:
+    """A cluster in which a user has a role in some namespaces; others refuse to list."""
+
+    server = 'https://127.0.0.1:6443'
+
+    def __init__(self, context: str, *namespaces: str) -> None:
+        self.context, self.namespace, self.namespaces = context, 'default', namespaces
+
+    def request(self, method: str, target: str, **more: Any) -> dict[str, Any]:
+        namespace = target.partition('/namespaces/')[2].partition('/')[0]
+        if namespace not in self.namespaces:
+            raise ApiError(f'User "robot" cannot list in "{namespace}"', status=403)
+        if not target.endswith('/jobs'):
+            return {}
+        job, _ = made(namespace=namespace)
+        job['metadata'].update(uid=f'uid-{namespace}', namespace=namespace,
+                               creationTimestamp='2026-01-01T00:00:00Z')
+        return {'items': [job]}
+
+
+@pytest.mark.parametrize(('places', 'regions', 'refused'), [
+    ([{'namespace': 'robots'}], ['here/robots'], ''),
+    ([{'namespace': 'robots', 'context': 'here'}], ['here/robots'], ''),
+    # the namespaces of one cluster are not searched in another
+    ([{'namespace': 'robots'}, {'namespace': 'lab', 'context': 'away'}],
+     ['away/lab', 'here/robots'], ''),
+    ([], [], 'default'),
+    ([{}, {'namespace': 'robots'}], [], 'default'),
+    ([{'namespace': 'robots'}, {'namespace': 'shut'}], ['here/robots'], 'shut')])
+def test_role_in_a_named_namespace_finds_its_pods(monkeypatch, places, regions, refused):
+    clusters = {'': Limited('here', 'robots'), 'away': Limited('away', 'lab')}
+    clusters['here'] = clusters['']
+    monkeypatch.setattr(kubernetes_client, 'connect', lambda context='': clusters[context])
+    monkeypatch.setattr(kubernetes_client, 'configured', lambda: True)
+    provider, searched = KubernetesProvider(), []
+    provider.search_for(MachineSpec('Talker', 'kubernetes', options) for options in places)
+
+    def search() -> None:
+        searched.extend(machine.region for machine in provider.find({TAG_NAME: 'Talker'}))
+
+    if refused:
+        assert f'cannot list in "{refused}"' in str(raised(ProviderError, search))
+    else:
+        search()
+    assert sorted(searched) == regions
+
+
 def test_a_pod_can_not_be_asked_to_stop():
     spec = MachineSpec('planner', 'kubernetes', on_exit='stop')
     error = raised(ConfigurationError, lambda: KubernetesProvider().check(spec))

@@ -220,6 +220,18 @@ def test_options_are_taken_as_they_are_meant(tmp_path):
     assert not any(secret in ' '.join(words) for secret in ('AAAA', '0123-token'))
 
 
+@pytest.mark.parametrize(('engine', 'gpus', 'flags'), [
+    ('docker', 'all', '--gpus all'), ('docker', '2', '--gpus 2'),
+    ('podman', 'all', '--device nvidia.com/gpu=all'),
+    ('podman', '1', '--device nvidia.com/gpu=0'),
+    ('podman', '2', '--device nvidia.com/gpu=0 --device nvidia.com/gpu=1')])
+def test_number_of_gpus_is_a_count_for_both_engines(engine, gpus, flags):
+    words = [*container_options.common_flags(Engine(engine), MachineSpec('m', 'container'),
+                                             REQUEST, Options.parse({'gpus': gpus}))]
+    text = ' '.join(words)
+    assert flags in text and text.count('gpu') == flags.count('gpu')
+
+
 @pytest.mark.parametrize('spec', [
     MachineSpec('m', 'container', {'containers': True}), MachineSpec('m', 'container')])
 @pytest.mark.parametrize('apparmor', [True, False])

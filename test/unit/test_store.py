@@ -4,6 +4,7 @@
 import errno
 import os
 from pathlib import Path
+import re
 import stat
 import subprocess
 import sys
@@ -24,6 +25,8 @@ from fogros2.store import (
     Store,
     write_private,
 )
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -203,6 +206,26 @@ def test_readers_find_digits_that_they_may_not_write(monkeypatch, tmp_path):
     (tmp_path / 'fogros2/robot.json').chmod(0o400)
     monkeypatch.setattr(store_module.os, 'open', read_only(os.open))
     assert robot_id(new=False) == robot_id() == known and not is_another_robot(known)
+
+
+def test_volume_of_the_docker_command_keeps_id_and_state(monkeypatch):
+    file = (ROOT / 'packaging/Dockerfile').read_text()
+    (volume,) = re.findall(r'-v fogros2:(\S+)', (ROOT / 'doc/install.md').read_text())
+    for name in ('XDG_CONFIG_HOME', 'XDG_STATE_HOME', 'FOGROS2_STATE_HOME'):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv('HOME', '/root')
+    for name, value in re.findall('^ENV (.*)=(.*)$', file, re.MULTILINE):
+        monkeypatch.setenv(name, value)
+    folders = []
+
+    def digits(folder, *, new):
+        folders.append(folder)
+        return '0123abcd'
+
+    monkeypatch.setattr(store_module, '_digits', digits)
+    assert robot_id().endswith('-0123abcd')
+    assert [folder for folder in (*folders, Store().root)
+            if not folder.is_relative_to(volume)] == [] and folders
 
 
 def read_only(opened):

@@ -155,9 +155,7 @@ def common_flags(
     if options.memory:
         yield from ('--memory', options.memory)
     if options.gpus:
-        # Podman names GPUs by the vendor's description (CDI).
-        yield from (('--gpus', options.gpus) if engine.name == 'docker' else
-                    ('--device', f'nvidia.com/gpu={options.gpus}'))
+        yield from gpu_flags(engine, options.gpus)
     for device in options.devices:
         yield from ('--device', device)
     for port in options.ports:
@@ -174,6 +172,16 @@ def common_flags(
         yield '--rm'
     if options.containers:
         yield from nested_flags(engine)
+
+
+def gpu_flags(engine: Engine, gpus: str) -> Iterator[str]:
+    """Yield the flags for 'all' GPUs or a number of them."""
+    if engine.name == 'docker':
+        yield from ('--gpus', gpus)
+        return
+    # Podman names each GPU by the vendor's description (CDI).
+    for gpu in range(int(gpus)) if gpus.isdecimal() else [gpus]:
+        yield from ('--device', f'nvidia.com/gpu={gpu}')
 
 
 def data_mount(engine: Engine, folder: Path, target: str) -> tuple[str, str]:

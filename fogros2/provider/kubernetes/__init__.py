@@ -11,7 +11,7 @@ everything. ``image`` builds images.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import contextlib
 import threading
 import time
@@ -77,7 +77,7 @@ class KubernetesProvider(Provider):
         self._asking = threading.Lock()
         #: When the cluster last agreed: that this user has all rights, or to a pod.
         self._agreed: dict[object, float] = {}
-        #: Contexts and namespaces in launch files.
+        #: Contexts and namespaces in launch files and records; '' for the current ones.
         self._places: set[tuple[str, str]] = set()
         self._lifetimes: dict[str, float] = {}
         #: Jobs that this process created, which saves requests.
@@ -254,7 +254,7 @@ class KubernetesProvider(Provider):
 
     def find(self, tags: Mapping[str, str]) -> Iterator[Machine]:
         """Yield the Jobs with all of ``tags``, in all namespaces if the user may list them."""
-        contexts = {'', *(context for context, _ in self._places)}
+        contexts = {'', *(context for context, _ in self._places.copy())}
         seen: set[str] = set()
         for context in sorted(contexts):
             if context == '' and not kubernetes_client.configured():
@@ -270,6 +270,12 @@ class KubernetesProvider(Provider):
                         seen.add(where.uid)
                         yield self._machine(api, where, job, pods.pod_of(job, pod_list))
 
+    def search_for(self, specs: Iterable[MachineSpec]) -> None:
+        """Let ``find`` search the namespaces of these specs."""
+        with self._lock:
+            self._places.update((str(spec.options.get('context') or ''),
+                                 str(spec.options.get('namespace') or '')) for spec in specs)
+
     def _entries(
         self, api: Api, kind: str, labels: str,
     ) -> Iterator[tuple[str, list[dict[str, Any]]]]:
@@ -279,11 +285,17 @@ class KubernetesProvider(Provider):
         except ApiError as error:
             if error.status != 403:
                 raise
-        namespaces = {api.namespace, *(
-            space for context, space in self._places if context in ('', api.context))}
-        for namespace in sorted(namespaces):
-            with explained(f'listing {kind}', namespace):
-                yield namespace, list(items(self._ask(api, kind, namespace, labels)))
+        named = {space or api.namespace for context, space in self._places.copy()
+                 if context == api.context or not context and api is kubernetes_client.connect()}
+        for namespace in sorted({api.namespace, *named}):
+            try:
+                entries = list(items(self._ask(api, kind, namespace, labels)))
+            except ApiError as error:
+                # the role may be in the named namespaces alone
+                if error.status == 403 and named and namespace not in named:
+                    continue
+                raise refused(error, f'listing {kind}', namespace) from error
+            yield namespace, entries
 
     def _ask(self, api: Api, kind: str, namespace: str, labels: str) -> dict[str, Any]:
         return api.request('GET', path(kind, namespace), labelSelector=labels, timeout=_FIRST)

@@ -15,6 +15,7 @@ import pytest
 from fogros2 import kubernetes_client
 from fogros2.errors import NameTaken, ProviderError, ShellError
 from fogros2.model import Command, MachineSpec
+from fogros2.provider import TAG_NAME
 from fogros2.provider.kubernetes import KubernetesProvider
 from fogros2.shell.kubernetes import KubernetesShell
 from fogros2.waiting import wait_until
@@ -88,6 +89,19 @@ def test_pod_has_no_token_of_the_cluster(pod):
         found = shell.run(Command(('ls', '/var/run/secrets/kubernetes.io'), sudo=True),
                           timeout=30.0, check=False)
         assert found.returncode != 0
+
+
+def test_pod_in_another_namespace_than_the_contexts_is_found(kubernetes, place, monkeypatch):
+    monkeypatch.setenv('KUBECONFIG', str(kubernetes.kubeconfig_of_robot('default')))
+    provider, machine_id, _ = run('elsewhere', namespace=place.name)
+    later = KubernetesProvider()
+    later.search_for([MachineSpec('elsewhere', later.name, {'namespace': place.name})])
+    try:
+        for each in (provider, later):
+            assert [found.id for found in each.find({TAG_NAME: 'elsewhere'})] == [machine_id]
+    finally:
+        provider.destroy(machine_id)
+    assert list(later.find({TAG_NAME: 'elsewhere'})) == []
 
 
 def test_launch_makes_few_requests_to_the_cluster(place, monkeypatch):
