@@ -60,11 +60,13 @@ class Choices:
         """
         Return the specs to try while there is no capacity, one after the other.
 
-        Their provider, which stands for others, is asked once, and again after ``forget``.
+        A provider that stands for others is asked for them once, and again after ``forget``.
 
         :raises FogError: nothing fits.
         """
         provider = self._provider(spec.provider)
+        if not provider.capabilities.places:
+            return [spec]
         if spec.name not in self._places:
             with step(self._report, spec.name, 'offers') as detail:
                 places = provider.places(spec)

@@ -18,7 +18,7 @@ from fogros2.errors import ConfigurationError, ConnectError, DeadlineExceeded, P
 from fogros2.model import Endpoint, MachineSpec, NodeSpec
 from fogros2.process import which
 from fogros2.runtime.coordinator import Coordinator
-from fogros2.runtime.remote_process import process_on
+from fogros2.runtime.remote_process import process_on, remote_of
 from fogros2.shell.local import LocalShell
 from fogros2.store import Store
 from fogros2.waiting import wait_until
@@ -151,9 +151,10 @@ def test_replica_that_is_not_replaced_again_leaves_the_others(run, fake, watch, 
     def replicate(context):
         Coordinator.of(context).session('planner').rename({}, 'the other replicas')
 
-    assert run(LaunchDescription([
-        *watch(), CloudNode(machine=planner, package='absent', executable='says'),
-        OpaqueFunction(function=replicate)])) == 0
+    node = CloudNode(machine=planner, package='absent', executable='says')
+    remote_of(node).needed = False
+    assert run(LaunchDescription(
+        [*watch(), node, OpaqueFunction(function=replicate)])) == 0
     said = capfd.readouterr()
     assert 'max_replacements=1 is reached; the other replicas go on' in said.out + said.err
 
