@@ -163,7 +163,9 @@ class Record:
     :param created: when the creation was requested, in seconds since the epoch.
     :param armed: when its lifetime last restarted; a launch that reuses the machine restarts it.
     :param launch: id of the launch that uses the machine, '' for none.
-    :param last: id of the launch that used it last; the agent may not know that launch's end.
+    :param last: id of the launch that used it last.
+    :param owners: ids of launches, oldest first; the agent knows one of them as its last launch,
+        whose end the agent may not know.
     :param robot: see :func:`robot_id`. It differs in a copied state folder.
     :param asked: the provider's options as requested; in ``spec`` all open choices ('cheapest',
         'nearest') are made.
@@ -171,6 +173,7 @@ class Record:
         detect a reused process id.
     :param endpoint: how to reach the machine from outside the VPN.
     :param host_key: the key that the machine generated, '' if the provider's key is used.
+    :param vpn_port: UDP port that its firewall admits, 0 if unknown.
     :param vpn: the machine's own VPN interface.
     :param public_key: the machine's VPN public key.
     :param robot_vpn: the robot's VPN interface.
@@ -190,6 +193,7 @@ class Record:
     machine_id: Optional[str] = None
     launch: str = ''
     last: str = ''
+    owners: tuple[str, ...] = ()
     robot: str = ''
     pid: int = 0
     pid_start: int = 0
@@ -197,6 +201,7 @@ class Record:
     asked: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     endpoint: Optional[Endpoint] = None
     host_key: str = ''
+    vpn_port: int = 0
     vpn: Optional[VpnInterface] = None
     public_key: str = ''
     robot_vpn: Optional[VpnInterface] = None
@@ -397,8 +402,14 @@ def robot_id(*, new: bool = True) -> str:
 
 
 def is_another_robot(noted: str) -> bool:
-    """Return whether a tag has the id of another robot."""
-    return noted not in ('', robot_id(new=False))
+    """
+    Return whether a tag or a record has the id of another robot.
+
+    The host name of this robot may have changed since; the digits stay.
+    """
+    own = robot_id(new=False)
+    digits = own.removeprefix(robot_name())
+    return noted not in ('', own) and not (digits and noted.endswith(digits))
 
 
 def _digits(folder: Path, *, new: bool) -> str:
@@ -573,4 +584,5 @@ def record_from_json(data: Mapping[str, Any]) -> Record:
         if values.get(key) is not None:
             values[key] = kind(**values[key])
     values['made'] = tuple(Made(**each) for each in values.get('made', ()))
+    values['owners'] = tuple(values.get('owners', ()))
     return Record(**values)

@@ -12,9 +12,8 @@ from launch.actions import ExecuteLocal, GroupAction
 from fogros2.describe import features, keywords
 from fogros2.describe.machines import checked
 from fogros2.launch_internals.wrapping import wrap
-from fogros2.runtime.added_process import AddedProcess
 from fogros2.runtime.coordinator import Coordinator
-from fogros2.runtime.remote_process import remote_of, send, send_components
+from fogros2.runtime.remote_process import remote_of, send, send_components, stays
 
 if TYPE_CHECKING:
     from fogros2.describe.machines import SomeMachine
@@ -58,8 +57,7 @@ class CloudGroup(GroupAction):
         if isinstance(entity, Action) and entity.condition is not None and (
                 not entity.condition.evaluate(context)):
             return  # launch skips it
-        if isinstance(entity, ExecuteLocal) and remote_of(entity) is None and not isinstance(
-                entity, AddedProcess):
+        if isinstance(entity, ExecuteLocal) and remote_of(entity) is None and not stays(entity):
             send(entity, self._resolved, self._own)
         else:
             send_components(entity, self._resolved, self._own, context)

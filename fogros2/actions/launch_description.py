@@ -166,5 +166,9 @@ def _hold(
     coordinator: Coordinator, entity: LaunchDescriptionEntity, context: LaunchContext,
 ) -> None:
     """Make a robot process or a timer wait until the cloud is up."""
+    async def released() -> bool:
+        # an outer CloudGroup may have sent it meanwhile: it is no longer a robot process
+        return remote_of(entity) is not None or await coordinator.hold()
+
     if isinstance(entity, (ExecuteLocal, TimerAction)) and remote_of(entity) is None:
-        private.delay_start(entity, coordinator.hold)
+        private.delay_start(entity, released)

@@ -59,8 +59,10 @@ class MachineJob(Site):
         self.undo.callback(self._report_left)
         self._left: list[str] = []
         self.life = Life()
-        #: The id of the last launch of a machine that an earlier launch created.
-        self.former = ''
+        #: Ids of earlier launches, oldest first; one of them has the machine's agent, if any.
+        self.formers: tuple[str, ...] = ()
+        #: When this launch created the machine or took it over, by ``time.monotonic``.
+        self.claimed = time.monotonic()
         #: Seconds of silence after which it is lost, whatever its provider reports.
         self.longest_silence: Optional[float] = None
         #: The agent's UDP port for heartbeats, and the address from which they come.

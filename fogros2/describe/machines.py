@@ -142,8 +142,8 @@ class CloudInstance:
 
     @property
     def own_name(self) -> SomeSubstitutionsType:
-        """The name as the launch file gives it."""
-        return self._name
+        """The name as the launch file gives it, or as the launch has resolved it."""
+        return self._name if self._spec is None else self._spec.name
 
     @property
     def ip(self) -> Optional[str]:

@@ -44,6 +44,19 @@ _RUN = ('depend', 'exec_depend', 'run_depend')
 _ALL = (*_RUN, 'build_depend', 'build_export_depend', 'buildtool_depend',
         'buildtool_export_depend', 'test_depend')
 
+# Delete packages of an earlier build that the workspace does not have any more: local_setup.sh
+# sources each package in the install space. $below is the folder of the sources.
+_CLEAN = """\
+if [ -d install ] &&
+    names=$(colcon --log-base /dev/null list --names-only --base-paths "$below"); then
+    for prefix in install/*; do
+        name=${prefix##*/}
+        [ ! -e "$prefix/share/colcon-core/packages/$name" ] ||
+            printf '%s\\n' "$names" | grep -qxFe "$name" || rm -rf "$prefix" "build/$name"
+    done
+fi
+"""
+
 
 @dataclasses.dataclass(frozen=True)
 class Workspace:
@@ -336,7 +349,7 @@ def _build(workspace: Workspace, ros_setup: Sequence[str]) -> Command:
     below = 'src' if (workspace.root / 'src').is_dir() else '.'
     source = ''.join(f'. {shlex.quote(script)}\n' for script in ros_setup)
     return Command.script(
-        f'{source}cd {root}\n'
+        f'{source}cd {root}\nbelow={below}\n{_CLEAN}'
         # each compiler needs gigabytes of memory
         f'colcon build --base-paths {below} --parallel-workers "$(nproc)" '
         '--event-handlers console_cohesion+ --cmake-args -DCMAKE_BUILD_TYPE=Release\n',

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 import contextlib
+from email.utils import parsedate_to_datetime
 import json
 import math
 import os
@@ -62,6 +63,8 @@ class Api:
     :raises PrerequisiteError: no kubeconfig, no such context, or no valid credentials.
     """
 
+    #: The Date header of the last response, and when it came (``time.monotonic``).
+    _date = ('', 0.0)
     #: When ``doubt`` has last asked the server.
     _doubted = -math.inf
 
@@ -79,6 +82,14 @@ class Api:
         return {each['key']: each['value']
                 for each in self._client.configuration.auth_settings().values()
                 if each['in'] == 'header' and each['value']}
+
+    def now(self) -> float:
+        """Return the time of the API server's last response, continued; else of this computer."""
+        text, since = self._date
+        try:
+            return parsedate_to_datetime(text).timestamp() + time.monotonic() - since
+        except (TypeError, ValueError):
+            return time.time()
 
     # -- requests -------------------------------------------------------------------------------
 
@@ -182,12 +193,14 @@ class Api:
             headers['content-type'] = 'application/merge-patch+json' \
                 if method == 'PATCH' else 'application/json'
         try:
-            return self._client.rest_client.pool_manager.request(
+            response = self._client.rest_client.pool_manager.request(
                 method, self._url(path, query), headers=headers, preload_content=False,
                 body=None if body is None else json.dumps(body).encode(), retries=False,
                 timeout=urllib3.Timeout(connect=CONNECT, read=read))
         except http_errors() as error:
             raise self._unreachable(error) from error
+        self._date = response.headers.get('Date', ''), time.monotonic()
+        return response
 
     def _url(self, path: str, query: Query) -> str:
         words = {name: value for name, value in query.items() if value is not None}

@@ -34,6 +34,11 @@ def are_loaded_by(entity: LaunchDescriptionEntity) -> bool:
     return any(cls.__name__ == 'LoadComposableNodes' for cls in type(entity).__mro__)
 
 
+def have_names(action: Action) -> bool:
+    """Return whether :func:`rename_topics` has changed an action."""
+    return 'execute' in vars(action)
+
+
 def rename_topics(
     action: Action, names: Callable[[], Mapping[str, str]],
     beside: Callable[[], Sequence[LaunchDescriptionEntity]],
@@ -44,8 +49,6 @@ def rename_topics(
     :param names: returns new topic names by full old names, when the action is executed.
     :param beside: called before that; returns processes that run beside the components.
     """
-    if 'execute' in vars(action):
-        return  # an earlier visit has replaced it
     execute = action.execute
 
     def renaming(context: LaunchContext) -> list[LaunchDescriptionEntity]:

@@ -208,6 +208,11 @@ def kept_environments(context: LaunchContext) -> list[dict[str, str]]:
     return environments
 
 
+def has_ros_node(context: LaunchContext) -> bool:
+    """Return whether launch_ros has created its ROS node, as for lifecycle events."""
+    return 'ros_adapter' in context.get_locals_as_dict()
+
+
 def waiting_events(context: LaunchContext) -> int:
     """Return the number of events that launch has yet to process."""
     return int(context._event_queue.qsize())

@@ -41,6 +41,16 @@ class Wrapped(LaunchDescriptionEntity):
         with _intercepted(context, self._apply):
             return wrap(entity.visit(context), self._apply)
 
+    def also(self, apply: Apply) -> Wrapped:
+        """Return the entity with another function, to be applied after its own."""
+        first = self._apply
+
+        def both(entity: LaunchDescriptionEntity, context: LaunchContext) -> None:
+            first(entity, context)
+            apply(entity, context)
+
+        return Wrapped(self._entity, both)
+
     def get_asyncio_future(self) -> Optional[asyncio.Future[Any]]:
         """Return the entity's own future."""
         future: Optional[asyncio.Future[Any]] = self._entity.get_asyncio_future()
@@ -83,11 +93,16 @@ def everything(
 
 
 def wrap(entities: Any, apply: Apply) -> Optional[list[LaunchDescriptionEntity]]:
-    """Wrap the result of a visit or a handler: None, an entity, or several."""
+    """
+    Wrap the result of a visit or a handler: None, an entity, or several.
+
+    If inner content has wrapped an entity, ``apply`` comes after that content's function.
+    """
     if entities is None:
         return None
     several: Iterable[Any] = entities if isinstance(entities, Iterable) else (entities,)
-    return [Wrapped(entity, apply) for entity in several if entity is not None]
+    return [entity.also(apply) if isinstance(entity, Wrapped) else Wrapped(entity, apply)
+            for entity in several if entity is not None]
 
 
 def _wrap_result(handles: Any, apply: Apply) -> None:

@@ -116,6 +116,8 @@ class Coordinator:
         self._deployments: list[asyncio.Task[None]] = []
         self._begun = True
         self._late: set[str] = set()
+        #: What the DDS settings replaced, by variable.
+        self._replaced: dict[str, Optional[str]] = {}
         self._on_machine: OnMachine
         self._dds: Optional[str] = None
         self._down: Optional[asyncio.Task[None]] = None
@@ -233,15 +235,15 @@ class Coordinator:
         """
         Check that each override has a machine.
 
-        :param early: check only if all machines are already known.
+        :param early: check only if all machines are already known, by names that are texts.
         """
-        if self._overrides is None or (early and not self._whole):
+        given = [known.own_name if isinstance(known, CloudInstance) else known
+                 for known in (*self._instances.values(), *self._mentioned)]
+        if self._overrides is None or early and not (
+                self._whole and all(isinstance(name, str) for name in given)):
             return
-        names = [self._resolved(
-            known.own_name if isinstance(known, CloudInstance) else known)
-            for known in (*self._instances.values(), *self._mentioned)]
-        if not early or None not in names:
-            self._overrides.check([name for name in names if name is not None])
+        self._overrides.check(
+            [name for name in map(self._resolved, given) if name is not None])
 
     def resolve(self, machine: SomeMachine) -> Union[CloudInstance, str]:
         """Return a machine as it is, or its name resolved."""
@@ -425,6 +427,11 @@ class Coordinator:
         environment = self.launch.robot_environment()
         for kept in (self._context.environment, *private.kept_environments(self._context)):
             kept.update(environment)
+        for name in environment:
+            self._replaced.setdefault(name, self.base_environment.get(name))
+        if private.has_ros_node(self._context) and not (
+                self.base_environment.items() >= environment.items()):
+            self._warn_of_late("launch's own ROS node")
         # these are not changes of the launch file, so they must not be sent to machines
         self.base_environment.update(environment)
         for action in private.processes(self._context):
@@ -438,9 +445,12 @@ class Coordinator:
                 details['env'].update(environment)
             elif details['name'] not in self._late:
                 self._late.add(details['name'])
-                self._logger.warning(
-                    f"{details['name']} runs already and so without the cloud's DDS settings: it "
-                    'may not see the cloud; use a FogROSLaunchDescription')
+                self._warn_of_late(details['name'])
+
+    def _warn_of_late(self, name: str) -> None:
+        self._logger.warning(
+            f"{name} runs already and so without the cloud's DDS settings: it "
+            'may not see the cloud; use a FogROSLaunchDescription')
 
     def _on_process_start(self, event: ProcessStarted, context: LaunchContext) -> None:
         if self._launch is not None and self._launch.drops(event.env or {}):
@@ -557,11 +567,23 @@ class Coordinator:
             self._logger.info(line)
 
     def _taken_down(self, task: asyncio.Task[None]) -> None:
+        self._restore_environment()
         self._raise_in_launch(task)
         if self._console is not None:
             self._console.close()
         self._pool.shutdown(wait=False)
         self._restore_signals()
+
+    def _restore_environment(self) -> None:
+        """Undo the DDS settings: they name deleted files, and this process may launch again."""
+        environment = self._context.environment
+        for name, value in self._replaced.items():
+            if environment.get(name) != self.base_environment[name]:
+                continue  # set anew by something else
+            if value is None:
+                del environment[name]
+            else:
+                environment[name] = value
 
     def _in_thread(self, function: Callable[..., Any], *args: Any) -> asyncio.Future[Any]:
         future: asyncio.Future[Any] = self._context.asyncio_loop.run_in_executor(

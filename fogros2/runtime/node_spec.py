@@ -22,8 +22,11 @@ from fogros2.describe.variables import LOCAL_VARIABLES, to_send
 from fogros2.errors import ConfigurationError
 from fogros2.host import workspace
 from fogros2.host.programs import check_program
-from fogros2.launch_internals import private
+from fogros2.launch_internals import environment, private
 from fogros2.model import MachineSpec, NodeSpec, Text, TextPart
+
+# launch files import FogROS2 before the actions that they describe execute
+environment.record()
 
 #: ROS arguments followed by a file name; the file is sent to the machine.
 _FILE_ARGUMENTS = ('--params-file', '--log-config-file')
@@ -51,11 +54,17 @@ class ProgramName(Substitution):
 
 
 def use_names_of_programs(action: ExecuteLocal) -> None:
-    """Replace substitutions that look programs up on the robot by the names, in place."""
-    for argument in action.process_description.cmd:
+    """
+    Replace substitutions that look programs up on the robot by the names, in place.
+
+    Of a package's programs, only the command's own: the paths of others become markers.
+    """
+    command = action.process_description.cmd
+    for argument in command:
         for index, part in enumerate(argument):
             if isinstance(part, ExecutableInPackage):
-                argument[index] = ProgramName(part.executable, part.package, part)
+                if argument is command[0] and len(argument) == 1:
+                    argument[index] = ProgramName(part.executable, part.package, part)
             elif isinstance(part, FindExecutable):
                 argument[index] = ProgramName(
                     normalize_to_list_of_substitutions(part.name), [], part)
@@ -210,7 +219,8 @@ def _environment(
         return {**to_send(listed, base), **added}
     return {**{
         key: value for key, value in final.items()
-        if base.get(key) != value and key not in LOCAL_VARIABLES}, **added}
+        if (base.get(key) != value or environment.is_set(context, key))
+        and key not in LOCAL_VARIABLES}, **added}
 
 
 def _emulate_tty(action: ExecuteLocal, context: LaunchContext) -> bool:

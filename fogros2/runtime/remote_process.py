@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 #: The attribute of an action that has its RemoteProcess.
 _REMOTE = '_fogros2_remote'
+#: The attribute of an action whose process no CloudGroup sends.
+_KEPT = '_fogros2_kept'
 
 
 class RemoteProcess:
@@ -207,6 +209,16 @@ def remote_of(entity: object) -> Optional[RemoteProcess]:
     return remote
 
 
+def keep(action: ExecuteLocal) -> None:
+    """Keep the process of an action on the robot, also in a CloudGroup."""
+    vars(action)[_KEPT] = True
+
+
+def stays(action: ExecuteLocal) -> bool:
+    """Return whether a CloudGroup must not send the process of an action."""
+    return isinstance(action, AddedProcess) or _KEPT in vars(action)
+
+
 def process_on(spec: NodeSpec, machine: str) -> ExecuteLocal:
     """Return a process that FogROS2 adds on a machine."""
     process = AddedProcess(spec)
@@ -220,10 +232,11 @@ def send_components(
     """
     Make the components that an entity loads on a machine use the topic names there.
 
-    :param entity: changed only if it loads components.
+    :param entity: changed only if it loads components, and only once.
     :param own: its items of features' lists, resolved.
     """
-    if not (isinstance(entity, Action) and components.are_loaded_by(entity)):
+    if not (isinstance(entity, Action) and components.are_loaded_by(entity)) or (
+            components.have_names(entity)):  # an inner group's, or of an earlier visit
         return
     coordinator = Coordinator.of(context)
     session = None if coordinator.on_robot(machine) else coordinator.session(machine)

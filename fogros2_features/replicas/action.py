@@ -20,7 +20,7 @@ from fogros2.model import NodeSpec
 from fogros2.ros_names import absolute, local_topic, remapped
 from fogros2.runtime.added_process import AddedProcess
 from fogros2.runtime.coordinator import Coordinator
-from fogros2.runtime.remote_process import remote_of
+from fogros2.runtime.remote_process import keep, remote_of
 from fogros2_features.replicas import starting
 
 if TYPE_CHECKING:
@@ -164,6 +164,7 @@ class _Last(GroupAction):
         _check(entity)
         if isinstance(entity, ExecuteLocal):
             private.change_command(entity, self._renamed)
+            keep(entity)
 
     def _renamed(self, command: Sequence[str]) -> Sequence[str]:
         node = remapped(NodeSpec('', '', arguments=tuple(command)), self.names)

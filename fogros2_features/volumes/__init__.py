@@ -68,6 +68,10 @@ if [ $# -gt 0 ]; then
         n=$((n + 1))
     done
     : >"$mark"
+    findmnt -n -o TARGET -S "$device" | while IFS= read -r other; do  # of a killed launch
+        [ "$other" = "$path" ] || umount -- "$other" ||
+            { sync -f "$other"; umount -l -- "$other"; }
+    done
     if ! mountpoint -q -- "$path"; then
         make
         traces=$(wipefs -n -- "$device")

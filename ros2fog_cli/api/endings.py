@@ -32,7 +32,7 @@ from fogros2.model import Command, Machine, MachineState
 from fogros2.provider import Provider
 from fogros2.report import Reporter, step
 from fogros2.shell import Shell
-from fogros2.store import launch_process, Record, robot_id, Store
+from fogros2.store import is_another_robot, launch_process, Record, Store
 from fogros2.vpn import owner
 from fogros2.waiting import Timeouts, wait_until
 from ros2fog_cli.api import machines, reach
@@ -183,7 +183,7 @@ def _sure(record: Record) -> bool:
     A record in a copied state folder may be another computer's: then the machine's agent has to
     be asked.
     """
-    return record.robot == robot_id(new=False)
+    return record.robot != '' and not is_another_robot(record.robot)
 
 
 def _hears_launch(client: AgentClient) -> bool:

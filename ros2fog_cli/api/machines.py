@@ -23,7 +23,7 @@ from fogros2.errors import (
 )
 from fogros2.model import Machine, MachineState
 from fogros2.provider import Provider, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
-from fogros2.store import Record, robot_id, Store
+from fogros2.store import is_another_robot, Record, Store
 from ros2fog_cli.api.interrupts import interruptible
 
 Warn = Callable[[str], None]
@@ -98,7 +98,7 @@ class Entry:
     @property
     def own(self) -> bool:
         """Whether the machine belongs to this robot."""
-        return self.robot in ('', robot_id(new=False))
+        return not is_another_robot(self.robot)
 
     @property
     def created(self) -> Optional[float]:

@@ -13,10 +13,13 @@ from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity, Su
 from launch.actions import (
     DeclareLaunchArgument,
     ExecuteLocal,
-    GroupAction,
     IncludeLaunchDescription,
     OpaqueFunction,
+    PopLaunchConfigurations,
+    PushLaunchConfigurations,
+    ResetLaunchConfigurations,
     SetLaunchConfiguration,
+    UnsetLaunchConfiguration,
 )
 from launch.substitutions import Command, SubstitutionFailure
 
@@ -35,6 +38,9 @@ from fogros2.runtime.remote_process import remote_of
 #: Raised by substitutions and conditions that only a launch can evaluate, by wrong values, and by
 #: the code of included files, which can raise anything.
 _UNKNOWN = Exception
+#: Executed here as in a launch; scoped groups contain the first three.
+_SETTERS = (PushLaunchConfigurations, PopLaunchConfigurations, ResetLaunchConfigurations,
+            SetLaunchConfiguration, UnsetLaunchConfiguration)
 #: Characters of a value; a longer one is cut.
 _LONGEST = 60
 
@@ -135,7 +141,7 @@ class Preview:
                 if entity.default_value is not None:
                     self._context.launch_configurations.setdefault(
                         entity.name, self._text(entity.default_value))
-            elif isinstance(entity, SetLaunchConfiguration):
+            elif isinstance(entity, _SETTERS):
                 with contextlib.suppress(_UNKNOWN):
                     entity.execute(self._context)
             elif isinstance(entity, FogMachine):
@@ -150,7 +156,6 @@ class Preview:
                 self._inside(entity, where, own)
 
     def _inside(self, entity: LaunchDescriptionEntity, where: str, note: str) -> None:
-        configurations = dict(self._context.launch_configurations)
         if isinstance(entity, IncludeLaunchDescription):
             try:
                 entity.launch_description_source.get_launch_description(self._context)
@@ -165,9 +170,6 @@ class Preview:
             where = self._name(entity.machine)
         for some in below(entity):
             self._look(some, where, note)
-        if isinstance(entity, (GroupAction, IncludeLaunchDescription)):
-            self._context.launch_configurations.clear()
-            self._context.launch_configurations.update(configurations)
 
     def _program(self, action: ExecuteLocal) -> str:
         program = [part for name in ('node_package', 'node_executable')

@@ -65,10 +65,12 @@ class MachineOption:
 
         :raises ConfigurationError: an argument is invalid, or the folder cannot be made.
         """
-        from fogros2.launch_internals import hints
+        from fogros2.launch_internals import environment, hints
         from fogros2.runtime import log_files
         log_files.prepare()
         hints.of_actions()
+        # the launch file may set variables before it includes one that imports FogROS2
+        environment.record()
         self._overrides = None
         if args.machine:
             from fogros2.describe.overrides import Overrides

@@ -156,6 +156,26 @@ sh -ec "$4" sh models "$2" root "$3" '' "$device"
         assert (result.returncode, result.stdout) == (0, 'new\n'), result.stderr
 
 
+def test_disk_leaves_the_path_of_a_killed_launch(tmp_path: Path) -> None:
+    if process.run(Command(('losetup', '-f'), sudo=True), timeout=60.0, check=False).returncode:
+        pytest.skip('no loop device')
+    disk, path = tmp_path / 'disk', tmp_path / 'data'
+    disk.write_bytes(bytes(1 << 24))
+    interface = f'fogt{uuid.uuid4().hex[:6]}'
+    result = process.run(Command(('unshare', '-m', 'sh', '-ec', """
+device=$(losetup --show -f "$1")
+trap 'umount -A "$device"; losetup -d "$device"; rm -f "/run/$3.volume-models"' EXIT
+for each in old new new; do sh -ec "$4" sh models "$2/$each" root "$3" '' "$device"; done
+findmnt -n -o TARGET -S "$device"
+cd "$2/new"
+sh -ec "$4" sh models "$2/busy" root "$3" '' "$device"
+findmnt -n -o TARGET -S "$device"
+cd /
+""", 'sh', str(disk), str(path), interface, volumes._MOUNT), sudo=True), timeout=60.0, check=False)
+    assert (result.returncode, result.stdout) == (
+        0, f'new\n{path}/new\n{path}/busy\n'), result.stderr
+
+
 @pytest.mark.parametrize(('held', 'error'), [
     ('data', '{}/data has another volume'), ('models', 'another launch uses it')])
 def test_volumes_and_paths_have_one_user(tmp_path: Path, held: str, error: str) -> None:

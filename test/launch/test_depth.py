@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import functools
+import threading
 
-from launch import events, LaunchDescription, LaunchDescriptionSource
+from launch import Action, events, LaunchDescription, LaunchDescriptionSource
 from launch.actions import (
     DeclareLaunchArgument,
     EmitEvent,
@@ -138,6 +139,51 @@ def test_nested_machines_are_kept(run, fake, planner):
     ])])) == 0
     assert sorted((machine, name[0]) for machine, name in fake.noted('start')) == [
         ('other', 'b'), ('planner', 'a'), ('third', 'c')]
+
+
+def test_group_sends_nodes_of_a_fogros_description(run, fake, planner, capfd):
+    fake.on_start = ends
+    assert run(LaunchDescription([CloudGroup(planner, [IncludeLaunchDescription(
+        LaunchDescriptionSource(FogROSLaunchDescription(at_all_depths(node)), location='x')),
+    ]), robot_process()])) == 0
+    assert depths(fake) == sorted(DEPTHS)
+    assert 'here' not in capfd.readouterr().out
+
+
+def test_timer_of_a_group_waits_for_the_cloud(run, fake, planner):
+    fake.on_start = ends
+    fake.waits['planner'] = go = threading.Event()
+    other = ContainerInstance(name='other', ros_workspace='')
+    assert run(FogROSLaunchDescription([
+        cloud_node(planner),
+        CloudGroup(other, [TimerAction(period=0.01, actions=[
+            OpaqueFunction(function=lambda context: fake.note('fires'))])]),
+        OpaqueFunction(function=lambda context: context.asyncio_loop.call_later(0.2, go.set)
+                       and None)])) == 0
+    assert [note[0] for note in fake.notes if note[0] in ('is up', 'fires')] == ['is up', 'fires']
+
+
+def test_timer_beside_nested_groups_stays_on_the_robot(run, fake, planner, capfd):
+    fake.on_start = ends
+    other = ContainerInstance(name='other', ros_workspace='')
+    assert run(LaunchDescription([
+        CloudGroup(other, [CloudGroup(planner, [TimerAction(period=0.01, actions=[node()])])]),
+        TimerAction(period=0.02, actions=[ExecuteProcess(
+            cmd=['echo', 'on', 'the', 'robot'], output='screen')]),
+    ])) == 0
+    assert [machine for machine, _ in fake.noted('start')] == ['planner']
+    assert 'on the robot' in capfd.readouterr().out
+
+
+def test_components_of_an_inner_group_need_no_outer_machine(run, fake, planner):
+    class LoadComposableNodes(Action):
+        def execute(self, context):
+            pass
+
+    other = ContainerInstance(name='other', ros_workspace='')
+    assert run(LaunchDescription([CloudGroup(other, [
+        CloudGroup(planner, [LoadComposableNodes()])])])) == 0
+    assert fake.noted('up') == [('planner',)]
 
 
 def test_settings_of_a_group_reach_its_nodes(run, fake, planner):

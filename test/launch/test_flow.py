@@ -4,25 +4,29 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
+import os
 import threading
 
 from launch import LaunchDescription
 from launch.actions import (
+    AppendEnvironmentVariable,
     EmitEvent,
     ExecuteProcess,
     GroupAction,
     LogInfo,
     OpaqueFunction,
     RegisterEventHandler,
+    ResetEnvironment,
     SetEnvironmentVariable,
     SetLaunchConfiguration,
     Shutdown,
     TimerAction,
+    UnsetEnvironmentVariable,
 )
 from launch.event_handlers import OnProcessExit, OnProcessIO, OnProcessStart
 from launch.events import matches_action
 from launch.events.process import ShutdownProcess, SignalProcess
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import EnvironmentVariable, LaunchConfiguration
 from launch_ros.actions import Node
 import pytest
 
@@ -62,6 +66,18 @@ def robot(fake, *cmd, **kwargs):
 
 def order(fake, *whats):
     return [note[0] for note in fake.notes if note[0] in whats]
+
+
+def test_launch_leaves_the_environment_unchanged(run, fake, planner, monkeypatch):
+    """Another launch of the same process would take leftovers for the user's own settings."""
+    monkeypatch.setenv('RMW_IMPLEMENTATION', 'rmw_cyclonedds_cpp')
+    monkeypatch.delenv('CYCLONEDDS_URI', raising=False)
+    fake.on_start = ends
+    before, during = dict(os.environ), []
+    assert run(LaunchDescription([
+        talker(planner), OpaqueFunction(function=lambda context: during.append(
+            context.environment['CYCLONEDDS_URI']))])) == 0
+    assert during == ['<CycloneDDS/>'] and dict(os.environ) == before
 
 
 # -- up ------------------------------------------------------------------------------------------
@@ -246,6 +262,49 @@ def test_robot_node_started_before_the_dds_is_warned_about(run, fake, planner, c
         RegisterEventHandler(OnProcessStart(target_action=process, on_start=[cloud])), process,
     ])) == 0
     assert f'{process.name} runs already' in capfd.readouterr().out
+
+
+def test_ros_node_of_launch_before_the_dds_is_warned_about(run, fake, planner, capfd):
+    fake.on_start = ends
+    made = OpaqueFunction(function=lambda context: context.extend_globals({'ros_adapter': None}))
+    other = ContainerInstance(name='other', ros_workspace='')
+    assert run(LaunchDescription([made, talker(planner), talker(other)])) == 0
+    assert capfd.readouterr().out.count("launch's own ROS node runs already") == 1
+    assert run(LaunchDescription([talker(planner), made, talker(other)])) == 0
+    assert 'runs already' not in capfd.readouterr().out
+
+
+@pytest.mark.parametrize('within', [
+    lambda *actions: actions, lambda *actions: [GroupAction(actions, scoped=False)]])
+def test_variables_that_are_set_as_they_are_here_are_sent(
+    run, fake, planner, monkeypatch, within,
+):
+    monkeypatch.setenv('TOKEN', 'secret')
+    monkeypatch.setenv('FOLDERS', '/b')
+    monkeypatch.setenv('ROS_HOME', '/robot')
+    fake.on_start = ends
+    assert run(LaunchDescription([*within(
+        SetEnvironmentVariable('TOKEN', EnvironmentVariable('TOKEN')),
+        SetEnvironmentVariable('ROS_HOME', EnvironmentVariable('ROS_HOME')),
+        UnsetEnvironmentVariable('FOLDERS'), AppendEnvironmentVariable('FOLDERS', '/b')),
+        talker(planner)])) == 0
+    assert fake.machines['planner'].nodes['talker'].environment == {
+        'TOKEN': 'secret', 'FOLDERS': '/b'}
+
+
+@pytest.mark.parametrize('before', [
+    lambda setting: GroupAction([setting]),
+    lambda setting: GroupAction([setting], forwarding=False),
+    lambda setting: GroupAction([SetEnvironmentVariable('TOKEN', ''), ResetEnvironment()],
+                                scoped=False),
+])
+def test_variables_of_another_scope_are_not_sent(run, fake, planner, monkeypatch, before):
+    monkeypatch.setenv('TOKEN', 'secret')
+    fake.on_start = ends
+    assert run(LaunchDescription([
+        before(SetEnvironmentVariable('TOKEN', EnvironmentVariable('TOKEN'))),
+        talker(planner)])) == 0
+    assert fake.machines['planner'].nodes['talker'].environment == {}
 
 
 def test_environment_of_the_launch_file_is_sent(run, fake, planner, monkeypatch):

@@ -100,10 +100,10 @@ def test_node_runs_on_its_machine(run, fake, planner, cls):
     seen = []
     assert run(LaunchDescription([
         RegisterEventHandler(OnProcessStart(
-            target_action=away, on_start=lambda event, context: seen.append(event.pid))),
+            target_action=away, on_start=lambda event, context: seen.append(
+                (event.pid, context.environment['RMW_IMPLEMENTATION'])))),
         away])) == 0
-    assert started(fake) == [('planner', 'talker')] and seen == [4001]
-    assert run.context.environment['RMW_IMPLEMENTATION'] == 'rmw_fastrtps_cpp'
+    assert started(fake) == [('planner', 'talker')] and seen == [(4001, 'rmw_fastrtps_cpp')]
 
 
 def test_timed_node_has_namespace_and_remappings_of_its_group(run, fake, planner):

@@ -12,6 +12,7 @@ from launch.actions import (
     GroupAction,
     IncludeLaunchDescription,
     RegisterEventHandler,
+    SetLaunchConfiguration,
     Shutdown,
     TimerAction,
 )
@@ -179,6 +180,27 @@ def test_a_machine_that_comes_late_is_known_all_the_same(run, fake, late):
     content = machines_late(ContainerInstance(name='planner', ros_workspace=''))[late]
     assert run(elsewhere(LaunchDescription([
         content, TimerAction(period=0.2, actions=[Shutdown()])]), 'planner=container')) == 0
+
+
+@pytest.mark.parametrize('text', ['left=container', '*=robot'])
+@pytest.mark.parametrize('outer', [[], [SetLaunchConfiguration('name', 'other')]])
+def test_override_knows_machines_by_names_of_includes(run, fake, tmp_path, program, text, outer):
+    fake.on_start = ends
+    path = tmp_path / 'inner.launch.py'
+    path.write_text("""
+from launch import LaunchDescription
+from launch.substitutions import LaunchConfiguration
+from fogros2 import AWSCloudInstance, CloudNode
+
+def generate_launch_description():
+    machine = AWSCloudInstance(name=LaunchConfiguration('name'), ros_workspace='')
+    return LaunchDescription([CloudNode(machine=machine, package='demo', executable='talker')])
+""")
+    assert run(elsewhere(LaunchDescription([*outer, *(GroupAction([IncludeLaunchDescription(
+        AnyLaunchDescriptionSource(str(path)), launch_arguments={'name': name}.items())])
+        for name in ('left', 'right'))]), text)) == 0
+    assert {name: machine.spec.provider for name, machine in fake.machines.items()} == (
+        {} if text == '*=robot' else {'left': 'container', 'right': 'aws'})
 
 
 def test_a_launch_without_machines_takes_no_override(run, fake, capfd):

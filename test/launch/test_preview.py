@@ -17,6 +17,7 @@ from launch.actions import (
     GroupAction,
     IncludeLaunchDescription,
     OpaqueFunction,
+    SetLaunchConfiguration,
     TimerAction,
 )
 from launch.conditions import IfCondition
@@ -151,6 +152,35 @@ def test_included_file_has_its_own_arguments(tmp_path: Path):
     assert lines([GroupAction([included]), included]) == [
         'planner: aws (region=us-east-1)', *['    fogros2_examples talker'] * 2,
         'robot', *['    fogros2_examples listener'] * 2]
+
+
+@pytest.mark.parametrize('around, where', [
+    (lambda first: first, 'aws'),
+    (lambda first: GroupAction([first]), 'container'),
+    (lambda first: GroupAction([first], scoped=False), 'aws'),
+    (lambda first: GroupAction([first], scoped=False,
+                               launch_configurations={'where': 'container'}), 'container'),
+])
+def test_preview_scopes_what_a_launch_scopes(tmp_path: Path, around, where):
+    paths = [tmp_path / f'{name}.launch.xml' for name in 'ab']
+    paths[0].write_text('<launch><arg name="where" default="aws"/></launch>')
+    paths[1].write_text("""<launch>
+        <arg name="where" default="container"/>
+        <fog_machine name="b" provider="$(var where)"/></launch>""")
+    first, second = (IncludeLaunchDescription(AnyLaunchDescriptionSource(str(path)))
+                     for path in paths)
+    assert lines([around(first), second]) == [f'b: {where}']
+
+
+def test_preview_of_a_group_without_forwarding():
+    def machine(name):
+        return node(ContainerInstance(name=name, memory=LaunchConfiguration(
+            'memory', default='none')))
+
+    assert lines([SetLaunchConfiguration('memory', '1g'),
+                  GroupAction([machine('a')], forwarding=False), machine('b')]) == [
+        'a: container (memory=none)', '    demo talker',
+        'b: container (memory=1g)', '    demo talker']
 
 
 def test_broken_include_spoils_nothing_else(tmp_path: Path):

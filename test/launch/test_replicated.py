@@ -18,12 +18,13 @@ from launch.actions import (
     Shutdown,
     TimerAction,
 )
-from launch.event_handlers import OnProcessStart
+from launch.event_handlers import OnProcessExit, OnProcessStart
 from launch.frontend import Parser
 from launch_ros.actions import LifecycleNode, LoadComposableNodes, Node, PushROSNamespace
 import pytest
 
 from fogros2 import (
+    CloudGroup,
     CloudNode,
     ContainerInstance,
     FogROSLaunchDescription,
@@ -119,6 +120,15 @@ def test_robot_runs_a_copy_under_a_name_of_its_own(run, fake, first, robot):
     settings, = first
     assert (settings['last'], settings['deadline']) == ('robot', 0.2)
     assert settings['replicas'] == {'one': '/fogros2/one', 'robot': '/fogros2/robot'}
+
+
+def test_robot_keeps_its_copy_in_a_group_of_a_machine(run, fake):
+    started = ends_when_started(fake, 2)
+    outer, one, two = machines('outer', 'one', 'two')
+    assert run(LaunchDescription([CloudGroup(outer, [FogROSLaunchDescription([
+        Replicated([one, two, None], [talker()], services=['/plan'], deadline=0.2),
+        RegisterEventHandler(OnProcessExit(on_exit=[Shutdown()]))])])])) == 0
+    assert sorted(machine.spec.name for machine, _ in started) == ['one', 'two']
 
 
 def test_names_are_relative_to_their_namespace(run, fake, first):

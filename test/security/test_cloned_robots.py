@@ -96,6 +96,21 @@ def test_clone_does_not_take_a_machine(
     assert 'destroy' not in provider.calls
 
 
+def test_renamed_robot_keeps_its_machines(
+    provider: FakeProvider, boot: Callable[[str], None], monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    launched('keep')
+    monkeypatch.setattr(store, 'robot_name', lambda: 'renamed-1000')
+    launched('keep')
+    assert provider.calls.count('create') == 1
+    shutil.rmtree(Store().root)
+    assert main(argv=['fog', 'list']) == 0
+    assert '(orphan)' in capsys.readouterr().out
+    assert main(argv=['fog', 'delete', 'all', '--yes']) == 0
+    assert list(provider.find({})) == []
+
+
 @pytest.mark.parametrize(('ages', 'left'), [
     ([0.5, 1.5, 0.4], 1), ([0.0, 3.0, 7.1], 0), ([None], 0)])
 def test_machine_in_use_elsewhere_needs_force(

@@ -13,6 +13,7 @@ import ipaddress
 import json
 import os
 from pathlib import Path
+import pwd
 import re
 import signal
 import socket
@@ -458,7 +459,7 @@ def test_booted_instance_starts_the_agent_that_it_gets(booted):
                       'lifetime': 600.0})
     top = booted(told)
     program = top / 'opt/fogros2/agent.py'
-    send = ['sh', '-ec', arming._SEND, 'sh', str(program), str(len(agent_program()))]
+    send = ['sh', '-ec', arming._SEND_FIRST, 'sh', str(program), str(len(agent_program()))]
     # a connection that is lost meanwhile
     assert subprocess.run(send, input=agent_program()[:-100], text=True).returncode
     assert not program.exists()
@@ -476,6 +477,28 @@ def test_booted_instance_starts_the_agent_that_it_gets(booted):
     os.kill(status['pid'], signal.SIGTERM)
     wait_until(lambda: not Path(f"/proc/{status['pid']}").exists(), timeout=60, what='its end')
     wait_until(server.exists, timeout=60.0, what='another agent')
+
+
+def test_other_version_of_the_agent_is_replaced(booted):
+    top = booted(boot.cloud_config(
+        name='planner', user=pwd.getpwuid(os.getuid()).pw_name, authorized_keys=[],
+        host_key=one_time(TOKEN), agent_config={
+            'machine': 'planner', 'directory': '/run/fogros2', 'lifetime': 600.0}))
+    program, pid = top / 'opt/fogros2/agent.py', top / 'run/fogros2/agent.pid'
+
+    def send(script, source, *words):
+        subprocess.run(['sh', '-ec', script, 'sh', str(program), str(len(source)), *words],
+                       input=source, text=True, check=True)
+
+    def process():
+        return pid.exists() and pid.read_text().strip()
+
+    send(arming._SEND_FIRST, f'{agent_program()}#\n')
+    older = wait_until(process, timeout=60.0, what='the agent')
+    send(arming._REPLACE, agent_program(), older)
+    assert program.read_text() == agent_program()
+    wait_until(lambda: process() not in (False, '', older), timeout=60.0,
+               what='the other agent')
 
 
 def test_keys_that_an_image_brings_along_are_taken_away_once(booted, tmp_path):
@@ -625,6 +648,40 @@ def test_policy_names_each_action_once_as_documented():
     told = (ROOT / 'doc' / 'aws.md').read_text()
     written = json.loads(re.search(r'```json\n(\{.*?\n\})\n```', told, re.DOTALL)[1])
     assert written == document
+
+
+@pytest.mark.parametrize('code', ['ExpiredToken', 'RequestExpired'])
+def test_running_launch_takes_renewed_credentials(code, monkeypatch, tmp_path):
+    file, keys = tmp_path / 'credentials', []
+
+    def answer(environ, start_response):
+        keys.append(re.search('Credential=([^/]*)', environ['HTTP_AUTHORIZATION'])[1])
+        expired = keys[-1] == 'OLD'
+        body = (f'<ErrorResponse><Error><Code>{code}</Code></Error></ErrorResponse>' if expired
+                else '<R><GetCallerIdentityResult><Account>7</Account>'
+                     '</GetCallerIdentityResult></R>').encode()
+        start_response('403 Forbidden' if expired else '200 OK', [
+            ('Content-Type', 'text/xml'), ('Content-Length', str(len(body)))])
+        return [body]
+
+    def ask(account):
+        return account.call('sts', 'eu-central-1', 'get_caller_identity', 'asking')['Account']
+
+    def write(key):
+        file.write_text(f'[default]\naws_access_key_id={key}\naws_secret_access_key=x\n')
+
+    for name in ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY', 'AWS_PROFILE'):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv('AWS_SHARED_CREDENTIALS_FILE', str(file))
+    write('OLD')
+    with serving.serve(answer) as url:
+        monkeypatch.setenv('AWS_ENDPOINT_URL', url)
+        account = clients.Account()
+        with pytest.raises(PrerequisiteError, match=code):
+            ask(account)
+        write('NEW')
+        assert (ask(account.having(None)), ask(account)) == ('7', '7')
+    assert keys == ['OLD', 'OLD', 'OLD', 'NEW', 'NEW']
 
 
 def test_unreachable_aws_is_one_line(hasty, monkeypatch):

@@ -6,6 +6,7 @@ from __future__ import annotations
 from concurrent.futures import Future
 import contextlib
 import dataclasses
+import hashlib
 import os
 from pathlib import Path
 import signal
@@ -17,20 +18,21 @@ from types import SimpleNamespace
 import pytest
 
 from fogros2 import plan, process
-from fogros2.agent_client import AgentClient
+from fogros2.agent_client import agent_program, AgentClient
 from fogros2.dds import Router
 from fogros2.dds.zenoh import Zenoh
 from fogros2.deploy import Launch, robot_router, robot_vpn, undo
 from fogros2.deploy import launch as deployed
 from fogros2.deploy.robot_vpn import VpnMember
 from fogros2.deploy.running import RunningMachine
-from fogros2.deploy.steps import connecting, dds, installing, watching
+from fogros2.deploy.steps import arming, connecting, dds, installing, watching
 from fogros2.deploy.steps.arming import Arming
 from fogros2.deploy.steps.connecting import Connection
 from fogros2.deploy.steps.creating import Creation
 from fogros2.deploy.steps.joining import Joining
 from fogros2.deploy.steps.watching import Watch
 from fogros2.errors import (
+    AgentError,
     Cancelled,
     CommandError,
     ConfigurationError,
@@ -338,6 +340,98 @@ def test_a_kept_machine_is_not_taken_for_another(launch, provider, changes, erro
     assert launch.store.load('planner').machine_id == 'fake-1'
 
 
+@pytest.fixture
+def killed(launch, provider):
+    """Return a function that runs steps of a new launch on a machine, and kills the launch."""
+    def run(*steps):
+        context, mine = begun(Launch(store=launch.store, environment={}))
+        with launch.store.lock(SPEC.name):
+            Creation(context, mine).run()
+            for step in steps:
+                step(context, mine)
+        launch.store.save(dataclasses.replace(launch.store.load(SPEC.name), pid=0))
+        return mine
+
+    return run
+
+
+@pytest.mark.parametrize(('program', 'owned', 'requests'), [
+    (agent_program(), True, ['configure']),
+    # another robot's machine keeps its agent
+    ('older', False, ['configure']),
+    ('older', True, ['configure', 'release', 'status', 'configure'])])
+def test_kept_machine_gets_the_agent_of_this_robot(monkeypatch, killed, program, owned, requests):
+    source, asked, shells = agent_program(), [], []
+    digest = hashlib.sha256(program.encode()).hexdigest()
+
+    class Agent:
+        def __init__(self, *_, **__):
+            self.close = lambda: None
+
+        def request(self, command, **_):
+            asked.append(command)
+            return {'pid': 4711}
+
+    def arm(context, mine):
+        mine.shell = FakeShell(handlers={
+            'sha256sum': lambda command: Result(0, f'{digest}  {command.argv[1]}\n', ''),
+            'sh': lambda command: Result(0, '', '')})
+        shells.append(mine.shell)
+        Arming(context, mine).arm()
+        mine.rearming.close()
+
+    monkeypatch.setattr(arming, 'AgentClient', Agent)
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(
+        agent_program='/agent.py', owned=owned))
+    killed(arm)
+    killed(arm)
+    first, later = shells
+    assert asked == ['configure', *requests] and first.commands == []
+    assert [(command.argv[4:], command.input) for command in later.commands[1:]] == [
+        (('/agent.py', str(len(source)), '4711'), source.encode())] * (len(requests) > 1)
+
+
+def test_machine_is_taken_over_after_several_killed_launches(provider, monkeypatch, killed):
+    owners, lost = [''], [False, True, False]
+
+    class Agent:
+        def __init__(self, *_, **__):
+            self.close = lambda: None
+
+        def request(self, command, *, timeout, launch, force, **_):
+            if owners[-1] and force != owners[-1]:
+                raise AgentError(f"this machine belongs to launch '{owners[-1]}'")
+            owners.append(launch)
+            if lost.pop(0):
+                raise ConnectError('the reply was lost')
+            return {}
+
+    def arm(context, mine):
+        mine.shell = FakeShell(handlers={'sh': lambda _: Result(0, 'there', '')})
+        Arming(context, mine).arm()
+        mine.rearming.close()
+
+    def arm_in_vain(context, mine):
+        with pytest.raises(ConnectError):
+            arm(context, mine)
+
+    monkeypatch.setattr(arming, 'AgentClient', Agent)
+    for steps in ((arm,), (), (arm_in_vain,), ()):
+        killed(*steps)
+    record = killed(arm).record
+    assert owners[-1] == record.last and record.owners == (record.last,)
+    assert len({*owners}) == 4 and provider.calls.count('create') == 1
+
+
+def test_adopted_machine_uses_the_port_that_was_opened(provider, monkeypatch, killed):
+    create, ports = provider.create, []
+    monkeypatch.setattr(provider, 'create', lambda spec, request: (
+        ports.append(request.vpn_port), create(spec, request))[1])
+    killed()
+    mine = killed(lambda context, mine: Joining(context, mine).choose_interface())
+    assert ports == [mine.interface.port]
+
+
 @pytest.mark.parametrize('id_known', [True, False])
 def test_what_a_machine_that_is_gone_left_is_deleted(launch, provider, monkeypatch, id_known):
     spec, told = kept(launch.store, provider), []
@@ -470,7 +564,8 @@ def test_ssh_port_stays_closed_after_the_launch_has_left(launch, provider, monke
 def test_a_machine_that_boots_slowly_has_the_time_of_its_boot(launch, provider, monkeypatch):
     context, mine = begun(launch, timeouts=Timeouts(boot=300.0, ssh=60.0))
     connection = Connection(context, mine)
-    mine.record = dataclasses.replace(mine.record, armed=time.time() - 20)
+    mine.claimed = time.monotonic() - 20
+    mine.record = dataclasses.replace(mine.record, armed=1.0)  # the clock was wrong then
     assert connection._timeout() == 60.0
     monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(one_time_host_key=True))
     assert 270 < connection._timeout() <= 280

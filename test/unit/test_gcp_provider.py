@@ -7,6 +7,7 @@ import base64
 import dataclasses
 from decimal import Decimal
 import re
+import shutil
 
 import pytest
 
@@ -28,7 +29,7 @@ from fogros2_features.images.keepers import image_keeper
 from fogros2_features.prices.market import seller
 from fogros2_features.prices.offers import wants
 from fogros2_testing import request_for
-from rigs.gce import catalogue
+from rigs.gce import catalogue, keys
 from rigs.gce.api import Fault
 
 SPEC = MachineSpec('planner', 'gcp', {})
@@ -375,6 +376,17 @@ def test_missing_credentials_are_named(monkeypatch, tmp_path):
     assert GCPProvider.configured() is False
     with pytest.raises(PrerequisiteError, match='there are no Google credentials'):
         GCPProvider().check(SPEC)
+
+
+def test_running_launch_takes_a_new_login(gce, monkeypatch, tmp_path):
+    valid = gce.variables['GOOGLE_APPLICATION_CREDENTIALS']
+    file = keys.write(tmp_path / 'renewed.json', keys.pair.__wrapped__()[0], gce.url)
+    monkeypatch.setenv('GOOGLE_APPLICATION_CREDENTIALS', str(file))
+    user = account.Account()
+    with pytest.raises(PrerequisiteError, match='does not take these credentials'):
+        user.token('asking')
+    shutil.copy(valid, file)
+    assert user.token('asking').startswith('ya29.')
 
 
 def test_project_is_that_of_the_options_first(gce, monkeypatch):

@@ -25,6 +25,9 @@ import yaml
 from fogros2 import kubernetes_client
 from fogros2.errors import Cancelled, DeadlineExceeded, PrerequisiteError
 from fogros2.kubernetes_client import ApiError, Unreachable
+from fogros2.provider import TAG_ON_EXIT
+from fogros2.provider.kubernetes import KubernetesProvider, names
+from fogros2.provider.kubernetes.start import Start
 from fogros2.store import Store
 from fogros2.waiting import ON_ITS_WAY, wait_until
 from fogros2_testing.shell_contract import raised
@@ -128,6 +131,24 @@ def api(server, tmp_path, monkeypatch):
     path = kubeconfig(tmp_path / 'config', f'http://127.0.0.1:{server.server_port}')
     monkeypatch.setenv('KUBECONFIG', str(path))
     return kubernetes_client.connect()
+
+
+def test_kept_pod_is_as_old_as_its_cluster_says(api, server, monkeypatch):
+    monkeypatch.setattr(
+        Handler, 'date_time_string', lambda *_: 'Mon, 01 Jan 2035 01:00:00 GMT')
+    monkeypatch.setattr(Start, 'wait', lambda *_: {'metadata': {'uid': 'pod'}})
+    provider, request, sent = KubernetesProvider(), api.request, []
+    monkeypatch.setattr(api, 'request', lambda method, path, body=None, **words: (
+        sent.append(body), request(method, path, body, **words))[1])
+    monkeypatch.setattr(provider, '_machine', lambda *_: None)
+    provider._lifetimes['fogros2-slam'] = 60.0
+    job = {'metadata': {
+        'name': 'fogros2-slam', 'uid': '1', 'annotations': {
+            names.TAGS: json.dumps({TAG_ON_EXIT: 'keep'}), names.EXPOSURE: 'pod_ip 10.0.0.1 1'}},
+        'status': {'startTime': '2035-01-01T00:00:00Z'}}
+    server.answers = [(200, job), (200, {})]
+    provider.reachable('robots/fogros2-slam/1@', name='slam', timeout=5.0)
+    assert sent == [None, {'spec': {'activeDeadlineSeconds': 3600 + 60 + 1}}]
 
 
 def refusal(status: int, reason: str, message: str) -> Answer:

@@ -11,6 +11,7 @@ from launch import LaunchContext
 from launch.actions import ExecuteProcess, SetEnvironmentVariable
 from launch.substitutions import FindExecutable, LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.substitutions import ExecutableInPackage
 import pytest
 import yaml
 
@@ -99,6 +100,17 @@ def test_a_command(context):
     spec = convert(ExecuteProcess(**command), context)
     # not where the robot has it
     assert (spec.package, spec.arguments, spec.shell) == ('', ('sh -c true',), True)
+
+
+@pytest.mark.parametrize('command, arguments', [
+    (lambda program: ['gdb', program], ('gdb', ({'prefix': 'demo'}, '/lib/demo/talker'))),
+    (lambda program: [[program, ' --fast']], (({'prefix': 'demo'}, '/lib/demo/talker --fast'),)),
+])
+def test_program_of_a_package_among_arguments(context, prefix, command, arguments):
+    (prefix / 'lib/demo/talker').chmod(0o755)
+    program = ExecutableInPackage(package='demo', executable='talker')
+    spec = convert(ExecuteProcess(cmd=command(program)), context)
+    assert (spec.package, spec.arguments) == ('', arguments)
 
 
 def test_parameter_files_travel(context, prefix, tmp_path):

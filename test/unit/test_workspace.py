@@ -251,6 +251,23 @@ def test_sources_alone_are_built_there(root: Path) -> None:
         plan(space, can_build=False)
 
 
+def test_machine_that_builds_drops_removed_packages(root: Path, tmp_path: Path) -> None:
+    subprocess.run(['rm', '-r', root / 'install'], check=True)
+    way = workspace.plan(workspace.inspect(root), ROBOT, ROBOT, ros_setup=(), can_build=True,
+                         name='m')
+    for name in ('alpha', 'alp', 'old one'):
+        write(root / 'install' / name / 'share/colcon-core/packages' / name)
+        write(root / 'build' / name / 'made')
+    write(root / 'install/other/file')
+    write(tmp_path / 'bin/colcon',
+          '#!/bin/sh\n[ "$3" != list ] || printf "alpha\\nbeta\\n"\n', 0o755)
+    build, = way.commands
+    subprocess.run(build.argv, check=True,
+                   env={'PATH': f"{tmp_path / 'bin'}:{os.environ['PATH']}"})
+    assert {path.name for path in (root / 'install').iterdir()} == {'alpha', 'other'}
+    assert {path.name for path in (root / 'build').iterdir()} == {'alpha'}
+
+
 def test_an_install_space_that_fits_nowhere_and_has_no_sources(root: Path) -> None:
     subprocess.run(['rm', '-r', root / 'src'], check=True)
     machine = HostFacts(pythons=(Python('/usr/bin/python3', (3, 11), True),))

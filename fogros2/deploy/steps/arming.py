@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import contextlib
+import functools
+import hashlib
 import secrets
 import time
 from typing import Any, Optional
@@ -42,10 +44,8 @@ mv -f -- "$aside" "$3"
 python3 -IS "$3" serve --detach --config "$4"
 """
 
-# Send the agent to a machine whose boot script waits for it; keep an earlier one.
-# $1 program, $2 its bytes. Standard input is the agent's source.
+# Send the agent's program: $1 path, $2 its bytes. Standard input is the agent's source.
 _SEND = """\
-[ -e "$1" ] && exit
 umask 077
 cat >"$1.new"
 # a lost connection ends standard input too
@@ -53,6 +53,10 @@ cat >"$1.new"
 chmod 755 "$1.new"
 mv -f -- "$1.new" "$1"
 """
+# To a machine whose boot script waits for it; keep an earlier one.
+_SEND_FIRST = f'[ -e "$1" ] && exit\n{_SEND}'
+# In place of another version, whose process is $3; the machine starts the agent again.
+_REPLACE = f'{_SEND}kill -KILL "$3" || true\n'
 
 
 class Arming(Step):
@@ -77,6 +81,8 @@ class Arming(Step):
             # the launch keeps in touch from now on: by re-arming the agent, then by heartbeats
             'boot_timeout': job.spec.robot_timeout}
         with job.step('watchdog'):
+            # the agent may take the request while its reply is lost
+            job.save(owners=(*job.formers[:9], context.launch_id))
             agent = None
             if not program:
                 program = f'{job.directory}/agent.py'
@@ -93,19 +99,49 @@ class Arming(Step):
                 if job.capabilities.agent_sent:
                     source = agent_program().encode()
                     job.run(Command(
-                        ('sh', '-ec', _SEND, 'sh', program, str(len(source))), sudo=True,
+                        ('sh', '-ec', _SEND_FIRST, 'sh', program, str(len(source))), sudo=True,
                         input=source, what='send the agent'))
-            job.agent = agent = agent or wait_until(
-                lambda: self._claim(program, config),
-                timeout=context.timeouts.agent, cancel=job.cancel,
-                what=f"the agent of '{job.name}'")
+            agent = agent or self._awaited(program, config)
             job.undo.callback(agent.close)
+            can = job.capabilities
+            if job.formers and can.owned and can.agent_program and self._renew(agent, program):
+                agent = self._awaited(program, config)
+                job.undo.callback(agent.close)
+            job.agent = agent
             # a busy machine gets more time to answer, as long as it sends anything
             job.probes.insert(0, lambda seconds: agent.request(
                 'ping', timeout=3 * seconds, silent=seconds))
-            job.push(NODES)
+            job.push(NODES, owners=(context.launch_id,))
             job.rearming = Periodic('fog-rearm', job.spec.robot_timeout / 4, self._rearm)
             job.undo.callback(job.rearming.close)
+
+    def _awaited(self, program: str, config: Mapping[str, Any]) -> AgentClient:
+        """Wait for the machine's agent, and claim it."""
+        return wait_until(
+            lambda: self._claim(program, config), timeout=self._context.timeouts.agent,
+            cancel=self._job.cancel, what=f"the agent of '{self._job.name}'")
+
+    def _renew(self, agent: AgentClient, program: str) -> bool:
+        """
+        End the agent of a kept machine if it is of another version than this robot's.
+
+        The launch has claimed the agent, so no nodes run. The machine starts the robot's version.
+
+        :return: whether the launch has to claim the new agent.
+        """
+        job, timeout, source = self._job, self._context.timeouts.agent, agent_program().encode()
+        digest = job.run(Command(
+            ('sha256sum', program), sudo=True, what='look at the version of the agent'))
+        if digest.split()[:1] == [hashlib.sha256(source).hexdigest()]:
+            return False
+        # its successor must see a kept machine, not one of a launch whose agent died
+        agent.request('release', timeout=timeout, launch=self._context.launch_id)
+        pid = int(agent.request('status', timeout=timeout)['pid'])
+        agent.close()
+        job.run(Command(
+            ('sh', '-ec', _REPLACE, 'sh', program, str(len(source)), str(pid)), sudo=True,
+            input=source, what='replace the agent'))
+        return True
 
     @property
     def _notice(self) -> list[str]:
@@ -153,9 +189,7 @@ class Arming(Step):
         # no cancel: the way down needs the connection too, and each request has a time-out
         agent = AgentClient(job.shell, job.directory, agent_path=program)
         try:
-            # the record shows that the former launch has ended; its agent may not know that yet
-            answer = agent.request('configure', timeout=self._context.timeouts.agent,
-                                   force=job.former, **config)
+            answer = self._configure(agent, config)
         except FogError as error:
             agent.close()
             if isinstance(error, AgentAbsent):
@@ -163,6 +197,20 @@ class Arming(Step):
             raise
         job.first_event = int(answer.get('next', 1))
         return agent
+
+    def _configure(self, agent: AgentClient, config: Mapping[str, Any]) -> Mapping[str, Any]:
+        # the record shows that the former launches have ended; the agent may not know that yet
+        configure = functools.partial(
+            agent.request, 'configure', timeout=self._context.timeouts.agent, **config)
+        *newer, first = reversed(self._job.formers or ('',))
+        for former in newer:
+            try:
+                return configure(force=former)
+            except AgentAbsent:
+                raise
+            except AgentError:
+                pass  # it may never have heard of that launch
+        return configure(force=first)
 
     # -- with nodes -----------------------------------------------------------------------------
 

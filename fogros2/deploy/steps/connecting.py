@@ -220,7 +220,7 @@ class Connection(Step):
             # the login to a machine that is up delays the next choice of its VPN's path
             return min(timeouts.ssh, LOGIN_TIMEOUT)
         boots = provider.capabilities.one_time_host_key and not record.host_key
-        remaining = timeouts.boot - (time.time() - record.armed) if boots else 0.0
+        remaining = timeouts.boot - (time.monotonic() - self._job.claimed) if boots else 0.0
         return max(timeouts.ssh, remaining)
 
     def _check(self) -> None:

@@ -31,7 +31,7 @@ from fogros2.provider import (
     TAG_ON_EXIT,
     TAG_ROBOT,
 )
-from fogros2.store import robot_id, this_process
+from fogros2.store import is_another_robot, robot_id, this_process
 
 
 class Creation(Step):
@@ -80,7 +80,7 @@ class Creation(Step):
         if not context.store.exists(job.name):
             return None  # ``create`` finds and refuses a machine without a record
         before = context.store.load(job.name)
-        if before.robot not in ('', robot_id()):
+        if is_another_robot(before.robot):
             raise NameTaken(
                 f"the machine '{job.name}' belongs to the robot {before.robot}: the state folder "
                 'is a copy, or this computer has another network card',
@@ -111,7 +111,7 @@ class Creation(Step):
         context.choices.expect(job.spec, context.choices.price(job.spec))
         job.limit(made=True)
         job.record = dataclasses.replace(before, spec=job.spec)
-        job.former = before.last
+        job.formers = before.owners or (before.last,)
         return machine
 
     def _check_alike(self, before: Any, machine: Machine) -> None:
@@ -154,7 +154,8 @@ class Creation(Step):
         job.limit()
         token = str(uuid.uuid4())
         context.store.delete(job.name)
-        job.record = dataclasses.replace(job.record, spec=job.spec)
+        job.record = dataclasses.replace(
+            job.record, spec=job.spec, vpn_port=plan.machine_port(context.launch_id))
         self._claim(token)
         config = {
             **plan.agent_config(job.spec, context.launch_id, job.directory, ()),
@@ -166,7 +167,7 @@ class Creation(Step):
         request = CreateRequest(
             token=token, authorized_key=key, tags=tags,
             dependencies=tags.get(TAG_DEPENDENCIES, ''),
-            vpn_port=plan.machine_port(context.launch_id), agent_config=config)
+            vpn_port=job.record.vpn_port, agent_config=config)
         for each, own in feature.used(job.spec):
             request = each.request(request, own)
         self._request = 'sent'
@@ -202,10 +203,12 @@ class Creation(Step):
         """Record that this launch has the machine, and ends it."""
         context, job = self._context, self._job
         job.undoing('end', self._end)
+        job.claimed = time.monotonic()
         job.save(
             token=token, created=job.record.created or time.time(), armed=time.time(),
-            launch=context.launch_id, last=context.launch_id, robot=robot_id(), **this_process(),
-            robot_vpn=context.vpn.interface, carried='', notes={})
+            launch=context.launch_id, last=context.launch_id, owners=job.formers,
+            robot=robot_id(), **this_process(), robot_vpn=context.vpn.interface, carried='',
+            notes={})
 
     def _login_key(self) -> str:
         context, job = self._context, self._job

@@ -41,7 +41,9 @@ class Joining(Step):
         context, job = self._context, self._job
         if Made(VPN) in job.record.made:
             self._former = job.record.vpn
-        port = job.record.vpn.port if job.record.vpn else plan.machine_port(context.launch_id)
+        record = job.record
+        port = record.vpn.port if record.vpn else \
+            record.vpn_port or plan.machine_port(context.launch_id)
         job.interface = plan.machine_interface(
             context.launch_id, context.vpn.interface.network, context.index, port,
             f'{job.directory}/vpn.key',

@@ -12,7 +12,7 @@ import time
 from typing import Any, Optional, TypeVar
 
 from fogros2.errors import FogError, PrerequisiteError
-from fogros2.provider.aws.failures import translated
+from fogros2.provider.aws.failures import Expired, translated
 from fogros2.provider.vm import account as vm
 from fogros2.provider.vm.failures import SETTLING, unless_gone
 
@@ -42,8 +42,7 @@ class Account(vm.Account):
 
     def __init__(self, session: Optional[Any] = None) -> None:
         super().__init__()
-        if session is not None:
-            self._known['session'] = session
+        self._given = session
         #: Instances and groups that this process has created, and when (``time.monotonic``).
         self.made: dict[str, float] = {}
         # boto3 creates clients of one session in one thread only; their use is thread-safe
@@ -61,7 +60,7 @@ class Account(vm.Account):
         :raises PrerequisiteError: boto3 is not installed, or its configuration is not readable.
         """
         with self._lock:
-            return self.once('session', _session)
+            return self._given or self.once('session', _session)
 
     def check_credentials(self) -> None:
         session = self.session()
@@ -127,12 +126,26 @@ class Account(vm.Account):
     def _ask(
         self, ask: Callable[[Any], T], service: str, region: str, operation: str, what: str,
     ) -> T:
-        def asked() -> T:
-            client = self.client(service, region, hasty=self.hasty)
+        def sent(client: Any) -> T:
             with translated(what, region, decode=lambda message: self._decode(region, message)):
                 return ask(client)
 
+        def asked() -> T:
+            client = self.client(service, region, hasty=self.hasty)
+            try:
+                return sent(client)
+            except Expired:
+                self._forget(client)
+                return sent(self.client(service, region, hasty=self.hasty))
+
         return self.repeated(asked, what, reads=operation.startswith(('describe_', 'get_')))
+
+    def _forget(self, client: Any) -> None:
+        """Read the credentials again: the user may have renewed them."""
+        with self._lock:
+            # not if another thread has done it
+            if client in self._known.values():
+                self._known.clear()
 
     def _decode(self, region: str, message: str) -> str:
         """Return an encoded authorization failure as JSON, '' if that isn't allowed either."""

@@ -17,6 +17,11 @@ from typing import Any, Optional
 from fogros2.errors import ConfigurationError, FogError, PrerequisiteError, ProviderError
 from fogros2.provider.vm.failures import CodedError, Failure, LENGTH, not_the_cloud, Silent
 
+
+class Expired(PrerequisiteError):
+    """AWS refused credentials that have expired; the user may have renewed them since."""
+
+
 _LOG_IN = 'aws sso login, or new keys: aws configure'
 _QUOTA = 'ask for more at Service Quotas (EC2, in this region), or take another type or region'
 _FAILURES = {
@@ -31,10 +36,10 @@ _FAILURES = {
     'SignatureDoesNotMatch': Failure(
         '', "is the secret access key right, and this computer's clock?", PrerequisiteError),
     **dict.fromkeys(('ExpiredToken', 'ExpiredTokenException'), Failure(
-        'the credentials have expired', _LOG_IN, PrerequisiteError)),
+        'the credentials have expired', _LOG_IN, Expired)),
     'RequestExpired': Failure(
         "the request's time is not AWS's, or the credentials have expired",
-        "set this computer's clock: timedatectl set-ntp true", PrerequisiteError),
+        "set this computer's clock: timedatectl set-ntp true", Expired),
     'RequestTimeTooSkewed': Failure(
         "this computer's clock is wrong", 'timedatectl set-ntp true', PrerequisiteError),
     'OptInRequired': Failure(

@@ -111,12 +111,22 @@ class Account(RestAccount):
 
     def token(self, what: str) -> str:
         credentials, _ = self._opened()
-        from google.auth.exceptions import GoogleAuthError, TransportError
+        from google.auth.exceptions import GoogleAuthError, RefreshError, TransportError
         from google.auth.transport.requests import Request
+
+        def renew() -> None:
+            if not credentials.valid:
+                credentials.refresh(cast(Any, Request)())
+
         try:
             with _RENEWING:
-                if not credentials.valid:
-                    credentials.refresh(cast(Any, Request)())
+                try:
+                    renew()
+                except RefreshError:
+                    # the user may have logged in again since
+                    _login.cache_clear()
+                    credentials, _ = self._opened()
+                    renew()
             return str(credentials.token)
         except TransportError as error:
             raise self.silent(error, what) from error

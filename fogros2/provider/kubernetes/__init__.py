@@ -218,7 +218,7 @@ class KubernetesProvider(Provider):
         job = self._made.get(machine_id) or self._job(api, where)
         pod = Start(api, where, job, name=name, cancel=cancel).wait(timeout)
         self._pods[machine_id] = str(pod['metadata']['uid'])
-        change = self._again(machine_id, job)
+        change = self._again(api, machine_id, job)
         exposure = ways.known(job)
         if exposure is None:
             exposure = ways.find(
@@ -232,13 +232,14 @@ class KubernetesProvider(Provider):
                     'PATCH', path('jobs', where.namespace, where.job), change, cancel=cancel)
         return self._machine(api, where, job, pod, exposure)
 
-    def _again(self, machine_id: str, job: Mapping[str, Any]) -> dict[str, Any]:
+    def _again(self, api: Api, machine_id: str, job: Mapping[str, Any]) -> dict[str, Any]:
         """Return the change that gives a kept machine another lifetime."""
         lifetime = self._lifetimes.get(str(job['metadata']['name']))
         begun = (job.get('status') or {}).get('startTime')
         if machine_id in self._made or lifetime is None or not begun:
             return {}
-        age = max(0.0, time.time() - pods.timestamp(str(begun)))
+        # by the clock of the cluster: that of this computer may be wrong
+        age = max(0.0, api.now() - pods.timestamp(str(begun)))
         return {'spec': {'activeDeadlineSeconds': int(age + lifetime) + 1}}
 
     def describe(self, machine_id: str) -> Machine:
