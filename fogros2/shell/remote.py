@@ -76,7 +76,7 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
         :raises ConnectError: the connection is lost, or gives no channel.
         """
 
-    def _abandon(self, command: Command, output: Output) -> None:
+    def _abandon(self, command: Command, channel: Channel, output: Output) -> None:
         """End a command whose channel is open, if closing the channel does not end it."""
 
     def _announced(self, command: Command) -> Command | str:
@@ -183,7 +183,7 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
             if feeder is not None:
                 feeder.join(_DRAIN)
         except (Cancelled, DeadlineExceeded):
-            self._abandon(command, output)
+            self._abandon(command, channel, output)
             raise
         finally:
             lines.close(channel)

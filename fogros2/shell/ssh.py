@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 #: Time-out of one attempt to connect or to open a session, in seconds.
 _ATTEMPT = 10.0
+#: Seconds that an abandoned command has to announce its process.
+_ANNOUNCE = 1.0
 
 
 class SSHShell(RemoteShell['paramiko.Transport']):
@@ -135,10 +137,18 @@ class SSHShell(RemoteShell['paramiko.Transport']):
         line = command_line.announced_line(command, user=self.user)
         return line if command.input else f'{line} </dev/null'
 
-    def _abandon(self, command: Command, output: Output) -> None:
+    def _abandon(self, command: Command, channel: Channel, output: Output) -> None:
         """Kill the processes of an abandoned command; closing its streams does not end them."""
-        if output.pid:
-            with contextlib.suppress(FogError):  # the machine itself may not answer
+        until = time.monotonic() + _ANNOUNCE
+        # the machine itself may not answer
+        with contextlib.suppress(FogError, ConnectionError):
+            while not output.pid and time.monotonic() < until:
+                channel.settimeout(0.05)
+                with contextlib.suppress(TimeoutError):
+                    if not (data := channel.recv(1 << 16)):
+                        break
+                    output.add(data)
+            if output.pid:
                 self.run(
                     Command(('sh', '-c', command_line.end_script(output.pid)), sudo=command.sudo),
                     timeout=3.0, check=False)

@@ -88,7 +88,8 @@ def test_both_directions_have_the_rate_and_no_echo(
 
     wait_until(look, timeout=60, longest=0.01, what='30 messages each way')
     for came in (came_up, came_down):
-        assert len(came) <= 10 * (came[-1] - came[0]) + 2
+        # a busy computer delivers some late; without a limit 30 take 0.3 s
+        assert len(came) <= 10 * (came[-1] - came[0]) + 10
     # the last ones arrive, and each publisher's own side has heard each once
     wait_until(lambda: all({sent, -sent} <= {message.data for _, message in heard}
                            for heard in (here, there)), timeout=60, what='the last messages')

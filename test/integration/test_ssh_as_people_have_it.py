@@ -26,6 +26,7 @@ from fogros2.errors import (
 )
 from fogros2.model import Command, Endpoint, MachineSpec
 from fogros2.provider.ssh import SSHProvider
+from fogros2.shell import command_line
 from fogros2.shell.ssh import SSHShell
 from fogros2.store import Record, Store
 from fogros2.waiting import Periodic, wait_until
@@ -314,6 +315,20 @@ def test_cancelled_command_ends_behind_a_talking_shell(server, tmp_path, home):
                                'exec sleep 600')), timeout=60.0, cancel=cancel)
         pid = int(path.read_text())
         wait_until(lambda: not os.path.exists(f'/proc/{pid}'), timeout=60.0, what='its end')
+
+
+def test_command_that_is_cancelled_at_once_ends(server, home, monkeypatch):
+    """Before its process is known here."""
+    ended, cancel = [], threading.Event()
+    monkeypatch.setattr(command_line, 'end_script', lambda pid, make=command_line.end_script: (
+        ended.append(pid) or make(pid)))
+    with contextlib.closing(talk(server, 'echo 4711')) as shell:
+        start = shell.start
+        monkeypatch.setattr(shell, 'start', lambda *words: (start(*words), cancel.set())[0])
+        with pytest.raises(Cancelled):
+            shell.run(Command(('sleep', '600')), timeout=60.0, cancel=cancel)
+    (pid,) = ended
+    wait_until(lambda: not os.path.exists(f'/proc/{pid}'), timeout=60.0, what='its end')
 
 
 @pytest.mark.parametrize(('words', 'error'), [

@@ -116,7 +116,7 @@ def test_machine_is_shown_from_its_steps_to_its_end(live: Live) -> None:
 def test_deletion_is_refused_forced_and_reported(live: Live) -> None:
     machine('a', **alive())
     machine('stuck')
-    when(live, 'a', lambda one: one['cost_per_hour'] is not None)
+    when(live, 'a', lambda one: one['cost_per_hour'] is not None and one['launch_pid'])
     with pytest.raises(NameTaken, match='has the machine'):
         live.delete('a')
     assert 'id-a' in Memory.machines
