@@ -503,14 +503,15 @@ def _network(process: int) -> Iterator[None]:
                 say(str(error))
                 return
 
-    keeper = threading.Thread(target=keep, args=[_slirp4netns(namespace, watched)])
+    keeper = threading.Thread(
+        target=keep, args=[_slirp4netns(namespace, watched)], daemon=True)
     keeper.start()
     try:
         yield
     finally:
         ended.set()
         os.close(held)
-        keeper.join()
+        keeper.join(10.0)
         os.close(watched)
 
 

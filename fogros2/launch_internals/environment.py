@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import functools
+import json
 from typing import Any
 
 from launch import LaunchContext
 from launch.actions import AppendEnvironmentVariable, SetEnvironmentVariable
 from launch.utilities import perform_substitutions
 
-#: The launch configuration: the values by the variables' names.
+#: The launch configuration: the values by the variables' names, as JSON: users' code expects text.
 _SET = 'fogros2_environment'
 
 
@@ -35,13 +36,18 @@ def _replace(cls: Any) -> None:
         before(self, context)
         name = perform_substitutions(context, self.name)
         configurations = context.launch_configurations
-        configurations[_SET] = {
-            **configurations.get(_SET, {}), name: context.environment.get(name)}
+        configurations[_SET] = json.dumps({
+            **_values(context), name: context.environment.get(name)})
 
     cls.execute = execute
 
 
+def _values(context: LaunchContext) -> Mapping[str, str]:
+    values: Mapping[str, str] = json.loads(context.launch_configurations.get(_SET, '{}'))
+    return values
+
+
 def is_set(context: LaunchContext, name: str) -> bool:
     """Return whether the launch file has set a variable to its present value, in this scope."""
-    values: Mapping[str, str] = context.launch_configurations.get(_SET, {})
+    values = _values(context)
     return name in values and values[name] == context.environment.get(name)
