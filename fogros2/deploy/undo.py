@@ -10,9 +10,10 @@ launch itself, and ``ros2 fog delete``, ``ros2 fog gc`` or the next launch for o
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 import contextlib
 import time
+from typing import Optional
 
 from fogros2 import feature, plugin_system
 from fogros2.errors import (
@@ -208,6 +209,7 @@ def unmake_all(site: Site, things: Sequence[Made]) -> None:
 
 def end_machine(
     provider: Provider, record: Record, age: float = 0.0, *, tidy: bool = True,
+    keep: Collection[Optional[str]] = (),
 ) -> bool:
     """
     Delete the machine of a record; return whether none of its creation can appear any more.
@@ -215,6 +217,7 @@ def end_machine(
     :param record: without an id, it may have a machine: only a search by tags shows it.
     :param age: seconds since the launch stopped waiting for the answer.
     :param tidy: delete what was created beside the machine; the creation does so itself.
+    :param keep: ids of machines of other requests.
     :raises FogError: the provider does not answer.
     """
     if record.machine_id is not None:
@@ -223,7 +226,9 @@ def end_machine(
     machines: list[Machine] = []
     provider.search_for([record.spec])
     with contextlib.suppress(Unsupported):
-        machines += provider.find({TAG_NAME: record.name, TAG_LAUNCH: record.last})
+        machines += (
+            machine for machine in provider.find(
+                {TAG_NAME: record.name, TAG_LAUNCH: record.last}) if machine.id not in keep)
     for machine in machines:
         provider.destroy(machine.id)
     if not record.token:

@@ -335,7 +335,11 @@ def end_request(record: Record, age: float, store: Store) -> None:
 
     :raises FogError: the machine may still appear, or the provider does not answer.
     """
-    if not undo.end_machine(machines.load(record.provider), record, age):
+    # the launch may have requested the machine again; without an id, it could be either one
+    again = [each.machine_id for each in store.machines()
+             if (each.name, each.last) == (record.name, record.last)]
+    if None in again or not undo.end_machine(
+            machines.load(record.provider), record, age, keep=again):
         raise undo.late(record)
     store.answered(record)
 

@@ -319,6 +319,19 @@ def test_request_of_a_killed_launch_is_watched(
     assert capfd.readouterr().out.endswith('nothing to clear\n')
 
 
+@pytest.mark.parametrize('known', ['id-slam', None])
+def test_gc_keeps_the_machine_of_a_repeated_request(known: Optional[str]) -> None:
+    """The first request of a launch got no answer; the second one created the machine."""
+    Store().set_aside(record('slam', machine_id=None, token='t1', last='abc123'))
+    record('slam', alive=True, machine_id=known, token='t2', last='abc123')
+    late = machine('slam')
+    Cloud.machines['id-slam'] = dataclasses.replace(
+        late, tags={**late.tags, TAG_LAUNCH: 'abc123'})
+    assert run('gc') == 1
+    assert [*Cloud.machines] == ['id-slam']
+    assert [request.token for request, _ in Store().requests()] == ['t1']
+
+
 def test_old_request_creates_nothing_any_more() -> None:
     Store().set_aside(record('slam', machine_id=None, token='t1', last='abc123'))
     assert run('gc') == 1
