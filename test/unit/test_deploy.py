@@ -297,6 +297,40 @@ def test_request_without_an_answer_is_kept(launch, provider, monkeypatch, error,
     assert [f"'{SPEC.name}' may still appear" in str(error) for error in errors] == [True] * kept
 
 
+@pytest.mark.parametrize('ended', [False, True])
+def test_launch_deletes_what_it_could_not_delete_before(launch, provider, ended):
+    """Such as before it creates a machine anew."""
+    for error in ConnectError('no network'), None:
+        context, mine = begun(launch, dataclasses.replace(SPEC, on_exit='keep'))
+        Creation(context, mine).run()
+        if error is not None:
+            provider.failures['destroy'] = error
+            mine.close()
+            assert launch.store.load('planner').spec.on_exit == 'delete'
+            if ended:
+                provider.machines.clear()
+    assert [*provider.machines] == [mine.machine_id]
+
+
+def test_launch_deletes_its_machine_that_appears_late(launch, provider, monkeypatch):
+    requests, create = [], provider.create
+
+    def cut(*request):
+        requests.append(request)
+        raise Cancelled('the request')
+
+    monkeypatch.setattr(provider, 'create', cut)
+    context, mine = begun(launch)
+    with pytest.raises(Cancelled):
+        Creation(context, mine).run()
+    mine.close()
+    create(*requests[0])
+    monkeypatch.setattr(provider, 'create', create)
+    context, mine = begun(launch)
+    Creation(context, mine).run()
+    assert [*provider.machines] == [mine.machine_id] and launch.store.requests() == []
+
+
 def test_next_launch_keeps_the_request_of_a_killed_one(launch, provider):
     killed, job = begun(launch)
     with launch.store.lock(SPEC.name):

@@ -20,10 +20,12 @@ from fogros2.errors import (
     MachineNotFound,
     NameTaken,
     PrerequisiteError,
+    StoreError,
 )
 from fogros2.host import bootstrap
 from fogros2.model import Command, CreateRequest, Machine, MachineState
 from fogros2.provider import (
+    Provider,
     TAG_DEPENDENCIES,
     TAG_EXPIRES,
     TAG_LAUNCH,
@@ -31,7 +33,7 @@ from fogros2.provider import (
     TAG_ON_EXIT,
     TAG_ROBOT,
 )
-from fogros2.store import is_another_robot, robot_id, this_process
+from fogros2.store import is_another_robot, Record, robot_id, this_process
 
 
 class Creation(Step):
@@ -85,18 +87,19 @@ class Creation(Step):
                 f"the machine '{job.name}' belongs to the robot {before.robot}: the state folder "
                 'is a copy, or this computer has another network card',
                 f'give the machine another name=, or: ros2 fog delete {job.name}')
-        if before.launch_alive:
+        own = before.launch == context.launch_id
+        if before.launch_alive and not own:
             raise NameTaken(
                 f"the launch with process {before.pid} has the machine '{job.name}'",
                 'give the machine another name=, or end that launch')
-        other = before.provider != job.spec.provider
-        provider = robot.provider(before.provider) if other else context.provider
+        other, provider = before.provider != job.spec.provider, self._provider(before)
         machine: Optional[Machine] = None
         # a launch that was killed did not save the id of its machine, if it has one
         if before.machine_id is not None:
             with contextlib.suppress(MachineNotFound):
                 machine = provider.describe(before.machine_id)
-        if machine is None or machine.state is MachineState.DELETED:
+        if machine is None or machine.state is MachineState.DELETED or (
+                own and before.spec.on_exit == 'delete'):
             # what was made for it may still be there
             if not end_machine(provider, before):
                 context.store.set_aside(before)
@@ -113,6 +116,10 @@ class Creation(Step):
         job.record = dataclasses.replace(before, spec=job.spec)
         job.formers = before.owners or (before.last,)
         return machine
+
+    def _provider(self, record: Record) -> Provider:
+        return self._context.provider if record.provider == self._job.spec.provider \
+            else robot.provider(record.provider)
 
     def _check_alike(self, before: Any, machine: Machine) -> None:
         """Raise if the kept machine was created with other options than this launch asks for."""
@@ -152,6 +159,7 @@ class Creation(Step):
         job.spec = context.choices.resolved(job.spec)
         context.choices.expect(job.spec, context.choices.price(job.spec))
         job.limit()
+        self._end_requests()
         token = str(uuid.uuid4())
         context.store.delete(job.name)
         job.record = dataclasses.replace(
@@ -182,6 +190,15 @@ class Creation(Step):
                 job.undo.failed('undo', failure)
             raise
         job.save(machine_id=machine_id)
+
+    def _end_requests(self) -> None:
+        """Delete what the launch requested before under this name, if it appeared meanwhile."""
+        context = self._context
+        for record, age in context.store.requests():
+            if (record.name, record.last) == (self._job.name, context.launch_id):
+                with contextlib.suppress(FogError):  # `ros2 fog gc` tries again
+                    if end_machine(self._provider(record), record, age):
+                        context.store.answered(record)
 
     def _tags(self) -> dict[str, str]:
         """Return the tags that change with the launch that uses the machine."""
@@ -244,6 +261,9 @@ class Creation(Step):
                 settled = end_machine(context.provider, job.record, tidy=False)
             except FogError:
                 if self._request != 'refused':
+                    with contextlib.suppress(StoreError):
+                        # a kept one has to be deleted later, too
+                        job.save(spec=dataclasses.replace(job.spec, on_exit='delete'))
                     raise
                 settled = True
             if self._request == 'unanswered' and not settled:
