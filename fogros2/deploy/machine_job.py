@@ -59,6 +59,8 @@ class MachineJob(Site):
         self.undo.callback(self._report_left)
         self._left: list[str] = []
         self.life = Life()
+        #: Whether the launch has deleted, stopped or left it as its ``on_exit`` says.
+        self.has_ended = False
         #: Ids of earlier launches, oldest first; one of them has the machine's agent, if any.
         self.formers: tuple[str, ...] = ()
         #: When this launch created the machine or took it over, by ``time.monotonic``.

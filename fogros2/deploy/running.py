@@ -267,10 +267,15 @@ class RunningMachine(MachineJob):
         """Count a silent machine as lost after this time, even if its provider says it runs."""
         self.longest_silence = seconds
 
-    def end(self, reason: str) -> None:
-        """End the machine as its ``on_exit`` says; its further events are ignored."""
+    def end(self, reason: str) -> bool:
+        """
+        End the machine as its ``on_exit`` says; its further events are ignored.
+
+        Try again until the machine or the launch ends; return whether the machine has ended.
+        """
         self._enter('ended', reason)
         self.close()
+        return self.has_ended
 
     def close(self) -> None:
         """End the machine as its ``on_exit`` says."""

@@ -514,8 +514,8 @@ class Session:
         for run in runs:
             run.on('stop')
         await asyncio.gather(*(run.complete for run in runs))
-        await self._in_thread(self.running.end, reason)
-        self._logger.info(f'{self.spec.name}: the machine has ended')
+        if await self._in_thread(self.running.end, reason):
+            self._logger.info(f'{self.spec.name}: the machine has ended')
 
     def end_all(self) -> None:
         """End all processes of a machine that is gone, for launch."""

@@ -82,6 +82,7 @@ class FakeMachine:
 
     def end(self, reason):
         self.launch.note('end', self.spec.name, reason)
+        return True
 
     def note(self, key, value):
         self.launch.note('note', key, value)

@@ -14,6 +14,7 @@ from fogros2.deploy import choosing, Launch
 from fogros2.deploy import launch as launches
 from fogros2.deploy.context import Context
 from fogros2.deploy.running import RunningMachine
+from fogros2.deploy.steps import creating
 from fogros2.deploy.steps.creating import Creation
 from fogros2.errors import AgentError, ConfigurationError, ProviderError, WorkspaceError
 from fogros2.feature import Cost
@@ -141,6 +142,21 @@ def test_machine_that_runs_gets_less_time_when_another_costs(launch, provider):
     first.end('nobody uses it')
     first.shorten()
     assert len(requests) == 2
+
+
+@pytest.mark.parametrize('over', [False, True])
+def test_end_of_an_idle_machine_is_tried_again(launch, provider, events, monkeypatch, over):
+    monkeypatch.setattr(creating, 'RETRY', 0.01)
+    mine = create(launch)
+    mine.enter('up')
+    provider.failures['destroy'] = ProviderError('the token has expired')
+    if over:
+        launch.cancel.set()
+    assert mine.end('nobody uses it') is not over
+    assert [cost.ended for cost in launch.costs()] == [not over]
+    assert len(launch._failures) == over and len(provider.machines) == over
+    assert [event.text for event in events if isinstance(event, Warned)] == [
+        "'planner' has not ended yet: the token has expired"] * (not over)
 
 
 def test_compiled_workspace_is_refused_before_creation(launch, provider, tmp_path, monkeypatch):

@@ -33,7 +33,11 @@ from fogros2.provider import (
     TAG_ON_EXIT,
     TAG_ROBOT,
 )
+from fogros2.report import Warned
 from fogros2.store import is_another_robot, Record, robot_id, this_process
+
+#: Seconds after which the launch tries again to end a machine without which it goes on.
+RETRY = 60.0
 
 
 class Creation(Step):
@@ -238,20 +242,35 @@ class Creation(Step):
     # -- the end --------------------------------------------------------------------------------
 
     def _end(self) -> None:
-        """End the machine by its ``on_exit``; delete the record only after the machine."""
+        """End the machine by its ``on_exit``; one that is given up is tried again."""
+        context, job = self._context, self._job
+        while True:
+            last = job.life.phase != 'ended' or context.cancel.is_set()
+            try:
+                self._try_to_end()
+                job.has_ended = True
+                return
+            except FogError as error:
+                if last:
+                    raise
+                context.report(Warned(
+                    job.name, f"'{job.name}' has not ended yet: {error.args[0]}",
+                    error.hint or f'the launch tries again every {RETRY:g} s'))
+            context.cancel.wait(RETRY)
+
+    def _try_to_end(self) -> None:
+        """End the machine; delete the record only after the machine."""
         context, job = self._context, self._job
         mode = job.life.ending(job.spec.on_exit)
-        try:
-            with job.step(mode if context.capabilities.owned else 'let go'):
-                if mode == 'delete':
-                    self._delete()
-                    return
+        with job.step(mode if context.capabilities.owned else 'let go'):
+            if mode == 'delete':
+                self._delete()
+            else:
                 if mode == 'stop' and job.record.machine_id is not None:
                     context.provider.stop(job.record.machine_id)
                 job.save(launch='', pid=0, pid_start=0, robot_vpn=None, notes={})
-        finally:
-            if mode != 'keep':
-                context.choices.end(job.name)
+        if mode != 'keep':
+            context.choices.end(job.name)
 
     def _delete(self) -> None:
         """Delete the machine and its record."""
