@@ -33,7 +33,13 @@ def alive(name: str) -> Optional[bool]:
     """Return whether the owner of an interface runs, None if that is not known here."""
     try:
         *marks, pid, start = (INTERFACES / name / 'ifalias').read_text().split()
-        return process_alive(int(pid), int(start)) if marks == _marks() else None
+        if marks != _marks():
+            return None
+        if process_start(int(pid)) is None:
+            os.kill(int(pid), 0)  # PermissionError: another account's, which hidepid hides
+        return process_alive(int(pid), int(start))
+    except ProcessLookupError:
+        return False
     except (OSError, ValueError):
         return None
 

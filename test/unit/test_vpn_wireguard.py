@@ -16,6 +16,7 @@ from fogros2.dds.fastdds import FastDds
 from fogros2.dds.zenoh import Zenoh
 from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
+from fogros2.vpn import owner
 from fogros2.vpn.wireguard import WireGuard
 
 KEY = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
@@ -239,3 +240,20 @@ def test_machine_without_tun_is_reported(tmp_path: Path) -> None:
     assert told.stderr.splitlines()[-1] == (
         'no WireGuard in this kernel (ip refuses), and no '
         f'{tmp_path}/net/tun nor the right to make it')
+
+
+@pytest.mark.parametrize(('error', 'dead'), [
+    (PermissionError, []), (ProcessLookupError, ['a1b2c3'])])
+def test_launch_that_hidepid_hides_is_not_dead(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[OSError], dead: list[str],
+) -> None:
+    def kill(pid: int, number: int) -> None:
+        raise error
+
+    (tmp_path / ROBOT.name).mkdir()
+    (tmp_path / ROBOT.name / 'ifalias').write_text(owner.note(ROBOT).argv[-1])
+    monkeypatch.setattr(owner, 'INTERFACES', tmp_path)
+    monkeypatch.setattr('fogros2.store.process_start', lambda pid: None)
+    monkeypatch.setattr(owner, 'process_start', lambda pid: None)
+    monkeypatch.setattr(os, 'kill', kill)
+    assert owner.abandoned() == dead
