@@ -136,7 +136,7 @@ def _bring(running: RunningMachine, own: Wanted) -> str:
     done, failures = [], []
     if sizes:
         _make(check_owner(own.target))
-        _make(home, new=True)
+        home = _make(home, number=1)
         done.append(f'{total / 1e6:.3g} MB to {home}')
     for folder, target in _targets(home, sizes).items():
         try:
@@ -153,13 +153,18 @@ def _bring(running: RunningMachine, own: Wanted) -> str:
     return ', '.join(done)
 
 
-def _make(folder: Path, *, new: bool = False) -> None:
+def _make(folder: Path, *, number: int = 0) -> Path:
+    """Make a folder, by ``number`` a new one: its name may be taken, as robots share disks."""
+    path = folder.with_name(f'{folder.name}-{number}') if number > 1 else folder
     try:
         # a new one is nobody else's
-        folder.mkdir(parents=True, exist_ok=not new)
+        path.mkdir(parents=True, exist_ok=not number)
     except OSError as error:
-        raise ShellError(f"{folder} can't be written: {error.strerror}",
+        if number and isinstance(error, FileExistsError):
+            return _make(folder, number=number + 1)
+        raise ShellError(f"{path} can't be written: {error.strerror}",
                          'fetch_to= names another folder') from error
+    return path
 
 
 def _copy(running: RunningMachine, folder: str, target: Path, limit: int) -> None:

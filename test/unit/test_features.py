@@ -8,6 +8,7 @@ import inspect
 import io
 import os
 from pathlib import Path
+import time
 from types import SimpleNamespace
 from typing import Any, Optional, TYPE_CHECKING
 
@@ -228,6 +229,18 @@ def test_folders_come_home_when_the_launch_ends(home: Path) -> None:
     found = brought(running, fetch=['~/maps', '~/other/maps', '~/maps-2'],
                     fetch_to=str(home / 'two'))
     assert found == ['maps-2-2/three=3', 'maps-2/two=other/maps/two', 'maps/one=maps/one']
+
+
+def test_robots_that_end_in_one_second_get_two_folders(
+    home: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (home / 'bags').mkdir()
+    monkeypatch.setattr(time, 'strftime', lambda form: '20260101-000000')
+    for _ in range(2):
+        with Results().machine(FakeRunning(), Results.options(fetch=['~/bags'])):
+            pass
+    assert sorted(path.name for path in (home / 'fogros2').iterdir()) == [
+        'a-20260101-000000', 'a-20260101-000000-2']
 
 
 def test_one_bad_folder_does_not_keep_the_others(
