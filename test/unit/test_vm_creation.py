@@ -4,13 +4,18 @@
 from __future__ import annotations
 
 import logging
+import threading
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from fogros2.model import CreateRequest, MachineSpec
+from fogros2.errors import Cancelled
+from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_NAME, TAG_ROBOT
+from fogros2.provider.aws.cloud import Ec2
+from fogros2.provider.aws.provider import AWSProvider
+from fogros2.provider.vm import provider
 from fogros2.provider.vm.cloud import CloudError, Place, TAG_ATTEMPT, TAG_MADE, VmCloud
 from fogros2.provider.vm.creation import Creation
 from fogros2.provider.vm.options import VmOptions
@@ -59,3 +64,19 @@ def test_leftovers_are_old_or_of_dead_launches(caplog: pytest.LogCaptureFixture)
         'old', 'no time', 'dead', 'dead, damaged')}
     (record,) = caplog.records
     assert "'damaged one' has the damaged tag fogros2-made='nan'" in record.message
+
+
+def test_launch_that_ends_does_not_wait_for_a_machine_to_stop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine = AWSProvider()
+    machine.cancel = cancel = threading.Event()
+
+    def get(self: Ec2, region: str, vm: str) -> SimpleNamespace:
+        cancel.set()
+        return SimpleNamespace(state=MachineState.STOPPING)
+
+    monkeypatch.setattr(Ec2, 'get', get)
+    monkeypatch.setattr(provider, 'END_TIMEOUT', 0.1)
+    with pytest.raises(Cancelled):
+        machine.start(f'aws:eu-west-1/i-{"0" * 17}/{"0" * 16}')

@@ -318,16 +318,16 @@ class VmProvider(Provider):
         self.cloud.stop(machine)
 
     def start(self, machine_id: str) -> None:
-        machine = self.vm_id(machine_id)
+        machine, cloud = self.vm_id(machine_id), self.cloud.until(self.cancel)
 
         def stopped() -> bool:
-            vm = self.cloud.get(machine.region, machine.vm)
+            vm = cloud.get(machine.region, machine.vm)
             return vm is None or vm.state is not MachineState.STOPPING
 
         if not stopped():
-            wait_through(stopped, timeout=END_TIMEOUT, first=1.0, interval=1.5, longest=5.0,
-                         what=f'{machine.vm} in {machine.region} to be stopped')
-        self.cloud.start(machine)
+            wait_through(stopped, timeout=END_TIMEOUT, cancel=self.cancel, first=1.0, interval=1.5,
+                         longest=5.0, what=f'{machine.vm} in {machine.region} to be stopped')
+        cloud.start(machine)
 
     def tidy(self, dead: Collection[str] = ()) -> list[str]:
         attempts = {attempt_of(token) for token in dead}
