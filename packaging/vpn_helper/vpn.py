@@ -479,11 +479,14 @@ def status(request: Mapping[str, Any], uid: int) -> None:
 def down(request: Mapping[str, Any], uid: int) -> None:
     """Take an interface away, with all that was made for it; one that is gone is no error."""
     name = name_of(request['name'])
-    if not (RECORDS / name).exists() and not Path('/sys/class/net', name).exists():
-        return
-    with own(name, uid) as record:
-        run(record.vpn().down(record.interface()))
-        shutil.rmtree(RECORDS / name)
+    try:
+        with own(name, uid) as record:
+            run(record.vpn().down(record.interface()))
+            shutil.rmtree(RECORDS / name)
+    except Refused:
+        # another process may have taken it away while this one waited
+        if (RECORDS / name).exists() or Path('/sys/class/net', name).exists():
+            raise
 
 
 def tidy() -> None:

@@ -325,6 +325,16 @@ def test_launch_whose_interface_has_gone_is_cleared_by_its_user(
     assert not folder.exists()
 
 
+def test_interface_that_goes_while_down_waits_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    folder = tmp_path / 'foga1b2c3'
+    folder.mkdir()
+    monkeypatch.setattr(vpn, 'RECORDS', tmp_path)
+    monkeypatch.setattr(vpn.fcntl, 'flock', lambda *_: folder.rmdir())
+    vpn.down({'name': folder.name}, 1000)
+
+
 def test_package_is_removed_while_another_user_has_an_interface(tmp_path: Path) -> None:
     """``sudo apt purge`` names the administrator; nor does a refusal end the script."""
     spec = importlib.util.spec_from_file_location('deb', FOLDER.parent / 'deb.py')
