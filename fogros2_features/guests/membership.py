@@ -48,15 +48,16 @@ def join(
     :raises FogError: the invitation is not for this computer, has expired, or collides with a
         network here; the user does not agree; or the interface cannot be created.
     """
-    owner = owner or {'pid': 1, 'pid_start': process_start(1) or 0, 'boot': boot_id()}
     key = own_key(store)
     invitation = unseal(text, key)
     vendor = _vendor(invitation, environment)
     folder = store.root / 'launches' / invitation.number
     up = is_up(invitation)
+    if owner is None or up and launch_process(folder) == (1, True):
+        owner = {'pid': 1, 'pid_start': process_start(1) or 0, 'boot': boot_id()}
     other = other_vpn(invitation, store)
     if up and stored_vpn(folder) == other and secret_of(folder) == invitation.secret:
-        if not is_held(folder):
+        if owner['pid'] == 1 or not is_held(folder):
             write_private(folder / 'process.json', to_json(owner).encode())
         return folder
     if not invitation.private and not agreed(

@@ -6,13 +6,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 import contextlib
 import dataclasses
+import os
 from typing import ClassVar
 
 from fogros2.errors import DdsError, MachineNotFound, Unsupported
 from fogros2.model import CreateRequest, Endpoint, Machine, MachineSpec, MachineState, OtherVpn
 from fogros2.provider import Capabilities, Provider
 from fogros2.provider.options import parsed
-from fogros2.store import other_vpn, Store, this_process
+from fogros2.store import launch_process, other_vpn, Store, this_process
 from fogros2_features.guests import network, program
 from fogros2_features.guests.invitation import DOOR_KEY, Invitation, own_key, unseal
 
@@ -73,7 +74,8 @@ class JoinedProvider(Provider):
         try:
             yield
         finally:
-            if not by_hand:
+            # others may have joined meanwhile
+            if not by_hand and launch_process(folder)[0] == os.getpid():
                 clear(folder)
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:

@@ -30,7 +30,14 @@ from fogros2.model import (
     VpnInterface,
 )
 from fogros2.provider import Capabilities
-from fogros2.store import OTHER_VPN, process_start, Record, Store, write_private
+from fogros2.store import (
+    launch_process,
+    OTHER_VPN,
+    process_start,
+    Record,
+    Store,
+    write_private,
+)
 from fogros2_features.guests import invitation, listing, membership, program, provider
 from fogros2_testing.fakes import FakeProvider, FakeShell
 from fogros2_testing.plugins import instead
@@ -242,6 +249,33 @@ def test_folder_of_a_joined_machine_stays_until_a_reboot(
             assert endings.leftovers(store) == []
         assert cleared == ends
         cleared.clear()  # the folder stays here, and its owner runs
+
+
+@pytest.mark.parametrize('at_once', [False, True])
+def test_launch_leaves_the_vpn_that_others_use(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, at_once: bool,
+) -> None:
+    """Of another launch that has started at once, or of terminals that have joined meanwhile."""
+    store, cleared = Store(tmp_path / 'second'), list[Path]()
+    text = invitation.seal(invitation.Invitation(
+        'planner', OTHER, '198.18.7.2', '203.0.113.9:30000', '198.18.7.224', '198.18.7.0/24',
+        'rmw_cyclonedds_cpp', 7, time.time() + 60), invitation.public_text(
+            invitation.own_key(store)))
+    monkeypatch.setattr(membership, 'check_robot', lambda: None)
+    monkeypatch.setattr(membership, 'run', lambda commands, **k: '')
+    monkeypatch.setattr(provider, 'Store', lambda: store)
+    monkeypatch.setattr('fogros2.deploy.robot.clear', cleared.append)
+    owner = {'pid': os.getppid(), 'pid_start': process_start(os.getppid())}
+    if at_once:
+        membership.join(text, store, {}, owner=owner)
+    ups = iter([False, True] if at_once else [False, False, True])
+    monkeypatch.setattr(membership, 'is_up', lambda invitation: next(ups))
+    spec = MachineSpec('m', 'joined', options={'invitation': text})
+    with provider.JoinedProvider().join(spec, 'rmw_cyclonedds_cpp', 7, {}):
+        if not at_once:
+            membership.join(text, store, {})
+    (folder,) = store.other_vpns().values()
+    assert launch_process(folder) == (owner['pid'] if at_once else 1, True) and cleared == []
 
 
 def test_invitation_that_fails_leaves_the_former_vpn(
