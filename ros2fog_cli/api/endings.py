@@ -337,7 +337,8 @@ def end_request(record: Record, age: float, store: Store) -> None:
     """
     # the launch may have requested the machine again; without an id, it could be either one
     again = [each.machine_id for each in store.machines()
-             if (each.name, each.last) == (record.name, record.last)]
+             if (each.name, each.last) == (record.name, record.last)
+             and each.token != record.token]
     if None in again or not undo.end_machine(
             machines.load(record.provider), record, age, keep=again):
         raise undo.late(record)
