@@ -21,11 +21,19 @@ import re
 import secrets
 import shutil
 import tempfile
+import threading
 import time
 from typing import Any, Optional
 
 from fogros2 import model, process
-from fogros2.errors import ConfigurationError, did_you_mean, FogError, NameTaken, StoreError
+from fogros2.errors import (
+    Cancelled,
+    ConfigurationError,
+    did_you_mean,
+    FogError,
+    NameTaken,
+    StoreError,
+)
 from fogros2.model import Command, Endpoint, MachineSpec, OtherVpn, Peer, VpnInterface
 
 #: Name of a file or folder that only one process uses, with that process.
@@ -300,11 +308,13 @@ class Store:
         self._request(record).unlink(missing_ok=True)
 
     @contextlib.contextmanager
-    def lock(self, name: str) -> Iterator[None]:
+    def lock(self, name: str, *, cancel: Optional[threading.Event] = None) -> Iterator[None]:
         """
         Lock a machine's name on this robot while a launch or a verb works on the machine.
 
+        :param cancel: a launch's, which waits for a verb to end, not for another launch.
         :raises NameTaken: another process holds the lock.
+        :raises Cancelled: the launch ends.
         :raises StoreError: the disk is full, or the folder is not writable.
         """
         # beside the folder: deleting the folder must not release the lock early
@@ -313,15 +323,24 @@ class Store:
         with contextlib.ExitStack() as undo:
             while True:
                 try:
-                    handle = undo.enter_context(open(path, 'a'))
+                    handle = undo.enter_context(open(path, 'a+'))
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    handle.truncate(0)
+                    handle.write('launch' if cancel else 'command')
+                    handle.flush()
+                except BlockingIOError:
+                    handle.seek(0)
+                    holder = handle.read()
+                    handle.close()
+                    if cancel is None or holder != 'command':
+                        raise NameTaken(
+                            f"another {holder or 'launch'} on this robot has the machine '{name}'",
+                            'give the machine another name=, or end that launch') from None
+                    if cancel.wait(0.2):
+                        raise Cancelled(f"waiting for another command with '{name}'") from None
+                    continue
                 except OSError as error:
                     raise _not_written(path, error) from error
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    raise NameTaken(
-                        f"another launch on this robot has the machine '{name}'",
-                        'give the machine another name=, or end that launch') from None
                 # a former holder may have removed the file between open and lock
                 with contextlib.suppress(FileNotFoundError):
                     if os.path.samestat(os.fstat(handle.fileno()), path.stat()):

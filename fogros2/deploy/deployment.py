@@ -44,7 +44,7 @@ def bring_up(context: Context, spec: MachineSpec) -> RunningMachine:
 
 
 def _run(context: Context, job: RunningMachine) -> None:
-    job.undo.enter_context(context.store.lock(job.name))
+    job.undo.enter_context(context.store.lock(job.name, cancel=job.cancel))
     connection, arming = Connection(context, job), Arming(context, job)
     joining = (Joining if context.other_vpn is None else Joined)(context, job)
     # the robot's VPN interface needs nothing from the machine: it comes up in parallel

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tests of fogros2.store: on real files, with real processes."""
 
+import contextlib
 import errno
 import os
 from pathlib import Path
@@ -8,11 +9,12 @@ import re
 import stat
 import subprocess
 import sys
+import threading
 
 import pytest
 
 from fogros2 import store as store_module
-from fogros2.errors import ConfigurationError, NameTaken, StoreError
+from fogros2.errors import Cancelled, ConfigurationError, NameTaken, StoreError
 from fogros2.model import Endpoint, MachineSpec, VpnInterface
 from fogros2.store import (
     boot_id,
@@ -89,6 +91,25 @@ def test_a_name_is_held_by_one_at_a_time(store):
     with store.lock('planner'):
         pass
     assert list(store.machine('planner').parent.iterdir()) == []
+
+
+def test_launch_waits_for_a_command_and_for_no_launch(store):
+    class Waiting(threading.Event):
+        def wait(self, timeout=None):
+            command.close()
+            return False
+
+    with contextlib.ExitStack() as command:
+        command.enter_context(store.lock('planner'))
+        with pytest.raises(Cancelled):
+            ended = threading.Event()
+            ended.set()
+            with store.lock('planner', cancel=ended):
+                pass
+        with store.lock('planner', cancel=Waiting()):
+            with pytest.raises(NameTaken, match='another launch'):
+                with store.lock('planner', cancel=Waiting()):
+                    pass
 
 
 def test_a_name_that_cannot_be_held_is_a_clear_error(store, monkeypatch):
