@@ -33,7 +33,7 @@ import sys
 
 import ros2cli.daemon
 
-ros2cli.daemon.get_port = lambda: {port}
+ros2cli.daemon.get_port = lambda: int(open({port!r}).read())
 
 from ros2cli.cli import main
 
@@ -50,9 +50,9 @@ def install(folder: Path, python: str) -> Path:
     """
     program = folder / PROGRAMS / 'ros2'
     if not program.exists():
-        port = _free_port()
-        write_private(folder / PORT_FILE, str(port).encode())
-        write_private(program, _PROGRAM.format(python=python, port=port).encode())
+        port = folder.absolute() / PORT_FILE
+        write_private(port, str(_free_port()).encode())
+        write_private(program, _PROGRAM.format(python=python, port=str(port)).encode())
         program.chmod(0o700)
     return program.parent
 

@@ -13,6 +13,7 @@ from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 import pytest
 
 from fogros2 import ros2_daemon
+from fogros2.store import write_private
 
 #: What of ROS 2's ros2cli the program uses.
 ROS2CLI = {
@@ -29,17 +30,38 @@ def port_of(folder: Path) -> int:
     return int((folder / ros2_daemon.PORT_FILE).read_text())
 
 
-def test_program_gives_the_daemon_another_port(tmp_path: Path) -> None:
+def ros2(programs: Path) -> subprocess.CompletedProcess[str]:
+    """Run the program in a terminal whose ros2cli prints the daemon's port."""
+    library = programs / 'lib'
+    (library / 'ros2cli').mkdir(parents=True)
     for name, text in ROS2CLI.items():
-        (tmp_path / 'lib' / 'ros2cli').mkdir(parents=True, exist_ok=True)
-        (tmp_path / 'lib' / 'ros2cli' / name).write_text(text)
+        (library / 'ros2cli' / name).write_text(text)
+    return subprocess.run([programs / 'ros2', 'topic', 'list'], capture_output=True, text=True,
+                          env={'PYTHONPATH': str(library)})
+
+
+def test_program_gives_the_daemon_another_port(tmp_path: Path) -> None:
     programs = ros2_daemon.install(tmp_path / 'launch', sys.executable)
-    done = subprocess.run([programs / 'ros2', 'topic', 'list'], capture_output=True, text=True,
-                          env={'PYTHONPATH': str(tmp_path / 'lib')})
-    port = port_of(tmp_path / 'launch')
+    done, port = ros2(programs), port_of(tmp_path / 'launch')
     assert port in ros2_daemon.PORTS
     assert (done.stdout, done.returncode) == (f'{port} topic list\n', 3), done.stderr
     assert (programs / 'ros2').stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize('name', ['launch', "it's a folder"])
+def test_two_terminals_at_once_get_one_port(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str,
+) -> None:
+    others = [tmp_path / name]
+
+    def write(path: Path, data: bytes) -> None:
+        if path.name == 'ros2' and others:
+            ros2_daemon.install(others.pop(), sys.executable)
+        write_private(path, data)
+
+    monkeypatch.setattr(ros2_daemon, 'write_private', write)
+    done = ros2(ros2_daemon.install(tmp_path / name, sys.executable))
+    assert done.stdout == f'{port_of(tmp_path / name)} topic list\n', done.stderr
 
 
 def test_second_terminal_gets_the_same_port(tmp_path: Path) -> None:
