@@ -14,7 +14,7 @@ from pathlib import Path
 import re
 import shlex
 
-from fogros2.errors import ShellError, Unsupported
+from fogros2.errors import MachineNotFound, ShellError, Unsupported
 from fogros2.model import Endpoint
 from fogros2.shell import ssh_config
 from fogros2.store import Store, write_private
@@ -47,6 +47,12 @@ def write(entry: Entry, store: Store) -> Path:
     if to.host_key:
         write_private(folder / KNOWN_HOSTS, f'{label(entry.name)} {to.host_key}\n'.encode())
     write_private(folder / FILE, text.encode())
+    if not store.exists(entry.name):
+        # its launch has deleted the folder, which is there again
+        with store.lock(entry.name):
+            store.delete(entry.name)
+        raise MachineNotFound(f"'{entry.name}' has ended meanwhile",
+                              'ros2 fog list shows the machines that exist')
     return folder / FILE
 
 

@@ -239,6 +239,18 @@ def test_ssh_reads_the_settings_of_a_machine(
     assert settings('a')['hostname'] == 'a'
 
 
+def test_machine_that_ends_meanwhile_leaves_no_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    def settings(name: str, *others: object) -> str:
+        Store().delete(name)
+        return 'Host a\n'
+
+    monkeypatch.setattr(ssh_settings, 'settings', settings)
+    machine('a')
+    record('a', endpoint=Endpoint('ssh', '203.0.113.1', 22, 'ubuntu', 'ssh-ed25519 AAAA'))
+    assert run('ssh-config', 'a') == 1
+    assert Store().machines() == []
+
+
 def test_line_for_ssh_is_shown_until_it_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
