@@ -326,7 +326,7 @@ class Store:
                     handle = undo.enter_context(open(path, 'a+'))
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     handle.truncate(0)
-                    handle.write('launch' if cancel else 'command')
+                    handle.write('command' if cancel is None else 'launch')
                     handle.flush()
                 except BlockingIOError:
                     handle.seek(0)
@@ -335,9 +335,10 @@ class Store:
                     if cancel is None or holder != 'command':
                         raise NameTaken(
                             f"another {holder or 'launch'} on this robot has the machine '{name}'",
+                            'try again when it has ended' if holder == 'command' else
                             'give the machine another name=, or end that launch') from None
                     if cancel.wait(0.2):
-                        raise Cancelled(f"waiting for another command with '{name}'") from None
+                        raise Cancelled(f"waiting for the command that has '{name}'") from None
                     continue
                 except OSError as error:
                     raise _not_written(path, error) from error

@@ -154,7 +154,7 @@ def _bring(running: RunningMachine, own: Wanted) -> str:
 
 
 def _make(folder: Path, *, number: int = 0) -> Path:
-    """Make a folder, by ``number`` a new one: its name may be taken, as robots share disks."""
+    """Make a folder; with ``number`` a new one, as another robot may have made its name."""
     path = folder.with_name(f'{folder.name}-{number}') if number > 1 else folder
     try:
         # a new one is nobody else's
