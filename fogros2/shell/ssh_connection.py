@@ -187,7 +187,8 @@ def transport_over(sock: socket.socket) -> paramiko.Transport:
     Return a transport whose channels raise only OSErrors.
 
     paramiko raises an EOFError for a connection that is gone, even in a read, which makes room for
-    more; and an SSHException if the key exchange takes too long.
+    more; and an SSHException if the key exchange takes too long. A login raises a
+    ConnectionAbortedError only if the server ends it with a message.
     """
     import paramiko
 
@@ -204,6 +205,11 @@ def transport_over(sock: socket.socket) -> paramiko.Transport:
                     errno.ECONNRESET, 'the connection is gone') from error
             except paramiko.SSHException as error:
                 raise TimeoutError(str(error)) from error
+
+        def _parse_disconnect(self, message: paramiko.Message) -> None:
+            super()._parse_disconnect(message)  # type: ignore[misc]
+            raise ConnectionAbortedError(
+                errno.ECONNABORTED, 'the server ended the connection')
 
     return Transport(sock)
 
@@ -294,12 +300,14 @@ def _log_in(transport: paramiko.Transport, settings: Settings, name: str) -> Non
         try:
             transport.auth_publickey(user, key)
             return
-        except paramiko.AuthenticationException:
-            if not transport.is_active():
-                raise AuthenticationError(
-                    f'{where} ended the login: it was offered too many keys, {tried}',
-                    'name the right one by key=, or by IdentityFile and IdentitiesOnly in '
-                    '~/.ssh/config') from None
+        except ConnectionAbortedError:
+            raise AuthenticationError(
+                f'{where} ended the login: it was offered too many keys, {tried}',
+                'name the right one by key=, or by IdentityFile and IdentitiesOnly in '
+                '~/.ssh/config') from None
+        except paramiko.AuthenticationException as error:
+            if not transport.is_active() or str(error) == 'Authentication timeout.':
+                raise TimeoutError('the login got no answer') from error
     add = f'ssh-add {locked[0]}' if locked else ''
     if add and not os.environ.get('SSH_AUTH_SOCK'):
         add = f'eval "$(ssh-agent)"; {add}'

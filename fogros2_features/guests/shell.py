@@ -53,23 +53,24 @@ def admitted(endpoint: Endpoint, name: str, timeout: float) -> socket.socket:
     except (OSError, ValueError) as error:
         raise AuthenticationError(f"this computer has left '{name}': {error}",
                                   'join it again: ros2 fog join') from error
-    try:
-        link = socket.create_connection((endpoint.host, endpoint.port), timeout)
-    except OSError as error:
-        raise ConnectError(
-            f"'{name}' does not answer: {error}",
-            'the invitation may have been revoked, or the machine may have ended') from error
     with contextlib.ExitStack() as failed:
-        failed.enter_context(link)
         try:
-            link.sendall(hmac.digest(secret, link.recv(_CHALLENGE, socket.MSG_WAITALL), 'sha256'))
-            while not text.endswith(b'\n') and len(text) < _LINE:
-                text += (more := link.recv(1))
-                if not more:
-                    raise ConnectionResetError('it closed the connection')
+            link = failed.enter_context(
+                socket.create_connection((endpoint.host, endpoint.port), timeout))
+            try:
+                link.sendall(hmac.digest(
+                    secret, link.recv(_CHALLENGE, socket.MSG_WAITALL), 'sha256'))
+                while not text.endswith(b'\n') and len(text) < _LINE:
+                    text += (more := link.recv(1))
+                    if not more:
+                        raise ConnectionResetError('it closed the connection')
+            except ConnectionError as error:
+                raise AuthenticationError(f"'{name}' refuses this invitation: {error}",
+                                          'ask for a new one: ros2 fog invite') from error
         except OSError as error:
-            raise AuthenticationError(f"'{name}' refuses this invitation: {error}",
-                                      'ask for a new one: ros2 fog invite') from error
+            raise ConnectError(
+                f"'{name}' does not answer: {error}",
+                'the invitation may have been revoked, or the machine may have ended') from error
         if text != b'\n':
             raise ConnectError(f"'{name}' has no room for this computer: "
                                f'{text.decode(errors="replace").strip()}',

@@ -18,7 +18,7 @@ from fogros2.errors import AuthenticationError, ConnectError
 from fogros2.model import Command, Endpoint
 from fogros2.waiting import wait_until
 from fogros2_features.guests import program as guests
-from fogros2_features.guests.shell import GuestShell
+from fogros2_features.guests.shell import admitted, GuestShell
 
 SECRET, OTHER = '5a' * 32, 'b7' * 32
 ME = '127.0.0.1'
@@ -169,3 +169,12 @@ def test_refused_shell_is_one_clear_error(door: Door, tmp_path: Path) -> None:
             as raised:
         GuestShell(endpoint(door, tmp_path), name='theirs').run(Command(('true',)), timeout=60.0)
     assert '\x1b' not in str(raised.value)
+
+
+def test_door_that_does_not_answer_refuses_no_invitation(tmp_path: Path) -> None:
+    (tmp_path / 'secret').write_text(SECRET)
+    with socket.create_server((ME, 0)) as silent:
+        place = Endpoint('guest', ME, silent.getsockname()[1], 'root', key_file=str(
+            tmp_path / 'secret'))
+        with pytest.raises(ConnectError, match="'theirs' does not answer: timed out"):
+            admitted(place, 'theirs', 0.05)

@@ -114,6 +114,38 @@ def test_key_exchange_without_an_end_is_a_lost_connection():
         transport.close()
 
 
+@pytest.mark.parametrize(('cut', 'timeout'), [(False, 1.0), (True, 60.0)])
+def test_login_that_the_network_interrupts_refuses_no_key(tmp_path, cut, timeout):
+    """The server is silent about the key, or its connection ends."""
+    paramiko = pytest.importorskip('paramiko')
+    key, over, servers = paramiko.ECDSAKey.generate(), threading.Event(), []
+    key.write_private_key_file(str(tmp_path / 'key'))
+
+    class Server(paramiko.ServerInterface):
+        def get_allowed_auths(self, username):
+            return 'publickey'
+
+        def check_auth_publickey(self, username, key):
+            if cut:
+                servers[0].sock.close()
+            over.wait(60.0)
+            return paramiko.common.AUTH_FAILED
+
+    def serve():
+        servers.append(paramiko.Transport(listener.accept()[0]))
+        servers[0].add_server_key(key)
+        servers[0].start_server(server=Server())
+
+    with socket.create_server(('127.0.0.1', 0)) as listener:
+        threading.Thread(target=serve, daemon=True).start()
+        endpoint = Endpoint('ssh', '127.0.0.1', listener.getsockname()[1], 'fog',
+                            f'{key.get_name()} {key.get_base64()}', str(tmp_path / 'key'))
+        with pytest.raises(ConnectError):
+            ssh_connection.connect(endpoint, name='planner', timeout=timeout)
+    over.set()
+    servers[0].close()
+
+
 def test_gone_connection_is_an_oserror_of_its_channels():
     """Reading, too, sends a message, which makes room for more."""
     paramiko = pytest.importorskip('paramiko')
