@@ -223,13 +223,14 @@ class Nodes:
         """
         Stop nodes, all of them if ``ids`` is None, as launch does: SIGINT, SIGTERM, SIGKILL.
 
-        :raises Refused: there is no such node.
+        :raises Refused: there is none of these nodes.
         """
         ids = list(self.known) if ids is None else [str(number) for number in ids]
-        for number in ids:
-            if number not in self.known:
-                raise Refused(f"there is no node '{number}'", kind='not running')
-        for node in map(self.known.__getitem__, ids):
+        # the launch may end before it has sent all its nodes
+        nodes = [self.known[number] for number in ids if number in self.known]
+        if ids and not nodes:
+            raise Refused(f"there is no node '{ids[0]}'", kind='not running')
+        for node in nodes:
             if not node.stopping:
                 self._stop(node, node.timeouts)
 

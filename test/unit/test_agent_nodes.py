@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import os
 from pathlib import Path
+import signal
 import subprocess
 from typing import Any
 
@@ -198,3 +199,14 @@ def test_program_of_another_missing_interpreter_is_refused(
 ) -> None:
     with pytest.raises(Refused, match="is for the interpreter '/gone/bin/ruby'"):
         prepared(arguments=[program(tmp_path, '/gone/bin/ruby')])
+
+
+def test_unknown_node_keeps_no_other_from_its_end(
+    nodes: Nodes, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sent: list[tuple[int, int]] = []
+    monkeypatch.setattr(nodes.processes, 'kill', lambda pid, number: sent.append((pid, number)))
+    nodes.known['a'] = Node({'id': 'a', 'name': 'n'})
+    nodes.known['a'].status['pid'] = 4711
+    nodes.stop(['a', 'nobody'])
+    assert sent == [(4711, signal.SIGINT)]
