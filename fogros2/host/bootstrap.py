@@ -544,7 +544,7 @@ def _install_wheels(
         lines += locked.requirements(names)
     module = f'venv/lib/python{python.version[0]}.{python.version[1]}/site-packages/fogros2/host'
     script = (
-        f'cd {shlex.quote(folder)}\n'
+        f'{installer.ENTER.format(folder=shlex.quote(folder))}'
         f'{_checked(wheels, wheels.pip)}'
         'rm -rf venv\n'
         f'{shlex.quote(python.path)} -m venv --without-pip venv\n'
@@ -582,7 +582,7 @@ def _ros(
         return Preparation('none', install)
     assert facts.python is not None
     script = (
-        f'cd {shlex.quote(folder)}\n'
+        f'{installer.ENTER.format(folder=shlex.quote(folder))}'
         'rm -rf site\n'
         f'{_checked(wheels, wheels.fogros2)}'
         f'{shlex.quote(facts.python.path)} -m zipfile -e '

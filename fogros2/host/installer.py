@@ -157,11 +157,18 @@ _ABLE = """\
 python3 -m pip --version || ls "$VIRTUAL_ENV"/../wheels/pip-*.whl ||
     python3 -c 'import ensurepip, venv'
 """
-#: Creates an empty folder, and sets ``"$@"`` to the command of pip for the nodes' Python.
-_PIP = """\
+#: Enters a folder while no other launch installs; exits with 0 if another one has completed it.
+ENTER = """\
 set -e
 mkdir -p {folder}
+exec 9<{folder}/..
+flock 9
+mkdir -p {folder}
 cd {folder}
+[ ! -e complete ] || exit 0
+"""
+#: Removes old packages, and sets ``"$@"`` to the command of pip for the nodes' Python.
+_PIP = ENTER + """\
 rm -rf site
 if python3 -m pip --version >/dev/null 2>&1; then
     set -- python3 -m pip
@@ -348,8 +355,7 @@ def fill(needs: Needs, requirements: Sequence[str], *, complete: bool = True) ->
     """
     names = ' '.join(name.replace('-', '_') for name in OURS)
     folder = shlex.quote(needs.folder)
-    script = _PIP.format(folder=folder) if requirements else (
-        f'set -e\nmkdir -p {folder}\ncd {folder}\n')
+    script = (_PIP if requirements else ENTER).format(folder=folder)
     script += f'mkdir -p last\nprintf %s {shlex.quote(_LAST_IN_PATH)} >last/sitecustomize.py\n'
     if requirements:
         script += (f'python3 -c {shlex.quote(_CONSTRAINTS)} >constraints.txt\n'
@@ -374,9 +380,12 @@ def pinned_install(
 
     :param lines: of a requirements file, see ``locked``.
     """
-    return among_nodes(environment, setup, _PIP.format(folder=shlex.quote(folder)) + (
+    folder = shlex.quote(folder)
+    return among_nodes(environment, setup, _PIP.format(folder=folder) + (
         f"printf '%s\\n' {shlex.join(lines)} >requirements.txt\n"
-        f'"$@" {shlex.join(locked.OPTIONS)} --requirement requirements.txt\nrm -rf pip\n'),
+        f'"$@" {shlex.join(locked.OPTIONS)} --requirement requirements.txt || {{\n'
+        f'    rm -rf {folder}; exit 1; }}\n'
+        'rm -rf pip\n: >complete\n'),
         'install Python modules')
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import os
 from pathlib import Path
 import re
@@ -20,6 +21,7 @@ from fogros2.host.inspection import HostFacts, Python
 from fogros2.host.wheels import Wheels
 from fogros2.model import Bootstrap, Command, MachineSpec, Result
 from fogros2.plan import Underlay
+from fogros2.waiting import in_thread
 from fogros2_testing.fakes import FakeShell
 
 TOOLS = frozenset({'ip', 'nft', 'rsync', 'wg', 'wireguard-go', 'apt-get', 'sudo'})
@@ -199,6 +201,29 @@ def test_auto_installs_ros_by_pip_elsewhere() -> None:
     assert not any(command.sudo for command in todo.commands)
     again = plan(dataclasses.replace(NOBLE, installed=frozenset({'k1'})))
     assert (again.mode, again.commands) == ('none', ())
+
+
+@pytest.mark.parametrize('what', ['wheels', 'beside ROS', 'pip', 'modules'])
+def test_second_launch_keeps_what_the_first_installed(tmp_path: Path, what: str) -> None:
+    """Both looked at the machine before anything was there; the first one's nodes run."""
+    home = dataclasses.replace(ROS if what == 'beside ROS' else NOBLE, home=str(tmp_path))
+    folder = tmp_path / bootstrap.INSTALL_FOLDER / 'k1'
+    if what == 'modules':
+        command = installer.pinned_install((), str(folder), {}, ())
+    elif what == 'pip':
+        needed = installer.Needs('m', home, True, pip=('x',))
+        command, folder = installer.fill(needed, needed.pip), Path(needed.folder)
+    else:
+        (command,) = plan(home).commands
+    (folder / 'venv').mkdir(parents=True)
+    (folder / 'site').mkdir()
+    first = os.open(folder.parent, os.O_RDONLY)
+    fcntl.flock(first, fcntl.LOCK_EX)
+    second = in_thread(lambda: process.run(command, timeout=60.0))
+    (folder / 'complete').touch()
+    os.close(first)
+    second.result(60.0)
+    assert {path.name for path in folder.iterdir()} == {'complete', 'site', 'venv'}
 
 
 @pytest.mark.parametrize('facts', [

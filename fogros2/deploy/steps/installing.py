@@ -125,17 +125,13 @@ class Modules(Step):
                 self._run(installer.pinned_install(
                     modules.pinned(present.missing), target, self._environment, self._setup))
             except CommandError as error:
-                self._discard(target)
                 raise self._without(present, str(error)) from error
         after = self._ask(present.missing, f'{target}/site')
         if after.missing:
-            self._discard(target)
+            self._run(Command(('rm', '-rf', target), what='delete modules that fail'))
             raise self._without(after, ': '.join(
                 ['they were installed, and cannot be imported', *after.broken]))
         self._run(Command(('touch', f'{target}/complete'), what='note what is there'))
-
-    def _discard(self, target: str) -> None:
-        self._run(Command(('rm', '-rf', target), what='delete modules that fail'))
 
     def _has(self, target: str) -> bool:
         done = self._job.shell.run(
