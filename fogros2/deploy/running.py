@@ -46,6 +46,7 @@ class RunningMachine(MachineJob):
         super().__init__(context, spec)
         self._lock = threading.Lock()
         self._shortening = threading.Lock()
+        self._closing = threading.Lock()
         self._callback: Optional[EventCallback] = None
         self._published: dict[int, tuple[str, int]] = {}
         self._watches: dict[str, _Watched] = {}
@@ -158,7 +159,8 @@ class RunningMachine(MachineJob):
         def tell(event: Event) -> None:
             # an agent that exits at the end of the launch is expected
             expected = event['event'] == 'connection' and self._context.ending.is_set()
-            if self.life.over or expected:
+            if self.life.over or expected or (
+                    event['event'] == 'watched' and self.ending.is_set()):
                 return
             if event['event'] != 'watched':
                 callback(event)
@@ -279,4 +281,5 @@ class RunningMachine(MachineJob):
 
     def close(self) -> None:
         """End the machine as its ``on_exit`` says."""
-        self.undo.close()
+        with self._closing:
+            self.undo.close()

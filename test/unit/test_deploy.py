@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 import contextlib
 import dataclasses
 import hashlib
@@ -64,7 +64,7 @@ from fogros2.report import StepDone, StepFailed
 from fogros2.shell import host_key
 from fogros2.store import Made, process_start, Store
 from fogros2.vpn import addresses, STAYS
-from fogros2.waiting import Periodic, Timeouts, wait_until
+from fogros2.waiting import in_thread, Periodic, Timeouts, wait_until
 from fogros2_features.guests import invitation
 from fogros2_features.guests.provider import JoinedProvider
 from fogros2_features.replacement import Replacement
@@ -993,6 +993,30 @@ def test_silence_is_reported_and_its_end(cut, provider):
     assert [(event.machine, event.over) for event in reported] == [
         ('planner', False), ('planner', True)]
     assert all(4.5 < event.seconds < 30 for event in reported) and events == []
+
+
+def test_idle_machine_that_ends_already_is_left_to_its_steps(launch, provider):
+    _, mine = begun(launch)
+    reasons, subscribed, steps = [], [], []
+    mine.agent = Cut()
+    mine.agent.subscribe = lambda callback, since: subscribed.append(callback)
+    mine.watch('idle', (), 1.0, reasons.append)
+    mine.subscribe(reasons.append)
+    mine.ending.set()
+    subscribed[0]({'event': 'watched', 'what': 'idle', 'reason': 'nobody'})
+    assert reasons == []
+    fetches, fetched = threading.Event(), threading.Event()
+    mine.undo.callback(steps.append, 'delete')
+    mine.undo.callback(lambda: (fetches.set(), fetched.wait(60)))
+    first = in_thread(mine.close)
+    assert fetches.wait(60)
+    second = in_thread(lambda: mine.end('idle'))
+    wait([second], 0.2)
+    assert steps == []
+    fetched.set()
+    for thread in (first, second):
+        thread.result(60)
+    assert steps == ['delete']
 
 
 def heard(*silences):
