@@ -30,18 +30,30 @@ from fogros2.model import Bootstrap, Command, Result
 #: Script that installs the Debian packages in some words for sh.
 APT = """\
 export DEBIAN_FRONTEND=noninteractive
-# a machine that has just booted runs apt by itself: wait for its locks
-tries=0
-until output=$(LC_ALL=C apt-get -q update 2>&1); do
-    case $output in *'Could not get lock'*) ;; *) tries=300 ;; esac
-    [ $((tries += 1)) -lt 300 ] || break
-    sleep 1
+attempts=0
+until
+    # a machine that has just booted runs apt by itself: wait for its locks
+    tries=0
+    until output=$(LC_ALL=C apt-get -q update 2>&1); do
+        case $output in *'Could not get lock'*) ;; *) tries=300 ;; esac
+        [ $((tries += 1)) -lt 300 ] || break
+        sleep 1
+    done
+    # the installation shows whether a source is missed
+    printf '%s\\n' "$output" >&2
+    # repair an installation that was killed; apt waits for one that still runs
+    dpkg --configure -a </dev/null || :
+    apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends {packages}
+do
+    # 'update' exits with 0 without a network, which may need some seconds after the boot
+    why=$(printf '%s\\n' "$output" | grep -E \\
+        'Failed to fetch|Temporary failure|Could not (resolve|connect)' | tail -n 1)
+    if [ -z "$why" ] || [ $((attempts += 1)) = 5 ]; then
+        printf '%s\\n' "$why" >&2
+        exit 100
+    fi
+    sleep 5
 done
-# the installation shows whether a source is missed
-printf '%s\\n' "$output" >&2
-# repair an installation that was killed; apt waits for one that still runs
-dpkg --configure -a </dev/null || :
-apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends {packages}
 """
 #: Prints the Debian packages that are not installed.
 _MISSING = """\

@@ -270,6 +270,30 @@ def test_apt_waits_for_its_lists_and_a_gone_source_is_no_error(
     assert (said in shown) is (said == GONE)
 
 
+OFFLINE = "W: Failed to fetch http://192.0.2.1/dists Temporary failure resolving '192.0.2.1'"
+
+
+@pytest.mark.parametrize(('offline', 'attempts'), [(2, 3), (1000, 5)])
+def test_apt_awaits_the_network_and_names_what_fails(
+    tmp_path: Path, offline: int, attempts: int,
+) -> None:
+    calls = tmp_path / 'calls'
+    for name, text in {
+            'apt-get': f'echo "$*" >>{calls}\n'
+                       f'[ "$(grep -c update {calls})" -le {offline} ] || exit 0\n'
+                       f'case "$*" in *update) echo "{OFFLINE}" >&2;;\n'
+                       '*) echo "E: Unable to locate package rsync" >&2; exit 100;; esac',
+            'sleep': ':', 'dpkg': ':'}.items():
+        (tmp_path / name).write_text(f'#!/bin/sh\n{text}\n')
+        (tmp_path / name).chmod(0o755)
+    done = subprocess.run(
+        ['sh', '-ec', installer.APT.format(packages='rsync')], text=True, capture_output=True,
+        timeout=60, env={'PATH': f'{tmp_path}:{os.environ["PATH"]}'})
+    assert calls.read_text().count('update') == attempts
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (
+        (100, OFFLINE) if offline > attempts else (0, ''))
+
+
 def test_machine_without_rosdep_says_so() -> None:
     command = installer.resolve(
         Needs('a', FACTS, True, environment={'PATH': '/usr/bin:/bin'}), ['x'])
