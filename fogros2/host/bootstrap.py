@@ -227,7 +227,7 @@ def ensure(
                 raise
             # its package index cannot be reached
             fetched = wheel_cache.fetch(
-                names, _pip_python(facts, wheels).version, timeout=timeout)
+                names, _pip_python(facts, wheels).version, timeout=timeout, cancel=cancel)
             shell.sync(fetched, f'{todo.wheels_target}-fetched', excludes=(), timeout=timeout,
                        cancel=cancel)
             run(_install_wheels(facts, wheels, wheel_cache.hashes(fetched)))

@@ -136,7 +136,7 @@ def hashes(folder: Path) -> dict[str, str]:
 
 def fetch(
     names: Iterable[str], python: tuple[int, int], *, timeout: float,
-    folder: Optional[Path] = None,
+    cancel: Optional[threading.Event] = None, folder: Optional[Path] = None,
 ) -> Path:
     """
     Fetch pinned wheels for another Python from FOGROS2_WHEELS or the index; return their folder.
@@ -146,6 +146,7 @@ def fetch(
     :param timeout: seconds.
     :param folder: the cache, by default ``cache_folder()``.
     :raises PrerequisiteError: a distribution is not pinned, or cannot be fetched.
+    :raises Cancelled: ``cancel`` was set meanwhile.
     """
     lines = locked.requirements(names, python)
     key = hashlib.sha256(json.dumps([python, lines]).encode()).hexdigest()[:16]
@@ -164,7 +165,8 @@ def fetch(
                 '--python-version', version, '--implementation', 'cp', '--abi', f'cp{version}',
                 '--abi', 'abi3', '--abi', 'none',
                 *(word for one in _PLATFORMS for word in ('--platform', one)),
-                '--requirement', file.name), what='fetch ROS 2 for a machine'), timeout=timeout)
+                '--requirement', file.name), what='fetch ROS 2 for a machine'),
+                timeout=timeout, cancel=cancel)
         except CommandError as error:
             raise PrerequisiteError(
                 "neither the machine nor this computer could fetch ROS 2's packages: "

@@ -432,7 +432,7 @@ def test_robot_fetches_for_a_machine_without_an_index(
     monkeypatch.setattr(host, 'parse_facts', lambda output: DEBIAN)
     monkeypatch.setattr(bootstrap, '_robot_facts', lambda prefixes, timeout: NOBLE)
     monkeypatch.setattr(bootstrap.wheel_cache, 'collect', lambda: WHEELS)
-    monkeypatch.setattr(bootstrap.wheel_cache, 'fetch', lambda names, python, timeout: (
+    monkeypatch.setattr(bootstrap.wheel_cache, 'fetch', lambda names, python, **_: (
         fetched.append((names, python)), tmp_path)[1])
     shell = FakeShell(handlers={'mkdir': lambda command: Result(0, '', ''), 'sh': lambda command: (
         Result(int('--retries 1 --timeout 8' in command.argv[-1]), '', ''))})

