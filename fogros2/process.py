@@ -32,6 +32,8 @@ PACKAGES = {'ip': 'iproute2', 'nft': 'nftables', 'ping': 'iputils-ping',
             'ssh': 'openssh-client', 'ssh-keygen': 'openssh-client', 'wg': 'wireguard-tools'}
 #: Maximum bytes of a line of output; a longer one is several.
 _LINE = 1 << 16
+#: Variables that name proxies, in upper or lower case.
+_PROXIES = ('all_proxy', 'ftp_proxy', 'http_proxy', 'https_proxy', 'no_proxy')
 #: A copy: launch empties ``os.environ`` briefly when a scoped group ends, while threads run.
 _ENVIRONMENT = dict(os.environ)
 
@@ -41,6 +43,16 @@ def argv(command: Command) -> list[str]:
     if _through_sudo(command):
         return ['sudo', '-n', '--', *command.argv]
     return list(command.argv)
+
+
+def proxies() -> tuple[str, ...]:
+    """
+    Return the proxies of this process's environment, as NAME=VALUE, for a download by sudo.
+
+    sudo passes no variables on. A proxy with a password is left out: all users see command lines.
+    """
+    return tuple(f'{name}={value}' for name, value in _ENVIRONMENT.items()
+                 if name.lower() in _PROXIES and '@' not in value)
 
 
 def start(

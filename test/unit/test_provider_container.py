@@ -456,6 +456,32 @@ def test_a_download_of_an_image_can_be_cancelled(monkeypatch):
         provider.create(MachineSpec('m', 'container', {'image': 'large'}), REQUEST)
 
 
+@pytest.mark.parametrize('options', [{'image': 'large'}, {'isolated': True}])
+def test_downloads_by_sudo_get_the_users_proxies(monkeypatch, tmp_path, options):
+    downloads = []
+
+    def run(command, **more):
+        if {'create', 'unshare'} & {*command.argv}:
+            downloads.append(command)
+            raise Cancelled('the download')
+        return Result(0, '', '')
+
+    monkeypatch.setattr(container_engine.process, 'run', run)
+    monkeypatch.setattr(container_engine.process, '_ENVIRONMENT', {
+        'HOME': '/home/me', 'HTTPS_PROXY': 'http://proxy:3128', 'no_proxy': 'localhost',
+        'http_proxy': 'http://me:secret@proxy:3128'})
+    monkeypatch.setattr(container_engine, 'select', lambda *_: container_engine.named('podman'))
+    monkeypatch.setattr(debian_root, 'cache_folder', lambda: tmp_path)
+    monkeypatch.setattr(debian_root, 'release', lambda: debian_root.parse_release(
+        'ubuntu', 'noble', TARGETS))
+    with pytest.raises(Cancelled):
+        container.ContainerProvider().create(MachineSpec('m', 'container', options), REQUEST)
+    assert [command.argv[:4] for command in downloads] == [(
+        'env', 'HTTPS_PROXY=http://proxy:3128', 'no_proxy=localhost',
+        'podman' if 'image' in options else 'unshare')]
+    assert downloads[0].sudo
+
+
 def test_docker_machine_gets_its_packet_filter_at_once(monkeypatch):
     commands = []
 

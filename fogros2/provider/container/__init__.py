@@ -313,7 +313,7 @@ class ContainerProvider(Provider):
             '--label-file', '/dev/stdin', '--user', '0:0', '--entrypoint', '/bin/sh',
             options.image, f'/{container_entry.FOLDER}/entry.sh', what=what, timeout=1800.0,
             data=container_machine.token_label(request.token).encode(),
-            cancel=self.cancel).stdout.split()[-1]
+            variables=process.proxies(), cancel=self.cancel).stdout.split()[-1]
         try:
             # podman keeps what it has copied in its folder for temporary files
             with tempfile.TemporaryDirectory() as aside:

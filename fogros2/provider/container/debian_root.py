@@ -166,9 +166,9 @@ def root(
         with contextlib.ExitStack() as undo:
             undo.callback(remove, aside)
             process.run(Command(
-                ('unshare', '--mount', '--pid', '--fork', '--kill-child', 'sh', '-ec', _MAKE, 'sh',
-                 str(aside), ','.join(packages), own.codename, own.address,
-                 ','.join(own.components)),
+                ('env', *process.proxies(), 'unshare', '--mount', '--pid', '--fork',
+                 '--kill-child', 'sh', '-ec', _MAKE, 'sh', str(aside), ','.join(packages),
+                 own.codename, own.address, ','.join(own.components)),
                 sudo=True, what=f'make a {own.system} {own.codename} system'),
                 timeout=TIMEOUT, cancel=cancel)
             process.run(Command(('mv', '-T', str(aside), str(target)), sudo=True), timeout=30.0)
