@@ -122,7 +122,7 @@ def _open(entry: Entry, port: int, undo: contextlib.ExitStack) -> None:
     """Open a TCP port to this robot until ``undo`` runs or a launch closes the port."""
     assert entry.machine is not None
     provider, machine_id = machines.load(entry.provider), entry.machine.id
-    provider.allow(machine_id, port, [provider.robot_address()])
+    address = provider.robot_address()
 
     def close() -> None:
         # A launch may have started meanwhile, and may be connecting through this port.
@@ -141,10 +141,11 @@ def _open(entry: Entry, port: int, undo: contextlib.ExitStack) -> None:
             except MachineNotFound:
                 pass  # the machine is gone, with its firewall
             except FogError as error:
-                print(f'{entry.name}: its TCP port {port} is still open to this computer, as '
+                print(f'{entry.name}: its TCP port {port} may still be open to this computer, as '
                       f'closing it failed: {error}', file=sys.stderr)
 
     undo.callback(close)
+    provider.allow(machine_id, port, [address])
 
 
 def let_go(entry: Entry) -> bool:
