@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses
+import fcntl
 import math
 import os
 from pathlib import Path
@@ -119,12 +120,25 @@ def through_vpn(entry: Entry, to: Endpoint) -> Optional[Endpoint]:
 
 
 def _open(entry: Entry, port: int, undo: contextlib.ExitStack) -> None:
-    """Open a TCP port to this robot until ``undo`` runs or a launch closes the port."""
+    """
+    Open a TCP port to this robot until ``undo`` runs or a launch closes the port.
+
+    Of several programs on this computer, the last one closes the port.
+    """
     assert entry.machine is not None
     provider, machine_id = machines.load(entry.provider), entry.machine.id
-    address = provider.robot_address()
+    address, users = provider.robot_address(), -1
+    if entry.record is not None:
+        users = os.open(Store().machine(entry.record.name), os.O_RDONLY)
+        undo.callback(os.close, users)
+        fcntl.flock(users, fcntl.LOCK_SH)
 
     def close() -> None:
+        try:
+            if users >= 0:
+                fcntl.flock(users, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return
         # A launch may have started meanwhile, and may be connecting through this port.
         record = entry.record
         if record is not None:

@@ -370,6 +370,17 @@ def test_session_opens_and_closes_the_firewall(shells: list[Endpoint]) -> None:
     assert shells[1].user == 'root'
 
 
+def test_last_of_two_sessions_closes_the_port(shells: list[Endpoint]) -> None:
+    machine('slam')
+    record('slam')
+    entry = reach.find('slam', pytest.fail)
+    with reach.session(entry):
+        with reach.session(entry):
+            pass
+        assert ('allow', 'id-slam', 22) not in Cloud.asked
+    assert Cloud.asked[-1] == ('allow', 'id-slam', 22)
+
+
 def test_port_that_opens_without_an_answer_is_closed(
     shells: list[Endpoint], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
