@@ -330,7 +330,8 @@ def _ask(
 
     :raises FogError: the provider can't be asked, about none of its machines.
     """
-    if not any(record.provider == name for record in records) and not wanted(name, regions):
+    records = [record for record in records if record.provider == name]
+    if not records and not wanted(name, regions):
         return Answer([])
     provider = load(name, regions, records)
     provider.cancel = cancel
@@ -343,22 +344,24 @@ def _ask(
     except Unsupported:
         pass
     except FogError as error:
-        if not matches:
+        if not matches and not any(record.machine_id for record in records):
             raise
-        failure = error  # such as one of several hosts
+        failure = error  # such as one of several hosts or regions
+        warn(f'{name}: {error}')
     # it may have no tags, or not be able to search where the machine is
     ids = {machine.id for machine in matches}
     for record in records:
-        if record.provider == name and record.machine_id not in ids:
+        if record.machine_id not in ids:
             try:
                 if record.machine_id:
                     matches.append(provider.describe(record.machine_id))
                 elif failure is not None:
-                    raise failure  # the machine may be where nobody answered
+                    silent.append(record.name)  # the machine may be where nobody answered
             except MachineNotFound:
                 pass
             except FogError as error:
-                warn(f'{name}: {error}')
+                if failure is None:
+                    warn(f'{name}: {error}')
                 silent.append(record.name)
     return Answer(matches, silent)
 

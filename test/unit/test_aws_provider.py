@@ -273,6 +273,20 @@ def test_a_foreign_id_is_no_machine(text):
         AWSProvider().describe(text)
 
 
+def test_silent_region_hides_no_machine_of_another():
+    def find(region):
+        if region == 'us-east-1':
+            raise ProviderError('us-east-1 does not answer')
+        return [region]
+
+    provider = AWSProvider()
+    provider.search_in(['us-east-1', 'eu-central-1'])
+    answers = provider.everywhere(provider.cloud, find)
+    assert next(answers) == ['eu-central-1']
+    with pytest.raises(ProviderError, match='us-east-1'):
+        next(answers)
+
+
 # -- who comes in -------------------------------------------------------------------------------
 
 

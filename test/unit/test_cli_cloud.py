@@ -180,6 +180,23 @@ def test_unconfigured_provider_is_not_asked(capsys: pytest.CaptureFixture[str]) 
     assert 'slam' in capsys.readouterr().out
 
 
+def test_machine_is_deleted_while_another_region_is_silent(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    def find(self: Cloud, tags: Mapping[str, str]) -> Iterable[Machine]:
+        raise Silent('us-east-1 does not answer', '', unsent=False)
+
+    machine('slam')
+    record('slam')
+    monkeypatch.setattr(Cloud, 'find', find)
+    assert run('delete', 'slam', '--yes') == 0
+    assert not Cloud.machines and not Store().exists('slam')
+    assert capsys.readouterr().err == 'cloud: us-east-1 does not answer\n'
+    record('lost', machine_id=None)  # it may be in that region
+    assert run('delete', 'lost', '--yes') == 1
+    assert Store().exists('lost')
+
+
 # -- what a user sees ---------------------------------------------------------------------
 
 

@@ -383,12 +383,14 @@ class VmProvider(Provider):
         regions = [region for region in self._named_regions() if region != ALL]
         return self.cloud.default_region() or (*regions, self.cloud.base_region)[0]
 
-    def everywhere(self, cloud: VmCloud, question: Callable[[str], T]) -> Iterable[T]:
+    def everywhere(self, cloud: VmCloud, question: Callable[[str], T]) -> Iterator[T]:
         """
-        Ask all regions at the same time; return their answers.
+        Ask all regions at the same time; yield their answers.
 
         A region that the account must not use has no machine of ours. Its refusal is an error
         only if the user has named the region, or if no region answers.
+
+        :raises FogError: a region does not answer, after the answers of all others.
         """
         regions = self._named_regions()
         named = bool(regions) and ALL not in regions
@@ -404,11 +406,11 @@ class VmProvider(Provider):
         with ThreadPoolExecutor(min(PARALLEL, len(regions)), 'fog-regions') as pool:
             answers = list(pool.map(attempt, regions))
         results = [answer for answer, error in answers if answer is not None]
+        yield from results
         for _, error in answers:
             denied = isinstance(error, CloudError) and error.denied
             if error is not None and (named or not results or not denied):
                 raise error
-        return results
 
     def _region(self, options: VmOptions) -> str:
         """
