@@ -350,6 +350,12 @@ def test_refusal_tells_what_can_be_tried(status, reason, full, certain):
     assert 'creating it failed' in str(error)
 
 
+def test_page_of_googles_front_end_is_a_temporary_fault():
+    error = failures.refused(502, '<!DOCTYPE html>\n<title>Error 502</title>', 'creating it')
+    assert str(error) == 'creating it failed: Google answered with status 502'
+    assert (error.temporary, error.refused) == (True, False)
+
+
 @pytest.mark.parametrize(('status', 'found', 'kind', 'words'), [
     (401, answer('authError'), PrerequisiteError, 'gcloud auth application-default login'),
     (403, answer('accessNotConfigured'), PrerequisiteError, 'gcloud services enable'),

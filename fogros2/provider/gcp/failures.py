@@ -52,7 +52,7 @@ def refused(status: int, answer: Any, what: str) -> FogError:
     """
     Return the error for a refused request.
 
-    :param answer: the answer, decoded from JSON; anything from a proxy.
+    :param answer: the answer, decoded from JSON; a page from a proxy, or of a fault at Google.
     """
     try:
         error = answer['error']
@@ -60,7 +60,9 @@ def refused(status: int, answer: Any, what: str) -> FogError:
         message = str(error.get('message') or '')
         code = re.sub('([a-z])([A-Z])', r'\1_\2', str(details.get('reason') or '')).upper()
     except (TypeError, KeyError, AttributeError, IndexError):
-        return not_the_cloud('Google', what, status)
+        if status < 500:
+            return not_the_cloud('Google', what, status)
+        error, message, code = {}, f'Google answered with status {status}', ''
     if status == 401:
         code = 'AUTH_ERROR'
     elif status == 404 and re.search(r"resource 'projects/[^/']+'", message):

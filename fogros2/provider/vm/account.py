@@ -96,7 +96,7 @@ class Account:
                     raise
                 pause = PAUSE * 2 ** (attempt - 1) if error.pause is None else error.pause
             except FogError as error:
-                error.refused = not unsure and not (sent and isinstance(error, Cancelled))
+                error.refused = not unsure and not (sent and error.refused is False)
                 raise
             (self.cancel or threading.Event()).wait(min(pause, LONGEST))
         raise AssertionError('the last attempt returns or raises')

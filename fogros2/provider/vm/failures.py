@@ -172,8 +172,14 @@ def one_line(text: object) -> str:
     return ' '.join(str(text).split())[:LENGTH]
 
 
-def not_the_cloud(title: str, what: str, status: object = '') -> FogError:
-    """Return the error for an answer that only another server can have given."""
+def not_the_cloud(title: str, what: str, status: int = 0) -> FogError:
+    """
+    Return the error for an answer that a cloud does not give.
+
+    :param status: of HTTP; 0 if it is unknown.
+    """
     detail = f' (HTTP {status})' if status else ''
-    return PrerequisiteError(f'{what} failed: what answered is not {title}{detail}',
-                             'is there a proxy, or a page to log in to this network?')
+    error = PrerequisiteError(f'{what} failed: what answered is not {title}{detail}',
+                              'is there a proxy, or a page to log in to this network?')
+    error.refused = status >= 300  # a damaged answer to a successful request looks the same
+    return error
