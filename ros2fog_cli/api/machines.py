@@ -336,7 +336,6 @@ def _ask(
     provider = load(name, regions, records)
     provider.cancel = cancel
     matches: list[Machine] = []
-    silent = []
     failure: Optional[FogError] = None
     try:
         for machine in provider.find(tags):
@@ -348,22 +347,27 @@ def _ask(
             raise
         failure = error  # such as one of several hosts or regions
         warn(f'{name}: {error}')
+
+    def look(record: Record) -> bool:
+        """Add a recorded machine, if it exists; return whether this is known."""
+        try:
+            if record.machine_id:
+                matches.append(provider.describe(record.machine_id))
+            # without an id, the machine may be where nobody answered
+            return bool(record.machine_id) or failure is None
+        except MachineNotFound:
+            return True
+        except FogError as error:
+            if failure is None:
+                warn(f'{name}: {error}')
+            return False
+
     # it may have no tags, or not be able to search where the machine is
     ids = {machine.id for machine in matches}
-    for record in records:
-        if record.machine_id not in ids:
-            try:
-                if record.machine_id:
-                    matches.append(provider.describe(record.machine_id))
-                elif failure is not None:
-                    silent.append(record.name)  # the machine may be where nobody answered
-            except MachineNotFound:
-                pass
-            except FogError as error:
-                if failure is None:
-                    warn(f'{name}: {error}')
-                silent.append(record.name)
-    return Answer(matches, silent)
+    others = [record for record in records if record.machine_id not in ids]
+    with ThreadPoolExecutor(16, 'fog-ask') as pool:
+        known = list(pool.map(look, others))
+    return Answer(matches, [record.name for record, sure in zip(others, known) if not sure])
 
 
 def load(

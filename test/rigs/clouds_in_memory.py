@@ -103,11 +103,13 @@ class Memory(abc.ABC):
     ) -> None:
         """Let a request fail if ``refused`` returns True for its method."""
         import requests
+        import urllib3
         send = requests.Session.request
 
         def sent(own: Any, method: str, *words: Any, **options: Any) -> Any:
             if refused(method):
-                raise requests.ConnectTimeout('the test cuts the network')
+                raise requests.ConnectTimeout(urllib3.exceptions.MaxRetryError(
+                    urllib3.HTTPConnectionPool('cloud'), '/', OSError('the network is cut')))
             return send(own, method, *words, **options)
 
         patch.setattr(requests.Session, 'request', sent)

@@ -3,14 +3,30 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 
 from fogros2.errors import PrerequisiteError
 from fogros2.provider.gcp import account as gcp
+from fogros2.provider.vm import account
+from fogros2.provider.vm.failures import Silent
 from rigs import serving
 
 #: A page of Google's front end.
 PAGE = '<!DOCTYPE html>\n<title>Error 502 (Server Error)!!1</title>'
+
+
+class Clock(threading.Event):
+    """A cancel that never comes, whose waits take no time."""
+
+    now = 0.0
+
+    def monotonic(self):
+        return self.now
+
+    def wait(self, timeout=None):
+        self.now += timeout
 
 
 @pytest.fixture
@@ -40,3 +56,30 @@ def test_damaged_answer_leaves_open_whether_it_had_an_effect(answers):
         with pytest.raises(PrerequisiteError, match='is there a proxy') as caught:
             gcp.Account().call('POST', 'robots', 'creating it')
         assert caught.value.refused is refused
+
+
+@pytest.mark.parametrize(('unsent', 'hasty', 'times', 'attempts', 'refused'), [
+    (True, False, 1, 2, None), (True, False, 99, 4, True), (True, True, 99, 1, True),
+    (False, False, 99, 2, False)])
+def test_request_without_an_answer_is_made_again(
+    monkeypatch, unsent, hasty, times, attempts, refused,
+):
+    clock = Clock()
+    monkeypatch.setattr(account, 'time', clock)
+    failures = [Silent('no answer', '', unsent=unsent) for _ in range(times)]
+    asked = []
+
+    def send():
+        asked.append(clock.now)
+        if failures:
+            raise failures.pop()
+        return 'answer'
+
+    own = account.Account().having(clock, hasty=hasty)
+    if refused is None:
+        assert own.repeated(send, 'creating it', reads=False) == 'answer'
+    else:
+        with pytest.raises(Silent) as caught:
+            own.repeated(send, 'creating it', reads=False)
+        assert caught.value.refused is refused
+    assert asked == [0.0, 1.0, 3.0, 7.0][:attempts]

@@ -222,5 +222,5 @@ def _unsent(error: BaseException, where: str) -> FogError:
         return Silent(
             f'{where} failed: AWS does not answer: {message}',
             'does region= exist, and is there a way to the Internet (a proxy, AWS_ENDPOINT_URL)?',
-            unsent=not isinstance(error, (known.ReadTimeoutError, known.ConnectionClosedError)))
+            unsent=isinstance(error, known.ConnectionError))
     return ProviderError(f'{where} failed: {message}')

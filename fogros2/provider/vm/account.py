@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import copy
 import threading
+import time
 from typing import Any, Optional, TypeVar
 
 from fogros2.errors import Cancelled, FogError
@@ -16,6 +17,8 @@ from fogros2.waiting import cancellable, ON_ITS_WAY
 ATTEMPTS = 8
 #: Seconds of the first pause between attempts, which doubles, and of the longest.
 PAUSE, LONGEST = 1.0, 20.0
+#: Seconds for further attempts after one that did not leave this computer.
+UNSENT = 10.0
 
 Own = TypeVar('Own', bound='Account')
 T = TypeVar('T')
@@ -72,6 +75,7 @@ class Account:
         :raises FogError: with ``refused`` set to False if it may have had an effect.
         """
         sent = unsure = False
+        end = 0.0
 
         def ask() -> T:
             nonlocal sent
@@ -90,13 +94,19 @@ class Account:
                 sent = False
                 unsure = unsure or not error.refused
                 error.refused = not unsure
-                silent = isinstance(error, Silent)
-                if not error.temporary or silent and not repeatable \
-                        or attempt >= (2 if silent or self.hasty else ATTEMPTS):
+                pause = min(LONGEST, PAUSE * 2 ** (attempt - 1) if error.pause is None
+                            else error.pause)
+                if not isinstance(error, Silent):
+                    last = not error.temporary or self.hasty and attempt >= 2
+                elif error.unsent:
+                    end = end or time.monotonic() + UNSENT
+                    last = self.hasty or time.monotonic() + pause > end
+                else:
+                    last = not repeatable or attempt >= 2
+                if last or attempt == ATTEMPTS:
                     raise
-                pause = PAUSE * 2 ** (attempt - 1) if error.pause is None else error.pause
             except FogError as error:
                 error.refused = not unsure and not (sent and error.refused is False)
                 raise
-            (self.cancel or threading.Event()).wait(min(pause, LONGEST))
+            (self.cancel or threading.Event()).wait(pause)
         raise AssertionError('the last attempt returns or raises')

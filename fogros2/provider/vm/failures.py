@@ -115,7 +115,7 @@ class Silent(PrerequisiteError):
 
     def __init__(self, message: str, hint: str, *, unsent: bool) -> None:
         super().__init__(message, hint)
-        self.refused, self.temporary = unsent, not unsent
+        self.refused = self.unsent = unsent
 
 
 def settled(request: Callable[[], T], *codes: str, what: str) -> T:

@@ -69,6 +69,7 @@ class RestAccount(Account, abc.ABC):
         timeout: float,
     ) -> Answer:
         import requests
+        import urllib3
 
         head = {'Authorization': f'Bearer {self.token(what)}'}
         try:
@@ -76,7 +77,10 @@ class RestAccount(Account, abc.ABC):
                 method, url, params=query, json=body, headers=head, allow_redirects=False,
                 timeout=(5.0, 5.0 if self.hasty else timeout))
         except requests.RequestException as error:
-            raise self.silent(error, what, isinstance(error, requests.ConnectTimeout)) from error
+            # urllib3 gives up after its attempts to connect; a lost answer is another error
+            unsent = any(isinstance(each, urllib3.exceptions.MaxRetryError)
+                         for each in error.args)
+            raise self.silent(error, what, unsent) from error
         try:
             content = answer.json() if answer.content else None
         except ValueError:
@@ -92,7 +96,7 @@ class RestAccount(Account, abc.ABC):
         return Answer(answer.status_code, answer.headers, content)
 
     def silent(self, error: BaseException, what: str, unsent: bool = True) -> Silent:
-        """Return the error for a request without an answer; it is made again if it was sent."""
+        """Return the error for a request without an answer."""
         return Silent(
             f'{what} failed: {self.TITLE} does not answer: {one_line(error)}',
             f'is there a way to the Internet (a proxy, {self.ENDPOINT_VARIABLE})?', unsent=unsent)
