@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import datetime
 from decimal import Decimal
+import errno
 import gzip
 import ipaddress
 import json
@@ -324,14 +325,44 @@ def test_robot_address_is_asked_once_for_all_machines(echo):
 def test_a_robot_with_ipv6_is_let_in_by_that_too(echo, monkeypatch):
     _, said = echo
     monkeypatch.setattr(address, 'own_ipv6', lambda: '2001:db8::7/128')
-    said += [(200, '198.51.100.7\n'), (503, '')]
+    said.append((200, '198.51.100.7\n'))
     own = address.RobotAddress()
     assert own.with_ipv6([own()]) == ['198.51.100.7/32', '2001:db8::7/128']
     # what somebody has named is that alone, and nobody is nobody
     assert own.with_ipv6(['198.51.100.0/24']) == ['198.51.100.0/24']
     assert own.with_ipv6([]) == []
-    # and one that has nothing else is known by that
+
+
+def test_robot_is_known_by_ipv6_only_without_ipv4(echo, monkeypatch):
+    _, said = echo
+    said += 2 * [(503, '')]
+    monkeypatch.setattr(address, 'own_ipv6', lambda: '2001:db8::7/128')
+    monkeypatch.setattr(address, 'has_ipv4', lambda: True)
+    with pytest.raises(ProviderError, match=f'503.*{address.ADDRESS_VARIABLE}'):
+        address.RobotAddress()()
+    monkeypatch.setattr(address, 'has_ipv4', lambda: False)
     assert address.RobotAddress()() == '2001:db8::7/128'
+
+
+@pytest.mark.parametrize('routed', [True, False])
+def test_computer_with_a_route_has_ipv4(monkeypatch, routed):
+    class Probe(socket.socket):
+        def connect(self, far):
+            assert ipaddress.ip_address(far[0]).is_global
+            if not routed:
+                raise OSError(errno.ENETUNREACH, 'no route')
+
+    monkeypatch.setattr(address.socket, 'socket', Probe)
+    assert address.has_ipv4() is routed
+
+
+@pytest.mark.parametrize('url', ['checkip.example', 'http://a b/'])
+def test_wrong_address_of_the_service_has_a_hint(monkeypatch, url):
+    monkeypatch.setenv(address.CHECKIP_VARIABLE, url)
+    monkeypatch.delenv(address.ADDRESS_VARIABLE, raising=False)
+    monkeypatch.setattr(address, 'has_ipv4', lambda: True)
+    with pytest.raises(ProviderError, match=address.ADDRESS_VARIABLE):
+        address.RobotAddress()()
 
 
 @pytest.mark.parametrize('own, known', [

@@ -20,8 +20,8 @@ ADDRESS_VARIABLE = 'FOGROS2_ROBOT_ADDRESS'
 CHECKIP, CHECKIP_VARIABLE = 'https://checkip.amazonaws.com', 'FOGROS2_AWS_CHECKIP'
 #: Seconds for which an answer is used again, so that machines of one launch ask once.
 ADDRESS_AGE = 5.0
-#: A public address, to which the system chooses a route; nothing is sent.
-FAR_IPV6 = ('2600:1f18::1', 22)
+#: Public addresses, to which the system chooses a route; nothing is sent.
+FAR_IPV4, FAR_IPV6 = ('3.80.0.1', 22), ('2600:1f18::1', 22)
 
 
 class RobotAddress:
@@ -56,20 +56,32 @@ class RobotAddress:
         return [*named, *([own] if own else [])]
 
     def _ask(self, url: str) -> str:
-        import urllib.request  # ssl and email too: 10 ms that a listing does not need
+        # ssl and email too: 10 ms that a listing does not need
+        from http.client import HTTPException
+        import urllib.request
         hint = f'{ADDRESS_VARIABLE}=... names it'
         try:
             with urllib.request.urlopen(url, timeout=5.0) as answer:
                 text = answer.read(100).decode('ascii', 'replace').strip()
-            return cidr(str(ipaddress.ip_address(text)))
-        except OSError as error:
-            own = own_ipv6()
+        except (OSError, HTTPException, ValueError) as error:
+            # a computer without IPv4 reaches only machines with IPv6
+            own = '' if has_ipv4() else own_ipv6()
             if own:
-                return own  # a computer without IPv4 reaches only machines with IPv6
+                return own
             raise ProviderError(
                 f"{url} did not return this robot's public address: {error}", hint) from error
+        try:
+            return cidr(str(ipaddress.ip_address(text)))
         except ValueError as error:
             raise ProviderError(f"{url} returned '{text[:40]}', not an address", hint) from error
+
+
+def has_ipv4() -> bool:
+    """Return whether this computer has a route to public IPv4 addresses; send nothing."""
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(FAR_IPV4)
+        return True
+    return False
 
 
 def own_ipv6() -> str:
