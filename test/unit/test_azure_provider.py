@@ -8,6 +8,8 @@ import dataclasses
 from decimal import Decimal
 import json
 import re
+import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -18,6 +20,7 @@ from fogros2.provider.azure import account, ending, failures, login, machines, p
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
 from fogros2.provider.vm.cloud import Order, Place
+from fogros2.provider.vm.failures import Silent
 from fogros2.provider.vm.rest import Answer
 from rigs.azure import catalogue, schema
 
@@ -220,6 +223,45 @@ def test_subscription_is_that_of_the_environment_or_of_the_login(monkeypatch, tm
     assert login.configured() and account.subscription() == 'two'
     monkeypatch.setenv('AZURE_SUBSCRIPTION_ID', 'three')
     assert account.subscription() == 'three'
+
+
+class Credential:
+    """
+    A credential of azure-identity that keeps no token.
+
+    :param answers: tokens' ends in seconds from now, or errors.
+    """
+
+    def __init__(self, *answers):
+        self.answers = [*answers]
+
+    def get_token(self, *scopes, **_):
+        answer = self.answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return SimpleNamespace(token=f'until {answer}', expires_on=int(time.time() + answer))
+
+
+def test_token_is_kept_as_long_as_it_is_valid(monkeypatch):
+    pytest.importorskip('azure.core')
+    credential, own = Credential(60, 3600), account.Account()
+    monkeypatch.setattr(own, 'credential', lambda: credential)
+    assert [own.having(None).token('asking') for _ in range(5)] == [
+        'until 60', *4 * ['until 3600']]
+
+
+@pytest.mark.parametrize(('error', 'kind', 'words'), [
+    ("it failed: Failed to resolve 'login.example'", Silent, "er: Failed to resolve 'login.ex"),
+    ('it failed: AADSTS7000215', PrerequisiteError, 'there are no credentials')])
+def test_token_without_a_network_is_no_lack_of_credentials(monkeypatch, error, kind, words):
+    identity = pytest.importorskip('azure.identity')
+    from azure.core.exceptions import ClientAuthenticationError
+    own = account.Account()
+    chain = identity.ChainedTokenCredential(Credential(ClientAuthenticationError(error)))
+    monkeypatch.setattr(own, 'credential', lambda: chain)
+    with pytest.raises(PrerequisiteError, match=re.escape(words)) as caught:
+        own.token('asking')
+    assert type(caught.value) is kind
 
 
 @pytest.mark.parametrize(('link', 'followed'), [

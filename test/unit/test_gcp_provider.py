@@ -24,6 +24,7 @@ from fogros2.provider.gcp.options import Options
 from fogros2.provider.gcp.provider import GCPProvider
 from fogros2.provider.vm import cloud
 from fogros2.provider.vm.cloud import Order, Place
+from fogros2.provider.vm.failures import Silent
 from fogros2.waiting import wait_until
 from fogros2_features.images.keepers import image_keeper
 from fogros2_features.prices.market import seller
@@ -393,6 +394,26 @@ def test_running_launch_takes_a_new_login(gce, monkeypatch, tmp_path):
         user.token('asking')
     shutil.copy(valid, file)
     assert user.token('asking').startswith('ya29.')
+
+
+@pytest.mark.parametrize(('text', 'retryable', 'kind'), [
+    ('<!DOCTYPE html>\n<title>Error 502</title>', False, Silent),
+    ('internal_failure: None', True, Silent),
+    ('invalid_grant: Bad\nRequest', False, PrerequisiteError)])
+def test_fault_of_the_token_server_is_no_refusal(gce, monkeypatch, text, retryable, kind):
+    from google.auth.exceptions import RefreshError
+    from google.oauth2.service_account import Credentials
+    timeouts = []
+
+    def refresh(own, request):
+        timeouts.append(request.keywords['timeout'])
+        raise RefreshError(text, retryable=retryable)
+
+    monkeypatch.setattr(Credentials, 'refresh', refresh)
+    with pytest.raises(PrerequisiteError) as caught:
+        account.Account().token('asking')
+    assert type(caught.value) is kind and '\n' not in str(caught.value)
+    assert timeouts == 2 * [(5.0, 30.0)]
 
 
 def test_project_is_that_of_the_options_first(gce, monkeypatch):

@@ -6,7 +6,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 import json
 import os
+import re
 import threading
+import time
 from typing import Any, Optional
 from urllib.parse import urlsplit
 
@@ -29,6 +31,12 @@ VERSIONS = {
     '': '2022-09-01'}
 #: Seconds for an operation; the deletion of a group takes a minute or two.
 OPERATION = 900.0
+#: Seconds before its end at which a token is renewed.
+EARLY = 300.0
+#: In azure-identity's messages: it has no way to a server. Its exceptions do not tell.
+_NO_WAY = re.compile(
+    'Failed to resolve.*|Failed to establish.*|Max retries exceeded.*|timed out.*|'
+    'Connection aborted.*')
 
 
 def endpoint() -> str:
@@ -81,7 +89,9 @@ class Account(RestAccount):
                 'machines at Azure take azure-identity, which is not installed',
                 'python3 -m pip install azure-identity requests') from error
         with self._lock:
-            return self.once('credential', DefaultAzureCredential)
+            # ``repeated`` connects again
+            return self.once('credential', lambda: DefaultAzureCredential(
+                connection_timeout=5.0, read_timeout=30.0, retry_connect=0))
 
     def path(self, group: str = '', rest: str = '') -> str:
         """Return the path of a resource of a group, or of the subscription."""
@@ -176,21 +186,25 @@ class Account(RestAccount):
         return refusal(status, body, what)
 
     def token(self, what: str) -> str:
-        """Return a token, which the library keeps as long as it is valid."""
+        """Return a token, which is kept as long as it is valid: some credentials keep none."""
         from azure.core.exceptions import AzureError as LibraryError
         from azure.core.exceptions import ClientAuthenticationError
 
-        credential = self.credential()
+        credential, scope = self.credential(), f'{endpoint()}/.default'
         try:
-            return str(credential.get_token(f'{endpoint()}/.default').token)
-        except ClientAuthenticationError as error:
+            with self._lock:
+                token = self._known.get(scope)
+                if token is None or token.expires_on < time.time() + EARLY:
+                    token = self._known[scope] = credential.get_token(scope)
+            return str(token.token)
+        except LibraryError as error:
+            reason = _NO_WAY.search(str(error))
+            if reason or not isinstance(error, ClientAuthenticationError):
+                raise self.silent(reason[0] if reason else error, what) from error
             raise PrerequisiteError(
                 f'{what} failed: there are no credentials for Azure: {one_line(error)}',
                 'az login, or set AZURE_TENANT_ID, AZURE_CLIENT_ID and AZURE_CLIENT_SECRET',
             ) from error
-        except LibraryError as error:
-            raise PrerequisiteError(f'{what} failed: Azure gives no token: {one_line(error)}',
-                                    'is there a way to the Internet (a proxy)?') from error
 
 
 def _server(url: str) -> str:

@@ -14,7 +14,7 @@ import warnings
 
 from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.gcp import failures, login
-from fogros2.provider.vm.failures import tolerated, unless_gone, wait_through
+from fogros2.provider.vm.failures import one_line, tolerated, unless_gone, wait_through
 from fogros2.provider.vm.rest import RestAccount
 
 #: The API, and gcloud's own variable that names another address.
@@ -116,7 +116,8 @@ class Account(RestAccount):
 
         def renew() -> None:
             if not credentials.valid:
-                credentials.refresh(cast(Any, Request)())
+                credentials.refresh(functools.partial(
+                    cast(Any, Request)(), timeout=(5.0, 5.0 if self.hasty else 30.0)))
 
         try:
             with _RENEWING:
@@ -128,11 +129,14 @@ class Account(RestAccount):
                     credentials, _ = self._opened()
                     renew()
             return str(credentials.token)
-        except TransportError as error:
-            raise self.silent(error, what) from error
         except GoogleAuthError as error:
+            # a page is no refusal: those are JSON
+            if isinstance(error, TransportError) or error.retryable \
+                    or str(error).lstrip().startswith('<'):
+                raise self.silent(error, what) from error
             raise PrerequisiteError(
-                f'{what} failed: Google does not take these credentials: {error.args[0]}',
+                f'{what} failed: Google does not take these credentials: '
+                f'{one_line(error.args[0])}',
                 'gcloud auth application-default login; is the clock of this computer right?',
             ) from error
 

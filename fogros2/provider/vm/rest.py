@@ -95,8 +95,8 @@ class RestAccount(Account, abc.ABC):
             raise not_the_cloud(self.TITLE, what, answer.status_code)
         return Answer(answer.status_code, answer.headers, content)
 
-    def silent(self, error: BaseException, what: str, unsent: bool = True) -> Silent:
+    def silent(self, reason: object, what: str, unsent: bool = True) -> Silent:
         """Return the error for a request without an answer."""
         return Silent(
-            f'{what} failed: {self.TITLE} does not answer: {one_line(error)}',
+            f'{what} failed: {self.TITLE} does not answer: {one_line(reason)}',
             f'is there a way to the Internet (a proxy, {self.ENDPOINT_VARIABLE})?', unsent=unsent)
