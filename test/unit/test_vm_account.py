@@ -8,6 +8,8 @@ import threading
 import pytest
 
 from fogros2.errors import PrerequisiteError
+from fogros2.provider.aws import clients
+from fogros2.provider.azure import account as azure
 from fogros2.provider.gcp import account as gcp
 from fogros2.provider.vm import account
 from fogros2.provider.vm.failures import Silent
@@ -31,7 +33,7 @@ class Clock(threading.Event):
 
 @pytest.fixture
 def answers(hasty, loopback_only, monkeypatch):
-    """Serve the answers of a list as Google, one after the other: status and body."""
+    """Serve the answers of a list as all clouds, one after the other: status and body."""
     said = []
 
     def answer(environ, start_response):
@@ -39,9 +41,13 @@ def answers(hasty, loopback_only, monkeypatch):
         start_response(f'{status} {status}', [('Content-Length', str(len(body)))])
         return [body.encode()]
 
-    monkeypatch.setattr(gcp.Account, 'token', lambda *_: 'secret')
     with serving.serve(answer) as url:
-        monkeypatch.setenv(gcp.ENDPOINT_VARIABLE, url)
+        for module in (azure, gcp):
+            monkeypatch.setattr(module.Account, 'token', lambda *_: 'secret')
+            monkeypatch.setenv(module.ENDPOINT_VARIABLE, url)
+        for name, value in {'AWS_ACCESS_KEY_ID': 'x', 'AWS_SECRET_ACCESS_KEY': 'x',
+                            'AWS_ENDPOINT_URL': url}.items():
+            monkeypatch.setenv(name, value)
         yield said
 
 
@@ -51,11 +57,26 @@ def test_page_of_a_fault_is_no_answer_yet(answers):
 
 
 def test_damaged_answer_leaves_open_whether_it_had_an_effect(answers):
-    for status, body, refused in ((200, PAGE, False), (407, PAGE, True)):
+    for status, body, refused in ((200, PAGE, False), (200, '', False), (407, PAGE, True)):
         answers.append((status, body))
         with pytest.raises(PrerequisiteError, match='is there a proxy') as caught:
-            gcp.Account().call('POST', 'robots', 'creating it')
+            gcp.Account().run('POST', 'robots', 'creating it')
         assert caught.value.refused is refused
+
+
+@pytest.mark.parametrize(('ask', 'body'), [
+    (lambda: list(azure.Account().pages('/things', 'looking')), ''),
+    (lambda: azure.Account().call('PUT', '/things', 'looking')['id'], ''),
+    (lambda: gcp.Account().call('GET', 'robots', 'looking')['name'], '{}'),
+    (lambda: list(clients.Account().pages(
+        'pricing', 'us-east-1', 'get_products', 'PriceList', 'looking', ServiceCode='AmazonEC2',
+    )), '{"PriceList": ["{'),
+    (lambda: clients.Account().call(
+        'ssm', 'us-east-1', 'get_parameter', 'looking', Name='image')['Parameter'], '')])
+def test_incomplete_answer_is_a_known_error(answers, ask, body):
+    answers.append((200, body))
+    with pytest.raises(PrerequisiteError, match='looking failed: what answered is not'):
+        ask()
 
 
 @pytest.mark.parametrize(('unsent', 'hasty', 'times', 'attempts', 'refused'), [

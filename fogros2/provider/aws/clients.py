@@ -14,7 +14,7 @@ from typing import Any, Optional, TypeVar
 from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.aws.failures import Expired, translated
 from fogros2.provider.vm import account as vm
-from fogros2.provider.vm.failures import SETTLING, unless_gone
+from fogros2.provider.vm.failures import Fields, SETTLING, unless_gone
 
 T = TypeVar('T')
 
@@ -102,10 +102,9 @@ class Account(vm.Account):
         :param operation: as boto3's method is called.
         :raises FogError: see :func:`~fogros2.provider.aws.failures.translated`.
         """
-        answer: Mapping[str, Any] = self._ask(
-            lambda client: getattr(client, operation)(**parameters), service, region, operation,
-            what)
-        return answer
+        return self._ask(
+            lambda client: Fields(getattr(client, operation)(**parameters), 'AWS', what), service,
+            region, operation, what)
 
     def remove(self, region: str, operation: str, what: str, **parameters: Any) -> None:
         """Make a call of EC2 that deletes something; it may be deleted already."""
@@ -119,7 +118,7 @@ class Account(vm.Account):
         """Yield what all pages of an answer have under ``key``."""
         def ask(client: Any) -> list[Mapping[str, Any]]:
             return [entry for page in client.get_paginator(operation).paginate(**parameters)
-                    for entry in page[key]]
+                    for entry in Fields(page, 'AWS', what)[key]]
 
         yield from self._ask(ask, service, region, operation, what)
 

@@ -73,6 +73,8 @@ def refusal(status: int, body: Any, what: str) -> FogError:
     :param body: the answer's JSON, with the error of ARM or of a long-running operation.
     """
     error = body.get('error', body) if isinstance(body, Mapping) else {}
+    if not isinstance(error, Mapping):
+        error = {'message': error or ''}
     code, message = str(error.get('code', '')), one_line(error.get('message', ''))
     for part in error.get('details') or ():
         # the outer code of a failed operation says only that it failed

@@ -14,7 +14,13 @@ import warnings
 
 from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.gcp import failures, login
-from fogros2.provider.vm.failures import one_line, tolerated, unless_gone, wait_through
+from fogros2.provider.vm.failures import (
+    Fields,
+    one_line,
+    tolerated,
+    unless_gone,
+    wait_through,
+)
 from fogros2.provider.vm.rest import RestAccount
 
 #: The API, and gcloud's own variable that names another address.
@@ -159,7 +165,7 @@ class Account(RestAccount):
             query.setdefault('requestId', str(uuid.uuid4()))
         answer: dict[str, Any] = self.ask(
             method, f'{self.endpoint}projects/{path}', what, body, query=query, grace=not waits,
-            timeout=WAIT_TIMEOUT if waits else 30.0).body or {}
+            timeout=WAIT_TIMEOUT if waits else 30.0).body or Fields({}, self.TITLE, what)
         return answer
 
     def run(

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import time
-from typing import Any, ClassVar, Literal, NamedTuple, Optional, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, NoReturn, Optional, TypeVar
 
 from fogros2.errors import DeadlineExceeded, FogError, PrerequisiteError, ProviderError
 from fogros2.provider.vm.cloud import CloudError
@@ -183,3 +183,18 @@ def not_the_cloud(title: str, what: str, status: int = 0) -> FogError:
                               'is there a proxy, or a page to log in to this network?')
     error.refused = status >= 300  # a damaged answer to a successful request looks the same
     return error
+
+
+class Fields(dict[str, Any]):
+    """
+    The fields of a cloud's answer.
+
+    :raises PrerequisiteError: a field that is looked up is missing, so the answer is damaged.
+    """
+
+    def __init__(self, answer: Mapping[str, Any], title: str, what: str) -> None:
+        super().__init__(answer)
+        self._title, self._what = title, what
+
+    def __missing__(self, field: str) -> NoReturn:
+        raise not_the_cloud(self._title, self._what)

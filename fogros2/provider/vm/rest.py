@@ -10,12 +10,12 @@ from typing import Any, ClassVar, NamedTuple, Optional
 
 from fogros2.errors import FogError
 from fogros2.provider.vm.account import Account
-from fogros2.provider.vm.failures import CodedError, not_the_cloud, one_line, Silent
+from fogros2.provider.vm.failures import CodedError, Fields, not_the_cloud, one_line, Silent
 from fogros2.waiting import ON_ITS_WAY
 
 
 class Answer(NamedTuple):
-    """An answer: HTTP status, headers, and the JSON of the body, None without one."""
+    """An answer: HTTP status, headers, and the JSON of the body, None if it needs none."""
 
     status: int
     headers: Mapping[str, str]
@@ -93,6 +93,8 @@ class RestAccount(Account, abc.ABC):
             raise refused
         if content is not None and not isinstance(content, dict):
             raise not_the_cloud(self.TITLE, what, answer.status_code)
+        if content is not None or method in ('GET', 'PUT') and answer.status_code != 202:
+            content = Fields(content or {}, self.TITLE, what)
         return Answer(answer.status_code, answer.headers, content)
 
     def silent(self, reason: object, what: str, unsent: bool = True) -> Silent:
