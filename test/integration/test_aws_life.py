@@ -12,6 +12,8 @@ import threading
 import uuid
 
 import boto3
+from botocore.exceptions import ReadTimeoutError
+from botocore.httpsession import URLLib3Session
 import pytest
 
 from fogros2.errors import (
@@ -29,6 +31,7 @@ from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.aws.failures import AwsError
 from fogros2.provider.aws.provider import AWSProvider
 from fogros2_features.images.keepers import image_keeper
+from fogros2_features.volumes.keepers import volume_keeper
 from fogros2_testing.provider_contract import PUBLIC_KEY
 from rigs.ec2 import iam
 from rigs.ec2.watched import ec2, left, NOTHING, Watched
@@ -526,6 +529,57 @@ def test_a_machine_that_ends_while_it_comes_up_says_why(aws):
     ec2().terminate_instances(InstanceIds=[machine_id.split('/')[1]])
     with pytest.raises(ProviderError, match='ended while it was coming up: Client.User'):
         aws.provider.reachable(machine_id, name='planner', timeout=20)
+
+
+# -- lost answers -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def lose(aws, monkeypatch):
+    """Lose the answer to an action, and refuse its repetition with a code."""
+    def lose(action, code):
+        def sent(own, request):
+            answer = send(own, request)
+            if f'Action={action}&' in str(request.body):
+                aws.refuse(action, code)
+                raise ReadTimeoutError(endpoint_url=request.url)
+            return answer
+
+        send = URLLib3Session.send
+        monkeypatch.setattr(URLLib3Session, 'send', sent)
+
+    return lose
+
+
+def test_image_without_an_answer_is_made_once(aws, lose):
+    machine_id = aws.provider.create(*ask())
+    lose('CreateImage', 'InvalidAMIName.Duplicate')
+    made = image_keeper(aws.provider).bake(machine_id, 'planner', 'abcd')
+    assert [image.id for image in image_keeper(aws.provider).images()] == [made]
+    image_keeper(aws.provider).delete_image(made)
+
+
+def test_volume_without_an_answer_is_attached_and_detached(aws, lose):
+    machine_id = aws.provider.create(*ask())
+    keeper = volume_keeper(aws.provider)
+    lose('AttachVolume', 'VolumeInUse')
+    keeper.attach(machine_id, 'models', 60)
+    (volume,) = keeper.volumes()
+    assert volume.user == machine_id.split('/')[1]
+    lose('DetachVolume', 'IncorrectState')
+    keeper.detach(machine_id, 'models')
+    assert [volume.user for volume in keeper.volumes()] == ['']
+
+
+def test_group_without_an_answer_is_waited_for(aws, lose, monkeypatch):
+    groups, lagging = Ec2._groups, [[]]
+    monkeypatch.setattr(Ec2, '_groups', lambda *words: (
+        lagging.pop() if lagging else groups(*words)))
+    lose('CreateSecurityGroup', 'InvalidGroup.Duplicate')
+    machine_id = aws.provider.create(*ask())
+    assert not lagging
+    aws.provider.destroy(machine_id)
+    assert left() == NOTHING
 
 
 # -- rights -------------------------------------------------------------------------------------

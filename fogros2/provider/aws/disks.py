@@ -10,7 +10,9 @@ import uuid
 
 from fogros2.provider.aws import instances
 from fogros2.provider.aws.clients import Account
+from fogros2.provider.aws.failures import AwsError
 from fogros2.provider.vm.cloud import Disk, TAG_VOLUME, VmCloud, VmId
+from fogros2.provider.vm.failures import tolerated
 
 #: Names of devices that EC2 recommends for data.
 _DEVICES = [f'/dev/sd{letter}' for letter in 'fghijklmnop']
@@ -48,26 +50,36 @@ class Ec2Disks(VmCloud):
                 {TAG_VOLUME: name, 'Name': f'fogros2 {name}'})}])['VolumeId'])
 
     def attach_disk(self, machine: VmId, disk: Disk) -> tuple[str, ...]:
-        taken = {str(entry['DeviceName']): str(entry['Ebs']['VolumeId'])
-                 for entry in self._instance(machine).get('BlockDeviceMappings') or ()}
+        taken = self._devices(machine)
         device = next((name for name, held in taken.items() if held == disk.id), '')
         if not device:
             device = next(name for name in _DEVICES if name not in taken)
-            self._account.call(
-                'ec2', machine.region, 'attach_volume', f"attaching the volume '{disk.name}'",
-                VolumeId=disk.id, InstanceId=machine.vm, Device=device)
+            try:
+                self._account.call(
+                    'ec2', machine.region, 'attach_volume', f"attaching the volume '{disk.name}'",
+                    VolumeId=disk.id, InstanceId=machine.vm, Device=device)
+            except AwsError:
+                # the answer to the first attempt may have been lost
+                if self._devices(machine).get(device) != disk.id:
+                    raise
         # by the disk's number, which Nitro's NVMe tells; by name on older instances
         return (f'/dev/disk/by-id/nvme-Amazon_Elastic_Block_Store_{disk.id.replace("-", "")}',
                 device.replace('sd', 'xvd'), device)
 
     def detach_disk(self, machine: VmId, disk: Disk) -> None:
-        self._account.call(
-            'ec2', machine.region, 'detach_volume', f"detaching the volume '{disk.name}'",
-            VolumeId=disk.id, InstanceId=machine.vm)
+        with tolerated('IncorrectState'):  # it is detached
+            self._account.call(
+                'ec2', machine.region, 'detach_volume', f"detaching the volume '{disk.name}'",
+                VolumeId=disk.id, InstanceId=machine.vm)
 
     def delete_disk(self, disk: Disk) -> None:
         self._account.remove(disk.region, 'delete_volume', f"deleting the volume '{disk.name}'",
                              VolumeId=disk.id)
+
+    def _devices(self, machine: VmId) -> dict[str, str]:
+        """Return the ids of a machine's disks by their devices."""
+        return {str(entry['DeviceName']): str(entry['Ebs']['VolumeId'])
+                for entry in self._instance(machine).get('BlockDeviceMappings') or ()}
 
     def _instance(self, machine: VmId) -> Mapping[str, Any]:
         return instances.instances_in(self._account.call(

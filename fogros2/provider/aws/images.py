@@ -16,8 +16,9 @@ from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import instance_type
 from fogros2.provider.machine_types import MachineType
 from fogros2.provider.vm.cloud import TAG_BAKED, TAG_DRIVER, TAG_USER, VmCloud, VmId, when
-from fogros2.provider.vm.failures import unless_gone
+from fogros2.provider.vm.failures import SETTLING, tolerated, unless_gone
 from fogros2.provider.vm.images import check_baked, Image, image_parts, image_tags
+from fogros2.waiting import wait_until
 
 #: Public parameters of AWS's parameter store, by architecture; ROS 2 Jazzy is for Ubuntu 24.04.
 UBUNTU = {
@@ -137,15 +138,24 @@ class Ec2Images(VmCloud):
         # names are unique in a region
         stamp = time.strftime('%Y%m%d-%H%M%S', time.gmtime())
         plain = re.sub(r"[^A-Za-z0-9()\[\] ./'@_-]", '-', name)[:80]
-        answer = self._account.call(
-            'ec2', vm.region, 'create_image', what,
-            InstanceId=vm.id, Name=f'fogros2-{plain}-{stamp}', NoReboot=True,
-            Description=f'FogROS2: {plain}',
-            **({'BlockDeviceMappings': [{'DeviceName': device, 'NoDevice': ''}
-                                        for device in others]} if others else {}),
-            TagSpecifications=[{'ResourceType': 'image', 'Tags': listed},
-                               {'ResourceType': 'snapshot', 'Tags': listed}])
-        return f'aws:{vm.region}/{answer["ImageId"]}'
+        unique = f'fogros2-{plain}-{stamp}'
+        with tolerated('InvalidAMIName.Duplicate'):
+            answer = self._account.call(
+                'ec2', vm.region, 'create_image', what,
+                InstanceId=vm.id, Name=unique, NoReboot=True, Description=f'FogROS2: {plain}',
+                **({'BlockDeviceMappings': [{'DeviceName': device, 'NoDevice': ''}
+                                            for device in others]} if others else {}),
+                TagSpecifications=[{'ResourceType': 'image', 'Tags': listed},
+                                   {'ResourceType': 'snapshot', 'Tags': listed}])
+            return f'aws:{vm.region}/{answer["ImageId"]}'
+        # the answer to the first attempt was lost
+        images = wait_until(
+            lambda: self._account.call(
+                'ec2', vm.region, 'describe_images', what, Owners=['self'],
+                Filters=[{'Name': 'name', 'Values': [unique]}])['Images'] or None,
+            timeout=SETTLING, cancel=self._account.cancel, interval=0.5, longest=4.0,
+            what=f'the image {unique}')
+        return f'aws:{vm.region}/{images[0]["ImageId"]}'
 
     def images(self, region: str) -> Iterator[Image]:
         for entry in self._account.pages(

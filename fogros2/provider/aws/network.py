@@ -19,7 +19,7 @@ from fogros2.provider.aws import instances
 from fogros2.provider.aws.clients import Account
 from fogros2.provider.aws.failures import AwsError
 from fogros2.provider.vm.cloud import Order, own_name, TAG_ATTEMPT, TAG_SSH_FROM, VmCloud, VmId
-from fogros2.provider.vm.failures import settled, tolerated, wait_through
+from fogros2.provider.vm.failures import settled, SETTLING, tolerated, wait_through
 from fogros2.provider.vm.options import cidr, FREE_PORTS, SSH
 from fogros2.waiting import wait_until
 
@@ -85,7 +85,11 @@ class Ec2Network(VmCloud):
             )['GroupId'])
             self._account.made[group] = time.monotonic()
             return group
-        return str(self._groups(region, order.attempt)[0]['GroupId'])
+        groups = wait_until(
+            lambda: self._groups(region, order.attempt) or None, timeout=SETTLING,
+            cancel=self._account.cancel, interval=0.5, longest=4.0,
+            what=f"the security group of '{name}'")
+        return str(groups[0]['GroupId'])
 
     def _open_group(self, region: str, group: str, order: Order) -> None:
         """Open the ports of a new group: the VPN's, and SSH for the order's sources."""
