@@ -51,6 +51,23 @@ def answers(hasty, loopback_only, monkeypatch):
         yield said
 
 
+def test_password_of_netrc_replaces_no_token(gce, monkeypatch, tmp_path):
+    (tmp_path / 'netrc').write_text('default login a password b\n')
+    monkeypatch.setenv('NETRC', str(tmp_path / 'netrc'))
+    headers = []
+
+    def answer(environ, start_response):
+        headers.append(environ.get('HTTP_AUTHORIZATION'))
+        start_response('200 OK', [('Content-Length', '2')])
+        return [b'{}']
+
+    with serving.serve(answer) as url:
+        monkeypatch.setenv(gcp.ENDPOINT_VARIABLE, url)
+        gcp.Account().call('GET', 'robots', 'looking')
+    (header,) = headers
+    assert header.startswith('Bearer ')
+
+
 def test_page_of_a_fault_is_no_answer_yet(answers):
     answers += [(502, PAGE), (200, '{"name": "robots"}')]
     assert gcp.Account().call('GET', 'robots', 'looking') == {'name': 'robots'}

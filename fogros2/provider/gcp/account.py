@@ -21,7 +21,7 @@ from fogros2.provider.vm.failures import (
     unless_gone,
     wait_through,
 )
-from fogros2.provider.vm.rest import RestAccount
+from fogros2.provider.vm.rest import RestAccount, unchanged
 
 #: The API, and gcloud's own variable that names another address.
 ENDPOINT = 'https://compute.googleapis.com/compute/v1/'
@@ -122,8 +122,10 @@ class Account(RestAccount):
 
         def renew() -> None:
             if not credentials.valid:
+                request = cast(Any, Request)()
+                request.session.auth = unchanged
                 credentials.refresh(functools.partial(
-                    cast(Any, Request)(), timeout=(5.0, 5.0 if self.hasty else 30.0)))
+                    request, timeout=(5.0, 5.0 if self.hasty else 30.0)))
 
         try:
             with _RENEWING:

@@ -27,9 +27,15 @@ def _session() -> Any:
     """Return the connections of this process; ``requests`` is imported when first needed."""
     import requests
     session = requests.Session()
+    session.auth = unchanged
     for scheme in ('https://', 'http://'):
         session.mount(scheme, requests.adapters.HTTPAdapter(pool_maxsize=20))
     return session
+
+
+def unchanged(request: Any) -> Any:
+    """Authenticate a session's requests by their headers, not by a password of ``~/.netrc``."""
+    return request
 
 
 class RestAccount(Account, abc.ABC):
