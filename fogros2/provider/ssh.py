@@ -125,6 +125,9 @@ class SSHProvider(Provider):
         try:
             reach(settings)
         except socket.gaierror as error:
+            if error.errno == socket.EAI_AGAIN:
+                raise ProviderError(f"no DNS server answers for '{settings.host}'",
+                                    "check the robot's network") from error
             raise ProviderError(f"there is no host called '{settings.host}'",
                                 'it is reached through another computer, and the VPN needs its '
                                 'address: write that as HostName' if settings.proxy else

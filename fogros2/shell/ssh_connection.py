@@ -149,6 +149,9 @@ def _dial(settings: Settings, name: str, timeout: float) -> PromptSocket:
     try:
         plain = socket.create_connection((settings.host, settings.port), timeout=timeout)
     except socket.gaierror as error:
+        if error.errno == socket.EAI_AGAIN:
+            raise ConnectError(f"'{name}': no DNS server answers for '{settings.host}'",
+                               "check the robot's network") from error
         raise ConnectError(f"'{name}': there is no host called '{settings.host}'",
                            'check host=') from error
     except ConnectionRefusedError as error:

@@ -10,10 +10,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from fogros2.errors import ConfigurationError, MachineNotFound, ProviderError
+from fogros2.errors import ConfigurationError, ConnectError, MachineNotFound, ProviderError
 from fogros2.model import MachineSpec, MachineState
 from fogros2.provider.ssh import Options, reach, SSHProvider
-from fogros2.shell import ssh_config
+from fogros2.shell import ssh_config, ssh_connection
 from fogros2_testing import ProviderContract, request_for
 
 
@@ -71,13 +71,24 @@ def test_a_computer_that_is_off_is_stopped(listener):
     assert machine.endpoint is None
 
 
-@pytest.mark.parametrize('host, words', [
-    ('127.0.0.1', 'refuses connections'), ('no-such-host.invalid', 'no host called'),
+@pytest.mark.parametrize('reason, words', [
+    (None, 'refuses connections'), (socket.EAI_NONAME, 'no host called'),
+    (socket.EAI_AGAIN, 'no DNS server answers'),
 ])
-def test_a_computer_that_can_t_be_reached_is_refused_at_once(listener, host, words):
+def test_a_computer_that_can_t_be_reached_is_refused_at_once(
+    monkeypatch, listener, reason, words,
+):
+    def look_up(*_, **__):
+        raise socket.gaierror(reason, 'no address')
+
     port = listener.getsockname()[1]
     listener.close()
-    spec = MachineSpec('planner', 'ssh', {'host': host, 'port': port})
+    if reason is not None:
+        monkeypatch.setattr(socket, 'getaddrinfo', look_up)
+    spec = MachineSpec('planner', 'ssh', {'host': '127.0.0.1', 'port': port})
+    if reason is not None:
+        with pytest.raises(ConnectError, match=words):
+            ssh_connection._dial(ssh_config.Settings('planner'), 'planner', 5.0)
     with pytest.raises(ProviderError, match=words):
         SSHProvider().create(spec, request_for(spec))
     with pytest.raises(ProviderError, match=words):

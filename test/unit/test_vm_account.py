@@ -4,17 +4,21 @@
 from __future__ import annotations
 
 import threading
+from types import SimpleNamespace
 
 import pytest
 
 from fogros2.errors import PrerequisiteError
-from fogros2.provider.aws import clients
+from fogros2.provider.aws import clients, failures
 from fogros2.provider.azure import account as azure
 from fogros2.provider.gcp import account as gcp
-from fogros2.provider.vm import account
+from fogros2.provider.vm import account, rest
 from fogros2.provider.vm.failures import Silent
 from rigs import serving
 
+exceptions = pytest.importorskip('botocore.exceptions')
+requests = pytest.importorskip('requests')
+urllib3 = pytest.importorskip('urllib3')
 #: A page of Google's front end.
 PAGE = '<!DOCTYPE html>\n<title>Error 502 (Server Error)!!1</title>'
 
@@ -104,13 +108,13 @@ def test_request_without_an_answer_is_made_again(
 ):
     clock = Clock()
     monkeypatch.setattr(account, 'time', clock)
-    failures = [Silent('no answer', '', unsent=unsent) for _ in range(times)]
+    silence = [Silent('no answer', '', unsent=unsent) for _ in range(times)]
     asked = []
 
     def send():
         asked.append(clock.now)
-        if failures:
-            raise failures.pop()
+        if silence:
+            raise silence.pop()
         return 'answer'
 
     own = account.Account().having(clock, hasty=hasty)
@@ -121,3 +125,21 @@ def test_request_without_an_answer_is_made_again(
             own.repeated(send, 'creating it', reads=False)
         assert caught.value.refused is refused
     assert asked == [0.0, 1.0, 3.0, 7.0][:attempts]
+
+
+def test_certificate_that_does_not_hold_is_the_reason(monkeypatch):
+    reason = '[SSL: CERTIFICATE_VERIFY_FAILED] certificate is not yet valid'
+    tls = urllib3.exceptions.SSLError(reason)
+    pool = urllib3.HTTPSConnectionPool('compute.googleapis.com')
+
+    def request(*words, **options):
+        raise requests.exceptions.SSLError(
+            urllib3.exceptions.MaxRetryError(pool, f'/{500 * "x"}', tls))
+
+    monkeypatch.setattr(rest, '_session', lambda: SimpleNamespace(request=request))
+    monkeypatch.setattr(gcp.Account, 'token', lambda *_: 'secret')
+    aws = failures._unsent(exceptions.SSLError(endpoint_url='https://aws', error=reason), 'asking')
+    with pytest.raises(Silent) as caught:
+        gcp.Account().having(None, hasty=True).call('GET', 'robots', 'asking')
+    for error in (aws, caught.value):
+        assert reason in error.args[0] and 'clock' in error.hint and error.refused

@@ -108,13 +108,16 @@ class Silent(PrerequisiteError):
     """
     A request got no answer.
 
+    :param hint: for all reasons but a certificate.
     :param unsent: it did not leave this computer.
     """
 
     pause: Optional[float] = None
 
     def __init__(self, message: str, hint: str, *, unsent: bool) -> None:
-        super().__init__(message, hint)
+        super().__init__(message, hint if 'CERTIFICATE_VERIFY_FAILED' not in message else (
+            "is this computer's clock right? For a proxy's certificates, set REQUESTS_CA_BUNDLE, "
+            'and for AWS AWS_CA_BUNDLE'))
         self.refused = self.unsent = unsent
 
 

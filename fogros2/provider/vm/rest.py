@@ -84,9 +84,9 @@ class RestAccount(Account, abc.ABC):
                 timeout=(5.0, 5.0 if self.hasty else timeout))
         except requests.RequestException as error:
             # urllib3 gives up after its attempts to connect; a lost answer is another error
-            unsent = any(isinstance(each, urllib3.exceptions.MaxRetryError)
-                         for each in error.args)
-            raise self.silent(error, what, unsent) from error
+            unsent = next((each for each in error.args
+                           if isinstance(each, urllib3.exceptions.MaxRetryError)), None)
+            raise self.silent(unsent and unsent.reason or error, what, bool(unsent)) from error
         try:
             content = answer.json() if answer.content else None
         except ValueError:
