@@ -109,9 +109,13 @@ class Api:
         """
         last: list[ProviderError] = []
         sure = time.monotonic() + doubt
-        answer = min(ANSWER, max(CONNECT, timeout))
+        end = time.monotonic() + timeout
 
         def attempt() -> Optional[dict[str, Any]]:
+            answer = min(ANSWER, max(CONNECT, end - time.monotonic()))
+            if not last and method != 'POST':
+                # a dead connection of the pool leaves time for a new one
+                answer = max(CONNECT, answer / 3)
             try:
                 return cancellable(lambda: self._once(method, path, body, query, answer), cancel,
                                    what=f'asking the API server {self.server}',
@@ -209,6 +213,8 @@ class Api:
 
     def _unreachable(self, error: BaseException) -> Unreachable:
         self.lost()
+        # its other connections may be dead, too
+        self._client.rest_client.pool_manager.clear()
         return Unreachable(
             f'the API server {self.server} does not answer: {words(error)}',
             'is the cluster up, and reachable from this robot? `kubectl cluster-info` asks the '

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 import http.server
 import inspect
 import json
@@ -325,6 +326,25 @@ def test_a_server_that_does_not_answer_is_given_up(tmp_path, monkeypatch):
     assert 0.4 < time.monotonic() - begin < 30.0
     assert 'Connection refused' in str(error)
     assert '0x' not in str(error)
+
+
+def test_dead_connections_leave_time_for_a_new_one(api, server, monkeypatch):
+    answer = Handler.do_GET
+
+    def first_alone(own):
+        if not hasattr(own, 'used'):
+            own.used = True
+            answer(own)
+        else:
+            server.ended.wait(60.0)
+
+    monkeypatch.setattr(Handler, 'do_GET', first_alone)
+    monkeypatch.setattr('fogros2.kubernetes_client.api.CONNECT', 1.0)
+    together = threading.Barrier(3, timeout=60.0)
+    server.answers = [*3 * [lambda: (200, {'number': together.wait()})], (200, {'a': 1})]
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(lambda _: api.request('GET', '/x'), range(3)))
+    assert api.request('GET', '/x', timeout=6.0) == {'a': 1}
 
 
 def test_a_right_that_lacks_is_believed_but_not_after_a_restart(api, server):
