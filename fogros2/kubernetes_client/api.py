@@ -213,8 +213,6 @@ class Api:
 
     def _unreachable(self, error: BaseException) -> Unreachable:
         self.lost()
-        # its other connections may be dead, too
-        self._client.rest_client.pool_manager.clear()
         return Unreachable(
             f'the API server {self.server} does not answer: {words(error)}',
             'is the cluster up, and reachable from this robot? `kubectl cluster-info` asks the '
