@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from fogros2.deploy.steps import watching
 from fogros2.errors import PrerequisiteError
 from fogros2.provider.aws import clients, failures
 from fogros2.provider.azure import account as azure
@@ -143,3 +144,19 @@ def test_certificate_that_does_not_hold_is_the_reason(monkeypatch):
         gcp.Account().having(None, hasty=True).call('GET', 'robots', 'asking')
     for error in (aws, caught.value):
         assert reason in error.args[0] and 'clock' in error.hint and error.refused
+
+
+def test_dead_connection_is_replaced_before_a_machine_is_lost(hasty, monkeypatch):
+    timeouts = []
+
+    def send(own, method, url, what, body, query, timeout):
+        timeouts.append(timeout)
+        raise Silent('no answer', '', unsent=False)
+
+    monkeypatch.setattr(gcp.Account, '_send', send)
+    for method in ('GET', 'POST'):
+        with pytest.raises(Silent):
+            gcp.Account().ask(method, 'robots', 'looking')
+    assert timeouts == [20.0, 30.0, 30.0, 30.0]
+    begin = watching.SILENCE + watching.POLL_INTERVAL
+    assert begin + max(timeouts[0], clients.READ_TIMEOUT) < watching.LOSS

@@ -18,7 +18,7 @@ from fogros2.provider.vm.failures import Fields, SETTLING, unless_gone
 
 T = TypeVar('T')
 
-CONNECT_TIMEOUT, READ_TIMEOUT = 5.0, 30.0
+CONNECT_TIMEOUT, READ_TIMEOUT = 5.0, 20.0
 
 
 def usual() -> Account:

@@ -66,8 +66,10 @@ class RestAccount(Account, abc.ABC):
 
         :param grace: wait for the answer to a sent request after a cancel.
         """
+        # after a dead connection, time is left for another before the machine counts as lost
+        first = iter([min(timeout, 20.0)] if method == 'GET' else ())
         return self.repeated(
-            lambda: self._send(method, url, what, body, query, timeout), what,
+            lambda: self._send(method, url, what, body, query, next(first, timeout)), what,
             reads=method == 'GET', repeatable=repeatable, grace=ON_ITS_WAY if grace else 0.0)
 
     def _send(
