@@ -15,11 +15,18 @@ from typing import Optional, TYPE_CHECKING
 
 from fogros2 import untrusted
 from fogros2.describe.values import check_folder
-from fogros2.errors import ConfigurationError, ConnectError, FogError, ShellError
+from fogros2.errors import (
+    ConfigurationError,
+    ConnectError,
+    DeadlineExceeded,
+    FogError,
+    ShellError,
+)
 from fogros2.feature import Feature, RunningMachine
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.ros_names import check_name
 from fogros2.shell.command_line import remote_path
+from fogros2.shell.sync import used
 from fogros2.store import check_owner
 
 if TYPE_CHECKING:
@@ -27,8 +34,9 @@ if TYPE_CHECKING:
 
 #: Where folders come to, and how many bytes they may have together, by default.
 TARGET, LIMIT = '~/fogros2', 10e9
-#: Seconds for one attempt to copy a folder, and the number of attempts on broken connections.
-TIMEOUT, ATTEMPTS = 3600.0, 3
+#: Seconds in which no byte comes, and the number of attempts in which none comes, until a copy
+#: fails. rsync reads what came before, so 10 GB on a slow disk need minutes.
+TIMEOUT, ATTEMPTS = 900.0, 3
 #: Bytes that a folder may take on the disk beyond its limit: each small file has a block.
 SLACK = 100e6
 #: Where a machine, by its name, keeps recordings until they come home, and the name of the folder.
@@ -169,13 +177,16 @@ def _make(folder: Path, *, number: int = 0) -> Path:
 
 def _copy(running: RunningMachine, folder: str, target: Path, limit: int) -> None:
     _make(target)
-    for attempt in range(1, ATTEMPTS + 1):
+    arrived, failures = 0, 0
+    while True:
         try:
             running.shell.fetch(folder, target, known=None, limit=limit, timeout=TIMEOUT)
             return
-        except ConnectError:
-            if attempt == ATTEMPTS:
-                raise  # rsync kept what has arrived
+        except (ConnectError, DeadlineExceeded):
+            failures = 1 if used(target) > arrived else failures + 1
+            if failures == ATTEMPTS:
+                raise  # what has arrived stays
+            arrived = used(target)
 
 
 def _targets(home: Path, folders: Iterable[str]) -> dict[str, Path]:

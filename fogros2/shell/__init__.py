@@ -92,7 +92,8 @@ class Shell(Protocol):
 
         :param known: a local folder; files that are equal there become hard links to it.
         :param limit: bytes that ``target`` may take on this computer.
-        :param timeout: seconds.
+        :param timeout: seconds in which ``target`` does not grow.
+        :raises DeadlineExceeded: nothing came for ``timeout`` seconds.
         """
 
     def open(self, command: Command) -> Stream:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
+import math
 import os
 from pathlib import Path
 import re
@@ -24,6 +25,7 @@ from fogros2 import process
 from fogros2.errors import (
     CommandError,
     ConnectError,
+    DeadlineExceeded,
     FogError,
     HostKeyError,
     PrerequisiteError,
@@ -109,18 +111,18 @@ class RsyncShell(Shell):
         and the target is measured while it grows, so its folders stay readable.
         """
         room = Room(target, limit, cancel, f'{self.where} has sent more than '
-                    f'{limit / 1e9:.1f} GB in place of {source}')
+                    f'{limit / 1e9:.1f} GB in place of {source}', timeout)
         process.require(['rsync'])
         words = ['rsync', '-rltp', _EXACT_TIMES, '-s', '--delete', '--safe-links']
         words += ['--chmod=u-s,g-s,Du+rx']
-        words += [f'--link-dest={known.resolve()}'] if known is not None else []
+        # The next call continues a file that was cut off; but not in a link to a known file.
+        words += ['--inplace'] if known is None else [f'--link-dest={known.resolve()}']
         with self._remote_shell() as (rsh, files, failures):
             words += ['-e', relay.RSH] if rsh else []
             result = process.run(
                 Command((*words, '--', place(source, remote=bool(rsh)), f'{target}/'),
                         environment={'LC_ALL': 'C', **rsh}, what='rsync'),
-                timeout=timeout, cancel=room, check=False, inherited=files,
-                kept=KEPT)
+                timeout=math.inf, cancel=room, check=False, inherited=files, kept=KEPT)
         if failures:
             raise failures[0]
         room.measure()
@@ -129,20 +131,49 @@ class RsyncShell(Shell):
             raise explained(result, Path(source), self.where if lost else process.HERE)
 
 
-class Room(threading.Event):
+class Stall(threading.Event):
     """
-    Is set with another event; raises an error while it is asked, if a folder becomes too large.
+    Is set with another event; raises an error while it is asked, if a copy makes no progress.
 
-    :param limit: bytes on the disk. Each file and folder counts as a block at least, because a
-        disk has room for a number of them.
+    :param timeout: seconds without progress.
+    """
+
+    def __init__(self, cancel: Optional[threading.Event], timeout: float) -> None:
+        super().__init__()
+        self._cancel, self._timeout = cancel, timeout
+        self._bytes, self._since = 0, time.monotonic()
+
+    def note(self, copied: int) -> None:
+        """Note the bytes that are copied; another number is progress."""
+        if copied != self._bytes:
+            self._bytes, self._since = copied, time.monotonic()
+
+    def is_set(self) -> bool:
+        """
+        Return whether the other event is set.
+
+        :raises DeadlineExceeded: the copy makes no progress.
+        """
+        if time.monotonic() - self._since > self._timeout:
+            raise DeadlineExceeded(f'rsync has copied nothing for {self._timeout:g} s',
+                                   "check the robot's network")
+        return self._cancel is not None and self._cancel.is_set()
+
+
+class Room(Stall):
+    """
+    Raises an error, too, if a folder becomes too large.
+
+    :param limit: bytes on the disk, see ``used``.
     :param message: of the error.
     """
 
     def __init__(
         self, folder: Path, limit: int, cancel: Optional[threading.Event], message: str,
+        timeout: float = math.inf,
     ) -> None:
-        super().__init__()
-        self._folder, self._limit, self._cancel = folder, limit, cancel
+        super().__init__(cancel, timeout)
+        self._folder, self._limit = folder, limit
         self._message = message
         self._next = 0.0
 
@@ -150,7 +181,7 @@ class Room(threading.Event):
         """Return whether the other event is set; measure the folder now and then."""
         if time.monotonic() >= self._next:
             self.measure()
-        return self._cancel is not None and self._cancel.is_set()
+        return super().is_set()
 
     def measure(self) -> None:
         """
@@ -158,14 +189,25 @@ class Room(threading.Event):
 
         :raises ShellError: it is too large.
         """
-        begin, size = time.monotonic(), 0
-        for entry in entries(self._folder):
-            with contextlib.suppress(OSError):  # deleted meanwhile
-                size += max(BLOCK, 512 * entry.stat(follow_symlinks=False).st_blocks)
-            if size > self._limit:
-                raise ShellError(self._message, 'the machine may be hijacked: delete it')
+        begin, size = time.monotonic(), used(self._folder)
+        if size > self._limit:
+            raise ShellError(self._message, 'the machine may be hijacked: delete it')
+        self.note(size)
         # a tenth of the time at most
         self._next = time.monotonic() + max(0.1, 10 * (time.monotonic() - begin))
+
+
+def used(folder: Path) -> int:
+    """
+    Return the bytes on the disk of what is in a folder.
+
+    Each file and folder counts as a block at least: a disk has room for a number of them.
+    """
+    size = 0
+    for entry in entries(folder):
+        with contextlib.suppress(OSError):  # deleted meanwhile
+            size += max(BLOCK, 512 * entry.stat(follow_symlinks=False).st_blocks)
+    return size
 
 
 def is_large(source: Path, limit: int) -> bool:

@@ -21,7 +21,13 @@ from fogros2 import AWSCloudInstance, ContainerInstance, plugin_system, process
 from fogros2.deploy import checks
 from fogros2.describe import defaults, features, keywords
 from fogros2.describe.overrides import Overrides
-from fogros2.errors import ConfigurationError, ConnectError, ShellError, StoreError
+from fogros2.errors import (
+    ConfigurationError,
+    ConnectError,
+    DeadlineExceeded,
+    ShellError,
+    StoreError,
+)
 from fogros2.feature import Feature
 from fogros2.model import MachineSpec
 from fogros2.report import silent
@@ -315,6 +321,23 @@ def test_broken_connection_is_tried_again(home: Path, monkeypatch: pytest.Monkey
     tries[:] = []
     running.lost = 'it was deleted'
     assert brought(running, fetch=['~/bags'], fetch_to=str(home / 'two')) == [] and not tries
+
+
+def test_link_that_drops_often_brings_all_home(
+    home: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each attempt brings a part: only attempts that bring nothing count."""
+    (home / 'bags').mkdir()
+    errors = [ConnectError('it was lost'), DeadlineExceeded('nothing came')] * results.ATTEMPTS
+    running = FakeRunning()
+
+    def dropped(source: str, target: Path, **more: Any) -> None:
+        (target / str(len(errors))).touch()
+        if errors:
+            raise errors.pop()
+
+    monkeypatch.setattr(running.shell, 'fetch', dropped)
+    assert len(brought(running, fetch=['~/bags'])) == 2 * results.ATTEMPTS + 1
 
 
 def test_folder_on_the_robot_is_checked_before(home: Path) -> None:

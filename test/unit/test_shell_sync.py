@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import functools
 import os
 from pathlib import Path
 import shlex
@@ -16,7 +18,7 @@ import paramiko
 import pytest
 
 from fogros2 import process
-from fogros2.errors import CommandError, ConnectError, ShellError
+from fogros2.errors import Cancelled, CommandError, ConnectError, DeadlineExceeded, ShellError
 from fogros2.model import Endpoint, Result
 from fogros2.shell import multiplexed, multiplexer, relay, remote, sync
 
@@ -154,6 +156,47 @@ def test_large_folders_go_both_ways(shell, tmp_path):
         shell.fetch(f'{there}/nowhere', tmp_path / 'back', known=None, limit=1 << 30,
                     timeout=60.0)
     assert set(os.listdir('/proc/self/fd')) == before
+
+
+class Enough(threading.Event):
+    """Is set when a folder has some bytes."""
+
+    def __init__(self, folder: Path, enough: int) -> None:
+        super().__init__()
+        self.folder, self.enough = folder, enough
+
+    def is_set(self) -> bool:
+        return sync.used(self.folder) >= self.enough
+
+
+def test_fetch_continues_a_file_that_was_cut_off(shell, tmp_path, monkeypatch):
+    (tmp_path / 'source').mkdir()
+    (tmp_path / 'source/bag').write_bytes(os.urandom(8 << 20))
+    run, outputs, more = process.run, [], ['--bwlimit=4M']
+
+    def slow(command, **words):
+        rsync, *others = command.argv
+        command = dataclasses.replace(command, argv=(rsync, *more, *others))
+        outputs.append(run(command, **words).stdout)
+        return Result(0, '', '')
+
+    monkeypatch.setattr(process, 'run', slow)
+    fetch = functools.partial(shell.fetch, str(tmp_path / 'source'), tmp_path / 'back',
+                              known=None, limit=1 << 30, timeout=60.0)
+    with pytest.raises(Cancelled):
+        fetch(cancel=Enough(tmp_path / 'back', 2 << 20))
+    more[:] = ['--stats', '--no-human-readable']
+    fetch()
+    assert 0 < sync._number(outputs[-1], 'Total bytes received') < 7 << 20
+    assert (tmp_path / 'back/bag').read_bytes() == (tmp_path / 'source/bag').read_bytes()
+
+
+def test_fetch_without_progress_times_out(shell, tmp_path, monkeypatch):
+    (tmp_path / 'source').mkdir()
+    monkeypatch.setattr(relay, 'relay', lambda *_: threading.Event().wait(1.0) or 255)
+    with pytest.raises(DeadlineExceeded, match='has copied nothing for 0.3 s .check the robot'):
+        shell.fetch(str(tmp_path / 'source'), tmp_path / 'back', known=None, limit=1 << 30,
+                    timeout=0.3)
 
 
 @pytest.mark.parametrize('folder, there', [
