@@ -15,7 +15,7 @@ import threading
 from typing import Optional
 
 from fogros2 import untrusted
-from fogros2.errors import ConnectError, FogError, ShellError
+from fogros2.errors import ConnectError, DeadlineExceeded, FogError, ShellError
 from fogros2.model import Command
 from fogros2.shell import Shell
 from fogros2.shell.command_line import remote_path
@@ -25,7 +25,7 @@ from fogros2.store import delete_folder
 LIMIT = 2 << 30
 #: The form of a hash.
 _HASH = re.compile('[0-9a-f]{64}')
-#: Seconds for one copy.
+#: Seconds in which a copy makes no progress.
 TIMEOUT = 600.0
 #: Attempts to copy a folder that changes meanwhile, and to restore one on broken connections.
 ATTEMPTS = 3
@@ -86,7 +86,7 @@ class Checkpoint:
                 self._store.mkdir(0o700, parents=True, exist_ok=True)
                 shell.fetch(self.folder, partial, known=self.newest, limit=LIMIT,
                             timeout=TIMEOUT, cancel=self._cancel)
-            except ConnectError:
+            except (ConnectError, DeadlineExceeded):
                 raise  # the next copy continues this one
             except (FogError, OSError) as error:
                 delete_folder(partial)

@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from fogros2.describe.values import check_folder
-from fogros2.errors import ConfigurationError, ConnectError, ShellError
+from fogros2.errors import ConfigurationError, ConnectError, DeadlineExceeded, ShellError
 from fogros2.model import Endpoint, Result
 from fogros2.process import which
 from fogros2.shell.local import LocalShell
@@ -92,18 +92,21 @@ def test_copy_of_a_changing_folder_is_not_used(kept, folder, torn):
     assert kept.save(torn, still=True), 'its node says that the files are consistent'
 
 
-def test_copy_that_was_cut_off_is_not_used(kept, folder, torn, shell):
+@pytest.mark.parametrize('error', [ConnectError, DeadlineExceeded])
+def test_next_copy_continues_the_one_that_was_cut_off(
+        kept, folder, torn, shell, tmp_path, error):
     def cut(source, target):
         target.mkdir()
         (target / 'parts').write_text('half')
-        raise ConnectError('the connection is lost')
+        raise error('the connection is lost')
 
     kept.save(shell, still=False)
     (folder / 'parts/2').write_text('two')
     torn.during = cut
-    with pytest.raises(ConnectError):
+    with pytest.raises(error):
         kept.save(torn, still=True)
     assert texts(kept.newest) == {'parts/1': 'one'}
+    assert texts(tmp_path / 'robot/partial') == {'parts': 'half'}
     kept.save(shell, still=True)
     assert texts(kept.newest) == {'parts/1': 'one', 'parts/2': 'two'}
 
