@@ -519,12 +519,21 @@ def _include(paths: Sequence[Path], root: Path) -> Iterator[str]:
         for parent in reversed(relative.parents[:-1]):
             if parent not in seen:
                 seen.add(parent)
-                yield f'/{parent}/'
+                yield _pattern(parent, '/')
         if path.is_dir() and not path.is_symlink():
-            yield f'/{relative}/'
-            yield f'/{relative}/***'
+            yield _pattern(relative, '/')
+            yield _pattern(relative, '/***')
         else:
-            yield f'/{relative}'
+            yield _pattern(relative)
+
+
+def _pattern(relative: Path, suffix: str = '') -> str:
+    """Return an rsync pattern in which the characters of a path stand for themselves."""
+    name = str(relative)
+    if re.search(r'[*?[]', name + suffix):
+        # in a pattern without wildcards, a backslash needs none
+        name = re.sub(r'[\\*?[]', r'\\\g<0>', name)
+    return f'/{name}{suffix}'
 
 
 def find_workspaces(environment: Mapping[str, str]) -> list[str]:

@@ -243,7 +243,8 @@ def rsync(
     """
     # -s protects arguments: the remote shell does not expand a folder's name.
     words = ['rsync', '-a', _EXACT_TIMES, '-s', '--delete', '--stats', '--no-human-readable']
-    words += [f'--include={pattern}' for pattern in includes]
+    # A workspace has more includes than a command line may have.
+    words += ['--from0', '--include-from=-'] if includes else []
     words += [f'--exclude={pattern}' for pattern in excludes]
     if compress:
         words.append('--compress')
@@ -256,7 +257,8 @@ def rsync(
         # rsync rewrites one line with carriage returns; convert them to lines.
         script = 'set -o pipefail; "$@" | stdbuf -oL tr "\\r" "\\n"'
         words = ['bash', '-c', script, 'rsync', *words]
-    return Command(tuple(words), environment={'LC_ALL': 'C', **rsh}, what='rsync')
+    return Command(tuple(words), input=os.fsencode('\0'.join(includes)),
+                   environment={'LC_ALL': 'C', **rsh}, what='rsync')
 
 
 class Progress:

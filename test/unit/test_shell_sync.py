@@ -158,6 +158,15 @@ def test_large_folders_go_both_ways(shell, tmp_path):
     assert set(os.listdir('/proc/self/fd')) == before
 
 
+def test_sync_takes_more_includes_than_a_command_line(shell, tmp_path):
+    (tmp_path / 'source').mkdir()
+    for name in 'ab':
+        (tmp_path / 'source' / name).touch()
+    shell.sync(tmp_path / 'source', str(tmp_path / 'there'), excludes=['/*'], timeout=60.0,
+               includes=[*(f'/{number:0250}' for number in range(30_000)), '/b'])
+    assert os.listdir(tmp_path / 'there') == ['b']
+
+
 class Enough(threading.Event):
     """Is set when a folder has some bytes."""
 

@@ -291,9 +291,8 @@ def test_symlink_install_brings_what_its_links_reach(root: Path) -> None:
         root / 'build/alpha', root / 'src/alpha/alpha', root / 'src/alpha/launch/a.launch.py'}
     target = root.parent / 'there'
     way = plan(space)
-    subprocess.run(
-        ['rsync', '-a', *(f'--include={p}' for p in way.includes),
-         *(f'--exclude={p}' for p in way.excludes), f'{root}/', f'{target}/'], check=True)
+    LocalShell(Endpoint('local'), name='here').sync(
+        root, str(target), includes=way.includes, excludes=way.excludes, timeout=60.0)
     sent = {str(p.relative_to(target)) for p in target.rglob('*') if not p.is_dir()}
     assert 'build/alpha/build.txt' in sent and 'src/alpha/alpha/node.py' in sent
     assert 'src/alpha/launch/a.launch.py' in sent
@@ -326,6 +325,21 @@ class Elsewhere(FakeShell):
         """Send it by rsync."""
         return LocalShell(Endpoint('local'), name='here').sync(
             source, f'{self.folder}{target}', **arguments)  # type: ignore
+
+
+@pytest.mark.parametrize('name', ['a[1]', 'a*', 'a?', 'a\\b', r'a\[1]'])
+def test_linked_files_with_odd_names_arrive(root: Path, tmp_path: Path, name: str) -> None:
+    share = root / 'install/alpha/share/alpha'
+    for kind in (f'{name}.yaml', f'folder {name}/file'):
+        write(root / 'src/alpha/config' / kind)
+        (share / kind.partition('/')[0]).symlink_to(
+            root / 'src/alpha/config' / kind.partition('/')[0])
+    write(root / 'src/alpha/config/ab.yaml')
+    workspace.transfer(Elsewhere(tmp_path / 'there'), [plan(workspace.inspect(root))],
+                       timeouts=Timeouts())
+    target = Path(f"{tmp_path / 'there'}{root}/src/alpha/config")
+    assert {str(path.relative_to(target)) for path in target.rglob('*') if path.is_file()} == {
+        f'{name}.yaml', f'folder {name}/file'}
 
 
 @pytest.fixture
