@@ -9,6 +9,7 @@ like the robot gets the install space. Another machine gets the sources, and bui
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+import contextlib
 import dataclasses
 import os
 from pathlib import Path
@@ -126,9 +127,17 @@ def inspect(path: str | os.PathLike[str]) -> Workspace:
     """
     Read a workspace; 10,000 files take about a tenth of a second.
 
-    :raises WorkspaceError: there is no such folder, or it contains no ROS package.
+    :raises WorkspaceError: there is no such folder, it contains no ROS package, or a file in it
+        cannot be read.
     """
-    root = _absolute(path)
+    try:
+        return _inspect(_absolute(path))
+    except OSError as error:
+        raise WorkspaceError(f"{error.filename} can't be read: {error.strerror}",
+                             'give this user the right to read it') from error
+
+
+def _inspect(root: Path) -> Workspace:
     if not root.is_dir():
         raise WorkspaceError(f'{root} is no folder', 'ros_workspace= names a colcon workspace')
     install = root / 'install'
@@ -431,9 +440,11 @@ def _inspect_installed(workspace: Workspace) -> Workspace:
         reached: list[Path] = []
         for entry in _files(folder):
             if entry.is_symlink():
-                reached.append(_target(entry.path))
+                with contextlib.suppress(FileNotFoundError):  # deleted meanwhile
+                    reached.append(_target(entry.path))
             elif entry.name.endswith(('.egg-link', '.pth')):
-                reached.extend(written_paths(Path(entry.path)))
+                with contextlib.suppress(FileNotFoundError):
+                    reached.extend(written_paths(Path(entry.path)))
             elif '/lib/' in entry.path or '/bin/' in entry.path or _LIBRARY.search(entry.name):
                 _note_compiled(entry.path, compiled)
             if not python and '/site-packages/' in entry.path:
@@ -504,7 +515,8 @@ def _note_compiled(path: str, compiled: dict[str, Path]) -> None:
     """Add the architecture of a file if it is a compiled program or shared library."""
     if path.endswith(('.py', '.sh', '.txt', '.xml', '.yaml', '.pyc')) or not os.path.isfile(path):
         return
-    with open(path, 'rb') as file:
+    header = b''
+    with contextlib.suppress(FileNotFoundError), open(path, 'rb') as file:
         header = file.read(20)
     if header[:4] == b'\x7fELF':
         number = int.from_bytes(header[18:20], 'little')

@@ -128,7 +128,8 @@ class RsyncShell(Shell):
         room.measure()
         if result.returncode != 0:
             lost = result.returncode in _LOST and 'No space left' not in result.stderr
-            raise explained(result, Path(source), self.where if lost else process.HERE)
+            raise explained(result, Path(source), self.where if lost else process.HERE,
+                            self.where)
 
 
 class Stall(threading.Event):
@@ -308,8 +309,14 @@ def missing_there(where: str) -> ShellError:
     return ShellError(f'{where} has no rsync', 'install it there: sudo apt-get install rsync')
 
 
-def explained(result: Result, source: Path, where: str) -> FogError:
-    """Return the error that explains rsync's failure."""
+def explained(
+    result: Result, source: Path, where: str, sender: str = process.HERE,
+) -> FogError:
+    """
+    Return the error that explains rsync's failure.
+
+    :param where: the receiver, for messages; the machine if the connection was lost.
+    """
     text = result.stderr
     if 'No space left on device' in text or 'Disk quota exceeded' in text:
         return ShellError(f'the disk of {where} is full: {source} did not fit',
@@ -328,7 +335,12 @@ def explained(result: Result, source: Path, where: str) -> FogError:
                             "check the robot's network")
     lines = [line for line in text.splitlines() if line.startswith('rsync:')] or text.splitlines()
     short = Result(result.returncode, '', '\n'.join(lines[:3]))
-    hint = 'give the login user the right to write there' if 'Permission denied' in text else ''
+    right, hint = 'write there', ''
+    if any(line.startswith('rsync: [sender]') for line in lines):
+        right, where = 'read it', sender
+    if 'Permission denied' in text:
+        user = 'this user' if where == process.HERE else 'the login user'
+        hint = f'give {user} the right to {right}'
     return CommandError(Command(('rsync',), what=f'sending {source}'), short, where, hint)
 
 

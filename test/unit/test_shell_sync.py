@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import os
 from pathlib import Path
+import re
 import shlex
 import socket
 import subprocess
@@ -104,6 +105,18 @@ def test_failures_are_explained(code, stderr, kind, words):
     error = sync.explained(Result(code, '', stderr), Path('/ws'), "'planner'")
     assert isinstance(error, kind)
     assert words in str(error)
+
+
+@pytest.mark.parametrize('receiver, sender, side, words', [
+    ("'planner'", 'this computer', 'sender', 'on this computer .* this user .* read it'),
+    ("'planner'", 'this computer', 'receiver', "on 'planner' .* login user .* write there"),
+    ('this computer', "'planner'", 'sender', "on 'planner' .* login user .* read it"),
+    ('this computer', "'planner'", 'receiver', 'on this computer .* this user .* write there'),
+])
+def test_side_without_a_right_is_named(receiver, sender, side, words):
+    result = Result(23, '', f'rsync: [{side}] open "/ws/a" failed: Permission denied (13)')
+    error = sync.explained(result, Path('/ws'), receiver, sender)
+    assert re.search(words, str(error))
 
 
 def test_large_folders_are_told_from_small_ones(tmp_path):

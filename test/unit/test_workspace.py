@@ -120,6 +120,21 @@ def test_a_broken_manifest_is_named(tmp_path: Path) -> None:
         workspace.inspect(tmp_path)
 
 
+def test_file_that_cannot_be_read_is_named(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    link = root / 'install/alpha/share/alpha/gone'
+    link.symlink_to(root / 'src/alpha')
+    error: OSError = FileNotFoundError(2, 'No such file or directory', str(link))
+
+    def refuse(path: str) -> str:
+        raise error
+
+    monkeypatch.setattr(os, 'readlink', refuse)
+    assert workspace.inspect(root).links == ()
+    error = PermissionError(13, 'Permission denied', str(link))
+    with pytest.raises(WorkspaceError, match=f"{link} can't be read: Permission denied .give"):
+        workspace.inspect(root)
+
+
 def test_install_space_is_copied_to_a_computer_that_can_use_it(root: Path) -> None:
     way = plan(workspace.inspect(root))
     assert (way.source, way.target, way.commands, way.reason) == (root, str(root), (), '')
