@@ -18,6 +18,8 @@ T = TypeVar('T')
 _doing: dict[int, list[str]] = {}
 #: Seconds to wait for the answer to a sent request, which may create something, after a cancel.
 ON_ITS_WAY = 15.0
+#: Seconds for a machine to write its memory's files to a disk: 400 GB at 125 MB/s.
+TO_DISK = 3600.0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,7 @@ from fogros2.model import Command, MachineState
 from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.vm.failures import wait_through
 from fogros2.provider.vm.images import Image
+from fogros2.waiting import TO_DISK
 from fogros2_features.images.keepers import image_keeper
 from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry, Warn
@@ -30,7 +31,7 @@ def flush(entry: Entry, warn: Warn) -> None:
         return
     try:
         with reach.session(entry) as shell:
-            shell.run(Command(('sync',), what='write everything to the disk'), timeout=60.0)
+            shell.run(Command(('sync',), what='write everything to the disk'), timeout=TO_DISK)
     except FogError as error:
         warn(f"{entry.name}: what isn't on the disk yet may be missing in the image: {error}")
 

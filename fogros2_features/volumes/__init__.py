@@ -19,9 +19,16 @@ import re
 from typing import ClassVar, Optional, TYPE_CHECKING
 
 from fogros2 import plugin_system
-from fogros2.errors import ConfigurationError, Unsupported
+from fogros2.errors import (
+    CommandError,
+    ConfigurationError,
+    DeadlineExceeded,
+    ShellError,
+    Unsupported,
+)
 from fogros2.feature import Feature, RunningMachine
 from fogros2.model import Command, CreateRequest, MachineSpec
+from fogros2.waiting import TO_DISK
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
@@ -212,10 +219,14 @@ def _detach(
     if running.lost:
         return  # its provider detaches a disk when the machine ends
     for attached in ways:  # none, if an interrupt or an error ended 'attach'
-        running.run(Command(
-            ('sh', '-ec', _UNMOUNT, 'sh', name, path, running.interface.name,
-             attached.folder or ''.join(attached.devices)),
-            sudo=True, what=f"unmount the volume '{name}'"), timeout=120.0)
+        try:
+            running.run(Command(
+                ('sh', '-ec', _UNMOUNT, 'sh', name, path, running.interface.name,
+                 attached.folder or ''.join(attached.devices)),
+                sudo=True, what=f"unmount the volume '{name}'"), timeout=TO_DISK)
+        except (CommandError, DeadlineExceeded) as error:
+            raise ShellError(f"'{running.spec.name}' may not have written all files to the "
+                             f"volume '{name}': {error}") from error
     if running.spec.on_exit != 'delete':  # the end of a machine detaches, too
         keeper.detach(running.machine.id, name)
 

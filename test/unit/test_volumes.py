@@ -14,13 +14,20 @@ import pytest
 
 from fogros2 import feature
 from fogros2.deploy import checks
-from fogros2.errors import Cancelled, ConfigurationError, FogError, NameTaken
-from fogros2.model import MachineSpec, NodeSpec, Volume
-from fogros2.provider import container, ssh, TAG_ROBOT
+from fogros2.errors import (
+    Cancelled,
+    ConfigurationError,
+    DeadlineExceeded,
+    FogError,
+    NameTaken,
+    ShellError,
+)
+from fogros2.model import Command, MachineSpec, NodeSpec, Volume
+from fogros2.provider import Attached, container, ssh, TAG_ROBOT
 from fogros2.provider.container import machine as container_machine
 from fogros2.provider.kubernetes import claims, names
 from fogros2_features.replacement import Replacement
-from fogros2_features.volumes import Volumes
+from fogros2_features.volumes import _detach, Volumes
 from fogros2_features.volumes.verbs import _named
 from fogros2_testing.fakes import FakeRunning
 
@@ -181,6 +188,22 @@ def test_volume_is_detached_when_its_attachment_is_interrupted(
     with pytest.raises(Cancelled), Volumes().machine(running, {'models': ('/data', 50)}):
         raise AssertionError('no node may start')
     assert calls == [('attach', 'fake-1', 'models'), ('detach', 'fake-1', 'models')]
+
+
+@pytest.mark.parametrize(('seconds', 'error'), [
+    (25e9 / 125e6, ''), (1e5, "'a' may not have written all files to the volume 'models': late")])
+def test_volume_has_time_to_be_written(seconds: float, error: str) -> None:
+    """A machine may have written a fifth of its memory, such as 25 GB, to no disk yet."""
+    class Slow(FakeRunning):
+        def run(self, command: Command, *, timeout: float) -> str:
+            if timeout < seconds:
+                raise DeadlineExceeded('late')
+            return ''
+
+    running: Any = Slow(spec=MachineSpec('a', 'aws'))
+    keeper: Any = None
+    with pytest.raises(ShellError, match=error) if error else contextlib.nullcontext():
+        _detach(running, keeper, 'models', '/data', [Attached(('/dev/x',))])
 
 
 def test_host_lists_no_volume_of_another_name(monkeypatch: pytest.MonkeyPatch) -> None:
