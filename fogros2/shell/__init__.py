@@ -16,12 +16,18 @@ machine (``rsh`` is rsync's end of it), ``terminal`` the user's terminal. ``sync
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import contextlib
 from pathlib import Path
 import threading
-from typing import Optional, Protocol
+from typing import Optional, Protocol, TypeVar
 
 from fogros2 import plugin_system
+from fogros2.errors import ConnectError
 from fogros2.model import Command, Endpoint, Result, SyncReport
+
+T = TypeVar('T')
+#: Attempts to copy a folder over connections that break.
+ATTEMPTS = 3
 
 
 class Stream(Protocol):
@@ -79,7 +85,7 @@ class Shell(Protocol):
 
         :param excludes: rsync patterns; matching files are neither sent nor deleted.
         :param includes: rsync patterns with precedence over ``excludes``.
-        :param timeout: seconds.
+        :param timeout: seconds without progress.
         :param on_progress: callback with the bytes sent and the total bytes (0: unknown).
         """
 
@@ -108,6 +114,18 @@ class Shell(Protocol):
 
     def close(self) -> None:
         """Close the connection; the next call opens a new one."""
+
+
+def retried(copy: Callable[[], T]) -> T:
+    """
+    Call ``sync`` up to ``ATTEMPTS`` times, while the connection is lost; rsync sends what lacks.
+
+    :raises ConnectError: it was lost in each attempt.
+    """
+    for _ in range(ATTEMPTS - 1):
+        with contextlib.suppress(ConnectError):
+            return copy()
+    return copy()
 
 
 def warm(kind: str) -> None:

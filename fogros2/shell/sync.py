@@ -87,13 +87,19 @@ class RsyncShell(Shell):
             raise missing_there(self.where)
         bulk = not answer and self.endpoint.kind == 'ssh' and not self.endpoint.alias \
             and process.which('ssh') is not None and is_large(source, BULK)
+        stall = Stall(cancel, timeout)
+
+        def advance(sent: int, total: int) -> None:
+            stall.note(sent)
+            if on_progress is not None:
+                on_progress(sent, total)
+
         with open_ssh(self.endpoint) if bulk else self._remote_shell() as (rsh, files, failures):
             result = process.run(
                 rsync(source, target, excludes=excludes, includes=includes, rsh=rsh,
-                      compress=bulk, progress=on_progress is not None),
-                timeout=max(0.1, timeout - (time.monotonic() - begin)), cancel=cancel,
-                check=False, inherited=files, kept=KEPT,
-                on_output=None if on_progress is None else Progress(on_progress))
+                      compress=bulk),
+                timeout=math.inf, cancel=stall, check=False, inherited=files, kept=KEPT,
+                on_output=Progress(advance))
         if failures:
             raise failures[0]
         if result.returncode not in (0, VANISHED):
@@ -233,31 +239,28 @@ def place(folder: str, *, remote: bool) -> str:
 
 def rsync(
     source: Path, target: str, *, excludes: Sequence[str], includes: Sequence[str],
-    rsh: Mapping[str, str] = {}, compress: bool = False, progress: bool = False,
+    rsh: Mapping[str, str] = {}, compress: bool = False,
 ) -> Command:
     """
-    Return the command that makes ``target`` equal to ``source``.
+    Return the command that makes ``target`` equal to ``source``, and prints its progress as lines.
 
     :param rsh: variables of ``relay.RSH`` if the target is on a machine.
     :param compress: use the best common compression, mostly zstd, which is faster than most links.
-    :param progress: print the progress as lines.
     """
     # -s protects arguments: the remote shell does not expand a folder's name.
-    words = ['rsync', '-a', _EXACT_TIMES, '-s', '--delete', '--stats', '--no-human-readable']
+    words = ['rsync', '-a', _EXACT_TIMES, '-s', '--delete', '--stats', '--no-human-readable',
+             '--info=progress2', '--no-inc-recursive']
     # A workspace has more includes than a command line may have.
     words += ['--from0', '--include-from=-'] if includes else []
     words += [f'--exclude={pattern}' for pattern in excludes]
     if compress:
         words.append('--compress')
-    if progress:
-        words += ['--info=progress2', '--no-inc-recursive']
     if rsh:
         words += ['-e', relay.RSH]
-    words += ['--', f'{source}/', place(target, remote=bool(rsh))]
-    if progress:
-        # rsync rewrites one line with carriage returns; convert them to lines.
-        script = 'set -o pipefail; "$@" | stdbuf -oL tr "\\r" "\\n"'
-        words = ['bash', '-c', script, 'rsync', *words]
+    # rsync rewrites one line with carriage returns; convert them to lines.
+    script = 'set -o pipefail; "$@" | stdbuf -oL tr "\\r" "\\n"'
+    words = ['bash', '-c', script, 'rsync', *words,
+             '--', f'{source}/', place(target, remote=bool(rsh))]
     return Command(tuple(words), input=os.fsencode('\0'.join(includes)),
                    environment={'LC_ALL': 'C', **rsh}, what='rsync')
 

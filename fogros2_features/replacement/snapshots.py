@@ -17,7 +17,7 @@ from typing import Optional
 from fogros2 import untrusted
 from fogros2.errors import ConnectError, DeadlineExceeded, FogError, ShellError
 from fogros2.model import Command
-from fogros2.shell import Shell
+from fogros2.shell import retried, Shell
 from fogros2.shell.command_line import remote_path
 from fogros2.store import delete_folder
 
@@ -27,7 +27,7 @@ LIMIT = 2 << 30
 _HASH = re.compile('[0-9a-f]{64}')
 #: Seconds in which a copy makes no progress.
 TIMEOUT = 600.0
-#: Attempts to copy a folder that changes meanwhile, and to restore one on broken connections.
+#: Attempts to copy a folder that changes meanwhile.
 ATTEMPTS = 3
 
 # Print the size of the folder $1 in bytes, and a hash of its files' names, sizes and times.
@@ -142,12 +142,7 @@ class Checkpoint:
             shell.run(Command.script(_ASIDE.format(
                 remote_path(self.folder), remote_path(self.folder + aside)),
                 what=f'keep {self.folder}'), timeout=60.0)
-        for attempt in range(1, ATTEMPTS + 1):
-            try:
-                shell.sync(newest, self.folder, excludes=(), timeout=TIMEOUT, cancel=self._cancel)
-                break
-            except ConnectError:
-                if attempt == ATTEMPTS:
-                    raise  # rsync kept what has arrived
+        retried(lambda: shell.sync(
+            newest, self.folder, excludes=(), timeout=TIMEOUT, cancel=self._cancel))
         self._unrestored = False
         return True

@@ -13,6 +13,7 @@ from fogros2.describe.values import check_folder
 from fogros2.errors import ConfigurationError, ConnectError, DeadlineExceeded, ShellError
 from fogros2.model import Endpoint, Result
 from fogros2.process import which
+from fogros2.shell import ATTEMPTS
 from fogros2.shell.local import LocalShell
 from fogros2_features.replacement import snapshots
 from fogros2_features.replacement.snapshots import Checkpoint
@@ -127,7 +128,7 @@ class Cut(LocalShell):
 def test_folder_that_was_not_restored_replaces_no_snapshot(kept, folder, shell, tmp_path, aside):
     kept.save(shell, still=True)
     other = Cut(Endpoint('local'), name='next')
-    other.cuts = snapshots.ATTEMPTS
+    other.cuts = ATTEMPTS
     (folder / 'parts/1').unlink()
     with pytest.raises(ConnectError):
         kept.restore(other, aside)
@@ -147,7 +148,7 @@ def test_restoring_goes_on_after_a_short_cut(kept, folder, shell):
     kept.save(shell, still=True)
     (folder / 'parts/1').unlink()
     other = Cut(Endpoint('local'), name='next')
-    other.cuts = snapshots.ATTEMPTS - 1
+    other.cuts = ATTEMPTS - 1
     assert kept.restore(other) and texts(folder) == {'parts/1': 'one'}
 
 

@@ -14,6 +14,7 @@ import socket
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
 
 import paramiko
 import pytest
@@ -213,12 +214,29 @@ def test_fetch_continues_a_file_that_was_cut_off(shell, tmp_path, monkeypatch):
     assert (tmp_path / 'back/bag').read_bytes() == (tmp_path / 'source/bag').read_bytes()
 
 
-def test_fetch_without_progress_times_out(shell, tmp_path, monkeypatch):
+@pytest.mark.parametrize('copy', ['sync', 'fetch'])
+def test_copy_without_progress_times_out(shell, tmp_path, monkeypatch, copy):
     (tmp_path / 'source').mkdir()
+    monkeypatch.setattr(shell, 'run', lambda *_, **__: Result(0, '', ''))
     monkeypatch.setattr(relay, 'relay', lambda *_: threading.Event().wait(1.0) or 255)
+    call = {'sync': functools.partial(shell.sync, tmp_path / 'source', 'there', excludes=()),
+            'fetch': functools.partial(shell.fetch, str(tmp_path / 'source'), tmp_path / 'back',
+                                       known=None, limit=1 << 30)}[copy]
     with pytest.raises(DeadlineExceeded, match='has copied nothing for 0.3 s .check the robot'):
-        shell.fetch(str(tmp_path / 'source'), tmp_path / 'back', known=None, limit=1 << 30,
-                    timeout=0.3)
+        call(timeout=0.3)
+
+
+def test_copy_that_makes_progress_has_no_end(monkeypatch):
+    now = 0.0
+    monkeypatch.setattr(sync, 'time', SimpleNamespace(monotonic=lambda: now))
+    stall = sync.Stall(None, 60.0)
+    for minutes in range(600):
+        now = minutes * 60.0
+        assert not stall.is_set()
+        stall.note(minutes)
+    now += 61.0
+    with pytest.raises(DeadlineExceeded):
+        stall.is_set()
 
 
 @pytest.mark.parametrize('folder, there', [

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from fogros2.errors import WorkspaceError
+from fogros2.errors import ConnectError, WorkspaceError
 from fogros2.host import workspace
 from fogros2.host.inspection import HostFacts, Python
 from fogros2.model import Command, Endpoint, Result, SyncReport
@@ -340,6 +340,23 @@ class Elsewhere(FakeShell):
         """Send it by rsync."""
         return LocalShell(Endpoint('local'), name='here').sync(
             source, f'{self.folder}{target}', **arguments)  # type: ignore
+
+
+def test_workspace_is_sent_again_when_the_connection_is_lost(
+    root: Path, tmp_path: Path,
+) -> None:
+    class Lost(Elsewhere):
+        calls = 0
+
+        def sync(self, *folders: Any, **arguments: Any) -> SyncReport:
+            self.calls += 1
+            if self.calls < 2:
+                raise ConnectError('the connection was lost')
+            return super().sync(*folders, **arguments)
+
+    shell = Lost(tmp_path / 'there')
+    workspace.transfer(shell, [plan(workspace.inspect(root))], timeouts=Timeouts())
+    assert shell.calls == 2 and Path(f'{shell.folder}{root}/install/alpha').is_dir()
 
 
 @pytest.mark.parametrize('name', ['a[1]', 'a*', 'a?', 'a\\b', r'a\[1]'])

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+import functools
 from pathlib import Path
 import platform
 import sys
@@ -17,6 +18,7 @@ from fogros2.errors import CommandError, PrerequisiteError
 from fogros2.host import bootstrap, installer, modules, workspace
 from fogros2.model import Command, NodeSpec
 from fogros2.report import Progress, Warned
+from fogros2.shell import retried
 
 
 def install_ros(
@@ -116,10 +118,10 @@ class Modules(Step):
         if copy is not None:
             for folder, entries in copy.entries.items():
                 # A sync does not delete excluded files, so the folders add up.
-                self._job.shell.sync(
-                    Path(folder), f'{target}/site', excludes=('/*',),
+                retried(functools.partial(
+                    self._job.shell.sync, Path(folder), f'{target}/site', excludes=('/*',),
                     includes=[f'/{entry}' for entry in entries],
-                    timeout=self._context.timeouts.install, cancel=self._job.cancel)
+                    timeout=self._context.timeouts.install, cancel=self._job.cancel))
         else:
             try:
                 self._run(installer.pinned_install(
