@@ -69,7 +69,7 @@ def check(
             "use on_exit='delete' to leave nothing there, or 'keep'")
     for each, own in feature.used(spec):
         each.check(spec, own)
-    chain = [workspace.inspect(path) for path in spec.workspaces]
+    chain = [workspace.inspected(path) for path in spec.workspaces]
     # a step that cannot do without reports what is wrong
     with contextlib.suppress(FogError, OSError):
         warned = undeclared.warning(
@@ -102,4 +102,4 @@ def check_architecture(spec: MachineSpec, provider: Provider) -> None:
     if architecture:
         bootstrap.check_architecture(
             spec, architecture,
-            workspace.inspect(spec.workspace) if spec.workspace else None)
+            workspace.inspected(spec.workspace) if spec.workspace else None)

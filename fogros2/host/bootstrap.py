@@ -141,7 +141,7 @@ def dependencies(spec: MachineSpec, under: Underlay, packages: Sequence[str] = (
     }
     # Our packages and those of ROS 2 come with the wheels.
     ours = {name.replace('-', '_') for name in needs.OURS}
-    named = needs.keys(map(workspaces.inspect, spec.workspaces), {*packages} - ours)
+    named = needs.keys(map(workspaces.inspected, spec.workspaces), {*packages} - ours)
     named = tuple({*named} & {*packages})
     if named := needs.outside(named, [sys.prefix] if wheels else []):
         wanted['launch'] = sorted(named)
@@ -187,7 +187,7 @@ def ensure(
         ) from error
     if elsewhere:
         check_elsewhere(spec, facts, robot)
-    chain = [workspaces.inspect(path) for path in spec.workspaces]
+    chain = [workspaces.inspected(path) for path in spec.workspaces]
     todo, prefixes = plan_alike(spec, facts, robot, under, chain), under.prefixes
     if todo is None:
         try:

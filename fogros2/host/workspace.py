@@ -18,6 +18,7 @@ import re
 import shlex
 import sys
 import threading
+import time
 from typing import Optional
 import xml.etree.ElementTree as ElementTree
 
@@ -33,6 +34,8 @@ from fogros2.waiting import Timeouts
 #: rsync patterns of files that no machine needs, anywhere in a workspace.
 EXCLUDES = ('.git', '.hg', '.svn', '__pycache__', '*.pyc', '.venv', '.cache', '.mypy_cache',
             '.pytest_cache', '.ruff_cache', '.vscode', '.idea')
+#: Seconds for which machines share what was read of a workspace.
+SHARED = 60.0
 #: Folders that colcon creates in a workspace.
 BUILT = ('build', 'install', 'log')
 #: Architecture in the form of ``uname -m``, by ``e_machine`` in the header of an ELF file.
@@ -101,6 +104,11 @@ class Workspace:
         return all(_build_type(path) == 'ament_python' for path in self.sources.values())
 
 
+_inspecting = threading.Lock()
+#: The time until which a workspace is shared, and the workspace, by its root.
+_inspected: dict[Path, tuple[float, Workspace]] = {}
+
+
 @dataclasses.dataclass(frozen=True)
 class WorkspacePlan:
     """
@@ -122,6 +130,23 @@ class WorkspacePlan:
     commands: tuple[Command, ...]
     setup: str
     reason: str = ''
+
+
+def inspected(path: str | os.PathLike[str]) -> Workspace:
+    """
+    Return what ``inspect`` returned in the last ``SHARED`` seconds, or call it.
+
+    All machines of a launch are checked, and then prepared, at about the same time.
+
+    :raises WorkspaceError: see ``inspect``.
+    """
+    root = _absolute(path)
+    with _inspecting:
+        until, workspace = _inspected.get(root, (0.0, None))
+        if workspace is None or time.monotonic() > until:
+            workspace = inspect(root)
+            _inspected[root] = time.monotonic() + SHARED, workspace
+        return workspace
 
 
 def inspect(path: str | os.PathLike[str]) -> Workspace:
@@ -149,9 +174,11 @@ def _inspect(root: Path) -> Workspace:
         if (root.parent / 'install').is_dir():
             hint = f'did you mean {root.parent}?'
         raise WorkspaceError(f'{root} is no colcon workspace: no ROS package in it', hint)
-    ways = {_way_out(folder, root) for folder in sources.values()}
+    way_out = _ways_out(root)
+    ways = {way_out(folder) for folder in sources.values()}
     linked = tuple(sorted({Path(os.path.realpath(way)) for way in ways if way is not None}))
-    return _inspect_installed(Workspace(root, installed, sources, linked_sources=linked))
+    return _inspect_installed(
+        Workspace(root, installed, sources, linked_sources=linked), way_out)
 
 
 def _absolute(path: str | os.PathLike[str]) -> Path:
@@ -427,7 +454,9 @@ def _build_type(folder: Path) -> str:
     return next(_field_texts(folder / 'package.xml', 'build_type'), '')
 
 
-def _inspect_installed(workspace: Workspace) -> Workspace:
+def _inspect_installed(
+    workspace: Workspace, way_out: Callable[[Path], Optional[Path]],
+) -> Workspace:
     """Return a workspace with what a walk through its install space and its links finds."""
     root, install = workspace.root, workspace.root / 'install'
     links: set[Path] = set()
@@ -455,7 +484,7 @@ def _inspect_installed(workspace: Workspace) -> Workspace:
             if path in seen or path.is_relative_to(install):
                 continue
             seen.add(path)
-            way = _way_out(path, root) if path.is_relative_to(root) else path
+            way = way_out(path) if path.is_relative_to(root) else path
             if way is None:
                 links.add(path)
                 todo.append(path)
@@ -476,15 +505,21 @@ def _inspect_installed(workspace: Workspace) -> Workspace:
         linked=tuple(sorted(linked)), compiled=compiled, python=python)
 
 
-def _way_out(path: Path, root: Path) -> Optional[Path]:
-    """Return the first link of a path in a workspace that leads out of it, None if none does."""
+def _ways_out(root: Path) -> Callable[[Path], Optional[Path]]:
+    """Return a function of a path in a workspace: the first link of it that leads out, or None."""
     top = os.path.realpath(root)
-    here = root
-    for part in path.relative_to(root).parts:
-        here /= part
-        if here.is_symlink() and not Path(os.path.realpath(here)).is_relative_to(top):
-            return here
-    return None
+
+    @functools.cache
+    def way_out(path: Path) -> Optional[Path]:
+        if path == root:
+            return None
+        way = way_out(path.parent)
+        if way is None and path.is_symlink() \
+                and not Path(os.path.realpath(path)).is_relative_to(top):
+            return path
+        return way
+
+    return way_out
 
 
 def _files(folder: Path) -> Iterator[os.DirEntry[str]]:

@@ -12,13 +12,15 @@ from typing import Any
 
 import pytest
 
+from fogros2.deploy import checks
 from fogros2.errors import ConnectError, WorkspaceError
 from fogros2.host import workspace
 from fogros2.host.inspection import HostFacts, Python
-from fogros2.model import Command, Endpoint, Result, SyncReport
+from fogros2.model import Command, Endpoint, MachineSpec, Result, SyncReport
+from fogros2.report import silent
 from fogros2.shell.local import LocalShell
 from fogros2.waiting import Timeouts
-from fogros2_testing.fakes import FakeShell
+from fogros2_testing.fakes import FakeProvider, FakeShell
 
 PYTHON = Python('/usr/bin/python3', (3, 12), True)
 ROBOT = HostFacts(system='ubuntu', release='24.04', architecture='x86_64', pythons=(PYTHON,),
@@ -133,6 +135,28 @@ def test_file_that_cannot_be_read_is_named(root: Path, monkeypatch: pytest.Monke
     error = PermissionError(13, 'Permission denied', str(link))
     with pytest.raises(WorkspaceError, match=f"{link} can't be read: Permission denied .give"):
         workspace.inspect(root)
+
+
+def test_workspace_is_read_once_for_all_machines(
+    root: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    inspect, calls = workspace.inspect, []
+
+    def counted(path: Path) -> workspace.Workspace:
+        calls.append(path)
+        return inspect(path)
+
+    monkeypatch.setattr(workspace, 'inspect', counted)
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(shell_kind='local'))
+    monkeypatch.setattr(FakeProvider, 'architecture', lambda *_: 'x86_64')
+    for name in 'abc':
+        spec = MachineSpec(name, 'fake', workspace=str(root))
+        checks.check(spec, FakeProvider(), environment={}, programs=(), report=silent)
+        checks.check_architecture(spec, FakeProvider())
+    assert calls == [root]
+    monkeypatch.setattr(workspace, 'SHARED', -1.0)
+    workspace._inspected.clear()
+    assert workspace.inspected(root) is not workspace.inspected(root), 'it may have changed'
 
 
 def test_install_space_is_copied_to_a_computer_that_can_use_it(root: Path) -> None:
