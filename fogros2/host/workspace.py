@@ -35,7 +35,7 @@ from fogros2.waiting import Timeouts
 EXCLUDES = ('.git', '.hg', '.svn', '__pycache__', '*.pyc', '.venv', '.cache', '.mypy_cache',
             '.pytest_cache', '.ruff_cache', '.vscode', '.idea')
 #: Seconds for which machines share what was read of a workspace.
-SHARED = 60.0
+SHARED = 20.0
 #: Folders that colcon creates in a workspace.
 BUILT = ('build', 'install', 'log')
 #: Architecture in the form of ``uname -m``, by ``e_machine`` in the header of an ELF file.
