@@ -125,6 +125,11 @@ class CycloneDds(DdsVendor):
             raise DdsError(
                 "CYCLONEDDS_URI's NetworkInterfaceAddress excludes the VPN",
                 'write <Interfaces><NetworkInterface name="..."/></Interfaces> instead')
+        if any((one.text or '').strip().lower() == 'false'
+               for one in self._find('allowmulticast', user)[-1:]):
+            raise DdsError(
+                "CYCLONEDDS_URI's AllowMulticast is false, but the robot's nodes and those of "
+                'machines discover each other by multicast', 'write spdp instead of false')
         has_peers = bool(self._find('peer', user) or user.get('ROS_STATIC_PEERS'))
         listed = self._find('networkinterface', user)
         _check_multicast(listed)

@@ -156,10 +156,11 @@ class FastDds(DdsVendor):
             if discovery.find(name) is None:
                 _child(_child(discovery, name), 'sec').text = str(seconds)
         names = [one.name for one in interfaces]
-        group, common = [multicast_group(names[-1])], [DISCOVERY_GROUP]
+        group = [multicast_group(names[-1])]
+        common = [] if ANY in names and _unicast_only(builtin) else [DISCOVERY_GROUP]
         # nodes that use a LAN also hear the common group, and so find each other by it. On Linux,
         # a socket hears its groups on each interface on which any process has joined them.
-        heard, found_by = (group + common, []) if ANY in names else (group, group)
+        heard, found_by = (group + common, []) if common and ANY in names else (group, group)
         groups = dict.fromkeys([*common, *found_by, *map(multicast_group, peers)])
         if not quiet:
             # the first group is announced, see max_multicast_locators
@@ -243,6 +244,12 @@ def _default_participant(profiles: Element) -> Element:
             return participant
     return ElementTree.SubElement(
         profiles, 'participant', profile_name='fogros2', is_default_profile='true')
+
+
+def _unicast_only(builtin: Element) -> bool:
+    """Return whether the user's participant announces itself to listed hosts only."""
+    return (builtin.find('metatrafficUnicastLocatorList/locator') is not None
+            and builtin.find('metatrafficMulticastLocatorList/locator') is None)
 
 
 def _own_transport(profiles: Element, rtps: Element, names: Sequence[str]) -> None:

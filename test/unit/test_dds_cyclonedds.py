@@ -98,6 +98,14 @@ def test_configuration_without_room_for_the_vpn_is_refused() -> None:
         CYCLONE.robot_interfaces('foga1b2c3', 'eth0', {'CYCLONEDDS_URI': uri})
 
 
+def test_configuration_without_multicast_is_refused() -> None:
+    some, none = (f'<General><AllowMulticast>{value}</></>' for value in ('spdp', ' False '))
+    with pytest.raises(DdsError, match='AllowMulticast is false'):
+        CYCLONE.robot_interfaces('foga1b2c3', 'eth0', {'CYCLONEDDS_URI': f'{some},{none}'})
+    # the last value is valid
+    CYCLONE.robot_interfaces('foga1b2c3', 'eth0', {'CYCLONEDDS_URI': f'{none},{some}'})
+
+
 INSIDE = '<CycloneDDS><Domain><General><Interfaces>{}</Interfaces></General></Domain></CycloneDDS>'
 #: Forms of CYCLONEDDS_URI that Cyclone reads, and the interfaces that it takes from them.
 FORMS = {

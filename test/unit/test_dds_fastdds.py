@@ -148,6 +148,23 @@ def test_a_users_profiles_are_taken_over(tmp_path: Path) -> None:
         'transport_descriptors', 'data_writer', 'participant', 'publisher']
 
 
+def default_participant(path: Path, rtps: str) -> dict[str, str]:
+    """Write a user's default participant; return the environment."""
+    path.write_text('<dds><profiles><participant is_default_profile="true"><rtps>'
+                    f'{rtps}</rtps></participant></profiles></dds>')
+    return {VARIABLE: str(path)}
+
+
+def test_a_user_without_multicast_stays_out_of_the_common_group(tmp_path: Path) -> None:
+    user = default_participant(
+        tmp_path / 'own.xml', '<builtin><metatrafficUnicastLocatorList><locator/>'
+        '</metatrafficUnicastLocatorList><initialPeersList><locator><udpv4><address>192.168.1.5'
+        '</address></udpv4></locator></initialPeersList></builtin>')
+    text = robot(FastDds(), user)
+    assert locators(text, 'metatrafficMulticastLocatorList') == [('239.18.7.1', '7402')]
+    assert [host for host, _ in locators(text)] == ['192.168.1.5', '239.18.7.1', '239.18.7.2']
+
+
 @pytest.mark.parametrize(('content', 'words'), [
     (None, "can't be read"), ('<dds', 'no XML'),
     ('<dds><profiles><participant is_default_profile="true"><rtps><useBuiltinTransports>false'
