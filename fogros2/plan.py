@@ -120,6 +120,23 @@ def check_domain(domain: int, specs: Iterable[MachineSpec]) -> None:
                 'set ROS_DOMAIN_ID for the whole launch, before it')
 
 
+def check_security(environment: Mapping[str, str], specs: Iterable[MachineSpec]) -> None:
+    """
+    Check that the nodes of machines are secured if the robot's are.
+
+    :param environment: the robot's variables.
+    :raises DdsError: secured and unsecured nodes would not hear each other.
+    """
+    for spec in specs:
+        if environment.get('ROS_SECURITY_ENABLE') == 'true' and (
+                'ROS_SECURITY_ENABLE' not in spec.environment):
+            raise DdsError(
+                'ROS_SECURITY_ENABLE=true secures the nodes here, but not those of machine '
+                f"'{spec.name}', which has no keystore: they would not hear each other",
+                f"unset it, or set the ROS_SECURITY variables in env= of '{spec.name}', which "
+                'needs a keystore')
+
+
 def has_wheels(prefix: str) -> bool:
     """Return whether a prefix has ROS 2 from the wheels of the package index."""
     return next(Path(prefix).glob('lib/python3*/site-packages/ros_rclpy-*.dist-info'),

@@ -130,6 +130,7 @@ class Launch:
         check_names(specs)
         plan.check_rmw(rmw, plan.ament_prefixes(self.user_environment), specs)
         plan.check_domain(self.domain, specs)
+        plan.check_security(self.user_environment, specs)
         self._check_router(specs)
         for spec in specs:
             check(spec, self.provider(spec.provider), environment=self.user_environment,

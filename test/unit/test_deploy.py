@@ -133,19 +133,22 @@ def test_domain_that_is_no_number_is_refused(launch):
         launch.dds()
 
 
-@pytest.mark.parametrize(('changes', 'count', 'words'), [
-    ({'environment': {'ROS_DOMAIN_ID': '5'}}, 1, 'ROS_DOMAIN_ID=5, those here 0'),
-    ({}, 33, 'has 33 machines, and the robot.s router can have 32')])
+@pytest.mark.parametrize(('robot', 'changes', 'count', 'words'), [
+    ({'ROS_SECURITY_ENABLE': 'true'}, {}, 1, "not those of machine 'm0', which has no keystore"),
+    ({}, {'environment': {'ROS_DOMAIN_ID': '5'}}, 1, 'ROS_DOMAIN_ID=5, those here 0'),
+    ({}, {}, 33, 'has 33 machines, and the robot.s router can have 32')])
 def test_machines_that_no_node_would_hear_are_not_created(
-        launch, checked, monkeypatch, changes, count, words):
+        launch, checked, monkeypatch, robot, changes, count, words):
     monkeypatch.setattr(deployed, 'check_robot', lambda: None)
     monkeypatch.setattr(plan, 'check_rmw', lambda *_: None)
+    launch.user_environment.update(robot)
     launch.use_dds('zenoh')
     specs = [dataclasses.replace(SPEC, name=f'm{n}', **changes) for n in range(count)]
     with pytest.raises(DdsError, match=words):
         launch.prepare(specs)
     assert checked.calls == []
-    launch.prepare([dataclasses.replace(SPEC, name=f'm{n}') for n in range(32)])
+    launch.prepare([dataclasses.replace(SPEC, name=f'm{n}', environment=robot)
+                    for n in range(32)])
 
 
 @pytest.mark.parametrize(('dds', 'environment', 'drops'), [
