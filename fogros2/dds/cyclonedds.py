@@ -117,7 +117,7 @@ class CycloneDds(DdsVendor):
         :param lan: see :meth:`parse_lan`.
         :param user: the user's environment variables. Interfaces configured there replace the LAN.
             Peers make the LAN come first, because a loopback cannot ask them. If ROS 2 is
-            limited to this computer, the LAN is not used.
+            limited to this computer, the LAN is not used, so peers are refused.
         :raises DdsError: the user's configuration cannot be read or extended, or blocks the
             announcements of machines.
         """
@@ -137,6 +137,13 @@ class CycloneDds(DdsVendor):
         if not any(_attribute(one, 'name') == 'lo' or _attribute(one, 'address').startswith('127.')
                    for one in listed):
             interfaces.append(DdsInterface('lo', -5 if has_peers else 20))
+        if local_only(user) and not listed and any(
+                not host.startswith('127.') and host != 'localhost' for host in self.asked(user)):
+            raise DdsError(
+                'ROS 2 is limited to this computer, so the nodes of Cyclone DDS do not use the '
+                "LAN and would not meet those of ROS_STATIC_PEERS or CYCLONEDDS_URI's Peers",
+                'use rmw_fastrtps_cpp, leave the peers out, or unset '
+                'ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_LOCALHOST_ONLY')
         if lan is not None and not listed and not local_only(user):
             interfaces.append(DdsInterface(lan, 10, required=False))
         # below 0, the default priority of the user's own interfaces

@@ -110,6 +110,8 @@ class FastDds(DdsVendor):
         """
         Return the interfaces of the robot's nodes: all of them, and the VPN's.
 
+        If ROS 2 is limited to this computer, they use the loopback, unless they have peers.
+
         :raises DdsError: the user's environment prevents communication with machines.
         """
         if user.get('ROS_DISCOVERY_SERVER'):
@@ -121,7 +123,8 @@ class FastDds(DdsVendor):
             raise DdsError(
                 f'with FASTDDS_BUILTIN_TRANSPORTS={transports}, nodes would reach no machine',
                 'unset it: machines speak UDP over IPv4')
-        first = LOOPBACK if local_only(user) else ANY
+        # a loopback cannot ask peers
+        first = LOOPBACK if local_only(user) and not static_peers(user) else ANY
         return [DdsInterface(first), DdsInterface(vpn)]
 
     def machine_interfaces(self, vpn: str) -> list[DdsInterface]:
@@ -157,7 +160,8 @@ class FastDds(DdsVendor):
                 _child(_child(discovery, name), 'sec').text = str(seconds)
         names = [one.name for one in interfaces]
         group = [multicast_group(names[-1])]
-        common = [] if ANY in names and _unicast_only(builtin) else [DISCOVERY_GROUP]
+        local = local_only(user)
+        common = [] if ANY in names and (local or _unicast_only(builtin)) else [DISCOVERY_GROUP]
         # nodes that use a LAN also hear the common group, and so find each other by it. On Linux,
         # a socket hears its groups on each interface on which any process has joined them.
         heard, found_by = (group + common, []) if common and ANY in names else (group, group)
@@ -166,11 +170,13 @@ class FastDds(DdsVendor):
             # the first group is announced, see max_multicast_locators
             _child(builtin, 'avoid_builtin_multicast').text = 'false'
             _child(builtin, 'metatrafficMulticastLocatorList')[:0] = map(self._group, heard)
+        if not (quiet and common):
+            # without it, Fast DDS joins the common group
             _child(_child(builtin, 'metatrafficUnicastLocatorList'), 'locator')
         # any initial peer replaces the default one
         _child(builtin, 'initialPeersList').extend([
             *map(self._group, groups),
-            *(one for host in [*static_peers(user), *({LOOPBACK} & {*names})]
+            *(one for host in [*static_peers(user), *([LOOPBACK] if local else [])]
               for one in self._ports(host))])
         _own_transport(profiles, rtps, names)
         size = ElementTree.SubElement(

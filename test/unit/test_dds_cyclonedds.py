@@ -92,6 +92,13 @@ def test_static_peers_put_the_lan_first(variable: str) -> None:
         'eth0', 'lo', 'foga1b2c3']
 
 
+def test_peers_of_a_robot_limited_to_itself_are_refused() -> None:
+    user = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    with pytest.raises(DdsError, match='would not meet those of ROS_STATIC_PEERS'):
+        CYCLONE.robot_interfaces('vpn', 'eth0', {**user, 'ROS_STATIC_PEERS': '192.168.0.7'})
+    CYCLONE.robot_interfaces('vpn', 'eth0', {**user, 'ROS_STATIC_PEERS': '127.0.0.1'})
+
+
 def test_configuration_without_room_for_the_vpn_is_refused() -> None:
     uri = '<CycloneDDS><General><NetworkInterfaceAddress>eth0</NetworkInterfaceAddress></General>'
     with pytest.raises(DdsError, match='NetworkInterfaceAddress'):

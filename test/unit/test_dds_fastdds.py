@@ -114,6 +114,20 @@ def test_robot_limited_to_itself_has_the_loopback_and_the_vpn(user: dict[str, st
     assert environment.get('ROS_LOCALHOST_ONLY') != '1'
 
 
+@pytest.mark.parametrize('quiet', [False, True])
+def test_robot_limited_to_itself_and_its_peers_asks_no_lan(quiet: bool) -> None:
+    text = robot(FastDds(), {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+                             'ROS_STATIC_PEERS': '192.168.1.5'}, quiet=quiet)
+    root = parsed(text)
+    assert root.find('.//interfaceWhiteList', NS) is None
+    assert list(dict.fromkeys(host for host, _ in locators(text))) == [
+        '239.18.7.1', '239.18.7.2', '192.168.1.5', '127.0.0.1']
+    assert locators(text, 'metatrafficMulticastLocatorList') == (
+        [] if quiet else [('239.18.7.1', '7402')])
+    # without a unicast locator, Fast DDS would join the common group
+    assert root.find('.//metatrafficUnicastLocatorList/locator', NS) is not None
+
+
 def test_static_peers_are_asked_beside_the_groups() -> None:
     text = robot(FastDds(), {'ROS_STATIC_PEERS': '192.168.1.5;nuc.local;'})
     assert list(dict.fromkeys(host for host, _ in locators(text))) == [
