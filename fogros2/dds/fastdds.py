@@ -73,6 +73,19 @@ LOOPBACK = '127.0.0.1'
 ANY = '0.0.0.0'
 #: Values of FASTDDS_BUILTIN_TRANSPORTS that can reach nodes with UDP only.
 _REACHABLE = ('', 'DEFAULT', 'UDPV4')
+#: Settings of the default participant that are refused: where in ``<rtps>``, the values that do
+#: not matter, and what follows from others.
+_REFUSED: Sequence[tuple[str, Sequence[str], str]] = (
+    ('userTransports/transport_id', (), 'exclude the VPN'),
+    ('useBuiltinTransports', ('true',), 'exclude the VPN'),
+    ('builtinTransports', ('DEFAULT', 'UDPv4'), 'have no plain UDP, which machines use'),
+    ('builtin/discovery_config/discoveryProtocol', ('SIMPLE',),
+     'discover by a server that no machine knows'),
+    ('builtin/discovery_config/ignoreParticipantFlags', ('NO_FILTER', 'FILTER_SAME_PROCESS'),
+     'ignore other hosts'),
+    ('builtin/metatrafficUnicastLocatorList//address', (), 'have no address in the VPN'),
+    ('defaultUnicastLocatorList//address', (), 'have no address in the VPN'),
+    ('port/portBase', (), 'have other ports than those of machines'))
 _PEER = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
 _UDP = 'fogros2_udp'
 
@@ -240,13 +253,14 @@ def _profiles(path: str) -> tuple[Element, Element]:
 def _default_participant(profiles: Element) -> Element:
     for participant in profiles.iter('participant'):
         if participant.get('is_default_profile') == 'true':
-            rtps = participant.find('rtps')
-            if rtps is not None and (
-                    rtps.find('userTransports') is not None
-                    or rtps.findtext('useBuiltinTransports', 'true').strip() == 'false'):
-                raise DdsError(
-                    f'the default participant of {VARIABLE} has its own transports, which'
-                    ' exclude the VPN', 'leave userTransports and useBuiltinTransports out')
+            for path, values, effect in _REFUSED:
+                for setting in participant.iterfind(f'rtps/{path}'):
+                    value = (setting.text or '').strip()
+                    if value and value not in values:
+                        raise DdsError(
+                            f'with {path}={value} of the default participant in {VARIABLE}, the '
+                            f"robot's nodes {effect}: they would not meet those of machines",
+                            f'leave {path} out')
             return participant
     return ElementTree.SubElement(
         profiles, 'participant', profile_name='fogros2', is_default_profile='true')

@@ -180,9 +180,7 @@ def test_a_user_without_multicast_stays_out_of_the_common_group(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(('content', 'words'), [
-    (None, "can't be read"), ('<dds', 'no XML'),
-    ('<dds><profiles><participant is_default_profile="true"><rtps><useBuiltinTransports>false'
-     '</useBuiltinTransports></rtps></participant></profiles></dds>', 'exclude the VPN')])
+    (None, "can't be read"), ('<dds', 'no XML')])
 def test_a_users_profiles_that_cannot_be_used_are_refused(
         tmp_path: Path, content: str | None, words: str) -> None:
     path = tmp_path / 'own.xml'
@@ -191,6 +189,31 @@ def test_a_users_profiles_that_cannot_be_used_are_refused(
     with pytest.raises(DdsError, match=words) as caught:
         robot(FastDds(), {VARIABLE: str(path)})
     assert caught.value.hint
+
+
+@pytest.mark.parametrize(('rtps', 'words'), [
+    ('<useBuiltinTransports>false</useBuiltinTransports>', 'useBuiltinTransports=false'),
+    ('<userTransports><transport_id>a</transport_id></userTransports>', 'transport_id=a'),
+    ('<builtinTransports>LARGE_DATA</builtinTransports>', 'builtinTransports=LARGE_DATA'),
+    ('<builtin><discovery_config><discoveryProtocol> SUPER_CLIENT </discoveryProtocol>'
+     '</discovery_config></builtin>', 'discoveryProtocol=SUPER_CLIENT'),
+    ('<builtin><discovery_config><ignoreParticipantFlags>FILTER_DIFFERENT_HOST'
+     '</ignoreParticipantFlags></discovery_config></builtin>', 'ignoreParticipantFlags=FILTER_D'),
+    ('<builtin><metatrafficUnicastLocatorList><locator><udpv4><port>7410</port><address>'
+     '192.168.1.2</address></udpv4></locator></metatrafficUnicastLocatorList></builtin>',
+     'metatrafficUnicastLocatorList//address=192.168.1.2'),
+    ('<defaultUnicastLocatorList><locator><udpv4><address>192.168.1.2</address></udpv4></locator>'
+     '</defaultUnicastLocatorList>', 'defaultUnicastLocatorList//address=192.168.1.2'),
+    ('<port><portBase>7000</portBase></port>', 'portBase=7000')])
+def test_participant_that_meets_no_machine_is_refused(
+        tmp_path: Path, rtps: str, words: str) -> None:
+    with pytest.raises(DdsError, match=words) as caught:
+        robot(FastDds(), default_participant(tmp_path / 'own.xml', rtps))
+    assert caught.value.hint
+    robot(FastDds(), default_participant(
+        tmp_path / 'own.xml', '<useBuiltinTransports>true</useBuiltinTransports><builtin>'
+        '<discovery_config><discoveryProtocol>SIMPLE</discoveryProtocol></discovery_config>'
+        '</builtin>'))
 
 
 @pytest.mark.parametrize(('name', 'value'), [
