@@ -59,6 +59,11 @@ RECEIVE_BUFFER = 4 * 1024 * 1024
 #: (28), RTPS, INFO_DST, INFO_TS and DATA_FRAG (84).
 FRAGMENT = 1280
 MESSAGE = 1380
+#: Settings that hosts have to share, in lower case: their values on machines.
+_SHARED: Mapping[str, Sequence[str]] = {
+    'transport': ('udp', 'default'), 'spdpmulticastaddress': ('239.255.0.1',), 'tag': (),
+    'externaldomainid': ('default',), 'security': (), 'base': ('7400',), 'domaingain': ('250',),
+    'participantgain': ('2',), 'multicastmetaoffset': ('0',), 'unicastmetaoffset': ('10',)}
 #: FogROS2's own interfaces, and the loopback.
 _NOT_LAN = re.compile('lo$|fog')
 #: <linux/if.h>
@@ -121,15 +126,7 @@ class CycloneDds(DdsVendor):
         :raises DdsError: the user's configuration cannot be read or extended, or blocks the
             announcements of machines.
         """
-        if self._find('networkinterfaceaddress', user):
-            raise DdsError(
-                "CYCLONEDDS_URI's NetworkInterfaceAddress excludes the VPN",
-                'write <Interfaces><NetworkInterface name="..."/></Interfaces> instead')
-        if any((one.text or '').strip().lower() == 'false'
-               for one in self._find('allowmulticast', user)[-1:]):
-            raise DdsError(
-                "CYCLONEDDS_URI's AllowMulticast is false, but the robot's nodes and those of "
-                'machines discover each other by multicast', 'write spdp instead of false')
+        self._check(user)
         has_peers = bool(self._find('peer', user) or user.get('ROS_STATIC_PEERS'))
         listed = self._find('networkinterface', user)
         _check_multicast(listed)
@@ -148,6 +145,26 @@ class CycloneDds(DdsVendor):
             interfaces.append(DdsInterface(lan, 10, required=False))
         # below 0, the default priority of the user's own interfaces
         return [*interfaces, DdsInterface(vpn, -10, required=False)]
+
+    def _check(self, user: Mapping[str, str]) -> None:
+        """Refuse settings with which the robot's nodes would not meet those of machines."""
+        if self._find('networkinterfaceaddress', user):
+            raise DdsError(
+                "CYCLONEDDS_URI's NetworkInterfaceAddress excludes the VPN",
+                'write <Interfaces><NetworkInterface name="..."/></Interfaces> instead')
+        if any((one.text or '').strip().lower() == 'false'
+               for one in self._find('allowmulticast', user)[-1:]):
+            raise DdsError(
+                "CYCLONEDDS_URI's AllowMulticast is false, but the robot's nodes and those of "
+                'machines discover each other by multicast', 'write spdp instead of false')
+        for tag, values in _SHARED.items():
+            for one in self._find(tag, user)[-1:]:
+                text = ''.join(one.itertext()).strip().lower()
+                if text and text not in values:
+                    raise DdsError(
+                        f'CYCLONEDDS_URI sets {one.tag}, which is '
+                        f"{values[0] if values else 'not set'} on machines: the robot's nodes "
+                        'would not meet those of machines', f'leave {one.tag} out')
 
     def _find(self, tag: str, user: Mapping[str, str]) -> list[Element]:
         """Return the user's settings with a tag, in lower case, that are for our domain."""

@@ -113,6 +113,19 @@ def test_configuration_without_multicast_is_refused() -> None:
     CYCLONE.robot_interfaces('foga1b2c3', 'eth0', {'CYCLONEDDS_URI': f'{none},{some}'})
 
 
+@pytest.mark.parametrize('setting', [
+    '<Discovery><Tag>a</Tag></Discovery>', '<General><Transport>tcp</Transport></General>',
+    '<Discovery><SPDPMulticastAddress>239.1.2.3</SPDPMulticastAddress></Discovery>',
+    '<Discovery><ExternalDomainId>7</ExternalDomainId></Discovery>',
+    '<Discovery><Ports><Base>7000</Base></Ports></Discovery>',
+    '<Security><Authentication><PrivateKey>a</PrivateKey></Authentication></Security>'])
+def test_settings_that_machines_do_not_share_are_refused(setting: str) -> None:
+    with pytest.raises(DdsError, match='would not meet those of machines') as caught:
+        CYCLONE.robot_interfaces('vpn', None, {'CYCLONEDDS_URI': setting})
+    assert caught.value.hint
+    CYCLONE.robot_interfaces('vpn', None, {'CYCLONEDDS_URI': '<General><Transport>UDP</></>'})
+
+
 INSIDE = '<CycloneDDS><Domain><General><Interfaces>{}</Interfaces></General></Domain></CycloneDDS>'
 #: Forms of CYCLONEDDS_URI that Cyclone reads, and the interfaces that it takes from them.
 FORMS = {
