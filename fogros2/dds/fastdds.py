@@ -33,7 +33,7 @@ from typing import ClassVar, Optional
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from fogros2.dds import check_discovery, DdsVendor, local_only, static_peers
+from fogros2.dds import addresses_of, check_discovery, DdsVendor, local_only, static_peers
 from fogros2.errors import DdsError
 from fogros2.model import DdsInterface
 from fogros2.vpn.addresses import dds_ports, DISCOVERY_GROUP, multicast_group
@@ -209,8 +209,15 @@ class FastDds(DdsVendor):
         if not _PEER.fullmatch(host):
             raise DdsError(f"'{host}' of ROS_STATIC_PEERS is no address or host name",
                            'write addresses or names, separated by ;')
+        addresses = addresses_of([host])
+        if not addresses:
+            # Fast DDS would ignore the whole profile, and nodes would use its defaults
+            raise DdsError(
+                f"'{host}' of ROS_STATIC_PEERS has no IPv4 address: nodes would not use the VPN",
+                'correct the name, or leave it out of ROS_STATIC_PEERS')
         begin, _ = dds_ports(self.domain)
-        return [_locator(host, begin + 10 + 2 * index) for index in range(ASKED)]
+        return [_locator(address, begin + 10 + 2 * index)
+                for address in addresses for index in range(ASKED)]
 
     def environment(self, path: str, user: Mapping[str, str]) -> Mapping[str, str]:
         """

@@ -129,9 +129,9 @@ def test_robot_limited_to_itself_and_its_peers_asks_no_lan(quiet: bool) -> None:
 
 
 def test_static_peers_are_asked_beside_the_groups() -> None:
-    text = robot(FastDds(), {'ROS_STATIC_PEERS': '192.168.1.5;nuc.local;'})
+    text = robot(FastDds(), {'ROS_STATIC_PEERS': '192.168.1.5;localhost;'})
     assert list(dict.fromkeys(host for host, _ in locators(text))) == [
-        DISCOVERY_GROUP, '239.18.7.2', '192.168.1.5', 'nuc.local']
+        DISCOVERY_GROUP, '239.18.7.2', '192.168.1.5', '127.0.0.1']
 
 
 def test_a_users_profiles_are_taken_over(tmp_path: Path) -> None:
@@ -227,3 +227,5 @@ def test_what_keeps_nodes_from_machines_is_refused(name: str, value: str) -> Non
         FastDds(300)
     with pytest.raises(DdsError, match="'<x>' of ROS_STATIC_PEERS"):
         robot(FastDds(), {'ROS_STATIC_PEERS': '<x>'})
+    with pytest.raises(DdsError, match="'nosuch.invalid' of ROS_STATIC_PEERS has no IPv4"):
+        robot(FastDds(), {'ROS_STATIC_PEERS': '192.168.1.5;nosuch.invalid'})
