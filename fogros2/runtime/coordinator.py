@@ -11,7 +11,7 @@ coordinator keeps it alive until all processes have ended and the machines are t
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import copy
@@ -61,8 +61,11 @@ OnMachine = Callable[[NodeSpec, str], ExecuteLocal]
 #: A machine or its name, and the package and executable of a process there, if both are known.
 Planned = tuple[Optional['SomeMachine'], Optional[tuple[str, str]]]
 
+#: The attribute of an action that has its RemoteProcess.
+REMOTE = '_fogros2_remote'
 #: Name of the coordinator in ``context.locals``.
 _LOCAL = 'fogros2'
+_EARLY = 'set it at the beginning of the launch file, outside of groups'
 #: More than any launch has machines: each may block a thread.
 _THREADS = 128
 
@@ -118,6 +121,8 @@ class Coordinator:
         self._late: set[str] = set()
         #: What the DDS settings replaced, by variable.
         self._replaced: dict[str, Optional[str]] = {}
+        #: The environment that the deployment got.
+        self._users: Mapping[str, str] = {}
         self._on_machine: OnMachine
         self._dds: Optional[str] = None
         self._down: Optional[asyncio.Task[None]] = None
@@ -173,8 +178,9 @@ class Coordinator:
         self._console = Console()
         self._pool = ThreadPoolExecutor(_THREADS, 'fogros2')
         # includes what the launch file has set so far, such as ROS_DOMAIN_ID
+        self._users = dict(context.environment)
         self._launch = self._make_launch(
-            report=self._console, environment=dict(context.environment), cancel=self._cancel)
+            report=self._console, environment=self._users, cancel=self._cancel)
         self._restore_signals = signals.take_over(context)
         private.guard_shutdown(context, self._fail)
         if self._dds is not None:
@@ -425,10 +431,10 @@ class Coordinator:
 
     def _set_dds_environment(self) -> None:
         environment = self.launch.robot_environment()
-        for kept in (self._context.environment, *private.kept_environments(self._context)):
-            kept.update(environment)
         for name in environment:
             self._replaced.setdefault(name, self.base_environment.get(name))
+        self._replace('the launch file', environment, self._context.environment,
+                      *private.kept_environments(self._context))
         if private.has_ros_node(self._context) and not (
                 self.base_environment.items() >= environment.items()):
             self._warn_of_late("launch's own ROS node")
@@ -442,10 +448,24 @@ class Coordinator:
                 continue
             if details.get('pid') is None:
                 # executed; starts when launch returns to its event loop
-                details['env'].update(environment)
+                self._replace(details['name'], environment, details['env'])
             elif details['name'] not in self._late:
                 self._late.add(details['name'])
                 self._warn_of_late(details['name'])
+
+    def _replace(
+        self, owner: str, settings: Mapping[str, str], *environments: MutableMapping[str, str],
+    ) -> None:
+        """Write the DDS settings; warn of replaced values that the deployment did not get."""
+        lost = {name for environment in environments for name, value in settings.items()
+                if environment.get(name) not in (
+                    None, value, self._replaced[name], self._users.get(name))}
+        for environment in environments:
+            environment.update(settings)
+        if lost:
+            self._logger.warning(
+                f"the launch's DDS settings replace {', '.join(sorted(lost))} of {owner}, so that "
+                f'it sees the cloud; {_EARLY}')
 
     def _warn_of_late(self, name: str) -> None:
         self._logger.warning(
@@ -457,6 +477,13 @@ class Coordinator:
             self._logger.warning(
                 f"{event.process_name} has another ROS_DOMAIN_ID than the launch: the launch's "
                 'DDS filter drops messages of other domains; start it outside of the launch')
+        others = [name for name in self._replaced
+                  if (event.env or {}).get(name) != self.base_environment[name]]
+        if others and REMOTE not in vars(event.action) and event.process_name not in self._late:
+            self._late.add(event.process_name)
+            self._logger.warning(
+                f"{event.process_name} has another {', '.join(others)} than the launch: it may "
+                f'not see the cloud; {_EARLY}')
 
     def _on_begin(self, context: LaunchContext) -> None:
         self._begun = True

@@ -17,7 +17,7 @@ from fogros2.launch_internals import components, private
 from fogros2.model import NodeSpec
 from fogros2.runtime import node_spec
 from fogros2.runtime.added_process import AddedProcess
-from fogros2.runtime.coordinator import Coordinator, Planned
+from fogros2.runtime.coordinator import Coordinator, Planned, REMOTE
 from fogros2.runtime.remote_run import RemoteRun
 
 if TYPE_CHECKING:
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from fogros2.runtime.parts import Lists
     from fogros2.runtime.session import Session
 
-#: The attribute of an action that has its RemoteProcess.
-_REMOTE = '_fogros2_remote'
 #: The attribute of an action whose process no CloudGroup sends.
 _KEPT = '_fogros2_kept'
 
@@ -66,7 +64,7 @@ class RemoteProcess:
         self.own = own
         self._own = private.replace_methods(action, private.Methods(
             self.execute, self.prepare, self.start, self.shut_down))
-        vars(action)[_REMOTE] = self
+        vars(action)[REMOTE] = self
 
     @property
     def lists(self) -> Lists:
@@ -205,7 +203,7 @@ def send(
 
 def remote_of(entity: object) -> Optional[RemoteProcess]:
     """Return what makes the process of an action run on a machine, None for all else."""
-    remote: Optional[RemoteProcess] = getattr(entity, _REMOTE, None)
+    remote: Optional[RemoteProcess] = getattr(entity, REMOTE, None)
     return remote
 
 

@@ -264,6 +264,20 @@ def test_robot_node_started_before_the_dds_is_warned_about(run, fake, planner, c
     assert f'{process.name} runs already' in capfd.readouterr().out
 
 
+@pytest.mark.parametrize('first', [True, False])
+def test_dds_settings_of_a_part_of_the_launch_are_warned_about(run, fake, planner, capfd, first):
+    fake.on_start = ends
+    process = ExecuteProcess(cmd=['sh', '-c', 'echo dds is $CYCLONEDDS_URI'], output='screen')
+    group = GroupAction([SetEnvironmentVariable('CYCLONEDDS_URI', '<mine/>'), process])
+    cloud = talker(planner)
+    assert run(FogROSLaunchDescription([cloud, group] if first else [
+        TimerAction(period=0.0, actions=[]), group, cloud])) == 0
+    out = capfd.readouterr().out
+    assert out.count(f'{process.name} has another CYCLONEDDS_URI' if first
+                     else f'replace CYCLONEDDS_URI of {process.name}') == 1
+    assert f"dds is {'<mine/>' if first else '<CycloneDDS/>'}" in out
+
+
 def test_ros_node_of_launch_before_the_dds_is_warned_about(run, fake, planner, capfd):
     fake.on_start = ends
     made = OpaqueFunction(function=lambda context: context.extend_globals({'ros_adapter': None}))
