@@ -15,6 +15,14 @@ from fogros2.errors import DdsError
 from fogros2.model import Command, DdsInterface
 from fogros2.vpn.addresses import dds_ports
 
+#: Variables that decide which nodes hear each other, and hold only on one host.
+VARIABLES = (
+    'CYCLONEDDS_URI', 'FASTDDS_BUILTIN_TRANSPORTS', 'FASTDDS_DEFAULT_PROFILES_FILE',
+    'FASTRTPS_DEFAULT_PROFILES_FILE', 'RMW_IMPLEMENTATION', 'ROS_AUTOMATIC_DISCOVERY_RANGE',
+    'ROS_DISCOVERY_SERVER', 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS', 'ZENOH_CONFIG_OVERRIDE',
+    'ZENOH_SESSION_CONFIG_URI',
+)
+
 
 @dataclasses.dataclass(frozen=True)
 class Router:

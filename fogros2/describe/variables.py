@@ -5,11 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from fogros2 import dds
+
 #: Variables that describe the robot's own system; a launch file's changes of them stay here.
 LOCAL_VARIABLES = frozenset({
-    'AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'CYCLONEDDS_URI', 'HOME',
-    'LD_LIBRARY_PATH', 'LOGNAME', 'OLDPWD', 'PATH', 'PWD', 'PYTHONPATH', 'RMW_IMPLEMENTATION',
-    'ROS_HOME', 'ROS_LOG_DIR', 'SHELL', 'SHLVL', 'TMPDIR', 'USER', '_',
+    *dds.VARIABLES, 'AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'HOME',
+    'LD_LIBRARY_PATH', 'LOGNAME', 'OLDPWD', 'PATH', 'PWD', 'PYTHONPATH', 'ROS_HOME',
+    'ROS_LOG_DIR', 'SHELL', 'SHLVL', 'TMPDIR', 'USER', '_',
 })
 #: Share of the robot's variables from which a list is a copy of its environment.
 COPY = 0.8

@@ -19,6 +19,7 @@ import re
 import shlex
 from typing import Any, Union
 
+from fogros2 import dds
 from fogros2.errors import ConfigurationError, DdsError, did_you_mean
 from fogros2.host.installer import APT
 from fogros2.model import Command, NodeSpec, Text
@@ -43,12 +44,9 @@ _VARIABLE = re.compile('[A-Za-z_][A-Za-z0-9_]*')
 _IMAGE = re.compile('[A-Za-z0-9][A-Za-z0-9._:/@+-]*')
 #: Variables that decide which nodes hear each other. Each container on the machine's network gets
 #: the values of the machine's nodes.
-_DDS_VARIABLES = (
-    'CYCLONEDDS_URI', 'FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE',
-    'RMW_FASTRTPS_USE_QOS_FROM_XML', 'RMW_IMPLEMENTATION', 'ROS_AUTOMATIC_DISCOVERY_RANGE',
-    'ROS_DOMAIN_ID', 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS', 'ZENOH_CONFIG_OVERRIDE',
-    'ZENOH_ROUTER_CHECK_ATTEMPTS', 'ZENOH_SESSION_CONFIG_URI',
-)
+_DDS_VARIABLES = sorted([
+    *dds.VARIABLES, 'RMW_FASTRTPS_USE_QOS_FROM_XML', 'ROS_DOMAIN_ID',
+    'ZENOH_ROUTER_CHECK_ATTEMPTS'])
 #: Variables of the machine's nodes that only nodes in images get.
 _NODE_VARIABLES = (
     'LANG', 'RCUTILS_COLORIZED_OUTPUT', 'RCUTILS_CONSOLE_OUTPUT_FORMAT',

@@ -61,6 +61,14 @@ def test_changed_variable_of_a_copy_travels(said: list[str]) -> None:
         'GITHUB_TOKEN': 'of the machine'}
 
 
+def test_dds_settings_of_a_copy_stay_here(said: list[str]) -> None:
+    for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'ROS_STATIC_PEERS', 'ROS_LOCALHOST_ONLY',
+                 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_DISCOVERY_SERVER', 'CYCLONEDDS_URI',
+                 'FASTDDS_BUILTIN_TRANSPORTS', 'ZENOH_SESSION_CONFIG_URI',
+                 'ZENOH_CONFIG_OVERRIDE', 'RMW_IMPLEMENTATION'):
+        assert sent(env={**os.environ, name: 'of the robot'}) == {}, name
+
+
 def test_listed_variables_travel(said: list[str]) -> None:
     listed = {name: os.environ[name] for name in ('GITHUB_TOKEN', 'PATH')}
     assert sent(env=listed) == listed == sent(additional_env=listed)
