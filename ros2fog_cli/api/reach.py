@@ -315,7 +315,8 @@ def variables_of(folder: Path) -> dict[str, str]:
     """
     Return the variables of a launch's folder, by which nodes of this computer join it.
 
-    :raises FogError: the user's RMW_IMPLEMENTATION differs from the launch's.
+    :raises FogError: the user's RMW_IMPLEMENTATION differs from the launch's, or another variable
+        keeps nodes from machines.
     """
     rmw = (folder / 'rmw').read_text()
     own = os.environ.get('RMW_IMPLEMENTATION') or rmw
@@ -323,5 +324,8 @@ def variables_of(folder: Path) -> dict[str, str]:
         raise DdsError(f'the launch has RMW_IMPLEMENTATION={rmw}, this terminal {own}',
                        'unset RMW_IMPLEMENTATION here')
     vendor = plugin_system.load('fogros2.dds', rmw)()
-    return {**vendor.environment(str(folder / vendor.file_name), os.environ),
-            'ROS_DOMAIN_ID': (folder / 'domain').read_text()}
+    variables = vendor.environment(str(folder / vendor.file_name), os.environ)
+    # only for its checks of what the launch's variables do not replace
+    vendor.robot_interfaces('', None, {
+        name: value for name, value in os.environ.items() if name not in variables})
+    return {**variables, 'ROS_DOMAIN_ID': (folder / 'domain').read_text()}

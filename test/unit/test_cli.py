@@ -717,6 +717,14 @@ def joined(monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
+def test_env_refuses_a_terminal_that_would_see_nothing(
+        joined: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (joined / 'rmw').write_text('rmw_fastrtps_cpp')
+    assert run('env', 'a') == 0
+    monkeypatch.setenv('ROS_DISCOVERY_SERVER', '127.0.0.1:11811')
+    assert 'ROS_DISCOVERY_SERVER makes nodes use only a server' in str(run('env', 'a'))
+
+
 def become(*words: str, stdin: Path = Path(os.devnull)) -> int:
     """Run the verb 'shell' in another process, and return the status of what it becomes."""
     child = os.fork()
